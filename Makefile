@@ -1,0 +1,40 @@
+PYTHON ?= python3
+BIN := .venv/bin
+export MUJOCO_GL ?= disabled
+# One BLAS thread: the matrices are tiny and the runs are parallel processes.
+export OMP_NUM_THREADS ?= 1
+
+.PHONY: demo test test-slow lint check bench figures clean
+
+.venv/installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@touch $@
+
+demo: .venv/installed
+	$(BIN)/safe-wrappers compare configs/demo.yaml --report
+
+test: .venv/installed
+	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+test-slow: .venv/installed
+	$(BIN)/python -m pytest -n 2 -m slow
+
+lint: .venv/installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+check: lint test
+
+.venv/bench: .venv/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
+	@touch $@
+
+bench: .venv/bench
+	$(BIN)/python -m benchmarks.projection
+	$(BIN)/python -m benchmarks.filter_call
+	$(BIN)/python -m benchmarks.env_step
+
+clean:
+	rm -rf .venv build dist *.egg-info safe_wrappers.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

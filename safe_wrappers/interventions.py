@@ -1,0 +1,55 @@
+"""The one place that names the info keys: their dtypes, units and meaning.
+
+Every wrapper writes its keys at every step with the dtype given here, so that `Monitor`, TensorBoard and
+Gymnasium's vector envs need no glue. No key holds a wall-clock value: `check_env` compares two runs exactly.
+"""
+
+from typing import Final
+
+# CBFActionFilter, every step ------------------------------------------------------------------------------
+CBF_INTERVENED: Final = "cbf/intervened"
+"""bool: the executed action is not the (boxed) proposed one."""
+CBF_INFEASIBLE: Final = "cbf/infeasible"
+"""bool: no action inside the actuator box satisfied every row at this step."""
+CBF_FALLBACK: Final = "cbf/fallback"
+"""bool: the fallback chose the executed action (infeasible, failed solve, or non-finite proposal)."""
+CBF_NONFINITE: Final = "cbf/nonfinite"
+"""bool: the proposed action held a NaN or an infinity; it never reaches the env."""
+CBF_CORRECTION: Final = "cbf/correction"
+"""float64: L2 norm of executed minus proposed, in action units (boxing counts; 0 for a non-finite proposal's
+missing entries: those are compared as 0)."""
+CBF_CLIPPED: Final = "cbf/clipped"
+"""float64: L2 norm of boxed minus proposed, in action units: what the action space alone took away."""
+CBF_MARGIN: Final = "cbf/margin"
+"""float64: the smallest barrier value h over all constraints before the step, each in its own unit (m, rad/s,
+...); 0 when no constraint has a barrier."""
+CBF_UNSAFE: Final = "cbf/unsafe"
+"""bool: some h was negative before the step."""
+EXECUTED_ACTION: Final = "executed_action"
+"""array: what the env was really given."""
+PROPOSED_ACTION: Final = "proposed_action"
+"""array: what the filter was given, before boxing."""
+
+CBF_BOOLS: Final = (CBF_INTERVENED, CBF_INFEASIBLE, CBF_FALLBACK, CBF_NONFINITE, CBF_UNSAFE)
+CBF_FLOATS: Final = (CBF_CORRECTION, CBF_CLIPPED, CBF_MARGIN)
+
+# Tasks, every step: the env's own truth, never the filter's plant ------------------------------------------
+COST: Final = "cost"
+"""float64: cost of this control step, judged at its end, as Safety-Gymnasium publishes it."""
+COST_SUBSTEP: Final = "cost_substep"
+"""float64: 1 if the constraint was violated at any physics substep of this control step, else 0."""
+
+# RecordInterventions ---------------------------------------------------------------------------------------
+EPISODE_SUMMARY: Final = "interventions"
+"""dict, at an episode's last step only, as RecordEpisodeStatistics adds `episode`."""
+RUNNING_PREFIX: Final = "interventions/"
+RUNNING: Final = (
+    "interventions/rate",
+    "interventions/correction_mean",
+    "interventions/infeasible",
+    "interventions/fallback",
+    "interventions/margin_min",
+    "interventions/cost",
+    "interventions/cost_substep",
+)
+"""float64, every step: the episode so far. Monitor reads them at the terminal step (`info_keywords`)."""
