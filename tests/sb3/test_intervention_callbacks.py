@@ -1,0 +1,117 @@
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from safe_wrappers import interventions as keys
+from safe_wrappers.sb3 import InterventionCallback, InterventionEvalCallback
+from safe_wrappers.wrappers.record_interventions import RecordInterventions
+
+
+class EveryFourthStep(gym.Wrapper):
+    """Stands for a filter that corrects every fourth step by 0.5, in a task with cost 1 there."""
+
+    def reset(self, *, seed=None, options=None):
+        self.steps = 0
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self.steps += 1
+        hit = self.steps % 4 == 0
+        info.update(dict.fromkeys(keys.CBF_BOOLS, False))
+        info.update(dict.fromkeys(keys.CBF_FLOATS, 0.0))
+        info[keys.CBF_INTERVENED] = hit
+        info[keys.CBF_CORRECTION] = 0.5 * hit
+        info[keys.COST] = info[keys.COST_SUBSTEP] = float(hit)
+        return observation, reward, terminated, truncated, info
+
+
+def make_env():
+    env = RecordInterventions(EveryFourthStep(gym.make("Pendulum-v1", max_episode_steps=16)))
+    return Monitor(env, info_keywords=keys.RUNNING)
+
+
+def scalars(folder):
+    events = EventAccumulator(str(folder))
+    events.Reload()
+    return {tag: [event.value for event in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
+
+
+EXPECTED = {
+    "interventions/step_rate": 0.25,
+    "interventions/step_correction": 0.125,
+    "interventions/step_cost": 0.25,
+    "interventions/rate": 0.25,
+    "interventions/correction_mean": 0.125,
+    "interventions/correction_p95": 0.5,
+    "interventions/infeasible": 0.0,
+    "interventions/cost": 4.0,
+    "interventions/cost_substep": 4.0,
+    "interventions/violations": 4.0,
+}
+
+
+@pytest.mark.parametrize("vec_env", [DummyVecEnv, SubprocVecEnv])
+def test_rollouts_reach_tensorboard_and_stdout(tmp_path, vec_env, capsys):
+    envs = vec_env([make_env] * 2)
+    model = PPO("MlpPolicy", envs, n_steps=32, n_epochs=1, batch_size=32, device="cpu", seed=0)
+    model.set_logger(configure(str(tmp_path), ["tensorboard", "stdout"]))
+    model.learn(128, callback=InterventionCallback())
+    envs.close()
+    logged = scalars(tmp_path)
+    for tag, value in EXPECTED.items():
+        assert logged[tag] == pytest.approx([value, value]), tag
+    assert "| interventions/" in capsys.readouterr().out
+
+
+def test_off_policy_rollouts(tmp_path):
+    model = SAC("MlpPolicy", make_env(), learning_starts=1000, buffer_size=200, device="cpu", seed=0)
+    model.set_logger(configure(str(tmp_path), ["tensorboard"]))
+    model.learn(64, log_interval=4, callback=InterventionCallback())
+    assert scalars(tmp_path)["interventions/rate"] == pytest.approx([0.25])
+
+
+def test_without_recorder_the_step_values_are_logged(tmp_path):
+    model = PPO(
+        "MlpPolicy", EveryFourthStep(gym.make("Pendulum-v1")), n_steps=32, n_epochs=1, device="cpu", seed=0
+    )
+    model.set_logger(configure(str(tmp_path), ["tensorboard"]))
+    model.learn(32, callback=InterventionCallback())
+    logged = scalars(tmp_path)
+    assert logged["interventions/step_rate"] == pytest.approx([0.25])
+    assert "interventions/rate" not in logged
+
+
+def test_evaluation_reaches_tensorboard_at_its_own_step(tmp_path):
+    model = PPO("MlpPolicy", make_env(), n_steps=32, n_epochs=1, batch_size=32, device="cpu", seed=0)
+    model.set_logger(configure(str(tmp_path), ["tensorboard"]))
+    evaluation = InterventionEvalCallback(Monitor(make_env()), n_eval_episodes=2, eval_freq=20, verbose=0)
+    model.learn(32, callback=evaluation)
+    events = EventAccumulator(str(tmp_path))
+    events.Reload()
+    (event,) = events.Scalars("eval/interventions/rate")
+    assert (event.step, event.value) == (20, 0.25)
+    assert np.isclose(events.Scalars("eval/interventions/cost")[0].value, 4.0)
+    assert events.Scalars("eval/mean_reward")[0].step == 20
+
+
+def test_monitor_file_holds_the_running_keys(tmp_path):
+    env = Monitor(
+        RecordInterventions(EveryFourthStep(gym.make("Pendulum-v1", max_episode_steps=16))),
+        str(tmp_path / "run"),
+        info_keywords=keys.RUNNING,
+    )
+    env.reset(seed=0)
+    for _ in range(16):
+        env.step(np.zeros(1, np.float32))
+    env.close()
+    comment, header, row = (tmp_path / "run.monitor.csv").read_text().splitlines()
+    assert comment.startswith("#")
+    values = dict(zip(header.split(","), row.split(","), strict=True))
+    assert values["interventions/rate"] == "0.25"
+    assert values["interventions/cost"] == "4.0"

@@ -1,0 +1,221 @@
+import pickle
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from safe_wrappers import interventions as keys
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.record_interventions import COLUMNS, RecordInterventions, read_episodes
+
+
+class Scripted(gym.Wrapper):
+    """Stands for a filter and a task: writes the infos it was given, one per step."""
+
+    def __init__(self, env, infos):
+        super().__init__(env)
+        self.infos = infos
+        self.filter_seconds = 0.0
+        self.filter_calls = 0
+
+    def reset(self, *, seed=None, options=None):
+        self.at = 0
+        self.seen = (seed, options)
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action):
+        observation, reward, terminated, truncated, _ = self.env.step(action)
+        self.filter_seconds += 5e-6
+        self.filter_calls += 1
+        info = dict(self.infos[self.at])
+        self.at += 1
+        return observation, reward, terminated, truncated, info
+
+
+def cbf(intervened=False, correction=0.0, margin=1.0, infeasible=False, fallback=False, unsafe=False, **task):
+    return {
+        keys.CBF_INTERVENED: intervened,
+        keys.CBF_CORRECTION: correction,
+        keys.CBF_MARGIN: margin,
+        keys.CBF_INFEASIBLE: infeasible,
+        keys.CBF_FALLBACK: fallback,
+        keys.CBF_NONFINITE: False,
+        keys.CBF_UNSAFE: unsafe,
+        **task,
+    }
+
+
+SCRIPT = [
+    cbf(cost=0.0, cost_substep=0.0, goals_reached=0),
+    cbf(True, 0.5, 0.2, cost=0.0, cost_substep=1.0, goals_reached=1),
+    cbf(
+        True,
+        1.5,
+        -0.1,
+        infeasible=True,
+        fallback=True,
+        unsafe=True,
+        cost=1.0,
+        cost_substep=1.0,
+        goals_reached=1,
+    ),
+    cbf(margin=float("inf"), cost=0.0, cost_substep=0.0, goals_reached=2, is_success=True),
+]
+
+
+def scripted_env(path=None, infos=SCRIPT):
+    return RecordInterventions(Scripted(gym.make("Pendulum-v1", max_episode_steps=len(infos)), infos), path)
+
+
+def play(env, seed=0):
+    env.reset(seed=seed)
+    infos, total, done = [], 0.0, False
+    while not done:
+        _, reward, terminated, truncated, info = env.step(np.zeros(1, np.float32))
+        infos.append(info)
+        total += reward
+        done = terminated or truncated
+    return infos, total
+
+
+def test_counts_of_an_episode():
+    infos, total = play(scripted_env())
+    assert [keys.EPISODE_SUMMARY in info for info in infos] == [False, False, False, True]
+    summary = infos[-1][keys.EPISODE_SUMMARY]
+    assert summary == {
+        "length": 4,
+        "return": pytest.approx(total),
+        "intervention_rate": 0.5,
+        "correction_mean": 0.5,
+        "correction_p95": pytest.approx(np.percentile([0.0, 0.5, 1.5, 0.0], 95)),
+        "infeasible": 1,
+        "fallback": 1,
+        "nonfinite": 0,
+        "unsafe": 1,
+        "margin_min": -0.1,
+        "violations": 2,
+        "cost": 1.0,
+        "cost_substep": 2.0,
+        "goals_reached": 2,
+        "success": True,
+    }
+
+
+def test_running_keys_at_every_step_with_one_dtype():
+    infos, _ = play(scripted_env())
+    for info in infos:
+        assert [type(info[key]) for key in keys.RUNNING] == [float] * len(keys.RUNNING)
+        assert all(np.isfinite(info[key]) for key in keys.RUNNING)
+    assert [info["interventions/rate"] for info in infos] == [0.0, 0.5, 2 / 3, 0.5]
+    assert [info["interventions/cost_substep"] for info in infos] == [0.0, 1.0, 2.0, 2.0]
+    assert [info["interventions/margin_min"] for info in infos] == [1.0, 0.2, -0.1, -0.1]
+
+
+def test_a_new_episode_starts_from_nothing():
+    env = scripted_env()
+    first, _ = play(env)
+    second, _ = play(env)
+    for key in keys.RUNNING:
+        assert [info[key] for info in first] == [info[key] for info in second]
+
+
+def test_without_a_filter_everything_counts_as_zero():
+    env = RecordInterventions(gym.make("Pendulum-v1", max_episode_steps=3))
+    infos, _ = play(env)
+    assert all(info[key] == 0.0 for info in infos for key in keys.RUNNING)
+    summary = infos[-1][keys.EPISODE_SUMMARY]
+    assert summary["length"] == 3
+    assert {key for key, value in summary.items() if value == 0} == set(COLUMNS) - {
+        "length",
+        "return",
+        "goals_reached",
+        "success",
+    }
+    assert env.filter_time_us is None
+
+
+def test_filter_time_is_an_attribute_and_never_in_info():
+    env = scripted_env()
+    assert env.filter_time_us is None
+    infos, _ = play(env)
+    assert env.filter_time_us == pytest.approx(5.0)
+    assert not any("time" in key or "seconds" in key for info in infos for key in info)
+
+
+def test_gymnasium_contract():
+    env = gym.make("Pendulum-v1")
+    wrapped = RecordInterventions(env)
+    check_env(wrapped, skip_render_check=True)
+    rebuilt = gym.make(wrapped.spec)
+    assert isinstance(rebuilt, RecordInterventions)
+    options = {"x_init": 0.1}
+    scripted = scripted_env()
+    scripted.reset(seed=3, options=options)
+    assert scripted.env.seen == (3, options)
+    assert options == {"x_init": 0.1}
+    assert isinstance(pickle.loads(pickle.dumps(wrapped)), RecordInterventions)
+
+
+@pytest.mark.parametrize("mode", list(gym.vector.AutoresetMode))
+def test_vector_env_counts_episodes_apart_in_every_autoreset_mode(mode):
+    envs = gym.vector.SyncVectorEnv([scripted_env] * 2, autoreset_mode=mode)
+    envs.reset(seed=0)
+    ends = 0
+    for _ in range(12):
+        _, _, _, truncated, info = envs.step(np.zeros((2, 1), np.float32))
+        info = info.get("final_info", info) if truncated.any() else info
+        if truncated.any():
+            ends += 1
+            assert info[keys.EPISODE_SUMMARY]["length"].tolist() == [4, 4]
+            assert info["interventions/cost"].dtype == np.float64
+            if mode is gym.vector.AutoresetMode.DISABLED:
+                envs.reset(options={"reset_mask": truncated})
+    assert ends >= 2
+
+
+def test_file_gains_one_row_per_episode(tmp_path: Path):
+    path = tmp_path / "deep" / "episodes.csv"
+    env = scripted_env(path)
+    play(env)
+    play(env)
+    assert path.read_text().splitlines()[0] == ",".join(COLUMNS)
+    assert len(path.read_text().splitlines()) == 3
+    first, second = read_episodes(path)
+    assert first["correction_mean"] == second["correction_mean"] == 0.5
+    assert first["success"] == 1.0
+    # A task without goals: empty cells, which do not come back.
+    bare = tmp_path / "bare.csv"
+    play(RecordInterventions(gym.make("Pendulum-v1", max_episode_steps=2), bare))
+    assert set(read_episodes(bare)[0]) == set(COLUMNS) - {"goals_reached", "success"}
+
+
+@pytest.mark.parametrize("cut", [1, 3, 30])
+def test_half_written_last_line_is_dropped_and_the_file_continued(tmp_path: Path, cut: int):
+    path = tmp_path / "episodes.csv"
+    env = scripted_env(path)
+    play(env)
+    play(env)
+    path.write_bytes(path.read_bytes()[:-cut])
+    assert len(read_episodes(path)) == 1
+    play(scripted_env(path))
+    rows = read_episodes(path)
+    assert len(rows) == 2
+    assert rows[0]["cost"] == rows[1]["cost"] == 1.0
+
+
+def test_file_killed_inside_its_header(tmp_path: Path):
+    path = tmp_path / "episodes.csv"
+    path.write_text("length,ret")
+    play(scripted_env(path))
+    assert len(read_episodes(path)) == 1
+
+
+def test_refused_paths(tmp_path: Path):
+    with pytest.raises(ConfigurationError, match="is a folder; give a file name in it"):
+        scripted_env(tmp_path)
+    other = tmp_path / "other.csv"
+    other.write_text("a,b\n1,2\n")
+    with pytest.raises(ConfigurationError, match=r"has other columns .'a,b'; expected 'length,return"):
+        scripted_env(other)
