@@ -1,0 +1,339 @@
+"""The minimal intervention: the control closest to the nominal one inside every half-space and the box.
+
+Source: appendix "Minimal-intervention quadratic program" and Systems Perspective 1.1: feasibility comes before
+invariance, and clamping a projection afterwards is not the projection with a box.
+
+The ways through, cheapest first: the nominal is feasible (returned bit for bit, no solver); one row and a box
+(exact, by the breakpoints of a piecewise linear function); else a QP backend. Every answer is checked with
+our own residual, whatever the solver says of it. Calls share no state, so a failed solve cannot spoil the next.
+"""
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import cast
+
+import daqp
+import numpy as np
+import qpsolvers
+from numpy.typing import ArrayLike, NDArray
+
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
+
+Array = NDArray[np.float64]
+
+FEASIBILITY_TOLERANCE = 1e-9
+"""Largest residual that counts as satisfied, per row divided by its normal's length: control units."""
+
+
+class Status(StrEnum):
+    """How a projection ended."""
+
+    INACTIVE = "inactive"
+    """The nominal control satisfies everything; `control` is that control, bit for bit."""
+    PROJECTED = "projected"
+    """`control` is the closest admissible control, residual checked."""
+    INFEASIBLE = "infeasible"
+    """No control in the box satisfies every row; `control` violates them least."""
+    FAILED = "failed"
+    """No backend gave an answer that passed the check; `control` is only inside the box."""
+
+
+@dataclass(frozen=True, slots=True)
+class Projection:
+    """An answer that has been checked.
+
+    Attributes:
+        control: Shape (m,), always finite and inside the box.
+        status: See `Status`; compares equal to its string.
+        violation: Largest `normals @ control - offsets` over all rows, at least 0, in row units.
+        multipliers: One per row, shape (k,), at least 0; zeros unless `projected`. With the box's own
+            multipliers they make the KKT conditions hold.
+        iterations: Of the backend; 0 where no solver was called.
+    """
+
+    control: Array
+    status: Status
+    violation: float
+    multipliers: Array
+    iterations: int
+
+
+def project(
+    u_nom: ArrayLike,
+    normals: ArrayLike,
+    offsets: ArrayLike,
+    lower: ArrayLike,
+    upper: ArrayLike,
+    solver: str = "daqp",
+) -> Projection:
+    """Project a nominal control onto `{u : normals @ u <= offsets, lower <= u <= upper}`.
+
+    Args:
+        u_nom: Nominal control, shape (m,), finite.
+        normals: Row normals, shape (k, m); k may be 0. Rows may be degenerate: a zero normal with a
+            non-negative offset is dropped, with a negative one it makes the problem infeasible.
+        offsets: Shape (k,).
+        lower: Box, shape (m,); -inf is no bound.
+        upper: Box, shape (m,); +inf is no bound.
+        solver: "daqp" (called directly) or any installed qpsolvers backend by name.
+
+    Returns:
+        A `Projection`. Infeasible problems give the least-violation control: the smallest sum of squared,
+        normalised violations, and among those the control closest to `u_nom`.
+
+    Raises:
+        ConfigurationError: Shapes do not match, bounds cross, or an argument that must be finite is not.
+        UnknownNameError: No such solver is installed.
+    """
+    check_solver(solver)
+    u = np.array(u_nom, dtype=np.float64, ndmin=1)
+    m = u.size
+    a = np.asarray(normals, dtype=np.float64)
+    b = np.asarray(offsets, dtype=np.float64).reshape(-1)
+    a = a.reshape(b.size, m) if a.size == b.size * m else a
+    lo, hi = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
+    if u.ndim != 1 or a.shape != (b.size, m):
+        raise ConfigurationError(
+            f"expected u_nom (m,), normals (k, m) and offsets (k,); got {u.shape}, {a.shape} and {b.shape}"
+        )
+    try:
+        lo, hi = np.broadcast_to(lo, (m,)), np.broadcast_to(hi, (m,))
+    except ValueError:
+        raise ConfigurationError(
+            f"expected bounds of shape ({m},); got {lo.shape} and {hi.shape}"
+        ) from None
+    if not np.isfinite(u).all():
+        raise ConfigurationError(f"u_nom must be finite, got {u}; replace it before projecting")
+    if not (lo <= hi).all():  # also refuses NaN
+        raise ConfigurationError(f"lower must not exceed upper, got {lo} and {hi}")
+    return project_unchecked(u, a, b, lo, hi, solver)
+
+
+def check_solver(solver: str) -> None:
+    """Refuse a solver that is not installed, naming those that are."""
+    if solver != "daqp" and solver not in qpsolvers.available_solvers:
+        raise UnknownNameError(
+            f"solver {solver!r} is not installed; installed: {', '.join(sorted(qpsolvers.available_solvers))}"
+        )
+
+
+def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array, solver: str) -> Projection:
+    """`project` for callers that have already checked types, shapes and finiteness of `u` and the box."""
+    inside = bool((u >= lo).all() and (u <= hi).all())
+    if b.size == 0:
+        status = Status.INACTIVE if inside else Status.PROJECTED
+        return Projection(u if inside else np.clip(u, lo, hi), status, 0.0, np.zeros(0), 0)
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        return _finite_rows_only(u, a, b, lo, hi, solver)
+    length = np.sqrt(np.einsum("ij,ij->i", a, a))
+    slack = FEASIBILITY_TOLERANCE * length
+    if inside and bool((a @ u - b <= slack).all()):
+        return Projection(u, Status.INACTIVE, 0.0, np.zeros(b.size), 0)
+    if b.size == 1:
+        needed = length > 0.0
+        hopeless = bool(b[0] < 0.0) and not needed[0]
+    else:
+        # What the box alone can reach decides which rows matter; a zero normal is the extreme case.
+        highest = _extreme(a, lo, hi)
+        lowest = -_extreme(-a, lo, hi)
+        needed = highest > b
+        hopeless = bool((lowest > b + slack).any())
+        needed &= length > 0.0
+    keep = np.flatnonzero(needed)
+    rows, limits = a[keep], b[keep]
+    if keep.size == 0:
+        control, weights, iterations, solved = np.clip(u, lo, hi), np.zeros(0), 0, True
+    elif keep.size == 1:
+        control, weight, solved = _one_row(u, rows[0], float(limits[0]), lo, hi)
+        weights, iterations = np.array([weight]), 0
+    else:
+        norm = length[keep]
+        unit, cut = rows / norm[:, None], limits / norm
+        control, weights, iterations, solved = _solve(u, unit, cut, lo, hi, solver, hopeless)
+        weights = weights / norm
+    residual = a @ control - b
+    feasible = bool((residual <= slack * 10.0).all())
+    violation = max(0.0, float(residual.max()))
+    if feasible and solved:
+        multipliers = np.zeros(b.size)
+        multipliers[keep] = weights
+        return Projection(control, Status.PROJECTED, violation, multipliers, iterations)
+    status = Status.FAILED if (feasible or not solved) else Status.INFEASIBLE
+    return Projection(control, status, violation, np.zeros(b.size), iterations)
+
+
+def _finite_rows_only(u: Array, a: Array, b: Array, lo: Array, hi: Array, solver: str) -> Projection:
+    """A row with a NaN or an infinity asks for nothing that can be checked: respect the others, say failed."""
+    # An offset of +inf asks for nothing; everything else that is not finite is a failed constraint.
+    harmless = np.isfinite(a).all(axis=1) & (b == np.inf)
+    fine = np.isfinite(a).all(axis=1) & np.isfinite(b)
+    part = project_unchecked(u, a[fine], b[fine], lo, hi, solver)
+    status = part.status if bool((harmless | fine).all()) else Status.FAILED
+    multipliers = np.zeros(b.size)
+    multipliers[fine] = part.multipliers
+    violation = part.violation if status is not Status.FAILED else math.inf
+    return Projection(part.control, status, violation, multipliers, part.iterations)
+
+
+def _extreme(a: Array, lo: Array, hi: Array) -> Array:
+    """The largest `a @ u` over the box, per row; a zero entry ignores its (possibly infinite) bound."""
+    with np.errstate(invalid="ignore"):
+        terms = np.where(a > 0.0, a * hi, np.where(a < 0.0, a * lo, 0.0))
+    return cast(Array, terms.sum(axis=1))
+
+
+def _one_row(u: Array, normal: Array, limit: float, lo: Array, hi: Array) -> tuple[Array, float, bool]:
+    """Exact projection on one half-space and the box, in scalars.
+
+    The solution is `clip(u - lam * a, lo, hi)` for the smallest lam >= 0 at which `a @ clip(...)` has come
+    down to the limit; that function of lam is non-increasing and piecewise linear, so its breakpoints are
+    walked in order. Where it never comes down, the corner with the smallest `a @ u` violates least.
+    """
+    nominal, slope, low, high = u.tolist(), normal.tolist(), lo.tolist(), hi.tolist()
+    value = 0.0
+    falling = 0.0  # -d value / d lam on the current stretch
+    events: list[tuple[float, float]] = []
+    for x, s, l_, h_ in zip(nominal, slope, low, high, strict=True):
+        value += s * min(max(x, l_), h_) if s else 0.0
+        if not s:
+            continue
+        enter, leave = ((x - h_) / s, (x - l_) / s) if s > 0.0 else ((x - l_) / s, (x - h_) / s)
+        if leave <= 0.0:
+            continue
+        if enter <= 0.0:
+            falling += s * s
+        else:
+            events.append((enter, s * s))
+        if leave < math.inf:
+            events.append((leave, -s * s))
+    lam = 0.0
+    events.sort()
+    for at, change in events:
+        if value - falling * (at - lam) <= limit:
+            break
+        value -= falling * (at - lam)
+        lam = at
+        falling += change
+    excess = value - limit
+    if excess > 0.0 and falling > 1e-300:
+        lam += excess / falling
+        excess = 0.0
+    control = np.array(
+        [
+            min(max(x - lam * s, l_), h_) if s else min(max(x, l_), h_)
+            for x, s, l_, h_ in zip(nominal, slope, low, high, strict=True)
+        ]
+    )
+    return control, lam, bool(np.isfinite(control).all())
+
+
+Backend = Callable[[Array, Array, Array, Array, Array, Array], tuple[Array, Array, int] | None]
+"""(P diagonal, q, G, h, lower, upper) -> (x, row multipliers, iterations), or None when it gave up."""
+
+
+def _daqp(p: Array, q: Array, g: Array, h: Array, lo: Array, hi: Array) -> tuple[Array, Array, int] | None:
+    n = q.size
+    # daqp takes at most 1e30 as "no bound".
+    upper = np.minimum(np.concatenate([hi, h]), 1e30)
+    lower = np.maximum(np.concatenate([lo, np.full(h.size, -1e30)]), -1e30)
+    x, _, flag, info = daqp.solve(
+        np.diag(p), np.ascontiguousarray(q), np.ascontiguousarray(g), upper, lower, np.zeros(n + h.size, np.int32)
+    )
+    if flag < 1:
+        return None
+    return np.array(x), np.maximum(np.asarray(info["lam"])[n:], 0.0), int(info["iterations"])
+
+
+def _named(name: str) -> Backend:
+    def solve(p: Array, q: Array, g: Array, h: Array, lo: Array, hi: Array) -> tuple[Array, Array, int] | None:
+        problem = qpsolvers.Problem(np.diag(p), q, g, h, lb=lo, ub=hi)
+        try:
+            with warnings.catch_warnings():  # of matrix conversions and of statuses, which we check ourselves
+                warnings.simplefilter("ignore")
+                solution = qpsolvers.solve_problem(problem, solver=name)
+        except (qpsolvers.exceptions.QPError, ValueError, ArithmeticError):
+            return None
+        if not solution.found or solution.x is None:
+            return None
+        dual = solution.z if solution.z is not None else np.zeros(h.size)
+        return np.asarray(solution.x), np.maximum(np.asarray(dual), 0.0), 0
+
+    return solve
+
+
+def _solve(
+    u: Array, g: Array, h: Array, lo: Array, hi: Array, solver: str, hopeless: bool
+) -> tuple[Array, Array, int, bool]:
+    """Several unit rows and a box by a QP backend; least violation where they contradict each other."""
+    backend = _daqp if solver == "daqp" else _named(solver)
+    if not hopeless:
+        answer = _nearest(backend, u, g, h, lo, hi)
+        if answer is not None:
+            return *answer, True
+    least = _least_violation(backend, u, g, h, lo, hi)
+    if least is None and solver != "daqp":
+        least = _least_violation(_daqp, u, g, h, lo, hi)
+    if least is None:
+        return np.clip(u, lo, hi), np.zeros(h.size), 0, False
+    # Closest to the nominal among those that violate (about) as little.
+    relaxed = np.maximum(h, g @ least) + FEASIBILITY_TOLERANCE
+    answer = _nearest(_daqp, u, g, relaxed, lo, hi)
+    if answer is None:
+        return least, np.zeros(h.size), 0, True
+    return *answer, True
+
+
+def _nearest(
+    backend: Backend, u: Array, g: Array, h: Array, lo: Array, hi: Array
+) -> tuple[Array, Array, int] | None:
+    answer = backend(np.ones(u.size), -u, g, h, lo, hi)
+    if answer is None:
+        return None
+    x, multipliers, iterations = answer
+    x = np.clip(x, lo, hi)  # removes the backend's round-off at the box; the residual is checked after it
+    if not np.isfinite(x).all() or bool((g @ x - h > 10.0 * FEASIBILITY_TOLERANCE).any()):
+        polished = _polish(u, g, h, lo, hi, x, multipliers)
+        if polished is None:
+            return None
+        x = polished
+    return x, multipliers, iterations
+
+
+def _polish(
+    u: Array, g: Array, h: Array, lo: Array, hi: Array, x: Array, multipliers: Array
+) -> Array | None:
+    """Solve the equalities of the active set that a first-order or interior-point backend has pointed to."""
+    if not np.isfinite(x).all():
+        return None
+    active = multipliers > 1e-6 * max(1.0, float(multipliers.max(initial=0.0)))
+    free = (x > lo + 1e-7) & (x < hi - 1e-7)
+    if not active.any() or not free.any():
+        return None
+    fixed = np.where(free, 0.0, np.where(np.abs(x - lo) < np.abs(x - hi), lo, hi))
+    fixed[free] = 0.0
+    part = g[np.ix_(active, free)]
+    need = h[active] - g[active][:, ~free] @ fixed[~free] - part @ u[free]
+    step = np.linalg.lstsq(part, need, rcond=None)[0]
+    polished = fixed.copy()
+    polished[free] = u[free] + step
+    inside = bool((polished >= lo).all() and (polished <= hi).all())
+    if not inside or bool((g @ polished - h > 10.0 * FEASIBILITY_TOLERANCE).any()):
+        return None
+    return polished
+
+
+def _least_violation(backend: Backend, u: Array, g: Array, h: Array, lo: Array, hi: Array) -> Array | None:
+    """Minimise the squared violations of unit rows over the box; the box itself is never softened."""
+    m, k = u.size, h.size
+    weight = np.concatenate([np.full(m, 1e-8), np.ones(k)])
+    linear = np.concatenate([-1e-8 * u, np.zeros(k)])
+    rows = np.hstack([g, -np.eye(k)])
+    answer = backend(
+        weight, linear, rows, h, np.concatenate([lo, np.zeros(k)]), np.concatenate([hi, np.full(k, np.inf)])
+    )
+    if answer is None or not np.isfinite(answer[0]).all():
+        return None
+    return cast(Array, np.clip(answer[0][:m], lo, hi))

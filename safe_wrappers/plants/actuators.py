@@ -1,0 +1,111 @@
+"""MuJoCo actuators as an affine map from control to force, refusing by name what is not one.
+
+`force = gain * ctrl + bias`, `gain = g0 + g1 length + g2 velocity`, likewise `bias`; then `forcerange` clamps
+it. Inside the clamp the map is affine with constants of the present state; outside it more control changes
+nothing, so the clamp becomes a bound on the control that still acts.
+"""
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.errors import UnsupportedEnvError
+
+Array = NDArray[np.float64]
+
+_TRANSMISSIONS = {
+    mujoco.mjtTrn.mjTRN_JOINT,
+    mujoco.mjtTrn.mjTRN_JOINTINPARENT,
+    mujoco.mjtTrn.mjTRN_SITE,
+    mujoco.mjtTrn.mjTRN_TENDON,
+}
+
+
+def refuse_unsupported(model: mujoco.MjModel) -> None:
+    """Raise for any actuator whose force is not affine in its control at a given state."""
+    for i in range(model.nu):
+        name = model.actuator(i).name or f"#{i}"
+        transmission = mujoco.mjtTrn(model.actuator_trntype[i])
+        dynamics = mujoco.mjtDyn(model.actuator_dyntype[i])
+        gain, bias = mujoco.mjtGain(model.actuator_gaintype[i]), mujoco.mjtBias(model.actuator_biastype[i])
+        if transmission not in _TRANSMISSIONS:
+            _refuse(name, f"transmission {transmission.name[5:].lower()}", "joint, jointinparent, site, tendon")
+        if dynamics != mujoco.mjtDyn.mjDYN_NONE:
+            _refuse(name, f"activation dynamics {dynamics.name[5:].lower()}", "none")
+        if gain not in (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE):
+            _refuse(name, f"gain type {gain.name[6:].lower()}", "fixed, affine")
+        if bias not in (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE):
+            _refuse(name, f"bias type {bias.name[6:].lower()}", "none, affine")
+    if model.jnt_actfrclimited.any():
+        joint = model.joint(int(np.flatnonzero(model.jnt_actfrclimited)[0])).name
+        raise UnsupportedEnvError(
+            f"joint {joint!r} clamps the sum of its actuators' forces (actuatorfrcrange), which MujocoPlant does "
+            "not model; give the actuators a forcerange instead, or use AnalyticPlant"
+        )
+
+
+def _refuse(actuator: str, what: str, handled: str) -> None:
+    raise UnsupportedEnvError(
+        f"actuator {actuator!r} has {what}, which MujocoPlant cannot write as f(x) + g(x) u; it handles: "
+        f"{handled}. Use AnalyticPlant with your own f and g."
+    )
+
+
+class AffineActuators:
+    """Gain, bias and acting control range of every actuator of one model.
+
+    Args:
+        model: The plant's own model; its arrays are read at every call, so they may be changed.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        refuse_unsupported(model)
+        self._model = model
+        self._moment = np.zeros((model.nu, model.nv))
+
+    def gain_and_bias(self, data: mujoco.MjData) -> tuple[Array, Array]:
+        """Force per control and force at zero control, shapes (nu,) and (nu,)."""
+        m = self._model
+        length, velocity = data.actuator_length, data.actuator_velocity
+        affine = m.actuator_gaintype == mujoco.mjtGain.mjGAIN_AFFINE
+        gain = m.actuator_gainprm[:, 0] + affine * (
+            m.actuator_gainprm[:, 1] * length + m.actuator_gainprm[:, 2] * velocity
+        )
+        biased = m.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
+        bias = biased * (
+            m.actuator_biasprm[:, 0]
+            + m.actuator_biasprm[:, 1] * length
+            + m.actuator_biasprm[:, 2] * velocity
+        )
+        return gain, bias
+
+    def moment(self, data: mujoco.MjData) -> Array:
+        """Generalised force per unit actuator force, shape (nu, nv)."""
+        mujoco.mju_sparse2dense(
+            self._moment,
+            data.actuator_moment.reshape(-1),
+            data.moment_rownnz,
+            data.moment_rowadr,
+            data.moment_colind.reshape(-1),
+        )
+        return self._moment
+
+    def acting_range(self, data: mujoco.MjData) -> tuple[Array, Array]:
+        """The controls between which the force still changes, inside ctrlrange; shapes (nu,) and (nu,).
+
+        An actuator that is saturated over its whole ctrlrange gets a range of zero width.
+        """
+        m = self._model
+        limited = m.actuator_ctrllimited.astype(bool)
+        low = np.where(limited, m.actuator_ctrlrange[:, 0], -np.inf)
+        high = np.where(limited, m.actuator_ctrlrange[:, 1], np.inf)
+        clamped = m.actuator_forcelimited.astype(bool)
+        if not clamped.any():
+            return low, high
+        gain, bias = self.gain_and_bias(data)
+        acts = clamped & (gain != 0.0)
+        scale = np.where(acts, gain, 1.0)
+        ends = (m.actuator_forcerange - bias[:, None]) / scale[:, None]
+        least = np.where(acts, ends.min(axis=1), -np.inf)
+        most = np.where(acts, ends.max(axis=1), np.inf)
+        return np.clip(least, low, high), np.clip(most, low, high)

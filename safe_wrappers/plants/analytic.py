@@ -1,0 +1,169 @@
+"""AnalyticPlant: the user's own f, g and state function, for any env with a Box action."""
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.plant import check_timing, read_attribute
+
+Array = NDArray[np.float64]
+
+
+class AnalyticPlant:
+    """`x' = f(x) + g(x) u` from plain functions.
+
+    Args:
+        f: x of shape (n,) to the drift, shape (n,), in state units per second.
+        g: x to the control matrix, shape (n, m).
+        state: Takes the (unwrapped) env, returns x.
+        lower: Smallest control, shape (m,) or scalar; None takes the action space's.
+        upper: Largest control, likewise.
+        hold_s: Control interval in s; compared with the env's `dt` where it has one.
+        delay_s: Delay from measurement to effect in s; predicted over with the commands in flight.
+
+    Raises:
+        ConfigurationError: Shapes that do not fit, values that are not finite, or a wrong hold interval.
+
+    Example:
+        >>> import gymnasium as gym, numpy as np, safe_wrappers as sw
+        >>> plant = sw.AnalyticPlant(
+        ...     f=lambda x: np.array([x[1], 15.0 * np.sin(x[0])]),
+        ...     g=lambda x: np.array([[0.0], [3.0]]),
+        ...     state=lambda env: env.state, lower=-2.0, upper=2.0, hold_s=0.05)
+        >>> slow = sw.Barrier(lambda x: 4.0 - x[1] ** 2, alpha=2.0)
+        >>> env = sw.CBFActionFilter(gym.make("Pendulum-v1"), [slow], plant=plant)
+    """
+
+    def __init__(
+        self,
+        f: Callable[[Array], ArrayLike],
+        g: Callable[[Array], ArrayLike],
+        state: Callable[[Any], ArrayLike],
+        lower: ArrayLike | None = None,
+        upper: ArrayLike | None = None,
+        hold_s: float = 0.05,
+        delay_s: float = 0.0,
+    ) -> None:
+        self._f, self._g, self._state_of = f, g, state
+        self.hold_s, self.delay_s = float(hold_s), float(delay_s)
+        self._box = (lower, upper)
+        self._env: gym.Env[Any, Any] | None = None
+        self._x = np.zeros(0)
+        self._drift: Array | None = None
+        self._effect: Array | None = None
+        self._pending: deque[Array] = deque(maxlen=max(1, int(np.ceil(self.delay_s / self.hold_s - 1e-9))))
+
+    def bind(self, env: gym.Env[Any, Any]) -> None:
+        """Attach to an env: checks the time step and the bounds."""
+        check_timing(env, self.hold_s, self.delay_s)
+        space = env.action_space
+        assert isinstance(space, gym.spaces.Box)  # the filter has refused every other space
+        m = space.shape[0]
+        low, high = (
+            np.asarray(given if given is not None else own, dtype=np.float64)
+            for given, own in zip(self._box, (space.low, space.high), strict=True)
+        )
+        try:
+            self._lower, self._upper = np.broadcast_to(low, (m,)), np.broadcast_to(high, (m,))
+        except ValueError:
+            raise ConfigurationError(
+                f"the env has {m} controls; got bounds of shape {low.shape} and {high.shape}"
+            ) from None
+        if not (self._lower <= self._upper).all():
+            raise ConfigurationError(f"lower must not exceed upper, got {low} and {high}")
+        self._env = env
+
+    def observe(self) -> None:
+        """Read the state, predict it over the delay."""
+        assert self._env is not None  # bound by the filter
+        x = np.array(self._state_of(self._env.unwrapped), dtype=np.float64).reshape(-1)
+        if self._pending and self.delay_s > 0.0:
+            x = self._advance(x)
+        self._x, self._drift, self._effect = x, None, None
+
+    def executed(self, control: Array | None) -> None:
+        """Remember a sent command for the delay."""
+        if control is None:
+            self._pending.clear()
+        elif self.delay_s > 0.0:
+            self._pending.append(np.array(control))
+
+    def _advance(self, x: Array) -> Array:
+        """RK4 through the commands in flight, the oldest first; each has at most one hold left to act."""
+        remaining = self.delay_s
+        for control in list(self._pending):
+            span = min(self.hold_s, remaining)
+            remaining -= span
+            x = self.integrate(x, control, span)
+        return x
+
+    def integrate(self, x: Array, control: Array, span_s: float, substeps: int = 4) -> Array:
+        """The state after holding a control for `span_s`, by classical Runge-Kutta."""
+
+        def rate(at: Array) -> Array:
+            return np.asarray(self._f(at), dtype=np.float64) + np.asarray(self._g(at), dtype=np.float64) @ control
+
+        step = span_s / substeps
+        for _ in range(substeps):
+            k1 = rate(x)
+            k2 = rate(x + 0.5 * step * k1)
+            k3 = rate(x + 0.5 * step * k2)
+            k4 = rate(x + step * k3)
+            x = x + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+        return x
+
+    @property
+    def state(self) -> Array:
+        """x, shape (n,)."""
+        return self._x
+
+    @property
+    def f(self) -> Array:
+        """f(x), shape (n,)."""
+        if self._drift is None:
+            self._drift = np.asarray(self._f(self._x), dtype=np.float64)
+            if self._drift.shape != self._x.shape:
+                raise ConfigurationError(
+                    f"f must return the shape of the state {self._x.shape}, got {self._drift.shape}"
+                )
+        return self._drift
+
+    @property
+    def g(self) -> Array:
+        """g(x), shape (n, m)."""
+        if self._effect is None:
+            self._effect = np.asarray(self._g(self._x), dtype=np.float64)
+            if self._effect.shape != (self._x.size, self._lower.size):
+                raise ConfigurationError(
+                    f"g must return shape (states, controls) = {(self._x.size, self._lower.size)}, "
+                    f"got {self._effect.shape}"
+                )
+        return self._effect
+
+    @property
+    def lower(self) -> Array:
+        """Smallest control, shape (m,)."""
+        return self._lower
+
+    @property
+    def upper(self) -> Array:
+        """Largest control, shape (m,)."""
+        return self._upper
+
+    def drift(self, x: Array) -> Array:
+        """f at any state."""
+        return np.asarray(self._f(x), dtype=np.float64)
+
+    def effect(self, x: Array) -> Array:
+        """g at any state."""
+        return np.asarray(self._g(x), dtype=np.float64)
+
+    def attribute(self, name: str) -> Any:
+        """Read a published fact of the env."""
+        assert self._env is not None
+        return read_attribute(self._env, name)

@@ -1,0 +1,302 @@
+"""MujocoPlant: f and g of any env whose unwrapped env has `.model` and `.data`.
+
+The plant owns a copy of the model and its own data. It never writes to the env's, and its model may be changed
+to be wrong on purpose (`plant.perturb(mass=1.2)`).
+"""
+
+import copy
+from collections import deque
+from collections.abc import Iterator
+from fnmatch import fnmatchcase
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.plants.actuators import AffineActuators
+from safe_wrappers.plants.plant import check_timing, read_attribute
+
+Array = NDArray[np.float64]
+
+_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+_QUADRATIC = int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC)
+
+
+class MujocoPlant:
+    """`x = (qpos, qvel)`, `x' = f + g u`, through the actuators and the active constraints.
+
+    The drift and the control matrix hold at the present set of active contacts and limits; a contact that
+    opens or closes within the hold changes them. They are exact for pyramidal friction cones.
+
+    Args:
+        model: The filter's model; None copies the env's. Pass another (other masses) to test mismatch.
+        delay_s: Evidence age plus detection plus actuation delay in s; the state is predicted over it with
+            the commands in flight, on this plant's model.
+
+    Raises:
+        UnsupportedEnvError: The env has no MuJoCo model, an actuator that is not affine, or an action space
+            that is not its model's control range.
+    """
+
+    hold_s: float
+
+    def __init__(self, model: mujoco.MjModel | None = None, delay_s: float = 0.0) -> None:
+        self._given = model
+        self.delay_s = float(delay_s)
+        self._pending: deque[Array] = deque()
+
+    def bind(self, env: gym.Env[Any, Any]) -> None:
+        """Attach to an env and copy its model."""
+        raw: Any = env.unwrapped
+        if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
+            raise UnsupportedEnvError(
+                f"{raw} has no MuJoCo .model and .data; describe it with "
+                "AnalyticPlant(f=..., g=..., state=...) instead"
+            )
+        self._raw = raw
+        self._env = env
+        self.model: mujoco.MjModel = copy.copy(self._given if self._given is not None else raw.model)
+        if (self.model.nq, self.model.nv, self.model.nu) != (raw.model.nq, raw.model.nv, raw.model.nu):
+            raise ConfigurationError(
+                "the plant's model must have the env's joints and actuators: expected (nq, nv, nu) = "
+                f"{(raw.model.nq, raw.model.nv, raw.model.nu)}, "
+                f"got {(self.model.nq, self.model.nv, self.model.nu)}"
+            )
+        self.data = mujoco.MjData(self.model)
+        self._actuators = AffineActuators(self.model)
+        self._check_action_space(env)
+        self.substeps = int(getattr(raw, "frame_skip", 1))
+        self.hold_s = self.substeps * float(raw.model.opt.timestep)
+        check_timing(env, self.hold_s, self.delay_s)
+        self._delay_steps = int(np.ceil(self.delay_s / self.model.opt.timestep - 1e-9))
+        self._pending = deque(maxlen=max(1, -(-self._delay_steps // self.substeps)))
+        self._snapshot = np.zeros(mujoco.mj_stateSize(self.model, int(_STATE)))
+        self._loaded = self._forwarded = False
+
+    def _check_action_space(self, env: gym.Env[Any, Any]) -> None:
+        space = env.action_space
+        assert isinstance(space, gym.spaces.Box)  # the filter has refused every other space
+        limits = self.model.actuator_ctrlrange
+        limited = self.model.actuator_ctrllimited.astype(bool)
+        fits = space.shape == (self.model.nu,) and (
+            np.allclose(space.low[limited], limits[limited, 0], atol=1e-6)
+            and np.allclose(space.high[limited], limits[limited, 1], atol=1e-6)
+        )
+        if not fits:
+            raise UnsupportedEnvError(
+                f"the action space {space} is not the model's control range {limits.tolist()}; put the filter "
+                "inside wrappers that rescale actions, or describe the env with AnalyticPlant"
+            )
+
+    def perturb(self, mass: float = 1.0, damping: float = 1.0) -> None:
+        """Scale the masses (and inertias) and joint damping of the plant's own model."""
+        if not (mass > 0.0 and damping >= 0.0):
+            raise ConfigurationError(f"factors must be positive, got mass={mass}, damping={damping}")
+        self.model.body_mass *= mass
+        self.model.body_inertia *= mass
+        self.model.dof_damping *= damping
+        mujoco.mj_setConst(self.model, self.data)
+        self._loaded = self._forwarded = False
+
+    def observe(self) -> None:
+        """Take the env's present state; nothing is computed until it is asked for."""
+        mujoco.mj_getState(self._raw.model, self._raw.data, self._snapshot, int(_STATE))
+        self._loaded = self._forwarded = False
+        if self._delay_steps and self._pending:
+            self._predict_over_delay()
+
+    def executed(self, control: Array | None) -> None:
+        """Remember a sent command for the delay."""
+        if control is None:
+            self._pending.clear()
+        elif self._delay_steps:
+            self._pending.append(np.array(control))
+
+    def _predict_over_delay(self) -> None:
+        self._load()
+        remaining = self._delay_steps
+        for control in list(self._pending):
+            self.data.ctrl[:] = control
+            steps = min(self.substeps, remaining)
+            remaining -= steps
+            mujoco.mj_step(self.model, self.data, steps)
+        mujoco.mj_getState(self.model, self.data, self._snapshot, int(_STATE))
+        self._loaded = False
+
+    def _load(self) -> None:
+        if not self._loaded:
+            mujoco.mj_setState(self.model, self.data, self._snapshot, int(_STATE))
+            self._loaded, self._forwarded = True, False
+
+    def forward(self) -> mujoco.MjData:
+        """The plant's data with every derived quantity up to date at the present state.
+
+        MuJoCo's own `data.xpos` and `data.xvel` lag one substep behind `qpos` after a step; these do not.
+        """
+        self._load()
+        if not self._forwarded:
+            if self.model.nu:
+                self.data.ctrl[:] = self._reference()
+            mujoco.mj_forward(self.model, self.data)
+            self._derive()
+            self._forwarded = True
+        return self.data
+
+    def _reference(self) -> Array:
+        """The control about which contact forces are linearised: zero, or the nearest the actuator has."""
+        limits = self.model.actuator_ctrlrange
+        limited = self.model.actuator_ctrllimited.astype(bool)
+        return np.where(limited, np.clip(0.0, limits[:, 0], limits[:, 1]), 0.0)
+
+    def _derive(self) -> None:
+        m, d = self.model, self.data
+        gain, bias = self._actuators.gain_and_bias(d)
+        self._lower, self._upper = self._actuators.acting_range(d)
+        moment = self._actuators.moment(d)
+        force_per_control = (moment * gain[:, None]).copy()
+        acting = np.clip(d.ctrl, self._lower, self._upper)
+        saturated = self._upper <= self._lower
+        force_per_control[saturated] = 0.0
+        self._effect = self._solve_inertia(force_per_control).T
+        self._drift = d.qacc - self._effect @ np.where(saturated, 0.0, acting)
+
+    def _solve_inertia(self, rows: Array) -> Array:
+        """`rows @ inv(M + J_a' D_a J_a)`: accelerations per generalised force with the active constraints."""
+        m, d = self.model, self.data
+        out = np.zeros_like(rows)
+        active = d.efc_state == _QUADRATIC if d.nefc else np.zeros(0, bool)
+        if not active.any():
+            mujoco.mj_solveM(m, d, out, np.ascontiguousarray(rows))
+            return out
+        jacobian = self._constraint_jacobian()[active]
+        inertia = np.empty((m.nv, m.nv))
+        for i, unit in enumerate(np.eye(m.nv)):
+            mujoco.mj_mulM(m, d, inertia[i], unit)
+        stiff = inertia + jacobian.T @ (d.efc_D[active][:, None] * jacobian)
+        return np.linalg.solve(stiff, rows.T).T
+
+    def _constraint_jacobian(self) -> Array:
+        m, d = self.model, self.data
+        if not mujoco.mj_isSparse(m):
+            return d.efc_J.reshape(d.nefc, m.nv).copy()
+        dense = np.zeros((d.nefc, m.nv))
+        mujoco.mju_sparse2dense(dense, d.efc_J, d.efc_J_rownnz, d.efc_J_rowadr, d.efc_J_colind)
+        return dense
+
+    @property
+    def qpos(self) -> Array:
+        """Positions, shape (nq,): m, rad, or quaternions."""
+        return self._snapshot[1 : 1 + self.model.nq]
+
+    @property
+    def qvel(self) -> Array:
+        """Velocities, shape (nv,): m/s or rad/s."""
+        return self._snapshot[1 + self.model.nq : 1 + self.model.nq + self.model.nv]
+
+    @property
+    def state(self) -> Array:
+        """(qpos, qvel), shape (nq + nv,)."""
+        return self._snapshot[1 : 1 + self.model.nq + self.model.nv]
+
+    @property
+    def f(self) -> Array:
+        """Drift of (qpos, qvel), shape (nq + nv,): at zero control, with bias forces and active constraints."""
+        self.forward()
+        return np.concatenate([self._position_rate(), self._drift])
+
+    @property
+    def g(self) -> Array:
+        """Control matrix, shape (nq + nv, nu); positions do not respond at once."""
+        self.forward()
+        return np.vstack([np.zeros((self.model.nq, self.model.nu)), self._effect])
+
+    @property
+    def acceleration(self) -> tuple[Array, Array]:
+        """`qacc = drift + effect @ u`: shapes (nv,) and (nv, nu)."""
+        self.forward()
+        return self._drift, self._effect
+
+    def _position_rate(self) -> Array:
+        if self.model.nq == self.model.nv:
+            return self.qvel.copy()
+        rate = np.zeros(self.model.nq)
+        for j in range(self.model.njnt):
+            q, v = int(self.model.jnt_qposadr[j]), int(self.model.jnt_dofadr[j])
+            kind = self.model.jnt_type[j]
+            if kind == mujoco.mjtJoint.mjJNT_FREE:
+                rate[q : q + 3] = self.qvel[v : v + 3]
+                q, v = q + 3, v + 3
+            if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
+                turn = np.zeros(4)
+                mujoco.mju_derivQuat(turn, self.qpos[q : q + 4].copy(), self.qvel[v : v + 3].copy())
+                rate[q : q + 4] = turn
+            else:
+                rate[q] = self.qvel[v]
+        return rate
+
+    @property
+    def lower(self) -> Array:
+        """Smallest control that still changes the force at this state, shape (nu,)."""
+        self.forward()
+        return self._lower
+
+    @property
+    def upper(self) -> Array:
+        """Largest control that still changes the force at this state, shape (nu,)."""
+        self.forward()
+        return self._upper
+
+    def rollout(self, control: Array) -> Iterator[mujoco.MjData]:
+        """Hold a control for one control interval on the plant's own model, substep by substep.
+
+        Yields the plant's data after each physics substep (positions and velocities are new, derived
+        quantities lag as MuJoCo leaves them). The present state is restored for the next question.
+        """
+        self._load()
+        self._loaded = False
+        self.data.ctrl[:] = control
+        for _ in range(self.substeps):
+            mujoco.mj_step(self.model, self.data)
+            yield self.data
+
+    def point(self, kind: str, name: str) -> tuple[Array, Array, Array, Array]:
+        """Motion of a named frame's origin: position, velocity, drift and control matrix of its acceleration.
+
+        Args:
+            kind: "body", "site" or "geom".
+            name: Its name in the model.
+
+        Returns:
+            p (3,) in m, v (3,) in m/s, a0 (3,) in m/s^2 and A (3, nu): `acceleration = a0 + A @ u`.
+        """
+        m, d = self.model, self.forward()
+        handle = self.named(kind, name)
+        body = handle if kind == "body" else int(getattr(m, f"{kind}_bodyid")[handle])
+        p = getattr(d, {"body": "xpos", "site": "site_xpos", "geom": "geom_xpos"}[kind])[handle]
+        jac, jac_dot = np.zeros((3, m.nv)), np.zeros((3, m.nv))
+        mujoco.mj_jac(m, d, jac, None, p, body)
+        mujoco.mj_jacDot(m, d, jac_dot, None, p, body)
+        drift, effect = self._drift, self._effect
+        return p.copy(), jac @ self.qvel, jac @ drift + jac_dot @ self.qvel, jac @ effect
+
+    def named(self, kind: str, name: str) -> int:
+        """The id of a body, site, geom, joint or actuator; an unknown name is refused with the list."""
+        found = mujoco.mj_name2id(self.model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
+        if found < 0:
+            raise UnknownNameError(
+                f"the model has no {kind} {name!r}; it has: {', '.join(self.names(kind))}"
+            )
+        return int(found)
+
+    def names(self, kind: str, pattern: str = "*") -> list[str]:
+        """All names of a kind that match a shell pattern."""
+        count = {"body": "nbody", "joint": "njnt", "actuator": "nu"}.get(kind, f"n{kind}")
+        every = (getattr(self.model, kind)(i).name for i in range(getattr(self.model, count)))
+        return [n for n in every if n and fnmatchcase(n, pattern)]
+
+    def attribute(self, name: str) -> Any:
+        """Read a published fact of the env."""
+        return read_attribute(self._env, name)

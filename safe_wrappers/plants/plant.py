@@ -1,0 +1,101 @@
+"""The Plant protocol: the filter's model of the machine.
+
+A Plant may be wrong on purpose (other masses, other damping): that is how mismatch is tested. What judges a
+violation is always the env, never the Plant.
+"""
+
+from typing import Any, Protocol, runtime_checkable
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
+
+Array = NDArray[np.float64]
+
+
+@runtime_checkable
+class Plant(Protocol):
+    """A control-affine machine `x' = f(x) + g(x) u`, read afresh from an env at every step.
+
+    Attributes:
+        hold_s: Control interval in s: how long one action is held.
+        delay_s: Evidence age plus detection plus actuation delay in s; the state that the constraints see is
+            predicted over it with the commands in flight.
+        state: x, shape (n,).
+        f: Drift at the state, shape (n,), state units per second.
+        g: Control matrix at the state, shape (n, m).
+        lower: Smallest control that still acts at this state, shape (m,).
+        upper: Largest control that still acts at this state, shape (m,).
+    """
+
+    hold_s: float
+    delay_s: float
+
+    @property
+    def state(self) -> Array: ...
+    @property
+    def f(self) -> Array: ...
+    @property
+    def g(self) -> Array: ...
+    @property
+    def lower(self) -> Array: ...
+    @property
+    def upper(self) -> Array: ...
+
+    def bind(self, env: gym.Env[Any, Any]) -> None:
+        """Attach to the env that the filter wraps; refuse one that this plant cannot describe."""
+
+    def observe(self) -> None:
+        """Take the env's present state."""
+
+    def executed(self, control: Array | None) -> None:
+        """Remember what was sent, for the delay; None forgets everything (a new episode)."""
+
+    def attribute(self, name: str) -> Any:
+        """Read a published fact of the env by name, for example the positions of its hazards."""
+
+
+def read_attribute(env: gym.Env[Any, Any], name: str) -> Any:
+    """`env.get_wrapper_attr(name)` with an error that lists what the env publishes."""
+    try:
+        return env.get_wrapper_attr(name)
+    except AttributeError:
+        public = sorted(n for n in dir(env.unwrapped) if not n.startswith("_"))
+        raise UnknownNameError(
+            f"the env publishes no attribute {name!r}; it has: {', '.join(public)}"
+        ) from None
+
+
+def check_timing(env: gym.Env[Any, Any], hold_s: float, delay_s: float) -> None:
+    """Refuse a hold interval that is not the env's own, or a negative delay."""
+    if not (np.isfinite(hold_s) and hold_s > 0.0):
+        raise ConfigurationError(f"hold_s is the control interval in seconds, > 0; got {hold_s}")
+    if not (np.isfinite(delay_s) and delay_s >= 0.0):
+        raise ConfigurationError(f"delay_s is a time in seconds, >= 0; got {delay_s}")
+    try:
+        dt = float(env.get_wrapper_attr("dt"))
+    except (AttributeError, TypeError, ValueError):
+        return  # the env names no time step: nothing to compare with
+    if not np.isclose(dt, hold_s, rtol=1e-6):
+        raise ConfigurationError(
+            f"hold_s = {hold_s} s, but one step of this env lasts dt = {dt} s; a filter that looks ahead by "
+            "another interval than the env's promises nothing: pass hold_s equal to env.unwrapped.dt"
+        )
+
+
+def check_actions(env: gym.Env[Any, Any]) -> gym.spaces.Box:
+    """The env's action space, refused unless it is a one-dimensional, floating Box."""
+    space = env.action_space
+    if not isinstance(space, gym.spaces.Box) or not np.issubdtype(space.dtype, np.floating):
+        raise ConfigurationError(
+            f"a filter needs a continuous Box action space, got {space}; for a discrete env there is no "
+            "closest safe action to project to"
+        )
+    if len(space.shape) != 1:
+        raise ConfigurationError(
+            f"expected actions of shape (m,), got {space.shape}; flatten them with "
+            "gymnasium.wrappers.TransformAction outside the filter"
+        )
+    return space
