@@ -1,0 +1,72 @@
+"""Time of one env step of each goal task, with the judging of every physics substep included.
+
+    python benchmarks/env_task_step.py
+
+The driver steers towards the goal and drives through whatever stands in its way, so that level 2's figures
+hold pushed and tumbling vases too. Reported: median and 99th percentile over steps, resets left out.
+"""
+
+import argparse
+import time
+
+import gymnasium as gym
+import numpy as np
+
+from safe_wrappers.envs import POINT_GOAL_IDS, register_envs
+
+LIMIT_US = 150.0
+
+
+def step_times(env_id: str, steps: int, seed: int, bare: bool) -> np.ndarray:
+    """Measure steps of one env.
+
+    Args:
+        env_id: Registered id.
+        steps: Number of steps.
+        seed: Seed of the first reset and of the driver's noise.
+        bare: Measure the env alone, without `gymnasium.make`'s wrappers.
+
+    Returns:
+        Time per step, shape (steps,), us.
+    """
+    env = gym.make(env_id)
+    inner = env.unwrapped
+    if bare:
+        env = inner
+    rng = np.random.default_rng(seed)
+    env.reset(seed=seed)
+    times = np.empty(steps)
+    for i in range(steps):
+        to_goal = inner.goal_position - inner.agent_position
+        bearing = np.arctan2(to_goal[1], to_goal[0]) - inner.agent_heading
+        turn = np.clip(np.arctan2(np.sin(bearing), np.cos(bearing)), -1, 1)
+        action = np.clip(np.array([np.cos(bearing), turn]) + rng.normal(0, 0.3, 2), -1, 1)
+        start = time.perf_counter()
+        env.step(action)
+        times[i] = time.perf_counter() - start
+        if (i + 1) % 1000 == 0:
+            env.reset()
+    inner.close()
+    return times * 1e6
+
+
+def main() -> None:
+    """Print one line per level."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--steps", type=int, default=5000, help="steps per env")
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    register_envs()
+    print(f"{'env':<20} {'median us':>10} {'p99 us':>8} {'with make() us':>15}   limit {LIMIT_US:.0f} us")
+    for env_id in POINT_GOAL_IDS:
+        bare = step_times(env_id, args.steps, args.seed, bare=True)
+        wrapped = step_times(env_id, args.steps, args.seed, bare=False)
+        print(
+            f"{env_id:<20} {np.median(bare):>10.1f} {np.percentile(bare, 99):>8.1f}"
+            f" {np.median(wrapped):>15.1f}"
+            f"   {'ok' if np.median(wrapped) <= LIMIT_US else 'over'}"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,312 @@
+"""The goal task for any planar robot: reach goals, keep out of hazards, leave vases alone."""
+
+import math
+from pathlib import Path
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+from gymnasium.envs.mujoco import MujocoEnv
+from gymnasium.spaces import Box
+from gymnasium.utils import EzPickle
+from numpy.typing import NDArray
+
+from safe_wrappers.envs.layout import Layout, PartialLayout, parse_layout
+from safe_wrappers.envs.levels import (
+    GOAL_RADIUS,
+    HAZARD_RADIUS,
+    LEVELS,
+    VASE_HALF_SIZE,
+    VASE_SPEED_LIMIT,
+)
+from safe_wrappers.envs.lidar import LIDAR_BINS, pseudo_lidar
+from safe_wrappers.envs.placement import sample_goal, sample_layout
+from safe_wrappers.envs.robot import PlanarRobot
+from safe_wrappers.errors import ActionError, ConfigurationError
+from safe_wrappers.interventions import COST, COST_SUBSTEP
+
+COST_HAZARDS: Final = "cost_hazards"
+"""float: 1 if the robot's centre is inside a hazard's disc at the end of the step, else 0."""
+COST_VASES: Final = "cost_vases"
+"""float: 1 if a vase is touched or moves at the end of the step, else 0 (always 0 below level 2)."""
+GOAL_MET: Final = "goal_met"
+"""bool: this step reached the goal (a new one stands already)."""
+GOALS_REACHED: Final = "goals_reached"
+"""int: goals reached in this episode so far."""
+
+_FRAME_SKIP: Final = 10
+_REWARD_LIMIT: Final = 10.0
+_VASE_Z: Final = 0.09996  # a vase's centre at the start, m: 40 um into the floor, nearly settled
+_GOAL_Z: Final = 0.16
+_HAZARD_Z: Final = 0.02
+_PARKED: Final = 1000.0  # m: objects outside the scenario, farther than a robot gets in an episode
+_SLEEP_TOLERANCE: Final = 1e-6  # m/s: a hundredth of the speed that costs
+_ASSETS: Final = Path(__file__).parent / "assets"
+_CAMERA: Final = {"distance": 5.5, "elevation": -55.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.2, 0.0])}
+
+
+class SafeGoalEnv(MujocoEnv, EzPickle):
+    """Safety-Gymnasium's goal task on today's MuJoCo: semantics theirs, model and code our own.
+
+    **Levels**: 0 has a goal alone; 1 has 8 hazards and a vase that costs nothing; 2 has 10 hazards and 10
+    vases that must not be touched.
+
+    **Observation**: the robot's sensors, then `pseudo_lidar` readings of 16 bins for the goal and, where the
+    level has them, for hazards and vases. float64.
+
+    **Reward**: distance to the goal gained in this step (m), plus 1 on coming within 0.3 m of it, clipped
+    at 10. Then a new goal is sampled and the episode goes on: `terminated` is never true.
+
+    **Info**, at every step and at reset: ``cost`` (1.0 if `cost_hazards` or `cost_vases`), ``cost_hazards``,
+    ``cost_vases``, ``cost_substep``, ``goal_met``, ``goals_reached``. `cost` is judged at the end of the
+    control step, as Safety-Gymnasium publishes it; `cost_substep` after every physics substep, so it also
+    sees a hazard's edge cut between two control steps (``cost <= cost_substep``). At reset they judge the
+    start state.
+
+    **Layout**: ``reset(options={"layout": {"agent": [x, y, heading], "goal": [x, y], "hazards": [[x, y],
+    ...], "vases": [[x, y], ...]}})``; any subset of the keys, the rest is sampled. With fewer hazards or
+    vases than the level has, the others are parked far away: no lidar, cost or property knows of them.
+
+    **State**: ``qpos = [x, y, heading, then x, y, z, quaternion per vase]`` in world coordinates;
+    `set_state` works as in every Gymnasium MuJoCo env. Vases at rest sleep where MuJoCo knows how to (from
+    3.4 on): without it level 2 is ten times slower, and the same to 1e-6.
+
+    Args:
+        robot: The machine.
+        level: 0, 1 or 2.
+        kwargs: Passed to `gymnasium.envs.mujoco.MujocoEnv`.
+
+    Raises:
+        ConfigurationError: There is no such level.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium declares it on the instance)
+        "render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"],
+        "render_fps": 50,
+    }
+
+    hazard_radius: Final = HAZARD_RADIUS
+    goal_radius: Final = GOAL_RADIUS
+    vase_half_size: Final = VASE_HALF_SIZE
+
+    def __init__(self, robot: PlanarRobot, level: int, **kwargs: Any) -> None:
+        if level not in range(len(LEVELS)):
+            raise ConfigurationError(f"level must be one of 0, 1, 2; got {level!r}")
+        self.robot = robot
+        self.level = LEVELS[level]
+        kwargs.setdefault("default_camera_config", _CAMERA)
+        kinds = 1 + (self.level.hazards > 0) + (self.level.vases > 0)
+        low = np.concatenate([np.full(robot.n_sensors, -np.inf), np.zeros(kinds * LIDAR_BINS)])
+        high = np.concatenate([np.full(robot.n_sensors, np.inf), np.ones(kinds * LIDAR_BINS)])
+        MujocoEnv.__init__(
+            self,
+            str(_ASSETS / f"{robot.name}_goal{level}.xml"),
+            _FRAME_SKIP,
+            Box(low, high, dtype=np.float64),
+            **kwargs,
+        )
+        self._kinds = kinds
+        self._hazard_group = 1
+        self._vase_group = 1 + (self.level.hazards > 0)
+        first = int(self.model.joint("vase0").qposadr[0]) if self.level.vases else self.model.nq
+        self._vases_qpos = slice(first, first + 7 * self.level.vases)
+        first = int(self.model.joint("vase0").dofadr[0]) if self.level.vases else self.model.nv
+        self._vases_qvel = slice(first, first + 6 * self.level.vases)
+        self._touch_side = self._sides_of_geoms()
+        if hasattr(mujoco.mjtEnableBit, "mjENBL_SLEEP"):
+            self.model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+            self.model.opt.sleep_tolerance = _SLEEP_TOLERANCE
+        self._given = PartialLayout()
+        self._path = np.zeros((_FRAME_SKIP, 2))
+        self._apply(Layout(np.zeros(3), np.zeros(2), np.zeros((0, 2)), np.zeros((0, 2))))
+
+    # What a constraint may read: from qpos, which is never a substep behind as xpos is after mj_step ---------
+
+    @property
+    def agent_position(self) -> NDArray[np.float64]:
+        """Robot's turning axis, shape (2,), m."""
+        return np.array(self.data.qpos[:2])
+
+    @property
+    def agent_heading(self) -> float:
+        """Robot's heading in [-pi, pi], rad."""
+        return math.remainder(self.data.qpos[2], math.tau)
+
+    @property
+    def goal_position(self) -> NDArray[np.float64]:
+        """Goal's centre, shape (2,), m."""
+        return np.array(self._targets[0])
+
+    @property
+    def hazard_positions(self) -> NDArray[np.float64]:
+        """Centres of the hazards in the scenario, shape (n, 2), m."""
+        return np.array(self._hazards)
+
+    @property
+    def vase_positions(self) -> NDArray[np.float64]:
+        """Centres of the vases in the scenario now, shape (n, 2), m."""
+        return np.array(self.data.qpos[self._vases_qpos].reshape(-1, 7)[: self._n_vases, :2])
+
+    # Gymnasium ---------------------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float64], dict[str, Any]]:
+        """Start an episode; ``options["layout"]`` fixes parts of the scenario.
+
+        Raises:
+            UnknownNameError: An unknown layout key.
+            ConfigurationError: A layout that cannot be used.
+        """
+        self._given = parse_layout(options, self.level)
+        observation, info = super().reset(seed=seed, options=options)
+        return observation, info
+
+    def reset_model(self) -> NDArray[np.float64]:
+        """Sample what the options left open, place everything, return the observation."""
+        self._apply(sample_layout(self.np_random, self.level, self._given))
+        return self._observation()
+
+    def set_state(self, qpos: NDArray[np.float64], qvel: NDArray[np.float64]) -> None:
+        """Set positions and velocities (shapes (nq,), (nv,)) and judge the state anew."""
+        super().set_state(qpos, qvel)  # type: ignore[no-untyped-call]  # type: ignore[no-untyped-call]
+        self._judge_now()
+
+    def step(  # type: ignore[override]  # MujocoEnv declares NumPy scalars where Env declares a float
+        self, action: NDArray[np.floating[Any]]
+    ) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
+        """Hold an action for one control step (0.02 s, ten physics substeps).
+
+        Raises:
+            ActionError: Wrong shape, or a number that is not finite; the env was not stepped.
+        """
+        control = np.asarray(action, dtype=np.float64)
+        if control.shape != (self.model.nu,) or not np.isfinite(control).all():
+            raise ActionError(f"action must be {self.model.nu} finite numbers; got {control.tolist()}")
+        before = self._goal_distance()
+        self._step_mujoco_simulation(control, self.frame_skip)
+        reward = before - self._goal_distance()
+        self._goal_met = self._goal_distance() <= GOAL_RADIUS
+        if self._goal_met:
+            reward += 1.0
+            self._goals_reached += 1
+            vases = self.vase_positions
+            self._set_goal(sample_goal(self.np_random, self.level, self.agent_position, self._hazards, vases))
+        if self.render_mode == "human":
+            self.render()  # type: ignore[no-untyped-call]
+        reward = max(-_REWARD_LIMIT, min(_REWARD_LIMIT, reward))
+        return self._observation(), reward, False, False, self._get_reset_info()
+
+    def _get_reset_info(self) -> dict[str, Any]:
+        return {
+            COST: float(self._in_hazard or self._vase_hit),
+            COST_SUBSTEP: float(self._violated),
+            COST_HAZARDS: float(self._in_hazard),
+            COST_VASES: float(self._vase_hit),
+            GOAL_MET: self._goal_met,
+            GOALS_REACHED: self._goals_reached,
+        }
+
+    # Physics and judging -----------------------------------------------------------------------------------
+
+    def _step_mujoco_simulation(self, ctrl: NDArray[np.float64], n_frames: int) -> None:
+        """Step substep by substep, keeping what the judge needs of each; judge them together at the end."""
+        model, data, qpos = self.model, self.data, self.data.qpos
+        data.ctrl[:] = ctrl
+        judge_vases = self.level.vases_cost and self._n_vases > 0
+        if len(self._path) != n_frames:
+            self._path = np.zeros((n_frames, 2))
+        path = self._path
+        touched = moved = moving = False
+        for k in range(n_frames):
+            mujoco.mj_step(model, data)
+            path[k] = qpos[:2]
+            if judge_vases:
+                moving = self._any_vase_moves()
+                moved = moved or moving
+                # mj_step integrates after it has looked for contacts, so those in data belong to the substep
+                # before: the first ones were judged by the last control step, the last ones follow below.
+                touched = touched or (k > 0 and self._any_vase_touched())
+        # Sensors and contacts of the state reached; also what Gymnasium calls mj_rnePostConstraint for.
+        mujoco.mj_forward(model, data)
+        touching = judge_vases and self._any_vase_touched()
+        inside = self._inside_hazard(path)
+        self._in_hazard = bool(inside[-1])
+        self._vase_hit = touching or moving
+        self._violated = bool(inside.any()) or moved or touched or touching
+
+    def _judge_now(self) -> None:
+        self._in_hazard = bool(self._inside_hazard(self.data.qpos[None, :2])[0])
+        judge_vases = self.level.vases_cost and self._n_vases > 0
+        self._vase_hit = judge_vases and (self._any_vase_moves() or self._any_vase_touched())
+        self._violated = self._in_hazard or self._vase_hit
+
+    def _inside_hazard(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether each point, shape (n, 2), lies in some hazard's disc; shape (n,)."""
+        gaps = points[:, None] - self._hazards
+        inside: NDArray[np.bool_] = (np.einsum("ijk,ijk->ij", gaps, gaps) <= HAZARD_RADIUS**2).any(axis=1)
+        return inside
+
+    def _any_vase_moves(self) -> bool:
+        velocity = self.data.qvel[self._vases_qvel]
+        if not velocity.any():  # the usual case: all asleep
+            return False
+        linear = velocity.reshape(-1, 6)[: self._n_vases, :3]
+        return bool((np.einsum("ij,ij->i", linear, linear) > VASE_SPEED_LIMIT**2).any())
+
+    def _any_vase_touched(self) -> bool:
+        if not self.data.ncon:
+            return False
+        return bool((self._touch_side[self.data.contact.geom].sum(axis=1) == 0).any())
+
+    def _sides_of_geoms(self) -> NDArray[np.int8]:
+        """+1 for the robot's geoms, -1 for vases, 2 for all else: only a robot-vase pair sums to 0."""
+        roots = self.model.body_rootid[self.model.geom_bodyid]
+        sides = np.full(self.model.ngeom, 2, dtype=np.int8)
+        sides[roots == self.model.body(self.robot.body).id] = 1
+        for i in range(self.level.vases):
+            sides[roots == self.model.body(f"vase{i}").id] = -1
+        return sides
+
+    # Scenario ----------------------------------------------------------------------------------------------
+
+    def _apply(self, layout: Layout) -> None:
+        """Start an episode from a layout, at rest."""
+        self._goals_reached = 0
+        self._goal_met = False
+        self._hazards = layout.hazards
+        self._n_vases = len(layout.vases)
+        n_hazards = len(layout.hazards)
+        sizes = [1, n_hazards, self._n_vases]
+        self._groups = np.repeat([0, self._hazard_group, self._vase_group], sizes)
+        self._targets = np.concatenate([layout.goal[None], layout.hazards, layout.vases])
+        mocap = self.data.mocap_pos
+        mocap[1:, :2] = _PARKED
+        mocap[1 : 1 + n_hazards, :2] = layout.hazards
+        mocap[1:, 2] = _HAZARD_Z
+        self._set_goal(layout.goal)
+        qpos = self.init_qpos.copy()
+        qpos[:3] = layout.agent
+        vases = qpos[self._vases_qpos].reshape(-1, 7)
+        vases[:, 0] = _PARKED
+        vases[:, 1] = np.arange(self.level.vases)  # a metre apart, so that parked vases do not touch
+        vases[:, 2] = _VASE_Z
+        vases[: self._n_vases, :2] = layout.vases
+        self.set_state(qpos, np.zeros(self.model.nv))
+
+    def _set_goal(self, goal: NDArray[np.float64]) -> None:
+        self._targets[0] = goal
+        self.data.mocap_pos[0] = goal[0], goal[1], _GOAL_Z
+
+    def _goal_distance(self) -> float:
+        goal, qpos = self._targets[0], self.data.qpos
+        return math.hypot(goal[0] - qpos[0], goal[1] - qpos[1])
+
+    def _observation(self) -> NDArray[np.float64]:
+        x, y, heading = self.data.qpos[:3].tolist()
+        targets = self._targets
+        targets[len(targets) - self._n_vases :] = self.vase_positions
+        cos, sin = math.cos(heading), math.sin(heading)
+        relative = (targets - (x, y)) @ np.array([[cos, -sin], [sin, cos]])
+        lidar = pseudo_lidar(relative, self._groups, self._kinds)
+        return np.concatenate([self.data.sensordata[: self.robot.n_sensors], lidar])

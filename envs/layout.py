@@ -1,0 +1,115 @@
+"""Where everything stands when an episode starts, and how a user asks for it."""
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.envs.levels import Level
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
+
+LAYOUT_KEYS: Final = ("agent", "goal", "hazards", "vases")
+"""What ``reset(options={"layout": {...}})`` understands; keys left out are sampled."""
+
+
+@dataclass
+class PartialLayout:
+    """A layout of which only some parts are fixed; None means "sample it".
+
+    Attributes:
+        agent: Position and heading, shape (3,), m and rad.
+        goal: Centre, shape (2,), m.
+        hazards: Centres, shape (n, 2), m.
+        vases: Centres, shape (n, 2), m.
+    """
+
+    agent: NDArray[np.float64] | None = None
+    goal: NDArray[np.float64] | None = None
+    hazards: NDArray[np.float64] | None = None
+    vases: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A whole layout: the same parts as `PartialLayout`, all of them known."""
+
+    agent: NDArray[np.float64]
+    goal: NDArray[np.float64]
+    hazards: NDArray[np.float64]
+    vases: NDArray[np.float64]
+
+
+def parse_layout(options: Mapping[str, Any] | None, level: Level) -> PartialLayout:
+    """Read the layout out of `reset`'s options.
+
+    Given positions are taken as they are: no keepouts are enforced among them, so a scenario may start inside
+    a hazard. Fewer hazards or vases than the level has are fine; the rest is parked out of the scenario.
+    Options other than ``"layout"`` belong to wrappers and are left alone.
+
+    Args:
+        options: `reset`'s options; never changed.
+        level: The level, for its numbers of hazards and vases.
+
+    Returns:
+        The parts that were given.
+
+    Raises:
+        UnknownNameError: An unknown key in the layout, or an option that looks like a misspelt ``"layout"``.
+        ConfigurationError: A wrong shape, too many objects, or a number that is not finite.
+    """
+    options = options or {}
+    for key in options:
+        if key != "layout" and difflib.get_close_matches(str(key), ["layout"], cutoff=0.7):
+            raise UnknownNameError(f"unknown reset option {key!r}: did you mean 'layout'?")
+    given = options.get("layout")
+    if given is None:
+        return PartialLayout()
+    if not isinstance(given, Mapping):
+        raise ConfigurationError(
+            f"options['layout'] must be a mapping with keys among {', '.join(LAYOUT_KEYS)};"
+            f" got {type(given).__name__}"
+        )
+    for key in given:
+        if key not in LAYOUT_KEYS:
+            raise UnknownNameError(f"unknown layout key {key!r}: valid keys are {', '.join(LAYOUT_KEYS)}")
+    return PartialLayout(
+        agent=_numbers(given, "agent", "[x, y, heading]", 3),
+        goal=_numbers(given, "goal", "[x, y]", 2),
+        hazards=_points(given, "hazards", level.hazards),
+        vases=_points(given, "vases", level.vases),
+    )
+
+
+def _numbers(given: Mapping[str, Any], key: str, form: str, length: int) -> NDArray[np.float64] | None:
+    if given.get(key) is None:
+        return None
+    value = _finite_array(given[key], key, form)
+    if value.shape != (length,):
+        raise ConfigurationError(f"layout {key!r} must be {form}; got shape {value.shape}")
+    return value
+
+
+def _points(given: Mapping[str, Any], key: str, at_most: int) -> NDArray[np.float64] | None:
+    if given.get(key) is None:
+        return None
+    value = _finite_array(given[key], key, "[[x, y], ...]")
+    if value.size == 0:
+        return np.zeros((0, 2))
+    if value.ndim != 2 or value.shape[1] != 2:
+        raise ConfigurationError(f"layout {key!r} must be [[x, y], ...]; got shape {value.shape}")
+    if len(value) > at_most:
+        raise ConfigurationError(f"layout gives {len(value)} {key}, but this level has at most {at_most}")
+    return value
+
+
+def _finite_array(value: Any, key: str, form: str) -> NDArray[np.float64]:
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ConfigurationError(f"layout {key!r} must be {form}; got {value!r}") from error
+    if not np.isfinite(array).all():
+        raise ConfigurationError(f"layout {key!r} must be finite; got {array.tolist()}")
+    return array
