@@ -1,0 +1,78 @@
+"""A tiny goal task and a tiny filter, so that runs of the whole machinery take a second."""
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.spaces import Box
+
+from safe_wrappers import interventions as keys
+
+HAZARD = np.array([0.5, 0.0])
+
+
+class FakeGoal(gym.Env):
+    """A point that moves by 0.1 of its action; a goal at (1, 0), a hazard of radius 0.2 on the way."""
+
+    hazard_positions = HAZARD[None, :]
+    hazard_radius = 0.2
+    goal_radius = 0.1
+    vase_positions = np.array([[0.5, 0.6]])
+
+    def __init__(self):
+        self.action_space = Box(-1.0, 1.0, (2,), np.float32)
+        self.observation_space = Box(-np.inf, np.inf, (2,), np.float64)
+
+    @property
+    def agent_position(self):
+        return self._at
+
+    @property
+    def goal_position(self):
+        return np.array([1.0, 0.0])
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self._at = self.np_random.uniform(-0.1, 0.1, 2)
+        self._steps = self._goals = 0
+        return self._at.copy(), {}
+
+    def step(self, action):
+        before = np.linalg.norm(self.goal_position - self._at)
+        self._at = np.clip(self._at + 0.1 * np.asarray(action, float), -2, 2)
+        self._steps += 1
+        after = np.linalg.norm(self.goal_position - self._at)
+        self._goals += after < self.goal_radius
+        inside = float(np.linalg.norm(self._at - HAZARD) < self.hazard_radius)
+        info = {keys.COST: inside, keys.COST_SUBSTEP: inside, "goals_reached": int(self._goals)}
+        return self._at.copy(), before - after, False, self._steps >= 20, info
+
+
+class FakeFilter(gym.Wrapper, gym.utils.RecordConstructorArgs):
+    """Refuses an action that ends inside the hazard, and stands still instead."""
+
+    def __init__(self, env, margin=0.0):
+        gym.utils.RecordConstructorArgs.__init__(self, margin=margin)
+        gym.Wrapper.__init__(self, env)
+        self.margin = margin
+        self.filter_seconds = 0.0
+        self.filter_calls = 0
+
+    def step(self, action):
+        task = self.unwrapped
+        gap = np.linalg.norm(task.agent_position + 0.1 * np.asarray(action) - HAZARD) - task.hazard_radius
+        hit = bool(gap < self.margin)
+        observation, reward, terminated, truncated, info = self.env.step(0 * action if hit else action)
+        info.update(dict.fromkeys(keys.CBF_BOOLS, False))
+        info.update(dict.fromkeys(keys.CBF_FLOATS, 0.0))
+        info[keys.CBF_INTERVENED] = hit
+        info[keys.CBF_CORRECTION] = float(np.linalg.norm(action)) if hit else 0.0
+        info[keys.CBF_MARGIN] = float(gap)
+        self.filter_seconds += 1e-6
+        self.filter_calls += 1
+        return observation, reward, terminated, truncated, info
+
+
+def shield(env, margin=0.0):
+    return FakeFilter(env, margin)
+
+
+gym.register("FakeGoal-v0", "fake_task:FakeGoal")

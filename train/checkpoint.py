@@ -1,0 +1,152 @@
+"""Checkpoints of one run: whole or not there, verified before they are read, the last two kept."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import pickle
+import random
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from safe_wrappers.errors import RunStateError
+from safe_wrappers.train.atomic import write_json
+from safe_wrappers.train.config import ALGORITHMS
+
+MODEL: Final = "model.zip"
+NORMALIZE: Final = "vecnormalize.pkl"
+REPLAY: Final = "replay_buffer.pkl"
+RANDOM: Final = "random.pkl"
+STATE: Final = "state.json"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A verified checkpoint."""
+
+    folder: Path
+    timesteps: int
+    elapsed_s: float
+
+    def load_model(self, algorithm: str, env: VecEnv | None, device: str) -> BaseAlgorithm:
+        """Loads the model; with an env also what training needs: replay buffer and random states."""
+        model: BaseAlgorithm = ALGORITHMS[algorithm].load(self.folder / MODEL, env=env, device=device)
+        if env is not None:
+            if isinstance(model, OffPolicyAlgorithm):
+                model.load_replay_buffer(self.folder / REPLAY)
+            _set_random_states(pickle.loads((self.folder / RANDOM).read_bytes()))
+        return model
+
+    def load_normalize(self, env: VecEnv) -> VecEnv:
+        """Puts the saved running statistics around the env; returns the env itself if the run had none."""
+        path = self.folder / NORMALIZE
+        return VecNormalize.load(str(path), env) if path.exists() else env
+
+
+def save_checkpoint(root: Path, model: BaseAlgorithm, elapsed_s: float, final: bool = False) -> Path:
+    """Saves model, normaliser, replay buffer and random states under `root`, then drops older checkpoints.
+
+    Everything is written into a hidden folder that is renamed at the end: there is no half checkpoint.
+
+    Args:
+        root: The run's folder of checkpoints.
+        model: The model between two rollouts.
+        elapsed_s: Training time so far, over all restarts.
+        final: The run is finished: no replay buffer is needed any more, and no older checkpoint.
+
+    Returns:
+        The checkpoint's folder.
+    """
+    folder = root / f"step_{model.num_timesteps:012d}"
+    temporary = root / ".writing"  # a killed process may have left one; its successor clears it
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
+    model.save(temporary / MODEL)
+    normalize = model.get_vec_normalize_env()
+    if normalize is not None:
+        normalize.save(str(temporary / NORMALIZE))
+    if isinstance(model, OffPolicyAlgorithm) and not final:
+        model.save_replay_buffer(temporary / REPLAY)
+    (temporary / RANDOM).write_bytes(pickle.dumps(_random_states()))
+    files = {path.name: _checksum(path) for path in sorted(temporary.iterdir())}
+    write_json(temporary / STATE, {"timesteps": model.num_timesteps, "elapsed_s": elapsed_s, "files": files})
+    if folder.exists():  # a damaged one that was passed over, or the last rollout's of a finishing run
+        shutil.rmtree(folder)
+    os.replace(temporary, folder)
+    for old in _folders(root)[: -1 if final else -2]:
+        shutil.rmtree(old)
+    return folder
+
+
+def latest_checkpoint(root: Path, warn: Callable[[str], None]) -> Checkpoint | None:
+    """Finds the newest checkpoint whose files are as they were written.
+
+    Args:
+        root: The run's folder of checkpoints.
+        warn: Told about each damaged checkpoint that is passed over.
+
+    Returns:
+        The checkpoint, or None when the run has none yet.
+
+    Raises:
+        RunStateError: There are checkpoints, and all are damaged; says which files and what to do.
+    """
+    damages: list[str] = []
+    for folder in reversed(_folders(root)):
+        damage = _damage(folder)
+        if damage is None:
+            state = json.loads((folder / STATE).read_text())
+            if damages:
+                warn(f"{damages[-1]}; continuing from the checkpoint before it, {folder}")
+            return Checkpoint(folder, int(state["timesteps"]), float(state["elapsed_s"]))
+        damages.append(damage)
+    if damages:
+        raise RunStateError(
+            f"Corrupted checkpoint: {'; '.join(damages)}. No other is left: delete {str(root.parent)!r} to"
+            " train this run again from the start."
+        )
+    return None
+
+
+def _folders(root: Path) -> list[Path]:
+    return sorted(root.glob("step_*"))
+
+
+def _damage(folder: Path) -> str | None:
+    state = folder / STATE
+    try:
+        files: dict[str, str] = json.loads(state.read_text())["files"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return f"{state} is missing or unreadable"
+    for name, checksum in files.items():
+        path = folder / name
+        if not path.exists():
+            return f"{path} is missing"
+        if _checksum(path) != checksum:
+            return f"{path} is not as it was written (its checksum differs)"
+    return None
+
+
+def _checksum(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _random_states() -> dict[str, Any]:
+    return {"python": random.getstate(), "numpy": np.random.get_state(), "torch": torch.get_rng_state()}
+
+
+def _set_random_states(states: dict[str, Any]) -> None:
+    random.setstate(states["python"])
+    np.random.set_state(states["numpy"])
+    torch.set_rng_state(states["torch"])

@@ -1,0 +1,305 @@
+"""An experiment's settings: a plain dict becomes frozen dataclasses, or is refused with the nearest name."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import gymnasium as gym
+from stable_baselines3 import PPO, SAC
+
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.train.names import check_name
+
+ALGORITHMS: Final[dict[str, type[PPO] | type[SAC]]] = {"PPO": PPO, "SAC": SAC}
+# What the run itself decides; the rest of the constructor's arguments are hyperparameters.
+_NOT_HYPERPARAMETERS: Final = {"self", "env", "seed", "device", "verbose", "tensorboard_log"} | {
+    "_init_setup_model",
+    "stats_window_size",
+}
+_ARM_KEYS: Final = (
+    "filter",
+    "env",
+    "algorithm",
+    "hyperparameters",
+    "normalize",
+    "total_steps",
+    "n_envs",
+    "checkpoint_every",
+    "device",
+)
+_SHARED_KEYS: Final = tuple(key for key in _ARM_KEYS if key != "filter")
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """Which env: `env: Id-v0`, or `env: {id: Id-v0, kwargs: {...}}`."""
+
+    id: str
+    kwargs: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FilterConfig:
+    """Which filter: `none`, `protect`, `{protect: {...}}`, `{factory: "module:function", kwargs: {...}}`."""
+
+    kind: str = "none"
+    kwargs: dict[str, Any] = field(default_factory=dict)
+    factory: str = ""
+
+
+@dataclass(frozen=True)
+class NormalizeConfig:
+    """What SB3's VecNormalize scales by its running statistics."""
+
+    observation: bool = False
+    reward: bool = False
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """Paired evaluation: episode i of every arm and seed starts from env seed `seed + i`."""
+
+    episodes: int = 10
+    seed: int = 1_000_000
+
+
+@dataclass(frozen=True)
+class ArmConfig:
+    """All that decides how one arm trains."""
+
+    name: str
+    filter: FilterConfig
+    env: EnvConfig
+    algorithm: str
+    hyperparameters: dict[str, Any]
+    normalize: NormalizeConfig
+    total_steps: int
+    n_envs: int
+    checkpoint_every: int
+    device: str
+
+    def fingerprint(self) -> dict[str, Any]:
+        """What a run folder must agree on to be continued: all that changes what is learned."""
+        values = asdict(self)
+        for harmless in ("name", "checkpoint_every", "device"):
+            del values[harmless]
+        return values
+
+
+@dataclass(frozen=True)
+class ExperimentConfig:
+    """An experiment: arms times seeds, one folder."""
+
+    name: str
+    arms: tuple[ArmConfig, ...]
+    seeds: tuple[int, ...]
+    evaluation: EvaluationConfig
+    output: Path
+    workers: int | None
+
+    @property
+    def folder(self) -> Path:
+        """Where everything of this experiment lies."""
+        return self.output / self.name
+
+    def run_folder(self, arm: ArmConfig, seed: int) -> Path:
+        """Where one run lies."""
+        return self.folder / arm.name / f"seed_{seed}"
+
+    @property
+    def evaluation_filter(self) -> FilterConfig:
+        """The filter of an unfiltered arm in the condition "filter on": that of the first filtered arm."""
+        return next((arm.filter for arm in self.arms if arm.filter.kind != "none"), FilterConfig())
+
+
+def parse_experiment(settings: Mapping[str, Any]) -> ExperimentConfig:
+    """Checks every setting of an experiment.
+
+    Args:
+        settings: What `read_config` returned.
+
+    Returns:
+        The experiment.
+
+    Raises:
+        UnknownNameError: A key, an algorithm or an env id that does not exist.
+        ConfigurationError: A value of the wrong type or outside its range, or a missing one.
+    """
+    valid = ("name", "arms", "seeds", "evaluation", "output", "workers", *_SHARED_KEYS)
+    for key in settings:
+        check_name(key, valid, "config")
+    for key in ("name", "env", "algorithm", "total_steps", "arms", "seeds"):
+        if key not in settings:
+            raise ConfigurationError(f"config: {key!r} is missing.")
+    shared = {key: settings[key] for key in _SHARED_KEYS if key in settings}
+    arms = _mapping(settings["arms"], "arms")
+    if not arms:
+        raise ConfigurationError("arms: expected at least one, such as `unfiltered: {filter: none}`.")
+    workers = settings.get("workers")
+    return ExperimentConfig(
+        name=_folder_name(settings["name"], "name"),
+        arms=tuple(_arm(name, _mapping(arm, f"arms.{name}"), shared) for name, arm in arms.items()),
+        seeds=_seeds(settings["seeds"]),
+        evaluation=_evaluation(settings.get("evaluation")),
+        output=Path(_text(settings.get("output", "runs"), "output")),
+        workers=None if workers is None else _integer(workers, "workers", 1),
+    )
+
+
+def _arm(name: object, own: Mapping[str, Any], shared: Mapping[str, Any]) -> ArmConfig:
+    where = f"arms.{name}"
+    for key in own:
+        check_name(key, _ARM_KEYS, where)
+    merged = {**shared, **own}
+    algorithm = check_name(merged["algorithm"], ALGORITHMS, f"{where}.algorithm")
+    hyperparameters = dict(_mapping(own.get("hyperparameters"), f"{where}.hyperparameters"))
+    if algorithm == shared["algorithm"]:  # another algorithm's hyperparameters would not fit
+        common = _mapping(shared.get("hyperparameters"), "hyperparameters")
+        hyperparameters = {**common, **hyperparameters}
+    total_steps = _integer(merged["total_steps"], "total_steps", 1)
+    arm = ArmConfig(
+        name=_folder_name(name, "arms"),
+        filter=_filter(own.get("filter"), f"{where}.filter"),
+        env=_env(merged["env"]),
+        algorithm=algorithm,
+        hyperparameters=_hyperparameters(algorithm, hyperparameters),
+        normalize=_normalize(merged.get("normalize")),
+        total_steps=total_steps,
+        n_envs=_integer(merged.get("n_envs", 1), "n_envs", 1),
+        checkpoint_every=_integer(merged.get("checkpoint_every", 50_000), "checkpoint_every", 1),
+        device=check_name(merged.get("device", "cpu"), ("cpu", "cuda", "auto"), "device"),
+    )
+    if arm.algorithm == "SAC":
+        # SB3's default of a million transitions would be saved with every checkpoint, mostly empty.
+        arm.hyperparameters.setdefault("buffer_size", min(1_000_000, total_steps))
+    return arm
+
+
+def _hyperparameters(algorithm: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    signature = inspect.signature(ALGORITHMS[algorithm])
+    parameters = {k: v for k, v in signature.parameters.items() if k not in _NOT_HYPERPARAMETERS}
+    for key, value in given.items():
+        check_name(key, parameters, f"hyperparameters of {algorithm}")
+        default = parameters[key].default
+        where = f"hyperparameters.{key}"
+        if key == "learning_rate":
+            _number(value, where, above=0.0)
+        elif isinstance(default, bool):
+            _flag(value, where)
+        elif isinstance(default, int) and key != "train_freq":  # train_freq may be [4, "episode"]
+            _integer(value, where, 0 if key in ("learning_starts", "sde_sample_freq") else None)
+        elif isinstance(default, float):
+            _number(value, where)
+        if key in ("n_steps", "batch_size", "n_epochs", "buffer_size"):
+            _integer(value, where, 1)
+    return dict(given)
+
+
+def _filter(value: Any, where: str) -> FilterConfig:
+    expected = "expected none, protect, {protect: {...}} or {factory: 'module:function', kwargs: {...}}"
+    if value is None or isinstance(value, str):
+        return FilterConfig(kind=check_name(value or "none", ("none", "protect"), where))
+    if not isinstance(value, dict):
+        raise ConfigurationError(f"{where}: {expected}; got {value!r}.")
+    for key in value:
+        check_name(key, ("protect", "factory", "kwargs"), where)
+    if set(value) == {"protect"}:
+        return FilterConfig("protect", dict(_mapping(value["protect"], f"{where}.protect")))
+    if "factory" in value and "protect" not in value:
+        factory = _text(value["factory"], f"{where}.factory")
+        if not re.fullmatch(r"[\w.]+:\w+", factory):
+            raise ConfigurationError(f"{where}.factory: expected 'module:function', got {factory!r}.")
+        return FilterConfig("factory", dict(_mapping(value.get("kwargs"), f"{where}.kwargs")), factory)
+    raise ConfigurationError(f"{where}: {expected}; got {value!r}.")
+
+
+def _env(value: Any) -> EnvConfig:
+    if isinstance(value, str):
+        value = {"id": value}
+    value = _mapping(value, "env")
+    for key in value:
+        check_name(key, ("id", "kwargs"), "env")
+    env_id = _text(value.get("id"), "env.id")
+    if ":" not in env_id:  # `module:Id-v0` is registered by importing the module, when the env is made
+        try:
+            gym.spec(env_id)
+        except gym.error.Error:
+            check_name(env_id, gym.registry, "env.id")
+    return EnvConfig(env_id, dict(_mapping(value.get("kwargs"), "env.kwargs")))
+
+
+def _normalize(value: Any) -> NormalizeConfig:
+    value = _mapping(value, "normalize")
+    for key in value:
+        check_name(key, ("observation", "reward"), "normalize")
+    return NormalizeConfig(**{key: _flag(flag, f"normalize.{key}") for key, flag in value.items()})
+
+
+def _evaluation(value: Any) -> EvaluationConfig:
+    value = _mapping(value, "evaluation")
+    for key in value:
+        check_name(key, ("episodes", "seed"), "evaluation")
+    return EvaluationConfig(
+        episodes=_integer(value.get("episodes", EvaluationConfig.episodes), "evaluation.episodes", 1),
+        seed=_integer(value.get("seed", EvaluationConfig.seed), "evaluation.seed", 0),
+    )
+
+
+def _seeds(value: Any) -> tuple[int, ...]:
+    if not isinstance(value, list) or not value:
+        raise ConfigurationError(f"seeds: expected a list such as [0, 1, 2], got {value!r}.")
+    seeds = tuple(_integer(seed, "seeds", 0) for seed in value)
+    if len(set(seeds)) < len(seeds):
+        raise ConfigurationError(f"seeds: each may be given once, got {value!r}.")
+    return seeds
+
+
+def _mapping(value: Any, where: str) -> Mapping[str, Any]:
+    if value is None:
+        return {}
+    if not isinstance(value, Mapping):
+        raise ConfigurationError(f"{where}: expected a mapping (`key: value`), got {value!r}.")
+    return value
+
+
+def _integer(value: Any, where: str, least: int | None = None) -> int:
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)  # 3e5 steps
+    if isinstance(value, bool) or not isinstance(value, int) or (least is not None and value < least):
+        bound = "" if least is None else f" of at least {least}"
+        raise ConfigurationError(f"{where}: expected an integer{bound}, got {value!r}.")
+    return value
+
+
+def _number(value: Any, where: str, above: float = -math.inf) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not above < value < math.inf:
+        bound = "" if above == -math.inf else f" above {above:g}"
+        raise ConfigurationError(f"{where}: expected a finite number{bound}, got {value!r}.")
+    return value
+
+
+def _flag(value: Any, where: str) -> bool:
+    if not isinstance(value, bool):
+        raise ConfigurationError(f"{where}: expected true or false, got {value!r}.")
+    return value
+
+
+def _text(value: Any, where: str) -> str:
+    if not isinstance(value, str) or not value:
+        raise ConfigurationError(f"{where}: expected a text, got {value!r}.")
+    return value
+
+
+def _folder_name(value: Any, where: str) -> str:
+    if not isinstance(value, str) or not re.fullmatch(r"[A-Za-z0-9][\w.-]*", value):
+        raise ConfigurationError(
+            f"{where}: expected a name that can be a folder's (letters, digits, '_', '-', '.'),"
+            f" got {value!r}."
+        )
+    return value

@@ -1,0 +1,71 @@
+"""An experiment's steps: train all runs, evaluate them, sum them up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rich.console import Console
+
+from safe_wrappers.train.config import ArmConfig, ExperimentConfig
+from safe_wrappers.train.evaluate import evaluate_run
+from safe_wrappers.train.parallel import Job, run_jobs
+from safe_wrappers.train.run import claim_folder, train_run
+from safe_wrappers.train.summary import Summary, summarize, write_summary
+
+
+def train_experiment(experiment: ExperimentConfig, console: Console) -> None:
+    """Trains what is not trained yet, arms times seeds in parallel.
+
+    Raises:
+        RunStateError: A run folder belongs to another config; nothing has been started.
+        RunsFailedError: Some runs failed.
+    """
+    # All folders before the first step: nobody should learn after an hour that the last one is taken.
+    for arm in experiment.arms:
+        for seed in experiment.seeds:
+            claim_folder(arm, seed, experiment.run_folder(arm, seed))
+    _run(experiment, console, "Training", lambda arm: arm.total_steps, "steps", train_run, ())
+
+
+def evaluate_experiment(experiment: ExperimentConfig, console: Console) -> None:
+    """Evaluates every trained run on the same episode seeds, filter off and on.
+
+    Raises:
+        RunsFailedError: Some runs failed, or are not trained to their end.
+    """
+    conditions = 1 if experiment.evaluation_filter.kind == "none" else 2
+    episodes = conditions * experiment.evaluation.episodes
+    arguments = (experiment.evaluation, experiment.evaluation_filter)
+    _run(experiment, console, "Evaluation", lambda _: episodes, "episodes", evaluate_run, arguments)
+
+
+def summarize_experiment(experiment: ExperimentConfig) -> Summary:
+    """Sums up what is there and writes it beside the runs."""
+    summary = summarize(experiment)
+    write_summary(summary, experiment.folder)
+    return summary
+
+
+def _run(
+    experiment: ExperimentConfig,
+    console: Console,
+    title: str,
+    total: Callable[[ArmConfig], int],
+    unit: str,
+    call: Callable[..., None],
+    more: tuple[Any, ...],
+) -> None:
+    # Seeds outside, arms inside: after the first wave there is already a pair to look at.
+    jobs = [
+        Job(
+            f"{title.lower()} {arm.name} seed {seed}",
+            total(arm),
+            unit,
+            call,
+            (arm, seed, experiment.run_folder(arm, seed), *more),
+        )
+        for seed in experiment.seeds
+        for arm in experiment.arms
+    ]
+    run_jobs(jobs, experiment.workers, console, title)

@@ -1,0 +1,36 @@
+"""The whole stack of one env, from the task to SB3's Monitor."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+import gymnasium as gym
+from stable_baselines3.common.monitor import Monitor
+
+import safe_wrappers
+from safe_wrappers import interventions as keys
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.train.config import EnvConfig, FilterConfig
+from safe_wrappers.train.names import check_name
+from safe_wrappers.wrappers.record_interventions import RecordInterventions
+
+
+def make_stack(env: EnvConfig, action_filter: FilterConfig) -> Monitor[Any, Any]:
+    """Makes the task, its filter if there is one, the recorder, and Monitor outermost, as SB3 wants it."""
+    task: gym.Env[Any, Any] = gym.make(env.id, **env.kwargs)
+    if action_filter.kind == "protect":
+        task = safe_wrappers.protect(task, **action_filter.kwargs)
+    elif action_filter.kind == "factory":
+        task = _factory(action_filter)(task, **action_filter.kwargs)
+    return Monitor(RecordInterventions(task), info_keywords=keys.RUNNING)
+
+
+def _factory(action_filter: FilterConfig) -> Any:
+    module_name, _, function = action_filter.factory.partition(":")
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        raise ConfigurationError(f"filter.factory: cannot import {module_name!r}: {error}") from None
+    check_name(function, [name for name in dir(module) if not name.startswith("_")], f"{module_name}")
+    return getattr(module, function)

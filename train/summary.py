@@ -1,0 +1,176 @@
+"""An experiment's numbers: a row per arm, seed and condition, and interquartile means with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+
+from safe_wrappers.train.atomic import write_json
+from safe_wrappers.train.config import ExperimentConfig
+from safe_wrappers.train.evaluate import evaluation_folder
+from safe_wrappers.train.tables import read_rows, write_rows
+
+CONDITIONS: Final = {
+    "training": "Training, all episodes",
+    "filter_off": "Evaluation, filter off",
+    "filter_on": "Evaluation, filter on",
+}
+TOTALS: Final = ("violations", "infeasible", "fallback")
+METRICS: Final = {
+    "return": "Return / episode",
+    "cost": "Cost / episode",
+    "cost_substep": "Cost in substeps / episode",
+    "violations": "Steps in violation, total",
+    "intervention_rate": "Share of steps changed",
+    "correction_mean": "Correction, mean",
+    "correction_p95": "Correction, 95th pct.",
+    "infeasible": "Infeasible steps, total",
+    "fallback": "Fallback steps, total",
+    "goals_reached": "Goals / episode",
+}
+"""What is reported. Totals are over a condition's episodes; all else is the mean over its episodes of the
+episode's value (so `correction_p95` is the mean of the episodes' percentiles)."""
+
+
+OF_THE_FILTER: Final = ("intervention_rate", "correction_mean", "correction_p95", "infeasible", "fallback")
+"""Left out where no filter is on: a zero there would say nothing."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The interquartile mean over seeds and its bootstrap 95 % interval (None with one seed)."""
+
+    iqm: float
+    low: float | None
+    high: float | None
+    seeds: int
+
+    def __str__(self) -> str:
+        if self.low is None or self.high is None:
+            return f"{number(self.iqm)} [n/a: 1 seed]"
+        return f"{number(self.iqm)} [{number(self.low)}, {number(self.high)}]"
+
+
+Table = dict[str, dict[str, dict[str, Estimate]]]
+"""arm -> condition -> metric -> estimate."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The per-seed rows and what they come to."""
+
+    per_seed: list[dict[str, Any]]
+    table: Table
+
+
+def interquartile_mean(values: ArrayLike, axis: int = -1) -> NDArray[np.float64]:
+    """The mean of the middle half: a quarter of the values (rounded down) is cut at either end.
+
+    With 1 to 3 values nothing is cut and it is the plain mean; with 4 or 5 the extremes go.
+    """
+    return np.asarray(stats.trim_mean(values, 0.25, axis=axis))
+
+
+def estimate(values: Sequence[float]) -> Estimate:
+    """Interquartile mean and 95 % percentile-bootstrap interval over seeds.
+
+    The percentile method, because BCa is undefined when all seeds agree (as with zero violations) and
+    unstable for a handful of seeds. With few seeds any bootstrap interval is too narrow; with one there is
+    none.
+    """
+    iqm = float(interquartile_mean(values))
+    if len(values) < 2:
+        return Estimate(iqm, None, None, len(values))
+    if np.ptp(values) == 0:
+        return Estimate(iqm, iqm, iqm, len(values))
+    interval = stats.bootstrap(
+        (np.asarray(values, dtype=float),),
+        interquartile_mean,
+        method="percentile",
+        n_resamples=9999,
+        rng=np.random.default_rng(0),  # the same rows always give the same interval
+    ).confidence_interval
+    return Estimate(iqm, float(interval.low), float(interval.high), len(values))
+
+
+def summarize(experiment: ExperimentConfig) -> Summary:
+    """Reads every run's rows and sums them up."""
+    per_seed: list[dict[str, Any]] = []
+    table: Table = {}
+    for arm in experiment.arms:
+        table[arm.name] = {}
+        for condition in CONDITIONS:
+            filtered = condition == "filter_on" or (condition == "training" and arm.filter.kind != "none")
+            rows = []
+            for seed in experiment.seeds:
+                episodes = read_rows(_episode_file(experiment.run_folder(arm, seed), condition))
+                if episodes:
+                    rows.append(
+                        {"arm": arm.name, "seed": seed, "condition": condition, **_seed_row(episodes)}
+                    )
+            per_seed += rows
+            table[arm.name][condition] = {
+                metric: estimate([row[metric] for row in rows])
+                for metric in METRICS
+                if rows and all(metric in row for row in rows) and (filtered or metric not in OF_THE_FILTER)
+            }
+    return Summary(per_seed, table)
+
+
+def write_summary(summary: Summary, folder: Path) -> None:
+    """Writes `per_seed.csv` (one row per arm, seed and condition), `summary.csv` and `summary.json`."""
+    write_rows(
+        folder / "per_seed.csv", ("arm", "seed", "condition", "episodes", "steps", *METRICS), summary.per_seed
+    )
+    rows = [
+        {"arm": arm, "condition": condition, "metric": metric}
+        | {key: "" if value is None else value for key, value in asdict(result).items()}
+        for arm, conditions in summary.table.items()
+        for condition, metrics in conditions.items()
+        for metric, result in metrics.items()
+    ]
+    write_rows(folder / "summary.csv", ("arm", "condition", "metric", "iqm", "low", "high", "seeds"), rows)
+    write_json(
+        folder / "summary.json",
+        {
+            arm: {
+                condition: {metric: asdict(result) for metric, result in metrics.items()}
+                for condition, metrics in conditions.items()
+            }
+            for arm, conditions in summary.table.items()
+        },
+    )
+
+
+def number(value: float) -> str:
+    """Three significant digits, whole numbers in full, no exponents for everyday sizes."""
+    if abs(value) >= 100 or value == int(value):
+        return f"{value:,.0f}"
+    return f"{value:.3g}"
+
+
+def _episode_file(run_folder: Path, condition: str) -> Path:
+    if condition == "training":
+        return run_folder / "episodes.csv"
+    return evaluation_folder(run_folder) / f"{condition}.csv"
+
+
+def _seed_row(episodes: Sequence[Mapping[str, float]]) -> dict[str, Any]:
+    combine: dict[str, Callable[..., Any]] = {
+        metric: np.sum if metric in TOTALS else np.mean for metric in METRICS
+    }
+    return {
+        "episodes": len(episodes),
+        "steps": int(sum(episode["length"] for episode in episodes)),
+        **{
+            metric: float(function([episode[metric] for episode in episodes]))
+            for metric, function in combine.items()
+            if all(metric in episode for episode in episodes)
+        },
+    }
