@@ -11,7 +11,6 @@ import time
 
 import gymnasium as gym
 import numpy as np
-
 from safe_wrappers.envs import POINT_GOAL_IDS, register_envs
 
 LIMIT_US = 150.0

@@ -10,7 +10,6 @@ from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
-
 from safe_wrappers.envs.layout import Layout, PartialLayout, parse_layout
 from safe_wrappers.envs.levels import (
     GOAL_RADIUS,
@@ -22,6 +21,7 @@ from safe_wrappers.envs.levels import (
 from safe_wrappers.envs.lidar import LIDAR_BINS, pseudo_lidar
 from safe_wrappers.envs.placement import sample_goal, sample_layout
 from safe_wrappers.envs.robot import PlanarRobot
+
 from safe_wrappers.errors import ActionError, ConfigurationError
 from safe_wrappers.interventions import COST, COST_SUBSTEP
 
@@ -40,7 +40,7 @@ _VASE_Z: Final = 0.09996  # a vase's centre at the start, m: 40 um into the floo
 _GOAL_Z: Final = 0.16
 _HAZARD_Z: Final = 0.02
 _PARKED: Final = 1000.0  # m: objects outside the scenario, farther than a robot gets in an episode
-_SLEEP_TOLERANCE: Final = 1e-6  # m/s: a hundredth of the speed that costs
+_SLEEP_TOLERANCE: Final = 1e-7  # m/s: a thousandth of the speed that costs
 _ASSETS: Final = Path(__file__).parent / "assets"
 _CAMERA: Final = {"distance": 5.5, "elevation": -55.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.2, 0.0])}
 
@@ -165,7 +165,7 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
     def reset_model(self) -> NDArray[np.float64]:
         """Sample what the options left open, place everything, return the observation."""
         self._apply(sample_layout(self.np_random, self.level, self._given))
-        return self._observation()
+        return self.observe()
 
     def set_state(self, qpos: NDArray[np.float64], qvel: NDArray[np.float64]) -> None:
         """Set positions and velocities (shapes (nq,), (nv,)) and judge the state anew."""
@@ -191,11 +191,13 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
             reward += 1.0
             self._goals_reached += 1
             vases = self.vase_positions
-            self._set_goal(sample_goal(self.np_random, self.level, self.agent_position, self._hazards, vases))
+            self.place_goal(
+                sample_goal(self.np_random, self.level, self.agent_position, self._hazards, vases)
+            )
         if self.render_mode == "human":
             self.render()  # type: ignore[no-untyped-call]
         reward = max(-_REWARD_LIMIT, min(_REWARD_LIMIT, reward))
-        return self._observation(), reward, False, False, self._get_reset_info()
+        return self.observe(), reward, False, False, self._get_reset_info()
 
     def _get_reset_info(self) -> dict[str, Any]:
         return {
@@ -284,7 +286,7 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
         mocap[1:, :2] = _PARKED
         mocap[1 : 1 + n_hazards, :2] = layout.hazards
         mocap[1:, 2] = _HAZARD_Z
-        self._set_goal(layout.goal)
+        self.place_goal(layout.goal)
         qpos = self.init_qpos.copy()
         qpos[:3] = layout.agent
         vases = qpos[self._vases_qpos].reshape(-1, 7)
@@ -294,7 +296,8 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
         vases[: self._n_vases, :2] = layout.vases
         self.set_state(qpos, np.zeros(self.model.nv))
 
-    def _set_goal(self, goal: NDArray[np.float64]) -> None:
+    def place_goal(self, goal: NDArray[np.float64]) -> None:
+        """Move the goal to a centre, shape (2,), m; the next step's reward counts from there."""
         self._targets[0] = goal
         self.data.mocap_pos[0] = goal[0], goal[1], _GOAL_Z
 
@@ -302,7 +305,8 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
         goal, qpos = self._targets[0], self.data.qpos
         return math.hypot(goal[0] - qpos[0], goal[1] - qpos[1])
 
-    def _observation(self) -> NDArray[np.float64]:
+    def observe(self) -> NDArray[np.float64]:
+        """Observation of the state as it is now: also right after `set_state`."""
         x, y, heading = self.data.qpos[:3].tolist()
         targets = self._targets
         targets[len(targets) - self._n_vases :] = self.vase_positions

@@ -7,8 +7,8 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-
 from safe_wrappers.envs.levels import Level
+
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 
 LAYOUT_KEYS: Final = ("agent", "goal", "hazards", "vases")

@@ -3,7 +3,6 @@
 from typing import Any
 
 from gymnasium.utils import EzPickle
-
 from safe_wrappers.envs.goal_env import SafeGoalEnv
 from safe_wrappers.envs.robot import POINT
 

@@ -1,7 +1,6 @@
 """What the goal task needs to know of a robot: the part that differs from machine to machine."""
 
 import math
-import math
 from dataclasses import dataclass
 from typing import Final
 

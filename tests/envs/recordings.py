@@ -1,0 +1,117 @@
+"""The recorded episodes in tests/data, in our coordinates, and how to replay them one step at a time.
+
+Each file holds one episode of 300 control steps from Safety-Gymnasium 1.2 on MuJoCo 2.3.3: the states before
+each step and after the last one, the solver's warm start, actions, observations, rewards, costs and goals.
+Their robot's joints are relative to where it started (`origin`: x, y, heading), ours are in world coordinates:
+`Recording` rotates and shifts the first three joints, and nothing else.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+DATA = Path(__file__).parents[1] / "data"
+EPISODES = [(1, 1), (1, 2), (2, 1), (2, 2)]
+"""Level and episode of every recording."""
+
+
+@dataclass
+class Recording:
+    """One episode; T = 300. States, observations and goals have T + 1 rows, the rest T."""
+
+    level: int
+    qpos: np.ndarray
+    qvel: np.ndarray
+    obs: np.ndarray
+    warmstart: np.ndarray
+    action: np.ndarray
+    reward: np.ndarray
+    cost: np.ndarray
+    goal_met: np.ndarray
+    goal: np.ndarray
+    hazards: np.ndarray
+
+    @classmethod
+    def load(cls, level, episode):
+        with np.load(DATA / f"point_goal{level}_ep{episode}.npz") as file:
+            arrays = {name: file[name] for name in file.files}
+        x, y, heading = arrays.pop("origin")
+        rotation = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
+        arrays["warmstart"] = arrays["warmstart"].astype(np.float64)
+        for name in ("qpos", "qvel", "warmstart"):
+            arrays[name][:, :2] = arrays[name][:, :2] @ rotation.T
+        arrays["qpos"][:, :3] += x, y, heading
+        return cls(level=level, **arrays)
+
+    def __len__(self):
+        return len(self.action)
+
+    def vases(self, t):
+        """Vase centres before step t, shape (n, 2)."""
+        return self.qpos[t, 3:].reshape(-1, 7)[:, :2]
+
+
+@dataclass
+class StepErrors:
+    """Largest absolute error per quantity of one replayed step, and what was touched in it."""
+
+    position: float
+    velocity: float
+    sensors: float
+    lidar: float
+    reward: float
+    cost: float
+    goal_met: bool
+    over: bool
+    nose_on_vase: bool
+
+
+def replay(env, recording, monkeypatch, mj_step=mujoco.mj_step):
+    """Replay every recorded step from its recorded state, by `mj_step`; one `StepErrors` per step."""
+    layout = {
+        "agent": recording.qpos[0, :3],
+        "goal": recording.goal[0],
+        "hazards": recording.hazards,
+        "vases": recording.vases(0),
+    }
+    env.reset(seed=0, options={"layout": layout})
+    nose = env.model.geom("pointarrow").id
+    vase = env.model.geom_bodyid >= env.model.body("vase0").id
+
+    def nose_on_vase():
+        pairs = env.data.contact.geom
+        return bool(((pairs == nose).any(axis=1) & vase[pairs].any(axis=1)).any())
+
+    touched = []
+
+    def watched_step(model, data):
+        mj_step(model, data)
+        touched.append(nose_on_vase())
+
+    monkeypatch.setattr(mujoco, "mj_step", watched_step)
+    errors = []
+    for t in range(len(recording)):
+        touched.clear()
+        env.place_goal(recording.goal[t])
+        env.set_state(recording.qpos[t], recording.qvel[t])
+        env.data.qacc_warmstart[:] = recording.warmstart[t]
+        _, reward, terminated, truncated, info = env.step(recording.action[t])
+        assert len(touched) == env.frame_skip
+        env.place_goal(recording.goal[t + 1])  # ours draws another new goal: look at theirs instead
+        error = np.abs(env.observe() - recording.obs[t + 1])
+        errors.append(
+            StepErrors(
+                position=np.abs(env.data.qpos - recording.qpos[t + 1]).max(),
+                velocity=np.abs(env.data.qvel - recording.qvel[t + 1]).max(),
+                sensors=error[:12].max(),
+                lidar=error[12:].max(),
+                reward=abs(reward - recording.reward[t]),
+                cost=abs(info["cost"] - recording.cost[t]),
+                goal_met=info["goal_met"] == recording.goal_met[t],
+                over=terminated or truncated,
+                nose_on_vase=any(touched) or nose_on_vase(),
+            )
+        )
+    return errors
