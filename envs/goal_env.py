@@ -10,20 +10,21 @@ from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
-from safe_wrappers.envs.layout import Layout, PartialLayout, parse_layout
-from safe_wrappers.envs.levels import (
+
+from safe_wrappers.errors import ActionError, ConfigurationError
+from safe_wrappers.interventions import COST, COST_SUBSTEP
+
+from .layout import Layout, PartialLayout, parse_layout
+from .levels import (
     GOAL_RADIUS,
     HAZARD_RADIUS,
     LEVELS,
     VASE_HALF_SIZE,
     VASE_SPEED_LIMIT,
 )
-from safe_wrappers.envs.lidar import LIDAR_BINS, pseudo_lidar
-from safe_wrappers.envs.placement import sample_goal, sample_layout
-from safe_wrappers.envs.robot import PlanarRobot
-
-from safe_wrappers.errors import ActionError, ConfigurationError
-from safe_wrappers.interventions import COST, COST_SUBSTEP
+from .lidar import LIDAR_BINS, pseudo_lidar
+from .placement import sample_goal, sample_layout
+from .robot import PlanarRobot
 
 COST_HAZARDS: Final = "cost_hazards"
 """float: 1 if the robot's centre is inside a hazard's disc at the end of the step, else 0."""
@@ -69,7 +70,7 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
 
     **State**: ``qpos = [x, y, heading, then x, y, z, quaternion per vase]`` in world coordinates;
     `set_state` works as in every Gymnasium MuJoCo env. Vases at rest sleep where MuJoCo knows how to (from
-    3.4 on): without it level 2 is ten times slower, and the same to 1e-6.
+    3.4 on): without it level 2 is several times slower, and the same to 1e-6 m/s.
 
     Args:
         robot: The machine.
@@ -120,7 +121,7 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
         self._path = np.zeros((_FRAME_SKIP, 2))
         self._apply(Layout(np.zeros(3), np.zeros(2), np.zeros((0, 2)), np.zeros((0, 2))))
 
-    # What a constraint may read: from qpos, which is never a substep behind as xpos is after mj_step ---------
+    # What a constraint may read: from qpos, never a substep behind as xpos is after mj_step ----------------
 
     @property
     def agent_position(self) -> NDArray[np.float64]:
@@ -172,7 +173,8 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
         super().set_state(qpos, qvel)  # type: ignore[no-untyped-call]  # type: ignore[no-untyped-call]
         self._judge_now()
 
-    def step(  # type: ignore[override]  # MujocoEnv declares NumPy scalars where Env declares a float
+    # MujocoEnv's signature promises NumPy scalars where Env's promises Python's: ours are Python's.
+    def step(  # type: ignore[override]
         self, action: NDArray[np.floating[Any]]
     ) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
         """Hold an action for one control step (0.02 s, ten physics substeps).

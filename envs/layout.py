@@ -7,9 +7,10 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from safe_wrappers.envs.levels import Level
 
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
+
+from .levels import Level
 
 LAYOUT_KEYS: Final = ("agent", "goal", "hazards", "vases")
 """What ``reset(options={"layout": {...}})`` understands; keys left out are sampled."""

@@ -4,10 +4,11 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from safe_wrappers.envs.layout import Layout, PartialLayout
-from safe_wrappers.envs.levels import AGENT_KEEPOUT, GOAL_KEEPOUT, HAZARD_KEEPOUT, VASE_KEEPOUT, Level
 
 from safe_wrappers.errors import ConfigurationError
+
+from .layout import Layout, PartialLayout
+from .levels import AGENT_KEEPOUT, GOAL_KEEPOUT, HAZARD_KEEPOUT, VASE_KEEPOUT, Level
 
 _TRIES_PER_OBJECT: Final = 100
 _TRIES_PER_LAYOUT: Final = 1000

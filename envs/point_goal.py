@@ -3,8 +3,9 @@
 from typing import Any
 
 from gymnasium.utils import EzPickle
-from safe_wrappers.envs.goal_env import SafeGoalEnv
-from safe_wrappers.envs.robot import POINT
+
+from .goal_env import SafeGoalEnv
+from .robot import POINT
 
 
 class SafePointGoalEnv(SafeGoalEnv):

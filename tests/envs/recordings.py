@@ -2,8 +2,8 @@
 
 Each file holds one episode of 300 control steps from Safety-Gymnasium 1.2 on MuJoCo 2.3.3: the states before
 each step and after the last one, the solver's warm start, actions, observations, rewards, costs and goals.
-Their robot's joints are relative to where it started (`origin`: x, y, heading), ours are in world coordinates:
-`Recording` rotates and shifts the first three joints, and nothing else.
+Their robot's joints are relative to where it started (`origin`: x, y, heading), ours are in world
+coordinates: `Recording` rotates and shifts the first three joints, and nothing else.
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,7 @@
-"""One-step equivalence with Safety-Gymnasium: every step of four recorded episodes, replayed from its state.
+"""One-step equivalence with Safety-Gymnasium: every step of four recorded episodes, from its state.
 
-The recordings are of Safety-Gymnasium 1.2 on MuJoCo 2.3.3; ours runs on a MuJoCo of today. Measured with 3.11,
-worst absolute errors over the 1200 steps (m, rad, m/s, rad/s, m/s^2):
+The recordings are of Safety-Gymnasium 1.2 on MuJoCo 2.3.3; ours runs on a MuJoCo of today. Measured with
+3.11, worst absolute errors over the 1200 steps (m, rad, m/s, rad/s, m/s^2):
 
 ======================================  =====  ========  ========  =======  =======  =======  ====
 steps                                   count  position  velocity  sensors  lidar    reward   cost
