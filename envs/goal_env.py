@@ -170,7 +170,7 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
 
     def set_state(self, qpos: NDArray[np.float64], qvel: NDArray[np.float64]) -> None:
         """Set positions and velocities (shapes (nq,), (nv,)) and judge the state anew."""
-        super().set_state(qpos, qvel)  # type: ignore[no-untyped-call]  # type: ignore[no-untyped-call]
+        super().set_state(qpos, qvel)  # type: ignore[no-untyped-call]
         self._judge_now()
 
     # MujocoEnv's signature promises NumPy scalars where Env's promises Python's: ours are Python's.

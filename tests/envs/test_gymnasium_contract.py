@@ -1,0 +1,120 @@
+"""What Gymnasium asks of a registered env."""
+
+import pickle
+import subprocess
+import sys
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import safe_wrappers.envs
+from gymnasium.utils.env_checker import check_env
+from safe_wrappers.envs import POINT_GOAL_IDS, register_envs
+
+# Said of every env with unbounded sensors, Gymnasium's own MuJoCo envs included.
+UNBOUNDED = "A Box observation space (minimum|maximum) value is -?infinity"
+
+
+@pytest.mark.parametrize("env_id", POINT_GOAL_IDS)
+def test_check_env_passes_without_warnings(env_id):
+    env = gym.make(env_id).unwrapped
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=f".*{UNBOUNDED}")
+        check_env(env, skip_render_check=True)
+    env.close()
+
+
+def test_spaces_and_timing(env):
+    bare = env.unwrapped
+    assert env.observation_space.dtype == np.float64
+    assert env.observation_space.shape == ((28,) if env.spec.id == POINT_GOAL_IDS[0] else (60,))
+    assert env.action_space == gym.spaces.Box(-1, 1, (2,), np.float32)
+    assert bare.dt == pytest.approx(0.02)
+    assert bare.frame_skip == 10
+    assert env.metadata["render_fps"] == 50
+
+
+def test_pickled_env_is_the_same_task(env):
+    again = pickle.loads(pickle.dumps(env.unwrapped))
+    observation, _ = env.reset(seed=7)
+    np.testing.assert_array_equal(again.reset(seed=7)[0], observation)
+    assert again.level == env.unwrapped.level
+
+
+@pytest.mark.parametrize("mode", ["sync", "async"])
+def test_vector_env_steps_and_reports(mode):
+    envs = gym.make_vec(POINT_GOAL_IDS[1], num_envs=2, vectorization_mode=mode)
+    observations, _ = envs.reset(seed=0)
+    assert not np.array_equal(observations[0], observations[1])
+    single = gym.make(POINT_GOAL_IDS[1])
+    single.reset(seed=0)
+    expected = single.step(np.array([1.0, 0.5]))
+    observations, rewards, _, _, infos = envs.step(np.tile([1.0, 0.5], (2, 1)))
+    np.testing.assert_allclose(observations[0], expected[0], atol=1e-12)
+    assert rewards[0] == pytest.approx(expected[1])
+    assert infos["cost"].dtype == np.float64
+    assert infos["goals_reached"].dtype.kind == "i"
+    envs.close()
+
+
+def test_spec_rebuilds_the_env(env):
+    again = gym.make(env.spec)
+    assert again.unwrapped.level == env.unwrapped.level
+
+
+def test_registering_twice_changes_nothing():
+    before = {env_id: gym.registry[env_id] for env_id in POINT_GOAL_IDS}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        register_envs()
+    assert all(gym.registry[env_id] is spec for env_id, spec in before.items())
+
+
+def test_registering_imports_no_physics():
+    # Loaded by its file, because the package around it may import MuJoCo for its plants.
+    code = (
+        "import sys, importlib.util as u; spec = u.spec_from_file_location('alone', sys.argv[1]);"
+        "module = u.module_from_spec(spec); spec.loader.exec_module(module); module.register_envs();"
+        "sys.exit('mujoco' in sys.modules)"
+    )
+    command = [sys.executable, "-c", code, safe_wrappers.envs.__file__]
+    assert subprocess.run(command, check=False).returncode == 0
+
+
+def test_stepping_needs_no_gl():
+    code = (
+        "import gymnasium as gym; from safe_wrappers.envs import register_envs; register_envs();"
+        "env = gym.make('SafePointGoal2-v0', render_mode='rgb_array'); env.reset(seed=0);"
+        "env.step(env.action_space.sample())"
+    )
+    environ = {"MUJOCO_GL": "disabled", "PATH": ""}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environ, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def gl_works():
+    code = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 32, 32).render()"
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
+
+
+def test_frames_show_the_scenario():
+    if not gl_works():
+        pytest.skip("no working GL here (libosmesa6 and MUJOCO_GL=osmesa, or MUJOCO_GL=egl, are enough)")
+    env = gym.make(POINT_GOAL_IDS[1], render_mode="rgb_array", width=160, height=120, camera_name="top")
+    layout = {"agent": [-1.0, -1.0, 0.0], "goal": [1.0, 1.0], "hazards": [[0.0, 0.0]], "vases": []}
+    env.reset(seed=0, options={"layout": layout})
+    frame = env.render().astype(int)
+    assert frame.shape == (120, 160, 3)
+    assert env.unwrapped.data.cam("top").xmat.reshape(3, 3)[2, 2] == pytest.approx(1.0)
+    middle = frame[60, 80]
+    assert middle[2] > middle[0] + 20  # the hazard's blue, where the camera looks
+    red, green, blue = np.moveaxis(frame, -1, 0)
+    goal = np.argwhere((green > red + 30) & (green > blue + 30)).mean(axis=0)
+    robot = np.argwhere((red > green + 60) & (red > blue + 60)).mean(axis=0)
+    assert goal[0] < 60 < robot[0]  # y grows upwards in the picture
+    assert robot[1] < 80 < goal[1]
+    env.close()
