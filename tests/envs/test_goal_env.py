@@ -104,6 +104,18 @@ def test_touching_a_vase_costs_at_level_2_only(make_env):
         assert info["cost"] == info["cost_vases"] == info["cost_substep"] == cost
 
 
+def test_touch_before_the_step_is_not_charged_to_the_step(make_env):
+    """MuJoCo's contacts lag one substep behind: those of the state before must not count again."""
+    env = make_env(2)
+    layout = {"agent": [0, 0, 0], "hazards": [], "vases": [[0.25 - 1e-6, 0.0]]}
+    assert env.reset(seed=0, options={"layout": layout})[1]["cost_vases"] == 1.0
+    qvel = np.zeros(env.model.nv)
+    qvel[0] = -1.0  # leaving: the vase feels no force
+    env.set_state(env.data.qpos.copy(), qvel)
+    info = env.step(np.zeros(2))[4]
+    assert (info["cost"], info["cost_substep"]) == (0.0, 0.0)
+
+
 def test_reward_is_distance_gained_plus_one_on_reaching(make_env):
     env = make_env(1)
     rng = np.random.default_rng(0)
