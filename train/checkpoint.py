@@ -20,8 +20,9 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from safe_wrappers.errors import RunStateError
-from safe_wrappers.train.atomic import write_json
-from safe_wrappers.train.config import ALGORITHMS
+
+from .atomic import write_json
+from .config import ALGORITHMS
 
 MODEL: Final = "model.zip"
 NORMALIZE: Final = "vecnormalize.pkl"

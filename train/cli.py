@@ -11,11 +11,12 @@ from pathlib import Path
 from rich.console import Console
 
 from safe_wrappers.errors import SafeWrappersError
-from safe_wrappers.train.config import parse_experiment
-from safe_wrappers.train.config_file import read_config
-from safe_wrappers.train.experiment import evaluate_experiment, summarize_experiment, train_experiment
-from safe_wrappers.train.report import write_report
-from safe_wrappers.train.table import comparison_table
+
+from .config import parse_experiment
+from .config_file import read_config
+from .experiment import evaluate_experiment, summarize_experiment, train_experiment
+from .report import write_report
+from .table import comparison_table
 
 _COMMANDS = {
     "train": "train every arm with every seed; a killed run goes on where it was, a finished one is left",

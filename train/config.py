@@ -14,7 +14,8 @@ import gymnasium as gym
 from stable_baselines3 import PPO, SAC
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.train.names import check_name
+
+from .names import check_name
 
 ALGORITHMS: Final[dict[str, type[PPO] | type[SAC]]] = {"PPO": PPO, "SAC": SAC}
 # What the run itself decides; the rest of the constructor's arguments are hyperparameters.

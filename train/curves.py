@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from safe_wrappers.train.config import ArmConfig, ExperimentConfig
-from safe_wrappers.train.summary import interquartile_mean
-from safe_wrappers.train.tables import read_rows
+from .config import ArmConfig, ExperimentConfig
+from .summary import interquartile_mean
+from .tables import read_rows
 
 _MOST_BINS = 40
 

@@ -13,14 +13,15 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from safe_wrappers import interventions as keys
-from safe_wrappers.train.atomic import write_json
-from safe_wrappers.train.checkpoint import Checkpoint
-from safe_wrappers.train.config import ArmConfig, EvaluationConfig, FilterConfig
-from safe_wrappers.train.run import Progress, finished_checkpoint
-from safe_wrappers.train.scene import Scene, SceneRecorder, save_scenes
-from safe_wrappers.train.stack import make_stack
-from safe_wrappers.train.tables import write_rows
 from safe_wrappers.wrappers.record_interventions import COLUMNS
+
+from .atomic import write_json
+from .checkpoint import Checkpoint
+from .config import ArmConfig, EvaluationConfig, FilterConfig
+from .run import Progress, finished_checkpoint
+from .scene import Scene, SceneRecorder, save_scenes
+from .stack import make_stack
+from .tables import write_rows
 
 EVALUATION_COLUMNS: Final = ("episode_seed", *COLUMNS)
 STATE_FILE: Final = "evaluation.json"

@@ -7,11 +7,11 @@ from typing import Any
 
 from rich.console import Console
 
-from safe_wrappers.train.config import ArmConfig, ExperimentConfig
-from safe_wrappers.train.evaluate import evaluate_run
-from safe_wrappers.train.parallel import Job, run_jobs
-from safe_wrappers.train.run import claim_folder, train_run
-from safe_wrappers.train.summary import Summary, summarize, write_summary
+from .config import ArmConfig, ExperimentConfig
+from .evaluate import evaluate_run
+from .parallel import Job, run_jobs
+from .run import check_finished, claim_folder, train_run
+from .summary import Summary, summarize, write_summary
 
 
 def train_experiment(experiment: ExperimentConfig, console: Console) -> None:
@@ -32,8 +32,12 @@ def evaluate_experiment(experiment: ExperimentConfig, console: Console) -> None:
     """Evaluates every trained run on the same episode seeds, filter off and on.
 
     Raises:
-        RunsFailedError: Some runs failed, or are not trained to their end.
+        RunStateError: A run is not trained to its end; nothing has been started.
+        RunsFailedError: Some runs failed.
     """
+    for arm in experiment.arms:
+        for seed in experiment.seeds:
+            check_finished(experiment.run_folder(arm, seed))
     conditions = 1 if experiment.evaluation_filter.kind == "none" else 2
     episodes = conditions * experiment.evaluation.episodes
     arguments = (experiment.evaluation, experiment.evaluation_filter)

@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from safe_wrappers.train.curves import Curve
-from safe_wrappers.train.scene import Scene
+from .curves import Curve
+from .scene import Scene
 
 # Placeholders that become CSS: the page decides the colours, light or dark, also after the picture is drawn.
 _INK: Final = "#010101"

@@ -19,7 +19,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from safe_wrappers.errors import SafeWrappersError
-from safe_wrappers.train.run import Progress as RunProgress
+
+from .run import Progress as RunProgress
 
 Message = tuple[str, Any]
 

@@ -12,15 +12,16 @@ from typing import Any
 import yaml
 
 from safe_wrappers.errors import RunStateError
-from safe_wrappers.train.atomic import write_text
-from safe_wrappers.train.config import ArmConfig, ExperimentConfig
-from safe_wrappers.train.curves import learning_curve
-from safe_wrappers.train.evaluate import evaluation_folder
-from safe_wrappers.train.figures import curves_svg, legend, scenes_svg
-from safe_wrappers.train.report_style import STYLE
-from safe_wrappers.train.run import FINISHED_FILE
-from safe_wrappers.train.scene import Scene, load_scenes
-from safe_wrappers.train.summary import CONDITIONS, METRICS, Estimate, Summary, number
+
+from .atomic import write_text
+from .config import ArmConfig, ExperimentConfig
+from .curves import learning_curve
+from .evaluate import evaluation_folder
+from .figures import curves_svg, legend, scenes_svg
+from .report_style import STYLE
+from .run import FINISHED_FILE
+from .scene import Scene, load_scenes
+from .summary import CONDITIONS, METRICS, Estimate, Summary, number
 
 _CURVES = {
     "return": "Return per episode",

@@ -17,12 +17,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from safe_wrappers.errors import RunStateError
 from safe_wrappers.sb3 import InterventionCallback
-from safe_wrappers.train.atomic import write_json
-from safe_wrappers.train.checkpoint import Checkpoint, latest_checkpoint, save_checkpoint
-from safe_wrappers.train.config import ALGORITHMS, ArmConfig
-from safe_wrappers.train.lock import only_writer
-from safe_wrappers.train.run_callbacks import CheckpointCallback, EpisodeRows, ProgressCallback
-from safe_wrappers.train.stack import make_stack
+
+from .atomic import write_json
+from .checkpoint import Checkpoint, latest_checkpoint, save_checkpoint
+from .config import ALGORITHMS, ArmConfig
+from .lock import only_writer
+from .run_callbacks import CheckpointCallback, EpisodeRows, ProgressCallback
+from .stack import make_stack
 
 RUN_FILE: Final = "run.json"
 FINISHED_FILE: Final = "finished.json"
@@ -106,16 +107,25 @@ def _train(
     write_json(folder / FINISHED_FILE, _facts(model, elapsed_s(), envs))
 
 
+def check_finished(folder: Path) -> None:
+    """Refuses a run that is not trained to its end.
+
+    Raises:
+        RunStateError: It is not.
+    """
+    if not (folder / FINISHED_FILE).exists():
+        raise RunStateError(
+            f"The run in {str(folder)!r} is not trained to its end; run `safe-wrappers train` (or `compare`)."
+        )
+
+
 def finished_checkpoint(arm: ArmConfig, seed: int, folder: Path) -> Checkpoint:
     """Returns the trained policy's checkpoint.
 
     Raises:
         RunStateError: The run is not finished, belongs to another config, or its policy is damaged.
     """
-    if not (folder / FINISHED_FILE).exists():
-        raise RunStateError(
-            f"The run in {str(folder)!r} is not trained to its end; run `safe-wrappers train` (or `compare`)."
-        )
+    check_finished(folder)
     claim_folder(arm, seed, folder)
     checkpoint = latest_checkpoint(folder / CHECKPOINTS, lambda _: None)
     if checkpoint is None:

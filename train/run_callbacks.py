@@ -10,8 +10,9 @@ from typing import Final
 from stable_baselines3.common.callbacks import BaseCallback
 
 from safe_wrappers import interventions as keys
-from safe_wrappers.train.tables import append_row, read_rows, write_rows
 from safe_wrappers.wrappers.record_interventions import COLUMNS
+
+from .tables import append_row, read_rows, write_rows
 
 EPISODE_COLUMNS: Final = ("timesteps", "env", *COLUMNS)
 

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import interventions as keys
-from safe_wrappers.train.atomic import write_bytes
+
+from .atomic import write_bytes
 
 _STATIC = ("hazard_positions", "hazard_radius", "goal_radius", "vase_positions")
 

@@ -11,9 +11,10 @@ from stable_baselines3.common.monitor import Monitor
 import safe_wrappers
 from safe_wrappers import interventions as keys
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.train.config import EnvConfig, FilterConfig
-from safe_wrappers.train.names import check_name
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
+
+from .config import EnvConfig, FilterConfig
+from .names import check_name
 
 
 def make_stack(env: EnvConfig, action_filter: FilterConfig) -> Monitor[Any, Any]:

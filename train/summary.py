@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from safe_wrappers.train.atomic import write_json
-from safe_wrappers.train.config import ExperimentConfig
-from safe_wrappers.train.evaluate import evaluation_folder
-from safe_wrappers.train.tables import read_rows, write_rows
+from .atomic import write_json
+from .config import ExperimentConfig
+from .evaluate import evaluation_folder
+from .tables import read_rows, write_rows
 
 CONDITIONS: Final = {
     "training": "Training, all episodes",
@@ -53,7 +53,7 @@ class Estimate:
 
     def __str__(self) -> str:
         if self.low is None or self.high is None:
-            return f"{number(self.iqm)} [n/a: 1 seed]"
+            return f"{number(self.iqm)} [n/a]"
         return f"{number(self.iqm)} [{number(self.low)}, {number(self.high)}]"
 
 

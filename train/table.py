@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from rich.table import Table
 
-from safe_wrappers.train.config import ExperimentConfig
-from safe_wrappers.train.summary import CONDITIONS, METRICS, Summary
+from .config import ExperimentConfig
+from .summary import CONDITIONS, METRICS, Summary
 
 
 def comparison_table(experiment: ExperimentConfig, summary: Summary) -> Table:

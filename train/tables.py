@@ -7,8 +7,9 @@ import io
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from safe_wrappers.train.atomic import write_text
 from safe_wrappers.wrappers.record_interventions import read_episodes
+
+from .atomic import write_text
 
 Row = Mapping[str, int | float | bool | str]
 

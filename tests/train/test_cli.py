@@ -1,0 +1,151 @@
+"""The command as a person runs it: a real process, spawned workers, kills, and what it prints."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from safe_wrappers.train.cli import main
+from safe_wrappers.train.tables import read_rows
+
+FAKE = Path(__file__).parent / "fake.yaml"
+FILTERED = "arms={filtered: {filter: {factory: 'fake_task:shield'}}}"
+COMMAND = [sys.executable, "-m", "safe_wrappers.train.cli"]
+
+
+def start(command, *overrides):
+    return subprocess.Popen(
+        [*COMMAND, command, str(FAKE), *overrides], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def wait_for(condition, seconds=60.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.01)
+
+
+def test_compare_from_nothing_to_the_report_in_parallel_processes(tmp_path):
+    process = start("compare", f"output={tmp_path}", "seeds=[0]", "workers=2", "--report")
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    assert "training filtered seed 0: done" in out
+    assert "evaluation unfiltered seed 0: done" in out
+    assert "interquartile mean over 1 seed [bootstrap 95 % interval]" in " ".join(out.split())
+    sections = ("Training, all episodes", "Evaluation, filter off", "Evaluation, filter on", "Cost / episode")
+    for text in sections:
+        assert text in out
+    report = tmp_path / "fake" / "report.html"
+    assert f"Report: {report}" in out
+    assert report.exists()
+    for arm in ("unfiltered", "filtered"):
+        folder = tmp_path / "fake" / arm / "seed_0"
+        assert json.loads((folder / "finished.json").read_text())["timesteps"] == 512
+        assert len(read_rows(folder / "evaluation" / "filter_on.csv")) == 3
+    assert (tmp_path / "fake" / "per_seed.csv").read_text().count("\n") == 1 + 2 * 3
+
+
+def test_a_killed_comparison_leaves_no_process_behind_and_goes_on(tmp_path):
+    overrides = (f"output={tmp_path}", "total_steps=8000", "checkpoint_every=1000", "seeds=[0]", FILTERED)
+    process = start("train", *overrides)
+    folder = tmp_path / "fake" / "filtered" / "seed_0"
+    wait_for(lambda: len(list(folder.glob("checkpoints/step_*/state.json"))) >= 2)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    # The workers notice and end: the rows stop growing, and the folder is free again.
+    wait_for(lambda: not _held(folder / ".lock"), 20)
+    at = max(int(path.name[5:]) for path in (folder / "checkpoints").glob("step_*"))
+    assert 1000 <= at < 8000
+    early = [row for row in read_rows(folder / "episodes.csv") if row["timesteps"] <= at]
+    assert not (folder / "finished.json").exists()
+    out, err = start("train", *overrides).communicate(timeout=120)
+    assert "training filtered seed 0: done" in out, err
+    rows = read_rows(folder / "episodes.csv")
+    assert rows[: len(early)] == early
+    steps = [row["timesteps"] for row in rows]
+    assert steps == sorted(steps)
+    assert sum(row["length"] for row in rows) <= 8064  # nothing counted twice; whole rollouts
+    assert json.loads((folder / "finished.json").read_text())["timesteps"] == 8064
+
+
+def test_a_killed_worker_is_reported_and_the_others_go_on(tmp_path):
+    overrides = (f"output={tmp_path}", "total_steps=8000", "checkpoint_every=1000", "seeds=[0]", "workers=2")
+    process = start("train", *overrides)
+    folder = tmp_path / "fake" / "filtered" / "seed_0"
+    wait_for(lambda: list(folder.glob("checkpoints/step_*/state.json")))
+    os.kill(_holder(folder / ".lock", process.pid), signal.SIGKILL)
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert "training unfiltered seed 0: done" in out
+    assert "training filtered seed 0: failed" in out
+    assert "error: Training: 1 of 2 failed." in err
+    assert "its process ended with exit code -9" in err
+    assert "The same command goes on from its last checkpoint." in err
+
+
+def test_errors_are_lines_and_not_tracebacks(tmp_path, capsys):
+    assert main(["train", str(FAKE), f"output={tmp_path}", "total_step=3"]) == 1
+    captured = capsys.readouterr()
+    assert captured.err.startswith("error: config: unknown name 'total_step'. Did you mean 'total_steps'?")
+    assert main(["report", str(FAKE), f"output={tmp_path}"]) == 1
+    assert "yet; run `safe-wrappers compare` first." in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["trian", str(FAKE)])
+    assert "invalid choice: 'trian'" in capsys.readouterr().err
+
+
+def test_train_evaluate_and_report_one_after_the_other(tmp_path, capsys):
+    arguments = [str(FAKE), f"output={tmp_path}", "seeds=[0]", "evaluation.episodes=1", FILTERED]
+    assert main(["evaluate", *arguments]) == 1
+    assert "is not trained to its end; run `safe-wrappers train`" in capsys.readouterr().err
+    assert main(["train", *arguments]) == 0
+    assert main(["evaluate", *arguments]) == 0
+    assert "Evaluation, filter on" in capsys.readouterr().out
+    assert main(["report", *arguments]) == 0
+    assert f"Report: {tmp_path / 'fake' / 'report.html'}" in capsys.readouterr().out
+
+
+def test_a_task_that_breaks_is_shown_with_its_traceback(tmp_path, capsys):
+    broken = [FILTERED, "arms.filtered.filter.kwargs.no_such=1"]
+    assert main(["train", str(FAKE), f"output={tmp_path}", "seeds=[0]", *broken]) == 1
+    err = capsys.readouterr().err
+    assert "error: Training: 1 of 1 failed." in err
+    assert "unexpected keyword argument 'no_such'" in err
+
+
+def test_another_configs_folder_is_refused_before_anything_starts(tmp_path, capsys):
+    (tmp_path / "fake" / "filtered" / "seed_1").mkdir(parents=True)
+    (tmp_path / "fake" / "filtered" / "seed_1" / "run.json").write_text(
+        '{"arm": "filtered", "seed": 1, "config": {"total_steps": 9}}'
+    )
+    assert main(["train", str(FAKE), f"output={tmp_path}"]) == 1
+    captured = capsys.readouterr()
+    assert "belongs to another config" in captured.err
+    assert "total_steps: 9 in the folder, 512 in the config" in captured.err
+    assert "started" not in captured.out
+
+
+def _held(path):
+    import fcntl
+
+    with path.open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
+
+
+def _holder(path, parent):
+    """The child process that has the file open."""
+    children = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
+    for child in children:
+        if any(os.path.realpath(link) == str(path) for link in Path(f"/proc/{child}/fd").iterdir()):
+            return int(child)
+    raise AssertionError(f"no process holds {path}")

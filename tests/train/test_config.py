@@ -1,0 +1,192 @@
+from pathlib import Path
+
+import pytest
+
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.train.config import parse_experiment
+from safe_wrappers.train.config_file import read_config
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+MINIMAL = {
+    "name": "x",
+    "env": "InvertedPendulum-v5",
+    "algorithm": "PPO",
+    "total_steps": 1000,
+    "arms": {"unfiltered": {}},
+    "seeds": [0],
+}
+
+
+def changed(**settings):
+    return parse_experiment({**MINIMAL, **settings})
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_config_of_the_repo_is_valid(path):
+    experiment = parse_experiment(read_config(path))
+    assert experiment.name == path.stem
+    kinds = {arm.name: arm.filter.kind for arm in experiment.arms}
+    assert kinds == {"unfiltered": "none", "filtered": "protect"}
+
+
+def test_the_repo_has_the_promised_configs():
+    demo = parse_experiment(read_config(CONFIGS / "demo.yaml"))
+    assert len(demo.arms) * len(demo.seeds) == 4
+    long = parse_experiment(read_config(CONFIGS / "pointgoal1_300k.yaml"))
+    assert {arm.total_steps for arm in long.arms} == {300_000}
+    assert len(long.seeds) == 5
+
+
+def test_defaults_and_shorthands():
+    experiment = changed()
+    (arm,) = experiment.arms
+    assert (arm.env.id, arm.env.kwargs) == ("InvertedPendulum-v5", {})
+    assert (arm.filter.kind, arm.n_envs, arm.device) == ("none", 1, "cpu")
+    assert (arm.normalize.observation, arm.normalize.reward) == (False, False)
+    assert experiment.evaluation.episodes == 10
+    assert experiment.folder == Path("runs/x")
+    assert experiment.workers is None
+
+
+def test_arms_override_what_they_share():
+    experiment = changed(
+        hyperparameters={"n_steps": 64, "gamma": 0.9},
+        arms={
+            "a": {"filter": {"protect": {"margin": 0.01}}},
+            "b": {"hyperparameters": {"gamma": 0.8}, "total_steps": 5, "n_envs": 3, "device": "auto"},
+            "c": {
+                "algorithm": "SAC",
+                "hyperparameters": {"learning_starts": 10},
+                "normalize": {"reward": True},
+            },
+            "d": {"env": {"id": "Pendulum-v1", "kwargs": {"g": 9.0}}, "checkpoint_every": 7},
+        },
+    )
+    a, b, c, d = experiment.arms
+    assert (a.filter.kind, a.filter.kwargs) == ("protect", {"margin": 0.01})
+    assert (b.hyperparameters, b.total_steps, b.n_envs) == ({"n_steps": 64, "gamma": 0.8}, 5, 3)
+    assert b.device == "auto"
+    # Another algorithm does not inherit PPO's hyperparameters; its buffer is no larger than the run.
+    assert c.hyperparameters == {"learning_starts": 10, "buffer_size": 1000}
+    assert c.normalize.reward
+    assert (d.env.id, d.env.kwargs, d.checkpoint_every) == ("Pendulum-v1", {"g": 9.0}, 7)
+    assert experiment.evaluation_filter == a.filter
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"totalsteps": 3}, "config: unknown name 'totalsteps'. Did you mean 'total_steps'?"),
+        ({"algorithm": "PP0"}, "arms.unfiltered.algorithm: unknown name 'PP0'. Did you mean 'PPO'?"),
+        ({"env": "InvertedPendulums-v5"}, "Did you mean 'InvertedPendulum-v5'?"),
+        ({"env": {"id": "Pendulum-v1", "kwarg": {}}}, "env: unknown name 'kwarg'. Did you mean 'kwargs'?"),
+        (
+            {"hyperparameters": {"nsteps": 3}},
+            "hyperparameters of PPO: unknown name 'nsteps'. Did you mean 'n_steps'?",
+        ),
+        ({"hyperparameters": {"seed": 3}}, "hyperparameters of PPO: unknown name 'seed'."),
+        ({"normalize": {"observations": True}}, "Did you mean 'observation'?"),
+        ({"evaluation": {"episode": 3}}, "evaluation: unknown name 'episode'. Did you mean 'episodes'?"),
+        ({"arms": {"a": {"filters": "none"}}}, "arms.a: unknown name 'filters'. Did you mean 'filter'?"),
+        (
+            {"arms": {"a": {"filter": "protected"}}},
+            "a.filter: unknown name 'protected'. Did you mean 'protect'?",
+        ),
+        (
+            {"arms": {"a": {"filter": {"protec": {}}}}},
+            "a.filter: unknown name 'protec'. Did you mean 'protect'?",
+        ),
+        ({"device": "gpu"}, "device: unknown name 'gpu'. Did you mean 'cpu'? Valid names: auto, cpu, cuda."),
+    ],
+)
+def test_unknown_names_are_refused_with_the_nearest(settings, message):
+    with pytest.raises(UnknownNameError) as refusal:
+        changed(**settings)
+    assert message in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"total_steps": 0}, "total_steps: expected an integer of at least 1, got 0."),
+        ({"total_steps": "many"}, "total_steps: expected an integer of at least 1, got 'many'."),
+        ({"total_steps": True}, "total_steps: expected an integer of at least 1, got True."),
+        ({"n_envs": 1.5}, "n_envs: expected an integer of at least 1, got 1.5."),
+        ({"workers": 0}, "workers: expected an integer of at least 1, got 0."),
+        ({"checkpoint_every": -1}, "checkpoint_every: expected an integer of at least 1, got -1."),
+        ({"seeds": 3}, "seeds: expected a list such as [0, 1, 2], got 3."),
+        ({"seeds": []}, "seeds: expected a list such as [0, 1, 2], got []."),
+        ({"seeds": [1, 1]}, "seeds: each may be given once, got [1, 1]."),
+        ({"seeds": [-1]}, "seeds: expected an integer of at least 0, got -1."),
+        ({"arms": {}}, "arms: expected at least one"),
+        ({"arms": [1]}, "arms: expected a mapping (`key: value`), got [1]."),
+        ({"arms": {"../x": {}}}, "arms: expected a name that can be a folder's"),
+        ({"name": "a/b"}, "name: expected a name that can be a folder's"),
+        ({"output": 3}, "output: expected a text, got 3."),
+        ({"arms": {"a": {"filter": False}}}, "arms.a.filter: expected none, protect, {protect: {...}}"),
+        (
+            {"arms": {"a": {"filter": {"factory": "no_colon"}}}},
+            "factory: expected 'module:function', got 'no_colon'.",
+        ),
+        ({"arms": {"a": {"filter": {"kwargs": {}}}}}, "arms.a.filter: expected none, protect"),
+        (
+            {"hyperparameters": {"learning_rate": -1}},
+            "learning_rate: expected a finite number above 0, got -1.",
+        ),
+        ({"hyperparameters": {"n_steps": 0}}, "n_steps: expected an integer of at least 1, got 0."),
+        ({"hyperparameters": {"gamma": "high"}}, "gamma: expected a finite number, got 'high'."),
+        ({"hyperparameters": {"use_sde": 1}}, "use_sde: expected true or false, got 1."),
+        ({"normalize": {"reward": "yes"}}, "normalize.reward: expected true or false, got 'yes'."),
+        ({"evaluation": {"seed": -1}}, "evaluation.seed: expected an integer of at least 0, got -1."),
+    ],
+)
+def test_bad_values_are_refused(settings, message):
+    with pytest.raises(ConfigurationError) as refusal:
+        changed(**settings)
+    assert message in str(refusal.value)
+
+
+@pytest.mark.parametrize("key", sorted(MINIMAL))
+def test_missing_settings_are_named(key):
+    with pytest.raises(ConfigurationError, match=f"config: '{key}' is missing"):
+        parse_experiment({k: v for k, v in MINIMAL.items() if k != key})
+
+
+def test_yaml_numbers_as_people_write_them(tmp_path):
+    path = tmp_path / "c.yaml"
+    path.write_text("a: 3e-4\nb: -1E5\nc: 1e\nd: 12\n")
+    assert read_config(path) == {"a": 3e-4, "b": -1e5, "c": "1e", "d": 12}
+
+
+def test_overrides(tmp_path):
+    path = tmp_path / "c.yaml"
+    path.write_text("a: {b: 1}\nc:\n")
+    settings = read_config(path, ["a.b=2", "a.d=[1, 2]", "c.e.f=none", "g=1e3", "g=2"])
+    assert settings == {"a": {"b": 2, "d": [1, 2]}, "c": {"e": {"f": "none"}}, "g": 2}
+
+
+@pytest.mark.parametrize(
+    ("text", "override", "message"),
+    [
+        ("a: 1", "a", "Override 'a': expected key=value, such as total_steps=1000."),
+        ("a: 1", "a.b=2", "Override 'a.b=2': a is 1, with no keys inside."),
+        ("a: 1", "a={", "override 'a={': not valid YAML"),
+        ("a: 1\na: 2", None, "'a' is given twice (line 2)."),
+        ("a: {", None, "not valid YAML"),
+        ("- a", None, "expected a mapping of settings"),
+    ],
+)
+def test_bad_files_and_overrides(tmp_path, text, override, message):
+    path = tmp_path / "c.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigurationError) as refusal:
+        read_config(path, [override] if override else [])
+    assert message in str(refusal.value)
+
+
+def test_a_missing_file_lists_its_neighbours(tmp_path):
+    (tmp_path / "demo.yaml").write_text("a: 1")
+    with pytest.raises(
+        ConfigurationError, match=r"no config file '.*demos.yaml'. Configs there: .*demo.yaml"
+    ):
+        read_config(tmp_path / "demos.yaml")

@@ -1,0 +1,105 @@
+import json
+
+import numpy as np
+import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from safe_wrappers.errors import RunStateError
+from safe_wrappers.train.evaluate import evaluate_run
+from safe_wrappers.train.run import Progress, train_run
+from safe_wrappers.train.scene import load_scenes
+from safe_wrappers.train.tables import read_rows
+
+SILENT = Progress(lambda steps: None, pytest.fail)
+
+
+def evaluate(experiment, arm, seed=0, train=True):
+    config = experiment.arms[arm]
+    folder = experiment.run_folder(config, seed)
+    if train:
+        train_run(config, seed, folder, SILENT)
+    evaluate_run(config, seed, folder, experiment.evaluation, experiment.evaluation_filter, SILENT)
+    return folder / "evaluation"
+
+
+def test_every_arm_sees_the_same_episodes_with_the_filter_off_and_on(fake_experiment):
+    experiment = fake_experiment()
+    folders = [evaluate(experiment, arm) for arm in (0, 1)]
+    starts = []
+    for folder in folders:
+        for condition in ("filter_off", "filter_on"):
+            rows = read_rows(folder / f"{condition}.csv")
+            assert [row["episode_seed"] for row in rows] == [100, 101, 102]
+            scenes = load_scenes(folder / f"{condition}.npz")
+            starts.append([scenes[seed].agent[0].tolist() for seed in (100, 101, 102)])
+            intervened = sum(row["intervention_rate"] for row in rows)
+            assert sum(scene.intervened.sum() for scene in scenes.values()) == pytest.approx(20 * intervened)
+            if condition == "filter_off":
+                assert intervened == 0
+            else:
+                assert sum(row["violations"] for row in rows) == 0
+    assert starts == [starts[0]] * 4
+    assert len({tuple(start) for start in starts[0]}) == 3
+
+
+def test_scenes_hold_what_the_picture_needs(fake_experiment):
+    scene = load_scenes(evaluate(fake_experiment(), 1) / "filter_on.npz")[100]
+    assert scene.agent.shape == (21, 2)
+    assert scene.intervened.shape == scene.violated.shape == (20,)
+    assert scene.goals.tolist() == [[1.0, 0.0]]
+    assert scene.hazards.tolist() == [[0.5, 0.0]]
+    assert (scene.hazard_radius, scene.goal_radius) == (0.2, 0.1)
+    assert scene.vases.tolist() == [[0.5, 0.6]]
+
+
+def test_done_once_and_again_when_its_settings_change(fake_experiment):
+    folder = evaluate(fake_experiment(), 1)
+    before = (folder / "filter_on.csv").stat().st_mtime_ns
+    evaluate(fake_experiment(), 1)
+    assert (folder / "filter_on.csv").stat().st_mtime_ns == before
+    evaluate(fake_experiment("evaluation.episodes=4"), 1)
+    assert len(read_rows(folder / "filter_on.csv")) == 4
+    assert json.loads((folder / "evaluation.json").read_text())["settings"]["episodes"] == 4
+
+
+def test_deterministic(fake_experiment):
+    experiment = fake_experiment()
+    folder = evaluate(experiment, 1)
+    first = (folder / "filter_on.csv").read_text()
+    (folder / "evaluation.json").unlink()
+    evaluate(experiment, 1)
+    assert (folder / "filter_on.csv").read_text() == first
+
+
+def test_without_any_filter_only_one_condition(fake_experiment):
+    folder = evaluate(fake_experiment("arms={unfiltered: {filter: none}}"), 0)
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "evaluation.json",
+        "filter_off.csv",
+        "filter_off.npz",
+    ]
+
+
+def test_a_task_that_publishes_no_positions_has_no_scenes(fake_experiment):
+    folder = evaluate(fake_experiment("env=InvertedPendulum-v5", "arms={unfiltered: {filter: none}}"), 0)
+    assert load_scenes(folder / "filter_off.npz") == {}
+    assert load_scenes(folder / "never_written.npz") == {}
+    row = read_rows(folder / "filter_off.csv")[0]
+    assert "goals_reached" not in row
+    assert np.isfinite(row["return"])
+
+
+def test_evaluation_reaches_tensorboard(fake_experiment):
+    folder = evaluate(fake_experiment(), 1)
+    events = EventAccumulator(str(folder.parent / "tensorboard"))
+    events.Reload()
+    tags = {tag for tag in events.Tags()["scalars"] if tag.startswith("evaluation")}
+    assert {"evaluation_filter_on/cost", "evaluation_filter_off/return"} <= tags
+    mean = np.mean([row["return"] for row in read_rows(folder / "filter_on.csv")])
+    (event,) = events.Scalars("evaluation_filter_on/return")
+    assert (event.step, event.value) == (512, pytest.approx(mean))
+
+
+def test_an_untrained_run_is_refused(fake_experiment):
+    with pytest.raises(RunStateError, match="is not trained to its end"):
+        evaluate(fake_experiment(), 1, train=False)

@@ -1,0 +1,271 @@
+"""One run in this process: where it resumes, what it refuses, what it leaves behind."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from safe_wrappers.errors import RunStateError, UnknownNameError
+from safe_wrappers.train.checkpoint import latest_checkpoint
+from safe_wrappers.train.config import FilterConfig
+from safe_wrappers.train.lock import only_writer
+from safe_wrappers.train.run import Progress, finished_checkpoint, train_run
+from safe_wrappers.train.run_callbacks import CheckpointCallback
+from safe_wrappers.train.stack import make_stack
+from safe_wrappers.train.tables import read_rows
+
+
+class Killed(BaseException):
+    """Stands for the end of the process."""
+
+
+class Reports:
+    def __init__(self):
+        self.steps, self.lines = [], []
+        self.progress = Progress(self.steps.append, self.lines.append)
+
+
+def run(experiment, arm=1, seed=0, reports=None):
+    """Trains one run of the experiment; returns its folder."""
+    config = experiment.arms[arm]
+    folder = experiment.run_folder(config, seed)
+    train_run(config, seed, folder, (reports or Reports()).progress)
+    return folder
+
+
+def run_killed_after(experiment, checkpoints, monkeypatch, arm=1):
+    """Trains until some checkpoints are there, and 64 steps more, as a kill would leave it."""
+    calls = []
+    step = CheckpointCallback._on_step
+
+    def counting(self):
+        if len(calls) == checkpoints and self.num_timesteps - self._last >= 64:
+            raise Killed
+        return step(self)
+
+    start = CheckpointCallback._on_rollout_start
+
+    def saving(self):
+        before = self._last
+        start(self)
+        if self._last != before:
+            calls.append(self._last)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(CheckpointCallback, "_on_step", counting)
+        patch.setattr(CheckpointCallback, "_on_rollout_start", saving)
+        with pytest.raises(Killed):
+            run(experiment, arm)
+    return experiment.run_folder(experiment.arms[arm], 0)
+
+
+def test_a_run_leaves_rows_logs_and_a_policy(fake_experiment):
+    experiment = fake_experiment()
+    reports = Reports()
+    folder = run(experiment, reports=reports)
+    rows = read_rows(folder / "episodes.csv")
+    assert len(rows) == 2 * (256 // 20)
+    assert {row["length"] for row in rows} == {20.0}
+    assert sum(row["intervention_rate"] for row in rows) > 0
+    assert sum(row["violations"] for row in rows) == 0
+    assert reports.steps[-1] == 512
+    facts = json.loads((folder / "finished.json").read_text())
+    assert facts["timesteps"] == 512
+    assert facts["filter_time_us"] == pytest.approx(1.0)
+    events = EventAccumulator(str(folder / "tensorboard"))
+    events.Reload()
+    tags = events.Tags()["scalars"]
+    assert {"interventions/rate", "interventions/step_rate", "rollout/ep_rew_mean", "train/loss"} <= set(tags)
+
+
+def test_a_finished_run_is_not_run_again(fake_experiment):
+    experiment = fake_experiment()
+    folder = run(experiment)
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.name != ".lock"}
+    reports = Reports()
+    run(experiment, reports=reports)
+    assert reports.steps == [512]
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.name != ".lock"} == before
+
+
+def test_same_seed_same_run_and_other_seed_other_run(fake_experiment, tmp_path):
+    first = read_rows(run(fake_experiment("name=a")) / "episodes.csv")
+    assert first == read_rows(run(fake_experiment("name=b")) / "episodes.csv")
+    assert first != read_rows(run(fake_experiment("name=c"), seed=1) / "episodes.csv")
+
+
+def test_a_killed_run_goes_on_from_its_last_checkpoint(fake_experiment, monkeypatch):
+    experiment = fake_experiment("total_steps=768")
+    folder = run_killed_after(experiment, 2, monkeypatch)
+    rows = read_rows(folder / "episodes.csv")
+    checkpoint = latest_checkpoint(folder / "checkpoints", pytest.fail)
+    assert checkpoint.timesteps == 256
+    late = [row for row in rows if row["timesteps"] > 256]
+    assert late  # steps after the checkpoint, whose rows must not be counted twice
+    with (folder / "episodes.csv").open("a") as file:
+        file.write("300.0,1.0,20")  # the kill came in the middle of a line
+    reports = Reports()
+    run(experiment, reports=reports)
+    assert reports.steps[0] > 256
+    after = read_rows(folder / "episodes.csv")
+    kept = [row for row in after if row["timesteps"] <= 256]
+    assert kept == [row for row in rows if row["timesteps"] <= 256]
+    steps = [row["timesteps"] for row in after]
+    assert steps == sorted(steps)
+    # 128 steps of either env before the checkpoint, 256 new ones after it, 20 steps an episode.
+    assert len(after) == 2 * (128 // 20) + 2 * (256 // 20)
+    assert json.loads((folder / "finished.json").read_text())["timesteps"] == 768
+    # New episodes after the restart, not the first ones again.
+    fresh = [row["return"] for row in after if row["timesteps"] > 256]
+    assert not set(fresh) & {row["return"] for row in kept}
+
+
+def test_a_killed_sac_run_keeps_its_replay_buffer(fake_experiment, monkeypatch):
+    experiment = fake_experiment(
+        "algorithm=SAC",
+        "hyperparameters={learning_starts: 50, batch_size: 16}",
+        "total_steps=400",
+        "n_envs=1",
+    )
+    folder = run_killed_after(experiment, 2, monkeypatch)
+    checkpoint = latest_checkpoint(folder / "checkpoints", pytest.fail)
+    envs = checkpoint.load_normalize(
+        DummyVecEnv([lambda: make_stack(experiment.arms[1].env, FilterConfig())])
+    )
+    model = checkpoint.load_model("SAC", envs, "cpu")
+    assert model.replay_buffer.size() == checkpoint.timesteps == 256
+    run(experiment)
+    final = folder / "checkpoints" / "step_000000000400"
+    assert [path.name for path in (folder / "checkpoints").iterdir()] == [final.name]
+    assert not (final / "replay_buffer.pkl").exists()  # of no use to a finished run, and large
+
+
+def test_the_normaliser_goes_on_too(fake_experiment, monkeypatch):
+    experiment = fake_experiment("total_steps=768", "normalize.reward=true")
+    folder = run_killed_after(experiment, 1, monkeypatch)
+    envs = DummyVecEnv([lambda: make_stack(experiment.arms[1].env, FilterConfig())] * 2)
+    seen = latest_checkpoint(folder / "checkpoints", pytest.fail).load_normalize(envs)
+    assert isinstance(seen, VecNormalize)
+    assert seen.norm_reward
+    assert seen.obs_rms.count == pytest.approx(128, abs=3)
+    run(experiment)
+    seen = latest_checkpoint(folder / "checkpoints", pytest.fail).load_normalize(envs)
+    assert seen.obs_rms.count == pytest.approx(768, abs=6)
+
+
+def test_another_configs_folder_is_refused_and_the_difference_shown(fake_experiment):
+    folder = run(fake_experiment())
+    with pytest.raises(RunStateError) as refusal:
+        run(fake_experiment("hyperparameters.n_steps=32", "total_steps=640", "hyperparameters.gamma=0.9"))
+    assert str(refusal.value).splitlines() == [
+        f"The run folder {str(folder)!r} belongs to another config:",
+        "  hyperparameters.gamma: 'unset' in the folder, 0.9 in the config",
+        "  hyperparameters.n_steps: 64 in the folder, 32 in the config",
+        "  total_steps: 512 in the folder, 640 in the config",
+        "Choose another `name` or `output`, go back to its settings, or delete the folder.",
+    ]
+    # What does not change the learning may change.
+    run(fake_experiment("checkpoint_every=64", "workers=1", "evaluation.episodes=7", "seeds=[0]"))
+
+
+def test_a_folder_without_its_run_file_is_refused(fake_experiment):
+    folder = run(fake_experiment())
+    (folder / "run.json").unlink()
+    with pytest.raises(RunStateError, match=r"has checkpoints but no run.json that says what they are of"):
+        run(fake_experiment())
+    (folder / "run.json").write_text("{")
+    with pytest.raises(RunStateError, match=r"run.json' is unreadable; delete"):
+        run(fake_experiment())
+
+
+def test_a_corrupted_checkpoint_falls_back_to_the_one_before(fake_experiment, monkeypatch):
+    experiment = fake_experiment("total_steps=768")
+    folder = run_killed_after(experiment, 3, monkeypatch)
+    older, newer = sorted((folder / "checkpoints").glob("step_*"))
+    model = newer / "model.zip"
+    model.write_bytes(model.read_bytes()[:-100])
+    reports = Reports()
+    run(experiment, reports=reports)
+    (line,) = reports.lines
+    assert str(model) in line
+    assert f"continuing from the checkpoint before it, {older}" in line
+    assert json.loads((folder / "finished.json").read_text())["timesteps"] == 768
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (
+            lambda c: (c / "model.zip").write_bytes(b"x"),
+            "model.zip is not as it was written (its checksum differs)",
+        ),
+        (lambda c: (c / "random.pkl").unlink(), "random.pkl is missing"),
+        (lambda c: (c / "state.json").write_text("{"), "state.json is missing or unreadable"),
+    ],
+)
+def test_no_whole_checkpoint_left(fake_experiment, monkeypatch, damage, message):
+    experiment = fake_experiment()
+    folder = run_killed_after(experiment, 1, monkeypatch)
+    damage(folder / "checkpoints" / "step_000000000128")
+    with pytest.raises(RunStateError) as refusal:
+        run(experiment)
+    text = str(refusal.value)
+    assert text.startswith("Corrupted checkpoint: ")
+    assert message in text
+    assert f"No other is left: delete {str(folder)!r} to train this run again from the start." in text
+    shutil.rmtree(folder)
+    run(experiment)
+
+
+def test_a_half_written_checkpoint_is_no_checkpoint(fake_experiment, monkeypatch):
+    experiment = fake_experiment()
+    folder = run_killed_after(experiment, 1, monkeypatch)
+    shutil.copytree(folder / "checkpoints" / "step_000000000128", folder / "checkpoints" / ".writing")
+    (folder / "checkpoints" / ".writing" / "model.zip").unlink()
+    run(experiment)
+    assert not (folder / "checkpoints" / ".writing").exists()
+
+
+def test_two_processes_do_not_train_one_run(fake_experiment):
+    experiment = fake_experiment()
+    with (
+        only_writer(experiment.run_folder(experiment.arms[1], 0)),
+        pytest.raises(RunStateError, match="Another process is working on the run in"),
+    ):
+        run(experiment)
+
+
+def test_an_unfinished_or_damaged_policy_is_not_evaluated(fake_experiment):
+    experiment = fake_experiment()
+    arm = experiment.arms[1]
+    folder = experiment.run_folder(arm, 0)
+    with pytest.raises(RunStateError, match=r"is not trained to its end; run `safe-wrappers train`"):
+        finished_checkpoint(arm, 0, folder)
+    run(experiment)
+    assert finished_checkpoint(arm, 0, folder).timesteps == 512
+    (folder / "checkpoints" / "step_000000000512" / "vecnormalize.pkl").write_bytes(b"")
+    with pytest.raises(RunStateError, match=r"vecnormalize.pkl is not as it was written"):
+        finished_checkpoint(arm, 0, folder)
+    shutil.rmtree(folder / "checkpoints")
+    with pytest.raises(RunStateError, match=r"checkpoints' is empty; delete"):
+        finished_checkpoint(arm, 0, folder)
+
+
+def test_unknown_factories(fake_experiment):
+    env = fake_experiment().arms[0].env
+    with pytest.raises(UnknownNameError, match=r"fake_task: unknown name 'sheild'. Did you mean 'shield'"):
+        make_stack(env, FilterConfig("factory", {}, "fake_task:sheild"))
+    with pytest.raises(ValueError, match=r"filter.factory: cannot import 'no_such_module'"):
+        make_stack(env, FilterConfig("factory", {}, "no_such_module:f"))
+
+
+def test_hyperparameters_and_device_reach_the_model(fake_experiment):
+    experiment = fake_experiment("hyperparameters.gamma=0.9", "hyperparameters.policy_kwargs={net_arch: [7]}")
+    folder = run(experiment)
+    model = latest_checkpoint(folder / "checkpoints", pytest.fail).load_model("PPO", None, "cpu")
+    assert (model.gamma, model.n_steps, model.device.type) == (0.9, 64, "cpu")
+    assert model.policy.mlp_extractor.latent_dim_pi == 7
+    assert np.isfinite(model.predict(np.zeros(2))[0]).all()
