@@ -23,7 +23,9 @@ test-slow: .venv/installed
 lint: .venv/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+	rm -rf build/types && mkdir -p build/types/safe_wrappers
+	ln -s $(CURDIR)/safe_wrappers/* $(CURDIR)/envs $(CURDIR)/train build/types/safe_wrappers/
+	cd build/types && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache -p safe_wrappers
 
 check: lint test
 

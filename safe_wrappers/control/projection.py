@@ -102,9 +102,7 @@ def project(
     try:
         lo, hi = np.broadcast_to(lo, (m,)), np.broadcast_to(hi, (m,))
     except ValueError:
-        raise ConfigurationError(
-            f"expected bounds of shape ({m},); got {lo.shape} and {hi.shape}"
-        ) from None
+        raise ConfigurationError(f"expected bounds of shape ({m},); got {lo.shape} and {hi.shape}") from None
     if not np.isfinite(u).all():
         raise ConfigurationError(f"u_nom must be finite, got {u}; replace it before projecting")
     if not (lo <= hi).all():  # also refuses NaN
@@ -240,7 +238,12 @@ def _daqp(p: Array, q: Array, g: Array, h: Array, lo: Array, hi: Array) -> tuple
     upper = np.minimum(np.concatenate([hi, h]), 1e30)
     lower = np.maximum(np.concatenate([lo, np.full(h.size, -1e30)]), -1e30)
     x, _, flag, info = daqp.solve(
-        np.diag(p), np.ascontiguousarray(q), np.ascontiguousarray(g), upper, lower, np.zeros(n + h.size, np.int32)
+        np.diag(p),
+        np.ascontiguousarray(q),
+        np.ascontiguousarray(g),
+        upper,
+        lower,
+        np.zeros(n + h.size, np.int32),
     )
     if flag < 1:
         return None
@@ -248,7 +251,9 @@ def _daqp(p: Array, q: Array, g: Array, h: Array, lo: Array, hi: Array) -> tuple
 
 
 def _named(name: str) -> Backend:
-    def solve(p: Array, q: Array, g: Array, h: Array, lo: Array, hi: Array) -> tuple[Array, Array, int] | None:
+    def solve(
+        p: Array, q: Array, g: Array, h: Array, lo: Array, hi: Array
+    ) -> tuple[Array, Array, int] | None:
         problem = qpsolvers.Problem(np.diag(p), q, g, h, lb=lo, ub=hi)
         try:
             with warnings.catch_warnings():  # of matrix conversions and of statuses, which we check ourselves
@@ -302,9 +307,7 @@ def _nearest(
     return x, multipliers, iterations
 
 
-def _polish(
-    u: Array, g: Array, h: Array, lo: Array, hi: Array, x: Array, multipliers: Array
-) -> Array | None:
+def _polish(u: Array, g: Array, h: Array, lo: Array, hi: Array, x: Array, multipliers: Array) -> Array | None:
     """Solve the equalities of the active set that a first-order or interior-point backend has pointed to."""
     if not np.isfinite(x).all():
         return None

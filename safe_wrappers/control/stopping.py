@@ -37,9 +37,7 @@ def kinetic_row(clearance: ArrayLike, speed: ArrayLike, brake: float, gamma: flo
     h = kinetic_inset(clearance, speed, brake)
     moving = v > 0.0
     safe_v = np.where(moving, v, 1.0)
-    return np.asarray(
-        np.where(moving, brake / safe_v * (gamma * h - safe_v), np.where(h > 0.0, np.inf, 0.0))
-    )
+    return np.asarray(np.where(moving, brake / safe_v * (gamma * h - safe_v), np.where(h > 0.0, np.inf, 0.0)))
 
 
 def predicted_approach(

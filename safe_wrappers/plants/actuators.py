@@ -29,7 +29,9 @@ def refuse_unsupported(model: mujoco.MjModel) -> None:
         dynamics = mujoco.mjtDyn(model.actuator_dyntype[i])
         gain, bias = mujoco.mjtGain(model.actuator_gaintype[i]), mujoco.mjtBias(model.actuator_biastype[i])
         if transmission not in _TRANSMISSIONS:
-            _refuse(name, f"transmission {transmission.name[5:].lower()}", "joint, jointinparent, site, tendon")
+            _refuse(
+                name, f"transmission {transmission.name[5:].lower()}", "joint, jointinparent, site, tendon"
+            )
         if dynamics != mujoco.mjtDyn.mjDYN_NONE:
             _refuse(name, f"activation dynamics {dynamics.name[5:].lower()}", "none")
         if gain not in (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE):
@@ -73,9 +75,7 @@ class AffineActuators:
         )
         biased = m.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
         bias = biased * (
-            m.actuator_biasprm[:, 0]
-            + m.actuator_biasprm[:, 1] * length
-            + m.actuator_biasprm[:, 2] * velocity
+            m.actuator_biasprm[:, 0] + m.actuator_biasprm[:, 1] * length + m.actuator_biasprm[:, 2] * velocity
         )
         return gain, bias
 

@@ -106,7 +106,10 @@ class AnalyticPlant:
         """The state after holding a control for `span_s`, by classical Runge-Kutta."""
 
         def rate(at: Array) -> Array:
-            return np.asarray(self._f(at), dtype=np.float64) + np.asarray(self._g(at), dtype=np.float64) @ control
+            return (
+                np.asarray(self._f(at), dtype=np.float64)
+                + np.asarray(self._g(at), dtype=np.float64) @ control
+            )
 
         step = span_s / substeps
         for _ in range(substeps):
@@ -124,7 +127,7 @@ class AnalyticPlant:
 
     @property
     def f(self) -> Array:
-        """f(x), shape (n,)."""
+        """Drift at the state, shape (n,)."""
         if self._drift is None:
             self._drift = np.asarray(self._f(self._x), dtype=np.float64)
             if self._drift.shape != self._x.shape:
@@ -135,7 +138,7 @@ class AnalyticPlant:
 
     @property
     def g(self) -> Array:
-        """g(x), shape (n, m)."""
+        """Control matrix at the state, shape (n, m)."""
         if self._effect is None:
             self._effect = np.asarray(self._g(self._x), dtype=np.float64)
             if self._effect.shape != (self._x.size, self._lower.size):
@@ -156,11 +159,11 @@ class AnalyticPlant:
         return self._upper
 
     def drift(self, x: Array) -> Array:
-        """f at any state."""
+        """The drift at any state, shape (n,)."""
         return np.asarray(self._f(x), dtype=np.float64)
 
     def effect(self, x: Array) -> Array:
-        """g at any state."""
+        """The control matrix at any state, shape (n, m)."""
         return np.asarray(self._g(x), dtype=np.float64)
 
     def attribute(self, name: str) -> Any:

@@ -42,11 +42,14 @@ class MujocoPlant:
     """
 
     hold_s: float
+    stamp: int
+    """Counts observations, so that a constraint can keep what it has computed for one of them."""
 
     def __init__(self, model: mujoco.MjModel | None = None, delay_s: float = 0.0) -> None:
         self._given = model
         self.delay_s = float(delay_s)
         self._pending: deque[Array] = deque()
+        self.stamp = 0
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
         """Attach to an env and copy its model."""
@@ -66,7 +69,11 @@ class MujocoPlant:
                 f"got {(self.model.nq, self.model.nv, self.model.nu)}"
             )
         self.data = mujoco.MjData(self.model)
+        self._nq, self._nv = int(self.model.nq), int(self.model.nv)
         self._actuators = AffineActuators(self.model)
+        limited = self.model.actuator_ctrllimited.astype(bool)
+        self._lower = np.where(limited, self.model.actuator_ctrlrange[:, 0], -np.inf)
+        self._upper = np.where(limited, self.model.actuator_ctrlrange[:, 1], np.inf)
         self._check_action_space(env)
         self.substeps = int(getattr(raw, "frame_skip", 1))
         self.hold_s = self.substeps * float(raw.model.opt.timestep)
@@ -79,16 +86,15 @@ class MujocoPlant:
     def _check_action_space(self, env: gym.Env[Any, Any]) -> None:
         space = env.action_space
         assert isinstance(space, gym.spaces.Box)  # the filter has refused every other space
-        limits = self.model.actuator_ctrlrange
         limited = self.model.actuator_ctrllimited.astype(bool)
         fits = space.shape == (self.model.nu,) and (
-            np.allclose(space.low[limited], limits[limited, 0], atol=1e-6)
-            and np.allclose(space.high[limited], limits[limited, 1], atol=1e-6)
+            np.allclose(space.low[limited], self._lower[limited], atol=1e-6)
+            and np.allclose(space.high[limited], self._upper[limited], atol=1e-6)
         )
         if not fits:
             raise UnsupportedEnvError(
-                f"the action space {space} is not the model's control range {limits.tolist()}; put the filter "
-                "inside wrappers that rescale actions, or describe the env with AnalyticPlant"
+                f"the action space {space} is not the model's control range {self._lower} to {self._upper}; "
+                "put the filter inside wrappers that rescale actions, or describe the env with AnalyticPlant"
             )
 
     def perturb(self, mass: float = 1.0, damping: float = 1.0) -> None:
@@ -105,6 +111,7 @@ class MujocoPlant:
         """Take the env's present state; nothing is computed until it is asked for."""
         mujoco.mj_getState(self._raw.model, self._raw.data, self._snapshot, int(_STATE))
         self._loaded = self._forwarded = False
+        self.stamp += 1
         if self._delay_steps and self._pending:
             self._predict_over_delay()
 
@@ -147,21 +154,33 @@ class MujocoPlant:
 
     def _reference(self) -> Array:
         """The control about which contact forces are linearised: zero, or the nearest the actuator has."""
-        limits = self.model.actuator_ctrlrange
-        limited = self.model.actuator_ctrllimited.astype(bool)
-        return np.where(limited, np.clip(0.0, limits[:, 0], limits[:, 1]), 0.0)
+        return np.asarray(np.clip(0.0, self._lower, self._upper))
 
     def _derive(self) -> None:
         m, d = self.model, self.data
-        gain, bias = self._actuators.gain_and_bias(d)
-        self._lower, self._upper = self._actuators.acting_range(d)
+        gain, _ = self._actuators.gain_and_bias(d)
+        least, most = self._actuators.acting_range(d)
         moment = self._actuators.moment(d)
-        force_per_control = (moment * gain[:, None]).copy()
-        acting = np.clip(d.ctrl, self._lower, self._upper)
-        saturated = self._upper <= self._lower
-        force_per_control[saturated] = 0.0
-        self._effect = self._solve_inertia(force_per_control).T
-        self._drift = d.qacc - self._effect @ np.where(saturated, 0.0, acting)
+        force_per_control = moment * gain[:, None]
+        saturated = most <= least
+        effect = self._solve_inertia(force_per_control).T
+        self._effect = np.where(saturated, 0.0, effect)
+        self._drift = d.qacc - self._effect @ np.where(saturated, 0.0, np.clip(d.ctrl, least, most))
+        self._acting = (least, most)
+        if m.actuator_forcelimited.any():
+            self._acting = self._acting_over_hold(least, most, moment, effect, gain)
+
+    def _acting_over_hold(
+        self, least: Array, most: Array, moment: Array, effect: Array, gain: Array
+    ) -> tuple[Array, Array]:
+        """A speed servo's clamp moves with the speed: widen by how far it can move within one hold."""
+        m = self.model
+        feedback = np.abs(np.where(m.actuator_biastype > 0, m.actuator_biasprm[:, 2], 0.0))
+        if not feedback.any():
+            return least, most
+        change = np.abs(moment @ self._drift) + np.abs(moment @ effect) @ (most - least)
+        widen = feedback * change * self.hold_s / np.where(gain != 0.0, np.abs(gain), np.inf)
+        return np.maximum(least - widen, self._lower), np.minimum(most + widen, self._upper)
 
     def _solve_inertia(self, rows: Array) -> Array:
         """`rows @ inv(M + J_a' D_a J_a)`: accelerations per generalised force with the active constraints."""
@@ -176,12 +195,12 @@ class MujocoPlant:
         for i, unit in enumerate(np.eye(m.nv)):
             mujoco.mj_mulM(m, d, inertia[i], unit)
         stiff = inertia + jacobian.T @ (d.efc_D[active][:, None] * jacobian)
-        return np.linalg.solve(stiff, rows.T).T
+        return np.asarray(np.linalg.solve(stiff, rows.T).T)
 
     def _constraint_jacobian(self) -> Array:
         m, d = self.model, self.data
         if not mujoco.mj_isSparse(m):
-            return d.efc_J.reshape(d.nefc, m.nv).copy()
+            return np.array(d.efc_J.reshape(d.nefc, m.nv))
         dense = np.zeros((d.nefc, m.nv))
         mujoco.mju_sparse2dense(dense, d.efc_J, d.efc_J_rownnz, d.efc_J_rowadr, d.efc_J_colind)
         return dense
@@ -189,17 +208,17 @@ class MujocoPlant:
     @property
     def qpos(self) -> Array:
         """Positions, shape (nq,): m, rad, or quaternions."""
-        return self._snapshot[1 : 1 + self.model.nq]
+        return self._snapshot[1 : 1 + self._nq]
 
     @property
     def qvel(self) -> Array:
         """Velocities, shape (nv,): m/s or rad/s."""
-        return self._snapshot[1 + self.model.nq : 1 + self.model.nq + self.model.nv]
+        return self._snapshot[1 + self._nq : 1 + self._nq + self._nv]
 
     @property
     def state(self) -> Array:
         """(qpos, qvel), shape (nq + nv,)."""
-        return self._snapshot[1 : 1 + self.model.nq + self.model.nv]
+        return self._snapshot[1 : 1 + self._nq + self._nv]
 
     @property
     def f(self) -> Array:
@@ -239,15 +258,31 @@ class MujocoPlant:
 
     @property
     def lower(self) -> Array:
-        """Smallest control that still changes the force at this state, shape (nu,)."""
-        self.forward()
+        """Smallest control, shape (nu,): ctrlrange, or -inf."""
         return self._lower
 
     @property
     def upper(self) -> Array:
-        """Largest control that still changes the force at this state, shape (nu,)."""
-        self.forward()
+        """Largest control, shape (nu,): ctrlrange, or inf."""
         return self._upper
+
+    @property
+    def acting_range(self) -> tuple[Array, Array]:
+        """The controls between which the force still changes at some time of the hold, shapes (nu,).
+
+        Narrower than the bounds where a forcerange clamps; beyond it f + g u is not the machine.
+        """
+        self.forward()
+        return self._acting
+
+    def inertia_diagonal(self) -> Array:
+        """Diagonal of the joint-space inertia, shape (nv,), kg or kg m^2."""
+        self.forward()
+        diagonal, column = np.empty(self.model.nv), np.empty(self.model.nv)
+        for i, unit in enumerate(np.eye(self.model.nv)):
+            mujoco.mj_mulM(self.model, self.data, column, unit)
+            diagonal[i] = column[i]
+        return diagonal
 
     def rollout(self, control: Array) -> Iterator[mujoco.MjData]:
         """Hold a control for one control interval on the plant's own model, substep by substep.
@@ -286,9 +321,7 @@ class MujocoPlant:
         """The id of a body, site, geom, joint or actuator; an unknown name is refused with the list."""
         found = mujoco.mj_name2id(self.model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
         if found < 0:
-            raise UnknownNameError(
-                f"the model has no {kind} {name!r}; it has: {', '.join(self.names(kind))}"
-            )
+            raise UnknownNameError(f"the model has no {kind} {name!r}; it has: {', '.join(self.names(kind))}")
         return int(found)
 
     def names(self, kind: str, pattern: str = "*") -> list[str]:
@@ -299,4 +332,5 @@ class MujocoPlant:
 
     def attribute(self, name: str) -> Any:
         """Read a published fact of the env."""
-        return read_attribute(self._env, name)
+        found = getattr(self._raw, name, None)
+        return found if found is not None else read_attribute(self._env, name)

@@ -26,23 +26,35 @@ class Plant(Protocol):
         state: x, shape (n,).
         f: Drift at the state, shape (n,), state units per second.
         g: Control matrix at the state, shape (n, m).
-        lower: Smallest control that still acts at this state, shape (m,).
-        upper: Largest control that still acts at this state, shape (m,).
+        lower: Smallest admissible control at this state, shape (m,).
+        upper: Largest admissible control at this state, shape (m,).
+
+    A plant whose actuators saturate inside the bounds also has `acting_range`, a pair of arrays: beyond it
+    the control has no further effect.
     """
 
     hold_s: float
     delay_s: float
 
     @property
-    def state(self) -> Array: ...
+    def state(self) -> Array:
+        """The state x, shape (n,)."""
+
     @property
-    def f(self) -> Array: ...
+    def f(self) -> Array:
+        """Drift, shape (n,)."""
+
     @property
-    def g(self) -> Array: ...
+    def g(self) -> Array:
+        """Control matrix, shape (n, m)."""
+
     @property
-    def lower(self) -> Array: ...
+    def lower(self) -> Array:
+        """Smallest control, shape (m,)."""
+
     @property
-    def upper(self) -> Array: ...
+    def upper(self) -> Array:
+        """Largest control, shape (m,)."""
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
         """Attach to the env that the filter wraps; refuse one that this plant cannot describe."""

@@ -1,0 +1,57 @@
+"""Composable Gymnasium wrappers that make reinforcement learning safe on MuJoCo robots.
+
+    import gymnasium as gym, safe_wrappers as sw
+    env = sw.protect(gym.make("SafePointGoal1-v0"))
+
+Importing registers the ids of our tasks and changes nothing else; it imports neither torch nor Stable-Baselines3
+(`safe_wrappers.sb3` and `safe_wrappers.train` do).
+"""
+
+from safe_wrappers.constraints import (
+    Barrier,
+    Box,
+    Clearance,
+    Constraint,
+    Disc,
+    Discs,
+    HalfSpaces,
+    HeadingDriveClearance,
+    JointSpeedLimit,
+    Plane,
+    Sphere,
+)
+from safe_wrappers.control.projection import Projection, project
+from safe_wrappers.envs import register_envs as _register_envs
+from safe_wrappers.errors import SafeWrappersError, UnsafeStateWarning
+from safe_wrappers.plants.analytic import AnalyticPlant
+from safe_wrappers.plants.mujoco import MujocoPlant
+from safe_wrappers.plants.plant import Plant
+from safe_wrappers.protect import protect
+from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
+from safe_wrappers.wrappers.record_interventions import RecordInterventions
+
+__all__ = [
+    "AnalyticPlant",
+    "Barrier",
+    "Box",
+    "CBFActionFilter",
+    "Clearance",
+    "Constraint",
+    "Disc",
+    "Discs",
+    "HalfSpaces",
+    "HeadingDriveClearance",
+    "JointSpeedLimit",
+    "MujocoPlant",
+    "Plane",
+    "Plant",
+    "Projection",
+    "RecordInterventions",
+    "SafeWrappersError",
+    "Sphere",
+    "UnsafeStateWarning",
+    "project",
+    "protect",
+]
+
+_register_envs()

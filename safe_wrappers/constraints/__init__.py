@@ -1,0 +1,23 @@
+"""Safety requirements: each turns a plant into half-spaces on the control."""
+
+from safe_wrappers.constraints.barrier import Barrier
+from safe_wrappers.constraints.clearance import Clearance
+from safe_wrappers.constraints.constraint import CertifyingConstraint, Constraint, HalfSpaces
+from safe_wrappers.constraints.heading_drive_clearance import HeadingDriveClearance
+from safe_wrappers.constraints.joint_speed_limit import JointSpeedLimit
+from safe_wrappers.constraints.obstacles import Box, Disc, Discs, Plane, Sphere
+
+__all__ = [
+    "Barrier",
+    "Box",
+    "CertifyingConstraint",
+    "Clearance",
+    "Constraint",
+    "Disc",
+    "Discs",
+    "HalfSpaces",
+    "HeadingDriveClearance",
+    "JointSpeedLimit",
+    "Plane",
+    "Sphere",
+]

@@ -1,0 +1,150 @@
+"""Clearance: keep points of the machine away from obstacles, with room to brake."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.constraints.constraint import HalfSpaces, Promise, non_negative, positive
+from safe_wrappers.constraints.obstacles import Nearest, obstacle_from
+from safe_wrappers.control.stopping import sampled_acceleration_limit, sampled_inset
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.mujoco import MujocoPlant
+from safe_wrappers.plants.plant import Plant
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Clearance:
+    """Keep `distance - v^2 / (2 braking) >= 0` from every point to every obstacle, also between samples.
+
+    The row bounds the acceleration towards the obstacle that may be held for a control interval, so that full
+    braking afterwards still stops in front of it (`control/stopping.py`). Delay is the plant's: the state is
+    predicted over it.
+
+    What it promises: in one dimension, and head on, the bound is exact for the declared `braking`. Elsewhere
+    the direction to the obstacle turns within a hold and the drift changes, which `margin` must cover; and
+    several obstacles at once, or joint limits, can ask for more than the actuators have. Hence best effort:
+    infeasible steps are counted and the fallback runs. A machine that cannot brake in every direction (a
+    heading drive) needs `HeadingDriveClearance`.
+
+    Args:
+        obstacles: `Disc`, `Sphere`, `Box`, `Plane`, `Discs`.
+        braking: Validated lower bound on the deceleration that the actuators can give in any direction
+            and every state of the envelope, m/s^2.
+        bodies: Names of bodies whose frame origins are kept clear (MujocoPlant).
+        sites: Names of sites, likewise.
+        position: Indices of the point's coordinates in the state (AnalyticPlant).
+        velocity: Indices of its velocity in the state, in the same order.
+        radius: Of the machine around the point, m.
+        margin: Fixed protective distance, m.
+        state_error: Bound on the error of the measured distance, m.
+
+    Source: appendix "Relative degree and kinetic stopping insets".
+    """
+
+    obstacles: Sequence[Any]
+    braking: float
+    bodies: Sequence[str] = ()
+    sites: Sequence[str] = ()
+    position: Sequence[int] = ()
+    velocity: Sequence[int] = ()
+    radius: float = 0.0
+    margin: float = 0.0
+    state_error: float = 0.0
+
+    promise: Promise = field(default="best effort", init=False)
+
+    def __post_init__(self) -> None:
+        if isinstance(self.obstacles, dict) or not isinstance(self.obstacles, Sequence) or not self.obstacles:
+            raise ConfigurationError(
+                f"obstacles is a list with at least one obstacle, got {self.obstacles!r}"
+            )
+        self.obstacles = [obstacle_from(o) for o in self.obstacles]
+        self.braking = positive("braking", self.braking, "m/s^2")
+        for name in ("radius", "margin", "state_error"):
+            setattr(self, name, non_negative(name, getattr(self, name), "m"))
+        for name in ("bodies", "sites"):
+            if isinstance(getattr(self, name), str):
+                raise ConfigurationError(f"{name} is a list of names, got the string {getattr(self, name)!r}")
+            setattr(self, name, list(getattr(self, name)))
+        self.position, self.velocity = list(self.position), list(self.velocity)
+        if len(self.position) != len(self.velocity) or len(self.position) > 3:
+            raise ConfigurationError(
+                "position and velocity are up to three state indices each, in the same order; got "
+                f"{self.position} and {self.velocity}"
+            )
+
+    def bind(self, plant: Plant) -> None:
+        """Resolve the points on the plant."""
+        if isinstance(plant, MujocoPlant):
+            if not self.bodies and not self.sites:
+                raise ConfigurationError(
+                    "name the bodies or sites to keep clear; the model has the bodies "
+                    + ", ".join(plant.names("body"))
+                )
+            for name in self.bodies:
+                plant.named("body", name)
+            for name in self.sites:
+                plant.named("site", name)
+        elif not self.position:
+            raise ConfigurationError(
+                "on an AnalyticPlant say where the point is in the state: position=[0, 1], velocity=[2, 3]"
+            )
+
+    def _points(self, plant: Plant) -> list[tuple[Array, Array, Array, Array]]:
+        """Position, velocity, acceleration drift and control matrix of each point."""
+        if isinstance(plant, MujocoPlant):
+            return [plant.point("body", n) for n in self.bodies] + [
+                plant.point("site", n) for n in self.sites
+            ]
+        x = plant.state
+        p, v = self.position, self.velocity
+        return [(x[p], x[v], plant.f[v], plant.g[v])]
+
+    def _gaps(self, plant: Plant, p: Array, v: Array) -> tuple[Nearest, Array, Array, Array]:
+        """Surfaces around a point: clearance, approach speed and relative velocity of each."""
+        found = [o.nearest(p, plant) for o in self.obstacles]
+        near = Nearest(*(np.concatenate(part) for part in zip(*found, strict=True)))
+        relative = v - near.velocity
+        return near, near.distance - self.radius, -np.einsum("ij,ij->i", near.normal, relative), relative
+
+    def value(self, plant: Plant) -> Array:
+        """Room left after braking, m, one per point and surface."""
+        values = []
+        for p, v, _, _ in self._points(plant):
+            _, clearance, approach, _ = self._gaps(plant, p, v)
+            values.append(
+                sampled_inset(
+                    clearance, approach, self.braking, state_error=self.state_error, margin=self.margin
+                )
+            )
+        return np.concatenate(values)
+
+    def rows(self, plant: Plant) -> HalfSpaces:
+        """One row per point and surface whose limit the actuators could exceed."""
+        normals, offsets = [], []
+        strongest = np.maximum(np.abs(plant.lower), np.abs(plant.upper))
+        for p, v, drift, effect in self._points(plant):
+            near, clearance, approach, relative = self._gaps(plant, p, v)
+            limit = sampled_acceleration_limit(
+                clearance,
+                approach,
+                self.braking,
+                plant.hold_s,
+                state_error=self.state_error,
+                margin=self.margin,
+            )
+            # approach acceleration = -n . (drift + effect u) - |sideways speed|^2 * curvature
+            sideways = np.maximum(np.einsum("ij,ij->i", relative, relative) - approach**2, 0.0)
+            bend = np.where(clearance + self.radius > 0.0, sideways * near.curvature, 0.0)
+            normal = -near.normal @ effect
+            # Room gone while approaching asks for everything: a finite row that no machine can meet.
+            offset = np.maximum(limit, -1e9) + near.normal @ drift + bend
+            reachable = np.abs(normal) @ np.where(np.isfinite(strongest), strongest, 1e12) > offset
+            normals.append(normal[reachable])
+            offsets.append(offset[reachable])
+        return HalfSpaces(np.concatenate(normals), np.concatenate(offsets))

@@ -1,0 +1,344 @@
+"""HeadingDriveClearance: keep a robot that is driven along its heading clear, counting its whole stopping path."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.constraints.constraint import HalfSpaces, Promise, non_negative
+from safe_wrappers.constraints.obstacles import Discs, obstacle_from
+from safe_wrappers.control.heading_drive import HeadingDrive, Motion, StoppingPath
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.plants.mujoco import MujocoPlant
+from safe_wrappers.plants.plant import Plant
+
+Array = NDArray[np.float64]
+
+_RECOVERY_RATE = 1.0
+"""1/s: an unsafe start must shrink its violation at least this fast, where the drive can."""
+_DECAY_PER_HOLD = 0.5
+"""The share of the clearance that one hold may use up: the discrete class-K decay, alpha times the hold."""
+_ROW_SLACK = 0.02
+"""The share of the needed clearance that prediction may miss of what the linear rows aimed at."""
+_RESERVE_M = 0.001
+"""Kept free in front of the boundary for what the closed form leaves out; only the backup may draw on it."""
+
+
+@dataclass
+class HeadingDriveClearance:
+    """Keep the stopping path of a planar robot out of every disc.
+
+    The robot slides on two joints with equal damping, turns on a hinge, and its drive pushes along the heading
+    only: nothing brakes it sideways. So the clearance is counted from the area that the backup manoeuvre (brake
+    along the heading, hold the heading) sweeps until rest, see `control/heading_drive.py`. The backup never
+    shrinks that clearance; a control is admitted if, holding it for one control step uses up at most half of
+    that clearance.
+
+    What it promises: proved. From a safe state the filter always finds an admissible control (the backup is
+    one), for any number of discs, and the discs stay clear at every physics substep, while mass and damping are
+    right to within `uncertainty`, the measured position is right to within `state_error`, discs stand still and
+    nothing hits the robot. `margin` covers what the closed form leaves out: the bend of the path within a
+    step, and the rest of a turn when it begins to brake (together under 2 mm for the Point robot).
+
+    Args:
+        obstacles: `Disc` and `Discs`; they stand still.
+        body: Name of the robot's body.
+        margin: Fixed protective distance, m.
+        state_error: Bound on the error of the measured position, m.
+        uncertainty: Relative uncertainty of mass and of damping, in [0, 1).
+        brake: False counts the path that coasts along the heading as well: needs no drive to stop, costs more.
+    """
+
+    obstacles: Sequence[Any]
+    body: str = "agent"
+    margin: float = 0.002
+    state_error: float = 0.0
+    uncertainty: float = 0.0
+    brake: bool = True
+
+    promise: Promise = field(default="proved", init=False)
+
+    def __post_init__(self) -> None:
+        if isinstance(self.obstacles, dict) or not isinstance(self.obstacles, Sequence) or not self.obstacles:
+            raise ConfigurationError(
+                f"obstacles is a list with at least one obstacle, got {self.obstacles!r}"
+            )
+        self.obstacles = [obstacle_from(o) for o in self.obstacles]
+        self.margin = non_negative("margin", self.margin, "m")
+        self.state_error = non_negative("state_error", self.state_error, "m")
+        self.uncertainty = non_negative("uncertainty", self.uncertainty, "a fraction")
+        if self.uncertainty >= 1.0:
+            raise ConfigurationError(f"uncertainty is a fraction in [0, 1), got {self.uncertainty}")
+
+    def bind(self, plant: Plant) -> None:
+        """Read the robot's constants from the plant's model."""
+        if not isinstance(plant, MujocoPlant):
+            raise UnsupportedEnvError("HeadingDriveClearance needs a MujocoPlant: it reads the robot's model")
+        self._frame = _PlanarFrame(plant, self.body)
+        self.drive = heading_drive(plant, self.body, self.uncertainty)
+        self._plant = plant
+        # How much any control can change the clearance within one hold: speed gained times what it adds to
+        # the path, plus the way travelled, plus a turn's share of the sideways coasting.
+        d = self.drive
+        self._growth = d.fastest_change * (d.hold_s + d.coast_time)
+        self._swivel = 2.0 * abs(d.com_offset)
+        self._stamp = -1
+
+    def _look(self, plant: MujocoPlant) -> None:
+        """Take the state, once per observation."""
+        if plant.stamp == self._stamp:
+            return
+        self._stamp = plant.stamp
+        self._motion = motion = self._frame.motion(plant)
+        self._path = self.drive.stopping_path(motion, self.brake)
+        self._backup_path: StoppingPath | None = None
+        groups: list[Array] = []
+        radii: list[Array] = []
+        for obstacle in self.obstacles:
+            where = obstacle.centers(plant) if isinstance(obstacle, Discs) else np.array([obstacle.center])
+            groups.append(where[:, :2])
+            radii.append(np.full(len(where), obstacle.radius))
+        self._centers, self._radii = (
+            (groups[0], radii[0]) if len(groups) == 1 else (np.concatenate(groups), np.concatenate(radii))
+        )
+        offset = self._centers - (motion.x, motion.y)
+        apart = np.sqrt(np.einsum("ij,ij->i", offset, offset)) - self._radii
+        self._gap = apart - (self.margin + self.state_error)
+        speed = math.hypot(motion.vx, motion.vy)
+        # Brake to coast at worst, over a whole hold, from wherever the heading turns to.
+        self._swing = (
+            speed * (self.drive.coast_time + self.drive.hold_s)
+            + self._growth
+            + self._swivel
+            + self.drive.com_offset * abs(motion.yaw_rate) * self.drive.coast_time
+        )
+        self._close = np.flatnonzero(self._gap < self._swing).tolist()
+
+    def _clearance(self, path: StoppingPath, i: int) -> float:
+        x, y = self._centers[i]
+        room = float(self._radii[i]) + self.margin + self.state_error
+        return (
+            min(path.distance(float(x), float(y)), path.end_distance(float(x), float(y)) - self._swivel)
+            - room
+        )
+
+    def value(self, plant: MujocoPlant) -> Array:
+        """Clearance of the stopping path from the nearest disc, m, shape (1,).
+
+        For discs that no manoeuvre of the next step can matter to, a lower bound.
+        """
+        self._look(plant)
+        if not self._gap.size:
+            return np.array([np.inf])
+        bound = self._gap - self._path.reach - self._swivel
+        order = np.argsort(bound)
+        best = math.inf
+        for i in order.tolist():
+            if bound[i] >= best:
+                break
+            best = min(best, self._clearance(self._path, i))
+        return np.array([best])
+
+    def _needed(self, i: int) -> float:
+        """The clearance that a control must leave: a share of today's, or some recovery where it is lost."""
+        now = self._clearance(self._path, i)
+        if now < 0.0:
+            return now * (1.0 - _RECOVERY_RATE * self.drive.hold_s)
+        target = _RESERVE_M + (1.0 - _DECAY_PER_HOLD) * max(0.0, now - _RESERVE_M)
+        # Never more than the backup manoeuvre leaves: it is what makes the constraint always feasible.
+        return min(target, self._clearance(self._after_backup(), i))
+
+    def _after_backup(self) -> StoppingPath:
+        if self._backup_path is None:
+            self._backup_path = self._after(self._ends()[0], 0.0)
+        return self._backup_path
+
+    def _after(self, drive: float, turn: float) -> StoppingPath:
+        return self.drive.stopping_path(self.drive.predict(self._motion, drive, turn), self.brake)
+
+    def admits(self, plant: MujocoPlant, control: Array) -> bool:
+        """Predict the held control step; its end must still have a safe stopping path."""
+        self._look(plant)
+        if not self._close:
+            return True
+        path = self._after(float(control[self._frame.drive_index]), float(control[self._frame.turn_index]))
+        for i in self._close:
+            left = self._clearance(path, i)
+            if left < self._growth and left < self._needed(i) * (1.0 - _ROW_SLACK):
+                return False
+        return True
+
+    def rows(self, plant: MujocoPlant) -> HalfSpaces:
+        """Secants of the clearance after one hold, over the acting controls, one row per disc in play."""
+        self._look(plant)
+        k, t = self._frame.drive_index, self._frame.turn_index
+        normals, offsets = [], []
+        if self._close:
+            braking, pushing = self._ends()
+            base, pushed = self._after_backup(), self._after(pushing, 0.0)
+            left, right = self._after(braking, 1.0), self._after(braking, -1.0)
+            for i in self._close:
+                at_brake = self._clearance(base, i)
+                by_drive = (self._clearance(pushed, i) - at_brake) / (pushing - braking)
+                by_turn = 0.5 * (self._clearance(left, i) - self._clearance(right, i))
+                needed = self._needed(i)
+                worst = at_brake + min(0.0, by_drive * (pushing - braking)) - abs(by_turn)
+                if worst >= needed:
+                    continue
+                normal = np.zeros(plant.model.nu)
+                normal[k], normal[t] = -by_drive, -by_turn
+                normals.append(normal)
+                offsets.append(at_brake - by_drive * braking - needed)
+        if not normals:
+            return HalfSpaces.none(plant.model.nu)
+        return HalfSpaces(np.array(normals), np.array(offsets))
+
+    def _ends(self) -> tuple[float, float]:
+        """The drive controls that brake and that push on, as far as the drive acts."""
+        m = self._motion
+        ahead = m.vx * math.cos(m.heading) + m.vy * math.sin(m.heading)
+        full = self.drive.drive_limit / self.drive.drive_gain
+        braking = self.drive.brake_control(ahead) if self.brake else 0.0
+        return braking, math.copysign(full, ahead)
+
+    def backup(self, plant: MujocoPlant) -> Array:
+        """The control that never shrinks the clearance: brake along the heading, hold the heading."""
+        self._look(plant)
+        control = np.zeros(plant.model.nu)
+        control[self._frame.drive_index] = self._ends()[0]
+        return control
+
+
+class _PlanarFrame:
+    """Where the planar robot's joints and actuators sit in the model, and its motion in the world."""
+
+    def __init__(self, plant: MujocoPlant, body: str) -> None:
+        m = plant.model
+        b = plant.named("body", body)
+        joints = list(range(int(m.body_jntadr[b]), int(m.body_jntadr[b]) + int(m.body_jntnum[b])))
+        kinds = [mujoco.mjtJoint(m.jnt_type[j]) for j in joints]
+        slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+        axes = m.jnt_axis[joints] if joints else np.zeros((0, 3))
+        planar = (
+            kinds == [slide, slide, hinge]
+            and m.body_parentid[b] == 0
+            and np.allclose(axes, np.eye(3), atol=1e-9)
+            and np.allclose(m.body_quat[b], [1, 0, 0, 0], atol=1e-9)
+            and np.allclose(m.jnt_pos[joints[2]], 0.0)
+        )
+        if not planar:
+            raise UnsupportedEnvError(
+                f"body {body!r} must slide along world x and y and turn about z (slide, slide, hinge, in this "
+                f"order); it has {[k.name[6:].lower() for k in kinds]}. Use Clearance for other machines."
+            )
+        self.joints = joints
+        self._q = [int(m.jnt_qposadr[j]) for j in joints]
+        self._v = [int(m.jnt_dofadr[j]) for j in joints]
+        self._origin = m.body_pos[b][:2].copy()
+        if m.nu != 2:
+            raise UnsupportedEnvError(
+                f"expected a drive and a turning actuator, the model has {m.nu} actuators"
+            )
+        turning = [
+            a
+            for a in range(2)
+            if m.actuator_trntype[a] in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+            and m.actuator_trnid[a, 0] == joints[2]
+        ]
+        pushing = [
+            a
+            for a in range(2)
+            if m.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_SITE
+            and m.site_bodyid[m.actuator_trnid[a, 0]] == b
+            and np.allclose(m.site_quat[m.actuator_trnid[a, 0]], [1, 0, 0, 0], atol=1e-9)
+            and np.count_nonzero(m.actuator_gear[a]) == 1
+            and m.actuator_gear[a, 0] != 0.0
+        ]
+        if len(turning) != 1 or len(pushing) != 1:
+            raise UnsupportedEnvError(
+                f"body {body!r} needs one actuator along its heading (at a site) and one on its hinge"
+            )
+        self.drive_index, self.turn_index = pushing[0], turning[0]
+
+    def motion(self, plant: MujocoPlant) -> Motion:
+        """Position, heading and velocities in the world."""
+        q, v = plant.qpos, plant.qvel
+        a, b, c = self._q
+        d, e, f = self._v
+        return Motion(
+            float(q[a]) + float(self._origin[0]),
+            float(q[b]) + float(self._origin[1]),
+            float(q[c]),
+            float(v[d]),
+            float(v[e]),
+            float(v[f]),
+        )
+
+
+def heading_drive(plant: MujocoPlant, body: str, uncertainty: float = 0.0) -> HeadingDrive:
+    """The constants of a planar robot from a plant's model.
+
+    Raises:
+        UnsupportedEnvError: The model is no heading drive; the message says what does not fit.
+    """
+    m = plant.model
+    frame = _PlanarFrame(plant, body)
+    b = plant.named("body", body)
+    dofs = [int(m.jnt_dofadr[j]) for j in frame.joints]
+    damping = m.dof_damping[dofs]
+    turn_axes = np.zeros(9)
+    mujoco.mju_quat2Mat(turn_axes, m.body_iquat[b])
+    axes = turn_axes.reshape(3, 3)
+    about_com = float(axes[2] ** 2 @ m.body_inertia[b])
+    mass, com = float(m.body_mass[b]), m.body_ipos[b]
+    a, t = frame.drive_index, frame.turn_index
+    fixed = int(mujoco.mjtGain.mjGAIN_FIXED)
+    problems = {
+        "the slides need equal damping above zero": damping[0] != damping[1] or damping[0] <= 0.0,
+        "the centre of mass must lie on the heading": abs(float(com[1])) > 1e-9,
+        "the joints must have no armature or stiffness": bool(
+            m.dof_armature[dofs].any() or m.jnt_stiffness[frame.joints].any()
+        ),
+        "the drive must be a plain motor": m.actuator_gaintype[a] != fixed
+        or m.actuator_biastype[a] != int(mujoco.mjtBias.mjBIAS_NONE),
+        "the turning actuator must be a speed servo": m.actuator_gaintype[t] != fixed
+        or m.actuator_biastype[t] != int(mujoco.mjtBias.mjBIAS_AFFINE)
+        or m.actuator_biasprm[t, 2] >= 0.0
+        or m.actuator_biasprm[t, 0] != 0.0
+        or m.actuator_biasprm[t, 1] != 0.0,
+        "the integrator must be Euler": m.opt.integrator != int(mujoco.mjtIntegrator.mjINT_EULER),
+    }
+    for expectation, broken in problems.items():
+        if broken:
+            raise UnsupportedEnvError(f"body {body!r} is no heading drive: {expectation}. Use Clearance.")
+    gear, turn_gear = float(m.actuator_gear[a, 0]), float(m.actuator_gear[t, 0])
+    gain, turn_gain = float(m.actuator_gainprm[a, 0]), float(m.actuator_gainprm[t, 0])
+    return HeadingDrive(
+        mass=mass,
+        damping=float(damping[0]),
+        com_offset=float(com[0]),
+        yaw_inertia=about_com + mass * float(com[0]) ** 2,
+        yaw_damping=float(m.dof_damping[dofs[2]]),
+        drive_gain=gear * gain,
+        drive_limit=gear * _force_limit(m, a, gain),
+        yaw_gain=turn_gear * turn_gain,
+        yaw_feedback=turn_gear**2 * float(m.actuator_biasprm[t, 2]),
+        yaw_limit=turn_gear
+        * (float(m.actuator_forcerange[t, 1]) if m.actuator_forcelimited[t] else math.inf),
+        timestep=float(m.opt.timestep),
+        substeps=plant.substeps,
+        uncertainty=uncertainty,
+    )
+
+
+def _force_limit(m: mujoco.MjModel, actuator: int, gain: float) -> float:
+    """The force that the actuator can give both ways: its clamp, or its control range times its gain."""
+    by_control = gain * float(min(-m.actuator_ctrlrange[actuator, 0], m.actuator_ctrlrange[actuator, 1]))
+    if not m.actuator_forcelimited[actuator]:
+        return by_control
+    low, high = m.actuator_forcerange[actuator]
+    return min(by_control, float(-low), float(high))

@@ -1,0 +1,231 @@
+"""Things to keep clear of: discs, spheres, boxes and planes, fixed or moving, given or published by the env.
+
+Each answers, for a point, how far its surface is and in which direction it lies. Plain data, so that a wrapper
+that is given obstacles can be recorded and rebuilt.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.constraints.constraint import positive
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.plant import Plant
+
+Array = NDArray[np.float64]
+
+
+class Nearest(NamedTuple):
+    """For one point and k surfaces in d dimensions.
+
+    Attributes:
+        distance: Signed, m, negative inside, shape (k,).
+        normal: Unit vectors from the surface towards the point, shape (k, d).
+        velocity: Of the surface, m/s, shape (k, d).
+        curvature: Of the surface of equal distance through the point, 1/m, shape (k,): what a sideways motion
+            gains in clearance.
+    """
+
+    distance: Array
+    normal: Array
+    velocity: Array
+    curvature: Array
+
+
+class Obstacle(Protocol):
+    """Anything with a nearest surface."""
+
+    def nearest(self, point: Array, plant: Plant) -> Nearest:
+        """The surfaces of this obstacle as seen from a point of shape (d,)."""
+
+
+def _vector(name: str, values: Sequence[float], sizes: tuple[int, ...]) -> list[float]:
+    try:
+        vector = [float(v) for v in values]
+    except (TypeError, ValueError):
+        raise ConfigurationError(f"{name} must be a list of numbers, got {values!r}") from None
+    if len(vector) not in sizes or not np.isfinite(vector).all():
+        raise ConfigurationError(
+            f"{name} must be {' or '.join(map(str, sizes))} finite numbers, got {values!r}"
+        )
+    return vector
+
+
+def _round(point: Array, centers: Array, radius: float, velocity: Array) -> Nearest:
+    """Discs and spheres; a disc seen from three dimensions is an upright cylinder."""
+    d = centers.shape[1]
+    if d > point.size:
+        raise ConfigurationError(f"a {d}-dimensional obstacle cannot meet a {point.size}-dimensional point")
+    offset = point[:d] - centers
+    length = np.sqrt(np.einsum("ij,ij->i", offset, offset))
+    apart = np.where(length > 1e-12, length, 1.0)
+    normal = np.zeros((len(centers), point.size))
+    normal[:, :d] = offset / apart[:, None]
+    normal[length <= 1e-12, 0] = 1.0  # at the very centre every way out is as good
+    moving = np.zeros_like(normal)
+    moving[:, :d] = velocity
+    return Nearest(length - radius, normal, moving, 1.0 / np.maximum(length, 1e-9))
+
+
+@dataclass
+class Disc:
+    """An upright cylinder: a disc of `radius` (m) in the plane at `center` (x, y), moving at `velocity` m/s."""
+
+    center: Sequence[float]
+    radius: float
+    velocity: Sequence[float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        self.center = _vector("center", self.center, (2,))
+        self.radius = positive("radius", self.radius, "m")
+        self.velocity = _vector("velocity", self.velocity, (2,))
+
+    def nearest(self, point: Array, plant: Plant) -> Nearest:
+        """One surface."""
+        return _round(point, np.array([self.center]), self.radius, np.array([self.velocity]))
+
+
+@dataclass
+class Sphere:
+    """A ball of `radius` (m) at `center` (x, y, z), moving at `velocity` m/s."""
+
+    center: Sequence[float]
+    radius: float
+    velocity: Sequence[float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        self.center = _vector("center", self.center, (3,))
+        self.radius = positive("radius", self.radius, "m")
+        self.velocity = _vector("velocity", self.velocity, (3,))
+
+    def nearest(self, point: Array, plant: Plant) -> Nearest:
+        """One surface."""
+        return _round(point, np.array([self.center]), self.radius, np.array([self.velocity]))
+
+
+@dataclass
+class Plane:
+    """A wall: everything behind `point` against the outward `normal` is forbidden; 1, 2 or 3 dimensions."""
+
+    point: Sequence[float]
+    normal: Sequence[float]
+
+    def __post_init__(self) -> None:
+        self.point = _vector("point", self.point, (1, 2, 3))
+        self.normal = _vector("normal", self.normal, (len(self.point),))
+        length = float(np.linalg.norm(self.normal))
+        if length < 1e-12:
+            raise ConfigurationError("normal must not be zero: it points from the wall into free space")
+        self.normal = [n / length for n in self.normal]
+
+    def nearest(self, point: Array, plant: Plant) -> Nearest:
+        """One surface."""
+        d = len(self.point)
+        if d > point.size:
+            raise ConfigurationError(f"a {d}-dimensional plane cannot meet a {point.size}-dimensional point")
+        normal = np.zeros((1, point.size))
+        normal[0, :d] = self.normal
+        distance = normal[0, :d] @ (point[:d] - np.asarray(self.point))
+        return Nearest(np.array([distance]), normal, np.zeros_like(normal), np.zeros(1))
+
+
+@dataclass
+class Box:
+    """An axis-aligned block of `half_size` (m per axis) at `center`, moving at `velocity`; 2 or 3 dimensions."""
+
+    center: Sequence[float]
+    half_size: Sequence[float]
+    velocity: Sequence[float] | None = None
+
+    def __post_init__(self) -> None:
+        self.center = _vector("center", self.center, (2, 3))
+        self.half_size = _vector("half_size", self.half_size, (len(self.center),))
+        for half in self.half_size:
+            positive("half_size", half, "m")
+        self.velocity = _vector("velocity", self.velocity or [0.0] * len(self.center), (len(self.center),))
+
+    def nearest(self, point: Array, plant: Plant) -> Nearest:
+        """One surface: a face, an edge or a corner."""
+        d = len(self.center)
+        if d > point.size:
+            raise ConfigurationError(f"a {d}-dimensional box cannot meet a {point.size}-dimensional point")
+        offset = point[:d] - np.asarray(self.center)
+        beyond = np.abs(offset) - np.asarray(self.half_size)
+        side = np.where(offset < 0.0, -1.0, 1.0)
+        outside = np.maximum(beyond, 0.0)
+        distance = float(np.linalg.norm(outside))
+        normal = np.zeros((1, point.size))
+        curvature = 0.0
+        if distance > 0.0:
+            normal[0, :d] = side * outside / distance
+            curvature = 1.0 / distance if int((outside > 0.0).sum()) > 1 else 0.0
+        else:
+            axis = int(np.argmax(beyond))
+            distance = float(beyond[axis])
+            normal[0, axis] = side[axis]
+        moving = np.zeros_like(normal)
+        moving[0, :d] = self.velocity
+        return Nearest(np.array([distance]), normal, moving, np.array([curvature]))
+
+
+@dataclass
+class Discs:
+    """Discs (or spheres) whose centres the env publishes, for example `hazard_positions`.
+
+    Args:
+        attribute: Name of the env's attribute, an array of shape (k, 2) or (k, 3) in m.
+        radius: m; the robot's own radius is the constraint's business.
+        velocity_attribute: Name of an array of the same shape in m/s; None says that they stand still.
+    """
+
+    attribute: str
+    radius: float
+    velocity_attribute: str | None = None
+
+    def __post_init__(self) -> None:
+        self.radius = positive("radius", self.radius, "m")
+
+    def centers(self, plant: Plant) -> Array:
+        """Where they are now, shape (k, 2) or (k, 3), m."""
+        where = np.asarray(plant.attribute(self.attribute), dtype=np.float64)
+        if where.ndim != 2 or where.shape[1] not in (2, 3):
+            raise ConfigurationError(
+                f"the env's {self.attribute} must have shape (k, 2) or (k, 3), got {where.shape}"
+            )
+        return where
+
+    def nearest(self, point: Array, plant: Plant) -> Nearest:
+        """One surface per centre."""
+        centers = self.centers(plant)
+        velocity = np.zeros_like(centers)
+        if self.velocity_attribute is not None:
+            velocity = np.asarray(plant.attribute(self.velocity_attribute), dtype=np.float64)
+        return _round(point, centers, self.radius, velocity)
+
+
+KINDS: dict[str, type[Any]] = {kind.__name__: kind for kind in (Disc, Sphere, Plane, Box, Discs)}
+
+
+def obstacle_from(data: Any) -> Obstacle:
+    """An obstacle itself, or rebuilt from the plain dict that a recorded wrapper holds."""
+    if not isinstance(data, dict):
+        if hasattr(data, "nearest"):
+            return data  # type: ignore[no-any-return]
+        raise ConfigurationError(f"expected an obstacle ({', '.join(KINDS)}) or its dict, got {data!r}")
+    kind = KINDS.get(data.get("kind", ""))
+    if kind is None:
+        raise ConfigurationError(
+            f"unknown obstacle kind {data.get('kind')!r}; the kinds are {', '.join(KINDS)}"
+        )
+    return kind(**{k: v for k, v in data.items() if k != "kind"})  # type: ignore[no-any-return]
+
+
+def obstacle_data(obstacle: Any) -> Any:
+    """The plain dict of an obstacle of ours, or a foreign obstacle as it is."""
+    kind = KINDS.get(type(obstacle).__name__)
+    if kind is not type(obstacle):
+        return obstacle
+    return {"kind": kind.__name__, **{f.name: getattr(obstacle, f.name) for f in fields(kind)}}

@@ -1,0 +1,48 @@
+"""Constraints as plain data, so that a wrapper that holds them can be recorded, rebuilt and written as JSON."""
+
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+from safe_wrappers.constraints.barrier import Barrier
+from safe_wrappers.constraints.clearance import Clearance
+from safe_wrappers.constraints.constraint import Constraint
+from safe_wrappers.constraints.heading_drive_clearance import HeadingDriveClearance
+from safe_wrappers.constraints.joint_speed_limit import JointSpeedLimit
+from safe_wrappers.constraints.obstacles import obstacle_data
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
+
+KINDS: dict[str, Callable[..., Constraint]] = {
+    "Barrier": Barrier,
+    "Clearance": Clearance,
+    "HeadingDriveClearance": HeadingDriveClearance,
+    "JointSpeedLimit": JointSpeedLimit,
+}
+
+
+def constraint_from(data: Any) -> Constraint:
+    """A constraint itself, or rebuilt from `constraint_data`."""
+    if not isinstance(data, dict):
+        if not callable(getattr(data, "rows", None)):
+            raise ConfigurationError(
+                f"expected a constraint (an object with rows(plant)) or the dict of one, got {data!r}"
+            )
+        return data  # type: ignore[no-any-return]
+    kind = data.get("kind", "")
+    if kind not in KINDS:
+        raise UnknownNameError(f"unknown constraint kind {kind!r}; the kinds are {', '.join(KINDS)}")
+    return KINDS[kind](**{k: v for k, v in data.items() if k != "kind"})
+
+
+def constraint_data(constraint: Constraint) -> Any:
+    """The plain dict of a constraint of ours; a foreign one, or one that holds functions, as it is."""
+    name = type(constraint).__name__
+    if KINDS.get(name) is not type(constraint) or isinstance(constraint, Barrier):
+        return constraint
+    assert is_dataclass(constraint)
+    data: dict[str, Any] = {"kind": name}
+    for field in fields(constraint):
+        if field.init and field.name != "promise":
+            value = getattr(constraint, field.name)
+            data[field.name] = [obstacle_data(o) for o in value] if field.name == "obstacles" else value
+    return data

@@ -1,0 +1,70 @@
+"""protect: the recommended stack for a known env, in one call."""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+
+from safe_wrappers.constraints import Clearance, Discs, HeadingDriveClearance, JointSpeedLimit, Plane
+from safe_wrappers.constraints.constraint import Constraint
+from safe_wrappers.errors import UnsupportedEnvError
+from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
+
+POINT_HULL_RADIUS_M = 0.1585
+"""Around the Point robot's turning axis: the far corners of its nose, sqrt(0.15^2 + 0.05^2), rounded up."""
+VASE_HULL_RADIUS_M = 0.1415
+"""Around a vase's centre: the corners of a square of side 0.2, rounded up."""
+
+
+def _point_goal(env: gym.Env[Any, Any]) -> list[Constraint]:
+    obstacles: list[Any] = [Discs("hazard_positions", radius=0.2)]
+    if env.unwrapped.level == 2:  # type: ignore[attr-defined]
+        obstacles.append(Discs("vase_positions", radius=POINT_HULL_RADIUS_M + VASE_HULL_RADIUS_M))
+    return [HeadingDriveClearance(obstacles=obstacles, body="agent", margin=0.004)]
+
+
+def _inverted_pendulum(env: gym.Env[Any, Any]) -> list[Constraint]:
+    # 300 N on 15.5 kg of cart and pole is 19 m/s^2; a tilted, falling pole takes less than half of it.
+    rail = [Plane([-0.95], [1.0]), Plane([0.95], [-1.0])]
+    return [Clearance(obstacles=rail, bodies=["cart"], braking=8.0)]
+
+
+def _reacher(env: gym.Env[Any, Any]) -> list[Constraint]:
+    return [JointSpeedLimit(limit=5.0, margin=0.01)]
+
+
+_RECIPES: dict[str, Callable[[gym.Env[Any, Any]], list[Constraint]]] = {
+    "SafePointGoal1": _point_goal,
+    "SafePointGoal2": _point_goal,
+    "InvertedPendulum": _inverted_pendulum,
+    "Reacher": _reacher,
+}
+
+
+def protect(env: gym.Env[Any, Any], **options: Any) -> CBFActionFilter:
+    """Wrap a known env with the constraints that we recommend and test for it.
+
+    Args:
+        env: Made by `gymnasium.make`; its id says which recipe applies, whatever the version.
+        options: Passed to `CBFActionFilter`: `margin` (added to the recipe's own), `fallback`, `solver`,
+            `plant`.
+
+    Raises:
+        UnsupportedEnvError: No recipe for this env; the message has the lines that protect it by hand.
+
+    Example:
+        >>> import gymnasium as gym, safe_wrappers as sw
+        >>> env = sw.protect(gym.make("SafePointGoal1-v0"))
+    """
+    env_id = env.spec.id if env.spec is not None else ""
+    family = env_id.rpartition("/")[2].rpartition("-v")[0]
+    recipe = _RECIPES.get(family)
+    if recipe is None:
+        raise UnsupportedEnvError(
+            f"no recipe for {env_id or env.unwrapped!r}; there are recipes for {', '.join(sorted(_RECIPES))}. "
+            "By hand it is three lines:\n"
+            "    import safe_wrappers as sw\n"
+            "    limit = sw.JointSpeedLimit(limit=4.0)  # or sw.Clearance(...), sw.Barrier(h, alpha=...)\n"
+            "    env = sw.CBFActionFilter(env, [limit])"
+        )
+    return CBFActionFilter(env, recipe(env), **options)

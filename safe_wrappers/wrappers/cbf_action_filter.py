@@ -1,0 +1,289 @@
+"""CBFActionFilter: the executed action is the closest one to the policy's that every constraint admits."""
+
+import copy
+import time
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers import interventions as keys
+from safe_wrappers.constraints.constraint import Constraint, non_negative
+from safe_wrappers.constraints.plain_data import constraint_data, constraint_from
+from safe_wrappers.control.projection import Status, check_solver, project_unchecked
+from safe_wrappers.errors import ActionError, ConfigurationError, UnsafeStateWarning
+from safe_wrappers.plants.mujoco import MujocoPlant
+from safe_wrappers.plants.plant import Plant, check_actions
+from safe_wrappers.wrappers.fallback import Fallback, FallbackFunction
+
+Array = NDArray[np.float64]
+
+_ROW_TOLERANCE = 1e-9
+_BLENDS = (0.1, 0.25, 0.5, 0.75)
+"""How far a projected control that prediction refuses is moved towards the fallback, step by step."""
+
+
+@dataclass(slots=True)
+class _Decision:
+    control: Array
+    fallback: bool = False
+    infeasible: bool = False
+    changed: bool = True
+
+
+class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
+    """Filters actions through constraints, all of them in one projection.
+
+    At every step: read the plant; if every constraint admits the policy's action, execute it bit for bit; else
+    project it onto the rows of all constraints and the actuator box at once, check the answer against the rows
+    and, where a constraint can, by prediction; if nothing admissible is found, run the fallback and say so.
+
+    **What it guarantees.** No non-finite action, and none outside the action space, reaches the env. Rows that
+    the executed action should satisfy are satisfied (to 1e-9 of a control unit), or `cbf/infeasible` or
+    `cbf/fallback` is True. If every constraint's `promise` is "proved" and the plant is right within the
+    constraints' margins, episodes that start safe stay safe at every physics substep.
+
+    **What it does not.** A "best effort" constraint, a plant outside its margins, or a start that is already
+    unsafe (warned of once per episode, counted in `cbf/unsafe`) void that; so does a wrapper *inside* this
+    one that changes actions: this must be the last word. It does not clip rewards or end episodes. A learner
+    that stores the policy's action learns from "naive" replays (Krasowski et al., 2023).
+
+    Args:
+        env: With a one-dimensional Box action space.
+        constraints: Instances, or the plain dicts that a recorded filter holds. They are copied.
+        plant: None reads the env's MuJoCo model; other envs need an `AnalyticPlant`.
+        fallback: "brake", "hold", "zero", or a function of the plant that returns a control.
+        solver: "daqp" or any installed qpsolvers backend.
+        margin: Added to every constraint's own `margin`, in that constraint's unit (m, rad/s, ...).
+
+    Info, at every step (see `safe_wrappers.interventions`): ``cbf/intervened``, ``cbf/infeasible``,
+    ``cbf/fallback``, ``cbf/nonfinite``, ``cbf/unsafe`` (bool); ``cbf/correction``, ``cbf/clipped``,
+    ``cbf/margin`` (float); ``proposed_action``, ``executed_action`` (arrays).
+
+    Attributes:
+        filter_seconds: Wall time spent filtering so far; `filter_calls` says over how many steps.
+
+    Raises:
+        ConfigurationError: Not a Box action space, an empty list, or a constraint or plant that does not fit.
+
+    Example:
+        >>> import gymnasium as gym, safe_wrappers as sw
+        >>> env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(limit=4.0)])
+        >>> _ = env.reset(seed=0)
+        >>> info = env.step(env.action_space.sample())[4]
+        >>> info["cbf/margin"] > 0.0
+        True
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        constraints: Sequence[Constraint | dict[str, Any]],
+        plant: Plant | None = None,
+        fallback: str | FallbackFunction = "brake",
+        solver: str = "daqp",
+        margin: float = 0.0,
+    ) -> None:
+        space = check_actions(env)
+        if isinstance(constraints, str | dict) or not isinstance(constraints, Sequence) or not constraints:
+            raise ConfigurationError(f"constraints is a list with at least one, got {constraints!r}")
+        own = [copy.deepcopy(constraint_from(c)) for c in constraints]
+        margin = non_negative("margin", margin, "the constraints' own units")
+        check_solver(solver)
+        gym.utils.RecordConstructorArgs.__init__(
+            self,
+            constraints=[constraint_data(c) for c in own],
+            plant=plant,
+            fallback=fallback,
+            solver=solver,
+            margin=margin,
+        )
+        gym.Wrapper.__init__(self, env)
+        self.constraints: list[Constraint] = [_with_margin(c, margin) for c in own] if margin else own
+        self.plant: Plant = plant if plant is not None else MujocoPlant()
+        self.plant.bind(env)
+        for constraint in self.constraints:
+            getattr(constraint, "bind", _nothing)(self.plant)
+        self._certifying: list[Any] = [c for c in self.constraints if hasattr(c, "admits")]
+        self._rows_only = [c for c in self.constraints if not hasattr(c, "admits")]
+        self._barriers: list[Any] = [c for c in self.constraints if hasattr(c, "value")]
+        self._fallback = Fallback(fallback, [c for c in self.constraints if hasattr(c, "backup")])
+        self._solver = solver
+        self._low = np.asarray(space.low, dtype=np.float64)
+        self._high = np.asarray(space.high, dtype=np.float64)
+        self._shape, self._dtype = space.shape, space.dtype
+        self._last = np.clip(np.zeros(self._shape), self._low, self._high)
+        self._warned: set[str] = set()
+        self.filter_seconds = 0.0
+        self.filter_calls = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Reset the env and forget the episode: commands in flight, the last action, the warning."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self.plant.executed(None)
+        self._last = np.clip(np.zeros(self._shape), self._low, self._high)
+        self._warned.discard("unsafe")
+        self.plant.observe()
+        margin = self._margin()
+        self._warn_if_unsafe(margin)
+        info.update(dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0))
+        info[keys.CBF_MARGIN] = margin
+        info[keys.CBF_UNSAFE] = margin < 0.0
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Filter the action and step the env with what may be executed."""
+        started = time.perf_counter()
+        proposed = self._checked(action)
+        finite = bool(np.isfinite(proposed).all())
+        self.plant.observe()
+        margin = self._margin()
+        self._warn_if_unsafe(margin)
+        if finite:
+            boxed = np.clip(proposed, self._low, self._high)
+            decision = self._decide(boxed)
+        else:
+            self._warn_once("nonfinite", f"the policy's action is not finite ({proposed}); the fallback acts")
+            proposed = np.where(np.isfinite(proposed), proposed, 0.0)
+            boxed = np.clip(proposed, self._low, self._high)
+            decision = replace(self._decide(self._safe(None)), fallback=True, changed=True)
+        boxing = boxed - proposed
+        clipped = float(np.sqrt(boxing @ boxing)) if finite else 0.0
+        if clipped > 0.0:
+            self._warn_once(
+                "clipped",
+                f"the policy's action left the action space by {clipped:.3g}; it is boxed (cbf/clipped)",
+            )
+        # Bit for bit the policy's own action wherever the filter has nothing to say.
+        if not decision.changed and clipped == 0.0:
+            sent: Any = action
+            executed = proposed
+        else:
+            sent = np.clip(decision.control, self._low, self._high).astype(self._dtype)
+            executed = sent.astype(np.float64)
+        self._last = executed
+        self.plant.executed(executed)
+        self.filter_seconds += time.perf_counter() - started
+        self.filter_calls += 1
+        observation, reward, terminated, truncated, info = self.env.step(sent)
+        change = executed - proposed
+        info[keys.CBF_INTERVENED] = decision.changed
+        info[keys.CBF_INFEASIBLE] = decision.infeasible
+        info[keys.CBF_FALLBACK] = decision.fallback
+        info[keys.CBF_NONFINITE] = not finite
+        info[keys.CBF_UNSAFE] = margin < 0.0
+        info[keys.CBF_CORRECTION] = float(np.sqrt(change @ change))
+        info[keys.CBF_CLIPPED] = clipped
+        info[keys.CBF_MARGIN] = margin
+        info[keys.PROPOSED_ACTION] = proposed
+        info[keys.EXECUTED_ACTION] = np.array(executed)
+        return observation, reward, terminated, truncated, info
+
+    def _checked(self, action: Any) -> Array:
+        try:
+            proposed = np.asarray(action, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ActionError(f"expected an action of shape {self._shape}, got {action!r}") from None
+        if proposed.shape != self._shape:
+            raise ActionError(f"expected an action of shape {self._shape}, got shape {proposed.shape}")
+        return proposed
+
+    def _margin(self) -> float:
+        lowest = np.inf
+        for barrier in self._barriers:
+            h = barrier.value(self.plant)
+            lowest = min(lowest, float(np.min(h, initial=np.inf)))
+        # inf: nothing is near; NaN: a broken h, which the rows will report as failed.
+        return lowest if np.isfinite(lowest) else (-np.inf if np.isnan(lowest) else 0.0)
+
+    def _warn_if_unsafe(self, margin: float) -> None:
+        if margin < 0.0:
+            self._warn_once(
+                "unsafe",
+                f"the state is outside the safe set (cbf/margin = {margin:.3g}); the filter drives it "
+                "back where it can, and promises nothing until it is inside",
+                UnsafeStateWarning,
+            )
+
+    def _warn_once(self, what: str, message: str, category: type[Warning] = UserWarning) -> None:
+        if what not in self._warned:
+            self._warned.add(what)
+            warnings.warn(message, category, stacklevel=3)
+
+    def _admitted(self, control: Array) -> bool:
+        return all(c.admits(self.plant, control) for c in self._certifying)
+
+    def _decide(self, boxed: Array) -> _Decision:
+        """The executed control for a boxed proposal."""
+        refused = not self._admitted(boxed)
+        if not refused and not self._rows_only:
+            return _Decision(boxed, changed=False)
+        asked = self.constraints if refused else self._rows_only
+        decision = self._projected(boxed, asked)
+        if decision is None and not refused:  # what the rows made of it is no longer admitted
+            decision = self._projected(boxed, self.constraints)
+        return decision or _Decision(self._safe(None), fallback=True, infeasible=True)
+
+    def _projected(self, boxed: Array, asked: list[Constraint]) -> _Decision | None:
+        """The projection onto the rows of `asked`, checked by prediction; None if that refuses all of it."""
+        normals, offsets = self._rows(asked)
+        low, high = np.maximum(self._low, self.plant.lower), np.minimum(self._high, self.plant.upper)
+        # Beyond the acting range actuators are saturated, and rows are linear only inside it.
+        least, most = getattr(self.plant, "acting_range", (low, high))
+        least, most = np.clip(least, low, high), np.clip(most, low, high)
+        nominal = np.clip(boxed, low, high)
+        acting = np.clip(nominal, least, most)
+        # Measured in shares of what acts: a control that saturates early must not look cheap to change.
+        reach, box = most - least, high - low
+        unit = np.where((reach > 0.0) & np.isfinite(box), reach / np.where(box > 0.0, box, 1.0), 1.0)
+        result = project_unchecked(
+            acting / unit, normals * unit, offsets, least / unit, most / unit, self._solver
+        )
+        if result.status in (Status.INFEASIBLE, Status.FAILED):
+            infeasible = result.status is Status.INFEASIBLE
+            return _Decision(self._safe(result.control * unit), fallback=True, infeasible=infeasible)
+        # A component that saturates just as the policy's did stays the policy's: the force is the same.
+        control = np.where(result.control == acting / unit, nominal, result.control * unit)
+        if self._admitted(control):
+            return _Decision(control, changed=not np.array_equal(control, boxed))
+        if asked is not self.constraints:
+            return None
+        return self._towards_fallback(control, normals, offsets)
+
+    def _rows(self, asked: list[Constraint]) -> tuple[Array, Array]:
+        parts = [c.rows(self.plant) for c in asked]
+        if len(parts) == 1:
+            return parts[0].normals, parts[0].offsets
+        return np.concatenate([p.normals for p in parts]), np.concatenate([p.offsets for p in parts])
+
+    def _towards_fallback(self, control: Array, normals: Array, offsets: Array) -> _Decision:
+        """The rows were too kind: approach the fallback until prediction agrees."""
+        safe = self._safe(control)
+        for share in _BLENDS:
+            blend = control + share * (safe - control)
+            if bool((normals @ blend <= offsets + _ROW_TOLERANCE).all()) and self._admitted(blend):
+                return _Decision(blend)
+        return _Decision(safe, fallback=True, infeasible=not self._admitted(safe))
+
+    def _safe(self, least: Array | None) -> Array:
+        return self._fallback(self.plant, self._last, self._low, self._high, least)
+
+
+def _nothing(plant: Plant) -> None:
+    """A constraint without `bind` resolves no names."""
+
+
+def _with_margin(constraint: Constraint, margin: float) -> Constraint:
+    """A copy with a wider margin."""
+    if not (is_dataclass(constraint) and any(f.name == "margin" for f in fields(constraint))):
+        raise ConfigurationError(
+            f"{type(constraint).__name__} has no margin to widen; give it a field `margin`, or margin=0 here"
+        )
+    wider: Constraint = replace(constraint, margin=getattr(constraint, "margin") + margin)  # noqa: B009
+    return wider
