@@ -11,6 +11,7 @@ import time
 
 import gymnasium as gym
 import numpy as np
+
 from safe_wrappers.envs import POINT_GOAL_IDS, register_envs
 
 LIMIT_US = 150.0

@@ -1,5 +1,6 @@
 import gymnasium as gym
 import pytest
+
 from safe_wrappers.envs import POINT_GOAL_IDS, register_envs
 
 if not all(env_id in gym.registry for env_id in POINT_GOAL_IDS):

@@ -6,8 +6,8 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from safe_wrappers.envs import EPISODE_STEPS, POINT_GOAL_IDS
 
+from safe_wrappers.envs import EPISODE_STEPS, POINT_GOAL_IDS
 from safe_wrappers.errors import ActionError, ConfigurationError
 
 INFO_TYPES = {

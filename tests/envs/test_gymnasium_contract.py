@@ -8,8 +8,9 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-import safe_wrappers.envs
 from gymnasium.utils.env_checker import check_env
+
+import safe_wrappers.envs
 from safe_wrappers.envs import POINT_GOAL_IDS, register_envs
 
 # Said of every env with unbounded sensors, Gymnasium's own MuJoCo envs included.

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from safe_wrappers.envs.lidar import LIDAR_BINS, LIDAR_RANGE, pseudo_lidar
 
 coordinate = st.floats(-4, 4, allow_nan=False)

@@ -1,10 +1,15 @@
 """A tiny goal task and a tiny filter, so that runs of the whole machinery take a second."""
 
+import os
+import time
+
 import gymnasium as gym
 import numpy as np
+import torch
 from gymnasium.spaces import Box
 
 from safe_wrappers import interventions as keys
+from safe_wrappers.errors import ConfigurationError
 
 HAZARD = np.array([0.5, 0.0])
 
@@ -76,3 +81,18 @@ def shield(env, margin=0.0):
 
 
 gym.register("FakeGoal-v0", "fake_task:FakeGoal")
+
+
+def count(steps, progress):
+    """A job for `run_jobs`."""
+    for at in range(0, steps + 1, max(steps // 4, 1)):
+        progress.steps(at)
+        time.sleep(0.05)
+    progress.say("a line to read")
+    assert torch.get_num_threads() == 1
+    assert os.environ["OMP_NUM_THREADS"] == "1"
+
+
+def fail(progress):
+    """A job that refuses."""
+    raise ConfigurationError("too hot")

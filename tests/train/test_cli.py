@@ -53,8 +53,13 @@ def test_compare_from_nothing_to_the_report_in_parallel_processes(tmp_path):
 
 def test_a_killed_comparison_leaves_no_process_behind_and_goes_on(tmp_path):
     overrides = (f"output={tmp_path}", "total_steps=8000", "checkpoint_every=1000", "seeds=[0]", FILTERED)
-    process = start("train", *overrides)
     folder = tmp_path / "fake" / "filtered" / "seed_0"
+    process = start("train", *overrides)
+    wait_for(lambda: list(folder.glob("checkpoints/step_*/state.json")))
+    process.send_signal(signal.SIGINT)
+    assert process.communicate()[1] == "Stopped. The same command goes on from the last checkpoints.\n"
+    assert process.returncode == 130
+    process = start("train", *overrides)
     wait_for(lambda: len(list(folder.glob("checkpoints/step_*/state.json"))) >= 2)
     process.send_signal(signal.SIGKILL)
     process.communicate()

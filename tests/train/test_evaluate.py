@@ -62,6 +62,22 @@ def test_done_once_and_again_when_its_settings_change(fake_experiment):
     assert json.loads((folder / "evaluation.json").read_text())["settings"]["episodes"] == 4
 
 
+def test_a_kill_between_the_conditions_leaves_nothing_that_looks_done(fake_experiment):
+    folder = evaluate(fake_experiment(), 1)
+    experiment = fake_experiment("evaluation.episodes=4")
+    arm = experiment.arms[1]
+
+    def kill(steps):
+        if steps == 5:
+            raise KeyboardInterrupt
+
+    progress = Progress(kill, pytest.fail)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate_run(arm, 0, folder.parent, experiment.evaluation, experiment.evaluation_filter, progress)
+    evaluate(fake_experiment(), 1)  # the first settings again: their rows are gone, so they are made anew
+    assert len(read_rows(folder / "filter_off.csv")) == len(read_rows(folder / "filter_on.csv")) == 3
+
+
 def test_deterministic(fake_experiment):
     experiment = fake_experiment()
     folder = evaluate(experiment, 1)

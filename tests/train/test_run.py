@@ -5,12 +5,14 @@ import shutil
 
 import numpy as np
 import pytest
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from safe_wrappers import CBFActionFilter, RecordInterventions
 from safe_wrappers.errors import RunStateError, UnknownNameError
 from safe_wrappers.train.checkpoint import latest_checkpoint
-from safe_wrappers.train.config import FilterConfig
+from safe_wrappers.train.config import EnvConfig, FilterConfig
 from safe_wrappers.train.lock import only_writer
 from safe_wrappers.train.run import Progress, finished_checkpoint, train_run
 from safe_wrappers.train.run_callbacks import CheckpointCallback
@@ -141,6 +143,10 @@ def test_a_killed_sac_run_keeps_its_replay_buffer(fake_experiment, monkeypatch):
     final = folder / "checkpoints" / "step_000000000400"
     assert [path.name for path in (folder / "checkpoints").iterdir()] == [final.name]
     assert not (final / "replay_buffer.pkl").exists()  # of no use to a finished run, and large
+    # A kill between this checkpoint and the note that the run is finished:
+    (folder / "finished.json").unlink()
+    run(experiment)
+    assert json.loads((folder / "finished.json").read_text())["timesteps"] == 400
 
 
 def test_the_normaliser_goes_on_too(fake_experiment, monkeypatch):
@@ -260,6 +266,20 @@ def test_unknown_factories(fake_experiment):
         make_stack(env, FilterConfig("factory", {}, "fake_task:sheild"))
     with pytest.raises(ValueError, match=r"filter.factory: cannot import 'no_such_module'"):
         make_stack(env, FilterConfig("factory", {}, "no_such_module:f"))
+
+
+def test_protect_is_the_filter_and_gets_its_settings():
+    env = make_stack(
+        EnvConfig("SafePointGoal1-v0"), FilterConfig("protect", {"margin": 0.25, "solver": "daqp"})
+    )
+    assert isinstance(env, Monitor)
+    assert isinstance(env.env, RecordInterventions)
+    assert isinstance(env.env.env, CBFActionFilter)
+    assert env.env.env.spec.additional_wrappers[-1].kwargs["margin"] == 0.25
+    env.reset(seed=0)
+    _, _, _, _, info = env.step(np.ones(2, np.float32))
+    assert {"cbf/intervened", "interventions/rate", "cost", "cost_substep", "goals_reached"} <= set(info)
+    assert env.get_wrapper_attr("filter_time_us") > 0
 
 
 def test_hyperparameters_and_device_reach_the_model(fake_experiment):
