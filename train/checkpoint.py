@@ -43,7 +43,8 @@ class Checkpoint:
         """Loads the model; with an env also what training needs: replay buffer and random states."""
         model: BaseAlgorithm = ALGORITHMS[algorithm].load(self.folder / MODEL, env=env, device=device)
         if env is not None:
-            if isinstance(model, OffPolicyAlgorithm):
+            # A finished run's last checkpoint has none: there is nothing left to train on.
+            if isinstance(model, OffPolicyAlgorithm) and (self.folder / REPLAY).exists():
                 model.load_replay_buffer(self.folder / REPLAY)
             _set_random_states(pickle.loads((self.folder / RANDOM).read_bytes()))
         return model

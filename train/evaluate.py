@@ -69,6 +69,7 @@ def evaluate_run(
     }
     if (out / STATE_FILE).exists() and json.loads((out / STATE_FILE).read_text()) == state:
         return
+    (out / STATE_FILE).unlink(missing_ok=True)  # from here on the rows may be of two settings
     logger = configure(str(folder / "tensorboard"), ["tensorboard"])
     for at, (condition, used) in enumerate(conditions.items()):
         rows: list[dict[str, Any]] = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import sys
 import threading
 import time
@@ -55,7 +56,7 @@ def run_jobs(jobs: Sequence[Job], workers: int | None, console: Console, title: 
     Raises:
         RunsFailedError: At least one job failed; holds all their messages.
     """
-    at_once = min(workers or len(os.sched_getaffinity(0)), len(jobs))
+    at_once = min(workers or _cores(), len(jobs))
     waiting = list(jobs)
     running: dict[Connection, tuple[Job, SpawnProcess]] = {}
     failures: dict[str, str] = {}
@@ -91,6 +92,12 @@ def run_jobs(jobs: Sequence[Job], workers: int | None, console: Console, title: 
         raise RunsFailedError(f"{title}: {len(failures)} of {len(jobs)} failed.\n{texts}")
 
 
+def _cores() -> int:
+    if hasattr(os, "sched_getaffinity"):  # in a container fewer than the machine has; not on macOS
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def _start(job: Job) -> tuple[Connection, SpawnProcess]:
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
@@ -119,6 +126,8 @@ def _work(job: Job, sender: Connection) -> None:
     import torch
 
     torch.set_num_threads(1)
+    # Ctrl-C goes to every process of the terminal; the parent's answer is enough.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     progress = RunProgress(
         steps=lambda steps: sender.send(("steps", steps)), say=lambda text: sender.send(("say", text))
