@@ -18,7 +18,7 @@ VASE_HULL_RADIUS_M = 0.1415
 
 def _point_goal(env: gym.Env[Any, Any]) -> list[Constraint]:
     obstacles: list[Any] = [Discs("hazard_positions", radius=0.2)]
-    if env.unwrapped.level == 2:  # type: ignore[attr-defined]
+    if env.unwrapped.level.vases_cost:  # type: ignore[attr-defined]
         obstacles.append(Discs("vase_positions", radius=POINT_HULL_RADIUS_M + VASE_HULL_RADIUS_M))
     return [HeadingDriveClearance(obstacles=obstacles, body="agent", margin=0.004)]
 
