@@ -93,7 +93,7 @@ def project(
     m = u.size
     a = np.asarray(normals, dtype=np.float64)
     b = np.asarray(offsets, dtype=np.float64).reshape(-1)
-    a = a.reshape(b.size, m) if a.size == b.size * m else a
+    a = a.reshape(b.size, m) if a.ndim < 2 and a.size == b.size * m else a  # one row may come flat
     lo, hi = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     if u.ndim != 1 or a.shape != (b.size, m):
         raise ConfigurationError(
@@ -124,9 +124,9 @@ def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array, solver
     if b.size == 0:
         status = Status.INACTIVE if inside else Status.PROJECTED
         return Projection(u if inside else np.clip(u, lo, hi), status, 0.0, np.zeros(0), 0)
-    if not (np.isfinite(a).all() and np.isfinite(b).all()):
-        return _finite_rows_only(u, a, b, lo, hi, solver)
     length = np.sqrt(np.einsum("ij,ij->i", a, a))
+    if not (np.isfinite(length).all() and np.isfinite(b).all()):
+        return _finite_rows_only(u, a, b, length, lo, hi, solver)
     slack = FEASIBILITY_TOLERANCE * length
     if inside and bool((a @ u - b <= slack).all()):
         return Projection(u, Status.INACTIVE, 0.0, np.zeros(b.size), 0)
@@ -163,11 +163,13 @@ def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array, solver
     return Projection(control, status, violation, np.zeros(b.size), iterations)
 
 
-def _finite_rows_only(u: Array, a: Array, b: Array, lo: Array, hi: Array, solver: str) -> Projection:
-    """A row with a NaN or an infinity asks for nothing that can be checked: respect the others, say failed."""
+def _finite_rows_only(
+    u: Array, a: Array, b: Array, length: Array, lo: Array, hi: Array, solver: str
+) -> Projection:
+    """A row whose length or offset is not finite cannot be checked: respect the others, say failed."""
     # An offset of +inf asks for nothing; everything else that is not finite is a failed constraint.
-    harmless = np.isfinite(a).all(axis=1) & (b == np.inf)
-    fine = np.isfinite(a).all(axis=1) & np.isfinite(b)
+    harmless = np.isfinite(length) & (b == np.inf)
+    fine = np.isfinite(length) & np.isfinite(b)
     part = project_unchecked(u, a[fine], b[fine], lo, hi, solver)
     status = part.status if bool((harmless | fine).all()) else Status.FAILED
     multipliers = np.zeros(b.size)
@@ -276,6 +278,8 @@ def _solve(
     backend = _daqp if solver == "daqp" else _named(solver)
     if not hopeless:
         answer = _nearest(backend, u, g, h, lo, hi)
+        if answer is None and solver != "daqp":  # its failure does not make the problem infeasible
+            answer = _nearest(_daqp, u, g, h, lo, hi)
         if answer is not None:
             return *answer, True
     least = _least_violation(backend, u, g, h, lo, hi)
