@@ -14,6 +14,7 @@ import gymnasium as gym
 from stable_baselines3 import PPO, SAC
 
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 
 from .names import check_name
 
@@ -22,6 +23,12 @@ ALGORITHMS: Final[dict[str, type[PPO] | type[SAC]]] = {"PPO": PPO, "SAC": SAC}
 _NOT_HYPERPARAMETERS: Final = {"self", "env", "seed", "device", "verbose", "tensorboard_log"} | {
     "_init_setup_model",
     "stats_window_size",
+}
+# What `protect` passes on, less what a YAML file cannot hold or the recipe decides.
+_PROTECT_OPTIONS: Final = inspect.signature(CBFActionFilter).parameters.keys() - {
+    "env",
+    "constraints",
+    "plant",
 }
 _ARM_KEYS: Final = (
     "filter",
@@ -211,7 +218,10 @@ def _filter(value: Any, where: str) -> FilterConfig:
     for key in value:
         check_name(key, ("protect", "factory", "kwargs"), where)
     if set(value) == {"protect"}:
-        return FilterConfig("protect", dict(_mapping(value["protect"], f"{where}.protect")))
+        options = dict(_mapping(value["protect"], f"{where}.protect"))
+        for key in options:
+            check_name(key, _PROTECT_OPTIONS, f"{where}.protect")
+        return FilterConfig("protect", options)
     if "factory" in value and "protect" not in value:
         factory = _text(value["factory"], f"{where}.factory")
         if not re.fullmatch(r"[\w.]+:\w+", factory):

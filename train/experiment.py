@@ -11,6 +11,7 @@ from .config import ArmConfig, ExperimentConfig
 from .evaluate import evaluate_run
 from .parallel import Job, run_jobs
 from .run import check_finished, claim_folder, train_run
+from .stack import make_stack
 from .summary import Summary, summarize, write_summary
 
 
@@ -18,11 +19,13 @@ def train_experiment(experiment: ExperimentConfig, console: Console) -> None:
     """Trains what is not trained yet, arms times seeds in parallel.
 
     Raises:
+        ConfigurationError: A task or a filter refuses its settings; nothing has been started.
         RunStateError: A run folder belongs to another config; nothing has been started.
         RunsFailedError: Some runs failed.
     """
-    # All folders before the first step: nobody should learn after an hour that the last one is taken.
+    # All arms and folders before the first step: nobody should learn after an hour that the last one is wrong.
     for arm in experiment.arms:
+        make_stack(arm.env, arm.filter).close()
         for seed in experiment.seeds:
             claim_folder(arm, seed, experiment.run_folder(arm, seed))
     _run(experiment, console, "Training", lambda arm: arm.total_steps, "steps", train_run, ())

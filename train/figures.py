@@ -87,7 +87,7 @@ def scenes_svg(scenes: Sequence[tuple[str, int, Scene]]) -> str:
         scenes: (title, index of the arm's colour, scene) from left to right.
     """
     with mpl.rc_context({**_STYLE, "svg.hashsalt": "scenes"}):
-        figure = Figure(figsize=(10, 5.4), layout="constrained")
+        figure = Figure(figsize=(10, 5.1), layout="constrained")
         grid = figure.subplots(1, len(scenes), sharex=True, sharey=True, squeeze=False)
         for axes, (title, color, scene) in zip(grid.flat, scenes, strict=True):
             axes.set_title(title)
@@ -111,7 +111,7 @@ def _draw(axes: Axes, scene: Scene, color: str) -> None:
     for x, y in scene.vases:
         axes.add_patch(Rectangle((x - 0.08, y - 0.08), 0.16, 0.16, facecolor=_VASE, alpha=0.5))
     for number, (x, y) in enumerate(scene.goals, start=1):
-        axes.add_patch(Circle((x, y), scene.goal_radius, facecolor=_GOAL, alpha=0.16, edgecolor=_GOAL))
+        axes.add_patch(Circle((x, y), scene.goal_radius, facecolor=_GOAL, alpha=0.1, edgecolor=_GOAL))
         axes.text(x, y, str(number), color=_GOAL, ha="center", va="center", weight="bold")
     path = scene.agent
     axes.plot(path[:, 0], path[:, 1], color=color, linewidth=1.4, solid_joinstyle="round")

@@ -21,7 +21,7 @@ from .figures import curves_svg, legend, scenes_svg
 from .report_style import STYLE
 from .run import FINISHED_FILE
 from .scene import Scene, load_scenes
-from .summary import CONDITIONS, METRICS, Estimate, Summary, number
+from .summary import CONDITIONS, METRICS, OF_THE_FILTER, Estimate, Summary, number
 
 _CURVES = {
     "return": "Return per episode",
@@ -121,13 +121,15 @@ def _headline(experiment: ExperimentConfig, summary: Summary) -> str:
             )
     changed = cell(filtered, "filter_on", "intervention_rate")
     if changed:
-        infeasible = total(filtered, "infeasible") + total(filtered, "infeasible", "filter_on")
+        infeasible, fallback = (
+            total(filtered, key) + total(filtered, key, "filter_on") for key in ("infeasible", "fallback")
+        )
         cards.append(
             _card(
                 "Steps changed by the filter",
                 f"{100 * changed.iqm:.1f} %",
                 "of evaluation steps",
-                f"{infeasible:,} infeasible steps in all",
+                f"{infeasible:,} infeasible, {fallback:,} fallback steps, training included",
             )
         )
     return f'<section class="cards">{"".join(cards)}</section>'
@@ -192,7 +194,11 @@ def _scenes(experiment: ExperimentConfig, arm: ArmConfig, condition: str) -> dic
 
 def _curves(experiment: ExperimentConfig) -> str:
     panels = {
-        title: {arm.name: learning_curve(experiment, arm, metric) for arm in experiment.arms}
+        title: {
+            arm.name: learning_curve(experiment, arm, metric)
+            for arm in experiment.arms
+            if arm.filter.kind != "none" or metric not in OF_THE_FILTER
+        }
         for metric, title in _CURVES.items()
     }
     names = [arm.name for arm in experiment.arms]

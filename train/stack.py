@@ -18,12 +18,25 @@ from .names import check_name
 
 
 def make_stack(env: EnvConfig, action_filter: FilterConfig) -> Monitor[Any, Any]:
-    """Makes the task, its filter if there is one, the recorder, and Monitor outermost, as SB3 wants it."""
-    task: gym.Env[Any, Any] = gym.make(env.id, **env.kwargs)
+    """Makes the task, its filter if there is one, the recorder, and Monitor outermost, as SB3 wants it.
+
+    Raises:
+        ConfigurationError: The task or the filter refuses its settings.
+    """
+    try:
+        task: gym.Env[Any, Any] = gym.make(env.id, **env.kwargs)
+    except (TypeError, gym.error.Error, ImportError) as error:
+        raise ConfigurationError(f"env: {env.id} with kwargs {env.kwargs} cannot be made: {error}") from error
     if action_filter.kind == "protect":
         task = safe_wrappers.protect(task, **action_filter.kwargs)
     elif action_filter.kind == "factory":
-        task = _factory(action_filter)(task, **action_filter.kwargs)
+        factory = _factory(action_filter)
+        try:
+            task = factory(task, **action_filter.kwargs)
+        except TypeError as error:
+            raise ConfigurationError(
+                f"filter: {action_filter.factory} refuses its kwargs: {error}"
+            ) from error
     return Monitor(RecordInterventions(task), info_keywords=keys.RUNNING)
 
 

@@ -96,3 +96,8 @@ def count(steps, progress):
 def fail(progress):
     """A job that refuses."""
     raise ConfigurationError("too hot")
+
+
+def crash(progress):
+    """A job with a mistake in it."""
+    raise ValueError("nobody expected this")

@@ -116,12 +116,23 @@ def test_train_evaluate_and_report_one_after_the_other(tmp_path, capsys):
     assert f"Report: {tmp_path / 'fake' / 'report.html'}" in capsys.readouterr().out
 
 
-def test_a_task_that_breaks_is_shown_with_its_traceback(tmp_path, capsys):
-    broken = [FILTERED, "arms.filtered.filter.kwargs.no_such=1"]
-    assert main(["train", str(FAKE), f"output={tmp_path}", "seeds=[0]", *broken]) == 1
-    err = capsys.readouterr().err
-    assert "error: Training: 1 of 1 failed." in err
-    assert "unexpected keyword argument 'no_such'" in err
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ([FILTERED, "arms.filtered.filter.kwargs.no_such=1"], "fake_task:shield refuses its kwargs"),
+        (
+            ["env={id: Pendulum-v1, kwargs: {no_such: 1}}"],
+            "env: Pendulum-v1 with kwargs {'no_such': 1} cannot",
+        ),
+        (["arms.filtered.filter=protect"], "no recipe for"),
+    ],
+)
+def test_arms_that_cannot_be_made_are_refused_before_anything_starts(tmp_path, capsys, overrides, message):
+    assert main(["train", str(FAKE), f"output={tmp_path}", "seeds=[0]", *overrides]) == 1
+    captured = capsys.readouterr()
+    assert captured.err.startswith("error: ")
+    assert message in captured.err
+    assert "started" not in captured.out
 
 
 def test_another_configs_folder_is_refused_before_anything_starts(tmp_path, capsys):

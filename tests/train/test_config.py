@@ -96,6 +96,10 @@ def test_arms_override_what_they_share():
             {"arms": {"a": {"filter": {"protec": {}}}}},
             "a.filter: unknown name 'protec'. Did you mean 'protect'?",
         ),
+        (
+            {"arms": {"a": {"filter": {"protect": {"margn": 0}}}}},
+            "unknown name 'margn'. Did you mean 'margin'?",
+        ),
         ({"device": "gpu"}, "device: unknown name 'gpu'. Did you mean 'cpu'? Valid names: auto, cpu, cuda."),
     ],
 )

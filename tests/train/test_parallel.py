@@ -30,15 +30,20 @@ def test_bars_on_a_terminal_with_speed_and_messages():
 
 
 def test_lines_in_a_file_and_one_failure_among_others():
-    jobs = [job("good", fake_task.count, 10), job("bad", fake_task.fail)]
+    jobs = [job("good", fake_task.count, 10), job("bad", fake_task.fail), job("worse", fake_task.crash)]
     text = io.StringIO()
     with pytest.raises(RunsFailedError) as failure:
         run_jobs(jobs, 1, Console(file=text, width=100), "Counting")
-    assert str(failure.value) == "Counting: 1 of 2 failed.\nbad: too hot"
+    first, refused, *trace = str(failure.value).strip().splitlines()
+    assert (first, refused) == ("Counting: 2 of 3 failed.", "bad: too hot")
+    assert trace[0].startswith("worse: Traceback")
+    assert trace[-1] == "ValueError: nobody expected this"
     assert [line.split(",")[0] for line in text.getvalue().splitlines()] == [
         "good: started (100 steps)",
         "good: a line to read",
         "good: done",
         "bad: started (100 steps)",
         "bad: failed",
+        "worse: started (100 steps)",
+        "worse: failed",
     ]

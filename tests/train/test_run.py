@@ -282,6 +282,15 @@ def test_protect_is_the_filter_and_gets_its_settings():
     assert env.get_wrapper_attr("filter_time_us") > 0
 
 
+def test_a_protected_run_on_the_real_task(fake_experiment):
+    experiment = fake_experiment(
+        "env=SafePointGoal1-v0", "arms={filtered: {filter: protect}}", "total_steps=1024", "n_envs=1"
+    )
+    (row,) = read_rows(run(experiment, arm=0) / "episodes.csv")
+    assert (row["length"], row["cost"], row["cost_substep"], row["violations"]) == (1000.0, 0.0, 0.0, 0.0)
+    assert row["goals_reached"] >= 0
+
+
 def test_hyperparameters_and_device_reach_the_model(fake_experiment):
     experiment = fake_experiment("hyperparameters.gamma=0.9", "hyperparameters.policy_kwargs={net_arch: [7]}")
     folder = run(experiment)
