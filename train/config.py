@@ -41,7 +41,7 @@ _ARM_KEYS: Final = (
     "checkpoint_every",
     "device",
 )
-_SHARED_KEYS: Final = tuple(key for key in _ARM_KEYS if key != "filter")
+_COMMON_KEYS: Final = tuple(key for key in _ARM_KEYS if key != "filter")
 
 
 @dataclass(frozen=True)
@@ -139,20 +139,20 @@ def parse_experiment(settings: Mapping[str, Any]) -> ExperimentConfig:
         UnknownNameError: A key, an algorithm or an env id that does not exist.
         ConfigurationError: A value of the wrong type or outside its range, or a missing one.
     """
-    valid = ("name", "arms", "seeds", "evaluation", "output", "workers", *_SHARED_KEYS)
+    valid = ("name", "arms", "seeds", "evaluation", "output", "workers", *_COMMON_KEYS)
     for key in settings:
         check_name(key, valid, "config")
     for key in ("name", "env", "algorithm", "total_steps", "arms", "seeds"):
         if key not in settings:
             raise ConfigurationError(f"config: {key!r} is missing.")
-    shared = {key: settings[key] for key in _SHARED_KEYS if key in settings}
+    common = {key: settings[key] for key in _COMMON_KEYS if key in settings}
     arms = _mapping(settings["arms"], "arms")
     if not arms:
         raise ConfigurationError("arms: expected at least one, such as `unfiltered: {filter: none}`.")
     workers = settings.get("workers")
     return ExperimentConfig(
         name=_folder_name(settings["name"], "name"),
-        arms=tuple(_arm(name, _mapping(arm, f"arms.{name}"), shared) for name, arm in arms.items()),
+        arms=tuple(_arm(name, _mapping(arm, f"arms.{name}"), common) for name, arm in arms.items()),
         seeds=_seeds(settings["seeds"]),
         evaluation=_evaluation(settings.get("evaluation")),
         output=Path(_text(settings.get("output", "runs"), "output")),
@@ -160,16 +160,16 @@ def parse_experiment(settings: Mapping[str, Any]) -> ExperimentConfig:
     )
 
 
-def _arm(name: object, own: Mapping[str, Any], shared: Mapping[str, Any]) -> ArmConfig:
+def _arm(name: object, own: Mapping[str, Any], common: Mapping[str, Any]) -> ArmConfig:
     where = f"arms.{name}"
     for key in own:
         check_name(key, _ARM_KEYS, where)
-    merged = {**shared, **own}
+    merged = {**common, **own}
     algorithm = check_name(merged["algorithm"], ALGORITHMS, f"{where}.algorithm")
     hyperparameters = dict(_mapping(own.get("hyperparameters"), f"{where}.hyperparameters"))
-    if algorithm == shared["algorithm"]:  # another algorithm's hyperparameters would not fit
-        common = _mapping(shared.get("hyperparameters"), "hyperparameters")
-        hyperparameters = {**common, **hyperparameters}
+    if algorithm == common["algorithm"]:  # another algorithm's hyperparameters would not fit
+        inherited = _mapping(common.get("hyperparameters"), "hyperparameters")
+        hyperparameters = {**inherited, **hyperparameters}
     total_steps = _integer(merged["total_steps"], "total_steps", 1)
     arm = ArmConfig(
         name=_folder_name(name, "arms"),

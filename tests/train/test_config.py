@@ -48,7 +48,7 @@ def test_defaults_and_shorthands():
     assert experiment.workers is None
 
 
-def test_arms_override_what_they_share():
+def test_arms_override_the_common_settings():
     experiment = changed(
         hyperparameters={"n_steps": 64, "gamma": 0.9},
         arms={
