@@ -1,5 +1,6 @@
 """protect: the recommended stack for a known env, in one call."""
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -7,7 +8,7 @@ import gymnasium as gym
 
 from safe_wrappers.constraints import Clearance, Discs, HeadingDriveClearance, JointSpeedLimit, Plane
 from safe_wrappers.constraints.constraint import Constraint
-from safe_wrappers.errors import UnsupportedEnvError
+from safe_wrappers.errors import UnknownNameError, UnsupportedEnvError
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 
 POINT_HULL_RADIUS_M = 0.1585
@@ -16,11 +17,11 @@ VASE_HULL_RADIUS_M = 0.1415
 """Around a vase's centre: the corners of a square of side 0.2, rounded up."""
 
 
-def _point_goal(env: gym.Env[Any, Any]) -> list[Constraint]:
+def _point_goal(env: gym.Env[Any, Any], detour: bool = True, uncertainty: float = 0.0) -> list[Constraint]:
     obstacles: list[Any] = [Discs("hazard_positions", radius=0.2)]
     if env.unwrapped.level.vases_cost:  # type: ignore[attr-defined]
         obstacles.append(Discs("vase_positions", radius=POINT_HULL_RADIUS_M + VASE_HULL_RADIUS_M))
-    return [HeadingDriveClearance(obstacles=obstacles, body="agent", margin=0.004)]
+    return [HeadingDriveClearance(obstacles, margin=0.004, detour=detour, uncertainty=uncertainty)]
 
 
 def _inverted_pendulum(env: gym.Env[Any, Any]) -> list[Constraint]:
@@ -33,12 +34,18 @@ def _reacher(env: gym.Env[Any, Any]) -> list[Constraint]:
     return [JointSpeedLimit(limit=5.0, margin=0.01)]
 
 
-_RECIPES: dict[str, Callable[[gym.Env[Any, Any]], list[Constraint]]] = {
+_RECIPES: dict[str, Callable[..., list[Constraint]]] = {
     "SafePointGoal1": _point_goal,
     "SafePointGoal2": _point_goal,
     "InvertedPendulum": _inverted_pendulum,
     "Reacher": _reacher,
 }
+
+
+def protect_options() -> frozenset[str]:
+    """Every option that `protect` knows, for whichever env."""
+    of_recipes = {n for recipe in _RECIPES.values() for n in inspect.signature(recipe).parameters}
+    return frozenset((of_recipes | inspect.signature(CBFActionFilter).parameters.keys()) - {"env", "constraints"})
 
 
 def protect(env: gym.Env[Any, Any], **options: Any) -> CBFActionFilter:
@@ -47,7 +54,8 @@ def protect(env: gym.Env[Any, Any], **options: Any) -> CBFActionFilter:
     Args:
         env: Made by `gymnasium.make`; its id says which recipe applies, whatever the version.
         options: Passed to `CBFActionFilter`: `margin` (added to the recipe's own), `fallback`, `solver`,
-            `plant`.
+            `plant`. SafePointGoal also takes `detour` (go around a hazard instead of stopping before it,
+            default True) and `uncertainty` (of mass and damping, a fraction, default 0).
 
     Raises:
         UnsupportedEnvError: No recipe for this env; the message has the lines that protect it by hand.
@@ -67,4 +75,12 @@ def protect(env: gym.Env[Any, Any], **options: Any) -> CBFActionFilter:
             "    limit = sw.JointSpeedLimit(limit=4.0)  # or sw.Clearance(...), sw.Barrier(h, alpha=...)\n"
             "    env = sw.CBFActionFilter(env, [limit])"
         )
-    return CBFActionFilter(env, recipe(env), **options)
+    of_recipe = [name for name in inspect.signature(recipe).parameters if name != "env"]
+    of_filter = [n for n in inspect.signature(CBFActionFilter).parameters if n not in ("env", "constraints")]
+    for name in options:
+        if name not in of_recipe + of_filter:
+            raise UnknownNameError(
+                f"protect has no option {name!r} for {family}; it has {', '.join(of_filter + of_recipe)}"
+            )
+    constraints = recipe(env, **{n: options.pop(n) for n in of_recipe if n in options})
+    return CBFActionFilter(env, constraints, **options)

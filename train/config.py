@@ -14,7 +14,7 @@ import gymnasium as gym
 from stable_baselines3 import PPO, SAC
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
+from safe_wrappers.protect import protect_options
 
 from .names import check_name
 
@@ -24,12 +24,8 @@ _NOT_HYPERPARAMETERS: Final = {"self", "env", "seed", "device", "verbose", "tens
     "_init_setup_model",
     "stats_window_size",
 }
-# What `protect` passes on, less what a YAML file cannot hold or the recipe decides.
-_PROTECT_OPTIONS: Final = inspect.signature(CBFActionFilter).parameters.keys() - {
-    "env",
-    "constraints",
-    "plant",
-}
+# What a YAML file can hold of what `protect` takes.
+_PROTECT_OPTIONS: Final = protect_options() - {"plant"}
 _ARM_KEYS: Final = (
     "filter",
     "env",

@@ -18,10 +18,14 @@ from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
 
+_Circle = tuple[float, float, float]
+"""Centre x, y and the radius to keep out of, margins included, m."""
 _RECOVERY_RATE = 1.0
 """1/s: an unsafe start must shrink its violation at least this fast, where the drive can."""
 _DECAY_PER_HOLD = 0.5
 """The share of the clearance that one hold may use up: the discrete class-K decay, alpha times the hold."""
+_DETOUR_MEMORY = 50
+"""Control steps for which a detour keeps its side after it was last needed, so that it cannot dither."""
 _ROW_SLACK = 0.02
 """The share of the needed clearance that prediction may miss of what the linear rows aimed at."""
 _RESERVE_M = 0.001
@@ -50,6 +54,9 @@ class HeadingDriveClearance:
         margin: Fixed protective distance, m.
         state_error: Bound on the error of the measured position, m.
         uncertainty: Relative uncertainty of mass and of damping, in [0, 1).
+        detour: When a driving action is refused, first try the same drive while turning towards the nearer
+            tangent of the disc in the way, then turning alone; both only if admitted. It is no safety measure:
+            it keeps a driver that is blind to the discs from standing in front of one for good.
         brake: False counts the path that coasts along the heading as well: needs no drive to stop, costs more.
     """
 
@@ -59,6 +66,7 @@ class HeadingDriveClearance:
     state_error: float = 0.0
     uncertainty: float = 0.0
     brake: bool = True
+    detour: bool = False
 
     promise: Promise = field(default="proved", init=False)
 
@@ -79,97 +87,90 @@ class HeadingDriveClearance:
         if not isinstance(plant, MujocoPlant):
             raise UnsupportedEnvError("HeadingDriveClearance needs a MujocoPlant: it reads the robot's model")
         self._frame = _PlanarFrame(plant, self.body)
-        self.drive = heading_drive(plant, self.body, self.uncertainty)
-        self._plant = plant
-        # How much any control can change the clearance within one hold: speed gained times what it adds to
-        # the path, plus the way travelled, plus a turn's share of the sideways coasting.
-        d = self.drive
-        self._growth = d.fastest_change * (d.hold_s + d.coast_time)
-        self._swivel = 2.0 * abs(d.com_offset)
+        self.drive = drive = heading_drive(plant, self.body, self.uncertainty)
+        # Predictions are made for the corners of the uncertainty: each must keep what is needed.
+        self._models = drive.corners()
+        self._swivel = 2.0 * abs(drive.com_offset)
+        # The most that one hold's drive can add to the path; a turn and the way travelled depend on the speed.
+        self._push = drive.fastest_change * (drive.hold_s + drive.coast_time)
+        self._turn = drive.hold_s * min(drive.yaw_limit / drive.yaw_damping, math.pi / drive.hold_s)
         self._stamp = -1
+        self.reset()
 
     def _look(self, plant: MujocoPlant) -> None:
         """Take the state, once per observation."""
         if plant.stamp == self._stamp:
             return
         self._stamp = plant.stamp
+        self._side_steps -= 1
         self._motion = motion = self._frame.motion(plant)
-        self._path = self.drive.stopping_path(motion, self.brake)
-        self._backup_path: StoppingPath | None = None
-        groups: list[Array] = []
-        radii: list[Array] = []
+        self._path = path = self.drive.stopping_path(motion, self.brake)
+        self._backup: list[StoppingPath] = []
+        speed = math.hypot(motion.vx, motion.vy) + abs(self.drive.com_offset * motion.yaw_rate)
+        self._loss = self._push + speed * (self.drive.hold_s + self._turn * self.drive.coast_time)
+        x, y, reserve = motion.x, motion.y, self.margin + self.state_error
+        kept = path.reach + self._swivel
+        bounds: list[tuple[float, _Circle]] = []
         for obstacle in self.obstacles:
-            where = obstacle.centers(plant) if isinstance(obstacle, Discs) else np.array([obstacle.center])
-            groups.append(where[:, :2])
-            radii.append(np.full(len(where), obstacle.radius))
-        self._centers, self._radii = (
-            (groups[0], radii[0]) if len(groups) == 1 else (np.concatenate(groups), np.concatenate(radii))
-        )
-        offset = self._centers - (motion.x, motion.y)
-        apart = np.sqrt(np.einsum("ij,ij->i", offset, offset)) - self._radii
-        self._gap = apart - (self.margin + self.state_error)
-        speed = math.hypot(motion.vx, motion.vy)
-        # Brake to coast at worst, over a whole hold, from wherever the heading turns to.
-        self._swing = (
-            speed * (self.drive.coast_time + self.drive.hold_s)
-            + self._growth
-            + self._swivel
-            + self.drive.com_offset * abs(motion.yaw_rate) * self.drive.coast_time
-        )
-        self._close = np.flatnonzero(self._gap < self._swing).tolist()
+            if isinstance(obstacle, Discs):
+                where, room = obstacle.centers(plant).tolist(), obstacle.radius + reserve
+            else:
+                where, room = [obstacle.center], obstacle.radius + reserve
+            for center in where:
+                cx, cy = center[0], center[1]
+                bounds.append((math.hypot(cx - x, cy - y) - room - kept, (cx, cy, room)))
+        bounds.sort()
+        best = math.inf
+        for bound, disc in bounds:
+            if bound >= best:
+                break
+            best = min(best, self._clearance(path, disc))
+        self._least = best
+        # Farther discs cannot come into play within one hold, whatever the control.
+        cutoff = 2.0 * (self._loss + _RESERVE_M)
+        self._close = [disc for bound, disc in bounds if bound < cutoff] if best < cutoff else []
 
-    def _clearance(self, path: StoppingPath, i: int) -> float:
-        x, y = self._centers[i]
-        room = float(self._radii[i]) + self.margin + self.state_error
-        return (
-            min(path.distance(float(x), float(y)), path.end_distance(float(x), float(y)) - self._swivel)
-            - room
-        )
+    def _clearance(self, path: StoppingPath, disc: _Circle) -> float:
+        x, y, room = disc
+        if path.spread:  # it may come to rest anywhere in the area
+            return path.distance(x, y) - self._swivel - room
+        return min(path.distance(x, y), path.end_distance(x, y) - self._swivel) - room
 
     def value(self, plant: MujocoPlant) -> Array:
-        """Clearance of the stopping path from the nearest disc, m, shape (1,).
-
-        For discs that no manoeuvre of the next step can matter to, a lower bound.
-        """
+        """Clearance of the stopping path from the nearest disc, m, shape (1,)."""
         self._look(plant)
-        if not self._gap.size:
-            return np.array([np.inf])
-        bound = self._gap - self._path.reach - self._swivel
-        order = np.argsort(bound)
-        best = math.inf
-        for i in order.tolist():
-            if bound[i] >= best:
-                break
-            best = min(best, self._clearance(self._path, i))
-        return np.array([best])
+        return np.array([self._least])
 
-    def _needed(self, i: int) -> float:
+    def _needed(self, disc: _Circle, backup: StoppingPath) -> float:
         """The clearance that a control must leave: a share of today's, or some recovery where it is lost."""
-        now = self._clearance(self._path, i)
+        now = self._clearance(self._path, disc)
         if now < 0.0:
             return now * (1.0 - _RECOVERY_RATE * self.drive.hold_s)
         target = _RESERVE_M + (1.0 - _DECAY_PER_HOLD) * max(0.0, now - _RESERVE_M)
         # Never more than the backup manoeuvre leaves: it is what makes the constraint always feasible.
-        return min(target, self._clearance(self._after_backup(), i))
+        return min(target, self._clearance(backup, disc))
 
-    def _after_backup(self) -> StoppingPath:
-        if self._backup_path is None:
-            self._backup_path = self._after(self._ends()[0], 0.0)
-        return self._backup_path
+    def _backups(self) -> list[StoppingPath]:
+        if not self._backup:
+            self._backup = self._after(self._ends()[0], 0.0)
+        return self._backup
 
-    def _after(self, drive: float, turn: float) -> StoppingPath:
-        return self.drive.stopping_path(self.drive.predict(self._motion, drive, turn), self.brake)
+    def _after(self, drive: float, turn: float) -> list[StoppingPath]:
+        """The stopping paths at the end of a held control, one per model of the uncertainty."""
+        path, motion, brake = self.drive.stopping_path, self._motion, self.brake
+        return [path(model.predict(motion, drive, turn), brake) for model in self._models]
 
     def admits(self, plant: MujocoPlant, control: Array) -> bool:
         """Predict the held control step; its end must still have a safe stopping path."""
         self._look(plant)
         if not self._close:
             return True
-        path = self._after(float(control[self._frame.drive_index]), float(control[self._frame.turn_index]))
-        for i in self._close:
-            left = self._clearance(path, i)
-            if left < self._growth and left < self._needed(i) * (1.0 - _ROW_SLACK):
-                return False
+        paths = self._after(float(control[self._frame.drive_index]), float(control[self._frame.turn_index]))
+        for k, path in enumerate(paths):
+            for disc in self._close:
+                left = self._clearance(path, disc)
+                if left < self._loss and left < self._needed(disc, self._backups()[k]) * (1.0 - _ROW_SLACK):
+                    return False
         return True
 
     def rows(self, plant: MujocoPlant) -> HalfSpaces:
@@ -179,20 +180,20 @@ class HeadingDriveClearance:
         normals, offsets = [], []
         if self._close:
             braking, pushing = self._ends()
-            base, pushed = self._after_backup(), self._after(pushing, 0.0)
-            left, right = self._after(braking, 1.0), self._after(braking, -1.0)
-            for i in self._close:
-                at_brake = self._clearance(base, i)
-                by_drive = (self._clearance(pushed, i) - at_brake) / (pushing - braking)
-                by_turn = 0.5 * (self._clearance(left, i) - self._clearance(right, i))
-                needed = self._needed(i)
-                worst = at_brake + min(0.0, by_drive * (pushing - braking)) - abs(by_turn)
-                if worst >= needed:
-                    continue
-                normal = np.zeros(plant.model.nu)
-                normal[k], normal[t] = -by_drive, -by_turn
-                normals.append(normal)
-                offsets.append(at_brake - by_drive * braking - needed)
+            probes = (self._after(pushing, 0.0), self._after(braking, 1.0), self._after(braking, -1.0))
+            for base, pushed, left, right in zip(self._backups(), *probes, strict=True):
+                for disc in self._close:
+                    at_brake = self._clearance(base, disc)
+                    by_drive = (self._clearance(pushed, disc) - at_brake) / (pushing - braking)
+                    by_turn = 0.5 * (self._clearance(left, disc) - self._clearance(right, disc))
+                    needed = self._needed(disc, base)
+                    worst = at_brake + min(0.0, by_drive * (pushing - braking)) - abs(by_turn)
+                    if worst >= needed:
+                        continue
+                    normal = np.zeros(plant.model.nu)
+                    normal[k], normal[t] = -by_drive, -by_turn
+                    normals.append(normal)
+                    offsets.append(at_brake - by_drive * braking - needed)
         if not normals:
             return HalfSpaces.none(plant.model.nu)
         return HalfSpaces(np.array(normals), np.array(offsets))
@@ -204,6 +205,38 @@ class HeadingDriveClearance:
         full = self.drive.drive_limit / self.drive.drive_gain
         braking = self.drive.brake_control(ahead) if self.brake else 0.0
         return braking, math.copysign(full, ahead)
+
+    def reset(self) -> None:
+        """Forget the side on which a disc is being passed."""
+        self._side, self._side_steps = 0.0, 0
+
+    def suggestions(self, plant: MujocoPlant, control: Array) -> list[Array]:
+        """Controls that lead around the disc in the way, to be tried before a refused control is projected."""
+        if not self.detour:
+            return []
+        self._look(plant)
+        k, t = self._frame.drive_index, self._frame.turn_index
+        drive = float(control[k])
+        if not self._close or drive == 0.0:
+            return []
+        m = self._motion
+        ahead, beside = math.cos(m.heading), math.sin(m.heading)
+        if drive < 0.0:
+            ahead, beside = -ahead, -beside
+        in_front = [d for d in self._close if (d[0] - m.x) * ahead + (d[1] - m.y) * beside > 0.0]
+        if not in_front:
+            return []  # driving away from all of them: nothing to go around
+        if self._side_steps <= 0:
+            path = self._after(drive, float(control[t]))[0]
+            x, y, _ = min(in_front, key=lambda disc: self._clearance(path, disc))
+            # A disc to the right of the drive is passed on the left.
+            self._side = 1.0 if ahead * (y - m.y) - beside * (x - m.x) <= 0.0 else -1.0
+        self._side_steps = _DETOUR_MEMORY
+        around = np.array(control)
+        around[t] = self._side
+        turn_only = np.array(around)
+        turn_only[k] = 0.0
+        return [around, turn_only]
 
     def backup(self, plant: MujocoPlant) -> Array:
         """The control that never shrinks the clearance: brake along the heading, hold the heading."""

@@ -19,7 +19,7 @@ regulating a clearance), for this plant. Plain floats: at this size they are fas
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 
@@ -44,6 +44,7 @@ class StoppingPath(NamedTuple):
         forward: Distance until the forward motion stops, m.
         sideways: Distance that the sideways motion coasts, m.
         crossing: Sideways distance at which the tangent of the motion reaches `forward`, m.
+        reach: No point of the area is farther than this from the present position, m.
         spread: True where mass or damping are uncertain: the trapezoid instead of the triangle.
     """
 
@@ -56,6 +57,7 @@ class StoppingPath(NamedTuple):
     forward: float
     sideways: float
     crossing: float
+    reach: float
     spread: bool
 
     def distance(self, px: float, py: float) -> float:
@@ -79,11 +81,6 @@ class StoppingPath(NamedTuple):
         end_x = self.x + self.forward * self.ex + self.sideways * self.sx
         end_y = self.y + self.forward * self.ey + self.sideways * self.sy
         return math.hypot(px - end_x, py - end_y)
-
-    @property
-    def reach(self) -> float:
-        """No point of the area is farther than this from the present position, m."""
-        return math.hypot(self.forward, self.sideways)
 
 
 def _to_segment(px: float, py: float, ax: float, ay: float, bx: float, by: float) -> float:
@@ -149,6 +146,24 @@ class HeadingDrive:
         """Largest change of speed in one control step inside the uncertainty, m/s."""
         return self.drive_limit / (self.mass * (1.0 - self.uncertainty)) * self.hold_s
 
+    def corners(self) -> "list[HeadingDrive]":
+        """The bodies at the corners of the uncertainty, each certain; this one alone if nothing is uncertain."""
+        if self.uncertainty == 0.0:
+            return [self]
+        factors = (1.0 - self.uncertainty, 1.0 + self.uncertainty)
+        return [
+            replace(
+                self,
+                mass=self.mass * m,
+                yaw_inertia=self.yaw_inertia * m,
+                damping=self.damping * c,
+                yaw_damping=self.yaw_damping * c,
+                uncertainty=0.0,
+            )
+            for m in factors
+            for c in factors
+        ]
+
     def brake_distance(self, speed: float) -> float:
         """Longest distance to a stop under full braking, m, for a forward speed in m/s (>= 0).
 
@@ -195,6 +210,7 @@ class HeadingDrive:
             forward,
             sideways,
             crossing,
+            math.hypot(forward, sideways),
             self.uncertainty > 0.0,
         )
 

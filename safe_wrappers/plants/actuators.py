@@ -20,6 +20,8 @@ _TRANSMISSIONS = {
     mujoco.mjtTrn.mjTRN_TENDON,
 }
 
+_JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+
 
 def refuse_unsupported(model: mujoco.MjModel) -> None:
     """Raise for any actuator whose force is not affine in its control at a given state."""
@@ -64,11 +66,12 @@ class AffineActuators:
         refuse_unsupported(model)
         self._model = model
         self._moment = np.zeros((model.nu, model.nv))
+        self._on_joints: tuple[Array, Array, Array] | None = None
+        self._joints_suffice = False
 
-    def gain_and_bias(self, data: mujoco.MjData) -> tuple[Array, Array]:
+    def gain_and_bias(self, length: Array, velocity: Array) -> tuple[Array, Array]:
         """Force per control and force at zero control, shapes (nu,) and (nu,)."""
         m = self._model
-        length, velocity = data.actuator_length, data.actuator_velocity
         affine = m.actuator_gaintype == mujoco.mjtGain.mjGAIN_AFFINE
         gain = m.actuator_gainprm[:, 0] + affine * (
             m.actuator_gainprm[:, 1] * length + m.actuator_gainprm[:, 2] * velocity
@@ -90,10 +93,16 @@ class AffineActuators:
         )
         return self._moment
 
-    def acting_range(self, data: mujoco.MjData) -> tuple[Array, Array]:
+    def acting_range(self, length: Array, velocity: Array, hold_s: float = 0.0) -> tuple[Array, Array]:
         """The controls between which the force still changes, inside ctrlrange; shapes (nu,) and (nu,).
 
         An actuator that is saturated over its whole ctrlrange gets a range of zero width.
+
+        Args:
+            length: Of the actuators' transmissions, m or rad, shape (nu,).
+            velocity: Of the same, shape (nu,).
+            hold_s: Widen by what a speed servo's own force can shift its clamp within this time, s; MuJoCo's
+                `actuator_acc0` (acceleration per force in the reference pose) bounds how fast.
         """
         m = self._model
         limited = m.actuator_ctrllimited.astype(bool)
@@ -102,10 +111,32 @@ class AffineActuators:
         clamped = m.actuator_forcelimited.astype(bool)
         if not clamped.any():
             return low, high
-        gain, bias = self.gain_and_bias(data)
+        gain, bias = self.gain_and_bias(length, velocity)
         acts = clamped & (gain != 0.0)
         scale = np.where(acts, gain, 1.0)
         ends = (m.actuator_forcerange - bias[:, None]) / scale[:, None]
-        least = np.where(acts, ends.min(axis=1), -np.inf)
-        most = np.where(acts, ends.max(axis=1), np.inf)
+        feedback = np.abs(m.actuator_biastype * m.actuator_biasprm[:, 2])
+        strongest = np.abs(m.actuator_forcerange).max(axis=1)
+        reach = np.abs(m.actuator_gear).max(axis=1) * m.actuator_acc0 * strongest * hold_s
+        widen = feedback * reach / np.abs(scale)
+        least = np.where(acts, ends.min(axis=1) - widen, -np.inf)
+        most = np.where(acts, ends.max(axis=1) + widen, np.inf)
         return np.clip(least, low, high), np.clip(most, low, high)
+
+    def motion_without_kinematics(self, qpos: Array, qvel: Array) -> tuple[Array, Array] | None:
+        """Length and velocity where joints alone tell all that a clamp depends on, else None."""
+        m = self._model
+        if self._on_joints is None:
+            depends = m.actuator_forcelimited.astype(bool) & (
+                m.actuator_biasprm[:, 1:3].any(axis=1) | m.actuator_gainprm[:, 1:3].any(axis=1)
+            )
+            depends &= (m.actuator_biastype > 0) | (m.actuator_gaintype > 0)
+            scalar = np.isin(m.actuator_trntype, _JOINT_TRANSMISSIONS)
+            joint = np.where(scalar, m.actuator_trnid[:, 0], 0)
+            scalar &= m.jnt_type[joint] >= int(mujoco.mjtJoint.mjJNT_SLIDE)  # slide or hinge
+            self._joints_suffice = bool((scalar | ~depends).all())
+            self._on_joints = (scalar * m.actuator_gear[:, 0], m.jnt_qposadr[joint], m.jnt_dofadr[joint])
+        if not self._joints_suffice:
+            return None
+        gear, q, v = self._on_joints
+        return gear * qpos[q], gear * qvel[v]

@@ -71,6 +71,7 @@ class MujocoPlant:
         self.data = mujoco.MjData(self.model)
         self._nq, self._nv = int(self.model.nq), int(self.model.nv)
         self._actuators = AffineActuators(self.model)
+        self._clamped = bool(self.model.actuator_forcelimited.any())
         limited = self.model.actuator_ctrllimited.astype(bool)
         self._lower = np.where(limited, self.model.actuator_ctrlrange[:, 0], -np.inf)
         self._upper = np.where(limited, self.model.actuator_ctrlrange[:, 1], np.inf)
@@ -158,29 +159,14 @@ class MujocoPlant:
 
     def _derive(self) -> None:
         m, d = self.model, self.data
-        gain, _ = self._actuators.gain_and_bias(d)
-        least, most = self._actuators.acting_range(d)
+        gain, _ = self._actuators.gain_and_bias(d.actuator_length, d.actuator_velocity)
+        least, most = self._actuators.acting_range(d.actuator_length, d.actuator_velocity)
         moment = self._actuators.moment(d)
         force_per_control = moment * gain[:, None]
         saturated = most <= least
         effect = self._solve_inertia(force_per_control).T
         self._effect = np.where(saturated, 0.0, effect)
         self._drift = d.qacc - self._effect @ np.where(saturated, 0.0, np.clip(d.ctrl, least, most))
-        self._acting = (least, most)
-        if m.actuator_forcelimited.any():
-            self._acting = self._acting_over_hold(least, most, moment, effect, gain)
-
-    def _acting_over_hold(
-        self, least: Array, most: Array, moment: Array, effect: Array, gain: Array
-    ) -> tuple[Array, Array]:
-        """A speed servo's clamp moves with the speed: widen by how far it can move within one hold."""
-        m = self.model
-        feedback = np.abs(np.where(m.actuator_biastype > 0, m.actuator_biasprm[:, 2], 0.0))
-        if not feedback.any():
-            return least, most
-        change = np.abs(moment @ self._drift) + np.abs(moment @ effect) @ (most - least)
-        widen = feedback * change * self.hold_s / np.where(gain != 0.0, np.abs(gain), np.inf)
-        return np.maximum(least - widen, self._lower), np.minimum(most + widen, self._upper)
 
     def _solve_inertia(self, rows: Array) -> Array:
         """`rows @ inv(M + J_a' D_a J_a)`: accelerations per generalised force with the active constraints."""
@@ -272,8 +258,13 @@ class MujocoPlant:
 
         Narrower than the bounds where a forcerange clamps; beyond it f + g u is not the machine.
         """
-        self.forward()
-        return self._acting
+        if not self._clamped:
+            return self._lower, self._upper
+        motion = self._actuators.motion_without_kinematics(self.qpos, self.qvel)
+        if motion is None:
+            data = self.forward()
+            motion = data.actuator_length, data.actuator_velocity
+        return self._actuators.acting_range(*motion, self.hold_s)
 
     def inertia_diagonal(self) -> Array:
         """Diagonal of the joint-space inertia, shape (nv,), kg or kg m^2."""

@@ -1,6 +1,7 @@
 """CBFActionFilter: the executed action is the closest one to the policy's that every constraint admits."""
 
 import copy
+import math
 import time
 import warnings
 from collections.abc import Sequence
@@ -110,6 +111,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
             getattr(constraint, "bind", _nothing)(self.plant)
         self._certifying: list[Any] = [c for c in self.constraints if hasattr(c, "admits")]
         self._rows_only = [c for c in self.constraints if not hasattr(c, "admits")]
+        self._suggesting: list[Any] = [c for c in self.constraints if hasattr(c, "suggestions")]
         self._barriers: list[Any] = [c for c in self.constraints if hasattr(c, "value")]
         self._fallback = Fallback(fallback, [c for c in self.constraints if hasattr(c, "backup")])
         self._solver = solver
@@ -127,11 +129,14 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         """Reset the env and forget the episode: commands in flight, the last action, the warning."""
         observation, info = self.env.reset(seed=seed, options=options)
         self.plant.executed(None)
+        for constraint in self.constraints:
+            getattr(constraint, "reset", _no_state)()
         self._last = np.clip(np.zeros(self._shape), self._low, self._high)
         self._warned.discard("unsafe")
         self.plant.observe()
         margin = self._margin()
-        self._warn_if_unsafe(margin)
+        if margin < 0.0:
+            self._warn_unsafe(margin)
         info.update(dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0))
         info[keys.CBF_MARGIN] = margin
         info[keys.CBF_UNSAFE] = margin < 0.0
@@ -141,53 +146,55 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         """Filter the action and step the env with what may be executed."""
         started = time.perf_counter()
         proposed = self._checked(action)
-        finite = bool(np.isfinite(proposed).all())
         self.plant.observe()
         margin = self._margin()
-        self._warn_if_unsafe(margin)
-        if finite:
+        if margin < 0.0:
+            self._warn_unsafe(margin)
+        # False for NaN too, so that one comparison clears the common case.
+        inside = bool(((proposed >= self._low) & (proposed <= self._high)).all())
+        finite = inside or bool(np.isfinite(proposed).all())
+        clipped = 0.0
+        if inside:
+            decision = self._decide(proposed)
+        elif finite:
             boxed = np.clip(proposed, self._low, self._high)
-            decision = self._decide(boxed)
-        else:
-            self._warn_once("nonfinite", f"the policy's action is not finite ({proposed}); the fallback acts")
-            proposed = np.where(np.isfinite(proposed), proposed, 0.0)
-            boxed = np.clip(proposed, self._low, self._high)
-            decision = replace(self._decide(self._safe(None)), fallback=True, changed=True)
-        boxing = boxed - proposed
-        clipped = float(np.sqrt(boxing @ boxing)) if finite else 0.0
-        if clipped > 0.0:
+            clipped = float(np.linalg.norm(boxed - proposed))
             self._warn_once(
                 "clipped",
                 f"the policy's action left the action space by {clipped:.3g}; it is boxed (cbf/clipped)",
             )
-        # Bit for bit the policy's own action wherever the filter has nothing to say.
-        if not decision.changed and clipped == 0.0:
-            sent: Any = action
-            executed = proposed
+            decision = self._decide(boxed)
+        else:
+            self._warn_once("nonfinite", f"the policy's action is not finite ({proposed}); the fallback acts")
+            proposed = np.where(np.isfinite(proposed), proposed, 0.0)
+            decision = replace(self._decide(self._safe(None)), fallback=True, changed=True)
+        if inside and not decision.changed:
+            # Bit for bit the policy's own action wherever the filter has nothing to say.
+            sent, executed, correction = action, proposed, 0.0
         else:
             sent = np.clip(decision.control, self._low, self._high).astype(self._dtype)
             executed = sent.astype(np.float64)
+            correction = float(np.linalg.norm(executed - proposed))
         self._last = executed
         self.plant.executed(executed)
         self.filter_seconds += time.perf_counter() - started
         self.filter_calls += 1
         observation, reward, terminated, truncated, info = self.env.step(sent)
-        change = executed - proposed
         info[keys.CBF_INTERVENED] = decision.changed
         info[keys.CBF_INFEASIBLE] = decision.infeasible
         info[keys.CBF_FALLBACK] = decision.fallback
         info[keys.CBF_NONFINITE] = not finite
         info[keys.CBF_UNSAFE] = margin < 0.0
-        info[keys.CBF_CORRECTION] = float(np.sqrt(change @ change))
+        info[keys.CBF_CORRECTION] = correction
         info[keys.CBF_CLIPPED] = clipped
         info[keys.CBF_MARGIN] = margin
         info[keys.PROPOSED_ACTION] = proposed
-        info[keys.EXECUTED_ACTION] = np.array(executed)
+        info[keys.EXECUTED_ACTION] = executed
         return observation, reward, terminated, truncated, info
 
     def _checked(self, action: Any) -> Array:
         try:
-            proposed = np.asarray(action, dtype=np.float64)
+            proposed = np.array(action, dtype=np.float64)
         except (TypeError, ValueError):
             raise ActionError(f"expected an action of shape {self._shape}, got {action!r}") from None
         if proposed.shape != self._shape:
@@ -195,21 +202,21 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         return proposed
 
     def _margin(self) -> float:
-        lowest = np.inf
+        lowest = math.inf
         for barrier in self._barriers:
             h = barrier.value(self.plant)
-            lowest = min(lowest, float(np.min(h, initial=np.inf)))
+            if h.size:
+                lowest = min(lowest, float(h.min()))
         # inf: nothing is near; NaN: a broken h, which the rows will report as failed.
-        return lowest if np.isfinite(lowest) else (-np.inf if np.isnan(lowest) else 0.0)
+        return lowest if math.isfinite(lowest) else (-1.0 if math.isnan(lowest) else 0.0)
 
-    def _warn_if_unsafe(self, margin: float) -> None:
-        if margin < 0.0:
-            self._warn_once(
-                "unsafe",
-                f"the state is outside the safe set (cbf/margin = {margin:.3g}); the filter drives it "
-                "back where it can, and promises nothing until it is inside",
-                UnsafeStateWarning,
-            )
+    def _warn_unsafe(self, margin: float) -> None:
+        self._warn_once(
+            "unsafe",
+            f"the state is outside the safe set (cbf/margin = {margin:.3g}); the filter drives it "
+            "back where it can, and promises nothing until it is inside",
+            UnsafeStateWarning,
+        )
 
     def _warn_once(self, what: str, message: str, category: type[Warning] = UserWarning) -> None:
         if what not in self._warned:
@@ -224,6 +231,11 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         refused = not self._admitted(boxed)
         if not refused and not self._rows_only:
             return _Decision(boxed, changed=False)
+        if refused:
+            for constraint in self._suggesting:
+                for control in constraint.suggestions(self.plant, boxed):
+                    if self._admitted(control) and self._rows_hold(control):
+                        return _Decision(control)
         asked = self.constraints if refused else self._rows_only
         decision = self._projected(boxed, asked)
         if decision is None and not refused:  # what the rows made of it is no longer admitted
@@ -256,6 +268,12 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
             return None
         return self._towards_fallback(control, normals, offsets)
 
+    def _rows_hold(self, control: Array) -> bool:
+        if not self._rows_only:
+            return True
+        normals, offsets = self._rows(self._rows_only)
+        return bool((normals @ control <= offsets + _ROW_TOLERANCE).all())
+
     def _rows(self, asked: list[Constraint]) -> tuple[Array, Array]:
         parts = [c.rows(self.plant) for c in asked]
         if len(parts) == 1:
@@ -269,10 +287,19 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
             blend = control + share * (safe - control)
             if bool((normals @ blend <= offsets + _ROW_TOLERANCE).all()) and self._admitted(blend):
                 return _Decision(blend)
+        for j in range(safe.size):
+            mixed = safe.copy()
+            mixed[j] = control[j]
+            if bool((normals @ mixed <= offsets + _ROW_TOLERANCE).all()) and self._admitted(mixed):
+                return _Decision(mixed)
         return _Decision(safe, fallback=True, infeasible=not self._admitted(safe))
 
     def _safe(self, least: Array | None) -> Array:
         return self._fallback(self.plant, self._last, self._low, self._high, least)
+
+
+def _no_state() -> None:
+    """A constraint without `reset` keeps nothing from one episode to the next."""
 
 
 def _nothing(plant: Plant) -> None:
