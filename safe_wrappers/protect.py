@@ -17,11 +17,15 @@ VASE_HULL_RADIUS_M = 0.1415
 """Around a vase's centre: the corners of a square of side 0.2, rounded up."""
 
 
-def _point_goal(env: gym.Env[Any, Any], detour: bool = True, uncertainty: float = 0.0) -> list[Constraint]:
+def _point_goal(
+    env: gym.Env[Any, Any], detour: bool = True, brake: bool = True, uncertainty: float = 0.0
+) -> list[Constraint]:
     obstacles: list[Any] = [Discs("hazard_positions", radius=0.2)]
     if env.unwrapped.level.vases_cost:  # type: ignore[attr-defined]
         obstacles.append(Discs("vase_positions", radius=POINT_HULL_RADIUS_M + VASE_HULL_RADIUS_M))
-    return [HeadingDriveClearance(obstacles, margin=0.004, detour=detour, uncertainty=uncertainty)]
+    return [
+        HeadingDriveClearance(obstacles, margin=0.004, detour=detour, brake=brake, uncertainty=uncertainty)
+    ]
 
 
 def _inverted_pendulum(env: gym.Env[Any, Any]) -> list[Constraint]:
@@ -45,7 +49,9 @@ _RECIPES: dict[str, Callable[..., list[Constraint]]] = {
 def protect_options() -> frozenset[str]:
     """Every option that `protect` knows, for whichever env."""
     of_recipes = {n for recipe in _RECIPES.values() for n in inspect.signature(recipe).parameters}
-    return frozenset((of_recipes | inspect.signature(CBFActionFilter).parameters.keys()) - {"env", "constraints"})
+    return frozenset(
+        (of_recipes | inspect.signature(CBFActionFilter).parameters.keys()) - {"env", "constraints"}
+    )
 
 
 def protect(env: gym.Env[Any, Any], **options: Any) -> CBFActionFilter:
@@ -55,7 +61,8 @@ def protect(env: gym.Env[Any, Any], **options: Any) -> CBFActionFilter:
         env: Made by `gymnasium.make`; its id says which recipe applies, whatever the version.
         options: Passed to `CBFActionFilter`: `margin` (added to the recipe's own), `fallback`, `solver`,
             `plant`. SafePointGoal also takes `detour` (go around a hazard instead of stopping before it,
-            default True) and `uncertainty` (of mass and damping, a fraction, default 0).
+            default True), `brake` (count on the drive to stop, default True) and `uncertainty` (of mass and
+            damping, a fraction, default 0).
 
     Raises:
         UnsupportedEnvError: No recipe for this env; the message has the lines that protect it by hand.

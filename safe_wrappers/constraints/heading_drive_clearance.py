@@ -87,6 +87,12 @@ class HeadingDriveClearance:
         if not isinstance(plant, MujocoPlant):
             raise UnsupportedEnvError("HeadingDriveClearance needs a MujocoPlant: it reads the robot's model")
         self._frame = _PlanarFrame(plant, self.body)
+        self._read_constants(plant)
+        self._stamp = -1
+        self.reset()
+
+    def _read_constants(self, plant: MujocoPlant) -> None:
+        self._revision = plant.revision
         self.drive = drive = heading_drive(plant, self.body, self.uncertainty)
         # Predictions are made for the corners of the uncertainty: each must keep what is needed.
         self._models = drive.corners()
@@ -94,14 +100,14 @@ class HeadingDriveClearance:
         # The most that one hold's drive can add to the path; a turn and the way travelled depend on the speed.
         self._push = drive.fastest_change * (drive.hold_s + drive.coast_time)
         self._turn = drive.hold_s * min(drive.yaw_limit / drive.yaw_damping, math.pi / drive.hold_s)
-        self._stamp = -1
-        self.reset()
 
     def _look(self, plant: MujocoPlant) -> None:
         """Take the state, once per observation."""
         if plant.stamp == self._stamp:
             return
         self._stamp = plant.stamp
+        if plant.revision != self._revision:
+            self._read_constants(plant)
         self._side_steps -= 1
         self._motion = motion = self._frame.motion(plant)
         self._path = path = self.drive.stopping_path(motion, self.brake)
@@ -145,7 +151,11 @@ class HeadingDriveClearance:
         """The clearance that a control must leave: a share of today's, or some recovery where it is lost."""
         now = self._clearance(self._path, disc)
         if now < 0.0:
-            return now * (1.0 - _RECOVERY_RATE * self.drive.hold_s)
+            # As much recovery as the drive can give here: across the heading it can give none.
+            full = self.drive.drive_limit / self.drive.drive_gain
+            ways = (self._after(full, 0.0)[0], self._after(-full, 0.0)[0], backup)
+            best = max(self._clearance(path, disc) for path in ways)
+            return min(now * (1.0 - _RECOVERY_RATE * self.drive.hold_s), best)
         target = _RESERVE_M + (1.0 - _DECAY_PER_HOLD) * max(0.0, now - _RESERVE_M)
         # Never more than the backup manoeuvre leaves: it is what makes the constraint always feasible.
         return min(target, self._clearance(backup, disc))
@@ -169,8 +179,10 @@ class HeadingDriveClearance:
         for k, path in enumerate(paths):
             for disc in self._close:
                 left = self._clearance(path, disc)
-                if left < self._loss and left < self._needed(disc, self._backups()[k]) * (1.0 - _ROW_SLACK):
-                    return False
+                if left < self._loss:
+                    needed = self._needed(disc, self._backups()[k])
+                    if left < needed - _ROW_SLACK * abs(needed):
+                        return False
         return True
 
     def rows(self, plant: MujocoPlant) -> HalfSpaces:

@@ -44,12 +44,16 @@ class MujocoPlant:
     hold_s: float
     stamp: int
     """Counts observations, so that a constraint can keep what it has computed for one of them."""
+    revision: int
+    """Counts changes of the model, so that a constraint can read its constants anew."""
 
     def __init__(self, model: mujoco.MjModel | None = None, delay_s: float = 0.0) -> None:
         self._given = model
         self.delay_s = float(delay_s)
         self._pending: deque[Array] = deque()
-        self.stamp = 0
+        self._factors = (1.0, 1.0)
+        self._raw: Any = None
+        self.stamp = self.revision = 0
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
         """Attach to an env and copy its model."""
@@ -83,6 +87,8 @@ class MujocoPlant:
         self._pending = deque(maxlen=max(1, -(-self._delay_steps // self.substeps)))
         self._snapshot = np.zeros(mujoco.mj_stateSize(self.model, int(_STATE)))
         self._loaded = self._forwarded = False
+        if self._factors != (1.0, 1.0):
+            self.perturb(*self._factors)
 
     def _check_action_space(self, env: gym.Env[Any, Any]) -> None:
         space = env.action_space
@@ -99,9 +105,13 @@ class MujocoPlant:
             )
 
     def perturb(self, mass: float = 1.0, damping: float = 1.0) -> None:
-        """Scale the masses (and inertias) and joint damping of the plant's own model."""
+        """Scale the masses (and inertias) and joint damping of the plant's own model, now or once it has one."""
         if not (mass > 0.0 and damping >= 0.0):
             raise ConfigurationError(f"factors must be positive, got mass={mass}, damping={damping}")
+        if self._raw is None:
+            self._factors = (self._factors[0] * mass, self._factors[1] * damping)
+            return
+        self.revision += 1
         self.model.body_mass *= mass
         self.model.body_inertia *= mass
         self.model.dof_damping *= damping
@@ -158,7 +168,7 @@ class MujocoPlant:
         return np.asarray(np.clip(0.0, self._lower, self._upper))
 
     def _derive(self) -> None:
-        m, d = self.model, self.data
+        d = self.data
         gain, _ = self._actuators.gain_and_bias(d.actuator_length, d.actuator_velocity)
         least, most = self._actuators.acting_range(d.actuator_length, d.actuator_velocity)
         moment = self._actuators.moment(d)

@@ -1,0 +1,158 @@
+"""Violations of SafePointGoal under adversarial drivers, with the filter on and off.
+
+    python -m benchmarks.adversarial                     # 1,000,000 filtered steps per level, 5 drivers
+    python -m benchmarks.adversarial --mismatch          # the plant wrong by 20 % in mass and damping
+    python -m benchmarks.adversarial --off --steps 20000 # the drivers unfiltered
+    python -m benchmarks.adversarial --price             # what each inset costs the goal-seeking driver
+
+A violation is a control step in which the env's own truth was broken at any physics substep
+(`cost_substep`): the centre in a hazard disc, or, at level 2, a vase touched or moving.
+"""
+
+import argparse
+import itertools
+import json
+import multiprocessing
+import warnings
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+import safe_wrappers as sw
+from benchmarks.drivers import DRIVERS
+from safe_wrappers.errors import UnsafeStateWarning
+
+RESULTS = Path(__file__).parent / "results"
+VARIANTS: dict[str, dict[str, Any]] = {
+    "brake and coast, detour": {},
+    "brake and coast": {"detour": False},
+    "coast only, detour": {"brake": False},
+    "coast only": {"brake": False, "detour": False},
+}
+
+
+@dataclass(frozen=True)
+class Job:
+    """One driver on one level for so many steps."""
+
+    level: int
+    driver: str
+    steps: int
+    seed: int
+    filtered: bool = True
+    mass: float = 1.0
+    damping: float = 1.0
+    uncertainty: float = 0.0
+    variant: str = "brake and coast, detour"
+
+
+def run(job: Job) -> dict[str, Any]:
+    """Drive, count, and say what it cost."""
+    warnings.simplefilter("ignore", UnsafeStateWarning)  # counted below
+    env: Any = gym.make(f"SafePointGoal{job.level}-v0")
+    if job.filtered:
+        plant = sw.MujocoPlant()
+        plant.perturb(mass=job.mass, damping=job.damping)
+        options = {"uncertainty": job.uncertainty, **VARIANTS[job.variant]}
+        env = sw.protect(env, plant=plant, **options)
+    raw = env.unwrapped
+    driver = DRIVERS[job.driver](raw, np.random.default_rng(job.seed))
+    count = dict.fromkeys(("violations", "cost", "intervened", "infeasible", "fallback", "unsafe"), 0)
+    returns: list[float] = []
+    total, lowest, episode = 0.0, np.inf, job.seed * 100_000
+    env.reset(seed=episode)
+    for _ in range(job.steps):
+        _, reward, _, truncated, info = env.step(driver())
+        total += float(reward)
+        count["violations"] += int(info["cost_substep"])
+        count["cost"] += int(info["cost"])
+        if job.filtered:
+            for name in ("intervened", "infeasible", "fallback", "unsafe"):
+                count[name] += int(info[f"cbf/{name}"])
+            lowest = min(lowest, info["cbf/margin"])
+        if truncated:
+            returns.append(total)
+            total, episode = 0.0, episode + 1
+            env.reset(seed=episode)
+    row: dict[str, Any] = asdict(job) | count
+    row["return_mean"] = float(np.mean(returns)) if returns else None
+    row["margin_min_m"] = float(lowest) if job.filtered else None
+    row["filter_us"] = 1e6 * env.filter_seconds / env.filter_calls if job.filtered else None
+    return row
+
+
+def jobs(arguments: argparse.Namespace) -> list[Job]:
+    """What to run."""
+    steps = arguments.steps // len(DRIVERS)
+    levels, drivers = arguments.level, list(DRIVERS)
+    if arguments.price:
+        pairs = itertools.product(levels, VARIANTS)
+        filtered = [Job(lv, "goal-seeking", arguments.steps, 1, variant=v) for lv, v in pairs]
+        return filtered + [Job(lv, "goal-seeking", arguments.steps, 1, filtered=False) for lv in levels]
+    if arguments.mismatch:
+        wrong = list(itertools.product((0.8, 1.2), repeat=2))
+        grid = itertools.product(levels, drivers, wrong)
+        # True is the plant's times 1 / factor: 0.8 needs 25 % of uncertainty, 1.2 needs 17 %.
+        return [Job(lv, d, steps // 4, 2, True, m, c, 0.25) for lv, d, (m, c) in grid]
+    return [
+        Job(lv, d, steps // arguments.parts, part, filtered=not arguments.off)
+        for lv, d, part in itertools.product(levels, drivers, range(arguments.parts))
+    ]
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Markdown: one line per level, driver and variant, episodes and plants pooled."""
+    lines = [
+        "| level | driver | filter | steps | violations | changed | infeasible | fallback | unsafe "
+        "| lowest h (mm) | return |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+
+    def label(row: dict[str, Any]) -> tuple[Any, ...]:
+        return row["level"], row["driver"], row["variant"] if row["filtered"] else "off"
+
+    for key, group in itertools.groupby(sorted(rows, key=label), label):
+        part = list(group)
+        sums = {k: sum(r[k] for r in part) for k in ("steps", "violations", "intervened")}
+        sums |= {k: sum(r[k] for r in part) for k in ("infeasible", "fallback", "unsafe")}
+        margins = [r["margin_min_m"] for r in part if r["margin_min_m"] is not None]
+        returns = [r["return_mean"] for r in part if r["return_mean"] is not None]
+        lines.append(
+            f"| {key[0]} | {key[1]} | {key[2]} | {sums['steps']:,} | {sums['violations']:,} "
+            f"| {sums['intervened'] / sums['steps']:.1%} | {sums['infeasible']} | {sums['fallback']} "
+            f"| {sums['unsafe']} | {1e3 * min(margins):.2f} | {np.mean(returns):.1f} |"
+            if margins
+            else f"| {key[0]} | {key[1]} | {key[2]} | {sums['steps']:,} | {sums['violations']:,} "
+            f"| - | - | - | - | - | {np.mean(returns):.1f} |"
+        )
+    steps, bad = sum(r["steps"] for r in rows), sum(r["violations"] for r in rows)
+    return "\n".join([*lines, "", f"In all: {bad:,} violations in {steps:,} steps."])
+
+
+def main() -> None:
+    """Run the jobs in parallel, print the table, keep the rows."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--level", type=int, nargs="+", default=[1, 2], choices=[1, 2])
+    parser.add_argument("--steps", type=int, default=1_000_000, help="per level (with --price: per variant)")
+    parser.add_argument("--parts", type=int, default=4, help="independent runs per driver")
+    parser.add_argument("--workers", type=int, default=multiprocessing.cpu_count())
+    mode = parser.add_mutually_exclusive_group()
+    mode.add_argument("--mismatch", action="store_true")
+    mode.add_argument("--off", action="store_true")
+    mode.add_argument("--price", action="store_true")
+    arguments = parser.parse_args()
+    with multiprocessing.get_context("spawn").Pool(arguments.workers) as pool:
+        rows = pool.map(run, jobs(arguments), chunksize=1)
+    name = next((m for m in ("mismatch", "off", "price") if getattr(arguments, m)), "filtered")
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / f"adversarial_{name}.json").write_text(json.dumps(rows, indent=1) + "\n")
+    text = table(rows)
+    (RESULTS / f"adversarial_{name}.md").write_text(text + "\n")
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

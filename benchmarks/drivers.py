@@ -1,0 +1,90 @@
+"""Drivers for SafePointGoal that make life hard for a filter; each is a function of the env, seeded."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Action = NDArray[np.float64]
+Driver = Callable[[], Action]
+
+
+def towards(env: Any, target: NDArray[np.float64]) -> Action:
+    """Turn towards a point and push on, knowing nothing of hazards."""
+    offset = target - env.agent_position
+    angle = math.atan2(offset[1], offset[0]) - env.agent_heading
+    angle = (angle + math.pi) % (2.0 * math.pi) - math.pi
+    return np.array([math.cos(angle), np.clip(3.0 * angle, -1.0, 1.0)])
+
+
+def goal_seeking(env: Any, rng: np.random.Generator) -> Driver:
+    """Straight to the goal, blind to hazards and vases."""
+    return lambda: towards(env, env.goal_position)
+
+
+def hazard_seeking(env: Any, rng: np.random.Generator) -> Driver:
+    """Into one obstacle after another, vases too; every 150 steps another one of the nearest three."""
+    state = {"step": 0, "pick": 0}
+
+    def act() -> Action:
+        obstacles = _obstacles(env)
+        if state["step"] % 150 == 0:
+            state["pick"] = int(rng.integers(3))
+        state["step"] += 1
+        near = np.argsort(np.linalg.norm(obstacles - env.agent_position, axis=1))
+        return towards(env, obstacles[near[state["pick"]]])
+
+    return act
+
+
+def lateral_drift(env: Any, rng: np.random.Generator) -> Driver:
+    """Gather speed towards an obstacle, then turn, so that no actuator acts along the velocity."""
+    state = {"step": 0, "pick": 0, "turn": 1.0, "drive": 0.0, "run": 60}
+
+    def act() -> Action:
+        obstacles = _obstacles(env)
+        phase = state["step"] % 110
+        if phase == 0:
+            state.update(pick=int(rng.integers(len(obstacles))), run=int(rng.integers(30, 90)))
+            state.update(turn=float(rng.choice([-1.0, 1.0])), drive=float(rng.choice([-1.0, 0.0, 1.0])))
+        state["step"] += 1
+        if phase < state["run"]:
+            return towards(env, obstacles[state["pick"]])
+        return np.array([state["drive"], state["turn"]])
+
+    return act
+
+
+def bang_bang(env: Any, rng: np.random.Generator) -> Driver:
+    """Full throttle one way or the other, both actuators, held for random times."""
+    state = {"left": 0, "action": np.ones(2)}
+
+    def act() -> Action:
+        if state["left"] == 0:
+            state["left"] = int(rng.geometric(0.04))
+            state["action"] = rng.choice([-1.0, 1.0], size=2)
+        state["left"] -= 1
+        return state["action"]
+
+    return act
+
+
+def uniform(env: Any, rng: np.random.Generator) -> Driver:
+    """Uniform random actions."""
+    return lambda: rng.uniform(-1.0, 1.0, size=2)
+
+
+def _obstacles(env: Any) -> NDArray[np.float64]:
+    vases = env.vase_positions
+    return np.concatenate([env.hazard_positions, vases]) if len(vases) else np.asarray(env.hazard_positions)
+
+
+DRIVERS: dict[str, Callable[[Any, np.random.Generator], Driver]] = {
+    "random": uniform,
+    "goal-seeking": goal_seeking,
+    "hazard-seeking": hazard_seeking,
+    "lateral-drift": lateral_drift,
+    "bang-bang": bang_bang,
+}
