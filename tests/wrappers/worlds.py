@@ -1,0 +1,82 @@
+"""Small worlds whose motion is known exactly: a cart on a line, pushed by a bounded acceleration."""
+
+from typing import ClassVar
+
+import gymnasium as gym
+import numpy as np
+
+import safe_wrappers as sw
+
+
+class Cart(gym.Env):
+    """x'' = u, integrated exactly; keeps what it was given and its largest position between samples."""
+
+    metadata: ClassVar = {"render_modes": []}
+
+    def __init__(self, dt=0.1, latency_steps=0, dtype=np.float32):
+        self.dt = dt
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,), dtype)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+        self.latency_steps = latency_steps
+        self.given, self.seeds, self.options = [], [], []
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.seeds.append(seed)
+        self.options.append(options)
+        self.state = np.array((options or {}).get("state", [0.0, 0.0]), dtype=np.float64)
+        self.queue = [0.0] * self.latency_steps
+        self.farthest = self.state[0]
+        return self.state.copy(), {}
+
+    def step(self, action):
+        self.given.append(action)
+        self.queue.append(float(np.asarray(action)[0]))
+        a = self.queue.pop(0)
+        x, v = self.state
+        times = np.linspace(0.0, self.dt, 21)
+        path = x + v * times + 0.5 * a * times**2
+        self.farthest = max(self.farthest, path.max())
+        self.state = np.array([path[-1], v + a * self.dt])
+        return self.state.copy(), 0.0, False, False, {}
+
+
+def drift(x):
+    return np.array([x[1], 0.0])
+
+
+def push(x):
+    return np.array([[0.0], [1.0]])
+
+
+def read(env):
+    return env.state
+
+
+def cart_plant(dt=0.1, delay_s=0.0, **bounds):
+    return sw.AnalyticPlant(f=drift, g=push, state=read, hold_s=dt, delay_s=delay_s, **bounds)
+
+
+def wall(at, **more):
+    """Stay left of a wall, on the cart's line."""
+    return sw.Clearance([sw.Plane([at], [-1.0])], braking=1.0, position=[0], velocity=[1], **more)
+
+
+class SpeedRow:
+    """v <= limit at the end of the hold, by the plainest possible constraint: rows alone, no h."""
+
+    def __init__(self, limit):
+        self.limit = limit
+
+    def rows(self, plant):
+        return sw.HalfSpaces(np.array([[plant.hold_s]]), np.array([self.limit - plant.state[1]]))
+
+
+class Raw:
+    """Fixed rows, whatever the state."""
+
+    def __init__(self, normals, offsets):
+        self.normals, self.offsets = np.array(normals, float), np.array(offsets, float)
+
+    def rows(self, plant):
+        return sw.HalfSpaces(self.normals, self.offsets)
