@@ -355,7 +355,6 @@ def test_a_safe_episode_warns_of_nothing():
         assert any(i["cbf/intervened"] for i in full_throttle(filtered, 60))
 
 
-@pytest.mark.xfail(strict=True, reason="recovery is infeasible from rest, and the fallback brakes for ever")
 def test_point_goal_started_inside_a_hazard_leaves_it():
     layout = {
         "agent": [0.0, 0.0, 0.3],

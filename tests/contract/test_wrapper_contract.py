@@ -1,0 +1,390 @@
+"""What Gymnasium asks of a wrapper, over every wrapper that the library exports.
+
+They are found by `safe_wrappers.__all__`; a new one needs an example below and is then held to all of it.
+"""
+
+import ast
+import inspect
+import json
+import pickle
+import textwrap
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env
+
+import safe_wrappers as sw
+
+TASK, STEPS = "SafePointGoal1-v0", 60
+
+
+def _clearance():
+    return sw.HeadingDriveClearance([sw.Discs("hazard_positions", radius=0.2)], margin=0.004)
+
+
+EXAMPLES = {
+    "CBFActionFilter": {
+        "a HeadingDriveClearance": (TASK, lambda: {"constraints": [_clearance()]}),
+        "a JointSpeedLimit with options": (
+            "Reacher-v5",
+            lambda: {
+                "constraints": [sw.JointSpeedLimit(4.0)],
+                "fallback": "hold",
+                "solver": "clarabel",
+                "margin": 0.1,
+            },
+        ),
+        "a Clearance": (
+            "InvertedPendulum-v5",
+            lambda: {
+                "constraints": [
+                    sw.Clearance([sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])], bodies=["cart"], braking=8.0)
+                ]
+            },
+        ),
+    },
+    "RecordInterventions": {"no arguments": (TASK, dict)},
+}
+"""Wrapper name -> what it shows -> (env id, function of its arguments): plain data or what becomes it."""
+
+EXPORTED = sorted(
+    name
+    for name in sw.__all__
+    if inspect.isclass(getattr(sw, name)) and issubclass(getattr(sw, name), gym.Wrapper)
+)
+CASES = [(name, case) for name in EXPORTED for case in EXAMPLES.get(name, {"": None})]
+every_wrapper = pytest.mark.parametrize(("name", "case"), CASES)
+
+
+def example(name, case):
+    if name not in EXAMPLES:
+        pytest.fail(f"{name} is exported but has no example: add one to EXAMPLES in {__file__}")
+    return EXAMPLES[name][case]
+
+
+def build(name, case):
+    env_id, arguments = example(name, case)
+    return getattr(sw, name)(gym.make(env_id), **arguments())
+
+
+def actions(env, steps=STEPS, seed=0):
+    """Bang-bang, held for a while: what makes a filter intervene."""
+    rng = np.random.default_rng(seed)
+    space = env.action_space
+    held = rng.choice([0.0, 1.0], (steps // 10 + 1, *space.shape)).repeat(10, axis=0)[:steps]
+    return (space.low + held * (space.high - space.low)).astype(space.dtype)
+
+
+def trace(env, seed=0, steps=STEPS):
+    """Everything an agent sees of one episode, as bytes and plain values."""
+    seen = [env.reset(seed=seed)[0].tobytes()]
+    for action in actions(env, steps):
+        observation, reward, terminated, truncated, info = env.step(action)
+        seen.append((observation.tobytes(), float(reward), terminated, truncated, plain(info)))
+        if terminated or truncated:
+            break
+    return seen
+
+
+def plain(info):
+    return {k: v.tobytes() if isinstance(v, np.ndarray) else v for k, v in info.items()}
+
+
+def test_there_are_wrappers_and_each_has_an_example():
+    assert "CBFActionFilter" in EXPORTED and "RecordInterventions" in EXPORTED
+    assert set(EXAMPLES) == set(EXPORTED), "every exported wrapper needs an example, and no other has one"
+
+
+# 1, 2: recording ----------------------------------------------------------------------------------------------
+
+
+@every_wrapper
+def test_gym_make_rebuilds_it_from_its_spec(name, case):
+    env = build(name, case)
+    again = gym.make(env.spec)
+    assert type(again) is getattr(sw, name)
+    assert trace(again) == trace(env)
+
+
+@every_wrapper
+def test_its_spec_survives_json(name, case):
+    env = build(name, case)
+    text = env.spec.to_json()
+    json.loads(text)
+    again = gym.make(EnvSpec.from_json(text))
+    assert trace(again) == trace(env)
+
+
+@every_wrapper
+def test_every_constructor_argument_is_recorded(name, case):
+    wrapper = getattr(sw, name)
+    recorded = build(name, case).spec.additional_wrappers[-1]
+    parameters = [p for p in inspect.signature(wrapper.__init__).parameters if p not in ("self", "env")]
+    assert recorded.name == name
+    assert sorted(recorded.kwargs) == sorted(parameters)
+
+
+def test_what_is_not_plain_data_is_still_recorded_for_gym_make():
+    plant = sw.AnalyticPlant(
+        f=lambda x: np.array([x[1], 15 * np.sin(x[0])]),
+        g=lambda x: np.array([[0.0], [3.0]]),
+        state=lambda env: env.state,
+        hold_s=0.05,
+    )
+    slow = sw.Barrier(lambda x: 4.0 - x[1] ** 2, alpha=2.0)
+    env = sw.CBFActionFilter(gym.make("Pendulum-v1"), [slow], plant=plant, fallback=lambda plant: [0.0])
+    again = gym.make(env.spec)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert trace(again, steps=100) == trace(env, steps=100)
+    assert again.plant is not env.plant  # each filter reads its own env
+
+
+# 3: spaces and check_env --------------------------------------------------------------------------------------
+
+
+@every_wrapper
+def test_check_env_passes_on_the_wrapped_env(name, case):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of unbounded sensors, and of an env that is wrapped
+        check_env(build(name, case), skip_render_check=True)
+
+
+@every_wrapper
+def test_spaces_are_the_envs_own(name, case):
+    env = build(name, case)
+    assert env.action_space == env.env.action_space
+    assert env.observation_space == env.env.observation_space
+    observation = env.reset(seed=0)[0]
+    assert env.observation_space.contains(observation)
+
+
+# 4, 5: reset --------------------------------------------------------------------------------------------------
+
+
+class Witness(gym.Wrapper):
+    """Keeps what the wrapper under test passes on."""
+
+    def reset(self, *, seed=None, options=None):
+        self.passed = (seed, options)
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        self.action = action
+        return super().step(action)
+
+
+@every_wrapper
+def test_reset_passes_seed_and_options_on_and_changes_neither(name, case):
+    env_id, arguments = example(name, case)
+    env = getattr(sw, name)(Witness(gym.make(env_id)), **arguments())
+    options = {"note": [1, 2, {"deep": 3}]}
+    if env_id == TASK:
+        options = {"layout": {"goal": [1.0, 1.0], "hazards": [[0.0, -1.0]]}}
+    before = json.dumps(options)
+    for seed in (3, None, 4):
+        env.reset(seed=seed, options=options)
+        assert env.env.passed[0] == seed and env.env.passed[1] is options
+    env.reset()
+    assert env.env.passed == (None, None)
+    assert json.dumps(options) == before
+
+
+@every_wrapper
+def test_reset_clears_the_wrappers_state(name, case):
+    env = build(name, case)
+    first = trace(env)
+    for action in actions(env, 37, seed=9):
+        env.step(action)
+    assert trace(env) == first
+
+
+@every_wrapper
+def test_it_never_draws_from_the_envs_generator(name, case):
+    env_id, _ = example(name, case)
+    env, bare = build(name, case), gym.make(env_id)
+    for seed in (0, None, None):
+        a, b = env.reset(seed=seed)[0], bare.reset(seed=seed)[0]
+        assert a.tobytes() == b.tobytes()
+        for _ in range(20):
+            env.step(env.action_space.low)
+    assert env.unwrapped.np_random.bit_generator.state == bare.unwrapped.np_random.bit_generator.state
+
+
+# 6: attributes ------------------------------------------------------------------------------------------------
+
+
+@every_wrapper
+def test_it_forwards_no_attributes(name, case):
+    env = build(name, case)
+    with pytest.raises(AttributeError):
+        _ = env.frame_skip
+    assert env.get_wrapper_attr("frame_skip") == env.unwrapped.frame_skip
+    assert "__getattr__" not in vars(getattr(sw, name)) and "__setattr__" not in vars(getattr(sw, name))
+    assert not env.set_wrapper_attr("filter_secnods", 0.0, force=False)
+
+
+# 7, 8: info ---------------------------------------------------------------------------------------------------
+
+
+def types(info):
+    return {
+        k: (v.dtype.str, v.shape) if isinstance(v, np.ndarray) else type(v).__name__
+        for k, v in info.items()
+        if k not in ("interventions", "episode")  # at an episode's end only, by design
+    }
+
+
+@every_wrapper
+def test_info_has_the_same_keys_and_types_at_every_step(name, case):
+    env = build(name, case)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        seen = []
+        for seed in range(2):
+            env.reset(seed=seed)
+            seen += [types(env.step(a)[4]) for a in actions(env)]
+        if name == "CBFActionFilter":
+            seen.append(types(env.step(np.full(env.action_space.shape, np.nan))[4]))
+            seen.append(types(env.step(np.full(env.action_space.shape, 9.0))[4]))
+    assert all(s == seen[0] for s in seen)
+    added = seen[0].keys() - env.unwrapped.step(env.action_space.low)[4].keys()
+    assert added, "a wrapper of ours reports something"
+    assert all("/" in key or key.endswith("_action") for key in added)
+
+
+@every_wrapper
+def test_info_holds_no_wall_clock_value(name, case):
+    # Two runs at different speeds agree in everything.
+    env = build(name, case)
+    first = trace(env, steps=20)
+    inner = env.env.step
+    env.env.step = lambda action: (sum(i * i for i in range(20_000)), inner(action))[1]
+    assert trace(env, steps=20) == first
+
+
+@every_wrapper
+@pytest.mark.parametrize("kind", ["sync", "async"])
+@pytest.mark.parametrize("mode", list(gym.vector.AutoresetMode))
+def test_inside_vector_envs_infos_are_whole(name, case, kind, mode):
+    single = build(name, case)
+    single.reset(seed=0)
+    steps = actions(single, 25)
+    kinds = {"sync": gym.vector.SyncVectorEnv, "async": gym.vector.AsyncVectorEnv}
+
+    def make():
+        return gym.wrappers.TimeLimit(build(name, case), 10)
+
+    envs = kinds[kind]([make, make], autoreset_mode=mode)
+    try:
+        envs.reset(seed=0)
+        first_episode = True
+        compared = 0
+        for action in steps:
+            _, _, terminated, truncated, infos = envs.step(np.stack([action, action]))
+            ended = terminated | truncated
+            first_episode = first_episode and not ended.any()
+            if first_episode:
+                compared += 1
+                expected = single.step(action)[4]
+                for key, value in expected.items():
+                    array = infos[key]
+                    assert infos[f"_{key}"].all()
+                    assert array.dtype == np.asarray(value).dtype, key
+                    np.testing.assert_array_equal(array[0], value, err_msg=key)
+            if ended.any() and mode == gym.vector.AutoresetMode.DISABLED:
+                envs.reset(options={"reset_mask": ended})
+        assert compared >= 2
+    finally:
+        envs.close()
+
+
+# 9: pickling --------------------------------------------------------------------------------------------------
+
+
+@every_wrapper
+def test_nothing_on_self_is_a_lambda_or_a_closure(name, case):
+    env = build(name, case)
+    env.reset(seed=0)
+    own = {k: v for k, v in vars(env).items() if k not in ("env", "_cached_spec", "_saved_kwargs")}
+    pickle.dumps(
+        {k: v for k, v in own.items() if k not in ("plant", "constraints") and not k.startswith("_")}
+    )
+    for key, value in own.items():
+        assert not (inspect.isfunction(value) and "<locals>" in value.__qualname__), key
+        assert not (inspect.isfunction(value) and value.__name__ == "<lambda>"), key
+    tree = ast.parse(textwrap.dedent(inspect.getsource(getattr(sw, name))))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Lambda):
+            assert not any(isinstance(t, ast.Attribute) for t in node.targets), ast.unparse(node)
+
+
+@every_wrapper
+def test_a_pickled_wrapper_still_works(name, case):
+    env = build(name, case)
+    env.reset(seed=0)
+    again = pickle.loads(pickle.dumps(env))
+    assert type(again) is type(env)
+    assert trace(again) == trace(env)
+    assert again.unwrapped is not env.unwrapped
+
+
+@pytest.mark.parametrize("bound", [False, True])
+@pytest.mark.parametrize("case", EXAMPLES["CBFActionFilter"])
+def test_constraints_and_plant_survive_pickling(case, bound):
+    env_id, arguments = example("CBFActionFilter", case)
+    if bound:
+        env = sw.CBFActionFilter(gym.make(env_id), **arguments())
+        env.reset(seed=0)
+        constraints, plant = pickle.loads(pickle.dumps((env.constraints, env.plant)))
+        for mine, theirs in zip(env.constraints, constraints, strict=True):
+            np.testing.assert_array_equal(mine.value(env.plant), theirs.value(plant))
+    else:
+        constraints, plant = pickle.loads(pickle.dumps((arguments()["constraints"], sw.MujocoPlant())))
+        assert constraints == arguments()["constraints"]
+        sw.CBFActionFilter(gym.make(env_id), constraints, plant=plant).reset(seed=0)
+
+
+# 10, 11: actions ----------------------------------------------------------------------------------------------
+
+
+def harmless(name, case):
+    """The wrapper over a witness, with limits that nothing reaches."""
+    if name == "CBFActionFilter":
+        return sw.CBFActionFilter(Witness(gym.make("Reacher-v5")), [sw.JointSpeedLimit(1e9)])
+    env_id, arguments = example(name, case)
+    return getattr(sw, name)(Witness(gym.make(env_id)), **arguments())
+
+
+@every_wrapper
+def test_inactive_is_bit_identical(name, case):
+    env = harmless(name, case)
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for dtype in (np.float32, np.float64):
+        for _ in range(20):
+            action = rng.uniform(-1, 1, env.action_space.shape).astype(dtype)
+            before = action.tobytes()
+            env.step(action)
+            assert env.env.action.tobytes() == before and env.env.action.dtype == dtype
+            assert action.tobytes() == before
+
+
+@every_wrapper
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_non_finite_action_does_not_get_through(name, case, bad):
+    env_id, arguments = example(name, case)
+    env = getattr(sw, name)(Witness(gym.make(env_id)), **arguments())
+    env.reset(seed=0)
+    action = np.full(env.action_space.shape, bad)
+    if name == "RecordInterventions":  # records and changes nothing: the task itself refuses
+        with pytest.raises(sw.SafeWrappersError, match="finite"):
+            env.step(action)
+        return
+    with pytest.warns(UserWarning, match="not finite"):
+        env.step(action)
+    assert np.isfinite(env.env.action).all()
+    assert env.action_space.contains(env.env.action)
