@@ -32,19 +32,27 @@ def refuse_unsupported(model: mujoco.MjModel) -> None:
         gain, bias = mujoco.mjtGain(model.actuator_gaintype[i]), mujoco.mjtBias(model.actuator_biastype[i])
         if transmission not in _TRANSMISSIONS:
             _refuse(
-                name, f"transmission {transmission.name[5:].lower()}", "joint, jointinparent, site, tendon"
+                name, f"transmission {transmission.name[6:].lower()}", "joint, jointinparent, site, tendon"
             )
         if dynamics != mujoco.mjtDyn.mjDYN_NONE:
-            _refuse(name, f"activation dynamics {dynamics.name[5:].lower()}", "none")
+            _refuse(name, f"activation dynamics {dynamics.name[6:].lower()}", "none")
         if gain not in (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE):
-            _refuse(name, f"gain type {gain.name[6:].lower()}", "fixed, affine")
+            _refuse(name, f"gain type {gain.name[7:].lower()}", "fixed, affine")
         if bias not in (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE):
-            _refuse(name, f"bias type {bias.name[6:].lower()}", "none, affine")
+            _refuse(name, f"bias type {bias.name[7:].lower()}", "none, affine")
+        if hasattr(model, "actuator_delay") and model.actuator_delay[i] > 0.0:
+            _refuse(name, f"a delay of {model.actuator_delay[i]} s", "none (say delay_s instead)")
     if model.jnt_actfrclimited.any():
         joint = model.joint(int(np.flatnonzero(model.jnt_actfrclimited)[0])).name
         raise UnsupportedEnvError(
             f"joint {joint!r} clamps the sum of its actuators' forces (actuatorfrcrange), which MujocoPlant does "
             "not model; give the actuators a forcerange instead, or use AnalyticPlant"
+        )
+    if model.tendon_actfrclimited.any():
+        tendon = model.tendon(int(np.flatnonzero(model.tendon_actfrclimited)[0])).name
+        raise UnsupportedEnvError(
+            f"tendon {tendon!r} clamps the sum of its actuators' forces (actuatorfrcrange), which MujocoPlant "
+            "does not model; give the actuators a forcerange instead, or use AnalyticPlant"
         )
 
 

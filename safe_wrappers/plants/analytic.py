@@ -56,11 +56,12 @@ class AnalyticPlant:
         self._x = np.zeros(0)
         self._drift: Array | None = None
         self._effect: Array | None = None
-        self._pending: deque[Array] = deque(maxlen=max(1, int(np.ceil(self.delay_s / self.hold_s - 1e-9))))
+        self._pending: deque[Array] = deque()
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
         """Attach to an env: checks the time step and the bounds."""
         check_timing(env, self.hold_s, self.delay_s)
+        self._pending = deque(maxlen=max(1, int(np.ceil(self.delay_s / self.hold_s - 1e-9))))
         space = env.action_space
         assert isinstance(space, gym.spaces.Box)  # the filter has refused every other space
         m = space.shape[0]
@@ -82,7 +83,7 @@ class AnalyticPlant:
         """Read the state, predict it over the delay."""
         assert self._env is not None  # bound by the filter
         x = np.array(self._state_of(self._env.unwrapped), dtype=np.float64).reshape(-1)
-        if self._pending and self.delay_s > 0.0:
+        if self.delay_s > 0.0:
             x = self._advance(x)
         self._x, self._drift, self._effect = x, None, None
 
@@ -94,12 +95,15 @@ class AnalyticPlant:
             self._pending.append(np.array(control))
 
     def _advance(self, x: Array) -> Array:
-        """RK4 through the commands in flight, the oldest first; each has at most one hold left to act."""
-        remaining = self.delay_s
-        for control in list(self._pending):
-            span = min(self.hold_s, remaining)
-            remaining -= span
-            x = self.integrate(x, control, span)
+        """RK4 through the commands in flight, the oldest first: it has acted in part already.
+
+        Before the first command of an episode no control acts.
+        """
+        early = self.delay_s - self.hold_s * len(self._pending)
+        if early > 0.0:
+            x = self.integrate(x, np.zeros(self._lower.size), early)
+        for i, control in enumerate(self._pending):
+            x = self.integrate(x, control, self.hold_s + (min(early, 0.0) if i == 0 else 0.0))
         return x
 
     def integrate(self, x: Array, control: Array, span_s: float, substeps: int = 4) -> Array:

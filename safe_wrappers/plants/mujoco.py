@@ -123,7 +123,7 @@ class MujocoPlant:
         mujoco.mj_getState(self._raw.model, self._raw.data, self._snapshot, int(_STATE))
         self._loaded = self._forwarded = False
         self.stamp += 1
-        if self._delay_steps and self._pending:
+        if self._delay_steps:
             self._predict_over_delay()
 
     def executed(self, control: Array | None) -> None:
@@ -135,12 +135,13 @@ class MujocoPlant:
 
     def _predict_over_delay(self) -> None:
         self._load()
-        remaining = self._delay_steps
-        for control in list(self._pending):
+        # The oldest command has acted in part already; before the first one the env's own control acts.
+        early = self._delay_steps - self.substeps * len(self._pending)
+        if early > 0:
+            mujoco.mj_step(self.model, self.data, early)
+        for i, control in enumerate(self._pending):
             self.data.ctrl[:] = control
-            steps = min(self.substeps, remaining)
-            remaining -= steps
-            mujoco.mj_step(self.model, self.data, steps)
+            mujoco.mj_step(self.model, self.data, self.substeps + (min(early, 0) if i == 0 else 0))
         mujoco.mj_getState(self.model, self.data, self._snapshot, int(_STATE))
         self._loaded = False
 
@@ -245,9 +246,10 @@ class MujocoPlant:
                 rate[q : q + 3] = self.qvel[v : v + 3]
                 q, v = q + 3, v + 3
             if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
+                # Angular velocities of these joints are in the body's frame; mju_derivQuat wants the world's.
                 turn = np.zeros(4)
-                mujoco.mju_derivQuat(turn, self.qpos[q : q + 4].copy(), self.qvel[v : v + 3].copy())
-                rate[q : q + 4] = turn
+                mujoco.mju_mulQuatAxis(turn, self.qpos[q : q + 4].copy(), self.qvel[v : v + 3].copy())
+                rate[q : q + 4] = 0.5 * turn
             else:
                 rate[q] = self.qvel[v]
         return rate
