@@ -1,0 +1,180 @@
+"""AnalyticPlant: shapes, bounds, time step, delay; on Pendulum and MountainCar against the envs themselves."""
+
+import itertools
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import safe_wrappers as sw
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
+
+PENDULUM = {
+    "f": lambda x: np.array([x[1], 15.0 * np.sin(x[0])]),
+    "g": lambda x: np.array([[0.0], [3.0]]),
+    "state": lambda env: env.state,
+    "hold_s": 0.05,
+}
+
+
+def plant_on(env, **changes):
+    plant = sw.AnalyticPlant(**{**PENDULUM, **changes})
+    plant.bind(env)
+    return plant
+
+
+def test_pendulum_state_f_and_g():
+    env = gym.make("Pendulum-v1")
+    env.reset(seed=0)
+    plant = plant_on(env)
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        env.unwrapped.state = np.array([rng.uniform(-3, 3), rng.uniform(-4, 4)])
+        plant.observe()
+        np.testing.assert_array_equal(plant.state, env.unwrapped.state)
+        u = rng.uniform(-2, 2, 1)
+        before = plant.state.copy()
+        env.step(u)
+        # Pendulum integrates by semi-implicit Euler: its speed is exact for f + g u at the start of the step
+        assert env.unwrapped.state[1] == pytest.approx(
+            before[1] + 0.05 * (plant.f + plant.g @ u)[1], abs=1e-12
+        )
+    assert isinstance(plant, sw.Plant)
+
+
+def test_bounds_default_to_the_action_space_and_broadcast():
+    env = gym.make("Pendulum-v1")
+    env.reset(seed=0)
+    plant = plant_on(env)
+    np.testing.assert_array_equal([plant.lower, plant.upper], [[-2.0], [2.0]])
+    plant = plant_on(env, lower=-1.0, upper=[0.5])
+    np.testing.assert_array_equal([plant.lower, plant.upper], [[-1.0], [0.5]])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"hold_s": 0.02}, r"hold_s = 0.02 s, but one step of this env lasts dt = 0.05 s"),
+        ({"hold_s": -0.05}, r"hold_s is the control interval in seconds, > 0; got -0.05"),
+        ({"hold_s": 0.0}, r"hold_s is the control interval in seconds, > 0; got 0.0"),
+        ({"hold_s": np.nan}, r"hold_s is the control interval in seconds, > 0; got nan"),
+        ({"delay_s": -0.1}, r"delay_s is a time in seconds, >= 0; got -0.1"),
+        ({"delay_s": np.inf}, r"delay_s is a time in seconds, >= 0; got inf"),
+        ({"lower": [-1.0, -1.0]}, r"the env has 1 controls; got bounds of shape \(2,\)"),
+        ({"lower": 3.0}, r"lower must not exceed upper"),
+        ({"upper": np.nan}, r"lower must not exceed upper"),
+    ],
+)
+def test_what_does_not_fit_is_refused(changes, message):
+    with pytest.raises(ConfigurationError, match=message):
+        plant_on(gym.make("Pendulum-v1"), **changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"f": lambda x: np.zeros(3)}, r"f must return the shape of the state \(2,\), got \(3,\)"),
+        ({"f": lambda x: 0.0}, r"f must return the shape of the state \(2,\), got \(\)"),
+        ({"g": lambda x: np.zeros(2)}, r"g must return shape .* \(2, 1\), got \(2,\)"),
+        ({"g": lambda x: np.zeros((2, 2))}, r"g must return shape .* \(2, 1\), got \(2, 2\)"),
+    ],
+)
+def test_wrong_shapes_are_named_when_they_are_first_asked_for(changes, message):
+    env = gym.make("Pendulum-v1")
+    env.reset(seed=0)
+    plant = plant_on(env, **changes)
+    plant.observe()
+    with pytest.raises(ConfigurationError, match=message):
+        _ = plant.f, plant.g
+
+
+def test_mountain_car_has_no_dt_so_any_hold_is_taken_at_its_word():
+    env = gym.make("MountainCarContinuous-v0")
+    env.reset(seed=0)
+    plant = plant_on(
+        env,
+        f=lambda x: np.array([x[1], -0.0025 * np.cos(3 * x[0])]),
+        g=lambda x: np.array([[0.0], [0.0015]]),
+        hold_s=1.0,
+    )
+    for _ in range(20):
+        plant.observe()
+        predicted = plant.state[1] + (plant.f + plant.g @ [1.0])[1]
+        env.step(np.ones(1, np.float32))
+        assert env.unwrapped.state[1] == pytest.approx(min(predicted, 0.07), abs=1e-7)
+
+
+def test_the_state_is_a_copy():
+    env = gym.make("Pendulum-v1")
+    env.reset(seed=0)
+    plant = plant_on(env)
+    plant.observe()
+    kept = plant.state
+    value = kept.copy()
+    env.step(np.ones(1, np.float32))
+    plant.observe()
+    np.testing.assert_array_equal(kept, value)
+    kept[:] = 9.0
+    assert not (env.unwrapped.state == 9.0).any()
+
+
+def test_integration_agrees_with_scipy():
+    env = gym.make("Pendulum-v1")
+    env.reset(seed=0)
+    plant = plant_on(env)
+    x = np.array([0.3, -1.0])
+    exact = solve_ivp(
+        lambda t, y: [*(PENDULUM["f"](y) + np.array([0.0, 4.5]))], (0, 0.05), x, rtol=1e-12, atol=1e-12
+    )
+    np.testing.assert_allclose(plant.integrate(x, np.array([1.5]), 0.05), exact.y[:, -1], atol=1e-8)
+
+
+def delayed(delay, commands):
+    """A double integrator that starts at (0.2, 1.5), with `commands` sent since the reset."""
+    env = gym.make("Pendulum-v1")
+    env.reset(seed=0)
+    env.unwrapped.state = np.array([0.2, 1.5])
+    plant = plant_on(
+        env, f=lambda x: np.array([x[1], 0.0]), g=lambda x: np.array([[0.0], [1.0]]), delay_s=delay
+    )
+    plant.executed(None)
+    for u in commands:
+        plant.executed(np.array([u]))
+    plant.observe()
+    hold, now = 0.05, 0.05 * len(commands)
+    x, v = 0.2, 1.5
+    cuts = sorted({0.0, delay, *(k * hold + delay - now for k in range(len(commands) + 1))})
+    cuts = [c for c in cuts if 0.0 <= c <= delay + 1e-12]
+    for start, end in itertools.pairwise(cuts):
+        if end - start < 1e-12:
+            continue
+        k = int(np.floor((now + 0.5 * (start + end) - delay) / hold))
+        a = commands[k] if k >= 0 else 0.0
+        span = end - start
+        x, v = x + v * span + 0.5 * a * span**2, v + a * span
+    np.testing.assert_allclose(plant.state, [x, v], atol=1e-9)
+
+
+@pytest.mark.parametrize("delay", [0.05, 0.1, 0.15])
+def test_delay_of_whole_holds(delay):
+    delayed(delay, [0.3, -0.7, 1.0, 0.4])
+
+
+@pytest.mark.parametrize("delay", [0.02, 0.07, 0.13])
+def test_delay_of_fractions_of_a_hold(delay):
+    delayed(delay, [0.3, -0.7, 1.0, 0.4])
+
+
+@pytest.mark.parametrize("sent", [0, 1])
+def test_delay_while_few_commands_have_been_sent(sent):
+    delayed(0.1, [0.3][:sent])
+
+
+def test_attributes_come_from_the_env():
+    env = gym.make("Pendulum-v1")
+    env.reset(seed=0)
+    plant = plant_on(env)
+    assert plant.attribute("max_torque") == 2.0
+    with pytest.raises(UnknownNameError, match=r"no attribute 'max_speeed'; it has: .*max_speed"):
+        plant.attribute("max_speeed")
