@@ -29,7 +29,12 @@ _COMMANDS = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
     parser = _parser()
-    options = parser.parse_args(arguments)
+    # argparse takes overrides only right behind the config; behind an option they arrive as unknown.
+    options, rest = parser.parse_known_args(arguments)
+    unknown = [word for word in rest if word.startswith("-") or "=" not in word]
+    if unknown:
+        parser.error(f"unrecognized arguments: {' '.join(unknown)}")
+    options.overrides += rest
     console = Console()
     try:
         _run(options, console)

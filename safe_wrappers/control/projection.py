@@ -8,12 +8,12 @@ The ways through, cheapest first: the nominal is feasible (returned bit for bit,
 our own residual, whatever the solver says of it. Calls share no state, so a failed solve cannot spoil the next.
 """
 
+import functools
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import StrEnum
-from typing import cast
+from typing import NamedTuple, cast
 
 import daqp
 import numpy as np
@@ -24,6 +24,8 @@ from safe_wrappers.errors import ConfigurationError, UnknownNameError
 
 Array = NDArray[np.float64]
 
+_SHORTEST = 1e-6
+"""Rows shorter than this, or longer than its inverse, are looked at one by one before a solver sees them."""
 FEASIBILITY_TOLERANCE = 1e-9
 """Largest residual that counts as satisfied, per row divided by its normal's length: control units."""
 
@@ -41,8 +43,7 @@ class Status(StrEnum):
     """No backend gave an answer that passed the check; `control` is only inside the box."""
 
 
-@dataclass(frozen=True, slots=True)
-class Projection:
+class Projection(NamedTuple):
     """An answer that has been checked.
 
     Attributes:
@@ -100,7 +101,8 @@ def project(
             f"expected u_nom (m,), normals (k, m) and offsets (k,); got {u.shape}, {a.shape} and {b.shape}"
         )
     try:
-        lo, hi = np.broadcast_to(lo, (m,)), np.broadcast_to(hi, (m,))
+        if lo.shape != u.shape or hi.shape != u.shape:
+            lo, hi = np.broadcast_to(lo, (m,)), np.broadcast_to(hi, (m,))
     except ValueError:
         raise ConfigurationError(f"expected bounds of shape ({m},); got {lo.shape} and {hi.shape}") from None
     if not np.isfinite(u).all():
@@ -120,33 +122,44 @@ def check_solver(solver: str) -> None:
 
 def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array, solver: str) -> Projection:
     """`project` for callers that have already checked types, shapes and finiteness of `u` and the box."""
-    inside = bool((u >= lo).all() and (u <= hi).all())
-    if b.size == 0:
+    k = b.size
+    if k == 1:
+        return _single(u, a, b, lo, hi)
+    inside = bool(((u >= lo) & (u <= hi)).all())
+    if k == 0:
         status = Status.INACTIVE if inside else Status.PROJECTED
         return Projection(u if inside else np.clip(u, lo, hi), status, 0.0, np.zeros(0), 0)
     length = np.sqrt(np.einsum("ij,ij->i", a, a))
-    if not (np.isfinite(length).all() and np.isfinite(b).all()):
+    total = float((length + b).sum())
+    if total - total != 0.0:  # a NaN or an infinity somewhere
         return _finite_rows_only(u, a, b, length, lo, hi, solver)
     slack = FEASIBILITY_TOLERANCE * length
     if inside and bool((a @ u - b <= slack).all()):
-        return Projection(u, Status.INACTIVE, 0.0, np.zeros(b.size), 0)
-    if b.size == 1:
-        needed = length > 0.0
-        hopeless = bool(b[0] < 0.0) and not needed[0]
-    else:
-        # What the box alone can reach decides which rows matter; a zero normal is the extreme case.
-        highest = _extreme(a, lo, hi)
-        lowest = -_extreme(-a, lo, hi)
-        needed = highest > b
-        hopeless = bool((lowest > b + slack).any())
-        needed &= length > 0.0
-    keep = np.flatnonzero(needed)
+        return Projection(u, Status.INACTIVE, 0.0, np.zeros(k), 0)
+    if solver == "daqp" and _SHORTEST < float(length.min()) and float(length.max()) < 1.0 / _SHORTEST:
+        answer = _daqp(_identity(u.size), -u, a, b, lo, hi)
+        if answer is not None:
+            control = np.minimum(np.maximum(answer[0], lo), hi)
+            residual = a @ control - b
+            if bool((residual <= 10.0 * slack).all()):
+                violation = max(0.0, float(residual.max()))
+                return Projection(control, Status.PROJECTED, violation, answer[1], answer[2])
+    return _careful(u, a, b, lo, hi, length, solver)
+
+
+def _careful(u: Array, a: Array, b: Array, lo: Array, hi: Array, length: Array, solver: str) -> Projection:
+    """Row by row: which matter, which are degenerate, which cannot be met; then a backend on unit rows."""
+    slack = FEASIBILITY_TOLERANCE * length
+    # What the box alone can reach decides which rows matter; a zero normal is the extreme case.
+    highest, lowest = _extreme(a, lo, hi), -_extreme(-a, lo, hi)
+    hopeless = bool((lowest > b + slack).any())
+    keep = np.flatnonzero((highest > b) & (length > 0.0))
     rows, limits = a[keep], b[keep]
     if keep.size == 0:
         control, weights, iterations, solved = np.clip(u, lo, hi), np.zeros(0), 0, True
     elif keep.size == 1:
-        control, weight, solved = _one_row(u, rows[0], float(limits[0]), lo, hi)
-        weights, iterations = np.array([weight]), 0
+        one = _single(u, rows, limits, lo, hi)
+        control, weights, iterations, solved = one.control, one.multipliers, 0, one.status != Status.FAILED
     else:
         norm = length[keep]
         unit, cut = rows / norm[:, None], limits / norm
@@ -185,22 +198,53 @@ def _extreme(a: Array, lo: Array, hi: Array) -> Array:
     return cast(Array, terms.sum(axis=1))
 
 
-def _one_row(u: Array, normal: Array, limit: float, lo: Array, hi: Array) -> tuple[Array, float, bool]:
-    """Exact projection on one half-space and the box, in scalars.
+def _single(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> Projection:
+    """Exact projection on one half-space and the box, in scalars: at this size they beat arrays.
 
     The solution is `clip(u - lam * a, lo, hi)` for the smallest lam >= 0 at which `a @ clip(...)` has come
     down to the limit; that function of lam is non-increasing and piecewise linear, so its breakpoints are
     walked in order. Where it never comes down, the corner with the smallest `a @ u` violates least.
     """
-    nominal, slope, low, high = u.tolist(), normal.tolist(), lo.tolist(), hi.tolist()
-    value = 0.0
+    nominal, slope, low, high = u.tolist(), a[0].tolist(), lo.tolist(), hi.tolist()
+    limit = float(b[0])
+    square = dot = value = 0.0
+    inside = True
+    for x, s, bottom, top in zip(nominal, slope, low, high, strict=True):
+        square += s * s
+        dot += s * x
+        if x < bottom or x > top:
+            inside = False
+            x = bottom if x < bottom else top
+        if s:
+            value += s * x
+    if square - square != 0.0 or limit - limit != 0.0:
+        return _finite_rows_only(u, a, b, np.sqrt(np.array([square])), lo, hi, "daqp")
+    slack = FEASIBILITY_TOLERANCE * math.sqrt(square)
+    if inside and dot - limit <= slack:
+        return Projection(u, Status.INACTIVE, 0.0, np.zeros(1), 0)
+    lam = _multiplier(nominal, slope, low, high, value, limit) if value > limit and square > 0.0 else 0.0
+    control = [
+        min(max(x - lam * s, bottom), top) if s else min(max(x, bottom), top)
+        for x, s, bottom, top in zip(nominal, slope, low, high, strict=True)
+    ]
+    excess = sum(s * x for s, x in zip(slope, control, strict=True) if s) - limit
+    if excess - excess != 0.0:  # a slope so small that the multiplier overflowed
+        return Projection(np.clip(u, lo, hi), Status.FAILED, max(0.0, value - limit), np.zeros(1), 0)
+    if excess <= 10.0 * slack:
+        return Projection(np.array(control), Status.PROJECTED, max(0.0, excess), np.array([lam]), 0)
+    return Projection(np.array(control), Status.INFEASIBLE, excess, np.zeros(1), 0)
+
+
+def _multiplier(
+    nominal: list[float], slope: list[float], low: list[float], high: list[float], value: float, limit: float
+) -> float:
+    """The smallest lam at which the row is met, or the one at which every component has hit its bound."""
     falling = 0.0  # -d value / d lam on the current stretch
     events: list[tuple[float, float]] = []
-    for x, s, l_, h_ in zip(nominal, slope, low, high, strict=True):
-        value += s * min(max(x, l_), h_) if s else 0.0
+    for x, s, bottom, top in zip(nominal, slope, low, high, strict=True):
         if not s:
             continue
-        enter, leave = ((x - h_) / s, (x - l_) / s) if s > 0.0 else ((x - l_) / s, (x - h_) / s)
+        enter, leave = ((x - top) / s, (x - bottom) / s) if s > 0.0 else ((x - bottom) / s, (x - top) / s)
         if leave <= 0.0:
             continue
         if enter <= 0.0:
@@ -217,46 +261,50 @@ def _one_row(u: Array, normal: Array, limit: float, lo: Array, hi: Array) -> tup
         value -= falling * (at - lam)
         lam = at
         falling += change
-    excess = value - limit
-    if excess > 0.0 and falling > 1e-300:
-        lam += excess / falling
-        excess = 0.0
-    control = np.array(
-        [
-            min(max(x - lam * s, l_), h_) if s else min(max(x, l_), h_)
-            for x, s, l_, h_ in zip(nominal, slope, low, high, strict=True)
-        ]
-    )
-    return control, lam, bool(np.isfinite(control).all())
+    if value > limit and falling > 1e-300:
+        lam += (value - limit) / falling
+    return lam
 
 
 Backend = Callable[[Array, Array, Array, Array, Array, Array], tuple[Array, Array, int] | None]
-"""(P diagonal, q, G, h, lower, upper) -> (x, row multipliers, iterations), or None when it gave up."""
+"""(P, q, G, h, lower, upper) -> (x, row multipliers, iterations), or None when it gave up."""
+
+
+_UNBOUNDED = 1e30
+"""What daqp takes as "no bound"."""
+
+
+@functools.cache
+def _identity(n: int) -> Array:
+    return np.eye(n)
+
+
+@functools.cache
+def _no_lower(k: int) -> Array:
+    return np.full(k, -_UNBOUNDED)
+
+
+@functools.cache
+def _sense(n: int) -> NDArray[np.int32]:
+    return np.zeros(n, np.int32)
 
 
 def _daqp(p: Array, q: Array, g: Array, h: Array, lo: Array, hi: Array) -> tuple[Array, Array, int] | None:
-    n = q.size
-    # daqp takes at most 1e30 as "no bound".
-    upper = np.minimum(np.concatenate([hi, h]), 1e30)
-    lower = np.maximum(np.concatenate([lo, np.full(h.size, -1e30)]), -1e30)
-    x, _, flag, info = daqp.solve(
-        np.diag(p),
-        np.ascontiguousarray(q),
-        np.ascontiguousarray(g),
-        upper,
-        lower,
-        np.zeros(n + h.size, np.int32),
-    )
+    n, k = q.size, h.size
+    upper = np.minimum(np.concatenate((hi, h)), _UNBOUNDED)
+    lower = np.maximum(np.concatenate((lo, _no_lower(k))), -_UNBOUNDED)
+    # daqp writes to the sense, so it gets a copy.
+    x, _, flag, info = daqp.solve(p, q, np.ascontiguousarray(g), upper, lower, _sense(n + k).copy())
     if flag < 1:
         return None
-    return np.array(x), np.maximum(np.asarray(info["lam"])[n:], 0.0), int(info["iterations"])
+    return np.asarray(x), np.maximum(info["lam"][n:], 0.0), int(info["iterations"])
 
 
 def _named(name: str) -> Backend:
     def solve(
         p: Array, q: Array, g: Array, h: Array, lo: Array, hi: Array
     ) -> tuple[Array, Array, int] | None:
-        problem = qpsolvers.Problem(np.diag(p), q, g, h, lb=lo, ub=hi)
+        problem = qpsolvers.Problem(p, q, g, h, lb=lo, ub=hi)
         try:
             with warnings.catch_warnings():  # of matrix conversions and of statuses, which we check ourselves
                 warnings.simplefilter("ignore")
@@ -298,7 +346,7 @@ def _solve(
 def _nearest(
     backend: Backend, u: Array, g: Array, h: Array, lo: Array, hi: Array
 ) -> tuple[Array, Array, int] | None:
-    answer = backend(np.ones(u.size), -u, g, h, lo, hi)
+    answer = backend(_identity(u.size), -u, g, h, lo, hi)
     if answer is None:
         return None
     x, multipliers, iterations = answer
@@ -339,7 +387,12 @@ def _least_violation(backend: Backend, u: Array, g: Array, h: Array, lo: Array, 
     linear = np.concatenate([-1e-8 * u, np.zeros(k)])
     rows = np.hstack([g, -np.eye(k)])
     answer = backend(
-        weight, linear, rows, h, np.concatenate([lo, np.zeros(k)]), np.concatenate([hi, np.full(k, np.inf)])
+        np.diag(weight),
+        linear,
+        rows,
+        h,
+        np.concatenate([lo, np.zeros(k)]),
+        np.concatenate([hi, np.full(k, np.inf)]),
     )
     if answer is None or not np.isfinite(answer[0]).all():
         return None

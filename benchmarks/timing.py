@@ -1,0 +1,20 @@
+"""Paired timing: both sides in turn, many short batches, so that a noisy machine hits both alike."""
+
+import statistics
+import time
+from collections.abc import Callable
+
+
+def paired_us(sides: dict[str, Callable[[], object]], batch: int = 50, rounds: int = 40) -> dict[str, float]:
+    """Median microseconds per call of each side, the batches interleaved."""
+    for call in sides.values():
+        for _ in range(batch):
+            call()
+    samples: dict[str, list[float]] = {name: [] for name in sides}
+    for _ in range(rounds):
+        for name, call in sides.items():
+            start = time.perf_counter()
+            for _ in range(batch):
+                call()
+            samples[name].append((time.perf_counter() - start) / batch * 1e6)
+    return {name: statistics.median(values) for name, values in samples.items()}
