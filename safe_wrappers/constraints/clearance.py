@@ -110,7 +110,10 @@ class Clearance:
         found = [o.nearest(p, plant) for o in self.obstacles]
         near = Nearest(*(np.concatenate(part) for part in zip(*found, strict=True)))
         relative = v - near.velocity
-        return near, near.distance - self.radius, -np.einsum("ij,ij->i", near.normal, relative), relative
+        # The point is predicted over the delay; what comes to meet it is too (a lower bound: distance is convex).
+        met = plant.delay_s * np.einsum("ij,ij->i", near.normal, near.velocity)
+        clearance = near.distance - met - self.radius
+        return near, clearance, -np.einsum("ij,ij->i", near.normal, relative), relative
 
     def value(self, plant: Plant) -> Array:
         """Room left after braking, m, one per point and surface."""
@@ -139,8 +142,10 @@ class Clearance:
                 margin=self.margin,
             )
             # approach acceleration = -n . (drift + effect u) - |sideways speed|^2 * curvature
-            sideways = np.maximum(np.einsum("ij,ij->i", relative, relative) - approach**2, 0.0)
-            bend = np.where(clearance + self.radius > 0.0, sideways * near.curvature, 0.0)
+            bend = (
+                np.einsum("ij,ij->i", near.curvature, relative**2) - near.curvature.max(axis=1) * approach**2
+            )
+            bend = np.where(clearance + self.radius > 0.0, np.maximum(bend, 0.0), 0.0)
             normal = -near.normal @ effect
             # Room gone while approaching asks for everything: a finite row that no machine can meet.
             offset = np.maximum(limit, -1e9) + near.normal @ drift + bend

@@ -25,8 +25,8 @@ class Nearest(NamedTuple):
         distance: Signed, m, negative inside, shape (k,).
         normal: Unit vectors from the surface towards the point, shape (k, d).
         velocity: Of the surface, m/s, shape (k, d).
-        curvature: Of the surface of equal distance through the point, 1/m, shape (k,): what a sideways motion
-            gains in clearance.
+        curvature: Of the surface of equal distance through the point, along each coordinate, 1/m, shape
+            (k, d): what a sideways motion gains in clearance. Zero along an edge or an upright cylinder.
     """
 
     distance: Array
@@ -67,7 +67,9 @@ def _round(point: Array, centers: Array, radius: float, velocity: Array) -> Near
     normal[length <= 1e-12, 0] = 1.0  # at the very centre every way out is as good
     moving = np.zeros_like(normal)
     moving[:, :d] = velocity
-    return Nearest(length - radius, normal, moving, 1.0 / np.maximum(length, 1e-9))
+    curvature = np.zeros_like(normal)
+    curvature[:, :d] = 1.0 / np.maximum(length, 1e-9)[:, None]
+    return Nearest(length - radius, normal, moving, curvature)
 
 
 @dataclass
@@ -129,7 +131,7 @@ class Plane:
         normal = np.zeros((1, point.size))
         normal[0, :d] = self.normal
         distance = normal[0, :d] @ (point[:d] - np.asarray(self.point))
-        return Nearest(np.array([distance]), normal, np.zeros_like(normal), np.zeros(1))
+        return Nearest(np.array([distance]), normal, np.zeros_like(normal), np.zeros_like(normal))
 
 
 @dataclass
@@ -158,17 +160,18 @@ class Box:
         outside = np.maximum(beyond, 0.0)
         distance = float(np.linalg.norm(outside))
         normal = np.zeros((1, point.size))
-        curvature = 0.0
+        curvature = np.zeros_like(normal)
         if distance > 0.0:
             normal[0, :d] = side * outside / distance
-            curvature = 1.0 / distance if int((outside > 0.0).sum()) > 1 else 0.0
+            if int((outside > 0.0).sum()) > 1:
+                curvature[0, :d] = (outside > 0.0) / distance
         else:
             axis = int(np.argmax(beyond))
             distance = float(beyond[axis])
             normal[0, axis] = side[axis]
         moving = np.zeros_like(normal)
         moving[0, :d] = self.velocity
-        return Nearest(np.array([distance]), normal, moving, np.array([curvature]))
+        return Nearest(np.array([distance]), normal, moving, curvature)
 
 
 @dataclass

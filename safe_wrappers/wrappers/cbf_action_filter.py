@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from safe_wrappers import interventions as keys
 from safe_wrappers.constraints.constraint import Constraint, non_negative
 from safe_wrappers.constraints.plain_data import constraint_data, constraint_from
-from safe_wrappers.control.projection import Status, check_solver, project_unchecked
+from safe_wrappers.control.projection import Projection, Status, check_solver, project_unchecked
 from safe_wrappers.errors import ActionError, ConfigurationError, UnsafeStateWarning
 from safe_wrappers.plants.mujoco import MujocoPlant
 from safe_wrappers.plants.plant import Plant, check_actions
@@ -228,7 +228,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
 
     def _decide(self, boxed: Array) -> _Decision:
         """The executed control for a boxed proposal."""
-        refused = not self._admitted(boxed)
+        refused = bool(self._certifying) and not self._admitted(boxed)
         if not refused and not self._rows_only:
             return _Decision(boxed, changed=False)
         if refused:
@@ -245,28 +245,47 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
     def _projected(self, boxed: Array, asked: list[Constraint]) -> _Decision | None:
         """The projection onto the rows of `asked`, checked by prediction; None if that refuses all of it."""
         normals, offsets = self._rows(asked)
-        low, high = np.maximum(self._low, self.plant.lower), np.minimum(self._high, self.plant.upper)
-        # Beyond the acting range actuators are saturated, and rows are linear only inside it.
-        least, most = getattr(self.plant, "acting_range", (low, high))
-        least, most = np.clip(least, low, high), np.clip(most, low, high)
-        nominal = np.clip(boxed, low, high)
+        lower, upper = self.plant.lower, self.plant.upper
+        low, high = np.maximum(self._low, lower), np.minimum(self._high, upper)
+        nominal = np.minimum(np.maximum(boxed, low), high)
+        acting = getattr(self.plant, "acting_range", None)
+        if acting is None or acting[0] is lower:
+            result = project_unchecked(nominal, normals, offsets, low, high, self._solver)
+            control = result.control
+        else:
+            least, most = np.clip(acting[0], low, high), np.clip(acting[1], low, high)
+            result, control = self._project_acting(nominal, normals, offsets, low, high, least, most)
+        if result.status in (Status.INFEASIBLE, Status.FAILED):
+            infeasible = result.status is Status.INFEASIBLE
+            return _Decision(self._safe(control), fallback=True, infeasible=infeasible)
+        if self._admitted(control):
+            return _Decision(control, changed=bool((control != boxed).any()))
+        if asked is not self.constraints:
+            return None
+        return self._towards_fallback(control, normals, offsets)
+
+    def _project_acting(
+        self,
+        nominal: Array,
+        normals: Array,
+        offsets: Array,
+        low: Array,
+        high: Array,
+        least: Array,
+        most: Array,
+    ) -> tuple[Projection, Array]:
+        """Project where actuators saturate inside the box: beyond `least` and `most` rows are not linear.
+
+        Distances are measured in shares of what acts, so that a control that saturates early does not look
+        cheap to change. A component that saturates as the policy's did stays the policy's: the force is the same.
+        """
         acting = np.clip(nominal, least, most)
-        # Measured in shares of what acts: a control that saturates early must not look cheap to change.
         reach, box = most - least, high - low
         unit = np.where((reach > 0.0) & np.isfinite(box), reach / np.where(box > 0.0, box, 1.0), 1.0)
         result = project_unchecked(
             acting / unit, normals * unit, offsets, least / unit, most / unit, self._solver
         )
-        if result.status in (Status.INFEASIBLE, Status.FAILED):
-            infeasible = result.status is Status.INFEASIBLE
-            return _Decision(self._safe(result.control * unit), fallback=True, infeasible=infeasible)
-        # A component that saturates just as the policy's did stays the policy's: the force is the same.
-        control = np.where(result.control == acting / unit, nominal, result.control * unit)
-        if self._admitted(control):
-            return _Decision(control, changed=not np.array_equal(control, boxed))
-        if asked is not self.constraints:
-            return None
-        return self._towards_fallback(control, normals, offsets)
+        return result, np.where(result.control == acting / unit, nominal, result.control * unit)
 
     def _rows_hold(self, control: Array) -> bool:
         if not self._rows_only:
