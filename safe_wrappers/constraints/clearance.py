@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass
 class Clearance:
-    """Keep `distance - v^2 / (2 braking) >= 0` from every point to every obstacle, also between samples.
+    """Keep `distance - (stopping distance) >= 0` from every point to every obstacle, also between samples.
 
     The row bounds the acceleration towards the obstacle that may be held for a control interval, so that full
     braking afterwards still stops in front of it (`control/stopping.py`). Delay is the plant's: the state is
@@ -122,7 +122,12 @@ class Clearance:
             _, clearance, approach, _ = self._gaps(plant, p, v)
             values.append(
                 sampled_inset(
-                    clearance, approach, self.braking, state_error=self.state_error, margin=self.margin
+                    clearance,
+                    approach,
+                    self.braking,
+                    plant.hold_s,
+                    state_error=self.state_error,
+                    margin=self.margin,
                 )
             )
         return np.concatenate(values)
@@ -147,8 +152,7 @@ class Clearance:
             )
             bend = np.where(clearance + self.radius > 0.0, np.maximum(bend, 0.0), 0.0)
             normal = -near.normal @ effect
-            # Room gone while approaching asks for everything: a finite row that no machine can meet.
-            offset = np.maximum(limit, -1e9) + near.normal @ drift + bend
+            offset = limit + near.normal @ drift + bend
             reachable = np.abs(normal) @ np.where(np.isfinite(strongest), strongest, 1e12) > offset
             normals.append(normal[reachable])
             offsets.append(offset[reachable])

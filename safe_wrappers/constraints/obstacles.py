@@ -1,4 +1,4 @@
-"""Things to keep clear of: discs, spheres, boxes and planes, fixed or moving, given or published by the env.
+"""Things to keep clear of: discs, spheres, boxes and planes; what moves is published by the env (`Discs`).
 
 Each answers, for a point, how far its surface is and in which direction it lies. Plain data, so that a wrapper
 that is given obstacles can be recorded and rebuilt.
@@ -74,38 +74,34 @@ def _round(point: Array, centers: Array, radius: float, velocity: Array) -> Near
 
 @dataclass
 class Disc:
-    """An upright cylinder: a disc of `radius` (m) in the plane at `center` (x, y), moving at `velocity` m/s."""
+    """An upright cylinder: a disc of `radius` (m) in the plane at `center` (x, y). It stands still."""
 
     center: Sequence[float]
     radius: float
-    velocity: Sequence[float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         self.center = _vector("center", self.center, (2,))
         self.radius = positive("radius", self.radius, "m")
-        self.velocity = _vector("velocity", self.velocity, (2,))
 
     def nearest(self, point: Array, plant: Plant) -> Nearest:
         """One surface."""
-        return _round(point, np.array([self.center]), self.radius, np.array([self.velocity]))
+        return _round(point, np.array([self.center]), self.radius, np.zeros((1, len(self.center))))
 
 
 @dataclass
 class Sphere:
-    """A ball of `radius` (m) at `center` (x, y, z), moving at `velocity` m/s."""
+    """A ball of `radius` (m) at `center` (x, y, z). It stands still."""
 
     center: Sequence[float]
     radius: float
-    velocity: Sequence[float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         self.center = _vector("center", self.center, (3,))
         self.radius = positive("radius", self.radius, "m")
-        self.velocity = _vector("velocity", self.velocity, (3,))
 
     def nearest(self, point: Array, plant: Plant) -> Nearest:
         """One surface."""
-        return _round(point, np.array([self.center]), self.radius, np.array([self.velocity]))
+        return _round(point, np.array([self.center]), self.radius, np.zeros((1, len(self.center))))
 
 
 @dataclass
@@ -136,18 +132,16 @@ class Plane:
 
 @dataclass
 class Box:
-    """An axis-aligned block of `half_size` (m per axis) at `center`, moving at `velocity`; 2 or 3 dimensions."""
+    """An axis-aligned block of `half_size` (m per axis) at `center`; 2 or 3 dimensions. It stands still."""
 
     center: Sequence[float]
     half_size: Sequence[float]
-    velocity: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
         self.center = _vector("center", self.center, (2, 3))
         self.half_size = _vector("half_size", self.half_size, (len(self.center),))
         for half in self.half_size:
             positive("half_size", half, "m")
-        self.velocity = _vector("velocity", self.velocity or [0.0] * len(self.center), (len(self.center),))
 
     def nearest(self, point: Array, plant: Plant) -> Nearest:
         """One surface: a face, an edge or a corner."""
