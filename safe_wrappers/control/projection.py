@@ -30,6 +30,10 @@ FEASIBILITY_TOLERANCE = 1e-9
 """Largest residual that counts as satisfied, per row divided by its normal's length: control units."""
 
 
+_OPTIMALITY_TOLERANCE = 1e-4
+"""Largest distance between a backend's answer and the one its multipliers stand for, control units."""
+
+
 class Status(StrEnum):
     """How a projection ended."""
 
@@ -356,6 +360,9 @@ def _nearest(
         if polished is None:
             return None
         x = polished
+    # Feasible is not yet closest: the multipliers must lead from the nominal to the answer.
+    if float(np.abs(np.clip(u - multipliers @ g, lo, hi) - x).max()) > _OPTIMALITY_TOLERANCE:
+        return None
     return x, multipliers, iterations
 
 

@@ -14,6 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
+_RETREAT_RATE = 1.0
+"""1/s: how fast a violation is to shrink once the room is gone."""
+
 
 def kinetic_inset(clearance: ArrayLike, speed: ArrayLike, brake: float) -> Array:
     """`h = D - v^2 / (2 a_brake)`; receding (v <= 0) needs no stopping distance.
@@ -55,9 +58,17 @@ def predicted_approach(
     )
 
 
-def largest_speed(room: ArrayLike, brake: float) -> Array:
-    """The approach speed from which braking stops within `room` (m), shape (...)."""
-    return np.sqrt(2.0 * brake * np.maximum(np.asarray(room, dtype=np.float64), 0.0))
+def held_stopping_distance(speed: ArrayLike, brake: float, hold_s: float) -> Array:
+    """The shortest way to a stop when every deceleration, at most `brake`, is held for a whole interval.
+
+    Full braking for as many holds as it takes, the last one just strong enough to end at rest: the chord of
+    `v^2 / (2 a_brake)` between whole multiples of the speed that one hold takes away. It exceeds the
+    continuous distance by at most `a_brake hold^2 / 8`, and, unlike it, can be kept without a kick back.
+    """
+    loss = brake * hold_s
+    holds = np.maximum(np.asarray(speed, dtype=np.float64), 0.0) / loss
+    whole = np.floor(holds)
+    return np.asarray(loss * hold_s * (0.5 * whole**2 + (whole + 0.5) * (holds - whole)))
 
 
 def sampled_acceleration_limit(
@@ -73,10 +84,11 @@ def sampled_acceleration_limit(
 ) -> Array:
     """The largest approach acceleration that may be *held* for a whole control interval.
 
-    Over the delay the commands in flight act, over the hold the new one, and from there on braking must still
-    stop the machine inside the room: `x(hold) + v(hold)^2 / (2 a_brake) <= room`. Solved exactly for the
-    speed at the end of the hold, so no sampling reserve is wasted, and valid at standstill: this is also the
-    start rule. Where the machine must come to rest within the hold, the limit is the braking that does it.
+    Over the delay the commands in flight act, over the hold the new one, and from there on held braking must
+    still stop the machine inside the room: `way in the hold + held_stopping_distance(v_end) <= room`, solved
+    exactly for v_end. So no sampling reserve is wasted, and it is valid at standstill: this is the start rule.
+    From outside the set the limit is the braking that halts inside the room that is left, and, with the room
+    gone, a retreat that shrinks the violation by 1/e in about a second.
 
     Args:
         clearance: Measured clearance D in m, shape (...).
@@ -89,44 +101,40 @@ def sampled_acceleration_limit(
         margin: Fixed protective distance, in m.
 
     Returns:
-        Limit in m/s^2, shape (...). Below `-brake` the state is outside the set that this barrier keeps: no
-        admissible command stops in time. `-inf` once the room is gone while still approaching.
+        Limit in m/s^2, shape (...). It is at least `-brake` wherever `sampled_inset` is not negative; below
+        that no admissible command may exist.
     """
     room0, v = predicted_approach(clearance, speed, delay_s, pending)
     room = room0 - state_error - margin
-    half = 0.5 * brake * hold_s
-    under_root = 2.0 * brake * (room - 0.5 * v * hold_s)
-    v_end = -half + np.sqrt(np.maximum(half * half + under_root, 0.0))
-    carried = (v_end - v) / hold_s
+    # In units of the speed and the way of one hold of full braking the condition on the end speed w is
+    # w / 2 + (chord of w^2 / 2) <= left, which at whole w = k reads k (k + 1) / 2 and has slope k + 1 above it.
+    left = (room - 0.5 * v * hold_s) / (brake * hold_s**2)
+    whole = np.floor(0.5 * (np.sqrt(1.0 + 8.0 * np.maximum(left, 0.0)) - 1.0))
+    end = (whole + (left - 0.5 * whole * (whole + 1.0)) / (whole + 1.0)) * brake * hold_s
+    # Nothing left: the machine must turn round inside the hold, before the room ends if there is some.
     approach = np.maximum(v, 0.0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        halted = np.where(
-            room > 0.0,
-            -(approach**2) / (2.0 * np.where(room > 0.0, room, 1.0)),
-            np.where(approach > 0.0, -np.inf, 0.0),
-        )
-    # v_end >= 0: still moving (or at rest) at the end of the hold; below, it must halt inside the hold.
-    moves_on = (half * half + under_root >= 0.0) & (v_end >= 0.0)
-    receding = v <= 0.0
-    # Receding with the room gone: any acceleration must not turn it round within the hold.
-    turned = np.where(receding & (room <= 0.0), -v / hold_s, halted)
-    return np.asarray(np.where(moves_on, carried, turned))
+    with np.errstate(divide="ignore", over="ignore"):
+        halting = -(approach**2) / (2.0 * np.where(room > 0.0, room, np.inf))
+    retreat = (_RETREAT_RATE * np.minimum(room, 0.0) - v) / hold_s
+    late = np.where(room > 0.0, np.minimum(halting, -v / hold_s), retreat)
+    return np.asarray(np.where(left >= 0.0, (end - v) / hold_s, late))
 
 
 def sampled_inset(
     clearance: ArrayLike,
     speed: ArrayLike,
     brake: float,
+    hold_s: float,
     *,
     delay_s: float = 0.0,
     pending: ArrayLike = 0.0,
     state_error: float = 0.0,
     margin: float = 0.0,
 ) -> Array:
-    """The barrier that `sampled_acceleration_limit` keeps non-negative: room left after delay and braking.
+    """The barrier that `sampled_acceleration_limit` keeps non-negative: room left after delay and held braking.
 
-    It needs no hold term: braking is admissible at every sample, and a hold that is admitted ends with a
-    non-negative inset by construction. Unsafe is negative; units of the clearance.
+    Full braking is admissible at every sample where it is not negative, and never makes it smaller. Units of
+    the clearance.
     """
     room, v = predicted_approach(clearance, speed, delay_s, pending)
-    return kinetic_inset(room - state_error - margin, v, brake)
+    return np.asarray(room - state_error - margin - held_stopping_distance(v, brake, hold_s))

@@ -24,6 +24,8 @@ from safe_wrappers.wrappers.fallback import Fallback, FallbackFunction
 Array = NDArray[np.float64]
 
 _ROW_TOLERANCE = 1e-9
+_SAFE_TOLERANCE = 1e-9
+"""h below zero by less is rounding, in the constraints' own units."""
 _BLENDS = (0.1, 0.25, 0.5, 0.75)
 """How far a projected control that prediction refuses is moved towards the fallback, step by step."""
 
@@ -134,12 +136,12 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         self._last = np.clip(np.zeros(self._shape), self._low, self._high)
         self._warned.discard("unsafe")
         self.plant.observe()
-        margin = self._margin()
-        if margin < 0.0:
+        margin, unsafe = self._margin()
+        if unsafe:
             self._warn_unsafe(margin)
         info.update(dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0))
         info[keys.CBF_MARGIN] = margin
-        info[keys.CBF_UNSAFE] = margin < 0.0
+        info[keys.CBF_UNSAFE] = unsafe
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -147,8 +149,8 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         started = time.perf_counter()
         proposed = self._checked(action)
         self.plant.observe()
-        margin = self._margin()
-        if margin < 0.0:
+        margin, unsafe = self._margin()
+        if unsafe:
             self._warn_unsafe(margin)
         # False for NaN too, so that one comparison clears the common case.
         inside = bool(((proposed >= self._low) & (proposed <= self._high)).all())
@@ -184,7 +186,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         info[keys.CBF_INFEASIBLE] = decision.infeasible
         info[keys.CBF_FALLBACK] = decision.fallback
         info[keys.CBF_NONFINITE] = not finite
-        info[keys.CBF_UNSAFE] = margin < 0.0
+        info[keys.CBF_UNSAFE] = unsafe
         info[keys.CBF_CORRECTION] = correction
         info[keys.CBF_CLIPPED] = clipped
         info[keys.CBF_MARGIN] = margin
@@ -201,14 +203,17 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
             raise ActionError(f"expected an action of shape {self._shape}, got shape {proposed.shape}")
         return proposed
 
-    def _margin(self) -> float:
+    def _margin(self) -> tuple[float, bool]:
+        """The smallest h, finite, and whether the state is unsafe; a broken h (NaN) is unsafe."""
         lowest = math.inf
         for barrier in self._barriers:
             h = barrier.value(self.plant)
             if h.size:
-                lowest = min(lowest, float(h.min()))
-        # inf: nothing is near; NaN: a broken h, which the rows will report as failed.
-        return lowest if math.isfinite(lowest) else (-1.0 if math.isnan(lowest) else 0.0)
+                least = float(h.min())
+                if least != least:
+                    return 0.0, True
+                lowest = min(lowest, least)
+        return (lowest if math.isfinite(lowest) else 0.0), lowest < -_SAFE_TOLERANCE
 
     def _warn_unsafe(self, margin: float) -> None:
         self._warn_once(

@@ -418,7 +418,6 @@ def test_a_lying_backend_is_not_believed(monkeypatch, lie):
     np.testing.assert_allclose(after.control, truth.control, atol=1e-7)
 
 
-@pytest.mark.xfail(strict=True, reason="only the primal residual is checked: safe, but not the closest")
 def test_a_feasible_answer_that_is_not_the_closest_is_not_called_the_projection(monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(module.qpsolvers, "solve_problem", lying(True, [-1.0, -1.0]))

@@ -331,7 +331,6 @@ def test_an_unsafe_start_is_warned_of_once_per_episode_counted_and_left():
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.xfail(strict=True, reason="h = -1e-11 by rounding counts as unsafe, and float32 as infeasible")
 def test_parked_at_the_wall_is_neither_unsafe_nor_infeasible(dtype):
     filtered = cart([wall(1.0)], env=Cart(0.1, dtype=dtype))
     with warnings.catch_warnings():
@@ -341,7 +340,6 @@ def test_parked_at_the_wall_is_neither_unsafe_nor_infeasible(dtype):
 
 
 @pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning")
-@pytest.mark.xfail(strict=True, reason="the exact halt within a hold is a kick back, of full strength")
 def test_parked_at_the_wall_it_does_not_chatter():
     filtered = cart([wall(1.0)], env=Cart(0.1, dtype=np.float64))
     infos = full_throttle(filtered, 200)
@@ -458,7 +456,6 @@ def test_a_broken_constraint_is_a_failed_solve_and_the_fallback(row):
     np.testing.assert_array_equal(info["executed_action"], [0.0])
 
 
-@pytest.mark.xfail(strict=True, reason="min(inf, nan) is inf: a NaN h is reported as margin 0 and safe")
 def test_a_barrier_that_turns_nan_is_unsafe_and_falls_back():
     filtered = cart([sw.Barrier(lambda x: np.nan if x[1] > 0.15 else 1.0 - x[1])], fallback="zero")
     with pytest.warns(sw.UnsafeStateWarning):
