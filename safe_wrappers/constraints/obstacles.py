@@ -163,9 +163,7 @@ class Box:
             axis = int(np.argmax(beyond))
             distance = float(beyond[axis])
             normal[0, axis] = side[axis]
-        moving = np.zeros_like(normal)
-        moving[0, :d] = self.velocity
-        return Nearest(np.array([distance]), normal, moving, curvature)
+        return Nearest(np.array([distance]), normal, np.zeros_like(normal), curvature)
 
 
 @dataclass
