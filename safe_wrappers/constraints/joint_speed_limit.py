@@ -47,6 +47,10 @@ class JointSpeedLimit:
             if isinstance(self.joints, str):
                 raise ConfigurationError(f"joints is a list of names, got the string {self.joints!r}")
             self.joints = list(self.joints)
+            if not self.joints:
+                raise ConfigurationError("joints is a list of names, or None for every driven joint; got []")
+        if not checked:
+            raise ConfigurationError("limit is one number, or a list with one per joint; got []")
         self.limit = checked if isinstance(self.limit, Sequence) else checked[0]
         if min(checked) <= self.margin:
             raise ConfigurationError(f"the margin {self.margin} leaves nothing of the limit {self.limit}")
