@@ -95,18 +95,6 @@ def test_curvature_is_what_sideways_motion_gains(name, size):
     assert checked > 100
 
 
-@pytest.mark.parametrize("name", ["disc", "sphere", "box", "box in space"])
-def test_velocity_is_reported(name):
-    still = SHAPES[name]
-    size = len(still.center)
-    velocity = [0.1, -0.2, 0.3][:size]
-    kind = type(still)
-    extent = {"half_size": still.half_size} if kind is sw.Box else {"radius": still.radius}
-    moving = kind(still.center, velocity=velocity, **extent)
-    np.testing.assert_array_equal(moving.nearest(np.ones(size), None).velocity, [velocity])
-    np.testing.assert_array_equal(still.nearest(np.ones(size), None).velocity, np.zeros((1, size)))
-
-
 def test_the_very_centre_still_has_a_way_out():
     for obstacle in (sw.Disc([1, 2], 0.5), sw.Sphere([1, 2, 3], 0.5), sw.Box([1, 2], [0.3, 0.4])):
         near = obstacle.nearest(np.array(obstacle.center), None)
@@ -150,7 +138,6 @@ def test_published_discs_are_read_afresh():
         (lambda: sw.Disc([0, 0, 0], 1), "center must be 2 finite numbers, got"),
         (lambda: sw.Disc([0, np.inf], 1), "center must be 2 finite numbers"),
         (lambda: sw.Disc(5.0, 1), "center must be a list of numbers, got 5.0"),
-        (lambda: sw.Disc([0, 0], 1, velocity=[1]), "velocity must be 2 finite numbers"),
         (lambda: sw.Sphere([0, 0], 1), "center must be 3 finite numbers"),
         (lambda: sw.Box([0, 0], [1, 1, 1]), "half_size must be 2 finite numbers"),
         (lambda: sw.Box([0, 0], [1, -1]), "half_size must be a finite number > 0 in m, got -1"),
@@ -243,8 +230,3 @@ def test_a_published_moving_disc_is_evaded(policy):
 
 def test_a_moving_disc_is_predicted_over_the_delay_too():
     assert 0.0 <= chase(sw.Discs("discs", 0.5, velocity_attribute="speeds"), 1.0, delay_s=0.3) < 0.05
-
-
-@pytest.mark.xfail(strict=True, reason="its centre stays where it was given, whatever the time")
-def test_a_disc_given_with_a_velocity_moves():
-    assert chase(sw.Disc([3.0, 0.0], 0.5, velocity=[-0.4, 0.0]), 1.0) >= 0.0
