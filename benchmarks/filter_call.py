@@ -93,13 +93,13 @@ def main() -> None:
     worst = 0.0
     for i in range(len(states)):
         executed = filter_ours(i)[4]["executed_action"]
-        worst = max(worst, float(np.abs(executed - np.asarray(theirs.safety_filter(states[i], nominal[i]))).max()))
+        worst = max(
+            worst, float(np.abs(executed - np.asarray(theirs.safety_filter(states[i], nominal[i]))).max())
+        )
     us = paired_us(
         {
             "safe-wrappers, whole env.step": cycle(filter_ours),
-            "CBFpy, safety_filter": cycle(
-                lambda i: np.asarray(theirs.safety_filter(states[i], nominal[i]))
-            ),
+            "CBFpy, safety_filter": cycle(lambda i: np.asarray(theirs.safety_filter(states[i], nominal[i]))),
         }
     )
     print("| filter call, double integrator | us |\n|---|---|")

@@ -54,7 +54,9 @@ def by_qpsolvers(solver: str) -> Callable[..., Any]:
 def main() -> None:
     """Print the table."""
     warnings.simplefilter("ignore")
-    print("| controls x rows | project (us) | qpsolvers+daqp (us) | ratio | qpsolvers+clarabel (us) | ratio |")
+    print(
+        "| controls x rows | project (us) | qpsolvers+daqp (us) | ratio | qpsolvers+clarabel (us) | ratio |"
+    )
     print("|---|---|---|---|---|---|")
     for m, k in SIZES:
         items = problems(m, k)

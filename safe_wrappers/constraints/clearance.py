@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,17 @@ from safe_wrappers.plants.mujoco import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
+
+
+class _Seen(NamedTuple):
+    """The surfaces around one point, and how its acceleration depends on the control."""
+
+    near: Nearest
+    clearance: Array
+    approach: Array
+    relative: Array
+    drift: Array
+    effect: Array
 
 
 @dataclass
@@ -80,6 +91,7 @@ class Clearance:
 
     def bind(self, plant: Plant) -> None:
         """Resolve the points on the plant."""
+        self._stamp: int | None = None
         if isinstance(plant, MujocoPlant):
             if not self.bodies and not self.sites:
                 raise ConfigurationError(
@@ -115,37 +127,33 @@ class Clearance:
         clearance = near.distance - met - self.radius
         return near, clearance, -np.einsum("ij,ij->i", near.normal, relative), relative
 
+    def _look(self, plant: Plant) -> list[_Seen]:
+        """What every point sees, once per observation."""
+        stamp = getattr(plant, "stamp", None)
+        if stamp is None or stamp != self._stamp:
+            self._stamp = stamp
+            self._seen = [
+                _Seen(*self._gaps(plant, p, v), drift, effect) for p, v, drift, effect in self._points(plant)
+            ]
+        return self._seen
+
     def value(self, plant: Plant) -> Array:
         """Room left after braking, m, one per point and surface."""
-        values = []
-        for p, v, _, _ in self._points(plant):
-            _, clearance, approach, _ = self._gaps(plant, p, v)
-            values.append(
-                sampled_inset(
-                    clearance,
-                    approach,
-                    self.braking,
-                    plant.hold_s,
-                    state_error=self.state_error,
-                    margin=self.margin,
-                )
-            )
-        return np.concatenate(values)
+        reserve = {"state_error": self.state_error, "margin": self.margin}
+        return np.concatenate(
+            [
+                sampled_inset(s.clearance, s.approach, self.braking, plant.hold_s, **reserve)
+                for s in self._look(plant)
+            ]
+        )
 
     def rows(self, plant: Plant) -> HalfSpaces:
         """One row per point and surface whose limit the actuators could exceed."""
         normals, offsets = [], []
         strongest = np.maximum(np.abs(plant.lower), np.abs(plant.upper))
-        for p, v, drift, effect in self._points(plant):
-            near, clearance, approach, relative = self._gaps(plant, p, v)
-            limit = sampled_acceleration_limit(
-                clearance,
-                approach,
-                self.braking,
-                plant.hold_s,
-                state_error=self.state_error,
-                margin=self.margin,
-            )
+        reserve = {"state_error": self.state_error, "margin": self.margin}
+        for near, clearance, approach, relative, drift, effect in self._look(plant):
+            limit = sampled_acceleration_limit(clearance, approach, self.braking, plant.hold_s, **reserve)
             # approach acceleration = -n . (drift + effect u) - |sideways speed|^2 * curvature
             bend = (
                 np.einsum("ij,ij->i", near.curvature, relative**2) - near.curvature.max(axis=1) * approach**2

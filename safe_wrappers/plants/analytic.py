@@ -79,8 +79,12 @@ class AnalyticPlant:
             raise ConfigurationError(f"lower must not exceed upper, got {low} and {high}")
         self._env = env
 
+    stamp = 0
+    """Counts observations, so that a constraint can keep what it has computed for one of them."""
+
     def observe(self) -> None:
         """Read the state, predict it over the delay."""
+        self.stamp += 1
         assert self._env is not None  # bound by the filter
         x = np.array(self._state_of(self._env.unwrapped), dtype=np.float64).reshape(-1)
         if self.delay_s > 0.0:
