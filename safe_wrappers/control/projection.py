@@ -140,7 +140,7 @@ def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array, solver
     slack = FEASIBILITY_TOLERANCE * length
     if inside and bool((a @ u - b <= slack).all()):
         return Projection(u, Status.INACTIVE, 0.0, np.zeros(k), 0)
-    if solver == "daqp" and _SHORTEST < float(length.min()) and float(length.max()) < 1.0 / _SHORTEST:
+    if solver == "daqp" and float(length.min()) > _SHORTEST and float(length.max()) < 1.0 / _SHORTEST:
         answer = _daqp(_identity(u.size), -u, a, b, lo, hi)
         if answer is not None:
             control = np.minimum(np.maximum(answer[0], lo), hi)
