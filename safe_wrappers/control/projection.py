@@ -17,7 +17,6 @@ from typing import NamedTuple, cast
 
 import daqp
 import numpy as np
-import qpsolvers
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
@@ -118,7 +117,11 @@ def project(
 
 def check_solver(solver: str) -> None:
     """Refuse a solver that is not installed, naming those that are."""
-    if solver != "daqp" and solver not in qpsolvers.available_solvers:
+    if solver == "daqp":
+        return
+    import qpsolvers  # here: it imports every solver that is installed, JAX and torch among them
+
+    if solver not in qpsolvers.available_solvers:
         raise UnknownNameError(
             f"solver {solver!r} is not installed; installed: {', '.join(sorted(qpsolvers.available_solvers))}"
         )
@@ -305,6 +308,8 @@ def _daqp(p: Array, q: Array, g: Array, h: Array, lo: Array, hi: Array) -> tuple
 
 
 def _named(name: str) -> Backend:
+    import qpsolvers
+
     def solve(
         p: Array, q: Array, g: Array, h: Array, lo: Array, hi: Array
     ) -> tuple[Array, Array, int] | None:

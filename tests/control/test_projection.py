@@ -135,7 +135,7 @@ def test_inactive_calls_no_solver(monkeypatch, solver):
         raise AssertionError("a solver was called")
 
     monkeypatch.setattr(module.daqp, "solve", refuse)
-    monkeypatch.setattr(module.qpsolvers, "solve_problem", refuse)
+    monkeypatch.setattr(qpsolvers, "solve_problem", refuse)
     assert (
         project([0.1, 0.2], [[1.0, 0.0], [0.0, 1.0]], [0.5, 0.5], -1, 1, solver=solver).status == "inactive"
     )
@@ -404,7 +404,7 @@ def test_a_lying_backend_is_not_believed(monkeypatch, lie):
     # Bugs 2 and 3. The least-violation problem falls back on daqp, so the answer is still the right one.
     truth = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0)
     with monkeypatch.context() as patch:
-        patch.setattr(module.qpsolvers, "solve_problem", lying(*LIES[lie]))
+        patch.setattr(qpsolvers, "solve_problem", lying(*LIES[lie]))
         answer = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0, solver="clarabel")
     assert np.isfinite(answer.control).all()
     assert (np.abs(answer.control) <= 1.0).all()
@@ -420,7 +420,7 @@ def test_a_lying_backend_is_not_believed(monkeypatch, lie):
 
 def test_a_feasible_answer_that_is_not_the_closest_is_not_called_the_projection(monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(module.qpsolvers, "solve_problem", lying(True, [-1.0, -1.0]))
+        patch.setattr(qpsolvers, "solve_problem", lying(True, [-1.0, -1.0]))
         answer = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0, solver="clarabel")
     truth = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0)
     if answer.status == "projected":
@@ -434,7 +434,7 @@ def test_a_backend_that_raises_is_replaced(monkeypatch, error):
     def solve_problem(*_, **__):
         raise error
 
-    monkeypatch.setattr(module.qpsolvers, "solve_problem", solve_problem)
+    monkeypatch.setattr(qpsolvers, "solve_problem", solve_problem)
     answer = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0, solver="clarabel")
     assert answer.status == "projected"
     np.testing.assert_allclose(answer.control, project(NOMINAL, NORMALS, OFFSETS, -1, 1).control, atol=1e-5)
