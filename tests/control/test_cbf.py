@@ -1,0 +1,169 @@
+"""Lie derivatives, class-K decay, Nagumo's test and relative degree: against differences and textbook systems."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from safe_wrappers.control.cbf import (
+    best_rate,
+    cbf_rows,
+    lie_derivatives,
+    linear_decay,
+    nagumo_holds,
+    numerical_gradient,
+    power_decay,
+    relative_degree,
+)
+
+
+def f(x):
+    return np.array([x[1], -np.sin(x[0]) - 0.1 * x[1], x[0] * x[2]])
+
+
+def g(x):
+    return np.array([[0.0, 0.0], [1.0 + x[0] ** 2, 0.2], [0.0, np.cos(x[2])]])
+
+
+def h(x):
+    return 2.0 - x[0] ** 2 - x[0] * x[1] - 0.5 * x[1] ** 2 + np.sin(x[2])
+
+
+def gradient(x):
+    return np.array([-2 * x[0] - x[1], -x[0] - x[1], np.cos(x[2])])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_lie_derivatives_are_the_rate_of_h(seed):
+    rng = np.random.default_rng(seed)
+    x, u = rng.normal(size=3), rng.normal(size=2)
+    drift, effect = lie_derivatives(gradient(x), f(x), g(x))
+    step = 1e-6
+    velocity = f(x) + g(x) @ u
+    expected = (h(x + step * velocity) - h(x - step * velocity)) / (2 * step)
+    assert drift + effect @ u == pytest.approx(expected, abs=1e-7)
+    assert effect.shape == (2,) and np.shape(drift) == ()
+
+
+def test_batches_of_any_shape():
+    rng = np.random.default_rng(0)
+    dh, fs, gs = rng.normal(size=(4, 5, 3)), rng.normal(size=(4, 5, 3)), rng.normal(size=(4, 5, 3, 2))
+    drift, effect = lie_derivatives(dh, fs, gs)
+    assert drift.shape == (4, 5) and effect.shape == (4, 5, 2)
+    one, row = lie_derivatives(dh[1, 2], fs[1, 2], gs[1, 2])
+    assert drift[1, 2] == pytest.approx(one)
+    np.testing.assert_allclose(effect[1, 2], row)
+    best = best_rate(drift, effect, -np.ones(2), np.ones(2))
+    np.testing.assert_allclose(best, drift + np.abs(effect).sum(-1))
+    normals, offsets = cbf_rows(drift, effect, linear_decay(drift, 2.0))
+    assert normals.shape == (4, 5, 2) and offsets.shape == (4, 5)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.floats(-5, 5), st.floats(-5, 5), st.floats(0.1, 10))
+def test_decay_is_class_k(a, b, alpha):
+    for decay in (
+        lambda v: linear_decay(v, alpha),
+        lambda v: power_decay(v, alpha, 3.0),
+        lambda v: power_decay(v, alpha, 0.5),
+    ):
+        assert decay(0.0) == 0.0
+        if a < b:
+            assert decay(a) <= decay(b)
+        assert decay(-a) == pytest.approx(-decay(a))
+    assert power_decay(a, alpha, 1.0) == pytest.approx(linear_decay(a, alpha))
+
+
+@pytest.mark.parametrize("power", [0.5, 1.0, 2.0])
+def test_an_unsafe_state_is_driven_back(power):
+    assert power_decay(-0.3, 2.0, power) < 0.0  # h' >= positive
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.integers(0, 1000))
+def test_rows_say_the_same_as_the_condition(seed):
+    rng = np.random.default_rng(seed)
+    x, u = rng.normal(size=3), rng.normal(size=2)
+    drift, effect = lie_derivatives(gradient(x), f(x), g(x))
+    normals, offsets = cbf_rows(drift, effect, linear_decay(h(x), 1.5))
+    left = drift + effect @ u + 1.5 * h(x)
+    assert offsets - normals @ u == pytest.approx(left, abs=1e-12)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 1000))
+def test_best_rate_is_reached_at_a_corner(seed):
+    rng = np.random.default_rng(seed)
+    effect, low = rng.normal(size=3), -rng.uniform(0, 2, 3)
+    high = low + rng.uniform(0, 2, 3)
+    corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
+    assert best_rate(0.7, effect, low, high) == pytest.approx(0.7 + (corners @ effect).max())
+
+
+def test_best_rate_ignores_an_infinite_bound_without_effect():
+    assert best_rate(0.5, [0.0, 1.0], [-np.inf, -1.0], [np.inf, 1.0]) == 1.5
+    assert best_rate(0.5, [1.0, 0.0], [-np.inf, -1.0], [np.inf, 1.0]) == np.inf
+
+
+def test_nagumo_at_the_boundary():
+    # v' = u in [-1, 1], h = 1 - v^2, at v = 1: h' = -2 u, so braking keeps it.
+    arguments = dict(lf_h=0.0, lg_h=[-2.0], lower=[-1.0], upper=[1.0])
+    assert nagumo_holds(0.0, **arguments)
+    assert nagumo_holds(0.0, **{**arguments, "lf_h": -2.0})  # just
+    assert not nagumo_holds(0.0, **{**arguments, "lf_h": -2.1})  # the drift is stronger
+    assert nagumo_holds(0.5, **{**arguments, "lf_h": -9.0})  # inside there is nothing to hold
+    assert not nagumo_holds(-0.5, **{**arguments, "lf_h": 9.0})  # outside it is lost
+    assert nagumo_holds(-1e-10, **arguments) and nagumo_holds(1e-10, **arguments)
+    assert nagumo_holds(0.05, lf_h=-9.0, lg_h=[0.0], lower=[-1], upper=[1], boundary=0.01)
+    assert not nagumo_holds(0.05, lf_h=-9.0, lg_h=[0.0], lower=[-1], upper=[1], boundary=0.1)
+    both = nagumo_holds([0.0, 0.0], [0.0, -3.0], [[-2.0], [-2.0]], [-1.0], [1.0])
+    np.testing.assert_array_equal(both, [True, False])
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_numerical_gradient(scale):
+    x = scale * np.array([0.3, -0.7, 1.2])
+    np.testing.assert_allclose(
+        numerical_gradient(lambda y: h(y / scale), x),
+        gradient(x / scale) / scale,
+        rtol=1e-5,
+        atol=1e-8 / scale,
+    )
+
+
+def chain(order):
+    """x1' = x2, ..., xn' = u."""
+    shift = np.eye(order, k=1)
+    last = np.eye(order)[:, -1:]
+    return (lambda x: shift @ x), (lambda x: last)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+@pytest.mark.parametrize("nonlinear", [False, True])
+def test_relative_degree_of_integrator_chains(order, nonlinear):
+    drift, effect = chain(order)
+    barrier = (lambda x: 2.0 - x[0] - 0.3 * x[0] ** 2) if nonlinear else (lambda x: 2.0 - x[0])
+    for x in (np.full(order, 0.4), np.linspace(-0.5, 1.0, order)):
+        assert relative_degree(barrier, drift, effect, x) == order
+    assert relative_degree(lambda x: 1.0 - x[-1], drift, effect, np.full(order, 0.4)) == 1
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+def test_relative_degree_does_not_depend_on_the_size_of_g(size):
+    drift, effect = chain(2)
+    scaled = lambda x: size * effect(x)  # noqa: E731
+    assert relative_degree(lambda x: 1.0 - x[0], drift, scaled, [0.3, 0.2]) == 2
+    assert relative_degree(lambda x: 1.0 - x[1], drift, scaled, [0.3, 0.2]) == 1
+
+
+def test_an_uncontrollable_state_has_none():
+    drift = lambda x: np.array([-x[0], x[1]])  # noqa: E731
+    effect = lambda x: np.array([[0.0], [1.0]])  # noqa: E731
+    assert relative_degree(lambda x: 1.0 - x[0], drift, effect, [0.3, 0.2]) is None
+    assert relative_degree(lambda x: 1.0, drift, effect, [0.3, 0.2]) is None
+    assert relative_degree(lambda x: 1.0 - x[0], *chain(3), [0.1, 0.2, 0.3], max_degree=2) is None
+
+
+def test_the_kinetic_inset_has_relative_degree_one():
+    drift, effect = chain(2)
+    assert relative_degree(lambda x: 3.0 - x[0] - x[1] ** 2 / 2.0, drift, effect, [0.3, 0.8]) == 1

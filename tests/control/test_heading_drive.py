@@ -1,0 +1,297 @@
+"""The heading drive: its prediction is MuJoCo's, its stopping area holds MuJoCo's braking, its distance is right."""
+
+import math
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import safe_wrappers as sw
+from safe_wrappers.constraints.heading_drive_clearance import heading_drive
+from safe_wrappers.control.heading_drive import Motion, StoppingPath
+
+
+def robot(level=0, uncertainty=0.0):
+    """Env, plant and constants."""
+    env = gym.make(f"SafePointGoal{level}-v0").unwrapped
+    layout = {"goal": [900.0, 900.0]} if level == 0 else {}
+    env.reset(seed=0, options={"layout": {**layout}} if layout else None)
+    plant = sw.MujocoPlant()
+    plant.bind(env)
+    return env, plant, heading_drive(plant, "agent", uncertainty)
+
+
+def place(env, motion):
+    qpos, qvel = env.data.qpos.copy(), env.data.qvel.copy()
+    qpos[:3], qvel[:3] = motion[:3], motion[3:]
+    env.set_state(qpos, qvel)
+
+
+def now(env):
+    return Motion(*env.data.qpos[:3].tolist(), *env.data.qvel[:3].tolist())
+
+
+def random_motion(rng, speed=1.3, yaw=3.0):
+    direction = rng.uniform(-math.pi, math.pi)
+    v = speed * rng.uniform() ** 0.5
+    return Motion(
+        *rng.uniform(-1, 1, 2),
+        rng.uniform(-math.pi, math.pi),
+        v * math.cos(direction),
+        v * math.sin(direction),
+        rng.uniform(-yaw, yaw),
+    )
+
+
+def test_prediction_is_mujocos_own_step():
+    env, _, drive = robot()
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        motion, action = random_motion(rng), rng.uniform(-1, 1, 2)
+        if rng.uniform() < 0.3:
+            action *= 0.04  # inside the drive's clamp
+        place(env, motion)
+        env.step(action)
+        np.testing.assert_allclose(now(env), drive.predict(motion, *action), atol=1e-9)
+
+
+def test_prediction_stays_mujocos_over_an_episode():
+    env, _, drive = robot()
+    motion = now(env)
+    rng = np.random.default_rng(1)
+    for k in range(300):
+        if k % 8 == 0:
+            action = rng.choice([-1.0, 1.0], 2)
+        env.step(action)
+        motion = drive.predict(motion, *action)
+        np.testing.assert_allclose(now(env), motion, atol=1e-8)
+
+
+@pytest.mark.parametrize("level", [1, 2])
+def test_vases_do_not_change_the_robots_constants(level):
+    assert robot(level)[2] == robot(0)[2]
+
+
+def test_constants_are_read_from_a_perturbed_model():
+    _, plant, right = robot()
+    plant.perturb(mass=1.2, damping=0.8)
+    wrong = heading_drive(plant, "agent")
+    assert wrong.mass == pytest.approx(1.2 * right.mass)
+    assert wrong.yaw_inertia == pytest.approx(1.2 * right.yaw_inertia)
+    assert wrong.damping == pytest.approx(0.8 * right.damping)
+    assert wrong.drive_limit == right.drive_limit
+
+
+def rest(drive, m):
+    """Where the axis comes to rest if nothing drives it: the damping acts on it, the momentum is the mass's."""
+    swing = drive.com_offset * m.yaw_rate * np.array([-math.sin(m.heading), math.cos(m.heading)])
+    return np.array([m.x, m.y]) + drive.mass / drive.damping * (np.array([m.vx, m.vy]) + swing)
+
+
+def test_coasting_ends_exactly_where_it_should():
+    # Whatever the step size, and the turning: the resting point is a constant of the motion.
+    env, _, drive = robot()
+    rng = np.random.default_rng(2)
+    for yaw in (0.0, 1.0, 3.0):
+        motion = random_motion(rng, yaw=yaw)
+        place(env, motion)
+        for k in range(400):
+            env.step(np.array([0.0, 0.7 if k < 100 else 0.0]))
+            if k % 50 == 0 or k == 399:
+                # 0.1 mm is what finite steps leave of it while turning
+                np.testing.assert_allclose(rest(drive, now(env)), rest(drive, motion), atol=2e-4)
+        assert math.hypot(env.data.qvel[0], env.data.qvel[1]) < 1e-2
+
+
+def backup(drive, motion):
+    ahead = motion.vx * math.cos(motion.heading) + motion.vy * math.sin(motion.heading)
+    return np.array([drive.brake_control(ahead), 0.0])
+
+
+def excursion(drive, truth, brake=True, yaw=0.0, speed=1.3, runs=12, seed=4):
+    """How far a machine gets out of the area while it runs the backup manoeuvre, m."""
+    rng = np.random.default_rng(seed)
+    worst = -math.inf
+    for _ in range(runs):
+        motion = random_motion(rng, speed, yaw)
+        place(truth, motion)
+        path = drive.stopping_path(motion, brake)
+        for _ in range(150):
+            truth.step(backup(drive, now(truth)) if brake else np.zeros(2))
+            worst = max(worst, *(path.distance(float(x), float(y)) for x, y in truth._path))
+    return worst
+
+
+@pytest.mark.parametrize("brake", [True, False])
+@pytest.mark.parametrize(("speed", "tolerance"), [(0.7, 3e-3), (1.3, 7e-3)])
+def test_the_area_holds_mujocos_stopping_path(brake, speed, tolerance):
+    # What is left is the drag's torque about the axis: it turns the heading by up to 0.02 rad while sliding.
+    env, _, drive = robot()
+    assert excursion(drive, env, brake, speed=speed) <= tolerance
+
+
+@pytest.mark.xfail(strict=True, reason="5 mm at 1.1 m/s sideways: the drag turns the heading while it slides")
+def test_what_the_area_leaves_out_is_under_two_millimetres_as_promised():
+    env, _, drive = robot()
+    assert excursion(drive, env) <= 2e-3
+
+
+def test_the_area_holds_the_stopping_path_while_turning():
+    env, _, drive = robot()
+    assert excursion(drive, env, yaw=2.0, speed=0.7) <= 2e-3 + 2 * drive.com_offset
+    assert excursion(drive, env, yaw=2.0, speed=0.7) <= 8e-3
+
+
+@pytest.mark.parametrize("mass", [0.8, 1.2])
+@pytest.mark.parametrize("damping", [0.8, 1.2])
+def test_the_area_holds_every_machine_inside_the_uncertainty(mass, damping):
+    # The constants are the nominal ones; the machine that brakes is another.
+    drive = robot(uncertainty=0.2)[2]
+    truth = robot()[0]
+    truth.model.body_mass *= mass
+    truth.model.body_inertia *= mass
+    truth.model.dof_damping *= damping
+    mujoco.mj_setConst(truth.model, mujoco.MjData(truth.model))
+    assert excursion(drive, truth, speed=0.7) <= 4e-3
+    if mass > damping:  # and without the uncertainty it does not
+        assert excursion(robot()[2], truth, speed=0.7) > 2e-2
+
+
+def test_the_area_is_no_larger_than_it_need_be():
+    env, _, drive = robot()
+    motion = Motion(0.0, 0.0, 0.0, 0.6, 0.4, 0.0)
+    place(env, motion)
+    for _ in range(300):
+        env.step(backup(drive, now(env)))
+    path = drive.stopping_path(motion)
+    end = np.array(
+        [path.forward * path.ex + path.sideways * path.sx, path.forward * path.ey + path.sideways * path.sy]
+    )
+    assert np.linalg.norm(end - env.data.qpos[:2]) < 2e-3
+    assert path.end_distance(*env.data.qpos[:2]) == pytest.approx(np.linalg.norm(end - env.data.qpos[:2]))
+
+
+def test_braking_control_ends_at_rest_and_does_not_turn_round():
+    env, _, drive = robot()
+    for speed in (-0.9, -0.01, 0.003, 0.5):
+        place(env, Motion(0, 0, 0, speed, 0, 0))
+        for _ in range(60):
+            env.step(backup(drive, now(env)))
+            assert env.data.qvel[0] * speed >= -1e-3
+        assert abs(env.data.qvel[0]) < 1e-3
+
+
+def test_the_turn_that_is_left_is_mujocos():
+    env, _, drive = robot()
+    for rate in (-3.0, -1.0, 0.4, 2.0):
+        place(env, Motion(0, 0, 0, 0, 0, rate))
+        headings = []
+        for _ in range(20):
+            env.step(np.zeros(2))
+            headings.append(env.data.qpos[2])
+        assert drive.turn_left(rate) == pytest.approx(headings[-1], abs=6e-3)
+
+
+# Distance to the area -----------------------------------------------------------------------------------------
+
+LENGTH = st.floats(0.0, 1.0).map(lambda v: round(v, 3))
+
+
+def polygon_distance(corners, point):
+    """Signed distance to a convex polygon by dense sampling of its sides and a half-plane test."""
+    n = len(corners)
+    sides = [np.linspace(corners[i], corners[(i + 1) % n], 2001) for i in range(n)]
+    near = min(float(np.linalg.norm(side - point, axis=1).min()) for side in sides)
+    crosses = [
+        (b[0] - a[0]) * (point[1] - a[1]) - (b[1] - a[1]) * (point[0] - a[0])
+        for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)
+    ]
+    area = sum(a[0] * b[1] - a[1] * b[0] for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True))
+    inside = all(c >= 0 for c in crosses) or all(c <= 0 for c in crosses)
+    return (-near if inside and abs(area) > 1e-12 else near), near
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    LENGTH,
+    LENGTH,
+    st.floats(0, 1),
+    st.booleans(),
+    st.floats(-3, 3),
+    st.floats(-1.5, 1.5),
+    st.floats(-1.5, 1.5),
+)
+def test_distance_agrees_with_brute_force(forward, sideways, share, spread, angle, px, py):
+    # The crossing lies at or below the end, as the tangent does.
+    e, s = np.array([math.cos(angle), math.sin(angle)]), np.array([-math.sin(angle), math.cos(angle)])
+    crossing = round(share, 3) * sideways
+    fields = dict(
+        x=0.1, y=-0.2, ex=e[0], ey=e[1], sx=s[0], sy=s[1],
+        forward=forward, sideways=sideways, crossing=crossing, spread=spread,
+    )  # fmt: skip
+    if "reach" in StoppingPath._fields:
+        fields["reach"] = math.hypot(forward, sideways)
+    path = StoppingPath(**fields)
+    start = np.array([0.1, -0.2])
+    area = [start, start + forward * e + crossing * s, start + forward * e + sideways * s]
+    if spread:
+        area.append(start + sideways * s)
+    expected, near = polygon_distance(np.array(area), np.array([px, py]))
+    if near < 1e-3:  # on the boundary the sampling decides the sign
+        assert abs(path.distance(px, py)) < 2e-3
+    else:
+        assert path.distance(px, py) == pytest.approx(expected, abs=1e-3)
+    assert path.end_distance(px, py) == pytest.approx(np.linalg.norm(area[2] - [px, py]))
+    assert path.reach >= max(np.linalg.norm(c - start) for c in area) - 1e-12
+
+
+def test_a_body_at_rest_is_a_point():
+    _, _, drive = robot()
+    path = drive.stopping_path(Motion(0.5, 0.25, 1.0, 0.0, 0.0, 0.0))
+    assert path.distance(0.5, 1.25) == pytest.approx(1.0)
+    assert path.reach == pytest.approx(0.0, abs=1e-12)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.floats(0, 1.4), st.floats(-1.4, 1.4), st.floats(-3.1, 3.1))
+def test_uncertainty_only_adds_area(ahead, aside, heading):
+    motion = Motion(
+        0.0,
+        0.0,
+        heading,
+        ahead * math.cos(heading) - aside * math.sin(heading),
+        ahead * math.sin(heading) + aside * math.cos(heading),
+        0.0,
+    )
+    small, large = DRIVES[0].stopping_path(motion), DRIVES[1].stopping_path(motion)
+    p, e, s = np.zeros(2), np.array([small.ex, small.ey]), np.array([small.sx, small.sy])
+    for corner in (p, small.forward * e + small.crossing * s, small.forward * e + small.sideways * s):
+        assert large.distance(*corner) <= 5e-5
+    assert large.forward >= small.forward - 5e-5 and large.sideways >= small.sideways
+
+
+DRIVES = (robot()[2], robot(uncertainty=0.2)[2])
+
+
+def test_refusals_name_what_does_not_fit():
+    _, plant, _ = robot()
+    plant.model.dof_damping[0] = 0.02
+    with pytest.raises(
+        sw.SafeWrappersError, match="'agent' is no heading drive: the slides need equal damping"
+    ):
+        heading_drive(plant, "agent")
+    _, plant, _ = robot()
+    plant.model.opt.integrator = int(mujoco.mjtIntegrator.mjINT_RK4)
+    with pytest.raises(sw.SafeWrappersError, match="the integrator must be Euler"):
+        heading_drive(plant, "agent")
+    _, plant, _ = robot()
+    plant.model.body_ipos[plant.named("body", "agent"), 1] = 0.01
+    with pytest.raises(sw.SafeWrappersError, match="the centre of mass must lie on the heading"):
+        heading_drive(plant, "agent")
+    ant = sw.MujocoPlant()
+    ant.bind(gym.make("Ant-v5"))
+    with pytest.raises(sw.SafeWrappersError, match="'torso' must slide along world x and y"):
+        heading_drive(ant, "torso")

@@ -1,0 +1,212 @@
+"""Stopping insets in one dimension: against exact simulation, with an adversary at the throttle."""
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from safe_wrappers.control import stopping
+from safe_wrappers.control.stopping import (
+    kinetic_inset,
+    kinetic_row,
+    predicted_approach,
+    sampled_acceleration_limit,
+    sampled_inset,
+)
+
+POSITIVE = st.floats(0.05, 5.0)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.floats(-1, 10), st.floats(-3, 3), POSITIVE)
+def test_kinetic_inset_is_the_room_left_after_braking(clearance, speed, brake):
+    if speed <= 0:
+        assert kinetic_inset(clearance, speed, brake) == clearance
+        return
+    time = speed / brake
+    way = speed * time - 0.5 * brake * time**2  # braking to rest
+    assert kinetic_inset(clearance, speed, brake) == pytest.approx(clearance - way, abs=1e-9)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.floats(0.1, 10), st.floats(0.05, 3), POSITIVE, st.floats(0.1, 5), st.floats(-5, 5))
+def test_kinetic_row_is_the_barrier_condition(clearance, speed, brake, gamma, accel):
+    step = 1e-6
+    ahead = kinetic_inset(clearance - speed * step, speed + accel * step, brake)
+    behind = kinetic_inset(clearance + speed * step, speed - accel * step, brake)
+    condition = (ahead - behind) / (2 * step) + gamma * kinetic_inset(clearance, speed, brake)
+    room = kinetic_row(clearance, speed, brake, gamma) - accel
+    # same sign, same zero: condition = room * speed / brake
+    assert condition == pytest.approx(room * speed / brake, abs=1e-4 * (1 + abs(condition)))
+
+
+def test_standstill_has_its_own_rule():
+    assert kinetic_row(1.0, 0.0, 1.0, 2.0) == np.inf
+    assert kinetic_row(1.0, -0.3, 1.0, 2.0) == np.inf
+    assert kinetic_row(0.0, 0.0, 1.0, 2.0) == 0.0
+    assert kinetic_row(-0.1, 0.0, 1.0, 2.0) == 0.0
+    with np.errstate(all="raise"):
+        kinetic_row(np.array([1.0, 0.0]), np.array([0.0, 0.0]), 1.0, 2.0)
+
+
+def test_batches_are_element_by_element():
+    rng = np.random.default_rng(0)
+    clearance, speed = rng.uniform(-0.5, 3, (4, 5)), rng.uniform(-1, 2, (4, 5))
+    together = sampled_acceleration_limit(clearance, speed, 1.3, 0.1, margin=0.05)
+    inset = sampled_inset(clearance, speed, 1.3, 0.1, margin=0.05)
+    for i in np.ndindex(4, 5):
+        assert together[i] == sampled_acceleration_limit(clearance[i], speed[i], 1.3, 0.1, margin=0.05)
+        assert inset[i] == sampled_inset(clearance[i], speed[i], 1.3, 0.1, margin=0.05)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(-1, 3), st.floats(-2, 2), st.floats(0, 1), st.floats(-2, 2))
+def test_the_prediction_is_exact_motion(clearance, speed, delay, accel):
+    room, v = predicted_approach(clearance, speed, delay, accel)
+    assert v == pytest.approx(speed + accel * delay)
+    times = np.linspace(0, delay, 20001)
+    travelled = np.trapezoid(speed + accel * times, times)
+    assert room == pytest.approx(clearance - travelled, abs=1e-7)
+
+
+def simulate(
+    start, speed, wall, brake, hold, *, holds_of_delay=0, error=0.0, margin=0.0, strength=None, seed=0
+):
+    """A point that always wants full throttle, limited by what is promised; commands act late, x is off.
+
+    Returns the exact closest approach to the wall between samples too, and the smallest inset.
+    """
+    strength = brake if strength is None else strength
+    rng = np.random.default_rng(seed)
+    x, v, queue = start, speed, [0.0] * holds_of_delay
+    closest, smallest = wall - x, np.inf
+    for _ in range(int(30 / hold)):
+        measured = wall - x + error * rng.uniform(-1, 1)
+        # exact over the commands in flight, one after the other
+        room, fast = measured, v
+        for a in queue:
+            room, fast = predicted_approach(room, fast, hold, a)
+        smallest = min(
+            smallest, float(sampled_inset(room, fast, brake, hold, state_error=error, margin=margin))
+        )
+        limit = float(sampled_acceleration_limit(room, fast, brake, hold, state_error=error, margin=margin))
+        queue.append(float(np.clip(min(strength, limit), -brake, strength)))
+        a = queue.pop(0)
+        turn = -v / a if a < 0 else np.inf
+        peak = x + v * turn + 0.5 * a * turn**2 if 0 < turn < hold else x
+        x, v = x + v * hold + 0.5 * a * hold**2, v + a * hold
+        closest = min(closest, wall - max(x, peak))
+    return closest, smallest
+
+
+@pytest.mark.parametrize("hold", [0.02, 0.1, 0.4])
+@pytest.mark.parametrize("strength", [1.0, 3.0])
+def test_full_throttle_stops_at_the_wall_and_close_to_it(hold, strength):
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        speed = rng.uniform(0, 1.5)
+        room = speed**2 / 2.0 + hold**2 / 8 + rng.uniform(0.2, 2.0)
+        closest, smallest = simulate(0.0, speed, room, 1.0, hold, strength=strength, seed=seed)
+        assert closest >= -1e-9
+        assert closest < 1e-3 + 1e-3 * hold
+        assert smallest >= -1e-9
+
+
+@pytest.mark.parametrize("hold", [0.02, 0.1])
+@pytest.mark.parametrize("holds_of_delay", [1, 4])
+def test_commands_in_flight_are_counted(hold, holds_of_delay):
+    for seed in range(4):
+        closest, smallest = simulate(0.0, 0.5, 2.0 + seed / 3, 1.0, hold, holds_of_delay=holds_of_delay)
+        assert -1e-9 <= closest < 1e-2
+        assert smallest >= -1e-9
+
+
+@pytest.mark.parametrize("hold", [0.02, 0.1])
+def test_a_state_error_within_its_bound_is_covered(hold):
+    for seed in range(8):
+        closest, _ = simulate(0.0, 0.3, 1.5, 1.0, hold, error=0.05, seed=seed)
+        assert closest >= 0.0
+        assert closest < 0.15
+    uncovered = [simulate_with_error_untold(hold, seed) for seed in range(8)]
+    assert min(uncovered) < 0.0  # the bound is what did it
+
+
+def simulate_with_error_untold(hold, seed):
+    rng = np.random.default_rng(seed)
+    x, v, closest = 0.0, 0.3, 1.5
+    for _ in range(int(10 / hold)):
+        limit = float(sampled_acceleration_limit(1.5 - x + 0.05 * rng.uniform(-1, 1), v, 1.0, hold))
+        a = float(np.clip(limit, -1.0, 1.0))
+        x, v = x + v * hold + 0.5 * a * hold**2, v + a * hold
+        closest = min(closest, 1.5 - x)
+    return closest
+
+
+def test_the_margin_is_kept():
+    closest, _ = simulate(0.0, 0.0, 1.5, 1.0, 0.1, margin=0.2)
+    assert 0.2 - 1e-9 <= closest < 0.21
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.floats(0, 3), st.floats(-2, 3), POSITIVE, st.floats(0.005, 0.5))
+def test_braking_is_always_admissible_inside_the_set(clearance, speed, brake, hold):
+    inset = float(sampled_inset(clearance, speed, brake, hold))
+    assume(inset >= 0.0)
+    limit = float(sampled_acceleration_limit(clearance, speed, brake, hold))
+    assert limit >= -brake - 1e-9 * max(1.0, brake) - 1e-9 * abs(speed) / hold
+    # and so is what it admits: the inset after a hold at the limit (or at full braking) is not negative
+    for a in {min(limit, 10.0), max(-brake, min(limit, -brake))}:
+        after = clearance - speed * hold - 0.5 * a * hold**2
+        inset_after = float(sampled_inset(after, speed + a * hold, brake, hold))
+        assert inset_after >= -1e-9 * (1 + abs(speed))
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.floats(0, 3), st.floats(-2, 3), POSITIVE, st.floats(0.005, 0.5))
+def test_the_limit_is_the_largest(clearance, speed, brake, hold):
+    # A little more acceleration than the limit leaves the set, at the end of the hold: nothing is given away.
+    assume(float(sampled_inset(clearance, speed, brake, hold)) >= 1e-6)
+    limit = float(sampled_acceleration_limit(clearance, speed, brake, hold))
+    more = limit + 1e-3 * max(1.0, abs(limit))
+    after = clearance - speed * hold - 0.5 * more * hold**2
+    assert float(sampled_inset(after, speed + more * hold, brake, hold)) < 1e-12
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.floats(0, 5), st.floats(0, 3), POSITIVE, st.floats(0.005, 0.5))
+def test_held_braking_takes_little_more_than_continuous(clearance, speed, brake, hold):
+    continuous = float(kinetic_inset(clearance, speed, brake))
+    sampled = float(sampled_inset(clearance, speed, brake, hold))
+    assert continuous - brake * hold**2 / 8 - 1e-9 <= sampled <= continuous + 1e-9
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.floats(-1, -0.001), st.floats(-1, 2), POSITIVE, st.floats(0.01, 0.3))
+def test_outside_of_the_set_the_limit_is_finite_and_retreats(clearance, speed, brake, hold):
+    limit = float(sampled_acceleration_limit(clearance, speed, brake, hold))
+    assert np.isfinite(limit)
+    after = clearance - speed * hold - 0.5 * limit * hold**2
+    end = speed + limit * hold
+    back_inside = float(sampled_inset(after, end, brake, hold)) >= -1e-9
+    assert back_inside or (end < 0.0 and after - end * hold > after)
+
+
+def test_held_stopping_distance_is_what_the_best_held_braking_needs():
+    # Brute force over the decelerations of every hold, in a coarse grid.
+    brake, hold = 1.0, 0.5
+    grid = np.linspace(-brake, 0.0, 41)
+
+    def shortest(v, depth=0):
+        if v <= 1e-12:
+            return 0.0
+        if depth == 3:
+            return np.inf
+        best = np.inf
+        for a in grid:
+            if v + a * hold < -1e-9:
+                continue
+            best = min(best, v * hold + 0.5 * a * hold**2 + shortest(max(0.0, v + a * hold), depth + 1))
+        return best
+
+    for v in (0.1, 0.25, 0.5, 0.75, 1.0):
+        assert float(stopping.held_stopping_distance(v, brake, hold)) == pytest.approx(shortest(v), abs=1e-9)
