@@ -1,0 +1,150 @@
+"""The one-way arrows: control <- plants <- constraints <- wrappers <- sb3, train; envs beside them."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import safe_wrappers
+
+ROOT = Path(__file__).parents[1]
+ROOMS = {
+    "control": ROOT / "safe_wrappers" / "control",
+    "plants": ROOT / "safe_wrappers" / "plants",
+    "constraints": ROOT / "safe_wrappers" / "constraints",
+    "wrappers": ROOT / "safe_wrappers" / "wrappers",
+    "sb3": ROOT / "safe_wrappers" / "sb3",
+    "envs": ROOT / "envs",
+    "train": ROOT / "train",
+}
+COMMON = {"errors", "interventions"}
+"""Single modules at the top that every room may use; `protect` and the package itself are the top."""
+MAY_USE = {
+    "control": {"control", "errors"},
+    "plants": {"control", "plants", *COMMON},
+    "constraints": {"control", "plants", "constraints", *COMMON},
+    "wrappers": {"control", "plants", "constraints", "wrappers", *COMMON},
+    "sb3": {"control", "plants", "constraints", "wrappers", "sb3", *COMMON},
+    "envs": {"control", "constraints", "envs", *COMMON},
+    "train": {"control", "plants", "constraints", "wrappers", "sb3", "envs", "train", "protect", "", *COMMON},
+}
+LEARNERS = {"torch", "stable_baselines3"}
+FORBIDDEN = {
+    "control": LEARNERS | {"gymnasium", "mujoco"},
+    "plants": LEARNERS,
+    "constraints": LEARNERS,
+    "wrappers": LEARNERS,
+    "envs": LEARNERS,
+    "sb3": set(),
+    "train": set(),
+}
+
+
+def modules(room):
+    return sorted(ROOMS[room].rglob("*.py"))
+
+
+def imports(path, package):
+    """Absolute dotted names of everything a module imports, inside functions too."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                above = package.split(".")[: len(package.split(".")) - node.level + 1]
+                base = ".".join([*above, base]).rstrip(".")
+            found |= {f"{base}.{alias.name}" for alias in node.names}
+    return found
+
+
+def dotted(room, path):
+    inside = path.relative_to(ROOMS[room]).parent.parts
+    return ".".join(["safe_wrappers", room, *inside])
+
+
+def rooms_used(room, path):
+    """The rooms and top modules that a module imports; "" is a public name of the package itself."""
+    used = set()
+    for name in imports(path, dotted(room, path)):
+        top, _, rest = name.partition(".")
+        if top == "safe_wrappers":
+            second = rest.split(".")[0]
+            known = second in ROOMS or (ROOT / "safe_wrappers" / f"{second}.py").exists()
+            used.add(second if known else "")
+    return used
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_no_arrow_points_back_up(room):
+    assert modules(room), f"{room} has no modules: the test looks in the wrong place"
+    for path in modules(room):
+        wrong = rooms_used(room, path) - MAY_USE[room]
+        assert not wrong, (
+            f"{path.relative_to(ROOT)} imports {sorted(wrong)}; {room} may use {sorted(MAY_USE[room])}"
+        )
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_heavy_libraries_stay_in_their_rooms(room):
+    for path in modules(room):
+        roots = {name.split(".")[0] for name in imports(path, dotted(room, path))}
+        wrong = roots & FORBIDDEN[room]
+        assert not wrong, f"{path.relative_to(ROOT)} imports {sorted(wrong)}"
+
+
+@pytest.mark.parametrize("name", ["__init__", "errors", "interventions", "protect"])
+def test_the_top_imports_no_torch_and_no_training(name):
+    found = imports(ROOT / "safe_wrappers" / f"{name}.py", "safe_wrappers")
+    assert not {n.split(".")[0] for n in found} & {"torch", "stable_baselines3"}
+    assert not any(n.startswith(("safe_wrappers.sb3", "safe_wrappers.train")) for n in found)
+
+
+def test_envs_and_train_are_never_imported_by_their_folder_names():
+    # They are safe_wrappers.envs and safe_wrappers.train wherever the package is installed.
+    for room in ROOMS:
+        for path in modules(room):
+            names = imports(path, dotted(room, path))
+            assert not {n.split(".")[0] for n in names} & {"envs", "train"}, path
+
+
+def test_every_folder_of_the_library_is_a_known_room():
+    folders = {p.name for p in (ROOT / "safe_wrappers").iterdir() if p.is_dir() and any(p.glob("*.py"))}
+    assert folders <= set(ROOMS), "a new room needs its place in the arrows"
+
+
+def test_the_parser_sees_what_it_should(tmp_path):
+    source = "import torch.nn\nfrom ..wrappers import x\ndef f():\n    from safe_wrappers.plants.plant import Plant\n"
+    path = tmp_path / "m.py"
+    path.write_text(source)
+    found = imports(path, "safe_wrappers.control")
+    assert found == {"torch.nn", "safe_wrappers.wrappers.x", "safe_wrappers.plants.plant.Plant"}
+    assert rooms_used("control", ROOMS["control"] / "projection.py") == {"errors"}
+    assert rooms_used("plants", ROOMS["plants"] / "mujoco.py") == {"errors", "plants"}
+
+
+def test_control_runs_without_gymnasium_and_mujoco():
+    # Each control module by its file, with those libraries blocked.
+    code = """
+import sys, importlib.util as u
+class Block:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("gymnasium", "mujoco", "torch", "stable_baselines3"):
+            raise ImportError(name + " is blocked")
+sys.meta_path.insert(0, Block())
+import types
+package = types.ModuleType("safe_wrappers"); package.__path__ = [sys.argv[1]]
+sys.modules["safe_wrappers"] = package
+import importlib
+for name in sys.argv[2:]:
+    importlib.import_module("safe_wrappers.control." + name)
+"""
+    names = [p.stem for p in modules("control") if p.stem != "__init__"]
+    folder = str(Path(safe_wrappers.__file__).parent)
+    done = subprocess.run(
+        [sys.executable, "-c", code, folder, *names], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
