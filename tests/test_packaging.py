@@ -2,6 +2,7 @@
 
 import email
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -106,7 +107,7 @@ def test_metadata(wheel):
     assert metadata["Requires-Python"] == ">=3.11"
     assert metadata["License-Expression"] == "MIT"
     plain = [r for r in metadata.get_all("Requires-Dist") if "extra ==" not in r]
-    needed = {r.split(">")[0].split("<")[0].split("=")[0].strip().lower() for r in plain}
+    needed = {re.split(r"[\s<>=\[;!~]", r)[0].lower() for r in plain}
     assert needed == {"numpy", "scipy", "gymnasium", "mujoco", "qpsolvers", "daqp", "clarabel"}
     (scripts,) = [n for n in archive.namelist() if n.endswith("entry_points.txt")]
     assert "safe-wrappers = safe_wrappers.train.cli:main" in archive.read(scripts).decode()

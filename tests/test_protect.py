@@ -81,7 +81,7 @@ def test_unknown_options_are_refused_with_the_list(options):
 @pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Swimmer-v5", "SafePointGoal0-v0"])
 def test_an_unknown_env_is_refused_with_lines_that_work(env_id):
     env = gym.make(env_id)
-    with pytest.raises(UnsupportedEnvError, match=f"no recipe for '?{env_id}") as caught:
+    with pytest.raises(UnsupportedEnvError, match=rf"no recipe for '?{env_id}") as caught:
         sw.protect(env)
     message = str(caught.value)
     assert all(
@@ -106,7 +106,7 @@ def test_an_env_without_a_spec_is_refused_and_not_a_crash():
 
 
 def test_a_discrete_env_is_refused():
-    with pytest.raises(ConfigurationError, match="no recipe for '?CartPole-v1"):
+    with pytest.raises(ConfigurationError, match=r"no recipe for '?CartPole-v1"):
         sw.protect(gym.make("CartPole-v1"))
 
 

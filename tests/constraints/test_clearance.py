@@ -168,7 +168,9 @@ def test_far_away_no_rows_are_asked_for(tmp_path):
     plant = sw.MujocoPlant()
     plant.bind(env)
     plant.observe()
-    rows = sw.Clearance([sw.Disc([50.0, 0.0], 0.3)], 1.5, bodies=["ball"]).rows(plant)
+    clear = sw.Clearance([sw.Disc([50.0, 0.0], 0.3)], 1.5, bodies=["ball"])
+    clear.bind(plant)
+    rows = clear.rows(plant)
     assert rows.normals.shape == (0, 2) and rows.offsets.shape == (0,)
 
 
