@@ -4,7 +4,7 @@ export MUJOCO_GL ?= disabled
 # One BLAS thread: the matrices are tiny and the runs are parallel processes.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test test-slow lint check bench figures clean
+.PHONY: demo test test-library test-slow lint check bench figures clean
 
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
@@ -16,6 +16,13 @@ demo: .venv/installed
 
 test: .venv/installed
 	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+# The library alone, without torch: make test-library PYTHON=python3.13
+LIBRARY_VENV = .venv-$(notdir $(PYTHON))
+test-library:
+	$(PYTHON) -m venv $(LIBRARY_VENV)
+	$(LIBRARY_VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]'
+	$(LIBRARY_VENV)/bin/python -m pytest -n 2 --dist loadfile --ignore tests/train --ignore tests/sb3
 
 test-slow: .venv/installed
 	$(BIN)/python -m pytest -n 2 -m slow
@@ -39,4 +46,4 @@ bench: .venv/bench
 	$(BIN)/python -m benchmarks.env_step
 
 clean:
-	rm -rf .venv build dist *.egg-info safe_wrappers.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv .venv-* build dist *.egg-info safe_wrappers.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

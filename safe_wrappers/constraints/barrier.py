@@ -27,7 +27,7 @@ class Barrier:
     Args:
         h: Takes the plant's state (n,), returns a number, positive inside the safe set. Its relative degree
             must be one: the control must act on h', so a position under a force needs its braking distance in
-            h (see `Clearance`). This is checked when the filter is built.
+            h (see `Clearance`). This is checked at the first reset.
         gradient: Takes the state, returns dh/dx (n,). None differentiates by central differences.
         alpha: Decay gain in 1/s (`alpha * h`), at most `1 / hold`; or an increasing function of h, with
             alpha(0) = 0, in h units per second (extended class K).
@@ -80,26 +80,28 @@ class Barrier:
         """The barrier condition as one half-space."""
         x = plant.state
         h = float(self.h(x))
-        if self.gradient is None:
-            dh = numerical_gradient(self.h, x)
-        else:
-            dh = np.asarray(self.gradient(x), dtype=np.float64)
-            if dh.shape != x.shape:
-                raise ConfigurationError(
-                    f"gradient must return the shape of the state {x.shape}, got {dh.shape}"
-                )
+        dh = self._gradient(x)
         effect = dh @ plant.g
-        if not self._degree_checked:
-            self._check_degree(plant, x, effect)
         room = h - self.margin
         decay = self.alpha(room) if callable(self.alpha) else self.alpha * room
         offset = float(dh @ plant.f) + decay - 0.5 * self.curvature * plant.hold_s
         return HalfSpaces(-effect[None, :], np.array([offset]))
 
-    def _check_degree(self, plant: Plant, x: Array, effect: Array) -> None:
-        """Refuse an h on which no control acts at first order, here or anywhere near."""
-        if np.abs(effect).max(initial=0.0) > 1e-9:
-            self._degree_checked = True
+    def _gradient(self, x: Array) -> Array:
+        if self.gradient is None:
+            return numerical_gradient(self.h, x)
+        dh = np.asarray(self.gradient(x), dtype=np.float64)
+        if dh.shape != x.shape:
+            raise ConfigurationError(f"gradient must return the shape of the state {x.shape}, got {dh.shape}")
+        return dh
+
+    def check(self, plant: Plant) -> None:
+        """Refuse an h on which no control acts at first order, at the first state or anywhere near."""
+        if self._degree_checked:
+            return
+        x = plant.state
+        self._degree_checked = True
+        if np.abs(self._gradient(x) @ plant.g).max(initial=0.0) > 1e-9:
             return
         drift = getattr(plant, "drift", lambda _: plant.f)
         matrix = getattr(plant, "effect", lambda _: plant.g)
@@ -113,4 +115,3 @@ class Barrier:
                 f"the control does not act on h' ({found}), so a barrier row cannot keep it: put the "
                 "braking distance into h (for example D - v^2 / (2 a_brake)), or use Clearance"
             )
-        self._degree_checked = True

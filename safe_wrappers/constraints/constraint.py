@@ -36,9 +36,10 @@ class Constraint(Protocol):
     """One safety requirement.
 
     A class with `rows` alone is enough. `value(plant)` (the barrier h, shape (k,), positive inside) lets the
-    filter report a margin. `bind(plant)` resolves names once, and refuses unknown ones. `promise` says what
-    holds: "proved" or "best effort". `admits` belongs to `CertifyingConstraint`. The plant is any `Plant`; a
-    constraint that needs a particular one refuses others in `bind`.
+    filter report a margin. `bind(plant)` resolves names once, and refuses unknown ones; `check(plant)` refuses
+    at a reset what only a state can show; `reset()` forgets an episode. `promise` says what holds: "proved" or
+    "best effort". `admits` belongs to `CertifyingConstraint`. The plant is any `Plant`; a constraint that needs
+    a particular one refuses others in `bind`.
     """
 
     def rows(self, plant: Any) -> HalfSpaces:

@@ -23,6 +23,14 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 
+_WANDER = 0.012
+"""Metres that the stopping path bends per metre of sideways coasting, at most.
+
+The drag acts at the turning axis, behind the centre of mass, so it turns a body that slides; the servo resists
+in the mean only, chattering about zero. Measured against MuJoCo: 0.0104 at 1.3 m/s, less below.
+"""
+
+
 class Motion(NamedTuple):
     """Position (m), heading (rad), velocity of the turning axis (m/s) and yaw rate (rad/s)."""
 
@@ -46,6 +54,7 @@ class StoppingPath(NamedTuple):
         crossing: Sideways distance at which the tangent of the motion reaches `forward`, m.
         reach: No point of the area is farther than this from the present position, m.
         spread: True where mass or damping are uncertain: the trapezoid instead of the triangle.
+        wander: How far the drag may turn the body off this path, m; distances are counted from there.
     """
 
     x: float
@@ -59,9 +68,10 @@ class StoppingPath(NamedTuple):
     crossing: float
     reach: float
     spread: bool
+    wander: float = 0.0
 
     def distance(self, px: float, py: float) -> float:
-        """Signed distance from a point to the area, m: negative inside."""
+        """Signed distance from a point to the area and its wander, m: negative inside."""
         dx, dy = px - self.x, py - self.y
         a, b = dx * self.ex + dy * self.ey, dx * self.sx + dy * self.sy
         s, c, e = self.forward, self.crossing, self.sideways
@@ -74,13 +84,13 @@ class StoppingPath(NamedTuple):
         above = b * s >= c * a
         below = b <= e if self.spread else b * s <= e * a
         inside = 0.0 <= a <= s and above and below
-        return -near if inside else near
+        return (-near if inside else near) - self.wander
 
     def end_distance(self, px: float, py: float) -> float:
-        """Distance from a point to where the body comes to rest, m."""
+        """Distance from a point to where the body comes to rest, its wander taken off, m."""
         end_x = self.x + self.forward * self.ex + self.sideways * self.sx
         end_y = self.y + self.forward * self.ey + self.sideways * self.sy
-        return math.hypot(px - end_x, py - end_y)
+        return math.hypot(px - end_x, py - end_y) - self.wander
 
 
 def _to_segment(px: float, py: float, ax: float, ay: float, bx: float, by: float) -> float:
@@ -214,6 +224,7 @@ class HeadingDrive:
         coast = self.coast_time
         forward = self.brake_distance(ahead) if brake else coast * ahead
         sideways = coast * aside
+        wander = _WANDER * sideways
         crossing = min(sideways, forward * aside / ahead) if ahead > 1e-9 else 0.0
         return StoppingPath(
             motion.x,
@@ -225,8 +236,9 @@ class HeadingDrive:
             forward,
             sideways,
             crossing,
-            math.hypot(forward, sideways),
+            math.hypot(forward, sideways) + wander,
             self.uncertainty > 0.0,
+            wander,
         )
 
     def predict(self, motion: Motion, drive: float, turn: float) -> Motion:

@@ -136,6 +136,8 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         self._last = np.clip(np.zeros(self._shape), self._low, self._high)
         self._warned.discard("unsafe")
         self.plant.observe()
+        for constraint in self.constraints:
+            getattr(constraint, "check", _nothing)(self.plant)
         margin, unsafe = self._margin()
         if unsafe:
             self._warn_unsafe(margin)
@@ -327,7 +329,7 @@ def _no_state() -> None:
 
 
 def _nothing(plant: Plant) -> None:
-    """A constraint without `bind` resolves no names."""
+    """A constraint without `bind` resolves no names, one without `check` needs no state to be refused."""
 
 
 def _with_margin(constraint: Constraint, margin: float) -> Constraint:

@@ -126,17 +126,11 @@ def excursion(drive, truth, brake=True, yaw=0.0, speed=1.3, runs=12, seed=4):
 
 
 @pytest.mark.parametrize("brake", [True, False])
-@pytest.mark.parametrize(("speed", "tolerance"), [(0.7, 3e-3), (1.3, 7e-3)])
-def test_the_area_holds_mujocos_stopping_path(brake, speed, tolerance):
-    # What is left is the drag's torque about the axis: it turns the heading by up to 0.02 rad while sliding.
+@pytest.mark.parametrize("speed", [0.7, 1.0, 1.3])
+def test_the_area_holds_mujocos_stopping_path(brake, speed):
+    # The drag's torque about the axis turns the heading by up to 0.02 rad while sliding: `wander` covers it.
     env, _, drive = robot()
-    assert excursion(drive, env, brake, speed=speed) <= tolerance
-
-
-@pytest.mark.xfail(strict=True, reason="5 mm at 1.1 m/s sideways: the drag turns the heading while it slides")
-def test_what_the_area_leaves_out_is_under_two_millimetres_as_promised():
-    env, _, drive = robot()
-    assert excursion(drive, env) <= 2e-3
+    assert excursion(drive, env, brake, speed=speed, runs=25) <= 1e-3
 
 
 def test_the_area_holds_the_stopping_path_while_turning():
@@ -171,7 +165,9 @@ def test_the_area_is_no_larger_than_it_need_be():
         [path.forward * path.ex + path.sideways * path.sx, path.forward * path.ey + path.sideways * path.sy]
     )
     assert np.linalg.norm(end - env.data.qpos[:2]) < 2e-3
-    assert path.end_distance(*env.data.qpos[:2]) == pytest.approx(np.linalg.norm(end - env.data.qpos[:2]))
+    assert path.end_distance(*env.data.qpos[:2]) == pytest.approx(
+        np.linalg.norm(end - env.data.qpos[:2]) - path.wander
+    )
 
 
 def test_braking_control_ends_at_rest_and_does_not_turn_round():

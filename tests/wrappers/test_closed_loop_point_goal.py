@@ -251,9 +251,6 @@ def test_constructor_refuses_nonsense(arguments, message):
 @pytest.mark.parametrize(
     "obstacle", [sw.Plane([1, 0], [-1, 0]), sw.Box([1, 0], [0.1, 0.1]), sw.Sphere([1, 0, 0], 0.1)]
 )
-@pytest.mark.xfail(
-    strict=True, reason="accepted at construction; a Plane or a Box then fails inside the step"
-)
 def test_obstacles_that_are_no_discs_are_refused(obstacle):
     with pytest.raises(ConfigurationError, match="Disc"):
         env = sw.CBFActionFilter(gym.make("SafePointGoal1-v0"), [sw.HeadingDriveClearance([obstacle])])
