@@ -22,7 +22,6 @@ import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-
 _WANDER = 0.012
 """Metres that the stopping path bends per metre of sideways coasting, at most.
 

@@ -12,7 +12,7 @@ import safe_wrappers as sw
 from safe_wrappers.control.stopping import sampled_acceleration_limit
 from safe_wrappers.errors import ConfigurationError
 
-POINT_MASS = """<mujoco><option timestep="{timestep}" gravity="0 0 0" integrator="RK4"/>
+POINT_MASS = """<mujoco><option timestep="{timestep}" gravity="{pull}" integrator="RK4"/>
 <worldbody><body name="ball">
 <joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>
 <geom type="sphere" size="0.05" mass="2" contype="0" conaffinity="0"/>
@@ -25,9 +25,9 @@ class PointMass(MujocoEnv):
 
     metadata = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"], "render_fps": 50}  # noqa: RUF012
 
-    def __init__(self, folder, timestep=0.002, frame_skip=10):
+    def __init__(self, folder, timestep=0.002, frame_skip=10, pull=(0.0, 0.0)):
         path = folder / "point_mass.xml"
-        path.write_text(POINT_MASS.format(timestep=timestep))
+        path.write_text(POINT_MASS.format(timestep=timestep, pull=f"{pull[0]} {pull[1]} 0"))
         self.metadata = {**self.metadata, "render_fps": round(1.0 / (timestep * frame_skip))}
         space = gym.spaces.Box(-np.inf, np.inf, (4,), np.float64)
         super().__init__(str(path), frame_skip, space)
@@ -59,7 +59,8 @@ def gap(path):
 
 @pytest.mark.parametrize("kind", ["bodies", "sites"])
 def test_rows_are_the_second_derivative_of_the_distance(tmp_path, kind):
-    env = PointMass(tmp_path)
+    pull = np.array([0.4, -0.7])  # a drift
+    env = PointMass(tmp_path, pull=pull)
     env.reset(seed=0)
     plant = sw.MujocoPlant()
     plant.bind(env)
@@ -72,7 +73,7 @@ def test_rows_are_the_second_derivative_of_the_distance(tmp_path, kind):
         env.set_state(np.array([0.55 - offset, 0.1]) + rng.uniform(-0.1, 0.1, 2), rng.uniform(-1, 1, 2))
         plant.observe()
         u = rng.uniform(-1, 1, 2)
-        p, v, a = env.data.qpos + np.array([offset, 0.0]), env.data.qvel, 2.0 * u
+        p, v, a = env.data.qpos + np.array([offset, 0.0]), env.data.qvel, 2.0 * u + pull
 
         def distance(t, p=p, v=v, a=a):
             return np.linalg.norm(p + v * t + 0.5 * a * t**2 - DISCS[0].center) - DISCS[0].radius
