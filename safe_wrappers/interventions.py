@@ -24,7 +24,7 @@ CBF_MARGIN: Final = "cbf/margin"
 """float64: the smallest barrier value h over all constraints before the step, each in its own unit (m, rad/s,
 ...); 0 when no constraint has a barrier."""
 CBF_UNSAFE: Final = "cbf/unsafe"
-"""bool: some h was negative (by more than rounding, 1e-9) or not a number before the step."""
+"""bool: some h was negative (by more than rounding, 1e-6) or not a number before the step."""
 EXECUTED_ACTION: Final = "executed_action"
 """array: what the env was really given."""
 PROPOSED_ACTION: Final = "proposed_action"

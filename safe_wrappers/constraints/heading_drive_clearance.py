@@ -28,6 +28,8 @@ _DETOUR_MEMORY = 50
 """Control steps for which a detour keeps its side after it was last needed, so that it cannot dither."""
 _ROW_SLACK = 0.02
 """The share of the needed clearance that prediction may miss of what the linear rows aimed at."""
+_HAIR_M = 1e-7
+"""Between two discs at rest the rows of both meet at one control; this much room lets a solver find it."""
 _RESERVE_M = 0.001
 """Kept free in front of the boundary for what the closed form leaves out; only the backup may draw on it."""
 
@@ -187,7 +189,9 @@ class HeadingDriveClearance:
                 left = self._clearance(path, disc)
                 if left < self._loss:
                     needed = self._needed(disc, self._backups()[k])
-                    if left < needed - _ROW_SLACK * abs(needed):
+                    if needed < 0.0:  # recovering: half of what the rows aim at will do
+                        needed = 0.5 * (needed + self._clearance(self._path, disc))
+                    if left < needed * (1.0 - _ROW_SLACK if needed > 0.0 else 1.0):
                         return False
         return True
 
@@ -211,7 +215,7 @@ class HeadingDriveClearance:
                     normal = np.zeros(plant.model.nu)
                     normal[k], normal[t] = -by_drive, -by_turn
                     normals.append(normal)
-                    offsets.append(at_brake - by_drive * braking - needed)
+                    offsets.append(at_brake - by_drive * braking - needed + _HAIR_M)
         if not normals:
             return HalfSpaces.none(plant.model.nu)
         return HalfSpaces(np.array(normals), np.array(offsets))

@@ -115,6 +115,15 @@ def project(
     return project_unchecked(u, a, b, lo, hi, solver)
 
 
+def box_least_squares(a: Array, b: Array, lower: Array, upper: Array) -> Array:
+    """The x in the box that minimises `|a x - b|^2`, shape (n,); `a` has full column rank."""
+    hessian, linear = a.T @ a, -(a.T @ b)
+    answer = _daqp(hessian, linear, np.zeros((0, linear.size)), np.zeros(0), lower, upper)
+    # Without rows the problem cannot be infeasible; on a numerical failure the unbounded answer, clipped.
+    x = answer[0] if answer is not None else np.linalg.solve(hessian, -linear)
+    return np.asarray(np.clip(x, lower, upper))
+
+
 def check_solver(solver: str) -> None:
     """Refuse a solver that is not installed, naming those that are."""
     if solver == "daqp":

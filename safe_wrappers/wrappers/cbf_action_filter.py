@@ -20,12 +20,15 @@ from safe_wrappers.errors import ActionError, ConfigurationError, UnsafeStateWar
 from safe_wrappers.plants.mujoco import MujocoPlant
 from safe_wrappers.plants.plant import Plant, check_actions
 from safe_wrappers.wrappers.fallback import Fallback, FallbackFunction
+from safe_wrappers.wrappers.rounding import cast_inside
 
 Array = NDArray[np.float64]
 
 _ROW_TOLERANCE = 1e-9
-_SAFE_TOLERANCE = 1e-9
-"""h below zero by less is rounding, in the constraints' own units."""
+_SAFE_TOLERANCE = 1e-6
+"""h below zero by less is rounding (of float32 actions, too), in the constraints' own units."""
+_OVERSHOOTS = (0.02, 0.1)
+"""Shares by which a correction that prediction refuses is made larger before the fallback is thought of."""
 _BLENDS = (0.1, 0.25, 0.5, 0.75)
 """How far a projected control that prediction refuses is moved towards the fallback, step by step."""
 
@@ -36,6 +39,7 @@ class _Decision:
     fallback: bool = False
     infeasible: bool = False
     changed: bool = True
+    rows: tuple[Array, Array] = (np.zeros((0, 0)), np.zeros(0))
 
 
 class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
@@ -176,7 +180,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
             # Bit for bit the policy's own action wherever the filter has nothing to say.
             sent, executed, correction = action, proposed, 0.0
         else:
-            sent = np.clip(decision.control, self._low, self._high).astype(self._dtype)
+            sent = cast_inside(decision.control, self._dtype, *decision.rows, self._low, self._high)
             executed = sent.astype(np.float64)
             correction = float(np.linalg.norm(executed - proposed))
         self._last = executed
@@ -252,24 +256,32 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
     def _projected(self, boxed: Array, asked: list[Constraint]) -> _Decision | None:
         """The projection onto the rows of `asked`, checked by prediction; None if that refuses all of it."""
         normals, offsets = self._rows(asked)
+        result, control = self._project(boxed, normals, offsets)
+        if result.status in (Status.INFEASIBLE, Status.FAILED):
+            infeasible = result.status is Status.INFEASIBLE
+            return _Decision(self._safe(control), fallback=True, infeasible=infeasible)
+        if self._admitted(control):
+            return _Decision(control, changed=bool((control != boxed).any()), rows=(normals, offsets))
+        if asked is not self.constraints:
+            return None
+        # The rows were a little too kind: ask for a little more of the same correction.
+        excess = np.maximum(normals @ boxed - offsets, 0.0)
+        for share in _OVERSHOOTS:
+            result, more = self._project(boxed, normals, offsets - share * excess)
+            if result.status is Status.PROJECTED and self._admitted(more):
+                return _Decision(more, rows=(normals, offsets))
+        return self._towards_fallback(control, normals, offsets)
+
+    def _project(self, boxed: Array, normals: Array, offsets: Array) -> tuple[Projection, Array]:
         lower, upper = self.plant.lower, self.plant.upper
         low, high = np.maximum(self._low, lower), np.minimum(self._high, upper)
         nominal = np.minimum(np.maximum(boxed, low), high)
         acting = getattr(self.plant, "acting_range", None)
         if acting is None or acting[0] is lower:
             result = project_unchecked(nominal, normals, offsets, low, high, self._solver)
-            control = result.control
-        else:
-            least, most = np.clip(acting[0], low, high), np.clip(acting[1], low, high)
-            result, control = self._project_acting(nominal, normals, offsets, low, high, least, most)
-        if result.status in (Status.INFEASIBLE, Status.FAILED):
-            infeasible = result.status is Status.INFEASIBLE
-            return _Decision(self._safe(control), fallback=True, infeasible=infeasible)
-        if self._admitted(control):
-            return _Decision(control, changed=bool((control != boxed).any()))
-        if asked is not self.constraints:
-            return None
-        return self._towards_fallback(control, normals, offsets)
+            return result, result.control
+        least, most = np.clip(acting[0], low, high), np.clip(acting[1], low, high)
+        return self._project_acting(nominal, normals, offsets, low, high, least, most)
 
     def _project_acting(
         self,
@@ -307,7 +319,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         return np.concatenate([p.normals for p in parts]), np.concatenate([p.offsets for p in parts])
 
     def _towards_fallback(self, control: Array, normals: Array, offsets: Array) -> _Decision:
-        """The rows were too kind: approach the fallback until prediction agrees."""
+        """The rows were far too kind: approach the fallback until prediction agrees."""
         safe = self._safe(control)
         for share in _BLENDS:
             blend = control + share * (safe - control)

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import lsq_linear
 
+from safe_wrappers.control.projection import box_least_squares
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.plants.mujoco import MujocoPlant
 from safe_wrappers.plants.plant import Plant
@@ -77,5 +77,4 @@ def brake(plant: MujocoPlant) -> Array:
     low, high = (np.clip(end, -1e6, 1e6) for end in plant.acting_range)
     stacked = np.vstack([a / scale, 1e-4 * np.eye(low.size)])
     aim = np.concatenate([-(plant.qvel / plant.hold_s + drift) * weight / scale, np.zeros(low.size)])
-    # lsq_linear wants low < high strictly
-    return np.asarray(lsq_linear(stacked, aim, bounds=(low, np.maximum(high, low + 1e-9))).x)
+    return box_least_squares(stacked, aim, low, high)

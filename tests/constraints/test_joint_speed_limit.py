@@ -189,9 +189,6 @@ def test_as_many_limits_as_joints():
         sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit([1.0, 2.0, 3.0])])
 
 
-@pytest.mark.xfail(
-    strict=True, reason="float32 rounding of the action ends 2e-9 rad/s above the limit: unsafe"
-)
 def test_at_the_limit_the_actions_rounding_is_not_called_unsafe():
     filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(4.0)])
     filtered.reset(seed=0)

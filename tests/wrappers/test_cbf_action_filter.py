@@ -346,7 +346,6 @@ def test_parked_at_the_wall_it_does_not_chatter():
     assert max(abs(i["executed_action"][0]) for i in infos[-50:]) < 0.5
 
 
-@pytest.mark.xfail(strict=True, reason="float32 rounding leaves the braking row 1e-9 short of feasible")
 def test_braking_to_the_wall_is_feasible_in_float32_too():
     filtered = cart([wall(3.0)], dt=0.02)
     assert not any(i["cbf/infeasible"] for i in full_throttle(filtered, 1000))
