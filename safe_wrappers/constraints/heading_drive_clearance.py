@@ -189,8 +189,8 @@ class HeadingDriveClearance:
                 left = self._clearance(path, disc)
                 if left < self._loss:
                     needed = self._needed(disc, self._backups()[k])
-                    if needed < 0.0:  # recovering: half of what the rows aim at will do
-                        needed = 0.5 * (needed + self._clearance(self._path, disc))
+                    if needed < 0.0:  # recovering: a quarter of what the rows aim at will do
+                        needed = 0.25 * needed + 0.75 * self._clearance(self._path, disc)
                     if left < needed * (1.0 - _ROW_SLACK if needed > 0.0 else 1.0):
                         return False
         return True
@@ -261,11 +261,22 @@ class HeadingDriveClearance:
         return [around, turn_only]
 
     def backup(self, plant: MujocoPlant) -> Array:
-        """The control that never shrinks the clearance: brake along the heading, hold the heading."""
+        """The control that never shrinks the clearance: brake along the heading, hold the heading.
+
+        From inside a disc it drives out, whichever way is better.
+        """
         self._look(plant)
         control = np.zeros(plant.model.nu)
-        control[self._frame.drive_index] = self._ends()[0]
+        drive = self._ends()[0]
+        if self._least < 0.0:
+            full = self.drive.drive_limit / self.drive.drive_gain
+            drive = max((drive, full, -full), key=lambda d: self._least_after(d))
+        control[self._frame.drive_index] = drive
         return control
+
+    def _least_after(self, drive: float) -> float:
+        paths = self._after(drive, 0.0)
+        return min(self._clearance(path, disc) for path in paths for disc in self._close)
 
 
 class _PlanarFrame:

@@ -1,0 +1,71 @@
+"""What is not seen through closed loops: the corners of the uncertainty, the side of a detour, recovery at rest."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import safe_wrappers as sw
+
+LAYOUT = {"agent": [0.0, 0.0, 0.0], "goal": [1.2, 1.2], "hazards": [[0.6, 0.0]], "vases": []}
+
+
+def filtered(layout=None, velocity=(0.0, 0.0, 0.0), **options):
+    env = sw.CBFActionFilter(
+        gym.make("SafePointGoal1-v0"),
+        [sw.HeadingDriveClearance([sw.Discs("hazard_positions", 0.2)], **options)],
+    )
+    env.reset(seed=0, options={"layout": LAYOUT | (layout or {})})
+    raw = env.unwrapped
+    qvel = raw.data.qvel.copy()
+    qvel[:3] = velocity
+    raw.set_state(raw.data.qpos.copy(), qvel)
+    env.plant.observe()
+    return env
+
+
+def test_a_control_must_be_safe_for_every_corner_of_the_uncertainty():
+    env = filtered({"agent": [-0.3, 0.0, 0.0]}, uncertainty=0.25)
+    (limit,), raw = env.constraints, env.unwrapped
+    every, push = limit._models, np.array([0.05, 0.0])
+    assert len(every) == 4
+
+    def refused(x, models):
+        qpos, qvel = raw.data.qpos.copy(), raw.data.qvel.copy()
+        qpos[0], qvel[0] = x, 0.9
+        raw.set_state(qpos, qvel)
+        env.plant.observe()
+        limit._models = models
+        return not limit.admits(env.plant, push)
+
+    places = np.linspace(-0.4, 0.2, 600)
+    by_all = np.array([refused(x, every) for x in places])
+    by_one = np.array([refused(x, [limit.drive]) for x in places])
+    assert by_all[by_one].all()
+    assert (by_all & ~by_one).any()
+
+
+@pytest.mark.parametrize(("beside", "side"), [(0.05, -1.0), (-0.05, 1.0)])
+def test_a_disc_ahead_on_the_left_is_passed_on_the_right(beside, side):
+    env = filtered({"hazards": [[0.26, beside]]}, detour=True)
+    (limit,) = env.constraints
+    around, turn_only = limit.suggestions(env.plant, np.array([1.0, 0.1]))
+    np.testing.assert_array_equal(around, [1.0, side])
+    np.testing.assert_array_equal(turn_only, [0.0, side])
+
+
+def test_no_detour_without_a_drive_or_without_a_disc_ahead():
+    env = filtered({"hazards": [[0.26, 0.0]]}, detour=True)
+    (limit,) = env.constraints
+    assert limit.suggestions(env.plant, np.array([0.0, 1.0])) == []
+    assert limit.suggestions(env.plant, np.array([-1.0, 0.0])) == []
+    env = filtered({"hazards": [[0.26, 0.0]]})
+    assert env.constraints[0].suggestions(env.plant, np.array([1.0, 0.0])) == []
+
+
+@pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning")
+@pytest.mark.parametrize("action", [(0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.3, -1.0)])
+def test_a_robot_inside_a_hazard_is_brought_out_whatever_the_policy_wants(action):
+    env = filtered({"hazards": [[0.05, 0.02]]})
+    costs = [env.step(np.array(action, np.float32))[4]["cost_substep"] for _ in range(400)]
+    assert costs[0] == 1.0
+    assert not any(costs[300:])
