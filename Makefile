@@ -44,6 +44,15 @@ bench: .venv/bench
 	$(BIN)/python -m benchmarks.projection
 	$(BIN)/python -m benchmarks.filter_call
 	$(BIN)/python -m benchmarks.env_step
+	$(BIN)/python -m benchmarks.env_task_step
+
+# Every long figure of the README: about an hour on two cores.
+figures: .venv/installed
+	$(BIN)/python -m benchmarks.adversarial
+	$(BIN)/python -m benchmarks.adversarial --mismatch
+	$(BIN)/python -m benchmarks.adversarial --price --steps 50000
+	$(BIN)/python -m benchmarks.adversarial --off --steps 100000
+	$(BIN)/safe-wrappers compare configs/pointgoal1_300k.yaml --report
 
 clean:
 	rm -rf .venv .venv-* build dist *.egg-info safe_wrappers.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

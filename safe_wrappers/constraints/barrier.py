@@ -7,7 +7,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.constraints.constraint import HalfSpaces, Promise, non_negative, positive
-from safe_wrappers.control.cbf import numerical_gradient, relative_degree
+from safe_wrappers.control.cbf import (
+    cbf_rows,
+    lie_derivatives,
+    linear_decay,
+    numerical_gradient,
+    relative_degree,
+)
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.plant import Plant
 
@@ -80,12 +86,11 @@ class Barrier:
         """The barrier condition as one half-space."""
         x = plant.state
         h = float(self.h(x))
-        dh = self._gradient(x)
-        effect = dh @ plant.g
+        drift, effect = lie_derivatives(self._gradient(x), plant.f, plant.g)
         room = h - self.margin
-        decay = self.alpha(room) if callable(self.alpha) else self.alpha * room
-        offset = float(dh @ plant.f) + decay - 0.5 * self.curvature * plant.hold_s
-        return HalfSpaces(-effect[None, :], np.array([offset]))
+        decay = self.alpha(room) if callable(self.alpha) else linear_decay(room, self.alpha)
+        normal, offset = cbf_rows(drift, effect, decay - 0.5 * self.curvature * plant.hold_s)
+        return HalfSpaces(normal[None, :], offset.reshape(1))
 
     def _gradient(self, x: Array) -> Array:
         if self.gradient is None:

@@ -26,6 +26,10 @@ def lie_derivatives(gradient: ArrayLike, f: ArrayLike, g: ArrayLike) -> tuple[Ar
         `Lf h` of shape (...) and `Lg h` of shape (..., m).
     """
     dh = np.asarray(gradient, dtype=np.float64)
+    if (
+        dh.ndim == 1 and np.ndim(f) == 1 and np.ndim(g) == 2
+    ):  # one state: the filter's case, and half the time
+        return np.asarray(dh @ f), dh @ np.asarray(g)
     drift = np.einsum("...n,...n->...", dh, np.asarray(f, dtype=np.float64))
     effect = np.einsum("...n,...nm->...m", dh, np.asarray(g, dtype=np.float64))
     return drift, effect
