@@ -25,14 +25,10 @@ def lie_derivatives(gradient: ArrayLike, f: ArrayLike, g: ArrayLike) -> tuple[Ar
     Returns:
         `Lf h` of shape (...) and `Lg h` of shape (..., m).
     """
-    dh = np.asarray(gradient, dtype=np.float64)
-    if (
-        dh.ndim == 1 and np.ndim(f) == 1 and np.ndim(g) == 2
-    ):  # one state: the filter's case, and half the time
-        return np.asarray(dh @ f), dh @ np.asarray(g)
-    drift = np.einsum("...n,...n->...", dh, np.asarray(f, dtype=np.float64))
-    effect = np.einsum("...n,...nm->...m", dh, np.asarray(g, dtype=np.float64))
-    return drift, effect
+    dh, drift, effect = (np.asarray(part, dtype=np.float64) for part in (gradient, f, g))
+    if dh.ndim == drift.ndim == 1 and effect.ndim == 2:  # one state: the filter's case, and half the time
+        return np.asarray(dh @ drift), np.asarray(dh @ effect)
+    return np.einsum("...n,...n->...", dh, drift), np.einsum("...n,...nm->...m", dh, effect)
 
 
 def linear_decay(h: ArrayLike, alpha: float) -> Array:
