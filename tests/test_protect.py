@@ -78,7 +78,7 @@ def test_unknown_options_are_refused_with_the_list(options):
         sw.protect(gym.make("Reacher-v5"), **options)
 
 
-@pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Swimmer-v5", "SafePointGoal0-v0"])
+@pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Swimmer-v5"])
 def test_an_unknown_env_is_refused_with_lines_that_work(env_id):
     env = gym.make(env_id)
     with pytest.raises(UnsupportedEnvError, match=rf"no recipe for '?{env_id}") as caught:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.constraints.constraint import HalfSpaces, Promise, non_negative, positive
+from safe_wrappers.constraints.cut import cut
 from safe_wrappers.control.cbf import (
     cbf_rows,
     lie_derivatives,
@@ -19,16 +20,22 @@ from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
 
+_ROUNDING = 1e-9
+"""Less is round-off, in units of h."""
+
 
 @dataclass
 class Barrier:
     """Keep `h(x) >= 0` by `Lf h + Lg h u >= -alpha (h - margin) + curvature * hold / 2`.
 
-    What it promises: in continuous time (and at samples short against 1/alpha) the set `h >= margin` is
-    invariant while the row is feasible. Between the samples of a held control it is proved only if `curvature`
-    bounds how fast h' can fall: then `h(t) >= (h - margin)(1 - alpha t) + margin >= 0` for the whole hold. With
-    the default of 0 that reserve is missing, and `margin` is what covers it. Feasibility depends on your h and
-    your actuators: infeasible steps are counted and the fallback runs. Hence best effort.
+    What it promises: in continuous time the set `h >= margin` is invariant while the row is feasible. A held
+    control is checked by prediction as well: h must not be negative at the half and at the end of the hold
+    (AnalyticPlant; the end by Runge-Kutta and by one Euler step), or at every physics substep (MujocoPlant);
+    where it is, the constraint is linearised anew about the refused control. So a control that is not flagged
+    keeps h at those instants, for a plant and an integration that are right; `margin` covers what is not (state
+    error, another integrator). `curvature`, a bound on -h'' under a held control, adds that reserve to the row
+    itself. Feasibility depends on your h and your actuators: infeasible steps are counted and the fallback
+    runs. Hence best effort.
 
     Args:
         h: Takes the plant's state (n,), returns a number, positive inside the safe set. Its relative degree
@@ -77,24 +84,66 @@ class Barrier:
                 f"alpha must be at most 1/hold = {1.0 / plant.hold_s:g}/s"
             )
         self._degree_checked = False
+        self._stamp: int | None = None
 
     def value(self, plant: Plant) -> Array:
         """H at the plant's state, shape (1,)."""
-        return np.array([float(self.h(plant.state))])
+        return np.array([self._height(plant.state)])
+
+    def _height(self, x: Array) -> float:
+        value = self.h(x)
+        if isinstance(value, float):  # np.float64 is one: the common case
+            return float(value)
+        h = np.asarray(value, dtype=np.float64)
+        if h.size != 1:
+            raise ConfigurationError(f"h must return one number, got an array of shape {h.shape}")
+        return float(h.reshape(()))
 
     def rows(self, plant: Plant) -> HalfSpaces:
         """The barrier condition as one half-space."""
+        stamp = getattr(plant, "stamp", None)
+        if stamp is None or stamp != self._stamp:
+            self._stamp, self._row = stamp, self._condition(plant)
+        return self._row
+
+    def _condition(self, plant: Plant) -> HalfSpaces:
         x = plant.state
-        h = float(self.h(x))
+        self._now = self._height(x)
         drift, effect = lie_derivatives(self._gradient(x), plant.f, plant.g)
-        room = h - self.margin
+        room = self._now - self.margin
         decay = self.alpha(room) if callable(self.alpha) else linear_decay(room, self.alpha)
         normal, offset = cbf_rows(drift, effect, decay - 0.5 * self.curvature * plant.hold_s)
         return HalfSpaces(normal[None, :], offset.reshape(1))
 
+    def admits(self, plant: Plant, control: Array) -> bool:
+        """Whether the row holds and prediction keeps h through the hold (from outside: does not lose more)."""
+        row = self.rows(plant)
+        excess = float(row.normals[0] @ control - row.offsets[0])
+        if not excess <= _ROUNDING * (1.0 + float(np.abs(row.normals[0]).sum())):
+            return False
+        path = getattr(plant, "path", None)
+        if path is None:
+            return True
+        floor = min(self._now, 0.0) - _ROUNDING
+        return all(self._height(x) >= floor for x in path(control))
+
+    def cut(self, plant: Plant, control: Array) -> HalfSpaces:
+        """The predicted h, linearised about a refused control."""
+        self.rows(plant)
+        path = getattr(plant, "path", None)
+        if path is None:
+            return HalfSpaces.none(control.size)
+        floor = min(self._now, 0.0)
+
+        def slacks(u: Array) -> Array:
+            heights = [self._height(x) - floor for x in path(u)]
+            return np.array(heights) if len(heights) <= 3 else np.array([heights[-1], min(heights)])
+
+        return cut(slacks, control, plant.lower, plant.upper)
+
     def _gradient(self, x: Array) -> Array:
         if self.gradient is None:
-            return numerical_gradient(self.h, x)
+            return numerical_gradient(self._height, x)
         dh = np.asarray(self.gradient(x), dtype=np.float64)
         if dh.shape != x.shape:
             raise ConfigurationError(f"gradient must return the shape of the state {x.shape}, got {dh.shape}")
@@ -106,13 +155,23 @@ class Barrier:
             return
         x = plant.state
         self._degree_checked = True
+        if not np.isfinite(x).all() or not np.isfinite(self._height(x)):
+            raise ConfigurationError(
+                f"the first state must be finite and h of it too; got {x}, h = {self._height(x)}"
+            )
+        if self.gradient is not None:
+            given, found = self._gradient(x), numerical_gradient(self._height, x)
+            if np.abs(given - found).max() > 1e-2 * (1.0 + np.abs(found).max()):
+                raise ConfigurationError(
+                    f"gradient does not fit h: at the first state it gives {given}, differences give {found}"
+                )
         if np.abs(self._gradient(x) @ plant.g).max(initial=0.0) > 1e-9:
             return
         drift = getattr(plant, "drift", lambda _: plant.f)
         matrix = getattr(plant, "effect", lambda _: plant.g)
         # The gradient may vanish at this very state (h = 1 - v^2 at rest): look around it before refusing.
         spread = np.random.default_rng(0).normal(size=(8, x.size)) * 0.1
-        degrees = [relative_degree(self.h, drift, matrix, x + s) for s in spread]
+        degrees = [relative_degree(self._height, drift, matrix, x + s) for s in spread]
         if 1 not in degrees:
             higher = min((d for d in degrees if d is not None), default=None)
             found = f"its relative degree is {higher}" if higher else "no control acts on it"

@@ -48,6 +48,7 @@ class Clearance:
             and every state of the envelope, m/s^2.
         bodies: Names of bodies whose frame origins are kept clear (MujocoPlant).
         sites: Names of sites, likewise.
+        geoms: Names of geoms: their centres, likewise.
         position: Indices of the point's coordinates in the state (AnalyticPlant).
         velocity: Indices of its velocity in the state, in the same order.
         radius: Of the machine around the point, m.
@@ -61,6 +62,7 @@ class Clearance:
     braking: float
     bodies: Sequence[str] = ()
     sites: Sequence[str] = ()
+    geoms: Sequence[str] = ()
     position: Sequence[int] = ()
     velocity: Sequence[int] = ()
     radius: float = 0.0
@@ -78,7 +80,7 @@ class Clearance:
         self.braking = positive("braking", self.braking, "m/s^2")
         for name in ("radius", "margin", "state_error"):
             setattr(self, name, non_negative(name, getattr(self, name), "m"))
-        for name in ("bodies", "sites"):
+        for name in ("bodies", "sites", "geoms"):
             if isinstance(getattr(self, name), str):
                 raise ConfigurationError(f"{name} is a list of names, got the string {getattr(self, name)!r}")
             setattr(self, name, list(getattr(self, name)))
@@ -93,15 +95,17 @@ class Clearance:
         """Resolve the points on the plant."""
         self._stamp: int | None = None
         if isinstance(plant, MujocoPlant):
-            if not self.bodies and not self.sites:
+            if not (self.bodies or self.sites or self.geoms):
                 raise ConfigurationError(
-                    "name the bodies or sites to keep clear; the model has the bodies "
+                    "name the bodies, sites or geoms to keep clear; the model has the bodies "
                     + ", ".join(plant.names("body"))
                 )
             for name in self.bodies:
                 plant.named("body", name)
             for name in self.sites:
                 plant.named("site", name)
+            for name in self.geoms:
+                plant.named("geom", name)
         elif not self.position:
             raise ConfigurationError(
                 "on an AnalyticPlant say where the point is in the state: position=[0, 1], velocity=[2, 3]"
@@ -110,9 +114,8 @@ class Clearance:
     def _points(self, plant: Plant) -> list[tuple[Array, Array, Array, Array]]:
         """Position, velocity, acceleration drift and control matrix of each point."""
         if isinstance(plant, MujocoPlant):
-            return [plant.point("body", n) for n in self.bodies] + [
-                plant.point("site", n) for n in self.sites
-            ]
+            named = {"body": self.bodies, "site": self.sites, "geom": self.geoms}
+            return [plant.point(kind, name) for kind, names in named.items() for name in names]
         x = plant.state
         p, v = self.position, self.velocity
         return [(x[p], x[v], plant.f[v], plant.g[v])]
@@ -138,13 +141,9 @@ class Clearance:
         return self._seen
 
     def value(self, plant: Plant) -> Array:
-        """Room left after braking, m, one per point and surface."""
-        reserve = {"state_error": self.state_error, "margin": self.margin}
+        """Room left after braking, margin and state error not taken off, m, one per point and surface."""
         return np.concatenate(
-            [
-                sampled_inset(s.clearance, s.approach, self.braking, plant.hold_s, **reserve)
-                for s in self._look(plant)
-            ]
+            [sampled_inset(s.clearance, s.approach, self.braking, plant.hold_s) for s in self._look(plant)]
         )
 
     def rows(self, plant: Plant) -> HalfSpaces:

@@ -1,7 +1,8 @@
 """HeadingDriveClearance: keep a robot that is driven along its heading clear, counting its whole stopping path."""
 
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -151,22 +152,29 @@ class HeadingDriveClearance:
         return min(path.distance(x, y), path.end_distance(x, y) - self._swivel) - room
 
     def value(self, plant: MujocoPlant) -> Array:
-        """Clearance of the stopping path from the nearest disc, m, shape (1,)."""
+        """Clearance of the stopping path from the nearest disc, margin and state error not taken off, m, (1,)."""
         self._look(plant)
-        return np.array([self._least])
+        return np.array([self._least + self.margin + self.state_error])
 
     def _needed(self, disc: _Circle, backup: StoppingPath) -> float:
-        """The clearance that a control must leave: a share of today's, or some recovery where it is lost."""
-        now = self._clearance(self._path, disc)
-        if now < 0.0:
-            # As much recovery as the drive can give here: across the heading it can give none.
-            full = self.drive.drive_limit / self.drive.drive_gain
-            ways = (self._after(full, 0.0)[0], self._after(-full, 0.0)[0], backup)
-            best = max(self._clearance(path, disc) for path in ways)
-            return min(now * (1.0 - _RECOVERY_RATE * self.drive.hold_s), best)
+        """The clearance that a control must leave of a disc, from inside the safe set: a share of today's."""
+        now = max(self._clearance(self._path, disc), 0.0)
         target = _RESERVE_M + (1.0 - _DECAY_PER_HOLD) * max(0.0, now - _RESERVE_M)
         # Never more than the backup manoeuvre leaves: it is what makes the constraint always feasible.
         return min(target, self._clearance(backup, disc))
+
+    def _needed_outside(self, backup: StoppingPath) -> float:
+        """The least clearance of all discs that a control must leave, once one of them is lost."""
+        # As much recovery as the drive can give here: across the heading it can give none.
+        full = self.drive.drive_limit / self.drive.drive_gain
+        best = max(self._least_after(full), self._least_after(-full), self._least_of(backup))
+        return min(self._least * (1.0 - _RECOVERY_RATE * self.drive.hold_s), best)
+
+    def _least_of(self, path: StoppingPath) -> float:
+        return min(self._clearance(path, disc) for disc in self._close)
+
+    def _least_after(self, drive: float) -> float:
+        return min(self._least_of(path) for path in self._after(drive, 0.0))
 
     def _backups(self) -> list[StoppingPath]:
         if not self._backup:
@@ -184,15 +192,15 @@ class HeadingDriveClearance:
         if not self._close:
             return True
         paths = self._after(float(control[self._frame.drive_index]), float(control[self._frame.turn_index]))
-        for k, path in enumerate(paths):
+        for path, backup in zip(paths, self._backups(), strict=True):
+            if self._least < 0.0:  # recovering: a quarter of what the rows aim at will do
+                if self._least_of(path) < 0.25 * self._needed_outside(backup) + 0.75 * self._least:
+                    return False
+                continue
             for disc in self._close:
                 left = self._clearance(path, disc)
-                if left < self._loss:
-                    needed = self._needed(disc, self._backups()[k])
-                    if needed < 0.0:  # recovering: a quarter of what the rows aim at will do
-                        needed = 0.25 * needed + 0.75 * self._clearance(self._path, disc)
-                    if left < needed * (1.0 - _ROW_SLACK if needed > 0.0 else 1.0):
-                        return False
+                if left < self._loss and left < self._needed(disc, backup) * (1.0 - _ROW_SLACK):
+                    return False
         return True
 
     def rows(self, plant: MujocoPlant) -> HalfSpaces:
@@ -204,11 +212,10 @@ class HeadingDriveClearance:
             braking, pushing = self._ends()
             probes = (self._after(pushing, 0.0), self._after(braking, 1.0), self._after(braking, -1.0))
             for base, pushed, left, right in zip(self._backups(), *probes, strict=True):
-                for disc in self._close:
-                    at_brake = self._clearance(base, disc)
-                    by_drive = (self._clearance(pushed, disc) - at_brake) / (pushing - braking)
-                    by_turn = 0.5 * (self._clearance(left, disc) - self._clearance(right, disc))
-                    needed = self._needed(disc, base)
+                for clearance, needed in self._asked(base):
+                    at_brake = clearance(base)
+                    by_drive = (clearance(pushed) - at_brake) / (pushing - braking)
+                    by_turn = 0.5 * (clearance(left) - clearance(right))
                     worst = at_brake + min(0.0, by_drive * (pushing - braking)) - abs(by_turn)
                     if worst >= needed:
                         continue
@@ -219,6 +226,15 @@ class HeadingDriveClearance:
         if not normals:
             return HalfSpaces.none(plant.model.nu)
         return HalfSpaces(np.array(normals), np.array(offsets))
+
+    def _asked(self, backup: StoppingPath) -> list[tuple[Callable[[StoppingPath], float], float]]:
+        """The clearances that count, as functions of the path, and what is needed of each."""
+        if self._least < 0.0:
+            return [(self._least_of, self._needed_outside(backup))]
+        return [
+            (functools.partial(self._clearance, disc=disc), self._needed(disc, backup))
+            for disc in self._close
+        ]
 
     def _ends(self) -> tuple[float, float]:
         """The drive controls that brake and that push on, as far as the drive acts."""
@@ -273,10 +289,6 @@ class HeadingDriveClearance:
             drive = max((drive, full, -full), key=lambda d: self._least_after(d))
         control[self._frame.drive_index] = drive
         return control
-
-    def _least_after(self, drive: float) -> float:
-        paths = self._after(drive, 0.0)
-        return min(self._clearance(path, disc) for path in paths for disc in self._close)
 
 
 class _PlanarFrame:

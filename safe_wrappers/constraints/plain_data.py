@@ -1,5 +1,6 @@
 """Constraints as plain data, so that a wrapper that holds them can be recorded, rebuilt and written as JSON."""
 
+import inspect
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from typing import Any
@@ -23,7 +24,7 @@ KINDS: dict[str, Callable[..., Constraint]] = {
 def constraint_from(data: Any) -> Constraint:
     """A constraint itself, or rebuilt from `constraint_data`."""
     if not isinstance(data, dict):
-        if not callable(getattr(data, "rows", None)):
+        if isinstance(data, type) or not callable(getattr(data, "rows", None)):
             raise ConfigurationError(
                 f"expected a constraint (an object with rows(plant)) or the dict of one, got {data!r}"
             )
@@ -31,6 +32,10 @@ def constraint_from(data: Any) -> Constraint:
     kind = data.get("kind", "")
     if kind not in KINDS:
         raise UnknownNameError(f"unknown constraint kind {kind!r}; the kinds are {', '.join(KINDS)}")
+    known = inspect.signature(KINDS[kind]).parameters
+    for key in data:
+        if key not in known and key != "kind":
+            raise UnknownNameError(f"{kind} has no {key!r}; it has {', '.join(known)}")
     return KINDS[kind](**{k: v for k, v in data.items() if k != "kind"})
 
 

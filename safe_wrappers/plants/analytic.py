@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.plant import check_timing, read_attribute
+from safe_wrappers.plants.plant import check_timing, read_attribute, refuse_second_env, seconds
 
 Array = NDArray[np.float64]
 
@@ -49,8 +49,11 @@ class AnalyticPlant:
         hold_s: float = 0.05,
         delay_s: float = 0.0,
     ) -> None:
+        for name, function in (("f", f), ("g", g), ("state", state)):
+            if not callable(function):
+                raise ConfigurationError(f"{name} must be a function, got {function!r}")
         self._f, self._g, self._state_of = f, g, state
-        self.hold_s, self.delay_s = float(hold_s), float(delay_s)
+        self.hold_s, self.delay_s = seconds("hold_s", hold_s), seconds("delay_s", delay_s)
         self._box = (lower, upper)
         self._env: gym.Env[Any, Any] | None = None
         self._x = np.zeros(0)
@@ -60,6 +63,7 @@ class AnalyticPlant:
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
         """Attach to an env: checks the time step and the bounds."""
+        refuse_second_env(self._env, env)
         check_timing(env, self.hold_s, self.delay_s)
         self._pending = deque(maxlen=max(1, int(np.ceil(self.delay_s / self.hold_s - 1e-9))))
         space = env.action_space
@@ -112,21 +116,30 @@ class AnalyticPlant:
 
     def integrate(self, x: Array, control: Array, span_s: float, substeps: int = 4) -> Array:
         """The state after holding a control for `span_s`, by classical Runge-Kutta."""
-
-        def rate(at: Array) -> Array:
-            return (
-                np.asarray(self._f(at), dtype=np.float64)
-                + np.asarray(self._g(at), dtype=np.float64) @ control
-            )
-
         step = span_s / substeps
         for _ in range(substeps):
-            k1 = rate(x)
-            k2 = rate(x + 0.5 * step * k1)
-            k3 = rate(x + 0.5 * step * k2)
-            k4 = rate(x + step * k3)
+            k1 = self._rate(x, control)
+            k2 = self._rate(x + 0.5 * step * k1, control)
+            k3 = self._rate(x + 0.5 * step * k2, control)
+            k4 = self._rate(x + step * k3, control)
             x = x + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
         return x
+
+    def path(self, control: Array) -> list[Array]:
+        """The states half-way through and at the end of a held control, by one Runge-Kutta step.
+
+        And the end by one Euler step: many envs integrate that way, and their truth counts.
+        """
+        x, hold = self._x, self.hold_s
+        k1 = self.f + self.g @ control
+        k2 = self._rate(x + 0.5 * hold * k1, control)
+        k3 = self._rate(x + 0.5 * hold * k2, control)
+        k4 = self._rate(x + hold * k3, control)
+        end = x + hold / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
+        return [x + 0.5 * hold * k3, end, x + hold * k1]
+
+    def _rate(self, x: Array, control: Array) -> Array:
+        return np.asarray(self._f(x), dtype=np.float64) + np.asarray(self._g(x), dtype=np.float64) @ control
 
     @property
     def state(self) -> Array:

@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.actuators import AffineActuators
-from safe_wrappers.plants.plant import check_timing, read_attribute
+from safe_wrappers.plants.plant import (
+    check_timing,
+    read_attribute,
+    refuse_changed_actions,
+    refuse_second_env,
+    seconds,
+)
 
 Array = NDArray[np.float64]
 
@@ -49,7 +55,7 @@ class MujocoPlant:
 
     def __init__(self, model: mujoco.MjModel | None = None, delay_s: float = 0.0) -> None:
         self._given = model
-        self.delay_s = float(delay_s)
+        self.delay_s = seconds("delay_s", delay_s)
         self._pending: deque[Array] = deque()
         self._factors = (1.0, 1.0)
         self._raw: Any = None
@@ -58,6 +64,7 @@ class MujocoPlant:
     def bind(self, env: gym.Env[Any, Any]) -> None:
         """Attach to an env and copy its model."""
         raw: Any = env.unwrapped
+        refuse_second_env(self._raw, env)
         if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
             raise UnsupportedEnvError(
                 f"{raw} has no MuJoCo .model and .data; describe it with "
@@ -80,6 +87,7 @@ class MujocoPlant:
         self._lower = np.where(limited, self.model.actuator_ctrlrange[:, 0], -np.inf)
         self._upper = np.where(limited, self.model.actuator_ctrlrange[:, 1], np.inf)
         self._check_action_space(env)
+        refuse_changed_actions(env)
         self.substeps = int(getattr(raw, "frame_skip", 1))
         self.hold_s = self.substeps * float(raw.model.opt.timestep)
         check_timing(env, self.hold_s, self.delay_s)
@@ -299,6 +307,10 @@ class MujocoPlant:
         for _ in range(self.substeps):
             mujoco.mj_step(self.model, self.data)
             yield self.data
+
+    def path(self, control: Array) -> list[Array]:
+        """The states (qpos, qvel) after each physics substep of a held control."""
+        return [np.concatenate([data.qpos, data.qvel]) for data in self.rollout(control)]
 
     def point(self, kind: str, name: str) -> tuple[Array, Array, Array, Array]:
         """Motion of a named frame's origin: position, velocity, drift and control matrix of its acceleration.

@@ -80,6 +80,38 @@ def read_attribute(env: gym.Env[Any, Any], name: str) -> Any:
         ) from None
 
 
+def refuse_second_env(bound: gym.Env[Any, Any] | None, env: gym.Env[Any, Any]) -> None:
+    """A plant reads one env: shared between two filters, one of them would read the wrong machine."""
+    if bound is not None and bound.unwrapped is not env.unwrapped:
+        raise ConfigurationError(
+            "this plant is bound to another env already; give every filter a plant of its own (in a vector env, "
+            "make it inside the function that makes the env)"
+        )
+
+
+_REPEATS = ("StickyAction", "MaxAndSkipObservation", "RepeatAction")
+
+
+def refuse_changed_actions(env: gym.Env[Any, Any]) -> None:
+    """Refuse wrappers inside the filter that change, repeat or drop the action it has checked."""
+    inner: Any = env
+    while isinstance(inner, gym.Wrapper):
+        if isinstance(inner, gym.ActionWrapper) or type(inner).__name__ in _REPEATS:
+            raise ConfigurationError(
+                f"{type(inner).__name__} inside the filter changes the actions that the filter has checked; "
+                "put it outside (filter first, then this wrapper), so that the filter has the last word"
+            )
+        inner = inner.env
+
+
+def seconds(name: str, value: Any) -> float:
+    """A number of seconds, or an error that names the parameter."""
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise ConfigurationError(f"{name} is a time in seconds, got {value!r}") from None
+
+
 def check_timing(env: gym.Env[Any, Any], hold_s: float, delay_s: float) -> None:
     """Refuse a hold interval that is not the env's own, or a negative delay."""
     if not (np.isfinite(hold_s) and hold_s > 0.0):

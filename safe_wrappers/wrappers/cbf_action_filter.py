@@ -5,7 +5,7 @@ import math
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass, replace
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
@@ -15,31 +15,18 @@ from numpy.typing import NDArray
 from safe_wrappers import interventions as keys
 from safe_wrappers.constraints.constraint import Constraint, non_negative
 from safe_wrappers.constraints.plain_data import constraint_data, constraint_from
-from safe_wrappers.control.projection import Projection, Status, check_solver, project_unchecked
+from safe_wrappers.control.projection import check_solver
 from safe_wrappers.errors import ActionError, ConfigurationError, UnsafeStateWarning
 from safe_wrappers.plants.mujoco import MujocoPlant
 from safe_wrappers.plants.plant import Plant, check_actions
+from safe_wrappers.wrappers.decision import Decider
 from safe_wrappers.wrappers.fallback import Fallback, FallbackFunction
 from safe_wrappers.wrappers.rounding import cast_inside
 
 Array = NDArray[np.float64]
 
-_ROW_TOLERANCE = 1e-9
 _SAFE_TOLERANCE = 1e-6
 """h below zero by less is rounding (of float32 actions, too), in the constraints' own units."""
-_OVERSHOOTS = (0.02, 0.1)
-"""Shares by which a correction that prediction refuses is made larger before the fallback is thought of."""
-_BLENDS = (0.1, 0.25, 0.5, 0.75)
-"""How far a projected control that prediction refuses is moved towards the fallback, step by step."""
-
-
-@dataclass(slots=True)
-class _Decision:
-    control: Array
-    fallback: bool = False
-    infeasible: bool = False
-    changed: bool = True
-    rows: tuple[Array, Array] = (np.zeros((0, 0)), np.zeros(0))
 
 
 class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
@@ -98,6 +85,11 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         space = check_actions(env)
         if isinstance(constraints, str | dict) or not isinstance(constraints, Sequence) or not constraints:
             raise ConfigurationError(f"constraints is a list with at least one, got {constraints!r}")
+        _refuse_nesting(env)
+        if plant is not None and (isinstance(plant, type) or not callable(getattr(plant, "observe", None))):
+            raise ConfigurationError(
+                f"plant is a MujocoPlant, an AnalyticPlant or another object with the Plant protocol, got {plant!r}"
+            )
         own = [copy.deepcopy(constraint_from(c)) for c in constraints]
         margin = non_negative("margin", margin, "the constraints' own units")
         check_solver(solver)
@@ -115,14 +107,11 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         self.plant.bind(env)
         for constraint in self.constraints:
             getattr(constraint, "bind", _nothing)(self.plant)
-        self._certifying: list[Any] = [c for c in self.constraints if hasattr(c, "admits")]
-        self._rows_only = [c for c in self.constraints if not hasattr(c, "admits")]
-        self._suggesting: list[Any] = [c for c in self.constraints if hasattr(c, "suggestions")]
         self._barriers: list[Any] = [c for c in self.constraints if hasattr(c, "value")]
-        self._fallback = Fallback(fallback, [c for c in self.constraints if hasattr(c, "backup")])
-        self._solver = solver
         self._low = np.asarray(space.low, dtype=np.float64)
         self._high = np.asarray(space.high, dtype=np.float64)
+        chosen = Fallback(fallback, [c for c in self.constraints if hasattr(c, "backup")])
+        self._decider = Decider(self.plant, self.constraints, chosen, solver, self._low, self._high)
         self._shape, self._dtype = space.shape, space.dtype
         self._last = np.clip(np.zeros(self._shape), self._low, self._high)
         self._warned: set[str] = set()
@@ -163,7 +152,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         finite = inside or bool(np.isfinite(proposed).all())
         clipped = 0.0
         if inside:
-            decision = self._decide(proposed)
+            decision = self._decider.decide(proposed, self._last)
         elif finite:
             boxed = np.clip(proposed, self._low, self._high)
             clipped = float(np.linalg.norm(boxed - proposed))
@@ -171,11 +160,11 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
                 "clipped",
                 f"the policy's action left the action space by {clipped:.3g}; it is boxed (cbf/clipped)",
             )
-            decision = self._decide(boxed)
+            decision = self._decider.decide(boxed, self._last)
         else:
             self._warn_once("nonfinite", f"the policy's action is not finite ({proposed}); the fallback acts")
             proposed = np.where(np.isfinite(proposed), proposed, 0.0)
-            decision = replace(self._decide(self._safe(None)), fallback=True, changed=True)
+            decision = self._decider.without_proposal(self._last)
         if inside and not decision.changed:
             # Bit for bit the policy's own action wherever the filter has nothing to say.
             sent, executed, correction = action, proposed, 0.0
@@ -234,107 +223,6 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
             self._warned.add(what)
             warnings.warn(message, category, stacklevel=3)
 
-    def _admitted(self, control: Array) -> bool:
-        return all(c.admits(self.plant, control) for c in self._certifying)
-
-    def _decide(self, boxed: Array) -> _Decision:
-        """The executed control for a boxed proposal."""
-        refused = bool(self._certifying) and not self._admitted(boxed)
-        if not refused and not self._rows_only:
-            return _Decision(boxed, changed=False)
-        if refused:
-            for constraint in self._suggesting:
-                for control in constraint.suggestions(self.plant, boxed):
-                    if self._admitted(control) and self._rows_hold(control):
-                        return _Decision(control)
-        asked = self.constraints if refused else self._rows_only
-        decision = self._projected(boxed, asked)
-        if decision is None and not refused:  # what the rows made of it is no longer admitted
-            decision = self._projected(boxed, self.constraints)
-        return decision or _Decision(self._safe(None), fallback=True, infeasible=True)
-
-    def _projected(self, boxed: Array, asked: list[Constraint]) -> _Decision | None:
-        """The projection onto the rows of `asked`, checked by prediction; None if that refuses all of it."""
-        normals, offsets = self._rows(asked)
-        result, control = self._project(boxed, normals, offsets)
-        if result.status in (Status.INFEASIBLE, Status.FAILED):
-            infeasible = result.status is Status.INFEASIBLE
-            return _Decision(self._safe(control), fallback=True, infeasible=infeasible)
-        if self._admitted(control):
-            return _Decision(control, changed=bool((control != boxed).any()), rows=(normals, offsets))
-        if asked is not self.constraints:
-            return None
-        # The rows were a little too kind: ask for a little more of the same correction.
-        excess = np.maximum(normals @ boxed - offsets, 0.0)
-        for share in _OVERSHOOTS:
-            result, more = self._project(boxed, normals, offsets - share * excess)
-            if result.status is Status.PROJECTED and self._admitted(more):
-                return _Decision(more, rows=(normals, offsets))
-        return self._towards_fallback(control, normals, offsets)
-
-    def _project(self, boxed: Array, normals: Array, offsets: Array) -> tuple[Projection, Array]:
-        lower, upper = self.plant.lower, self.plant.upper
-        low, high = np.maximum(self._low, lower), np.minimum(self._high, upper)
-        nominal = np.minimum(np.maximum(boxed, low), high)
-        acting = getattr(self.plant, "acting_range", None)
-        if acting is None or acting[0] is lower:
-            result = project_unchecked(nominal, normals, offsets, low, high, self._solver)
-            return result, result.control
-        least, most = np.clip(acting[0], low, high), np.clip(acting[1], low, high)
-        return self._project_acting(nominal, normals, offsets, low, high, least, most)
-
-    def _project_acting(
-        self,
-        nominal: Array,
-        normals: Array,
-        offsets: Array,
-        low: Array,
-        high: Array,
-        least: Array,
-        most: Array,
-    ) -> tuple[Projection, Array]:
-        """Project where actuators saturate inside the box: beyond `least` and `most` rows are not linear.
-
-        Distances are measured in shares of what acts, so that a control that saturates early does not look
-        cheap to change. A component that saturates as the policy's did stays the policy's: the force is the same.
-        """
-        acting = np.clip(nominal, least, most)
-        reach, box = most - least, high - low
-        unit = np.where((reach > 0.0) & np.isfinite(box), reach / np.where(box > 0.0, box, 1.0), 1.0)
-        result = project_unchecked(
-            acting / unit, normals * unit, offsets, least / unit, most / unit, self._solver
-        )
-        return result, np.where(result.control == acting / unit, nominal, result.control * unit)
-
-    def _rows_hold(self, control: Array) -> bool:
-        if not self._rows_only:
-            return True
-        normals, offsets = self._rows(self._rows_only)
-        return bool((normals @ control <= offsets + _ROW_TOLERANCE).all())
-
-    def _rows(self, asked: list[Constraint]) -> tuple[Array, Array]:
-        parts = [c.rows(self.plant) for c in asked]
-        if len(parts) == 1:
-            return parts[0].normals, parts[0].offsets
-        return np.concatenate([p.normals for p in parts]), np.concatenate([p.offsets for p in parts])
-
-    def _towards_fallback(self, control: Array, normals: Array, offsets: Array) -> _Decision:
-        """The rows were far too kind: approach the fallback until prediction agrees."""
-        safe = self._safe(control)
-        for share in _BLENDS:
-            blend = control + share * (safe - control)
-            if bool((normals @ blend <= offsets + _ROW_TOLERANCE).all()) and self._admitted(blend):
-                return _Decision(blend)
-        for j in range(safe.size):
-            mixed = safe.copy()
-            mixed[j] = control[j]
-            if bool((normals @ mixed <= offsets + _ROW_TOLERANCE).all()) and self._admitted(mixed):
-                return _Decision(mixed)
-        return _Decision(safe, fallback=True, infeasible=not self._admitted(safe))
-
-    def _safe(self, least: Array | None) -> Array:
-        return self._fallback(self.plant, self._last, self._low, self._high, least)
-
 
 def _no_state() -> None:
     """A constraint without `reset` keeps nothing from one episode to the next."""
@@ -342,6 +230,18 @@ def _no_state() -> None:
 
 def _nothing(plant: Plant) -> None:
     """A constraint without `bind` resolves no names, one without `check` needs no state to be refused."""
+
+
+def _refuse_nesting(env: gym.Env[Any, Any]) -> None:
+    """Layers that filter one after another undo each other, and the outer one's report would be wrong."""
+    inner: Any = env
+    while isinstance(inner, gym.Wrapper):
+        if isinstance(inner, CBFActionFilter):
+            raise ConfigurationError(
+                "this env is filtered already; constraints compose in one projection, so pass all of them to one "
+                "filter: CBFActionFilter(env, [*inner.constraints, more])"
+            )
+        inner = inner.env
 
 
 def _with_margin(constraint: Constraint, margin: float) -> Constraint:
