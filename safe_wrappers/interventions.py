@@ -22,7 +22,8 @@ CBF_CLIPPED: Final = "cbf/clipped"
 """float64: L2 norm of boxed minus proposed, in action units: what the action space alone took away."""
 CBF_MARGIN: Final = "cbf/margin"
 """float64: the smallest barrier value h over all constraints before the step, each in its own unit (m, rad/s,
-...); 0 when no constraint has a barrier."""
+...), to the limit itself: a constraint's margin is not taken off. 0 when no constraint has a barrier, or nothing
+that it watches is there."""
 CBF_UNSAFE: Final = "cbf/unsafe"
 """bool: some h was negative (by more than rounding, 1e-6) or not a number before the step."""
 EXECUTED_ACTION: Final = "executed_action"

@@ -160,10 +160,10 @@ class Barrier:
                 f"the first state must be finite and h of it too; got {x}, h = {self._height(x)}"
             )
         if self.gradient is not None:
-            given, found = self._gradient(x), numerical_gradient(self._height, x)
-            if np.abs(given - found).max() > 1e-2 * (1.0 + np.abs(found).max()):
+            given, differences = self._gradient(x), numerical_gradient(self._height, x)
+            if np.abs(given - differences).max() > 1e-2 * (1.0 + np.abs(differences).max()):
                 raise ConfigurationError(
-                    f"gradient does not fit h: at the first state it gives {given}, differences give {found}"
+                    f"gradient does not fit h: at the first state it gives {given}, differences give {differences}"
                 )
         if np.abs(self._gradient(x) @ plant.g).max(initial=0.0) > 1e-9:
             return

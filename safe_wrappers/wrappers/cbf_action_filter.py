@@ -36,15 +36,15 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
     project it onto the rows of all constraints and the actuator box at once, check the answer against the rows
     and, where a constraint can, by prediction; if nothing admissible is found, run the fallback and say so.
 
-    **What it guarantees.** No non-finite action, and none outside the action space, reaches the env. Rows that
-    the executed action should satisfy are satisfied (to 1e-9 of a control unit), or `cbf/infeasible` or
-    `cbf/fallback` is True. If every constraint's `promise` is "proved" and the plant is right within the
-    constraints' margins, episodes that start safe stay safe at every physics substep.
+    **What it guarantees.** No non-finite action, and none outside the action space, reaches the env. The executed
+    action satisfies every constraint's rows (to 1e-9 of a control unit) or, where a constraint predicts the held
+    step, its prediction; else `cbf/infeasible` or `cbf/fallback` is True. If every constraint's `promise` is
+    "proved" and the plant is right within the constraints' margins, episodes that start safe stay safe at every
+    physics substep, whatever the fallback: a proved stopping control is tried before it.
 
     **What it does not.** A "best effort" constraint, a plant outside its margins, or a start that is already
-    unsafe (warned of once per episode, counted in `cbf/unsafe`) void that; so does a wrapper *inside* this
-    one that changes actions: this must be the last word. It does not clip rewards or end episodes. A learner
-    that stores the policy's action learns from "naive" replays (Krasowski et al., 2023).
+    unsafe (warned of once per episode, counted in `cbf/unsafe`) void that. It does not clip rewards or end
+    episodes. A learner that stores the policy's action learns from "naive" replays (Krasowski et al., 2023).
 
     Args:
         env: With a one-dimensional Box action space.
