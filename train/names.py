@@ -32,5 +32,5 @@ def check_name(name: object, valid: Iterable[str], what: str) -> str:
     near = difflib.get_close_matches(str(name), options, n=1, cutoff=0.5)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     if len(options) > _MANY:
-        options = difflib.get_close_matches(str(name), options, n=8, cutoff=0.3) + ["..."]
+        options = [*difflib.get_close_matches(str(name), options, n=8, cutoff=0.3), "..."]
     raise UnknownNameError(f"{what}: unknown name {name!r}.{hint} Valid names: {', '.join(options)}.")
