@@ -1,7 +1,7 @@
 """Barrier: the user's own h on the plant's state."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -56,7 +56,7 @@ class Barrier:
     margin: float = 0.0
     curvature: float = 0.0
 
-    promise: Promise = "best effort"
+    promise: Promise = field(default="best effort", init=False)
 
     def __post_init__(self) -> None:
         if not callable(self.h):

@@ -160,7 +160,8 @@ class Clearance:
             bend = np.where(clearance + self.radius > 0.0, np.maximum(bend, 0.0), 0.0)
             normal = -near.normal @ effect
             offset = limit + near.normal @ drift + bend
-            reachable = np.abs(normal) @ np.where(np.isfinite(strongest), strongest, 1e12) > offset
+            # Negated, so that a row that is not a number is kept, and fails, instead of being left out.
+            reachable = ~(np.abs(normal) @ np.where(np.isfinite(strongest), strongest, 1e12) <= offset)
             normals.append(normal[reachable])
             offsets.append(offset[reachable])
         return HalfSpaces(np.concatenate(normals), np.concatenate(offsets))

@@ -108,7 +108,9 @@ class HeadingDriveClearance:
         self._swivel = 2.0 * abs(drive.com_offset)
         # The most that one hold's drive can add to the path; a turn and the way travelled depend on the speed.
         self._push = drive.fastest_change * (drive.hold_s + drive.coast_time)
-        self._turn = drive.hold_s * min(drive.yaw_limit / drive.yaw_damping, math.pi / drive.hold_s)
+        self._turn = drive.hold_s * min(
+            drive.yaw_limit / max(drive.yaw_damping, 1e-12), math.pi / drive.hold_s
+        )
 
     def _look(self, plant: MujocoPlant) -> None:
         """Take the state, once per observation."""
@@ -135,9 +137,10 @@ class HeadingDriveClearance:
                 cx, cy = center[0], center[1]
                 bounds.append((math.hypot(cx - x, cy - y) - room - kept, (cx, cy, room)))
         bounds.sort()
-        best = math.inf
+        # A position that is not a number may be anywhere: the clearance is then not a number either.
+        best = math.nan if any(bound != bound for bound, _ in bounds) else math.inf
         for bound, disc in bounds:
-            if bound >= best:
+            if not bound < best:
                 break
             best = min(best, self._clearance(path, disc))
         self._least = best

@@ -131,7 +131,8 @@ class MujocoPlant:
         mujoco.mj_getState(self._raw.model, self._raw.data, self._snapshot, int(_STATE))
         self._loaded = self._forwarded = False
         self.stamp += 1
-        if self._delay_steps:
+        # MuJoCo resets a state that is not a number, which a prediction would hide.
+        if self._delay_steps and bool(np.isfinite(self._snapshot).all()):
             self._predict_over_delay()
 
     def executed(self, control: Array | None) -> None:

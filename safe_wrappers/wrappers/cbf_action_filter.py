@@ -132,6 +132,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         for constraint in self.constraints:
             getattr(constraint, "check", _nothing)(self.plant)
         margin, unsafe = self._margin()
+        margin = margin if margin == margin else 0.0
         if unsafe:
             self._warn_unsafe(margin)
         info.update(dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0))
@@ -145,13 +146,18 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         proposed = self._checked(action)
         self.plant.observe()
         margin, unsafe = self._margin()
+        readable = margin == margin
+        margin = margin if readable else 0.0
         if unsafe:
             self._warn_unsafe(margin)
         # False for NaN too, so that one comparison clears the common case.
         inside = bool(((proposed >= self._low) & (proposed <= self._high)).all())
         finite = inside or bool(np.isfinite(proposed).all())
         clipped = 0.0
-        if inside:
+        if not readable:
+            proposed = np.where(np.isfinite(proposed), proposed, 0.0)
+            decision = self._decider.unreadable(self._last)
+        elif inside:
             decision = self._decider.decide(proposed, self._last)
         elif finite:
             boxed = np.clip(proposed, self._low, self._high)
@@ -199,14 +205,17 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         return proposed
 
     def _margin(self) -> tuple[float, bool]:
-        """The smallest h, finite, and whether the state is unsafe; a broken h (NaN) is unsafe."""
+        """The smallest h and whether the state is unsafe; NaN, and unsafe, if the state or an h is no number."""
+        reading = float(self.plant.state.sum())
+        if reading - reading != 0.0:
+            return math.nan, True
         lowest = math.inf
         for barrier in self._barriers:
             h = barrier.value(self.plant)
             if h.size:
                 least = float(h.min())
                 if least != least:
-                    return 0.0, True
+                    return math.nan, True
                 lowest = min(lowest, least)
         return (lowest if math.isfinite(lowest) else 0.0), lowest < -_SAFE_TOLERANCE
 

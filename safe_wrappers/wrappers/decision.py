@@ -169,6 +169,11 @@ class Decider:
         decision.fallback = decision.changed = True
         return decision
 
+    def unreadable(self, last: Array) -> Decision:
+        """The fallback alone: a state or a barrier that is not a number says nothing about any control."""
+        control = self._fallback(self._plant, last, self._low, self._high, None, readable=False)
+        return Decision(control, fallback=True)
+
     def _admitted(self, control: Array) -> bool:
         return all(c.admits(self._plant, control) for c in self._certifying)
 

@@ -41,19 +41,34 @@ class Fallback:
         self._choice = choice
         self._backups = backups
 
-    def __call__(self, plant: Plant, last: Array, low: Array, high: Array, least: Array | None) -> Array:
-        """The control, clipped to the box; a user's function that returns nonsense is replaced by zero."""
+    def __call__(
+        self,
+        plant: Plant,
+        last: Array,
+        low: Array,
+        high: Array,
+        least: Array | None,
+        readable: bool = True,
+    ) -> Array:
+        """The control, finite and clipped to the box; one that is not finite is replaced by zero.
+
+        Args:
+            plant: Observed.
+            last: What was executed before, shape (m,).
+            low: Action box, shape (m,).
+            high: Likewise.
+            least: The control that violates the rows least, if one is known.
+            readable: False if the state is not a number: braking is then no control, for want of a motion to brake.
+        """
         if callable(self._choice):
             control = np.asarray(self._choice(plant), dtype=np.float64)
             if control.shape != low.shape:
                 raise ConfigurationError(
                     f"the fallback must return a control of shape {low.shape}, got {control.shape}"
                 )
-            if not np.isfinite(control).all():
-                control = np.zeros_like(low)
         elif self._choice == "hold":
             control = last
-        elif self._choice == "zero":
+        elif self._choice == "zero" or not readable:
             control = np.zeros_like(low)
         elif self._backups:
             control = np.asarray(self._backups[0].backup(plant), dtype=np.float64)
@@ -61,6 +76,8 @@ class Fallback:
             control = brake(plant)
         else:
             control = least if least is not None else np.zeros_like(low)
+        if not np.isfinite(control).all():
+            control = np.zeros_like(low)
         return np.clip(control, low, high)
 
 

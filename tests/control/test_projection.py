@@ -7,7 +7,7 @@ import pytest
 import qpsolvers
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import minimize
+from scipy.optimize import lsq_linear, minimize
 
 import safe_wrappers as sw
 from safe_wrappers.control import projection as module
@@ -511,3 +511,15 @@ def test_public_name_and_status_are_strings():
     answer = sw.project([0.0], [[1.0]], [1.0], [-1.0], [1.0])
     assert isinstance(answer, sw.Projection)
     assert answer.status == "inactive" and isinstance(answer.status, Status)
+
+
+@given(st.integers(1, 6), st.integers(0, 6), st.integers(0, 2**31))
+def test_box_least_squares_agrees_with_scipy(n, more, seed):
+    rng = np.random.default_rng(seed)
+    a, b = rng.normal(size=(n + more, n)), 3.0 * rng.normal(size=n + more)
+    a += np.vstack([np.eye(n), np.zeros((more, n))])
+    low, high = -rng.random(n) - 0.01, rng.random(n) + 0.01
+    ours = module.box_least_squares(a, b, low, high)
+    truth = lsq_linear(a, b, (low, high), tol=1e-12).x
+    assert np.linalg.norm(a @ ours - b) <= np.linalg.norm(a @ truth - b) + 1e-6
+    assert ((ours >= low) & (ours <= high)).all()
