@@ -88,7 +88,7 @@ class MujocoPlant:
         self._upper = np.where(limited, self.model.actuator_ctrlrange[:, 1], np.inf)
         self._check_action_space(env)
         refuse_changed_actions(env)
-        self.substeps = int(getattr(raw, "frame_skip", 1))
+        self.substeps = int(getattr(_stepped(raw), "frame_skip", 1))
         self.hold_s = self.substeps * float(raw.model.opt.timestep)
         check_timing(env, self.hold_s, self.delay_s)
         self._delay_steps = int(np.ceil(self.delay_s / self.model.opt.timestep - 1e-9))
@@ -350,3 +350,11 @@ class MujocoPlant:
         """Read a published fact of the env."""
         found = getattr(self._raw, name, None)
         return found if found is not None else read_attribute(self._env, name)
+
+
+def _stepped(raw: Any) -> Any:
+    """The env that steps the physics: this one, or one that it holds over the same data (a maze holds its robot)."""
+    if hasattr(raw, "frame_skip"):
+        return raw
+    held = (e for e in vars(raw).values() if isinstance(e, gym.Env) and getattr(e, "data", None) is raw.data)
+    return next(held, raw)

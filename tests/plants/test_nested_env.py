@@ -1,0 +1,25 @@
+"""Envs that hold the env which steps the physics: gymnasium-robotics' mazes."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import safe_wrappers as sw
+
+robotics = pytest.importorskip("gymnasium_robotics")
+gym.register_envs(robotics)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "substeps", "hold_s"), [("AntMaze_UMaze-v5", 5, 0.05), ("PointMaze_UMaze-v3", 1, 0.01)]
+)
+def test_the_hold_is_the_inner_env_s(env_id, substeps, hold_s):
+    env = gym.make(env_id)
+    plant = sw.MujocoPlant()
+    plant.bind(env)
+    assert plant.substeps == substeps
+    assert plant.hold_s == pytest.approx(hold_s)
+    env.reset(seed=0)
+    before = env.unwrapped.data.time
+    env.step(np.zeros(env.action_space.shape, env.action_space.dtype))
+    assert env.unwrapped.data.time - before == pytest.approx(plant.hold_s)
