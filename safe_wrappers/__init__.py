@@ -16,9 +16,13 @@ from safe_wrappers.constraints import (
     Discs,
     HalfSpaces,
     HeadingDriveClearance,
+    JointPositionLimit,
     JointSpeedLimit,
     Plane,
+    SpeedLimit,
     Sphere,
+    Upright,
+    Workspace,
 )
 from safe_wrappers.control.projection import Projection, project
 from safe_wrappers.envs import register_envs as _register_envs
@@ -27,10 +31,12 @@ from safe_wrappers.plants.analytic import AnalyticPlant
 from safe_wrappers.plants.mujoco import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.protect import protect
+from safe_wrappers.wrappers.adaption_penalty import AdaptionPenalty
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
 
 __all__ = [
+    "AdaptionPenalty",
     "AnalyticPlant",
     "Barrier",
     "Box",
@@ -41,6 +47,7 @@ __all__ = [
     "Discs",
     "HalfSpaces",
     "HeadingDriveClearance",
+    "JointPositionLimit",
     "JointSpeedLimit",
     "MujocoPlant",
     "Plane",
@@ -48,8 +55,11 @@ __all__ = [
     "Projection",
     "RecordInterventions",
     "SafeWrappersError",
+    "SpeedLimit",
     "Sphere",
     "UnsafeStateWarning",
+    "Upright",
+    "Workspace",
     "project",
     "protect",
 ]

@@ -4,8 +4,12 @@ from safe_wrappers.constraints.barrier import Barrier
 from safe_wrappers.constraints.clearance import Clearance
 from safe_wrappers.constraints.constraint import CertifyingConstraint, Constraint, HalfSpaces
 from safe_wrappers.constraints.heading_drive_clearance import HeadingDriveClearance
+from safe_wrappers.constraints.joint_position_limit import JointPositionLimit
 from safe_wrappers.constraints.joint_speed_limit import JointSpeedLimit
 from safe_wrappers.constraints.obstacles import Box, Disc, Discs, Plane, Sphere
+from safe_wrappers.constraints.speed_limit import SpeedLimit
+from safe_wrappers.constraints.upright import Upright
+from safe_wrappers.constraints.workspace import Workspace
 
 __all__ = [
     "Barrier",
@@ -17,7 +21,11 @@ __all__ = [
     "Discs",
     "HalfSpaces",
     "HeadingDriveClearance",
+    "JointPositionLimit",
     "JointSpeedLimit",
     "Plane",
+    "SpeedLimit",
     "Sphere",
+    "Upright",
+    "Workspace",
 ]

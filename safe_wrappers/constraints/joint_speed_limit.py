@@ -2,30 +2,25 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.constraints.constraint import HalfSpaces, Promise, non_negative, positive
-from safe_wrappers.constraints.cut import cut
+from safe_wrappers.constraints.joints import scalar_joints
+from safe_wrappers.constraints.predicted import RECOVERY_S, Predicted
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.plants.forecast import Forecast
 from safe_wrappers.plants.mujoco import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
 
-_ROUNDING = 1e-9
-"""rad/s or m/s: less is round-off."""
-_RECOVERY_S = 0.1
-"""Time constant, s, in which a joint above its limit has to come back to it."""
-
-_HINGE_OR_SLIDE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-_DRIVES = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
 @dataclass
-class JointSpeedLimit:
+class JointSpeedLimit(Predicted):
     """Keep `|joint speed| <= limit`.
 
     Speed under a force has relative degree one, so no stopping inset is needed: the rows bound the speed at
@@ -41,13 +36,19 @@ class JointSpeedLimit:
         limit: In rad/s for hinges, m/s for slides; one number, or one per named joint.
         joints: Joint names. None takes every hinge and slide that an actuator drives directly.
         margin: Kept free below the limit, for model and state error, in the same units.
+        holds: Control steps to look ahead; the actuated joints are braked after the first.
+        rate: The highest joint acceleration that is possible in the declared envelope, rad/s^2 or m/s^2;
+            states that cannot reach the limit by it need no forecast. None forecasts always.
     """
 
     limit: float | Sequence[float]
     joints: Sequence[str] | None = None
     margin: float = 0.0
+    holds: int = 1
+    rate: float | None = None
 
     promise: Promise = field(default="best effort", init=False)
+    unit: ClassVar[str] = "rad/s or m/s"
 
     def __post_init__(self) -> None:
         self.margin = non_negative("margin", self.margin, "rad/s or m/s")
@@ -65,6 +66,7 @@ class JointSpeedLimit:
         self.limit = checked if many else checked[0]
         if min(checked) <= self.margin:
             raise ConfigurationError(f"the margin {self.margin} leaves nothing of the limit {self.limit}")
+        self._check_shared()
 
     def bind(self, plant: Plant) -> None:
         """Resolve the joints."""
@@ -73,25 +75,9 @@ class JointSpeedLimit:
                 "JointSpeedLimit needs a MujocoPlant (named joints); on an AnalyticPlant write "
                 "Barrier(lambda x: limit**2 - x[i]**2)"
             )
-        model = plant.model
-        if self.joints is None:
-            driven = {
-                int(model.actuator_trnid[a, 0])
-                for a in range(model.nu)
-                if model.actuator_trntype[a] in _DRIVES
-            }
-            ids = [j for j in sorted(driven) if model.jnt_type[j] in _HINGE_OR_SLIDE]
-            if not ids:
-                raise ConfigurationError(
-                    "no actuator drives a hinge or slide directly: name the joints; the model has: "
-                    + ", ".join(plant.names("joint"))
-                )
-        else:
-            ids = [plant.named("joint", name) for name in self.joints]
-            for j, name in zip(ids, self.joints, strict=True):
-                if model.jnt_type[j] not in _HINGE_OR_SLIDE:
-                    raise ConfigurationError(f"joint {name!r} is neither a hinge nor a slide")
-        self._dofs = np.array([int(model.jnt_dofadr[j]) for j in ids])
+        super().bind(plant)
+        ids = scalar_joints(plant, self.joints)
+        self._dofs = np.array([int(plant.model.jnt_dofadr[j]) for j in ids])
         try:
             limits = np.broadcast_to(np.asarray(self.limit, dtype=np.float64), (len(ids),))
         except ValueError:
@@ -99,27 +85,22 @@ class JointSpeedLimit:
         self._bound = limits - self.margin
         self._limits = limits
 
-    def value(self, plant: MujocoPlant) -> Array:
+    def _now(self, plant: MujocoPlant) -> Array:
         """Speed left below the limit, per joint, rad/s or m/s."""
-        return np.asarray(self._limits - np.abs(plant.qvel[self._dofs]))
+        self._speeds = np.abs(plant.qvel[self._dofs])
+        return np.asarray(self._limits - self._speeds)
 
-    def admits(self, plant: MujocoPlant, control: Array) -> bool:
-        """Roll the held step out: every substep stays below the bound, or comes back to it."""
-        return bool((self._slacks(plant, control) >= -_ROUNDING).all())
+    def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
+        return np.asarray(self._limits - np.abs(forecast.qvel[:, self._dofs]))
 
-    def cut(self, plant: MujocoPlant, control: Array) -> HalfSpaces:
-        """The predicted speeds, linearised about a refused control."""
-        return cut(lambda u: self._slacks(plant, u), control, plant.lower, plant.upper)
-
-    def _slacks(self, plant: MujocoPlant, control: Array) -> Array:
-        """What is left below the bound along the held step and at its end, per joint, shape (2 k,)."""
-        now = np.abs(plant.qvel[self._dofs])
-        speeds = np.abs([data.qvel[self._dofs] for data in plant.rollout(control)])
-        over = np.maximum(now - self._bound, 0.0)
-        # From above the bound: never faster on the way, and closer at the end.
-        on_the_way = self._bound + over
-        at_the_end = self._bound + over * np.exp(-plant.hold_s / _RECOVERY_S)
-        return np.concatenate([on_the_way - speeds.max(axis=0), at_the_end - speeds[-1]])
+    def slacks(self, plant: MujocoPlant, control: Array) -> Array:
+        """What is left below the bound along the forecast and at its end, per joint, shape (2 k,)."""
+        self._look(plant)
+        left = self._room(plant, plant.forecast(control, self.holds)) - self.margin
+        over = np.maximum(self._speeds - self._bound, 0.0)
+        # From above the bound, joint by joint: never faster on the way, and closer at the end.
+        decay = np.exp(-self.holds * plant.hold_s / RECOVERY_S)
+        return np.concatenate([left.min(axis=0) + over, left[-1] + over * decay])
 
     def rows(self, plant: MujocoPlant) -> HalfSpaces:
         """Two rows per joint that could reach its limit within the hold."""

@@ -9,15 +9,23 @@ from safe_wrappers.constraints.barrier import Barrier
 from safe_wrappers.constraints.clearance import Clearance
 from safe_wrappers.constraints.constraint import Constraint
 from safe_wrappers.constraints.heading_drive_clearance import HeadingDriveClearance
+from safe_wrappers.constraints.joint_position_limit import JointPositionLimit
 from safe_wrappers.constraints.joint_speed_limit import JointSpeedLimit
 from safe_wrappers.constraints.obstacles import obstacle_data
+from safe_wrappers.constraints.speed_limit import SpeedLimit
+from safe_wrappers.constraints.upright import Upright
+from safe_wrappers.constraints.workspace import Workspace
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 
 KINDS: dict[str, Callable[..., Constraint]] = {
     "Barrier": Barrier,
     "Clearance": Clearance,
     "HeadingDriveClearance": HeadingDriveClearance,
+    "JointPositionLimit": JointPositionLimit,
     "JointSpeedLimit": JointSpeedLimit,
+    "SpeedLimit": SpeedLimit,
+    "Upright": Upright,
+    "Workspace": Workspace,
 }
 
 
@@ -49,5 +57,6 @@ def constraint_data(constraint: Constraint) -> Any:
     for field in fields(constraint):
         if field.init and field.name != "promise":
             value = getattr(constraint, field.name)
-            data[field.name] = [obstacle_data(o) for o in value] if field.name == "obstacles" else value
+            obstacles = field.name in ("obstacles", "keep_out")
+            data[field.name] = [obstacle_data(o) for o in value] if obstacles else value
     return data

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.actuators import AffineActuators
+from safe_wrappers.plants.forecast import Forecast, Recorder
 from safe_wrappers.plants.plant import (
     check_timing,
     read_attribute,
@@ -93,6 +94,8 @@ class MujocoPlant:
         check_timing(env, self.hold_s, self.delay_s)
         self._delay_steps = int(np.ceil(self.delay_s / self.model.opt.timestep - 1e-9))
         self._pending = deque(maxlen=max(1, -(-self._delay_steps // self.substeps)))
+        self._recorder = Recorder(self.model, self.substeps)
+        self._forecasts: dict[bytes, Forecast] = {}
         self._snapshot = np.zeros(mujoco.mj_stateSize(self.model, int(_STATE)))
         self._loaded = self._forwarded = False
         if self._factors != (1.0, 1.0):
@@ -125,11 +128,13 @@ class MujocoPlant:
         self.model.dof_damping *= damping
         mujoco.mj_setConst(self.model, self.data)
         self._loaded = self._forwarded = False
+        self._forecasts.clear()
 
     def observe(self) -> None:
         """Take the env's present state; nothing is computed until it is asked for."""
         mujoco.mj_getState(self._raw.model, self._raw.data, self._snapshot, int(_STATE))
         self._loaded = self._forwarded = False
+        self._forecasts.clear()
         self.stamp += 1
         # MuJoCo resets a state that is not a number, which a prediction would hide.
         if self._delay_steps and bool(np.isfinite(self._snapshot).all()):
@@ -210,6 +215,11 @@ class MujocoPlant:
         dense = np.zeros((d.nefc, m.nv))
         mujoco.mju_sparse2dense(dense, d.efc_J, d.efc_J_rownnz, d.efc_J_rowadr, d.efc_J_colind)
         return dense
+
+    @property
+    def time(self) -> float:
+        """Of the present state, s; under a delay the predicted one."""
+        return float(self._snapshot[0])
 
     @property
     def qpos(self) -> Array:
@@ -308,6 +318,37 @@ class MujocoPlant:
         for _ in range(self.substeps):
             mujoco.mj_step(self.model, self.data)
             yield self.data
+
+    def forecast(self, control: Array, holds: int = 1) -> Forecast:
+        """What a control leads to: held for one control interval, then the actuated joints are braked.
+
+        Kept until the next observation, so that constraints that ask about one control share one forecast.
+
+        Args:
+            control: Shape (nu,).
+            holds: Control intervals to look ahead, >= 1. In those after the first every actuator opposes its
+                own motion (`Recorder`), which is one way to go on, not the best one.
+        """
+        key = control.tobytes()
+        known = self._forecasts.get(key)
+        wanted = holds * self.substeps
+        if known is None or len(known.qpos) < wanted:
+            self._load()
+            self._loaded = False
+            known = self._forecasts[key] = self._recorder.record(self.data, control, holds)
+        return known.first(wanted)
+
+    def pose(self) -> mujoco.MjData:
+        """The plant's data with positions of bodies up to date at the present state; cheaper than `forward`."""
+        if not self._forwarded:
+            self._load()
+            mujoco.mj_kinematics(self.model, self.data)
+        return self.data
+
+    def published(self) -> mujoco.MjData | None:
+        """The env's own data, to read what it publishes; None under a delay, when the present is predicted."""
+        data: mujoco.MjData = self._raw.data
+        return None if self._delay_steps else data
 
     def path(self, control: Array) -> list[Array]:
         """The states (qpos, qvel) after each physics substep of a held control."""

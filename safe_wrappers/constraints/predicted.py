@@ -1,0 +1,132 @@
+"""What constraints share that are judged on a forecast of the machine instead of on rows."""
+
+import warnings
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.constraints.constraint import HalfSpaces, positive
+from safe_wrappers.constraints.cut import cut
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.plants.forecast import Forecast
+from safe_wrappers.plants.mujoco import MujocoPlant
+from safe_wrappers.plants.plant import Plant
+
+Array = NDArray[np.float64]
+
+_ROUNDING = 1e-9
+RECOVERY_S = 0.1
+"""Time constant, s, in which a state outside has to come back."""
+
+
+class Predicted(ABC):
+    """A requirement `room >= margin` along a forecast: the held control first, braking after it.
+
+    A subclass says what is left of its limit at the present state (`value`) and along a forecast (`_room`).
+    This class decides from it (`admits`), linearises about a refused control (`cut`) and says by how much a
+    control fails (`shortfall`).
+
+    A forecast costs at least what a step of the env costs. So `rate` may declare how fast `value` can fall at
+    most, whatever the control does: a state that cannot come to its limit within the forecast by that rate is
+    admitted without one. The declaration is checked at every step, and dropped with a warning when broken.
+
+    Attributes of a subclass (dataclass fields): `margin` (units of the value), `holds` (control intervals to
+    look ahead), `rate` (units of the value per s, or None: always forecast).
+    """
+
+    margin: float
+    holds: int
+    rate: float | None
+    unit: str = "units of the value"
+
+    def _check_shared(self) -> None:
+        if isinstance(self.holds, bool) or self.holds != int(self.holds) or self.holds < 1:
+            raise ConfigurationError(
+                f"holds is a whole number of control intervals to look ahead, >= 1; got {self.holds!r}"
+            )
+        self.holds = int(self.holds)
+        if self.rate is not None:
+            self.rate = positive("rate", self.rate, f"{self.unit} per s")
+
+    @abstractmethod
+    def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
+        """What is left of the limit along a forecast, in time: shape (instants, n)."""
+
+    @abstractmethod
+    def _now(self, plant: MujocoPlant) -> Array:
+        """What is left of the limit at the present state, shape (n,)."""
+
+    def bind(self, plant: Plant) -> None:
+        """Refuse a plant without a model to forecast with."""
+        if not isinstance(plant, MujocoPlant):
+            raise UnsupportedEnvError(
+                f"{type(self).__name__} forecasts with a MuJoCo model; on an AnalyticPlant use "
+                "Barrier(h) or Clearance(...)"
+            )
+        self._stamp: int | None = None
+        self._previous: float | None = None
+        self._rate = self.rate
+
+    def reset(self) -> None:
+        """Forget the episode."""
+        self._stamp = self._previous = None
+
+    def value(self, plant: MujocoPlant) -> Array:
+        """What is left of the limit at the present state, margin not taken off."""
+        self._look(plant)
+        return self._value
+
+    def _look(self, plant: MujocoPlant) -> None:
+        if self._stamp == plant.stamp:
+            return
+        self._value = self._now(plant)
+        self._least = float(self._value.min())
+        if self._rate is not None and self._previous is not None and self._stamp == plant.stamp - 1:
+            if self._previous - self._least > self._rate * plant.hold_s * (1.0 + 1e-6) + _ROUNDING:
+                warnings.warn(
+                    f"{type(self).__name__} fell by {self._previous - self._least:.3g} {self.unit} in a step of "
+                    f"{plant.hold_s} s, faster than the declared rate of {self._rate:g} per s; from now on every "
+                    "control is forecast",
+                    stacklevel=2,
+                )
+                self._rate = None
+        self._previous, self._stamp = self._least, plant.stamp
+        self._outside = self._violation(self._least)
+        self._far = (
+            self._rate is not None
+            and self._least - self._rate * self.holds * plant.hold_s >= self.margin + _ROUNDING
+        )
+
+    def _violation(self, least: float) -> float:
+        """The present violation that a forecast starts from, <= 0."""
+        return min(0.0, least - self.margin)
+
+    def slacks(self, plant: MujocoPlant, control: Array) -> Array:
+        """What is left of what is asked for along the forecast of a control, shape (k,); wanted >= 0."""
+        self._look(plant)
+        left = self._room(plant, plant.forecast(control, self.holds)) - self.margin
+        if self._outside == 0.0:
+            return np.asarray(left.min(axis=0))
+        # From outside: no farther out on the way, and closer at the end.
+        closer = self._outside * float(np.exp(-self.holds * plant.hold_s / RECOVERY_S))
+        return np.concatenate([left.min(axis=0) - self._outside, left[-1] - closer])
+
+    def admits(self, plant: MujocoPlant, control: Array) -> bool:
+        """Whether the forecast keeps the margin (from outside: whether it comes back towards it)."""
+        self._look(plant)
+        return self._far or self.shortfall(plant, control) <= _ROUNDING
+
+    def shortfall(self, plant: MujocoPlant, control: Array) -> float:
+        """By how much the forecast of a control misses what is asked for, in the value's units; <= 0: not at all."""
+        least = float(self.slacks(plant, control).min())
+        return -least if least == least else np.inf
+
+    def cut(self, plant: MujocoPlant, control: Array) -> HalfSpaces:
+        """The forecast, linearised about a refused control."""
+        return cut(lambda u: self.slacks(plant, u), control, plant.lower, plant.upper)
+
+    def rows(self, plant: Any) -> HalfSpaces:
+        """None: what counts is the forecast, linearised where a control has been refused."""
+        return HalfSpaces.none(plant.lower.size)
