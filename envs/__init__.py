@@ -9,22 +9,29 @@ from typing import Final
 import gymnasium as gym
 
 EPISODE_STEPS: Final = 1000
-"""Control steps per episode, after which `TimeLimit` truncates (20 s at 50 Hz)."""
+"""Control steps per episode of every task, after which `TimeLimit` truncates (20 s at PointGoal's 50 Hz)."""
 
 POINT_GOAL_IDS: Final = tuple(f"SafePointGoal{level}-v0" for level in range(3))
 """Ids of the goal task with the point robot, by level."""
+
+VELOCITY_IDS: Final = tuple(
+    f"Safe{robot}Velocity-v0" for robot in ("HalfCheetah", "Hopper", "Walker2d", "Swimmer", "Ant", "Humanoid")
+)
+"""Ids of the velocity tasks: Gymnasium's robots with a published speed limit."""
 
 
 def register_envs() -> None:
     """Register every task of this package with Gymnasium; ids already there are left alone."""
     for level, env_id in enumerate(POINT_GOAL_IDS):
-        if env_id not in gym.registry:
-            gym.register(
-                env_id,
-                entry_point="safe_wrappers.envs.point_goal:SafePointGoalEnv",
-                kwargs={"level": level},
-                max_episode_steps=EPISODE_STEPS,
-            )
+        _register(env_id, "safe_wrappers.envs.point_goal:SafePointGoalEnv", {"level": level})
+    for env_id in VELOCITY_IDS:
+        robot = env_id.removeprefix("Safe").removesuffix("Velocity-v0")
+        _register(env_id, "safe_wrappers.envs.velocity:make_velocity_env", {"robot": robot})
 
 
-__all__ = ["EPISODE_STEPS", "POINT_GOAL_IDS", "register_envs"]
+def _register(env_id: str, entry_point: str, kwargs: dict[str, object]) -> None:
+    if env_id not in gym.registry:
+        gym.register(env_id, entry_point=entry_point, kwargs=kwargs, max_episode_steps=EPISODE_STEPS)
+
+
+__all__ = ["EPISODE_STEPS", "POINT_GOAL_IDS", "VELOCITY_IDS", "register_envs"]
