@@ -26,6 +26,9 @@ CBF_MARGIN: Final = "cbf/margin"
 that it watches is there."""
 CBF_UNSAFE: Final = "cbf/unsafe"
 """bool: some h was negative (by more than rounding, 1e-6) or not a number before the step."""
+CBF_REFUSED: Final = "cbf/refused"
+"""bool array, one per constraint in the order of the filter's `constraint_names`: it did not admit the boxed
+proposal. More than one may; all False when nothing was changed, or when the state or the proposal was not finite."""
 EXECUTED_ACTION: Final = "executed_action"
 """array: what the env was really given."""
 PROPOSED_ACTION: Final = "proposed_action"
@@ -54,3 +57,9 @@ RUNNING: Final = (
     "interventions/cost_substep",
 )
 """float64, every step: the episode so far. Monitor reads them at the terminal step (`info_keywords`)."""
+
+# AdaptionPenalty, every step --------------------------------------------------------------------------------
+ADAPTION_PENALTY: Final = "adaption/penalty"
+"""float64: what was taken off this step's reward because the filter changed the action, in reward units; else 0."""
+ADAPTION_TASK_REWARD: Final = "adaption/task_reward"
+"""float64: the task's own reward of this step, before the penalty."""

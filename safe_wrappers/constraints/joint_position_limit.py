@@ -100,7 +100,9 @@ def _positions(name: str, given: float | Sequence[float] | None) -> float | list
     try:
         many = [float(v) for v in given] if isinstance(given, Sequence | np.ndarray) else [float(given)]
     except (TypeError, ValueError):
-        raise ConfigurationError(f"{name} is a position in rad or m, or one per joint; got {given!r}") from None
+        raise ConfigurationError(
+            f"{name} is a position in rad or m, or one per joint; got {given!r}"
+        ) from None
     if not many or np.isnan(many).any():
         raise ConfigurationError(f"{name} is a position in rad or m, or one per joint; got {given!r}")
     return many if isinstance(given, Sequence | np.ndarray) else many[0]

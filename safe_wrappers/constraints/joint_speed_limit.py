@@ -18,7 +18,6 @@ from safe_wrappers.plants.plant import Plant
 Array = NDArray[np.float64]
 
 
-
 @dataclass
 class JointSpeedLimit(Predicted):
     """Keep `|joint speed| <= limit`.
@@ -67,6 +66,11 @@ class JointSpeedLimit(Predicted):
         if min(checked) <= self.margin:
             raise ConfigurationError(f"the margin {self.margin} leaves nothing of the limit {self.limit}")
         self._check_shared()
+
+    @property
+    def scale(self) -> float:
+        """The limit."""
+        return float(np.min(self.limit))
 
     def bind(self, plant: Plant) -> None:
         """Resolve the joints."""

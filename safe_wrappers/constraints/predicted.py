@@ -41,6 +41,11 @@ class Predicted(ABC):
     rate: float | None
     unit: str = "units of the value"
 
+    @property
+    def scale(self) -> float:
+        """What a shortfall is compared with, where constraints of several units fail at once."""
+        return 1.0
+
     def _check_shared(self) -> None:
         if isinstance(self.holds, bool) or self.holds != int(self.holds) or self.holds < 1:
             raise ConfigurationError(

@@ -69,6 +69,11 @@ class SpeedLimit(Predicted):
         self._axes = ["xyz".index(letter) for letter in self.direction.strip("+-")]
         self._sign = {"+": 1.0, "-": -1.0}.get(self.direction[0])
 
+    @property
+    def scale(self) -> float:
+        """The limit."""
+        return self.limit
+
     def bind(self, plant: Plant) -> None:
         """Resolve the body and its share in the machine's mass."""
         super().bind(plant)

@@ -56,9 +56,10 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
 
     Info, at every step (see `safe_wrappers.interventions`): ``cbf/intervened``, ``cbf/infeasible``,
     ``cbf/fallback``, ``cbf/nonfinite``, ``cbf/unsafe`` (bool); ``cbf/correction``, ``cbf/clipped``,
-    ``cbf/margin`` (float); ``proposed_action``, ``executed_action`` (arrays).
+    ``cbf/margin`` (float); ``cbf/refused``, ``proposed_action``, ``executed_action`` (arrays).
 
     Attributes:
+        constraint_names: Of the constraints, in the order of ``cbf/refused``: their kinds, numbered if repeated.
         filter_seconds: Wall time spent filtering so far; `filter_calls` says over how many steps.
 
     Raises:
@@ -103,6 +104,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         )
         gym.Wrapper.__init__(self, env)
         self.constraints: list[Constraint] = [_with_margin(c, margin) for c in own] if margin else own
+        self.constraint_names = _unique([type(c).__name__ for c in self.constraints])
         self.plant: Plant = plant if plant is not None else MujocoPlant()
         self.plant.bind(env)
         for constraint in self.constraints:
@@ -138,6 +140,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         info.update(dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0))
         info[keys.CBF_MARGIN] = margin
         info[keys.CBF_UNSAFE] = unsafe
+        info[keys.CBF_REFUSED] = np.zeros(len(self.constraints), dtype=bool)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -188,6 +191,10 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         info[keys.CBF_FALLBACK] = decision.fallback
         info[keys.CBF_NONFINITE] = not finite
         info[keys.CBF_UNSAFE] = unsafe
+        refused = decision.refused
+        info[keys.CBF_REFUSED] = (
+            refused if refused is not None else np.zeros(len(self.constraints), dtype=bool)
+        )
         info[keys.CBF_CORRECTION] = correction
         info[keys.CBF_CLIPPED] = clipped
         info[keys.CBF_MARGIN] = margin
@@ -231,6 +238,14 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         if what not in self._warned:
             self._warned.add(what)
             warnings.warn(message, category, stacklevel=3)
+
+
+def _unique(kinds: list[str]) -> list[str]:
+    """A number behind every kind that occurs more than once."""
+    return [
+        kind if kinds.count(kind) == 1 else f"{kind} {kinds[: i + 1].count(kind)}"
+        for i, kind in enumerate(kinds)
+    ]
 
 
 def _no_state() -> None:

@@ -33,6 +33,7 @@ class Decision:
         infeasible: Nothing that was tried is admitted by every constraint.
         changed: It is not the proposal.
         rows: The half-spaces that it satisfies, for rounding.
+        refused: Which constraints did not admit the proposal, shape (number of constraints,); None: none did.
     """
 
     control: Array
@@ -40,6 +41,7 @@ class Decision:
     infeasible: bool = False
     changed: bool = True
     rows: tuple[Array, Array] = (np.zeros((0, 0)), np.zeros(0))
+    refused: NDArray[np.bool_] | None = None
 
 
 class Decider:
@@ -64,6 +66,7 @@ class Decider:
         high: Array,
     ) -> None:
         self._plant, self._fallback, self._solver, self._low, self._high = plant, fallback, solver, low, high
+        self._constraints = constraints
         self._certifying: list[Any] = [c for c in constraints if hasattr(c, "admits")]
         self._rows_only: list[Constraint] = [c for c in constraints if not hasattr(c, "admits")]
         self._suggesting: list[Any] = [c for c in constraints if hasattr(c, "suggestions")]
@@ -74,12 +77,27 @@ class Decider:
 
     def decide(self, boxed: Array, last: Array) -> Decision:
         """The executed control for a proposal inside the box; `last` is what was executed before."""
-        if not self._narrower:
-            return self._decide(boxed, last)
-        nominal = np.clip(boxed, self._plant.lower, self._plant.upper)
+        nominal = np.clip(boxed, self._plant.lower, self._plant.upper) if self._narrower else boxed
+        self._tried: list[Array] = []
         decision = self._decide(nominal, last)
-        decision.changed |= bool((nominal != boxed).any())
+        if decision.changed:
+            decision.refused = self._refusing(nominal)
+        if self._narrower:
+            decision.changed |= bool((nominal != boxed).any())
         return decision
+
+    def _refusing(self, boxed: Array) -> NDArray[np.bool_]:
+        """Which constraints do not admit a control: those that predict by their prediction, others by rows."""
+        refused = np.zeros(len(self._constraints), dtype=bool)
+        for i, constraint in enumerate(self._constraints):
+            admits = getattr(constraint, "admits", None)
+            if admits is not None:
+                refused[i] = not admits(self._plant, boxed)
+            else:
+                rows = constraint.rows(self._plant)
+                # Negated, so that a row that is not a number counts as refusing.
+                refused[i] = not bool((rows.normals @ boxed <= rows.offsets).all())
+        return refused
 
     def _decide(self, boxed: Array, last: Array) -> Decision:
         refused = bool(self._certifying) and not self._admitted(boxed)
@@ -155,7 +173,20 @@ class Decider:
                 return Decision(mixed)
         if safe is not None:
             return Decision(safe)
-        return Decision(target, fallback=True, infeasible=not self._keeps(target, strict))
+        if self._keeps(target, strict):
+            return Decision(target, fallback=True)
+        return Decision(self._least_failing(target, strict), fallback=True, infeasible=True)
+
+    def _least_failing(self, target: Array, strict: tuple[Array, Array]) -> Array:
+        """Of all that was tried, the control whose forecast fails least; the fallback's own if it is not "brake"."""
+        if not (self._fallback.brakes and all(hasattr(c, "shortfall") for c in self._certifying)):
+            return target
+        kept = [u for u in self._tried if bool((strict[0] @ u <= strict[1] + _ROW_TOLERANCE).all())]
+
+        def failing(control: Array) -> float:
+            return max(c.shortfall(self._plant, control) / c.scale for c in self._certifying)
+
+        return min([target, *kept], key=failing)
 
     def _fall_back(self, least: Array, last: Array, infeasible: bool) -> Decision:
         return Decision(self._fallback_control(least, last), fallback=True, infeasible=infeasible)
@@ -175,7 +206,10 @@ class Decider:
         return Decision(control, fallback=True)
 
     def _admitted(self, control: Array) -> bool:
-        return all(c.admits(self._plant, control) for c in self._certifying)
+        admitted = all(c.admits(self._plant, control) for c in self._certifying)
+        if not admitted:
+            self._tried.append(control)
+        return admitted
 
     def _keeps(self, control: Array, strict: tuple[Array, Array]) -> bool:
         within = not strict[1].size or bool((strict[0] @ control <= strict[1] + _ROW_TOLERANCE).all())

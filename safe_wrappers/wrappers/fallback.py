@@ -25,8 +25,9 @@ class Fallback:
     Args:
         choice: "brake" takes the motion away as fast as the actuators can: by a constraint's own proved
             stopping control where one has it, else by `brake` on a MujocoPlant; an AnalyticPlant does not say
-            which states are velocities, so there it is the control that violates the rows least. "hold" repeats
-            the last executed action; "zero" is no control; or a function of the plant.
+            which states are velocities, so there it is the control that violates the rows least. Where all
+            constraints forecast and none admits it, the filter takes, of all that it has tried, the control that
+            fails least. "hold" repeats the last executed action; "zero" is no control; or a function of the plant.
         backups: Constraints that bring their own stopping control; "brake" uses the first of them.
 
     Raises:
@@ -40,6 +41,7 @@ class Fallback:
             )
         self._choice = choice
         self._backups = backups
+        self.brakes = choice == "brake"
 
     def __call__(
         self,

@@ -42,7 +42,7 @@ def check_info(info, size):
         assert np.isfinite(info[key]), key
     for key in (keys.PROPOSED_ACTION, keys.EXECUTED_ACTION):
         assert info[key].dtype == np.float64 and info[key].shape == (size,)
-    assert {k for k in info if k.startswith("cbf/")} == BOOLS | FLOATS
+    assert {k for k in info if k.startswith("cbf/")} == BOOLS | FLOATS | {keys.CBF_REFUSED}
 
 
 # What reaches the env -----------------------------------------------------------------------------------------

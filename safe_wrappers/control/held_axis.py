@@ -1,0 +1,161 @@
+"""One axis of a damped point mass under a held force: its exact step, its stopping distance, and the inverse.
+
+A physics step maps speed v and control u to `v' = decay v + gain u` and moves by `timestep v'` (MuJoCo's
+semi-implicit Euler step with implicit joint damping; decay = 1 without damping). A control is held for `substeps`
+of them. All of that is linear, so three things are exact and cheap:
+
+* A hold: `v_end = A v + B u`, `x_end = x + P v + Q u`.
+* The brake: the full opposing control for as many holds as it takes, and in the last one just the control
+  `-A v / B` that ends it at rest. A braking force held any longer would reverse the motion. Within each of these holds
+  the speed falls monotonically to zero or above, so the body never turns back.
+* The stopping distance: while the number n of full holds is the same, every map is linear in v, so the distance
+  is piecewise linear in v, with a knot at each speed that n full holds take away exactly. It is tabulated once.
+
+An env may clip the speed at the start of every control step (PointMaze: 5 m/s). Braking from above the clip is
+then braking from the clip: the table is flat there.
+"""
+
+import bisect
+import math
+from dataclasses import dataclass, field
+
+_MOST_HOLDS = 4096
+"""Length of the table, in holds of full braking; faster than it knows is counted as never stopping."""
+_FLAT = 1e9
+"""m/s; the stopping distance is flat from the clip up to here."""
+
+
+@dataclass(frozen=True)
+class _Stops:
+    """Stopping distance over speed for one direction of motion.
+
+    Attributes:
+        speeds: The knots, m/s, ascending from 0.
+        ways: Stopping distance at each, m.
+        totals: Way of the hold that ends at this speed (its share that depends on it) and the stop after it, m.
+    """
+
+    speeds: list[float]
+    ways: list[float]
+    totals: list[float]
+
+    def way(self, speed: float) -> float:
+        """Stopping distance from a speed >= 0, m; infinite beyond the table."""
+        return _interpolate(self.speeds, self.ways, speed)
+
+    def speed(self, total: float) -> float:
+        """The inverse over `totals`; the fastest that the table knows beyond it."""
+        if total >= self.totals[-1]:
+            return self.speeds[-1]
+        return _interpolate(self.totals, self.speeds, total)
+
+
+def _interpolate(xs: list[float], ys: list[float], x: float) -> float:
+    i = bisect.bisect_right(xs, x)
+    if i == len(xs):
+        return ys[-1] if x == xs[-1] else math.inf
+    before = xs[i - 1]
+    return ys[i - 1] + (x - before) / (xs[i] - before) * (ys[i] - ys[i - 1])
+
+
+@dataclass(frozen=True)
+class HeldAxis:
+    """The constants of one axis.
+
+    Attributes:
+        decay: Share of the speed that one physics step keeps without control, in (0, 1].
+        gain: Speed that one physics step adds per control, m/s, > 0.
+        timestep: Physics step, s.
+        substeps: Physics steps per control step.
+        low: Smallest control, < 0.
+        high: Largest control, > 0.
+        clip: Speed to which the env clips the motion at the start of every control step, m/s; inf: it does not.
+    """
+
+    decay: float
+    gain: float
+    timestep: float
+    substeps: int
+    low: float
+    high: float
+    clip: float = math.inf
+
+    keep: float = field(init=False)
+    """A: share of the speed that one hold keeps."""
+    add: float = field(init=False)
+    """B: speed that one hold adds per control, m/s."""
+    drift: float = field(init=False)
+    """P: way in one hold per speed, s."""
+    shift: float = field(init=False)
+    """Q: way in one hold per control, m."""
+    _up: _Stops = field(init=False, repr=False)
+    _down: _Stops = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        keep, add, drift, shift = 1.0, 0.0, 0.0, 0.0
+        for _ in range(self.substeps):
+            keep, add = self.decay * keep, self.decay * add + self.gain
+            drift, shift = drift + self.timestep * keep, shift + self.timestep * add
+        fields = {"keep": keep, "add": add, "drift": drift, "shift": shift}
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "_up", self._table(-self.low))
+        object.__setattr__(self, "_down", self._table(self.high))
+
+    def _table(self, brake: float) -> _Stops:
+        """Knots until the speed that no control can exceed, or the clip."""
+        loss, lost_way = self.add * brake, self.shift * brake
+        just_stops = self.drift - self.shift * self.keep / self.add  # way of the last hold, per speed
+        speeds, ways = [0.0, loss / self.keep], [0.0, just_stops * loss / self.keep]
+        while len(speeds) < _MOST_HOLDS and speeds[-1] < self.clip:
+            speed = (speeds[-1] + loss) / self.keep
+            ways.append(self.drift * speed - lost_way + ways[-1])
+            speeds.append(speed)
+        if speeds[-1] >= self.clip:
+            ways[-1] = _interpolate(speeds, ways, self.clip)
+            speeds[-1] = self.clip
+            speeds.append(_FLAT)
+            ways.append(ways[-1])
+        per_speed = self.shift / self.add
+        return _Stops(speeds, ways, [per_speed * v + w for v, w in zip(speeds, ways, strict=True)])
+
+    def clipped(self, v: float) -> float:
+        """The speed with which a control step starts."""
+        return max(-self.clip, min(v, self.clip))
+
+    def step(self, x: float, v: float, u: float) -> tuple[float, float]:
+        """Position and speed at the end of a hold; `v` is clipped already."""
+        u = max(self.low, min(u, self.high))
+        return x + self.drift * v + self.shift * u, self.keep * v + self.add * u
+
+    def rest(self, x: float, v: float) -> float:
+        """Where braking comes to rest."""
+        return x + self._up.way(v) if v >= 0.0 else x - self._down.way(-v)
+
+    def brake(self, v: float) -> float:
+        """The control that brakes fully, or just to rest within one hold."""
+        return max(self.low, min(-self.keep * self.clipped(v) / self.add, self.high))
+
+    def extent(self, x: float, v: float, u: float) -> tuple[float, float]:
+        """Least and greatest position during a hold, its start included; `v` is clipped already."""
+        end, speed = self.step(x, v, u)
+        if self.substeps == 1 or v * speed >= 0.0:
+            return min(x, end), max(x, end)
+        u = max(self.low, min(u, self.high))
+        least = most = x
+        for _ in range(self.substeps):
+            v = self.decay * v + self.gain * u
+            x += self.timestep * v
+            least, most = min(least, x), max(most, x)
+        return least, most
+
+    def control_to_rest_at(self, x: float, v: float, target: float) -> float:
+        """The control whose hold, and braking after it, comes to rest at `target`; it may be out of bounds.
+
+        `rest` after a hold grows with the control, so this is the bound on the control that keeps the rest point
+        on this side of the target. `v` is clipped already.
+        """
+        per_speed = self.shift / self.add
+        way = target - x - (self.drift - per_speed * self.keep) * v
+        end = self._up.speed(way) if way >= 0.0 else -self._down.speed(-way)
+        return (end - self.keep * v) / self.add

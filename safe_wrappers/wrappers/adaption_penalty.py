@@ -1,0 +1,96 @@
+"""AdaptionPenalty: the learner's reward is reduced where the filter changed its action."""
+
+from typing import Any, SupportsFloat
+
+import gymnasium as gym
+
+from safe_wrappers import interventions as keys
+from safe_wrappers.constraints.constraint import non_negative
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
+
+
+class AdaptionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
+    """Takes a penalty off the reward at every step at which the filter changed the action.
+
+    The "adaption penalty" of Krasowski et al. (Provably Safe Reinforcement Learning, TMLR 2023): the learner keeps
+    its own action a, and learns from r(s, a_safe) - penalty instead of r(s, a_safe), where
+
+        penalty = penalty + per_correction * |a_safe - a|    if `cbf/intervened`
+                  0                                          otherwise.
+
+    The constant alone is what their benchmark used; the part that grows with the distance is the one that they
+    give for action projection. Any algorithm can learn from it, PPO too: the action is still the policy's own.
+    What a penalty is worth depends on the task's reward; look at both before choosing it.
+
+    **Order.** filter -> `RecordInterventions` -> SB3's `Monitor` -> `AdaptionPenalty`. What lies inside sees the
+    task's own reward, so that the episodes' returns, in `info["interventions"]`, in Monitor's files and in
+    `rollout/ep_rew_mean`, can be compared with a run that has no penalty; only the learner sees the penalised one.
+    A Monitor put outside records the penalised reward. Wrappers that scale or clip rewards belong inside. For
+    evaluation leave this wrapper out.
+
+    Args:
+        env: With a `CBFActionFilter` inside.
+        penalty: For every changed step, in units of the task's reward, at least 0.
+        per_correction: For each unit of `cbf/correction` (L2 norm, action units) of a changed step, at least 0.
+
+    Info, at every step: ``adaption/penalty`` and ``adaption/task_reward`` (float), whose difference is the reward.
+
+    Raises:
+        ConfigurationError: No filter inside, a second AdaptionPenalty, a penalty that is negative or not finite,
+            or none at all.
+
+    Example:
+        >>> import gymnasium as gym, safe_wrappers as sw
+        >>> env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(limit=4.0)])
+        >>> env = sw.AdaptionPenalty(env, penalty=0.1)
+        >>> _ = env.reset(seed=0)
+        >>> _, reward, _, _, info = env.step(env.action_space.sample())
+        >>> float(reward) == info["adaption/task_reward"] - info["adaption/penalty"]
+        True
+
+    Change log:
+        * v0.2.0: added.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], penalty: float = 0.0, per_correction: float = 0.0) -> None:
+        _check_inside(env)
+        penalty = non_negative("penalty", penalty, "the task's reward")
+        per_correction = non_negative("per_correction", per_correction, "reward per action unit")
+        if penalty == 0.0 and per_correction == 0.0:
+            raise ConfigurationError(
+                "AdaptionPenalty: give penalty (per changed step), per_correction (per unit of cbf/correction), or"
+                " both; with neither the learner is the naive one, which needs no wrapper"
+            )
+        gym.utils.RecordConstructorArgs.__init__(self, penalty=penalty, per_correction=per_correction)
+        gym.Wrapper.__init__(self, env)
+        self.penalty = penalty
+        self.per_correction = per_correction
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Steps the env; an unchanged step's reward passes through untouched."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        penalty = 0.0
+        info[keys.ADAPTION_TASK_REWARD] = float(reward)
+        if info[keys.CBF_INTERVENED]:
+            penalty = self.penalty + self.per_correction * float(info[keys.CBF_CORRECTION])
+            reward = float(reward) - penalty
+        info[keys.ADAPTION_PENALTY] = penalty
+        return observation, reward, terminated, truncated, info
+
+
+def _check_inside(env: gym.Env[Any, Any]) -> None:
+    inner: Any = env
+    filtered = False
+    while isinstance(inner, gym.Wrapper):
+        if isinstance(inner, AdaptionPenalty):
+            raise ConfigurationError(
+                "this env has an AdaptionPenalty already; its penalty would be taken twice"
+            )
+        filtered = filtered or isinstance(inner, CBFActionFilter)
+        inner = inner.env
+    if not filtered:
+        raise ConfigurationError(
+            "AdaptionPenalty needs a CBFActionFilter inside, which says when an action was changed:"
+            " AdaptionPenalty(sw.protect(env), penalty=...)"
+        )
