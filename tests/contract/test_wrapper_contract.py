@@ -26,6 +26,9 @@ def _clearance():
 
 
 EXAMPLES = {
+    "AdaptionPenalty": {
+        "a constant and a part that grows": (TASK, lambda: {"penalty": 0.5, "per_correction": 0.25})
+    },
     "CBFActionFilter": {
         "a HeadingDriveClearance": (TASK, lambda: {"constraints": [_clearance()]}),
         "a JointSpeedLimit with options": (
@@ -50,6 +53,9 @@ EXAMPLES = {
 }
 """Wrapper name -> what it shows -> (env id, function of its arguments): plain data or what becomes it."""
 
+INSIDE = {"AdaptionPenalty": lambda env: sw.CBFActionFilter(env, [_clearance()])}
+"""Wrapper name -> the wrapper that it needs inside."""
+
 EXPORTED = sorted(
     name
     for name in sw.__all__
@@ -65,9 +71,14 @@ def example(name, case):
     return EXAMPLES[name][case]
 
 
+def inside(name, env):
+    """The env as the wrapper needs it."""
+    return INSIDE.get(name, lambda env: env)(env)
+
+
 def build(name, case):
     env_id, arguments = example(name, case)
-    return getattr(sw, name)(gym.make(env_id), **arguments())
+    return getattr(sw, name)(inside(name, gym.make(env_id)), **arguments())
 
 
 def actions(env, steps=STEPS, seed=0):
@@ -180,7 +191,7 @@ class Witness(gym.Wrapper):
 @every_wrapper
 def test_reset_passes_seed_and_options_on_and_changes_neither(name, case):
     env_id, arguments = example(name, case)
-    env = getattr(sw, name)(Witness(gym.make(env_id)), **arguments())
+    env = getattr(sw, name)(Witness(inside(name, gym.make(env_id))), **arguments())
     options = {"note": [1, 2, {"deep": 3}]}
     if env_id == TASK:
         options = {"layout": {"goal": [1.0, 1.0], "hazards": [[0.0, -1.0]]}}
@@ -356,7 +367,7 @@ def harmless(name, case):
     if name == "CBFActionFilter":
         return sw.CBFActionFilter(Witness(gym.make("Reacher-v5")), [sw.JointSpeedLimit(1e9)])
     env_id, arguments = example(name, case)
-    return getattr(sw, name)(Witness(gym.make(env_id)), **arguments())
+    return getattr(sw, name)(Witness(inside(name, gym.make(env_id))), **arguments())
 
 
 @every_wrapper
@@ -377,7 +388,8 @@ def test_inactive_is_bit_identical(name, case):
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_non_finite_action_does_not_get_through(name, case, bad):
     env_id, arguments = example(name, case)
-    env = getattr(sw, name)(Witness(gym.make(env_id)), **arguments())
+    witness = Witness(gym.make(env_id))
+    env = getattr(sw, name)(inside(name, witness), **arguments())
     env.reset(seed=0)
     action = np.full(env.action_space.shape, bad)
     if name == "RecordInterventions":  # records and changes nothing: the task itself refuses
@@ -386,5 +398,5 @@ def test_a_non_finite_action_does_not_get_through(name, case, bad):
         return
     with pytest.warns(UserWarning, match="not finite"):
         env.step(action)
-    assert np.isfinite(env.env.action).all()
-    assert env.action_space.contains(env.env.action)
+    assert np.isfinite(witness.action).all()
+    assert env.action_space.contains(witness.action)
