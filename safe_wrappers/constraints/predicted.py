@@ -88,21 +88,24 @@ class Predicted(ABC):
             return
         self._value = self._now(plant)
         self._least = float(self._value.min())
-        if self._rate is not None and self._previous is not None and self._stamp == plant.stamp - 1:
-            if self._previous - self._least > self._rate * plant.hold_s * (1.0 + 1e-6) + _ROUNDING:
-                warnings.warn(
-                    f"{type(self).__name__} fell by {self._previous - self._least:.3g} {self.unit} in a step of "
-                    f"{plant.hold_s} s, faster than the declared rate of {self._rate:g} per s; from now on every "
-                    "control is forecast",
-                    stacklevel=2,
-                )
-                self._rate = None
+        if self._previous is not None and self._stamp == plant.stamp - 1:
+            self._check_rate(self._previous - self._least, plant.hold_s)
         self._previous, self._stamp = self._least, plant.stamp
         self._outside = self._violation(self._least)
         self._far = (
             self._rate is not None
             and self._least - self._rate * self.holds * plant.hold_s >= self.margin + _ROUNDING
         )
+
+    def _check_rate(self, fallen: float, hold_s: float) -> None:
+        if self._rate is not None and fallen > self._rate * hold_s * (1.0 + 1e-6) + _ROUNDING:
+            warnings.warn(
+                f"{type(self).__name__}: what is left of the limit fell by {fallen:.3g} {self.unit} in a step of "
+                f"{hold_s} s, faster than the declared rate of {self._rate:g} per s; from now on every control is "
+                "forecast",
+                stacklevel=2,
+            )
+            self._rate = None
 
     def _violation(self, least: float) -> float:
         """The present violation that a forecast starts from, <= 0."""

@@ -31,8 +31,9 @@ class SpeedLimit(Predicted):
     momentum, and contact forces have one sign. Hence best effort; then the step is counted infeasible and
     the control that was found to exceed the limit least is executed.
 
-    Over one control step both windows count that are in use: from state to state, and the one that MuJoCo's
-    `data.xpos` shows, which lags one physics substep (Gymnasium reads Ant's and Humanoid's speed from it).
+    Over one control step both displacements count that are in use: from state to state, and the one that MuJoCo's
+    `data.xpos` shows, which belongs to the last point that the integrator evaluated (Gymnasium reads Ant's and
+    Humanoid's speed from it).
 
     Args:
         limit: m/s.
@@ -104,12 +105,13 @@ class SpeedLimit(Predicted):
             self._revision = plant.revision
             self._weigh(plant)
         pose = plant.pose()
-        published = plant.published()
-        self._lagging = None if published is None else self._point(published.xpos, published.xipos)
+        data = plant.published()
+        self._shown = None if data is None else self._point(data.xpos, data.xipos)
         before, self._here = self._here, self._point(pose.xpos, pose.xipos)
         if before is None:
             # Nothing has moved yet that could be measured: the first physics substep shows the speed.
-            ahead = plant.forecast(np.clip(np.zeros(plant.lower.size), plant.lower, plant.upper))
+            standing = np.clip(np.zeros(plant.lower.size), plant.lower, plant.upper)
+            ahead = plant.forecast(standing).poses()
             moved = self._point(ahead.frames[0], ahead.centres[0]) - self._here
             self._last = self._left(moved[None], 1, plant)
         elif plant.time != self._time:  # the first step looks at the state of the reset again
@@ -128,12 +130,12 @@ class SpeedLimit(Predicted):
 
     def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
         assert self._here is not None
-        points = self._point(forecast.frames, forecast.centres)
-        left = self._over(points[self._window - 1 :: self._window], self._here, plant)
-        if self._window == 1 or self._lagging is None:
+        poses = forecast.poses(self._window)
+        left = self._along(self._point(poses.frames, poses.centres), self._here, plant)
+        if self.average == "substep" or self._shown is None:
             return left[:, None]
-        lagging = self._over(points[self._window - 2 :: self._window], self._lagging, plant)
-        return np.stack([left, lagging], axis=1)
+        shown = self._point(forecast.published_frames, forecast.published_centres)
+        return np.stack([left, self._along(shown, self._shown, plant)], axis=1)
 
-    def _over(self, ends: Array, start: Array, plant: MujocoPlant) -> Array:
-        return self._left(np.diff(ends, axis=0, prepend=start[None]), self._window, plant)
+    def _along(self, points: Array, start: Array, plant: MujocoPlant) -> Array:
+        return self._left(np.diff(points, axis=0, prepend=start[None]), self._window, plant)

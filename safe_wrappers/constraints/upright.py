@@ -96,5 +96,6 @@ class Upright(Predicted):
         return np.array(left)
 
     def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
-        left = self._left(forecast.frames[:, self._body, 2], forecast.axes[:, self._body, 2, 2])
+        poses = forecast.poses()
+        left = self._left(poses.frames[:, self._body, 2], poses.axes[:, self._body, 2, 2])
         return np.asarray(left.T)

@@ -126,7 +126,8 @@ class Workspace(Predicted):
         return np.asarray(self._left(points, plant)[0])
 
     def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
-        return self._left(self._points(forecast.frames, forecast.axes), plant)
+        poses = forecast.poses()
+        return self._left(self._points(poses.frames, poses.axes), plant)
 
 
 def _corner(name: str, given: Sequence[float | None] | None) -> list[float | None] | None:

@@ -12,28 +12,58 @@ _BRAKING = 0.5
 """Share of an actuated joint's own motion that braking takes away per control interval; more would chatter."""
 
 
-class Forecast(NamedTuple):
-    """The machine at k instants: after every physics substep of the forecast, one row each.
-
-    Kinematics belong to the same instant as the positions (MuJoCo's own lag one substep behind).
+class Poses(NamedTuple):
+    """Where the bodies are at k instants.
 
     Attributes:
-        qpos: Positions, shape (k, nq).
-        qvel: Velocities, shape (k, nv).
         frames: Origins of the bodies' frames, shape (k, nbody, 3), m.
         axes: Their rotation matrices, shape (k, nbody, 3, 3).
         centres: Centres of mass of the bodies, shape (k, nbody, 3), m.
     """
 
-    qpos: Array
-    qvel: Array
     frames: Array
     axes: Array
     centres: Array
 
-    def first(self, instants: int) -> "Forecast":
-        """Its first instants."""
-        return self if instants == len(self.qpos) else Forecast(*(part[:instants] for part in self))
+
+class Forecast:
+    """The machine after every physics substep of a forecast.
+
+    Attributes:
+        qpos: Positions, shape (k, nq).
+        qvel: Velocities, shape (k, nv).
+        published_frames: `data.xpos` as MuJoCo leaves it at the end of every control interval, shape (holds,
+            nbody, 3), m. It is not the state's: after Euler steps it lags one substep behind, after
+            Runge-Kutta steps it is that of the last point that was evaluated.
+        published_centres: Likewise `data.xipos`.
+    """
+
+    def __init__(
+        self,
+        recorder: "Recorder",
+        qpos: Array,
+        qvel: Array,
+        published_frames: Array,
+        published_centres: Array,
+    ) -> None:
+        self._recorder = recorder
+        self.qpos, self.qvel = qpos, qvel
+        self.published_frames, self.published_centres = published_frames, published_centres
+        self._poses: dict[int, Poses] = {}
+
+    def poses(self, every: int = 1) -> Poses:
+        """Poses of the states after every `every`-th substep, computed once."""
+        if every not in self._poses:
+            self._poses[every] = self._recorder.poses(self.qpos[every - 1 :: every])
+        return self._poses[every]
+
+    def first(self, holds: int) -> "Forecast":
+        """Its first control intervals."""
+        if holds == len(self.published_frames):
+            return self
+        k = len(self.qpos) // len(self.published_frames) * holds
+        published = self.published_frames[:holds], self.published_centres[:holds]
+        return Forecast(self._recorder, self.qpos[:k], self.qvel[:k], *published)
 
 
 class Recorder:
@@ -46,6 +76,7 @@ class Recorder:
 
     def __init__(self, model: mujoco.MjModel, substeps: int) -> None:
         self._model, self._substeps = model, substeps
+        self._still = mujoco.MjData(model)
         limited = model.actuator_ctrllimited.astype(bool)
         self._low = np.where(limited, model.actuator_ctrlrange[:, 0], -np.inf)
         self._high = np.where(limited, model.actuator_ctrlrange[:, 1], np.inf)
@@ -67,23 +98,18 @@ class Recorder:
             control: Shape (nu,).
             holds: Control intervals in all, >= 1.
         """
-        m = self._model
-        k = holds * self._substeps
-        qpos, qvel = np.empty((k, m.nq)), np.empty((k, m.nv))
-        frames, axes = np.empty((k, m.nbody, 3)), np.empty((k, m.nbody, 9))
-        centres = np.empty((k, m.nbody, 3))
+        m, n = self._model, self._substeps
+        qpos, qvel = np.empty((holds * n, m.nq)), np.empty((holds * n, m.nv))
+        frames, centres = np.empty((holds, m.nbody, 3)), np.empty((holds, m.nbody, 3))
         data.ctrl[:] = control
-        last = k - 1
-        for i in range(k):
-            if i and i % self._substeps == 0:
+        for hold in range(holds):
+            if hold:
                 data.ctrl[:] = self._braking(data)
-            mujoco.mj_step(m, data)
-            qpos[i], qvel[i] = data.qpos, data.qvel
-            if i:  # the kinematics in data are still those of the instant before
-                frames[i - 1], axes[i - 1], centres[i - 1] = data.xpos, data.xmat, data.xipos
-        mujoco.mj_kinematics(m, data)
-        frames[last], axes[last], centres[last] = data.xpos, data.xmat, data.xipos
-        return Forecast(qpos, qvel, frames, axes.reshape(k, m.nbody, 3, 3), centres)
+            for i in range(hold * n, hold * n + n):
+                mujoco.mj_step(m, data)
+                qpos[i], qvel[i] = data.qpos, data.qvel
+            frames[hold], centres[hold] = data.xpos, data.xipos
+        return Forecast(self, qpos, qvel, frames, centres)
 
     def _braking(self, data: mujoco.MjData) -> Array:
         """Read once per control interval, as a controller would."""
@@ -91,3 +117,14 @@ class Recorder:
         if self._holds_position.any():
             control = np.where(self._holds_position, data.actuator_length, control)
         return np.minimum(np.maximum(control, self._low), self._high)
+
+    def poses(self, qpos: Array) -> Poses:
+        """Forward kinematics of positions of shape (k, nq)."""
+        m, data, k = self._model, self._still, len(qpos)
+        poses = Poses(np.empty((k, m.nbody, 3)), np.empty((k, m.nbody, 3, 3)), np.empty((k, m.nbody, 3)))
+        for i, q in enumerate(qpos):
+            data.qpos[:] = q
+            mujoco.mj_kinematics(m, data)
+            poses.frames[i], poses.centres[i] = data.xpos, data.xipos
+            poses.axes[i] = data.xmat.reshape(-1, 3, 3)
+        return poses

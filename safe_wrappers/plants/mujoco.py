@@ -331,12 +331,11 @@ class MujocoPlant:
         """
         key = control.tobytes()
         known = self._forecasts.get(key)
-        wanted = holds * self.substeps
-        if known is None or len(known.qpos) < wanted:
+        if known is None or len(known.published_frames) < holds:
             self._load()
             self._loaded = False
             known = self._forecasts[key] = self._recorder.record(self.data, control, holds)
-        return known.first(wanted)
+        return known.first(holds)
 
     def pose(self) -> mujoco.MjData:
         """The plant's data with positions of bodies up to date at the present state; cheaper than `forward`."""
@@ -346,7 +345,10 @@ class MujocoPlant:
         return self.data
 
     def published(self) -> mujoco.MjData | None:
-        """The env's own data, to read what it publishes; None under a delay, when the present is predicted."""
+        """The env's own data, to read what it publishes; None under a delay, when the present is predicted.
+
+        After a step `data.xpos` and what depends on it belong to the last point that the integrator evaluated.
+        """
         data: mujoco.MjData = self._raw.data
         return None if self._delay_steps else data
 

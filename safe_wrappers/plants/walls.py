@@ -31,6 +31,7 @@ def walls(model: mujoco.MjModel, body: int) -> tuple[list[Rectangle], float]:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     welded = model.body_weldid[model.geom_bodyid]
+    carried = model.body_mocapid[model.body_rootid[model.geom_bodyid]] >= 0
     own = np.flatnonzero((welded == body) & ((model.geom_contype > 0) | (model.geom_conaffinity > 0)))
     if not own.size:
         raise UnsupportedEnvError(f"body {model.body(body).name!r} has no geom that collides with anything")
@@ -49,7 +50,7 @@ def walls(model: mujoco.MjModel, body: int) -> tuple[list[Rectangle], float]:
         kind = int(model.geom_type[g])
         if kind == _PLANE and abs(turn[2, 2]) >= 1.0 - _ALIGNED:
             continue
-        if welded[g] != 0:
+        if carried[g]:
             raise UnsupportedEnvError(
                 f"geom {name!r} can be run into and moves; walls stand still. Use Clearance with obstacles that "
                 "the env publishes (Discs)."
