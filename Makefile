@@ -4,7 +4,7 @@ export MUJOCO_GL ?= disabled
 # One BLAS thread: the matrices are tiny and the runs are parallel processes.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test test-library test-slow lint check bench figures clean
+.PHONY: demo test test-library test-slow lint check bench figures docs clean
 
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
@@ -53,6 +53,16 @@ figures: .venv/installed
 	$(BIN)/python -m benchmarks.adversarial --price --steps 50000
 	$(BIN)/python -m benchmarks.adversarial --off --steps 100000
 	$(BIN)/safe-wrappers compare configs/pointgoal1_300k.yaml --report
+
+.venv/docs: .venv/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	@touch $@
+
+# The site, for file:// too: nothing in it comes from elsewhere. Pictures are drawn anew; a warning is an error.
+docs: .venv/docs
+	rm -rf build/docs
+	$(BIN)/python -m sphinx -b html -E -W --keep-going -q docs build/docs
+	@echo "build/docs/index.html"
 
 clean:
 	rm -rf .venv .venv-* build dist *.egg-info safe_wrappers.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,0 +1,88 @@
+"""The stopping inset over speed, and a point mass that is steered around a disc by nothing but the projection."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from _style import FORBIDDEN, INK, OFF, ON, OTHER, panels
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from numpy.typing import NDArray
+
+import safe_wrappers as sw
+from safe_wrappers.control.stopping import held_stopping_distance
+
+Array = NDArray[np.float64]
+
+BRAKE, HOLD, DELAY = 2.0, 0.25, 0.2
+CENTER, RADIUS = (2.0, 0.12), 0.5
+
+
+class PointMass(gym.Env[Array, Array]):
+    """Two forces on one kilogram, 20 Hz."""
+
+    def __init__(self) -> None:
+        self.dt = 0.05
+        self.action_space = gym.spaces.Box(-3.0, 3.0, (2,), np.float64)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (4,), np.float64)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Array, dict[str, Any]]:
+        """At the origin, moving right."""
+        super().reset(seed=seed)
+        self.state = np.array([0.0, 0.0, 1.2, 0.0])
+        return self.state, {}
+
+    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """Hold an acceleration."""
+        p, v = self.state[:2], self.state[2:]
+        self.state = np.concatenate([p + v * self.dt + 0.5 * action * self.dt**2, v + action * self.dt])
+        return self.state, 0.0, False, False, {}
+
+
+def to_the_right(state: Array) -> Array:
+    """Hold 1.2 m/s along x and the line y = 0."""
+    return np.clip([4.0 * (1.2 - state[2]), -4.0 * state[1] - 3.0 * state[3]], -3.0, 3.0)
+
+
+def drive(env: Any) -> Array:
+    """Positions, shape (k, 2)."""
+    env.reset(seed=0)
+    path = [env.unwrapped.state[:2]]
+    for _ in range(140):
+        env.step(to_the_right(env.unwrapped.state))
+        path.append(env.unwrapped.state[:2])
+    return np.array(path)
+
+
+def draw() -> Figure:
+    """Left: distance that must be left, over approach speed. Right: paths."""
+    figure, (inset, chart) = panels(2, height=3.0, width_ratios=[3, 4])
+    speed = np.linspace(0.0, 2.0, 401)
+    held = held_stopping_distance(speed, BRAKE, HOLD)
+    inset.plot(speed, speed**2 / (2 * BRAKE), color=INK, ls="--", lw=1.2, label="v² / 2a")
+    inset.plot(speed, held, color=ON, label="held for 0.25 s")
+    inset.plot(speed, held + speed * DELAY, color=OTHER, label="and 0.2 s of delay")
+    inset.fill_between(speed, 0.0, held, color=FORBIDDEN, alpha=0.12, lw=0)
+    inset.set_ylim(0.0, 1.6)
+    inset.set_xlabel("approach speed (m/s)")
+    inset.set_ylabel("stopping distance (m)")
+    inset.legend(loc="upper left")
+    raw = PointMass()
+    plant = sw.AnalyticPlant(
+        f=lambda x: np.array([x[2], x[3], 0.0, 0.0]),
+        g=lambda x: np.array([[0.0, 0.0], [0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]),
+        state=lambda env: env.state,
+        hold_s=0.05,
+    )
+    disc = sw.Clearance(
+        [sw.Disc(CENTER, RADIUS)], braking=2.5, position=[0, 1], velocity=[2, 3], radius=0.1, margin=0.01
+    )
+    chart.plot(*drive(raw).T, color=OFF)
+    chart.plot(*drive(sw.CBFActionFilter(raw, [disc], plant=plant)).T, color=ON)
+    chart.add_patch(Circle(CENTER, RADIUS, color=FORBIDDEN, alpha=0.35, lw=0))
+    chart.add_patch(Circle(CENTER, RADIUS + 0.1, fill=False, color=FORBIDDEN, lw=0.8, ls=":"))
+    chart.set_aspect("equal")
+    chart.set_xlim(-0.1, 4.2)
+    chart.set_xlabel("x (m)")
+    chart.set_ylabel("y (m)")
+    return figure

@@ -1,0 +1,44 @@
+"""The continuous condition, asked at samples only, against the bound for a held control."""
+
+import numpy as np
+from _cart import Cart, run, wall
+from _style import FORBIDDEN, GRID, OFF, ON, panels
+from matplotlib.figure import Figure
+
+import safe_wrappers as sw
+from safe_wrappers.control.stopping import kinetic_row
+
+WALL, GAMMA = 1.0, 2.0
+
+
+class ContinuousRow:
+    """(a / v) (gamma h - v), the textbook's row, evaluated at the samples."""
+
+    def rows(self, plant: sw.Plant) -> sw.HalfSpaces:
+        """One half-space on the acceleration; nothing at standstill."""
+        x, v = plant.state
+        limit = np.maximum(kinetic_row(WALL - x, v, 1.0, GAMMA), -1.0)
+        return sw.HalfSpaces(np.array([[1.0]]), np.array([limit if np.isfinite(limit) else 1.0]))
+
+
+def draw() -> Figure:
+    """Left: the distance left. Right: the executed control, held between the dots."""
+    figure, (distance, commands) = panels(2, height=3.0)
+    dt = 0.25
+    for constraint, color, name in (
+        (ContinuousRow(), OFF, "continuous row at samples"),
+        (wall(WALL), ON, "bound for a held control"),
+    ):
+        loop = run(Cart((0.0, 0.0), dt), 20, [constraint])
+        distance.plot(loop.t, 1000 * (WALL - loop.x), color=color, label=name)
+        distance.plot(loop.t[::20], 1000 * (WALL - loop.x[::20]), "o", color=color, ms=3.5)
+        commands.step(np.arange(len(loop.u)) * dt, loop.u, where="post", color=color)
+    distance.axhline(0.0, color=FORBIDDEN, lw=1.2)
+    distance.set_ylim(-150, 400)
+    distance.set_xlabel("time (s)")
+    distance.set_ylabel("distance to the wall (mm)")
+    distance.legend(loc="upper right")
+    commands.axhline(0.0, color=GRID, lw=0.8)
+    commands.set_xlabel("time (s)")
+    commands.set_ylabel("executed acceleration (m/s²)")
+    return figure

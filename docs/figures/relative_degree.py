@@ -1,0 +1,47 @@
+"""A position check on a plant with inertia brakes too late; a braking distance in h does not."""
+
+import numpy as np
+from _cart import Cart, run, wall
+from _style import FORBIDDEN, GRID, OFF, ON, SAFE, panels
+from matplotlib.figure import Figure
+
+import safe_wrappers as sw
+from safe_wrappers.control.stopping import held_stopping_distance
+
+WALL = 2.0
+
+
+class NextPosition:
+    """The naive rule: any control whose next position is still left of the wall."""
+
+    def rows(self, plant: sw.Plant) -> sw.HalfSpaces:
+        """X + v hold + u hold^2 / 2 <= wall."""
+        x, v = plant.state
+        half = 0.5 * plant.hold_s**2
+        return sw.HalfSpaces(np.array([[half]]), np.array([WALL - x - v * plant.hold_s]))
+
+
+def draw() -> Figure:
+    """Left: paths in the plane of position and speed. Right: what was executed."""
+    figure, (plane, commands) = panels(2, height=3.1, width_ratios=[3, 2])
+    speed = np.linspace(0.0, 2.2, 200)
+    inset = WALL - held_stopping_distance(speed, 1.0, 0.1)
+    plane.fill_betweenx(speed, -0.2, inset, color=SAFE, alpha=0.15, lw=0)
+    plane.plot(inset, speed, color=SAFE, lw=1.2)
+    plane.text(0.1, 1.62, "from here it\ncan still stop", color=SAFE)
+    plane.axvline(WALL, color=FORBIDDEN, lw=2)
+    plane.text(WALL + 0.05, 0.1, "wall", color=FORBIDDEN)
+    for constraint, color in ((NextPosition(), OFF), (wall(WALL), ON)):
+        loop = run(Cart((0.0, 0.0), dt=0.1), 45, [constraint])
+        plane.plot(loop.x, loop.v, color=color)
+        commands.step(np.arange(len(loop.u)) * 0.1, loop.u, where="post", color=color)
+    plane.text(2.5, 1.85, "checks the next\nposition only", color=OFF)
+    plane.text(0.68, 0.55, "counts the\nbraking distance", color=ON)
+    plane.set_xlim(-0.2, 3.4)
+    plane.set_ylim(0.0, 2.3)
+    plane.set_xlabel("position (m)")
+    plane.set_ylabel("speed (m/s)")
+    commands.axhline(0.0, color=GRID, lw=0.8)
+    commands.set_xlabel("time (s)")
+    commands.set_ylabel("executed acceleration (m/s²)")
+    return figure
