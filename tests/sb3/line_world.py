@@ -1,0 +1,87 @@
+"""A point on a line, pushed left and right, and a filter that is known in closed form."""
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.monitor import Monitor
+
+import safe_wrappers as sw
+
+HOLD, WALL, PENALTY, PER_CORRECTION = 0.1, -0.3, 5.0, 0.5
+
+
+class Line(gym.Env):
+    """x' = u with u in [-2, 3], so that scaling is no identity; ends left of -1, is cut off after 9 steps.
+
+    What it was given, from where, and what it paid, is in info, for a record that no wrapper has touched.
+    """
+
+    def __init__(self):
+        self.action_space = gym.spaces.Box(-2.0, 3.0, (1,), np.float32)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x, self.steps = float(self.np_random.uniform(-0.8, -0.4)), 0
+        return self.observed(), {}
+
+    def observed(self):
+        return np.array([self.x, self.steps], np.float32)
+
+    def step(self, action):
+        given, before = float(action[0]), self.x
+        self.x += HOLD * given
+        self.steps += 1
+        reward = 10.0 * self.x + 12.0 - 0.3 * given**2
+        info = {"truth": {"given": given, "before": before, "paid": reward, "after": self.observed()}}
+        return self.observed(), reward, self.x < -1.0, self.steps >= 9, info
+
+
+class BehindTheWall:
+    """x <= wall at the end of the hold, which is u <= (wall - x) / hold."""
+
+    def __init__(self, wall):
+        self.wall = wall
+
+    def rows(self, plant):
+        return sw.HalfSpaces(np.array([[plant.hold_s]]), np.array([self.wall - plant.state[0]]))
+
+
+class AsDict(gym.ObservationWrapper):
+    """The same observation in two parts."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        parts = {"x": gym.spaces.Box(-np.inf, np.inf, (1,)), "steps": gym.spaces.Box(-np.inf, np.inf, (1,))}
+        self.observation_space = gym.spaces.Dict(parts)
+
+    def observation(self, observation):
+        return {"x": observation[:1], "steps": observation[1:]}
+
+
+def drift(x):
+    return np.zeros(1)
+
+
+def push(x):
+    return np.ones((1, 1))
+
+
+def read(env):
+    return np.array([env.x])
+
+
+def filtered(wall=WALL):
+    plant = sw.AnalyticPlant(f=drift, g=push, state=read, hold_s=HOLD)
+    return Monitor(sw.RecordInterventions(sw.CBFActionFilter(Line(), [BehindTheWall(wall)], plant=plant)))
+
+
+def penalised(wall=WALL):
+    return sw.AdaptionPenalty(filtered(wall), penalty=PENALTY, per_correction=PER_CORRECTION)
+
+
+def filtered_dict():
+    return AsDict(filtered())
+
+
+def penalised_dict():
+    return AsDict(penalised())

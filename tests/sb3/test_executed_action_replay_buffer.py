@@ -1,0 +1,382 @@
+"""Each mode against a record that the env and a callback keep, not the buffer."""
+
+import functools
+import pickle
+
+import gymnasium as gym
+import line_world
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box, Dict, Discrete
+from line_world import HOLD, PENALTY, PER_CORRECTION, WALL, filtered, penalised
+from scipy import stats
+from stable_baselines3 import DDPG, SAC, TD3
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+
+import safe_wrappers as sw
+from safe_wrappers import interventions as keys
+from safe_wrappers.sb3 import ExecutedActionDictReplayBuffer, ExecutedActionReplayBuffer
+
+torch.set_num_threads(1)
+BUFFERS = {"safe_action": filtered, "both": penalised}
+"""Mode -> the env that it is for."""
+both_modes = pytest.mark.parametrize("mode", BUFFERS)
+
+
+class Record(BaseCallback):
+    """What the algorithm chose and saw, and what the env says was done, before the buffer hears of it."""
+
+    def __init__(self):
+        super().__init__()
+        self.steps = []
+
+    def _on_step(self):
+        seen = self.locals
+        truths = [info["truth"] for info in seen["infos"]]
+        self.steps.append(
+            {
+                "observed": np.array(self.model._last_obs),
+                "sent": np.array(seen["actions"]),
+                "stored": np.array(seen["buffer_actions"]),
+                "reward": np.array(seen["rewards"], np.float32),  # of processes they come in float64
+                "done": np.array(seen["dones"]),
+                "cut": np.array([info["TimeLimit.truncated"] for info in seen["infos"]]),
+                **{key: np.array([truth[key] for truth in truths]) for key in truths[0]},
+            }
+        )
+        return True
+
+    def __getitem__(self, key):
+        """(steps, envs, ...)"""
+        return np.stack([step[key] for step in self.steps])
+
+
+def learn(mode, n_envs=1, steps=200, algorithm=SAC, vec_env=DummyVecEnv, make=None, **settings):
+    """A trained model with the buffer under test, and the record of its steps."""
+    envs = vec_env([make or BUFFERS[mode]] * n_envs)
+    noise = None if algorithm is SAC else NormalActionNoise(np.zeros(1), 0.6 * np.ones(1))
+    settings = {
+        "buffer_size": 1000,
+        "learning_starts": 60,
+        "batch_size": 16,
+        "action_noise": noise,
+        "replay_buffer_class": ExecutedActionReplayBuffer,
+        "replay_buffer_kwargs": {"mode": mode},
+        "policy_kwargs": {"net_arch": [8]},
+        "policy": "MlpPolicy",
+        "seed": 0,
+        "device": "cpu",
+        **settings,
+    }
+    model = algorithm(env=envs, **settings)
+    record = Record()
+    model.learn(steps, callback=record)
+    envs.close()
+    return model, record
+
+
+def check(model, record, mode):
+    """The buffer, slot by slot, is what the record and the closed-form filter say; returns its transitions."""
+    buffer, n = model.replay_buffer, len(record.steps)
+    assert buffer.size() == n
+    sent, given = record["sent"][..., 0], record["given"]
+    np.testing.assert_allclose(given, np.minimum(sent, (WALL - record["before"]) / HOLD), atol=1e-5)
+    changed = given != sent
+    assert 0.05 < changed.mean() < 0.95, "the run shows both kinds of steps"
+    assert record["done"].any() and not record["done"].all()
+
+    stored, task = record["stored"], record["paid"].astype(np.float32)
+    # As SB3 scales them, in float32; what was not changed is what SB3 would have stored, bit for bit.
+    executed = model.policy.scale_action(given.astype(np.float32)[..., None])
+    executed = np.where(changed[..., None], executed, stored)
+    charged = task - (PENALTY + PER_CORRECTION * (sent - given)) * changed
+    same = {
+        "observations": record["observed"],
+        "next_observations": record["after"],  # the env's last observation, not the next episode's first
+        "dones": record["done"],
+        "timeouts": record["cut"],
+    }
+    if mode == "safe_action":
+        same |= {"actions": executed, "rewards": task}
+        np.testing.assert_array_equal(record["reward"], task)
+    else:
+        same |= {"actions": stored, "rewards": record["reward"]}
+        same |= {"executed_actions": executed, "task_rewards": task, "changed": changed}
+        np.testing.assert_allclose(record["reward"], charged, atol=1e-4)
+    for name, expected in same.items():
+        np.testing.assert_array_equal(getattr(buffer, name)[:n], expected, err_msg=name)
+
+    def transitions(actions, rewards, where):
+        ends = (record["done"] & ~record["cut"]).astype(np.float32)
+        columns = (record["observed"], actions, record["after"], ends[..., None], rewards[..., None])
+        return np.concatenate(columns, axis=-1, dtype=np.float32)[where]
+
+    if mode == "safe_action":
+        return transitions(executed, task, np.ones_like(changed))
+    first = transitions(stored, record["reward"], np.ones_like(changed))
+    return np.concatenate([first, transitions(executed, task, changed)])
+
+
+def rows(samples):
+    """Observation, action, next observation, done, reward; the sixth part is for n-step returns."""
+    return np.concatenate([part.numpy() for part in samples[:5]], axis=1)
+
+
+@both_modes
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_sac_stores_what_the_mode_says(mode, n_envs):
+    model, record = learn(mode, n_envs)
+    check(model, record, mode)
+    assert all(torch.isfinite(p).all() for p in model.policy.parameters())
+
+
+@both_modes
+@pytest.mark.parametrize("algorithm", [TD3, DDPG])
+def test_so_do_td3_and_ddpg(mode, algorithm):
+    check(*learn(mode, algorithm=algorithm, steps=100), mode)
+
+
+@both_modes
+def test_infos_arrive_whole_from_other_processes(mode):
+    fork = functools.partial(SubprocVecEnv, start_method="fork")
+    check(*learn(mode, n_envs=2, steps=100, vec_env=fork), mode)
+
+
+@both_modes
+def test_batches_are_drawn_uniformly_from_all_transitions(mode):
+    model, record = learn(mode, n_envs=2, steps=120)
+    # Two steps along the wall can be the same transition.
+    known, times = np.unique(check(model, record, mode), axis=0, return_counts=True)
+    np.random.seed(0)
+    drawn = rows(model.replay_buffer.sample(100 * len(known)))
+    # Every draw is one of the record's transitions, whole.
+    index = {row.tobytes(): at for at, row in enumerate(known)}
+    counts = np.bincount([index[row.tobytes()] for row in drawn], minlength=len(known))
+    assert stats.chisquare(counts, times * len(drawn) / times.sum()).pvalue > 1e-3
+
+
+@both_modes
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_a_full_buffer_forgets_its_oldest_steps_and_only_those(mode, n_envs):
+    model, record = learn(mode, n_envs, steps=240, buffer_size=60, learning_starts=1000)
+    buffer, kept = model.replay_buffer, 60 // n_envs
+    assert buffer.full and buffer.size() == kept
+    fresh, tail = learn(mode, n_envs, steps=240, learning_starts=1000)
+    for name in ("actions", "rewards", "observations", *vars(buffer).keys() & {"changed", "task_rewards"}):
+        theirs = getattr(fresh.replay_buffer, name)[: len(tail.steps)][-kept:]
+        mine = np.roll(getattr(buffer, name), -buffer.pos, axis=0)
+        np.testing.assert_array_equal(mine, theirs, err_msg=name)
+    assert rows(buffer.sample(500)).shape == (500, 7)
+    np.testing.assert_array_equal(record["paid"], tail["paid"])
+
+
+def test_an_inactive_filter_changes_nothing_of_the_learning():
+    far = functools.partial(filtered, wall=100.0)
+    ours, record = learn("safe_action", make=far)
+    assert (record["given"] == record["sent"][..., 0]).all()
+    theirs, _ = learn("safe_action", make=far, replay_buffer_class=None, replay_buffer_kwargs=None)
+    assert type(theirs.replay_buffer) is ReplayBuffer
+    for mine, other in zip(ours.policy.parameters(), theirs.policy.parameters(), strict=True):
+        assert torch.equal(mine, other)
+    n = len(record.steps)
+    np.testing.assert_array_equal(ours.replay_buffer.actions[:n], theirs.replay_buffer.actions[:n])
+
+
+def test_both_with_an_inactive_filter_stores_every_step_once():
+    model, record = learn("both", make=functools.partial(penalised, wall=100.0), steps=80)
+    n = len(record.steps)
+    assert not model.replay_buffer.changed.any()
+    np.testing.assert_array_equal(model.replay_buffer.rewards[:n], record["paid"].astype(np.float32))
+
+
+@both_modes
+def test_saving_and_loading(mode, tmp_path):
+    model, record = learn(mode, n_envs=2)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    again = SAC.load(tmp_path / "model", env=DummyVecEnv([BUFFERS[mode]] * 2), device="cpu")
+    assert type(again.replay_buffer) is ExecutedActionReplayBuffer and again.replay_buffer.size() == 0
+    again.load_replay_buffer(tmp_path / "buffer")
+    check(again, record, mode)
+    copy = pickle.loads(pickle.dumps(model.replay_buffer))
+    np.random.seed(3)
+    first = rows(again.replay_buffer.sample(64))
+    np.random.seed(3)
+    np.testing.assert_array_equal(rows(copy.sample(64)), first)
+    before = again.replay_buffer.size()
+    again.learn(20, reset_num_timesteps=False)
+    assert again.replay_buffer.size() == before + 10
+
+
+@both_modes
+def test_dict_observations(mode):
+    make = {"safe_action": line_world.filtered_dict, "both": line_world.penalised_dict}[mode]
+    model, record = learn(
+        mode,
+        n_envs=2,
+        make=make,
+        policy="MultiInputPolicy",
+        replay_buffer_class=ExecutedActionDictReplayBuffer,
+    )
+    flat, same = learn(mode, n_envs=2)
+    n = 60 // 2  # from there on the networks differ
+    buffer, plain = model.replay_buffer, flat.replay_buffer
+    np.testing.assert_array_equal(record["paid"][:n], same["paid"][:n])
+    for name in (
+        "actions",
+        "rewards",
+        "dones",
+        "timeouts",
+        *vars(plain).keys() & {"changed", "task_rewards"},
+    ):
+        np.testing.assert_array_equal(getattr(buffer, name)[:n], getattr(plain, name)[:n], err_msg=name)
+    for part, at in (("x", 0), ("steps", 1)):
+        np.testing.assert_array_equal(buffer.observations[part][:n, :, 0], plain.observations[:n, :, at])
+        np.testing.assert_array_equal(
+            buffer.next_observations[part][:n, :, 0], plain.next_observations[:n, :, at]
+        )
+    batch = buffer.sample(32)
+    known = buffer.observations["x"].ravel()
+    assert set(batch.observations["x"].numpy().ravel()) <= set(known)
+    assert batch.actions.shape == batch.rewards.shape == batch.dones.shape == (32, 1)
+
+
+@both_modes
+def test_what_is_stored_is_raw_and_what_is_drawn_is_normalised(mode):
+    envs = VecNormalize(DummyVecEnv([BUFFERS[mode]] * 2))
+    model = SAC(
+        "MlpPolicy",
+        envs,
+        buffer_size=400,
+        learning_starts=1000,
+        replay_buffer_class=ExecutedActionReplayBuffer,
+        replay_buffer_kwargs={"mode": mode},
+        seed=0,
+        device="cpu",
+    )
+    record = Record()
+    model.learn(120, callback=record)
+    n = len(record.steps)
+    task = model.replay_buffer.rewards if mode == "safe_action" else model.replay_buffer.task_rewards
+    np.testing.assert_array_equal(task[:n], record["paid"].astype(np.float32))
+    np.random.seed(1)
+    raw = model.replay_buffer.sample(200)
+    np.random.seed(1)
+    drawn = model.replay_buffer.sample(200, env=model.get_vec_normalize_env())
+    scale = np.sqrt(envs.ret_rms.var + envs.epsilon)
+    np.testing.assert_allclose(drawn.rewards, np.clip(raw.rewards.numpy() / scale, -10, 10), rtol=1e-5)
+    centred = (raw.observations.numpy() - envs.obs_rms.mean) / np.sqrt(envs.obs_rms.var + envs.epsilon)
+    np.testing.assert_allclose(drawn.observations, np.clip(centred, -10, 10), rtol=1e-4, atol=1e-5)
+    np.testing.assert_array_equal(drawn.actions, raw.actions)
+
+
+def test_memory_saving_works_with_the_safe_action():
+    settings = {"mode": "safe_action", "handle_timeout_termination": False}
+    model, record = learn("safe_action", steps=100, optimize_memory_usage=True, replay_buffer_kwargs=settings)
+    given = record["given"].astype(np.float32)[..., None]
+    np.testing.assert_allclose(model.replay_buffer.actions[:100], model.policy.scale_action(given), atol=1e-6)
+    assert rows(model.replay_buffer.sample(50)).shape == (50, 7)
+
+
+# One step, by hand ---------------------------------------------------------------------------------------------
+
+SPACE = Box(np.array([-2.0, 0.0], np.float32), np.array([3.0, 10.0], np.float32))
+
+
+def buffer(mode="safe_action", **more):
+    return ExecutedActionReplayBuffer(8, Box(-1.0, 1.0, (1,)), SPACE, device="cpu", mode=mode, **more)
+
+
+def info(proposed, executed, penalty=None, reward=1.0):
+    wrote = {
+        keys.PROPOSED_ACTION: np.array(proposed, np.float64),
+        keys.EXECUTED_ACTION: np.array(executed, np.float64),
+        keys.CBF_INTERVENED: proposed != executed,
+    }
+    if penalty is not None:
+        wrote |= {keys.ADAPTION_PENALTY: penalty, keys.ADAPTION_TASK_REWARD: reward}
+    return wrote
+
+
+def add(to, action, reward, infos):
+    n = to.n_envs
+    to.add(
+        np.zeros((n, 1)), np.ones((n, 1)), np.array(action, np.float32), np.array(reward), np.zeros(n), infos
+    )
+
+
+def test_an_action_that_is_not_finite_is_never_stored():
+    bad = [[np.nan, 0.0], [0.0, 0.0]]
+    wrote = [info([0.0, 5.0], [1.0, 2.5], 0.5, 4.0), info([0.5, 5.0], [0.5, 5.0], 0.0, 6.0)]
+    safe = buffer(n_envs=2)
+    add(safe, bad, [4.0, 6.0], [info([0.0, 5.0], [1.0, 2.5]), info([0.5, 5.0], [0.5, 5.0])])
+    np.testing.assert_allclose(safe.actions[0], [[0.2, -0.5], [0.0, 0.0]], atol=1e-6)
+    both = buffer("both", n_envs=2)
+    add(both, bad, [3.5, 6.0], wrote)
+    np.testing.assert_array_equal(both.actions[0], safe.actions[0])
+    np.testing.assert_array_equal(
+        both.rewards[0], [4.0, 6.0]
+    )  # the one transition that is left is the safe one
+    assert not both.changed.any()
+    assert torch.isfinite(both.sample(50).actions).all()
+
+
+def test_an_executed_action_that_is_not_finite_is_refused():
+    with pytest.raises(sw.SafeWrappersError, match="executed action is not finite"):
+        add(buffer(), [[0.0, 0.0]], [1.0], [info([0.5, 5.0], [np.nan, 5.0])])
+
+
+@pytest.mark.parametrize(
+    ("mode", "wrote", "message"),
+    [
+        ("safe_action", {}, r"no info\['executed_action'\].*needs a CBFActionFilter"),
+        ("both", info([0.5, 5.0], [0.5, 5.0]), r"no info\['adaption/penalty'\].*AdaptionPenalty\(env"),
+        ("safe_action", info([0.5, 5.0], [0.5, 5.0], 0.0), "has an AdaptionPenalty.*use mode 'both'"),
+        ("safe_action", info([0.4, 5.0], [0.4, 5.0]), "take that wrapper away"),
+        ("safe_action", info([0.5], [0.5]), r"has shape \(1,\), the action space \(2,\)"),
+    ],
+)
+def test_infos_that_do_not_fit_are_refused(mode, wrote, message):
+    with pytest.raises(sw.SafeWrappersError, match=message):
+        add(buffer(mode), [[0.0, 0.0]], [1.0], [wrote])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"mode": "naive"}, "expected 'safe_action' or 'both', got 'naive'; the naive learner"),
+        ({"action_space": Discrete(3)}, "expected a bounded Box of actions, got Discrete"),
+        ({"action_space": Box(-np.inf, 1.0, (1,))}, "expected a bounded Box of actions"),
+        ({"observation_space": Dict({"x": Box(-1, 1, (1,))})}, "use ExecutedActionDictReplayBuffer for Dict"),
+        ({"mode": "both", "optimize_memory_usage": True}, "does not work with optimize_memory_usage"),
+    ],
+)
+def test_what_it_refuses(arguments, message):
+    given = {"observation_space": Box(-1, 1, (1,)), "action_space": SPACE, **arguments}
+    with pytest.raises(sw.SafeWrappersError, match=message):
+        ExecutedActionReplayBuffer(8, **given)
+
+
+def test_the_dict_buffer_wants_dict_observations():
+    with pytest.raises(sw.SafeWrappersError, match="ExecutedActionReplayBuffer for all others"):
+        ExecutedActionDictReplayBuffer(8, Box(-1, 1, (1,)), SPACE)
+
+
+def test_an_env_without_a_filter_and_a_rescaled_one_are_refused_at_the_first_step():
+    with pytest.raises(sw.SafeWrappersError, match="without a filter use SB3's own ReplayBuffer"):
+        learn("safe_action", make=line_world.Line, steps=2)
+
+    def rescaled():
+        return gym.wrappers.RescaleAction(filtered(), np.float32(-10.0), np.float32(10.0))
+
+    with pytest.raises(sw.SafeWrappersError, match="SB3 scales actions to"):
+        learn("safe_action", make=rescaled, steps=20)
+
+
+def test_n_steps_is_ignored_with_a_warning_as_the_docstring_says():
+    with pytest.warns(UserWarning, match="`n_steps=3` is ignored"):
+        learn("safe_action", steps=2, n_steps=3)
