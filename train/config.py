@@ -28,6 +28,7 @@ _NOT_HYPERPARAMETERS: Final = {"self", "env", "seed", "device", "verbose", "tens
 _PROTECT_OPTIONS: Final = protect_options() - {"plant"}
 _ARM_KEYS: Final = (
     "filter",
+    "learner",
     "env",
     "algorithm",
     "hyperparameters",
@@ -37,7 +38,10 @@ _ARM_KEYS: Final = (
     "checkpoint_every",
     "device",
 )
-_COMMON_KEYS: Final = tuple(key for key in _ARM_KEYS if key != "filter")
+_COMMON_KEYS: Final = tuple(key for key in _ARM_KEYS if key not in ("filter", "learner"))
+LEARNERS: Final = ("naive", "adaption_penalty", "safe_action", "both")
+_PENALISED: Final = ("adaption_penalty", "both")
+_EXECUTED: Final = ("safe_action", "both")
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,38 @@ class FilterConfig:
     kind: str = "none"
     kwargs: dict[str, Any] = field(default_factory=dict)
     factory: str = ""
+
+
+@dataclass(frozen=True)
+class LearnerConfig:
+    """What the learner sees where the filter changed its action, by the names of Krasowski et al. (TMLR 2023).
+
+    - `naive`: its own action and the task's reward;
+    - `adaption_penalty`: its own action and the reward less a penalty (`AdaptionPenalty`);
+    - `safe_action`: the executed action and the task's reward (`ExecutedActionReplayBuffer`); not PPO;
+    - `both`: the transitions of the two before; not PPO.
+
+    In a config `learner: safe_action`, or `learner: {kind: both, penalty: 0.1, per_correction: 0.0}`. Only training
+    has the penalty; evaluation, and every return that is reported, is the task's own.
+    """
+
+    kind: str = "naive"
+    penalty: float = 0.0
+    per_correction: float = 0.0
+
+    @property
+    def penalised(self) -> bool:
+        """Whether the reward is reduced where the action was changed."""
+        return self.kind in _PENALISED
+
+    @property
+    def stores_executed(self) -> bool:
+        """Whether the replay buffer holds executed actions."""
+        return self.kind in _EXECUTED
+
+
+NAIVE: Final = LearnerConfig()
+"""The default, which is all that there was before there was a choice."""
 
 
 @dataclass(frozen=True)
@@ -87,12 +123,15 @@ class ArmConfig:
     n_envs: int
     checkpoint_every: int
     device: str
+    learner: LearnerConfig = NAIVE
 
     def fingerprint(self) -> dict[str, Any]:
         """What a run folder must agree on to be continued: all that changes what is learned."""
         values = asdict(self)
         for harmless in ("name", "checkpoint_every", "device"):
             del values[harmless]
+        if self.learner == NAIVE:
+            del values["learner"]  # as in the folders of runs that were made before there was a choice
         return values
 
 
@@ -178,7 +217,9 @@ def _arm(name: object, own: Mapping[str, Any], common: Mapping[str, Any]) -> Arm
         n_envs=_integer(merged.get("n_envs", 1), "n_envs", 1),
         checkpoint_every=_integer(merged.get("checkpoint_every", 50_000), "checkpoint_every", 1),
         device=check_name(merged.get("device", "cpu"), ("cpu", "cuda", "auto"), "device"),
+        learner=_learner(own.get("learner"), f"{where}.learner"),
     )
+    _check_learner(arm, f"{where}.learner")
     if arm.algorithm == "SAC":
         # SB3's default of a million transitions would be saved with every checkpoint, mostly empty.
         arm.hyperparameters.setdefault("buffer_size", min(1_000_000, total_steps))
@@ -224,6 +265,53 @@ def _filter(value: Any, where: str) -> FilterConfig:
             raise ConfigurationError(f"{where}.factory: expected 'module:function', got {factory!r}.")
         return FilterConfig("factory", dict(_mapping(value.get("kwargs"), f"{where}.kwargs")), factory)
     raise ConfigurationError(f"{where}: {expected}; got {value!r}.")
+
+
+def _learner(value: Any, where: str) -> LearnerConfig:
+    if value is None or isinstance(value, str):
+        value = {"kind": value or "naive"}
+    value = _mapping(value, where)
+    for key in value:
+        check_name(key, ("kind", "penalty", "per_correction"), where)
+    learner = LearnerConfig(
+        kind=check_name(value.get("kind"), LEARNERS, f"{where}.kind"),
+        penalty=_number(value.get("penalty", 0.0), f"{where}.penalty"),
+        per_correction=_number(value.get("per_correction", 0.0), f"{where}.per_correction"),
+    )
+    if min(learner.penalty, learner.per_correction) < 0:
+        raise ConfigurationError(f"{where}: penalties are at least 0, got {dict(value)}.")
+    if learner.penalised and learner.penalty == learner.per_correction == 0:
+        raise ConfigurationError(
+            f"{where}: {learner.kind} needs a penalty in units of the task's reward, per changed step or per unit of"
+            f" correction: {{kind: {learner.kind}, penalty: 0.1}} or {{kind: {learner.kind}, per_correction: 0.1}}."
+        )
+    if not learner.penalised and (learner.penalty or learner.per_correction):
+        raise ConfigurationError(f"{where}: {learner.kind} takes no penalty; {' and '.join(_PENALISED)} do.")
+    return learner
+
+
+def _check_learner(arm: ArmConfig, where: str) -> None:
+    kind = arm.learner.kind
+    if kind != "naive" and arm.filter.kind == "none":
+        raise ConfigurationError(
+            f"{where}: without a filter no action is ever changed; leave `learner` out, or give the arm a filter."
+        )
+    if not arm.learner.stores_executed:
+        return
+    if arm.algorithm == "PPO":
+        raise ConfigurationError(
+            f"{where}: PPO cannot learn from the executed action: it weighs an action by the probability with which"
+            f" its policy drew it, and the policy did not draw this one. Use naive or adaption_penalty, or {kind}"
+            " with SAC."
+        )
+    for key in ("replay_buffer_class", "replay_buffer_kwargs"):
+        if key in arm.hyperparameters:
+            raise ConfigurationError(f"{where}: {kind} sets hyperparameters.{key} itself; leave it out.")
+    if arm.hyperparameters.get("n_steps", 1) > 1:
+        raise ConfigurationError(
+            f"{where}: {kind} has one-step returns, hyperparameters.n_steps is {arm.hyperparameters['n_steps']}: SB3"
+            " makes n-step returns with a buffer of its own. Leave n_steps out, or use naive or adaption_penalty."
+        )
 
 
 def _env(value: Any) -> EnvConfig:

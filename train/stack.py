@@ -1,4 +1,4 @@
-"""The whole stack of one env, from the task to SB3's Monitor."""
+"""The whole stack of one env, from the task to SB3's Monitor, and in training the learner's penalty around it."""
 
 from __future__ import annotations
 
@@ -11,14 +11,24 @@ from stable_baselines3.common.monitor import Monitor
 import safe_wrappers
 from safe_wrappers import interventions as keys
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.adaption_penalty import AdaptionPenalty
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
 
-from .config import EnvConfig, FilterConfig
+from .config import NAIVE, EnvConfig, FilterConfig, LearnerConfig
 from .names import check_name
 
 
-def make_stack(env: EnvConfig, action_filter: FilterConfig) -> Monitor[Any, Any]:
-    """Makes the task, its filter if there is one, the recorder, and Monitor outermost, as SB3 wants it.
+def make_stack(
+    env: EnvConfig, action_filter: FilterConfig, learner: LearnerConfig = NAIVE
+) -> gym.Env[Any, Any]:
+    """Makes the task, its filter if there is one, the recorder and Monitor; AdaptionPenalty outermost if asked for.
+
+    The recorder and Monitor see the task's own reward, whatever the learner sees.
+
+    Args:
+        env: The task.
+        action_filter: The filter around it.
+        learner: In training the arm's; in evaluation left out, so that no return ever holds a penalty.
 
     Raises:
         ConfigurationError: The task or the filter refuses its settings.
@@ -37,7 +47,10 @@ def make_stack(env: EnvConfig, action_filter: FilterConfig) -> Monitor[Any, Any]
             raise ConfigurationError(
                 f"filter: {action_filter.factory} refuses its kwargs: {error}"
             ) from error
-    return Monitor(RecordInterventions(task), info_keywords=keys.RUNNING)
+    monitored = Monitor(RecordInterventions(task), info_keywords=keys.RUNNING)
+    if not learner.penalised:
+        return monitored
+    return AdaptionPenalty(monitored, penalty=learner.penalty, per_correction=learner.per_correction)
 
 
 def _factory(action_filter: FilterConfig) -> Any:
