@@ -38,8 +38,8 @@ class JointPositionLimit(Predicted):
         joints: Names. None takes every hinge and slide that an actuator drives directly.
         margin: Kept free inside the range, in the same units.
         holds: Control steps to look ahead; cover the time that braking takes.
-        rate: The highest joint speed that is possible in the declared envelope, rad/s or m/s; states that
-            cannot reach the range's end by it need no forecast. None forecasts always.
+        reach: The farthest that a joint can move within `holds` control steps in the declared envelope, rad or m;
+            states with more than that left need no forecast. None forecasts always.
     """
 
     lower: float | Sequence[float] | None = None
@@ -47,7 +47,7 @@ class JointPositionLimit(Predicted):
     joints: Sequence[str] | None = None
     margin: float = 0.0
     holds: int = 5
-    rate: float | None = None
+    reach: float | None = None
 
     promise: Promise = field(default="best effort", init=False)
     unit: ClassVar[str] = "rad or m"

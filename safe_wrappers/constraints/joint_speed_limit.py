@@ -36,15 +36,15 @@ class JointSpeedLimit(Predicted):
         joints: Joint names. None takes every hinge and slide that an actuator drives directly.
         margin: Kept free below the limit, for model and state error, in the same units.
         holds: Control steps to look ahead; the actuated joints are braked after the first.
-        rate: The highest joint acceleration that is possible in the declared envelope, rad/s^2 or m/s^2;
-            states that cannot reach the limit by it need no forecast. None forecasts always.
+        reach: The most that a joint's speed can rise within `holds` control steps in the declared envelope, rad/s
+            or m/s; states with more than that left need no forecast. None forecasts always.
     """
 
     limit: float | Sequence[float]
     joints: Sequence[str] | None = None
     margin: float = 0.0
     holds: int = 1
-    rate: float | None = None
+    reach: float | None = None
 
     promise: Promise = field(default="best effort", init=False)
     unit: ClassVar[str] = "rad/s or m/s"

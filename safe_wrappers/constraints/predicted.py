@@ -2,6 +2,7 @@
 
 import warnings
 from abc import ABC, abstractmethod
+from collections import deque
 from typing import Any
 
 import numpy as np
@@ -28,17 +29,17 @@ class Predicted(ABC):
     This class decides from it (`admits`), linearises about a refused control (`cut`) and says by how much a
     control fails (`shortfall`).
 
-    A forecast costs at least what a step of the env costs. So `rate` may declare how fast `value` can fall at
-    most, whatever the control does: a state that cannot come to its limit within the forecast by that rate is
-    admitted without one. The declaration is checked at every step, and dropped with a warning when broken.
+    A forecast costs at least what a step of the env costs. So `reach` may declare how far `value` can fall at most
+    within the forecast, whatever the controls do: a state with more than that left is admitted without one. The
+    declaration is checked at every step, and dropped with a warning when broken.
 
     Attributes of a subclass (dataclass fields): `margin` (units of the value), `holds` (control intervals to
-    look ahead), `rate` (units of the value per s, or None: always forecast).
+    look ahead), `reach` (units of the value, or None: always forecast).
     """
 
     margin: float
     holds: int
-    rate: float | None
+    reach: float | None
     unit: str = "units of the value"
 
     @property
@@ -52,8 +53,8 @@ class Predicted(ABC):
                 f"holds is a whole number of control intervals to look ahead, >= 1; got {self.holds!r}"
             )
         self.holds = int(self.holds)
-        if self.rate is not None:
-            self.rate = positive("rate", self.rate, f"{self.unit} per s")
+        if self.reach is not None:
+            self.reach = positive("reach", self.reach, self.unit)
 
     @abstractmethod
     def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
@@ -71,12 +72,13 @@ class Predicted(ABC):
                 "Barrier(h) or Clearance(...)"
             )
         self._stamp: int | None = None
-        self._previous: float | None = None
-        self._rate = self.rate
+        self._recent: deque[float] = deque(maxlen=self.holds)
+        self._reach = self.reach
 
     def reset(self) -> None:
         """Forget the episode."""
-        self._stamp = self._previous = None
+        self._stamp = None
+        self._recent.clear()
 
     def value(self, plant: MujocoPlant) -> Array:
         """What is left of the limit at the present state, margin not taken off."""
@@ -88,24 +90,23 @@ class Predicted(ABC):
             return
         self._value = self._now(plant)
         self._least = float(self._value.min())
-        if self._previous is not None and self._stamp == plant.stamp - 1:
-            self._check_rate(self._previous - self._least, plant.hold_s)
-        self._previous, self._stamp = self._least, plant.stamp
+        self._stamp = plant.stamp
+        if self._reach is not None:
+            self._check_reach(self._reach)
         self._outside = self._violation(self._least)
-        self._far = (
-            self._rate is not None
-            and self._least - self._rate * self.holds * plant.hold_s >= self.margin + _ROUNDING
-        )
+        self._far = self._reach is not None and self._least - self._reach >= self.margin + _ROUNDING
 
-    def _check_rate(self, fallen: float, hold_s: float) -> None:
-        if self._rate is not None and fallen > self._rate * hold_s * (1.0 + 1e-6) + _ROUNDING:
+    def _check_reach(self, reach: float) -> None:
+        fallen = max(self._recent, default=-np.inf) - self._least
+        if fallen > reach + _ROUNDING:
             warnings.warn(
-                f"{type(self).__name__}: what is left of the limit fell by {fallen:.3g} {self.unit} in a step of "
-                f"{hold_s} s, faster than the declared rate of {self._rate:g} per s; from now on every control is "
-                "forecast",
+                f"{type(self).__name__}: what is left of the limit fell by {fallen:.3g} {self.unit} within "
+                f"{len(self._recent)} control steps, farther than the declared reach of {reach:g}; from now on every "
+                "control is forecast",
                 stacklevel=2,
             )
-            self._rate = None
+            self._reach = None
+        self._recent.append(self._least)
 
     def _violation(self, least: float) -> float:
         """The present violation that a forecast starts from, <= 0."""

@@ -42,8 +42,8 @@ class SpeedLimit(Predicted):
         average: "step" over a control step, "substep" over a physics substep (instantaneous).
         margin: Kept free below the limit, m/s.
         holds: Control steps to look ahead.
-        rate: The highest acceleration that is possible in the declared envelope, m/s^2 (over the averaging
-            time); states that cannot reach the limit by it need no forecast. None forecasts always.
+        reach: The most that the speed can rise within `holds` control steps in the declared envelope, m/s; states
+            with more than that left need no forecast. None forecasts always.
     """
 
     limit: float
@@ -52,7 +52,7 @@ class SpeedLimit(Predicted):
     average: Literal["step", "substep"] = "step"
     margin: float = 0.0
     holds: int = 3
-    rate: float | None = None
+    reach: float | None = None
 
     promise: Promise = field(default="best effort", init=False)
     unit: ClassVar[str] = "m/s"

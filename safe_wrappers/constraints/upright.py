@@ -33,8 +33,8 @@ class Upright(Predicted):
         tilt: Largest angle between the body's z axis and the world's, rad; None: no bound.
         margin: Kept free, m for the heights and rad for the tilt.
         holds: Control steps to look ahead.
-        rate: The fastest that height (m/s) or tilt (rad/s) can change in the declared envelope; states that
-            cannot reach a bound by it need no forecast. None forecasts always.
+        reach: The most that height (m) and tilt (rad) can change within `holds` control steps in the declared
+            envelope; states with more than that left need no forecast. None forecasts always.
     """
 
     body: str = "torso"
@@ -43,7 +43,7 @@ class Upright(Predicted):
     tilt: float | None = None
     margin: float = 0.0
     holds: int = 5
-    rate: float | None = None
+    reach: float | None = None
 
     promise: Promise = field(default="best effort", init=False)
     unit: ClassVar[str] = "m or rad"

@@ -41,8 +41,8 @@ class Workspace(Predicted):
         radius: Of the machine around each point, m.
         margin: Kept free, m.
         holds: Control steps to look ahead; cover the time that braking takes.
-        rate: The highest speed that a point can have in the declared envelope, m/s; states that cannot reach a
-            bound by it need no forecast. None forecasts always.
+        reach: The farthest that a point can move within `holds` control steps in the declared envelope, m; states
+            with more than that left need no forecast. None forecasts always.
     """
 
     low: Sequence[float | None] | None = None
@@ -54,7 +54,7 @@ class Workspace(Predicted):
     radius: float = 0.0
     margin: float = 0.0
     holds: int = 5
-    rate: float | None = None
+    reach: float | None = None
 
     promise: Promise = field(default="best effort", init=False)
     unit: ClassVar[str] = "m"
