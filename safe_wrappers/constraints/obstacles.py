@@ -36,10 +36,23 @@ class Nearest(NamedTuple):
 
 
 class Obstacle(Protocol):
-    """Anything with a nearest surface."""
+    """Anything with a nearest surface. Ours also have `distances`, for many points at once."""
 
     def nearest(self, point: Array, plant: Plant) -> Nearest:
         """The surfaces of this obstacle as seen from a point of shape (d,)."""
+
+
+def distances(obstacle: Obstacle, points: Array, plant: Plant) -> Array:
+    """Signed distances of points of shape (k, d) to an obstacle's n surfaces, shape (k, n), m."""
+    together = getattr(obstacle, "distances", None)
+    if together is not None:
+        return np.asarray(together(points, plant))
+    return np.stack([obstacle.nearest(point, plant).distance for point in points])
+
+
+def _to_centers(points: Array, centers: Array, radius: float) -> Array:
+    offsets = points[:, None, : centers.shape[1]] - centers
+    return np.asarray(np.sqrt(np.einsum("kni,kni->kn", offsets, offsets)) - radius)
 
 
 def _vector(name: str, values: Sequence[float], sizes: tuple[int, ...]) -> list[float]:
@@ -87,6 +100,10 @@ class Disc:
         """One surface."""
         return _round(point, np.array([self.center]), self.radius, np.zeros((1, len(self.center))))
 
+    def distances(self, points: Array, plant: Plant) -> Array:
+        """Shape (k, 1), m."""
+        return _to_centers(points, np.array([self.center]), self.radius)
+
 
 @dataclass
 class Sphere:
@@ -102,6 +119,10 @@ class Sphere:
     def nearest(self, point: Array, plant: Plant) -> Nearest:
         """One surface."""
         return _round(point, np.array([self.center]), self.radius, np.zeros((1, len(self.center))))
+
+    def distances(self, points: Array, plant: Plant) -> Array:
+        """Shape (k, 1), m."""
+        return _to_centers(points, np.array([self.center]), self.radius)
 
 
 @dataclass
@@ -128,6 +149,11 @@ class Plane:
         normal[0, :d] = self.normal
         distance = normal[0, :d] @ (point[:d] - np.asarray(self.point))
         return Nearest(np.array([distance]), normal, np.zeros_like(normal), np.zeros_like(normal))
+
+    def distances(self, points: Array, plant: Plant) -> Array:
+        """Shape (k, 1), m."""
+        offsets = points[:, : len(self.point)] - np.asarray(self.point)
+        return np.asarray((offsets @ np.asarray(self.normal))[:, None])
 
 
 @dataclass
@@ -165,6 +191,13 @@ class Box:
             normal[0, axis] = side[axis]
         return Nearest(np.array([distance]), normal, np.zeros_like(normal), curvature)
 
+    def distances(self, points: Array, plant: Plant) -> Array:
+        """Shape (k, 1), m."""
+        offsets = points[:, : len(self.center)] - np.asarray(self.center)
+        beyond = np.abs(offsets) - np.asarray(self.half_size)
+        outside = np.sqrt((np.maximum(beyond, 0.0) ** 2).sum(axis=1))
+        return np.asarray((outside + np.minimum(beyond.max(axis=1), 0.0))[:, None])
+
 
 @dataclass
 class Discs:
@@ -199,6 +232,10 @@ class Discs:
         if self.velocity_attribute is not None:
             velocity = np.asarray(plant.attribute(self.velocity_attribute), dtype=np.float64)
         return _round(point, centers, self.radius, velocity)
+
+    def distances(self, points: Array, plant: Plant) -> Array:
+        """Shape (k, n), m."""
+        return _to_centers(points, self.centers(plant), self.radius)
 
 
 KINDS: dict[str, type[Any]] = {kind.__name__: kind for kind in (Disc, Sphere, Plane, Box, Discs)}

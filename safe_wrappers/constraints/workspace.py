@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.constraints.constraint import Promise, non_negative
-from safe_wrappers.constraints.obstacles import obstacle_from
+from safe_wrappers.constraints.obstacles import distances, obstacle_from
 from safe_wrappers.constraints.predicted import Predicted
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.forecast import Forecast
@@ -112,12 +112,8 @@ class Workspace(Predicted):
             (points - self._low)[:, :, low].reshape(k, -1),
             (self._high - points)[:, :, high].reshape(k, -1),
         ]
-        if self.keep_out:
-            near = [
-                np.concatenate([o.nearest(p, plant).distance for o in self.keep_out for p in instant])
-                for instant in points
-            ]
-            left.append(np.array(near))
+        every = points.reshape(-1, 3)
+        left += [distances(o, every, plant).reshape(k, -1) for o in self.keep_out]
         return np.concatenate(left, axis=1) - self.radius
 
     def _now(self, plant: MujocoPlant) -> Array:

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import safe_wrappers as sw
+from safe_wrappers.constraints.obstacles import distances
 from safe_wrappers.errors import ConfigurationError
 
 COORDINATE = st.floats(-2, 2).map(lambda v: round(v, 4))
@@ -230,3 +231,38 @@ def test_a_published_moving_disc_is_evaded(policy):
 
 def test_a_moving_disc_is_predicted_over_the_delay_too():
     assert 0.0 <= chase(sw.Discs("discs", 0.5, velocity_attribute="speeds"), 1.0, delay_s=0.3) < 0.05
+
+
+OBSTACLES = [
+    sw.Disc([0.3, -0.2], 0.4),
+    sw.Sphere([0.3, -0.2, 0.1], 0.4),
+    sw.Plane([0.1, 0.0, 0.0], [1.0, 2.0, 0.5]),
+    sw.Plane([0.1], [1.0]),
+    sw.Box([0.0, 0.1], [0.5, 0.3]),
+    sw.Box([0.0, 0.1, 0.2], [0.5, 0.3, 0.1]),
+    sw.Discs("centers", 0.3),
+]
+
+
+class Publishes:
+    def attribute(self, name):
+        return np.array([[0.0, 0.5], [-0.4, 0.1]])
+
+
+@pytest.mark.parametrize("obstacle", OBSTACLES, ids=lambda o: f"{type(o).__name__}{len(o.__dict__)}")
+def test_distances_of_many_points_are_those_of_each(obstacle):
+    points = np.random.default_rng(0).uniform(-1.0, 1.0, size=(200, 3))
+    one_by_one = np.stack([obstacle.nearest(point, Publishes()).distance for point in points])
+    assert (one_by_one < 0.0).any() and (one_by_one > 0.0).any()
+    np.testing.assert_allclose(distances(obstacle, points, Publishes()), one_by_one, atol=1e-12)
+
+
+def test_distances_of_a_foreign_obstacle_come_from_its_nearest():
+    class Foreign:
+        def nearest(self, point, plant):
+            return sw.Disc([0.0, 0.0], 0.5).nearest(point, plant)
+
+    points = np.random.default_rng(0).uniform(-1.0, 1.0, size=(20, 3))
+    np.testing.assert_allclose(
+        distances(Foreign(), points, None), distances(sw.Disc([0.0, 0.0], 0.5), points, None)
+    )
