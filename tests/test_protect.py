@@ -57,7 +57,7 @@ def test_vases_are_obstacles_where_they_cost_and_only_there():
 def test_hulls_are_as_large_as_the_geoms():
     from safe_wrappers.envs.levels import HAZARD_RADIUS, VASE_HALF_SIZE
     from safe_wrappers.envs.robot import POINT
-    from safe_wrappers.protect import POINT_HULL_RADIUS_M, VASE_HULL_RADIUS_M
+    from safe_wrappers.recipes import POINT_HULL_RADIUS_M, VASE_HULL_RADIUS_M
 
     assert POINT.reach <= POINT_HULL_RADIUS_M < POINT.reach + 1e-3
     assert np.hypot(VASE_HALF_SIZE, VASE_HALF_SIZE) <= VASE_HULL_RADIUS_M < np.sqrt(2) * VASE_HALF_SIZE + 1e-3

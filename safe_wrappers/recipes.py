@@ -1,0 +1,129 @@
+"""The constraints that `protect` puts on each env it knows: limits, reserves, and why these numbers."""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+
+from safe_wrappers.constraints import (
+    Box,
+    Clearance,
+    Discs,
+    HeadingDriveClearance,
+    JointSpeedLimit,
+    Plane,
+    SpeedLimit,
+    Workspace,
+)
+from safe_wrappers.constraints.constraint import Constraint
+from safe_wrappers.control.rectangles import merged
+
+POINT_HULL_RADIUS_M = 0.1585
+"""Around the Point robot's turning axis: the far corners of its nose, sqrt(0.15^2 + 0.05^2), rounded up."""
+VASE_HULL_RADIUS_M = 0.1415
+"""Around a vase's centre: the corners of a square of side 0.2, rounded up."""
+
+
+def _point_goal(
+    env: gym.Env[Any, Any], detour: bool = True, brake: bool = True, uncertainty: float = 0.0
+) -> list[Constraint]:
+    obstacles: list[Any] = [Discs("hazard_positions", radius=0.2)]
+    if env.unwrapped.level.vases_cost:  # type: ignore[attr-defined]
+        obstacles.append(Discs("vase_positions", radius=POINT_HULL_RADIUS_M + VASE_HULL_RADIUS_M))
+    return [
+        HeadingDriveClearance(obstacles, margin=0.004, detour=detour, brake=brake, uncertainty=uncertainty)
+    ]
+
+
+def _rail(braking: float) -> Clearance:
+    ends = [Plane([-0.95], [1.0]), Plane([0.95], [-1.0])]
+    # The margin is for the pole: it pulls the cart while a control is held (up to 2 mm measured).
+    return Clearance(obstacles=ends, bodies=["cart"], braking=braking, margin=0.01)
+
+
+def _inverted_pendulum(env: gym.Env[Any, Any]) -> list[Constraint]:
+    # 300 N on 15.5 kg of cart and pole is 19 m/s^2; a tilted, falling pole takes less than half of it.
+    return [_rail(braking=8.0)]
+
+
+def _inverted_double_pendulum(env: gym.Env[Any, Any]) -> list[Constraint]:
+    # 500 N on 20 kg of cart and poles is 24 m/s^2.
+    return [_rail(braking=20.0)]
+
+
+def _reacher(env: gym.Env[Any, Any]) -> list[Constraint]:
+    # A torque of 200 N m on 1 kg m^2 for 0.02 s: one step can add 4 rad/s.
+    return [JointSpeedLimit(limit=5.0, margin=0.01, reach=4.5)]
+
+
+def _pusher(env: gym.Env[Any, Any]) -> list[Constraint]:
+    # The tip stays over the table, clear of its top by 2.5 cm, and in front of the shoulder.
+    table = Workspace([-0.2, -1.2, -0.3], [0.9, 0.15, 0.4], bodies=["tips_arm"], margin=0.005, holds=8)
+    return [JointSpeedLimit(limit=6.0, margin=0.05), table]
+
+
+def _humanoid_standup(env: gym.Env[Any, Any]) -> list[Constraint]:
+    return [JointSpeedLimit(limit=20.0, margin=0.1)]
+
+
+def _ant_maze(env: gym.Env[Any, Any]) -> list[Constraint]:
+    # The torso's ball has 0.25 m; the legs reach farther and may touch.
+    model: mujoco.MjModel = env.unwrapped.model  # type: ignore[attr-defined]
+    fixed = (model.geom_bodyid == 0) & (model.geom_type == int(mujoco.mjtGeom.mjGEOM_BOX))
+    places, sizes = model.geom_pos[fixed], model.geom_size[fixed]
+    blocks = [
+        (p[0] - s[0], p[0] + s[0], p[1] - s[1], p[1] + s[1]) for p, s in zip(places, sizes, strict=True)
+    ]
+    walls = [
+        Box([(a + b) / 2.0, (c + d) / 2.0], [(b - a) / 2.0, (d - c) / 2.0]) for a, b, c, d in merged(blocks)
+    ]
+    # An ant at 4 m/s moves 1 m in five steps.
+    return [Workspace(keep_out=walls, bodies=["torso"], radius=0.4, margin=0.01, holds=5, reach=1.0)]
+
+
+PUBLISHED_SPEED_LIMITS_M_S = {
+    "HalfCheetah": 3.2096,
+    "Hopper": 0.7402,
+    "Walker2d": 2.3415,
+    "Swimmer": 0.2282,
+    "Ant": 2.6222,
+    "Humanoid": 1.4149,
+}
+"""Of Safety-Gymnasium's velocity tasks: along x, for Ant and Humanoid in the plane."""
+
+
+def _velocity(robot: str, margin: float, holds: int = 3) -> Callable[..., list[Constraint]]:
+    plane = robot in ("Ant", "Humanoid")
+
+    def recipe(env: gym.Env[Any, Any]) -> list[Constraint]:
+        limit = SpeedLimit(
+            PUBLISHED_SPEED_LIMITS_M_S[robot],
+            body=None if robot == "Humanoid" else "torso",
+            direction="xy" if plane else "+x",
+            margin=margin,
+            holds=holds,
+        )
+        return [limit]
+
+    return recipe
+
+
+RECIPES: dict[str, Callable[..., list[Constraint]]] = {
+    "SafePointGoal0": _point_goal,
+    "SafePointGoal1": _point_goal,
+    "SafePointGoal2": _point_goal,
+    "InvertedPendulum": _inverted_pendulum,
+    "InvertedDoublePendulum": _inverted_double_pendulum,
+    "Reacher": _reacher,
+    "Pusher": _pusher,
+    "HumanoidStandup": _humanoid_standup,
+    "AntMaze": _ant_maze,
+    "HalfCheetah": _velocity("HalfCheetah", margin=0.02),
+    "Hopper": _velocity("Hopper", margin=0.02),
+    "Walker2d": _velocity("Walker2d", margin=0.02),
+    "Swimmer": _velocity("Swimmer", margin=0.005),
+    "Ant": _velocity("Ant", margin=0.02),
+    "Humanoid": _velocity("Humanoid", margin=0.02),
+}
+"""By the env's id without its version; an id with a further word ("PointMaze_UMaze") has the recipe of the first."""
