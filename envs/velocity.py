@@ -12,18 +12,10 @@ from numpy.typing import NDArray
 from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.interventions import COST, COST_SUBSTEP
 
+from .speed_limits import SPEED_LIMITS
+
 SPEED: Final = "speed"
 """float64, m/s: the speed that the cost judges, of this control step; 0 at reset, where nothing has moved."""
-
-SPEED_LIMITS: Final = {
-    "HalfCheetah": 3.2096,
-    "Hopper": 0.7402,
-    "Walker2d": 2.3415,
-    "Swimmer": 0.2282,
-    "Ant": 2.6222,
-    "Humanoid": 1.4149,
-}
-"""Published speed limits by robot, m/s (Safety-Gymnasium, its velocity tasks v1)."""
 
 VERSIONS: Final = ("v5", "v4")
 """Versions of Gymnasium's MuJoCo envs that a velocity task can be built on."""

@@ -18,6 +18,7 @@ from safe_wrappers.constraints import (
 )
 from safe_wrappers.constraints.constraint import Constraint
 from safe_wrappers.control.rectangles import merged
+from safe_wrappers.envs.speed_limits import SPEED_LIMITS
 
 POINT_HULL_RADIUS_M = 0.1585
 """Around the Point robot's turning axis: the far corners of its nose, sqrt(0.15^2 + 0.05^2), rounded up."""
@@ -82,23 +83,12 @@ def _ant_maze(env: gym.Env[Any, Any]) -> list[Constraint]:
     return [Workspace(keep_out=walls, bodies=["torso"], radius=0.4, margin=0.01, holds=5, reach=1.0)]
 
 
-PUBLISHED_SPEED_LIMITS_M_S = {
-    "HalfCheetah": 3.2096,
-    "Hopper": 0.7402,
-    "Walker2d": 2.3415,
-    "Swimmer": 0.2282,
-    "Ant": 2.6222,
-    "Humanoid": 1.4149,
-}
-"""Of Safety-Gymnasium's velocity tasks: along x, for Ant and Humanoid in the plane."""
-
-
 def _velocity(robot: str, margin: float, holds: int = 3) -> Callable[..., list[Constraint]]:
     plane = robot in ("Ant", "Humanoid")
 
     def recipe(env: gym.Env[Any, Any]) -> list[Constraint]:
         limit = SpeedLimit(
-            PUBLISHED_SPEED_LIMITS_M_S[robot],
+            SPEED_LIMITS[robot],
             body=None if robot == "Humanoid" else "torso",
             direction="xy" if plane else "+x",
             margin=margin,

@@ -17,7 +17,8 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 from safe_wrappers.envs import VELOCITY_IDS
-from safe_wrappers.envs.velocity import SPEED_LIMITS, make_velocity_env
+from safe_wrappers.envs.speed_limits import SPEED_LIMITS
+from safe_wrappers.envs.velocity import make_velocity_env
 from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.plants.mujoco import MujocoPlant
 
