@@ -50,7 +50,7 @@ class AdaptionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         True
 
     Change log:
-        * v0.2.0: added.
+        * v0.1.0: added.
     """
 
     def __init__(self, env: gym.Env[Any, Any], penalty: float = 0.0, per_correction: float = 0.0) -> None:

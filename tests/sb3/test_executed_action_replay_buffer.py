@@ -310,17 +310,20 @@ def add(to, action, reward, infos):
 
 
 def test_an_action_that_is_not_finite_is_never_stored():
-    bad = [[np.nan, 0.0], [0.0, 0.0]]
-    wrote = [info([0.0, 5.0], [1.0, 2.5], 0.5, 4.0), info([0.5, 5.0], [0.5, 5.0], 0.0, 6.0)]
-    safe = buffer(n_envs=2)
-    add(safe, bad, [4.0, 6.0], [info([0.0, 5.0], [1.0, 2.5]), info([0.5, 5.0], [0.5, 5.0])])
-    np.testing.assert_allclose(safe.actions[0], [[0.2, -0.5], [0.0, 0.0]], atol=1e-6)
-    both = buffer("both", n_envs=2)
-    add(both, bad, [3.5, 6.0], wrote)
-    np.testing.assert_array_equal(both.actions[0], safe.actions[0])
-    np.testing.assert_array_equal(
-        both.rewards[0], [4.0, 6.0]
-    )  # the one transition that is left is the safe one
+    # The first two are not; for the second one the filter chose just what stands for it in the infos.
+    chosen = [[np.nan, 0.0], [0.0, np.inf], [0.0, 0.0]]
+    wrote = [
+        ([0.0, 5.0], [1.0, 2.5], 0.5, 4.0),
+        ([0.5, 0.0], [0.5, 0.0], 0.5, 5.0),
+        ([0.5, 5.0], [0.5, 5.0], 0.0, 6.0),
+    ]
+    safe, both = buffer(n_envs=3), buffer("both", n_envs=3)
+    add(safe, chosen, [4.0, 5.0, 6.0], [info(*each[:2]) for each in wrote])
+    add(both, chosen, [3.5, 4.5, 6.0], [info(*each) for each in wrote])
+    for stored in (safe.actions, both.actions, both.executed_actions):
+        np.testing.assert_allclose(stored[0], [[0.2, -0.5], [0.0, -1.0], [0.0, 0.0]], atol=1e-6)
+    # The one transition that is left is the safe one.
+    np.testing.assert_array_equal(both.rewards[0], [4.0, 5.0, 6.0])
     assert not both.changed.any()
     assert torch.isfinite(both.sample(50).actions).all()
 

@@ -15,6 +15,7 @@ from safe_wrappers import interventions as keys
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.sb3 import ExecutedActionReplayBuffer
 from safe_wrappers.train import run as run_module
+from safe_wrappers.train import stack as stack_module
 from safe_wrappers.train.checkpoint import latest_checkpoint
 from safe_wrappers.train.config import NAIVE, EvaluationConfig, FilterConfig, LearnerConfig
 from safe_wrappers.train.evaluate import evaluate_run, evaluation_folder
@@ -135,12 +136,13 @@ def test_training_has_what_the_kind_says_and_the_rows_have_the_tasks_return(
 
 
 @pytest.mark.parametrize(("algorithm", "kind"), [("SAC", "both"), ("PPO", "adaption_penalty")])
-def test_evaluation_never_has_the_penalty(fake_experiment, algorithm, kind):
+def test_evaluation_never_has_the_penalty(fake_experiment, monkeypatch, algorithm, kind):
     experiment = one_arm(fake_experiment, KINDS[kind], algorithm=algorithm)
     (arm,) = experiment.arms
     folder = experiment.run_folder(arm, 0)
     train_run(arm, 0, folder, Reports().progress)
     settings = EvaluationConfig(episodes=3, seed=7)
+    monkeypatch.setattr(stack_module, "AdaptionPenalty", pytest.fail)
     evaluate_run(arm, 0, folder, settings, FilterConfig(), Reports().progress)
     model = latest_checkpoint(folder / "checkpoints", pytest.fail).load_model(algorithm, None, "cpu")
     changed = 0
