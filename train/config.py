@@ -145,6 +145,7 @@ class ExperimentConfig:
     evaluation: EvaluationConfig
     output: Path
     workers: int | None
+    given_evaluation_filter: FilterConfig | None = None
 
     @property
     def folder(self) -> Path:
@@ -157,7 +158,9 @@ class ExperimentConfig:
 
     @property
     def evaluation_filter(self) -> FilterConfig:
-        """The filter of an unfiltered arm in the condition "filter on": that of the first filtered arm."""
+        """The filter of an unfiltered arm in the condition "filter on": as given, or the first filtered arm's."""
+        if self.given_evaluation_filter is not None:
+            return self.given_evaluation_filter
         return next((arm.filter for arm in self.arms if arm.filter.kind != "none"), FilterConfig())
 
 
@@ -185,6 +188,7 @@ def parse_experiment(settings: Mapping[str, Any]) -> ExperimentConfig:
     if not arms:
         raise ConfigurationError("arms: expected at least one, such as `unfiltered: {filter: none}`.")
     workers = settings.get("workers")
+    filter_given = _mapping(settings.get("evaluation"), "evaluation").get("filter")
     return ExperimentConfig(
         name=_folder_name(settings["name"], "name"),
         arms=tuple(_arm(name, _mapping(arm, f"arms.{name}"), common) for name, arm in arms.items()),
@@ -192,6 +196,7 @@ def parse_experiment(settings: Mapping[str, Any]) -> ExperimentConfig:
         evaluation=_evaluation(settings.get("evaluation")),
         output=Path(_text(settings.get("output", "runs"), "output")),
         workers=None if workers is None else _integer(workers, "workers", 1),
+        given_evaluation_filter=None if filter_given is None else _filter(filter_given, "evaluation.filter"),
     )
 
 
@@ -339,7 +344,7 @@ def _normalize(value: Any) -> NormalizeConfig:
 def _evaluation(value: Any) -> EvaluationConfig:
     value = _mapping(value, "evaluation")
     for key in value:
-        check_name(key, ("episodes", "seed"), "evaluation")
+        check_name(key, ("episodes", "seed", "filter"), "evaluation")
     return EvaluationConfig(
         episodes=_integer(value.get("episodes", EvaluationConfig.episodes), "evaluation.episodes", 1),
         seed=_integer(value.get("seed", EvaluationConfig.seed), "evaluation.seed", 0),

@@ -25,7 +25,7 @@ def train_experiment(experiment: ExperimentConfig, console: Console) -> None:
     """
     # All arms and folders before the first step: nobody should learn after an hour that the last one is wrong.
     for arm in experiment.arms:
-        make_stack(arm.env, arm.filter).close()
+        make_stack(arm.env, arm.filter, arm.learner).close()
         for seed in experiment.seeds:
             claim_folder(arm, seed, experiment.run_folder(arm, seed))
     _run(experiment, console, "Training", lambda arm: arm.total_steps, "steps", train_run, ())

@@ -17,6 +17,7 @@ _STEP_KEYS = {
     keys.CBF_CORRECTION: "step_correction",
     keys.COST: "step_cost",
     keys.COST_SUBSTEP: "step_cost_substep",
+    keys.ADAPTION_PENALTY: "step_penalty",
 }
 
 
@@ -26,7 +27,7 @@ class InterventionCallback(BaseCallback):
     Two kinds of values reach the logger (stdout, TensorBoard, CSV), both as means since its last dump:
 
     - `interventions/step_rate`, `step_infeasible`, `step_fallback`, `step_correction`, `step_cost`,
-      `step_cost_substep`: over all steps of all envs, from the keys that the filter and the task write at
+      `step_cost_substep`, `step_penalty` (AdaptionPenalty's): over all steps of all envs, from the keys that the filter and the task write at
       every step;
     - `interventions/rate`, `correction_mean`, `correction_p95`, `infeasible`, `fallback`, `nonfinite`,
       `unsafe`, `margin_min`, `violations`, `cost`, `cost_substep`, `goals_reached`, `success`: over the
