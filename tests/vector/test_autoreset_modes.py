@@ -1,0 +1,95 @@
+"""Gymnasium's vector envs in every autoreset mode are the single envs, bit for bit, infos and all."""
+
+import functools
+
+import gymnasium as gym
+import pytest
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from single_loops import assert_same_episodes, by_hand, script, unroll
+from vector_worlds import TASKS, sub_envs
+
+import safe_wrappers as sw
+
+KINDS = {
+    "sync": SyncVectorEnv,
+    "async": AsyncVectorEnv,
+    "async, pipes": functools.partial(AsyncVectorEnv, shared_memory=False),
+}
+PLAYED = [*((task, kind) for task in TASKS for kind in ("sync", "async")), ("cart", "async, pipes")]
+SEED, STEPS = 5, 30
+pytestmark = pytest.mark.filterwarnings("ignore:the policy's action is not finite:UserWarning")
+every_mode = pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
+
+
+def actions_for(task):
+    return script(TASKS[task]().action_space, drive=0.9 if task == "point_goal" else None)
+
+
+@functools.cache
+def single(task):
+    """Each task by hand once; all modes are compared with the same episodes."""
+    actions = actions_for(task)
+    return [by_hand(TASKS[task], actions, i, seed=SEED + i, steps=STEPS) for i in range(3)]
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_episodes_by_hand_have_in_them_what_is_to_be_compared(task):
+    for episodes in single(task):
+        whole = episodes[:-1]
+        assert len(whole) >= 2
+        steps = [step for episode in whole for step in episode.steps]
+        assert any(s.info["cbf/intervened"] and not s.info["cbf/nonfinite"] for s in steps)
+        assert any(not s.info["cbf/intervened"] for s in steps)
+        for episode in whole:
+            summaries = ["interventions" in step.info for step in episode.steps]
+            assert summaries == [False] * (len(summaries) - 1) + [True]
+        # The filter holds the last executed action; a new episode has none.
+        assert all(not e.steps[0].info["executed_action"].any() for e in whole[1:] if not odd(e.steps[0]))
+    ends = {(e.steps[-1].terminated, e.steps[-1].truncated) for es in single(task) for e in es[:-1]}
+    assert ends == {"cart": {(True, False)}, "pendulum": {(True, False)}}.get(task, {(False, True)})
+
+
+def odd(step):
+    """The filter had to move even the held zero."""
+    return step.info["cbf/infeasible"] or step.info["cbf/unsafe"]
+
+
+@every_mode
+@pytest.mark.parametrize(("task", "kind"), PLAYED)
+def test_a_vector_env_is_its_single_envs(task, kind, mode):
+    envs = KINDS[kind](sub_envs(TASKS[task]), autoreset_mode=mode)
+    try:
+        episodes = unroll(envs, actions_for(task), seed=SEED, steps=STEPS)
+        calls = envs.get_attr("filter_calls")
+    finally:
+        envs.close()
+    for i, (got, wanted) in enumerate(zip(episodes, single(task), strict=True)):
+        whole = assert_same_episodes(got, wanted, f"sub-env {i}, ")
+        assert whole >= 2
+        # An action that only triggers a reset is not filtered.
+        assert calls[i] == sum(len(episode.steps) for episode in got)
+    firsts = {episodes[i][0].observation.tobytes() for i in range(3)}
+    assert len(firsts) == 3, "every sub-env has a seed of its own"
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings(
+    "ignore::safe_wrappers.UnsafeStateWarning"
+)  # a delay that is declared, but not there
+@every_mode
+@pytest.mark.parametrize("level", [1, 2])
+def test_long_episodes_beside_vases_are_single_ones_too(level, mode):
+    # On level 2 vases sleep and wake, in the env and in the plant that predicts over the delay.
+    make = functools.partial(long_goal, level)
+    envs = SyncVectorEnv(sub_envs(make, 2), autoreset_mode=mode)
+    actions = script(envs.single_action_space, drive=0.95)
+    episodes = unroll(envs, actions, seed=3, steps=700)
+    for i, got in enumerate(episodes):
+        wanted = by_hand(make, actions, i, seed=3 + i, steps=700)
+        assert assert_same_episodes(got, wanted, f"sub-env {i}, ") >= 4
+        assert any(s.info["cbf/correction"] > 0.0 for e in got for s in e.steps)
+
+
+def long_goal(level, index):
+    env = gym.make(f"SafePointGoal{level}-v0", max_episode_steps=150 + index)
+    return sw.RecordInterventions(sw.protect(env, plant=sw.MujocoPlant(delay_s=0.05)))

@@ -1,0 +1,236 @@
+"""SB3's Dummy and Subproc vector envs are the single envs, bit for bit, infos and all."""
+
+import functools
+import multiprocessing
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from random_episodes import STEPS, plays, spoken
+from single_loops import Episode, Step, assert_same_episodes, by_hand, script
+from vector_worlds import AtHazard, cart, cart_filter
+
+import safe_wrappers as sw
+from safe_wrappers import interventions as keys
+
+pytest.importorskip("stable_baselines3")
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+from safe_wrappers.train.config import EnvConfig, FilterConfig
+from safe_wrappers.train.stack import make_stack
+
+pytestmark = pytest.mark.filterwarnings("ignore:the policy's action:UserWarning")
+KINDS = {"dummy": DummyVecEnv, "subproc": functools.partial(SubprocVecEnv, start_method="fork")}
+every_kind = pytest.mark.parametrize("kind", KINDS)
+
+
+def monitored_cart(index):
+    return Monitor(cart(index), info_keywords=keys.RUNNING)
+
+
+def stack(env_id, name, steps, index):
+    """The training's own stack, Monitor outermost."""
+    env = EnvConfig(env_id, {"max_episode_steps": steps + 2 * index})
+    return make_stack(env, FilterConfig("factory", {}, f"vector_worlds:{name}"))
+
+
+def plain_stack(index):
+    return make_stack(EnvConfig("SafePointGoal1-v0", {"max_episode_steps": 5}), FilterConfig("protect"))
+
+
+TASKS = {
+    "cart": monitored_cart,
+    "point_goal": functools.partial(stack, "SafePointGoal1-v0", "point_goal_filter", 7),
+    "reacher": functools.partial(stack, "Reacher-v5", "reacher_filter", 7),
+    "pendulum": functools.partial(stack, "InvertedPendulum-v5", "pendulum_filter", 9),
+}
+
+
+def unroll(envs, actions, *, seed, steps, options=None):
+    """The episodes of every sub-env of an SB3 vector env, which resets within the step."""
+    n = envs.num_envs
+    envs.seed(seed)
+    envs.set_options(options)
+    observations = envs.reset()
+    episodes = [[Episode(o, told)] for o, told in zip(observations, envs.reset_infos, strict=True)]
+    for _ in range(steps):
+        proposed = [actions(i, len(e) - 1, len(e[-1].steps)) for i, e in enumerate(episodes)]
+        observations, rewards, dones, infos = envs.step(np.stack(proposed))
+        assert len(infos) == n
+        for i in range(n):
+            info = dict(infos[i])
+            truncated = info.pop("TimeLimit.truncated")
+            assert ("terminal_observation" in info) == dones[i] == ("episode" in info)
+            last = info.pop("terminal_observation") if dones[i] else observations[i]
+            episodes[i][-1].steps.append(Step(last, rewards[i], dones[i] and not truncated, truncated, info))
+            if dones[i]:
+                episodes[i].append(Episode(observations[i], envs.reset_infos[i]))
+    return episodes
+
+
+def without_time(episodes):
+    """Monitor writes the wall-clock time of an episode's end: the one thing that may differ."""
+    for episode in episodes:
+        for step in episode.steps:
+            if "episode" in step.info:
+                step.info["episode"].pop("t", None)
+    return episodes
+
+
+def assert_same(got, wanted, kind, name=""):
+    if kind == "dummy":  # its rewards are float32
+        for episode in wanted:
+            for step in episode.steps:
+                step.reward = np.float32(step.reward)
+    return assert_same_episodes(without_time(got), without_time(wanted), name, types=True)
+
+
+@every_kind
+@pytest.mark.parametrize("task", TASKS)
+def test_a_vec_env_is_its_single_envs(task, kind):
+    make = TASKS[task]
+    envs = KINDS[kind]([functools.partial(make, i) for i in range(3)])
+    try:
+        actions = script(envs.action_space, drive=0.9 if task == "point_goal" else None)
+        episodes = unroll(envs, actions, seed=5, steps=26)
+        calls = envs.get_attr("filter_calls")
+    finally:
+        envs.close()
+    for i, got in enumerate(episodes):
+        wanted = by_hand(make, actions, i, seed=5 + i, steps=26)
+        assert assert_same(got, wanted, kind, f"sub-env {i}, ") >= 2
+        steps = [step for episode in got for step in episode.steps]
+        assert any(s.info["cbf/intervened"] and not s.info["cbf/nonfinite"] for s in steps)
+        assert any(s.info["cbf/nonfinite"] for s in steps)
+        assert calls[i] == len(steps)
+        for episode in got[:-1]:
+            # The recorder's summary and Monitor's agree, and Monitor has its keywords from the terminal step.
+            info = episode.steps[-1].info
+            assert info["episode"]["l"] == info["interventions"]["length"] == len(episode.steps)
+            assert info["episode"]["r"] == round(info["interventions"]["return"], 6)
+            assert {key: info["episode"][key] for key in keys.RUNNING} == {k: info[k] for k in keys.RUNNING}
+
+
+@pytest.mark.parametrize(("kind", "examples"), [("dummy", 12), ("subproc", 8)])
+def test_any_actions_and_any_ends(kind, examples):
+    envs = KINDS[kind]([functools.partial(monitored_cart, i) for i in range(3)])
+
+    @settings(max_examples=examples, deadline=None)
+    @given(play=plays)
+    def check(play):
+        actions, options = spoken(play["said"]), {"ends": play["ends"]}
+        episodes = unroll(envs, actions, seed=play["seed"], steps=STEPS, options=options)
+        for i, got in enumerate(episodes):
+            wanted = by_hand(monitored_cart, actions, i, seed=play["seed"] + i, steps=STEPS, options=options)
+            assert_same(got, wanted, kind, f"sub-env {i}, ")
+
+    try:
+        check()
+    finally:
+        envs.close()
+
+
+@every_kind
+def test_methods_and_attributes_by_sub_env(kind):
+    envs = KINDS[kind]([functools.partial(plain_stack, i) for i in range(2)])
+    try:
+        envs.seed(0)
+        envs.reset()
+        for _ in range(6):
+            envs.step(np.stack([envs.action_space.sample() for _ in range(2)]))
+        assert envs.get_attr("filter_calls") == [6, 6]
+        assert all(0.0 < seconds < 3.0 for seconds in envs.get_attr("filter_seconds"))
+        for constraints in envs.get_attr("constraints"):
+            assert [(type(c).__name__, c.promise) for c in constraints] == [
+                ("HeadingDriveClearance", "proved")
+            ]
+        assert envs.env_method("has_wrapper_attr", "filter_seconds", indices=1) == [True]
+        assert envs.env_method("get_episode_lengths") == [[5], [5]]
+        assert envs.env_is_wrapped(sw.CBFActionFilter) == [True, True]
+        assert envs.env_is_wrapped(sw.RecordInterventions) == [True, True]
+        assert envs.env_is_wrapped(Monitor) == [True, True]
+    finally:
+        envs.close()
+
+
+def test_closing_leaves_no_process():
+    before = set(multiprocessing.active_children())
+    envs = KINDS["subproc"]([functools.partial(monitored_cart, i) for i in range(2)])
+    envs.reset()
+    assert len(set(multiprocessing.active_children()) - before) == 2
+    envs.close()
+    assert set(multiprocessing.active_children()) == before
+
+
+SHARED = [sw.HeadingDriveClearance([sw.Discs("hazard_positions", radius=0.2)], margin=0.004, detour=True)]
+"""One constraint for all: the filter's business is to take a copy."""
+
+
+def sharing(index):
+    env = sw.CBFActionFilter(AtHazard(gym.make("SafePointGoal1-v0", max_episode_steps=8 + index)), SHARED)
+    return Monitor(sw.RecordInterventions(env), info_keywords=keys.RUNNING)
+
+
+def test_two_envs_in_one_process_share_nothing_but_what_they_were_given():
+    before = repr(SHARED), set(vars(SHARED[0]))
+    envs = DummyVecEnv([functools.partial(sharing, i) for i in range(2)])
+    actions = script(envs.action_space, drive=0.9)
+    episodes = unroll(envs, actions, seed=8, steps=30)
+    first, second = envs.get_attr("constraints")
+    assert first[0] is not second[0] and first[0] is not SHARED[0]
+    assert envs.get_attr("plant")[0] is not envs.get_attr("plant")[1]
+    # Step by step in turn they are what each is alone.
+    for i, got in enumerate(episodes):
+        alone = by_hand(sharing, actions, i, seed=8 + i, steps=30)
+        assert assert_same(got, alone, "dummy", f"sub-env {i}, ") >= 2
+        assert any(s.info["cbf/intervened"] for e in got for s in e.steps)
+    assert (repr(SHARED), set(vars(SHARED[0]))) == before
+
+
+def test_not_a_number_in_one_sub_env_is_its_own_affair():
+    envs, healthy = (DummyVecEnv([functools.partial(monitored_cart, i) for i in range(3)]) for _ in range(2))
+    actions = script(envs.action_space)
+
+    def sick(i, k, t):
+        return np.array([np.nan], np.float32) if i == 1 and t == 1 else actions(i, k, t)
+
+    ill, well = (unroll(e, a, seed=2, steps=10) for e, a in ((envs, sick), (healthy, actions)))
+    for i in (0, 2):
+        assert_same_episodes(without_time(ill[i]), without_time(well[i]), types=True)
+    assert ill[1][0].steps[1].info["cbf/nonfinite"] and not well[1][0].steps[1].info["cbf/nonfinite"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_infos_are_the_readers_own(kind):
+    # What a callback does to an info reaches neither the filter nor the next step's info.
+    envs = KINDS[kind]([functools.partial(cart_filter, i) for i in range(2)])
+    try:
+        envs.set_options({"start": [-1.0, 0.0]})
+        envs.reset()
+        infos = envs.step(np.full((2, 1), 0.5, np.float32))[3]
+        kept = [dict(info) for info in infos]
+        for info in infos:
+            info["executed_action"][:] = 9.0
+            info["cbf/margin"] = -1.0
+        infos = envs.step(np.full((2, 1), np.nan, np.float32))[3]
+    finally:
+        envs.close()
+    for info, before in zip(infos, kept, strict=True):
+        assert info["executed_action"] == 0.5  # held
+        assert info["cbf/margin"] > 0.0 and before["cbf/margin"] > 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start_method", ["spawn", "forkserver"])
+def test_the_same_in_a_process_that_starts_from_nothing(start_method):
+    make = TASKS["point_goal"]
+    envs = SubprocVecEnv([functools.partial(make, i) for i in range(2)], start_method=start_method)
+    try:
+        actions = script(envs.action_space, drive=0.9)
+        episodes = unroll(envs, actions, seed=1, steps=20)
+    finally:
+        envs.close()
+    for i, got in enumerate(episodes):
+        assert assert_same(got, by_hand(make, actions, i, seed=1 + i, steps=20), "subproc") >= 2

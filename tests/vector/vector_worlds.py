@@ -1,0 +1,150 @@
+"""Worlds for the vector envs: a cart whose episodes end when the test says, and three of the library's tasks.
+
+Everything is a function or a class of a module, so that a spawned process can unpickle it; no learner is imported.
+"""
+
+import warnings
+from collections import deque
+from functools import partial
+from typing import ClassVar
+
+import gymnasium as gym
+import numpy as np
+
+import safe_wrappers as sw
+from safe_wrappers.interventions import COST, COST_SUBSTEP
+
+WALL = 1.0
+DT = 0.1
+
+
+class ScheduledCart(gym.Env):
+    """x'' = u, integrated exactly; starts anywhere (at times behind the wall), ends by a schedule.
+
+    `reset(options={"ends": [[length, ...], ...]})` gives sub-env i its episodes' lengths, row i; a negative length
+    truncates instead of terminating. Without it an episode lasts four steps.
+    """
+
+    metadata: ClassVar = {"render_modes": []}
+    dt = DT
+
+    def __init__(self, index=0):
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+        self.index = index
+        self.ends = deque()
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        if options and "ends" in options:
+            self.ends = deque(options["ends"][self.index])
+        self.end = self.ends.popleft() if self.ends else 4
+        self.steps = 0
+        self.state = self.np_random.uniform([-0.5, -0.3], [1.2, 0.3])
+        if options and "start" in options:
+            self.state = np.array(options["start"], dtype=np.float64)
+        return self.state.copy(), {"start": self.state.copy()}
+
+    def step(self, action):
+        a = float(action[0])
+        x, v = self.state
+        self.state = np.array([x + v * DT + 0.5 * a * DT**2, v + a * DT])
+        self.steps += 1
+        over = self.steps >= abs(self.end)
+        beyond = float(self.state[0] > WALL)
+        info = {COST: beyond, COST_SUBSTEP: beyond, "effort": 0.7 * abs(a), "count": self.steps}
+        return self.state.copy(), -abs(a), over and self.end > 0, over and self.end < 0, info
+
+
+def drift(x):
+    return np.array([x[1], 0.0])
+
+
+def push(x):
+    return np.array([[0.0], [1.0]])
+
+
+def read(env):
+    return env.state
+
+
+def slow(x):
+    return 0.25 - x[1] ** 2
+
+
+class CountUnsafeWarnings(gym.Wrapper):
+    """Says in info how often this episode has warned of an unsafe state: warnings do not cross processes."""
+
+    def reset(self, **kwargs):
+        self.count = 0
+        observation, info = self._watched(self.env.reset, **kwargs)
+        return observation, {**info, "unsafe_warnings": self.count}
+
+    def step(self, action):
+        *rest, info = self._watched(self.env.step, action)
+        return *rest, {**info, "unsafe_warnings": self.count}
+
+    def _watched(self, function, *args, **kwargs):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            result = function(*args, **kwargs)
+        self.count += sum(issubclass(w.category, sw.UnsafeStateWarning) for w in caught)
+        return result
+
+
+def cart_filter(index=0, delay_s=0.0, fallback="hold"):
+    """A cart that stays in front of a wall and below 0.5 m/s. `hold` shows the last action after a reset."""
+    plant = sw.AnalyticPlant(f=drift, g=push, state=read, hold_s=DT, delay_s=delay_s)
+    wall = sw.Clearance([sw.Plane([WALL], [-1.0])], braking=1.0, position=[0], velocity=[1])
+    return sw.CBFActionFilter(
+        ScheduledCart(index), [wall, sw.Barrier(slow, alpha=2.0)], plant=plant, fallback=fallback
+    )
+
+
+def cart(index=0, delay_s=0.25):
+    """The whole stack; the delay makes commands in flight show in `cbf/margin`."""
+    return CountUnsafeWarnings(sw.RecordInterventions(cart_filter(index, delay_s)))
+
+
+class AtHazard(gym.Wrapper):
+    """Starts every episode in front of a hazard; goal and vase stay random."""
+
+    def reset(self, *, seed=None, options=None):
+        layout = {"agent": [0.0, 0.0, 0.0], "hazards": [[0.26, 0.0]]}
+        return self.env.reset(seed=seed, options={"layout": layout})
+
+
+def point_goal_filter(env):
+    return sw.protect(AtHazard(env), fallback="hold", plant=sw.MujocoPlant(delay_s=0.03))
+
+
+def reacher_filter(env):
+    return sw.protect(env, fallback="hold")
+
+
+def pendulum_filter(env):
+    """The pole falls, and so terminates, by itself; the margin brings the rail's end within reach of that."""
+    return sw.protect(env, margin=0.85, fallback="hold", plant=sw.MujocoPlant(delay_s=0.06))
+
+
+def point_goal(index=0):
+    env = gym.make("SafePointGoal1-v0", max_episode_steps=7 + 2 * index)
+    return CountUnsafeWarnings(sw.RecordInterventions(point_goal_filter(env)))
+
+
+def reacher(index=0):
+    env = gym.make("Reacher-v5", max_episode_steps=7 + 2 * index)
+    return CountUnsafeWarnings(sw.AdaptionPenalty(sw.RecordInterventions(reacher_filter(env)), penalty=0.1))
+
+
+def pendulum(index=0):
+    env = gym.make("InvertedPendulum-v5", max_episode_steps=9 + index)
+    return CountUnsafeWarnings(sw.RecordInterventions(pendulum_filter(env)))
+
+
+TASKS = {"cart": cart, "point_goal": point_goal, "reacher": reacher, "pendulum": pendulum}
+
+
+def sub_envs(make, n=3):
+    """One function per sub-env, as the vector envs want them."""
+    return [partial(make, i) for i in range(n)]
