@@ -6,8 +6,8 @@ of them. All of that is linear, so three things are exact and cheap:
 
 * A hold: `v_end = A v + B u`, `x_end = x + P v + Q u`.
 * The brake: the full opposing control for as many holds as it takes, and in the last one just the control
-  `-A v / B` that ends it at rest. A braking force held any longer would reverse the motion. Within each of these holds
-  the speed falls monotonically to zero or above, so the body never turns back.
+  `-A v / B` that ends it at rest; full braking, held for all of it, would reverse the motion. Within each of these
+  holds the speed falls monotonically to zero or above, so the body never turns back.
 * The stopping distance: while the number n of full holds is the same, every map is linear in v, so the distance
   is piecewise linear in v, with a knot at each speed that n full holds take away exactly. It is tabulated once.
 
@@ -135,6 +135,20 @@ class HeldAxis:
     def brake(self, v: float) -> float:
         """The control that brakes fully, or just to rest within one hold."""
         return max(self.low, min(-self.keep * self.clipped(v) / self.add, self.high))
+
+    def braking(self, x: float, v: float) -> list[float]:
+        """Positions at the ends of the holds of the braking manoeuvre, the present one first, rest last."""
+        v = self.clipped(v)
+        end, brake = self.rest(x, v), self.low if v >= 0.0 else self.high
+        drift, shift, keep, loss = self.drift, self.shift * brake, self.keep, self.add * brake
+        last, direction = abs(loss) / keep, 1.0 if v >= 0.0 else -1.0
+        points = [x]
+        while direction * v > last:
+            x, v = x + drift * v + shift, keep * v + loss
+            points.append(x)
+        if x != end:
+            points.append(end)
+        return points
 
     def extent(self, x: float, v: float, u: float) -> tuple[float, float]:
         """Least and greatest position during a hold, its start included; `v` is clipped already."""
