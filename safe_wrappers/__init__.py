@@ -22,6 +22,7 @@ from safe_wrappers.constraints import (
     SpeedLimit,
     Sphere,
     Upright,
+    WallClearance,
     Workspace,
 )
 from safe_wrappers.control.projection import Projection, project
@@ -59,6 +60,7 @@ __all__ = [
     "Sphere",
     "UnsafeStateWarning",
     "Upright",
+    "WallClearance",
     "Workspace",
     "project",
     "protect",

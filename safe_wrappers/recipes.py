@@ -14,6 +14,7 @@ from safe_wrappers.constraints import (
     JointSpeedLimit,
     Plane,
     SpeedLimit,
+    WallClearance,
     Workspace,
 )
 from safe_wrappers.constraints.constraint import Constraint
@@ -68,6 +69,11 @@ def _humanoid_standup(env: gym.Env[Any, Any]) -> list[Constraint]:
     return [JointSpeedLimit(limit=20.0, margin=0.1)]
 
 
+def _point_maze(env: gym.Env[Any, Any]) -> list[Constraint]:
+    # gymnasium-robotics' point is clipped to 5 m/s along each axis before every step.
+    return [WallClearance(velocity_clip=5.0)]
+
+
 def _ant_maze(env: gym.Env[Any, Any]) -> list[Constraint]:
     # The torso's ball has 0.25 m; the legs reach farther and may touch.
     model: mujoco.MjModel = env.unwrapped.model  # type: ignore[attr-defined]
@@ -108,6 +114,7 @@ RECIPES: dict[str, Callable[..., list[Constraint]]] = {
     "Reacher": _reacher,
     "Pusher": _pusher,
     "HumanoidStandup": _humanoid_standup,
+    "PointMaze": _point_maze,
     "AntMaze": _ant_maze,
     "HalfCheetah": _velocity("HalfCheetah", margin=0.02),
     "Hopper": _velocity("Hopper", margin=0.02),

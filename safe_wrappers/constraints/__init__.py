@@ -9,6 +9,7 @@ from safe_wrappers.constraints.joint_speed_limit import JointSpeedLimit
 from safe_wrappers.constraints.obstacles import Box, Disc, Discs, Plane, Sphere
 from safe_wrappers.constraints.speed_limit import SpeedLimit
 from safe_wrappers.constraints.upright import Upright
+from safe_wrappers.constraints.wall_clearance import WallClearance
 from safe_wrappers.constraints.workspace import Workspace
 
 __all__ = [
@@ -27,5 +28,6 @@ __all__ = [
     "SpeedLimit",
     "Sphere",
     "Upright",
+    "WallClearance",
     "Workspace",
 ]

@@ -14,6 +14,7 @@ from safe_wrappers.constraints.joint_speed_limit import JointSpeedLimit
 from safe_wrappers.constraints.obstacles import obstacle_data
 from safe_wrappers.constraints.speed_limit import SpeedLimit
 from safe_wrappers.constraints.upright import Upright
+from safe_wrappers.constraints.wall_clearance import WallClearance
 from safe_wrappers.constraints.workspace import Workspace
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 
@@ -25,6 +26,7 @@ KINDS: dict[str, Callable[..., Constraint]] = {
     "JointSpeedLimit": JointSpeedLimit,
     "SpeedLimit": SpeedLimit,
     "Upright": Upright,
+    "WallClearance": WallClearance,
     "Workspace": Workspace,
 }
 
