@@ -67,6 +67,14 @@ class AdaptionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         self.penalty = penalty
         self.per_correction = per_correction
 
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Resets the env; its info holds the keys of a step, as 0."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        info[keys.ADAPTION_PENALTY] = info[keys.ADAPTION_TASK_REWARD] = 0.0
+        return observation, info
+
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Steps the env; an unchanged step's reward passes through untouched."""
         observation, reward, terminated, truncated, info = self.env.step(action)

@@ -85,6 +85,8 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         margin: float = 0.0,
     ) -> None:
         space = check_actions(env)
+        if isinstance(plant, _PlantOfSpec):
+            plant = plant.fresh()
         if isinstance(constraints, str | dict) or not isinstance(constraints, Sequence) or not constraints:
             raise ConfigurationError(f"constraints is a list with at least one, got {constraints!r}")
         _refuse_nesting(env)
@@ -98,7 +100,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         gym.utils.RecordConstructorArgs.__init__(
             self,
             constraints=[constraint_data(c) for c in own],
-            plant=plant,
+            plant=None if plant is None else _PlantOfSpec(plant),
             fallback=fallback,
             solver=solver,
             margin=margin,
@@ -142,6 +144,10 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         info[keys.CBF_MARGIN] = margin
         info[keys.CBF_UNSAFE] = unsafe
         info[keys.CBF_REFUSED] = np.zeros(len(self.constraints), dtype=bool)
+        # Nothing was proposed or executed yet. But when all sub-envs of a vector env reset at once, its infos hold
+        # these keys only if a reset reports them, and a loop reads them at every step.
+        info[keys.PROPOSED_ACTION] = np.zeros(self._shape)
+        info[keys.EXECUTED_ACTION] = np.zeros(self._shape)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -177,7 +183,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
             decision = self._decider.without_proposal(self._last)
         if inside and not decision.changed:
             # Bit for bit the policy's own action wherever the filter has nothing to say.
-            sent, executed, correction = action, proposed, 0.0
+            sent, executed, correction = action, proposed.copy(), 0.0
         else:
             sent = cast_inside(decision.control, self._dtype, *decision.rows, self._low, self._high)
             executed = sent.astype(np.float64)
@@ -200,7 +206,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         info[keys.CBF_CLIPPED] = clipped
         info[keys.CBF_MARGIN] = margin
         info[keys.PROPOSED_ACTION] = proposed
-        info[keys.EXECUTED_ACTION] = executed
+        info[keys.EXECUTED_ACTION] = executed.copy()
         return observation, reward, terminated, truncated, info
 
     def _checked(self, action: Any) -> Array:
@@ -233,12 +239,26 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
             f"the state is outside the safe set (cbf/margin = {margin:.3g}); the filter drives it "
             "back where it can, and promises nothing until it is inside",
             UnsafeStateWarning,
+            stacklevel=4,
         )
 
-    def _warn_once(self, what: str, message: str, category: type[Warning] = UserWarning) -> None:
+    def _warn_once(
+        self, what: str, message: str, category: type[Warning] = UserWarning, stacklevel: int = 3
+    ) -> None:
+        """Warn once per episode (unsafe) or filter, at the line of the caller of `step` or `reset`."""
         if what not in self._warned:
             self._warned.add(what)
-            warnings.warn(message, category, stacklevel=3)
+            warnings.warn(message, category, stacklevel=stacklevel)
+
+
+class _PlantOfSpec:
+    """A plant as an env's spec keeps it: every env that is made from the spec gets one of its own."""
+
+    def __init__(self, plant: Plant) -> None:
+        self._plant = plant
+
+    def fresh(self) -> Plant:
+        return copy.deepcopy(self._plant)
 
 
 def _unique(kinds: list[str]) -> list[str]:

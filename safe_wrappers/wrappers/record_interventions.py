@@ -102,9 +102,11 @@ class RecordInterventions(
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Starts a new episode's counts; seed and options pass through untouched."""
+        """Starts a new episode's counts, all zero in info; seed and options pass through untouched."""
         self._clear()
-        return self.env.reset(seed=seed, options=options)
+        observation, info = self.env.reset(seed=seed, options=options)
+        info.update(dict.fromkeys(keys.RUNNING, 0.0))
+        return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Steps the env and adds the running counts, and the summary at the episode's end, to its info."""

@@ -80,9 +80,6 @@ def test_dtypes_shapes_and_masks_at_every_step_and_reset(task, mode):
                 assert again[f"_{key}"].tolist() == ended.tolist()
 
 
-@pytest.mark.xfail(
-    strict=True, reason="a reset's info has the filter's cbf keys, but not the other keys of a step"
-)
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, SAME], ids=lambda mode: mode.value)
 def test_no_key_goes_missing_when_all_sub_envs_reset_at_once(mode):
     # Tasks that only a time limit ends do: a loop that reads infos["executed_action"] must not fail there.
@@ -152,10 +149,6 @@ def test_make_vec_from_a_filtered_envs_spec(kind):
         envs.close()
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="a spec holds one plant, which the first env made from it binds: the second is refused",
-)
 def test_make_vec_from_a_spec_that_records_a_plant():
     env = sw.protect(gym.make("Reacher-v5"), plant=sw.MujocoPlant(delay_s=0.02))
     envs = gym.make_vec(env.spec, 2, vectorization_mode="sync")
@@ -165,7 +158,6 @@ def test_make_vec_from_a_spec_that_records_a_plant():
     assert envs.step(envs.action_space.sample())[4]["_cbf/margin"].all()
 
 
-@pytest.mark.xfail(strict=True, reason="an untouched action is reported twice by one array")
 def test_what_was_proposed_and_what_was_executed_are_two_arrays():
     # Whoever writes to one (a reader that scales it in place) must not change the other, nor what the filter holds.
     env = cart_filter()
