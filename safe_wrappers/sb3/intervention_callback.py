@@ -27,8 +27,8 @@ class InterventionCallback(BaseCallback):
     Two kinds of values reach the logger (stdout, TensorBoard, CSV), both as means since its last dump:
 
     - `interventions/step_rate`, `step_infeasible`, `step_fallback`, `step_correction`, `step_cost`,
-      `step_cost_substep`, `step_penalty` (AdaptionPenalty's): over all steps of all envs, from the keys that the filter and the task write at
-      every step;
+      `step_cost_substep`, `step_penalty` (AdaptionPenalty's): over all steps of all envs, from the keys that the
+      filter and the task write at every step;
     - `interventions/rate`, `correction_mean`, `correction_p95`, `infeasible`, `fallback`, `nonfinite`,
       `unsafe`, `margin_min`, `violations`, `cost`, `cost_substep`, `goals_reached`, `success`: over the
       episodes that ended, from `RecordInterventions`.

@@ -44,8 +44,8 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
 
     **What it does not.** A "best effort" constraint, a plant outside its margins, or a start that is already
     unsafe (warned of once per episode, counted in `cbf/unsafe`) void that. It does not clip rewards or end
-    episodes. A learner that stores the policy's action learns from "naive" replays (Krasowski et al., 2023); `AdaptionPenalty`
-    and `safe_wrappers.sb3.ExecutedActionReplayBuffer` are the other choices.
+    episodes. A learner that stores the policy's action learns from "naive" replays (Krasowski et al., 2023);
+    `AdaptionPenalty` and `safe_wrappers.sb3.ExecutedActionReplayBuffer` are the other choices.
 
     Args:
         env: With a one-dimensional Box action space.
