@@ -111,12 +111,12 @@ class PointAmongWalls:
         return best
 
     def path(self, motion: PointMotion) -> list[Rectangle]:
-        """What the braking manoeuvre stays in, one rectangle per hold."""
+        """What the braking manoeuvre stays in: one rectangle per hold, and the rest point."""
         across = self.x_axis.braking(motion.x, motion.vx)
         along = self.y_axis.braking(motion.y, motion.vy)
         points = zip_longest(across, along)  # one axis may be at rest before the other
         places = [(across[-1] if x is None else x, along[-1] if y is None else y) for x, y in points]
-        return [_spanned(*start, *end) for start, end in pairwise(places)]
+        return [_spanned(*start, *end) for start, end in pairwise([*places, places[-1]])]
 
 
 def _spanned(x: float, y: float, to_x: float, to_y: float) -> Rectangle:

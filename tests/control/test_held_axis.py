@@ -1,0 +1,129 @@
+"""One held axis against a simulation of single physics steps, written here, and against the undamped formula."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from safe_wrappers.control.held_axis import HeldAxis
+from safe_wrappers.control.stopping import held_stopping_distance
+
+SPEEDS = st.floats(-7.0, 7.0).map(lambda v: round(v, 6))
+PLACES = st.floats(-3.0, 3.0)
+CONTROLS = st.floats(-1.0, 1.0)
+
+
+@st.composite
+def axes(draw, clip=True):
+    return HeldAxis(
+        decay=draw(st.floats(0.8, 1.0)),
+        gain=draw(st.floats(0.01, 0.5)),
+        timestep=draw(st.sampled_from([0.002, 0.01, 0.05])),
+        substeps=draw(st.integers(1, 6)),
+        low=draw(st.floats(-2.0, -0.2)),
+        high=draw(st.floats(0.2, 2.0)),
+        clip=draw(st.one_of(st.just(math.inf), st.floats(1.0, 6.0))) if clip else math.inf,
+    )
+
+
+def simulated(axis, x, v, u):
+    """Every physics step of one hold: positions and speeds, the start included."""
+    v = min(max(v, -axis.clip), axis.clip)
+    u = min(max(u, axis.low), axis.high)
+    xs, vs = [x], [v]
+    for _ in range(axis.substeps):
+        v = axis.decay * v + axis.gain * u
+        x = x + axis.timestep * v
+        xs.append(x)
+        vs.append(v)
+    return xs, vs
+
+
+def braked(axis, x, v):
+    """Every physics step of the manoeuvre until rest, asked for anew at every hold."""
+    xs, vs = [x], [v]
+    for _ in range(5000):
+        if abs(vs[-1]) <= 1e-12:
+            return xs, vs
+        more_x, more_v = simulated(axis, xs[-1], vs[-1], axis.brake(vs[-1]))
+        xs += more_x[1:]
+        vs += more_v[1:]
+    raise AssertionError("did not come to rest")
+
+
+@settings(max_examples=150, deadline=None)
+@given(axes(), PLACES, SPEEDS, CONTROLS)
+def test_a_hold_is_its_physics_steps(axis, x, v, u):
+    v = axis.clipped(v)
+    xs, vs = simulated(axis, x, v, u)
+    assert axis.step(x, v, u) == pytest.approx((xs[-1], vs[-1]), abs=1e-12)
+    assert axis.extent(x, v, u) == pytest.approx((min(xs), max(xs)), abs=1e-12)
+
+
+@settings(max_examples=150, deadline=None)
+@given(axes(), PLACES, SPEEDS)
+def test_braking_ends_where_it_says_and_never_turns_back(axis, x, v):
+    xs, vs = braked(axis, x, v)
+    assert axis.rest(x, v) == pytest.approx(xs[-1], abs=1e-9)
+    assert (np.sign(v) * np.array(vs) >= -1e-12).all()
+    ends = axis.braking(x, v)
+    assert ends[0] == x and ends[-1] == pytest.approx(xs[-1], abs=1e-9)
+    assert ends == pytest.approx(xs[:: axis.substeps][: len(ends)], abs=1e-9)
+
+
+@settings(max_examples=150, deadline=None)
+@given(axes(), PLACES, SPEEDS)
+def test_after_one_hold_of_braking_the_rest_point_is_the_same(axis, x, v):
+    end = axis.step(x, axis.clipped(v), axis.brake(v))
+    assert axis.rest(*end) == pytest.approx(axis.rest(x, v), abs=1e-9)
+
+
+@settings(max_examples=200, deadline=None)
+@given(axes(), PLACES, SPEEDS, st.floats(-2.0, 2.0))
+def test_the_control_to_rest_at_a_target_does(axis, x, v, way):
+    v = axis.clipped(v)
+    u = axis.control_to_rest_at(x, v, x + way)
+    assume(axis.low <= u <= axis.high)
+    end, speed = axis.step(x, v, u)
+    assert axis.rest(end, speed) == pytest.approx(x + way, abs=1e-9)
+
+
+@settings(max_examples=200, deadline=None)
+@given(axes(), PLACES, SPEEDS, CONTROLS, CONTROLS)
+def test_more_control_never_rests_or_reaches_less_far(axis, x, v, a, b):
+    v, (a, b) = axis.clipped(v), sorted((a, b))
+    assert axis.rest(*axis.step(x, v, a)) <= axis.rest(*axis.step(x, v, b)) + 1e-12
+    low, high = axis.extent(x, v, a), axis.extent(x, v, b)
+    assert low[0] <= high[0] + 1e-12 and low[1] <= high[1] + 1e-12
+
+
+@settings(max_examples=100, deadline=None)
+@given(axes(clip=False), PLACES, SPEEDS, st.floats(0.3, 8.0))
+def test_a_clip_never_leads_farther(axis, x, v, clip):
+    clipped = HeldAxis(axis.decay, axis.gain, axis.timestep, axis.substeps, axis.low, axis.high, clip)
+    free, held = axis.rest(x, v), clipped.rest(x, v)
+    assert min(x, free) - 1e-12 <= held <= max(x, free) + 1e-12
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.floats(0.0, 5.0), st.integers(1, 8))
+def test_without_damping_a_finely_stepped_hold_is_the_held_formula(speed, holds):
+    # A thousand steps a hold: the step's own share of the way, gain * timestep, is below the tolerance.
+    brake, hold, steps = 3.0, 0.1, 1000
+    axis = HeldAxis(1.0, brake * hold / steps, hold / steps, steps, -1.0, 1.0)
+    assert axis.rest(0.0, speed) == pytest.approx(float(held_stopping_distance(speed, brake, hold)), abs=1e-3)
+
+
+def test_faster_than_the_table_knows_never_stops():
+    axis = HeldAxis(1.0, 0.1, 0.01, 1, -1.0, 1.0)
+    assert axis.rest(0.0, 400.0) < math.inf
+    assert axis.rest(0.0, 500.0) == math.inf
+    assert axis.rest(0.0, -500.0) == -math.inf
+    assert math.isfinite(axis.control_to_rest_at(0.0, 0.0, 1e12))
+
+
+def test_the_two_directions_have_their_own_brakes():
+    axis = HeldAxis(1.0, 0.1, 0.01, 1, low=-0.5, high=1.0)
+    assert axis.rest(0.0, 3.0) == pytest.approx(2.0 * -axis.rest(0.0, -3.0), rel=0.02)

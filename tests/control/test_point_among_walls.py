@@ -1,0 +1,154 @@
+"""A point among walls: the braking path against single physics steps, and the facts that the proof stands on."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from safe_wrappers.control.held_axis import HeldAxis
+from safe_wrappers.control.point_among_walls import PointAmongWalls, PointMotion
+from safe_wrappers.control.rectangles import apart
+
+WALLS = [(-3.0, 3.0, -3.0, -2.0), (-3.0, 3.0, 2.0, 3.0), (-3.0, -2.0, -2.0, 2.0), (2.0, 3.0, -2.0, 2.0)]
+BLOCK = (-0.5, 0.5, -0.5, 0.4)
+CLIP = 5.0
+
+
+def among(clip_known, substeps=1, walls=(*WALLS, BLOCK)):
+    clip = CLIP if clip_known else math.inf
+    x_axis = HeldAxis(0.998, 0.24 / substeps, 0.01, substeps, -1.0, 1.0, clip)
+    y_axis = HeldAxis(0.99, 0.2 / substeps, 0.01, substeps, -0.7, 0.9, clip)
+    return PointAmongWalls(x_axis, y_axis, list(walls), clip_known)
+
+
+MOTIONS = st.builds(
+    PointMotion, st.floats(-2.0, 2.0), st.floats(-2.0, 2.0), st.floats(-6.0, 6.0), st.floats(-6.0, 6.0)
+)
+CONTROLS = st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
+
+
+def truth(point, motion, control, clip):
+    """Every physics step of one control step of an env that clips the speed at its start."""
+    x, y = motion.x, motion.y
+    vx, vy = (min(max(v, -clip), clip) for v in (motion.vx, motion.vy))
+    ax, ay = point.x_axis, point.y_axis
+    ux, uy = min(max(control[0], ax.low), ax.high), min(max(control[1], ay.low), ay.high)
+    out = []
+    for _ in range(ax.substeps):
+        vx, vy = ax.decay * vx + ax.gain * ux, ay.decay * vy + ay.gain * uy
+        x, y = x + ax.timestep * vx, y + ay.timestep * vy
+        out.append(PointMotion(x, y, vx, vy))
+    return out
+
+
+def braking(point, motion, clip):
+    steps = []
+    while abs(motion.vx) + abs(motion.vy) > 1e-12:
+        steps += truth(point, motion, point.brake(motion), clip)
+        motion = steps[-1]
+    return steps
+
+
+def inside(r, p, slack=1e-9):
+    return r[0] - slack <= p.x <= r[1] + slack and r[2] - slack <= p.y <= r[3] + slack
+
+
+def from_walls(point, p):
+    return min(
+        math.hypot(max(a - p.x, p.x - b, 0.0), max(c - p.y, p.y - d, 0.0)) for a, b, c, d in point.walls
+    )
+
+
+@settings(max_examples=100, deadline=None)
+@given(MOTIONS, st.sampled_from([1, 4]))
+def test_the_path_of_rectangles_contains_every_physics_step_of_braking(motion, substeps):
+    point = among(True, substeps)
+    boxes = point.path(point.clipped(motion))
+    steps = braking(point, motion, CLIP)
+    for k, place in enumerate(steps):
+        assert inside(boxes[min(k // substeps, len(boxes) - 1)], place)
+    assert all(inside(point.stop(motion), place) for place in steps)
+
+
+@settings(max_examples=100, deadline=None)
+@given(MOTIONS, st.sampled_from([1, 4]), st.booleans())
+def test_no_physics_step_of_braking_is_closer_than_the_distance(motion, substeps, clip_known):
+    point = among(clip_known, substeps)
+    steps = [motion, *braking(point, motion, CLIP)]
+    distance = point.distance(point.clipped(motion))
+    assert min(from_walls(point, p) for p in steps) >= distance - 1e-9
+
+
+@settings(max_examples=100, deadline=None)
+@given(MOTIONS)
+def test_the_path_is_never_closer_than_its_rectangle_and_as_close_as_its_own_boxes(motion):
+    known, unknown = among(True), among(False)
+    motion = known.clipped(motion)
+    by_hand = min(apart(box, w) for box in known.path(motion) for w in known.walls)
+    assert known.distance(motion) >= unknown.distance(motion) - 1e-12
+    assert known.distance(motion) == pytest.approx(by_hand, abs=1e-12)
+    assert known.distance(motion, by_hand + 0.1) == pytest.approx(by_hand, abs=1e-12)
+    assert known.distance(motion, -9.0) == -9.0
+
+
+@settings(max_examples=150, deadline=None)
+@given(MOTIONS, st.sampled_from([1, 4]), st.booleans())
+def test_braking_for_one_hold_never_loses_distance_and_is_clear(motion, substeps, clip_known):
+    point = among(clip_known, substeps)
+    motion = point.clipped(motion)
+    distance = point.distance(motion)
+    assume(distance > 0.0)
+    stop = point.brake(motion)
+    assert point.distance(point.clipped(point.step(motion, *stop))) >= distance - 1e-9
+    assert point.clear(motion, *stop, distance - 1e-9)
+
+
+@settings(max_examples=200, deadline=None)
+@given(MOTIONS, CONTROLS, st.sampled_from([1, 4]), st.booleans(), st.floats(0.05, 0.2))
+def test_a_clear_control_stays_clear_and_leads_back_inside(motion, control, substeps, clip_known, room):
+    point = among(clip_known, substeps)
+    start = point.clipped(motion)
+    assume(point.distance(start) >= room and point.clear(start, *control, room))
+    steps = truth(point, motion, control, CLIP)
+    assert min(from_walls(point, p) for p in steps) >= room - 1e-9
+    assert point.distance(point.clipped(steps[-1])) >= room - 1e-9
+
+
+@settings(max_examples=150, deadline=None)
+@given(MOTIONS, CONTROLS, st.floats(0.5, 6.0), st.floats(0.05, 0.2))
+def test_without_the_clip_s_level_every_clip_is_covered(motion, control, clip, room):
+    # Down to 0.5 m/s: one hold of full force reverses at most 0.24 m/s.
+    point = among(False)
+    assume(point.distance(motion) >= room and point.clear(motion, *control, room))
+    end = truth(point, motion, control, clip)[-1]
+    assert from_walls(point, end) >= room - 1e-9
+    assert point.distance(end) >= room - 1e-9
+
+
+@settings(max_examples=100, deadline=None)
+@given(MOTIONS, CONTROLS)
+def test_only_reachable_walls_can_be_met(motion, control):
+    point = among(True)
+    motion = point.clipped(motion)
+    alone = among(True, walls=[w for w in point.walls if w not in point.reachable(motion, 0.1)])
+    assert alone.clear(motion, *control, 0.1)
+
+
+def test_the_price_of_not_knowing_the_clip_is_at_corners():
+    # Up and to the left past the block's upper right corner: the path passes it, its rectangle does not.
+    motion = PointMotion(0.7, 0.38, -3.5, 3.5)
+    known, unknown = among(True), among(False)
+    assert known.distance(motion) > 0.1 > 0.0 > unknown.distance(motion)
+    # Straight ahead there is no difference.
+    straight = PointMotion(1.0, 0.0, 3.0, 0.0)
+    assert known.distance(straight) == unknown.distance(straight)
+
+
+def test_far_beyond_the_table_nothing_is_clear():
+    point = among(False)
+    motion = PointMotion(1.0, 1.0, 1e6, 0.0)
+    assert not point.clear(motion, -1.0, 0.0, 0.1)
+    assert point.distance(motion) < 0.0
+    assert np.isfinite(point.distance(motion))
