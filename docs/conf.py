@@ -11,22 +11,33 @@ sys.path.insert(0, str(Path(__file__).parent / "extensions"))
 
 project = "safe-wrappers"
 author = "The safe-wrappers authors"
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "drawn", "mathml"]
-exclude_patterns = ["figures", "extensions"]
-suppress_warnings: list[str] = []
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "docstrings",
+    "drawn",
+    "mathml",
+]
+default_role = "code"  # single backticks in docstrings
 
 myst_enable_extensions = ["dollarmath", "deflist", "colon_fence"]
 myst_heading_anchors = 3
 
 html_theme = "furo"
+pygments_dark_style = "one-dark"
 html_title = "safe-wrappers"
 html_math_renderer = "mathml"
 html_static_path = ["static"]
 html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sphinx = False
+html_show_copyright = False
 html_sidebars = {
-    "**": [f"sidebar/{part}.html" for part in ("brand", "search", "scroll-start", "navigation", "scroll-end")]
+    "**": [
+        f"sidebar/{part}.html"
+        for part in ("brand", "search", "scroll-start", "navigation", "scroll-end")
+    ]
 }
 _LIGHT = {
     "ink": "#1d232b", "grid": "#b9bfc6", "off": "#d1601f", "on": "#1a6fb5",
@@ -48,3 +59,4 @@ autodoc_preserve_defaults = True
 add_module_names = False
 python_maximum_signature_line_length = 90
 napoleon_numpy_docstring = False
+napoleon_use_ivar = True

@@ -22,7 +22,7 @@ class Cart(gym.Env[Array, Array]):
     def __init__(
         self, start: tuple[float, float], dt: float, latency: int = 0, strength: float = 1.0
     ) -> None:
-        self.start, self.dt, self.latency, self.strength = start, dt, latency, strength
+        self.start, self.dt, self.latency, self.strength = (start, dt, latency, strength)
         self.action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float64)
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
 

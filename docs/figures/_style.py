@@ -2,12 +2,15 @@
 
 import io
 import re
+import warnings
 from collections.abc import Callable
 from typing import Any, Final
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from safe_wrappers import UnsafeStateWarning
 
 INK: Final = "#010101"
 """Text, axes and what needs no colour."""
@@ -80,7 +83,8 @@ def bare(ax: Axes) -> None:
 def as_svg(draw: Callable[[], Figure], name: str) -> str:
     """SVG text that depends on nothing but the code: no dates, no random ids, colours as variables."""
     text = io.StringIO()
-    with mpl.rc_context({**_RC, "svg.hashsalt": name}):
+    with mpl.rc_context({**_RC, "svg.hashsalt": name}), warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnsafeStateWarning)  # pictures show unsafe states on purpose
         draw().savefig(text, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
     body = text.getvalue()
     body = body[body.index("<svg ") :]  # no XML prologue: it stands inside a page

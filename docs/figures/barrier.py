@@ -1,11 +1,11 @@
 """A speed limit as a barrier: what the row allows, and how alpha shapes the approach."""
 
 import numpy as np
-from _cart import Cart, run
-from _style import FORBIDDEN, OFF, ON, OTHER, SAFE, panels
 from matplotlib.figure import Figure
 
 import safe_wrappers as sw
+from _cart import Cart, run
+from _style import FORBIDDEN, OFF, ON, OTHER, SAFE, panels
 
 LIMIT = 1.0
 ALPHAS = {0.5: OTHER, 2.0: ON, 10.0: OFF}

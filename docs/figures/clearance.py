@@ -4,12 +4,12 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from _style import FORBIDDEN, INK, OFF, ON, OTHER, panels
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
 import safe_wrappers as sw
+from _style import FORBIDDEN, INK, OFF, ON, OTHER, panels
 from safe_wrappers.control.stopping import held_stopping_distance
 
 Array = NDArray[np.float64]

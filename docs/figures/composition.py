@@ -1,11 +1,11 @@
 """Two filters in a row against one projection on both rows."""
 
 import numpy as np
-from _style import FORBIDDEN, GRID, INK, OFF, ON, OTHER, SAFE, panels
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
 
 import safe_wrappers as sw
+from _style import FORBIDDEN, GRID, INK, OFF, ON, OTHER, SAFE, panels
 
 ROWS = np.array([[-0.6, 1.0], [1.0, 0.15]])
 OFFSETS = np.array([0.15, -0.05])

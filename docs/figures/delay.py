@@ -1,8 +1,9 @@
 """Commands that act 0.2 s late: undeclared, and declared to the plant."""
 
+from matplotlib.figure import Figure
+
 from _cart import Cart, run, wall
 from _style import FORBIDDEN, OFF, ON, panels
-from matplotlib.figure import Figure
 
 WALL = 2.0
 

@@ -5,12 +5,12 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from _style import FORBIDDEN, INK, OFF, ON, SAFE, bare, panels
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
 import safe_wrappers as sw
+from _style import FORBIDDEN, INK, OFF, ON, SAFE, bare, panels
 
 LAYOUT = {
     "agent": [-1.6, -1.0, 0.3],
@@ -61,7 +61,7 @@ def draw() -> Figure:
     chart.plot(*path[0], "s", color=INK, ms=5)
     bare(chart)
     distance.axhline(0.0, color=FORBIDDEN, lw=1.2)
-    distance.set_ylim(-22, 90)
+    distance.set_ylim(-22, 110)
     distance.set_xlabel("time (s)")
     distance.set_ylabel("distance to the nearest hazard (cm)")
     distance.legend(loc="upper right")

@@ -5,13 +5,13 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from _style import FORBIDDEN, INK, ON, OTHER, SAFE, bare, panels
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
 from numpy.typing import NDArray
 
 import safe_wrappers as sw
+from _style import FORBIDDEN, INK, ON, OTHER, SAFE, bare, panels
 
 Array = NDArray[np.float64]
 

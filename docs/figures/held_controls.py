@@ -1,11 +1,11 @@
 """The continuous condition, asked at samples only, against the bound for a held control."""
 
 import numpy as np
-from _cart import Cart, run, wall
-from _style import FORBIDDEN, GRID, OFF, ON, panels
 from matplotlib.figure import Figure
 
 import safe_wrappers as sw
+from _cart import Cart, run, wall
+from _style import FORBIDDEN, GRID, OFF, ON, panels
 from safe_wrappers.control.stopping import kinetic_row
 
 WALL, GAMMA = 1.0, 2.0
@@ -26,8 +26,8 @@ def draw() -> Figure:
     figure, (distance, commands) = panels(2, height=3.0)
     dt = 0.25
     for constraint, color, name in (
-        (ContinuousRow(), OFF, "continuous row at samples"),
-        (wall(WALL), ON, "bound for a held control"),
+        (ContinuousRow(), OFF, "continuous condition"),
+        (wall(WALL), ON, "held control"),
     ):
         loop = run(Cart((0.0, 0.0), dt), 20, [constraint])
         distance.plot(loop.t, 1000 * (WALL - loop.x), color=color, label=name)

@@ -1,13 +1,10 @@
 """What a braking bound that is too good costs, and what one that is too careful costs."""
 
-import warnings
-
 import numpy as np
-from _cart import Cart, run, wall
-from _style import FORBIDDEN, GRID, OFF, ON, panels
 from matplotlib.figure import Figure
 
-from safe_wrappers import UnsafeStateWarning
+from _cart import Cart, run, wall
+from _style import FORBIDDEN, GRID, OFF, ON, panels
 
 WALL = 2.0
 NEAR_M = 0.05
@@ -19,9 +16,7 @@ def draw() -> Figure:
     ratios = np.linspace(0.4, 1.6, 25)
     closest, times = [], []
     for ratio in ratios:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UnsafeStateWarning)  # the point of the picture
-            loop = run(Cart((0.0, 0.0), dt=0.1), 60, [wall(WALL, braking=ratio)])
+        loop = run(Cart((0.0, 0.0), dt=0.1), 60, [wall(WALL, braking=ratio)])
         closest.append(1000 * (WALL - loop.x.max()))
         times.append(loop.t[np.argmax(loop.x > WALL - NEAR_M)])
     depth.plot(ratios, closest, color=ON)

@@ -1,13 +1,13 @@
 """The executed action: projected onto the row and the box at once, against clamped afterwards."""
 
 import numpy as np
-from _style import FORBIDDEN, GRID, INK, OFF, ON, OTHER, SAFE, panels
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
 from numpy.typing import NDArray
 
 import safe_wrappers as sw
+from _style import FORBIDDEN, GRID, INK, OFF, ON, OTHER, SAFE, panels
 
 Array = NDArray[np.float64]
 

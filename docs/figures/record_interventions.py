@@ -2,11 +2,11 @@
 
 import gymnasium as gym
 import numpy as np
-from _style import OFF, ON, OTHER, panels
-from first_look import towards_goal
 from matplotlib.figure import Figure
 
 import safe_wrappers as sw
+from _style import OFF, ON, OTHER, panels
+from first_look import towards_goal
 
 STEPS = 500
 

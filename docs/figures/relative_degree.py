@@ -1,11 +1,11 @@
 """A position check on a plant with inertia brakes too late; a braking distance in h does not."""
 
 import numpy as np
-from _cart import Cart, run, wall
-from _style import FORBIDDEN, GRID, OFF, ON, SAFE, panels
 from matplotlib.figure import Figure
 
 import safe_wrappers as sw
+from _cart import Cart, run, wall
+from _style import FORBIDDEN, GRID, OFF, ON, SAFE, panels
 from safe_wrappers.control.stopping import held_stopping_distance
 
 WALL = 2.0
@@ -28,7 +28,7 @@ def draw() -> Figure:
     inset = WALL - held_stopping_distance(speed, 1.0, 0.1)
     plane.fill_betweenx(speed, -0.2, inset, color=SAFE, alpha=0.15, lw=0)
     plane.plot(inset, speed, color=SAFE, lw=1.2)
-    plane.text(0.1, 1.62, "from here it\ncan still stop", color=SAFE)
+    plane.text(-0.16, 1.0, "from here it\ncan still stop", color=SAFE)
     plane.axvline(WALL, color=FORBIDDEN, lw=2)
     plane.text(WALL + 0.05, 0.1, "wall", color=FORBIDDEN)
     for constraint, color in ((NextPosition(), OFF), (wall(WALL), ON)):

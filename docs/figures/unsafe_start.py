@@ -1,13 +1,11 @@
 """An episode that starts inside a hazard: what is reported while the filter drives out."""
 
-import warnings
-
 import gymnasium as gym
 import numpy as np
-from _style import FORBIDDEN, ON, panels
 from matplotlib.figure import Figure
 
 import safe_wrappers as sw
+from _style import FORBIDDEN, ON, panels
 
 LAYOUT = {"agent": [0.05, 0.0, 0.6], "goal": [1.5, 1.0], "hazards": [[0.0, 0.0]], "vases": []}
 
@@ -16,10 +14,8 @@ def draw() -> Figure:
     """The reported margin over time; the policy pushes straight ahead and turns."""
     figure, ax = panels(width=5.2, height=2.5)
     env = sw.protect(gym.make("SafePointGoal1-v0"))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", sw.UnsafeStateWarning)  # the point of the picture
-        env.reset(seed=0, options={"layout": LAYOUT})
-        infos = [env.step(np.array([-1.0, 0.3]))[4] for _ in range(75)]
+    env.reset(seed=0, options={"layout": LAYOUT})
+    infos = [env.step(np.array([-1.0, 0.3]))[4] for _ in range(75)]
     time = np.arange(len(infos)) * env.plant.hold_s
     margin = 100.0 * np.array([i["cbf/margin"] for i in infos])
     unsafe = np.array([i["cbf/unsafe"] for i in infos])

@@ -1,0 +1,94 @@
+"""The built site: complete, without warnings, and nothing in it comes from elsewhere."""
+
+import html.parser
+import os
+import subprocess
+import sys
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import pytest
+
+import safe_wrappers as sw
+
+pytestmark = pytest.mark.slow
+DOCS = Path(__file__).parents[2] / "docs"
+LOADED = {("script", "src"), ("img", "src"), ("link", "href"), ("iframe", "src"), ("source", "src")}
+
+
+class Page(html.parser.HTMLParser):
+    def __init__(self, text):
+        super().__init__()
+        self.ids, self.links, self.loaded = set(), [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        for name, value in attrs:
+            if name == "id":
+                self.ids.add(value)
+            if (tag, name) in LOADED and value:
+                self.loaded.append(value)
+            elif (tag, name) == ("a", "href") and value:
+                self.links.append(value)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    for needed in ("sphinx", "furo", "myst_parser", "latex2mathml", "matplotlib", "stable_baselines3"):
+        pytest.importorskip(needed)
+    folder = tmp_path_factory.mktemp("site")
+    done = subprocess.run(
+        [sys.executable, "-m", "sphinx", "-b", "html", "-E", "-W", "--keep-going", "-q", DOCS, folder],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "MUJOCO_GL": "disabled"},
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    return folder
+
+
+@pytest.fixture(scope="module")
+def pages(site):
+    return {path: Page(path.read_text(encoding="utf-8")) for path in site.rglob("*.html")}
+
+
+def test_nothing_is_loaded_from_elsewhere(site, pages):
+    for path, page in pages.items():
+        for address in page.loaded:
+            assert not urlsplit(address).scheme and not address.startswith("//"), (path, address)
+            assert (path.parent / unquote(urlsplit(address).path)).exists(), (path, address)
+    for sheet in site.rglob("*.css"):
+        text = sheet.read_text(encoding="utf-8")
+        assert "@import" not in text and "url(http" not in text and "url(//" not in text, sheet
+
+
+def test_every_link_inside_the_site_leads_somewhere(site, pages):
+    for path, page in pages.items():
+        for address in page.links:
+            parts = urlsplit(address)
+            if parts.scheme:
+                continue
+            target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
+            assert target.exists(), (path, address)
+            if parts.fragment and target in pages and target.name not in ("search.html", "genindex.html"):
+                assert unquote(parts.fragment) in pages[target].ids, (path, address)
+
+
+def test_every_public_name_is_in_the_api(pages):
+    ids = set().union(*(page.ids for page in pages.values()))
+    assert {name for name in sw.__all__ if f"safe_wrappers.{name}" not in ids} == set()
+
+
+@pytest.mark.parametrize(
+    ("folder", "module"),
+    [("constraints", "safe_wrappers.constraints."), ("wrappers", "safe_wrappers.wrappers.")],
+)
+def test_every_constraint_and_wrapper_has_a_page_with_a_picture(folder, module):
+    protocols = {"constraint", "obstacles"}
+    for name in sw.__all__:
+        thing = getattr(sw, name)
+        where = getattr(thing, "__module__", "")
+        if where.startswith(module) and where.removeprefix(module) not in protocols:
+            page = DOCS / folder / (where.removeprefix(module).replace("_", "-") + ".md")
+            assert "```{drawn}" in page.read_text(encoding="utf-8"), page
