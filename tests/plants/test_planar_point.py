@@ -1,0 +1,171 @@
+"""Which models are a point on two slides among walls, what is read from them, and which are refused, by name."""
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+
+from safe_wrappers.errors import UnsupportedEnvError
+from safe_wrappers.plants.mujoco import MujocoPlant
+from safe_wrappers.plants.planar_point import planar_point
+from safe_wrappers.plants.walls import walls
+
+SLIDES = '<joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>'
+BALL = '<geom type="sphere" size="0.1"/>'
+MOTORS = '<motor joint="x" ctrlrange="-1 2" gear="10"/><motor joint="y" ctrlrange="-3 1" gear="5"/>'
+WALL = '<geom name="wall" type="box" pos="2 0 0" size="0.5 1 0.2"/>'
+
+
+def xml(slides=SLIDES, ball=BALL, motors=MOTORS, world=WALL, option="", body=""):
+    return f"""
+    <mujoco>
+      <option timestep="0.01" gravity="0 0 0" {option}/>
+      <default><joint damping="1"/><geom margin="0.002"/></default>
+      <worldbody>
+        {world}
+        <body name="point" pos="0.5 -0.25 0" {body}>{slides}{ball}</body>
+      </worldbody>
+      <actuator>{motors}</actuator>
+    </mujoco>"""
+
+
+class World(gym.Env):
+    frame_skip = 2
+
+    def __init__(self, text):
+        self.model = mujoco.MjModel.from_xml_string(text)
+        self.data = mujoco.MjData(self.model)
+        limits = self.model.actuator_ctrlrange
+        self.action_space = gym.spaces.Box(limits[:, 0], limits[:, 1], dtype=np.float64)
+
+
+def bound(text):
+    plant = MujocoPlant()
+    plant.bind(World(text))
+    plant.observe()
+    return plant
+
+
+def test_the_point_is_found():
+    plant = bound(xml())
+    point = planar_point(plant, clip=4.0)
+    assert plant.model.body(point.body).name == "point"
+    assert (point.joints, point.actuators, point.origin) == ((0, 1), (0, 1), (0.5, -0.25))
+    mass = plant.model.body_mass[point.body]
+    for axis, gear, low, high in zip(point.axes, (10, 5), (-1, -3), (2, 1), strict=True):
+        # MuJoCo's semi-implicit Euler step with implicit joint damping 1.
+        assert axis.decay == pytest.approx(mass / (mass + 0.01))
+        assert axis.gain == pytest.approx(0.01 * gear / (mass + 0.01))
+        assert (axis.low, axis.high, axis.clip, axis.substeps, axis.timestep) == (low, high, 4.0, 2, 0.01)
+
+
+def test_slides_and_motors_may_come_in_any_order():
+    other = '<joint name="y" type="slide" axis="0 1 0"/><joint name="x" type="slide" axis="1 0 0"/>'
+    point = planar_point(bound(xml(slides=other)), 5.0)
+    assert (point.joints, point.actuators) == ((1, 0), (0, 1))
+    motors = '<motor joint="y" ctrlrange="-3 1" gear="5"/><motor joint="x" ctrlrange="-1 2" gear="10"/>'
+    point = planar_point(bound(xml(motors=motors)), 5.0)
+    assert (point.joints, point.actuators, point.axes[0].high) == ((0, 1), (1, 0), 2.0)
+
+
+def test_a_clamp_of_the_force_is_the_end_of_what_acts():
+    motors = MOTORS.replace('gear="10"', 'gear="10" forcerange="-0.5 0.5"')
+    axis = planar_point(bound(xml(motors=motors)), 5.0).axes[0]
+    assert (axis.low, axis.high) == (-0.5, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"slides": SLIDES.replace("slide", "hinge")}, "hinge"),
+        ({"slides": "<freejoint/>", "motors": ""}, "free"),
+        ({"slides": SLIDES.replace("0 1 0", "0 0 1")}, "world x and world y"),
+        ({"slides": SLIDES.replace("1 0 0", "-1 0 0")}, "world x and world y"),
+        ({"body": 'euler="0 0 30"'}, "world x and world y"),
+        ({"slides": SLIDES.replace('"0 1 0"', '"0 1 0" range="-1 1" limited="true"')}, "no limits"),
+        ({"motors": MOTORS.split("/>")[0] + "/>"}, "actuator of its own"),
+        ({"motors": MOTORS + '<motor joint="x" ctrlrange="-1 1"/>'}, "actuator of its own"),
+        ({"motors": MOTORS.replace("-1 2", "0 2")}, "push both ways"),
+        ({"motors": MOTORS.replace('gear="10"', 'gear="-10"')}, "gear above zero"),
+        ({"motors": MOTORS.replace("<motor joint", '<position kp="3" joint')}, "is .* off that"),
+        ({"slides": SLIDES.replace('type="slide"', 'type="slide" stiffness="4"')}, "springs"),
+        ({"slides": SLIDES.replace('type="slide"', 'type="slide" frictionloss="1"')}, "friction"),
+        ({"option": 'integrator="RK4"'}, "Euler"),
+        ({"option": 'density="1000" viscosity="1"'}, "is .* off that"),
+        ({"world": WALL + '<body><freejoint/><geom size="0.1"/></body>'}, "nothing else that moves"),
+        ({"ball": BALL + '<body><joint type="hinge"/><geom size="0.1"/></body>'}, "nothing else that moves"),
+    ],
+)
+def test_other_machines_are_refused_with_the_reason_and_the_alternative(changed, says):
+    with pytest.raises(UnsupportedEnvError, match=f"(?s){says}.*Use Clearance"):
+        planar_point(bound(xml(**changed)), 5.0)
+
+
+def found(world, ball=BALL):
+    plant = bound(xml(world=world, ball=ball))
+    return walls(plant.model, plant.named("body", "point"))
+
+
+def test_a_box_is_a_wall_and_reach_is_where_a_contact_is_reported():
+    (wall,), reach = found(WALL)
+    assert wall == pytest.approx((1.5, 2.5, -1.0, 1.0))
+    plant = bound(xml())
+    data = mujoco.MjData(plant.model)
+    # Versions of MuJoCo differ in whether two contact margins add up: between these two a contact may be reported.
+    for distance, contacts in ((reach + 1e-6, 0), (0.102 - 1e-6, 1)):
+        data.qpos[:] = [1.5 - distance - 0.5, 0.25]  # qpos counts from the body's own place
+        mujoco.mj_forward(plant.model, data)
+        assert data.ncon == contacts
+
+
+def test_touching_walls_are_one():
+    both = WALL + '<geom type="box" pos="2 2 0" size="0.5 1 0.2"/>'
+    assert found(both)[0] == [pytest.approx((1.5, 2.5, -1.0, 3.0))]
+
+
+@pytest.mark.parametrize(
+    "world",
+    [
+        '<geom type="plane" size="9 9 1" pos="0 0 -0.1"/>',
+        WALL.replace('name="wall"', 'contype="0" conaffinity="0"'),
+        WALL.replace("2 0 0", "2 0 0.4"),
+        WALL.replace("2 0 0", "2 0 -0.4"),
+    ],
+    ids=["floor", "does not collide", "above", "below"],
+)
+def test_what_cannot_be_run_into_is_left_out(world):
+    assert found(world)[0] == []
+
+
+def test_a_box_turned_by_a_quarter_is_aligned():
+    assert found(WALL.replace("<geom", '<geom euler="0 0 90"'))[0] == [pytest.approx((1.0, 3.0, -0.5, 0.5))]
+    assert found(WALL.replace("<geom", '<geom euler="90 0 0"'))[0] == [pytest.approx((1.5, 2.5, -0.2, 0.2))]
+
+
+def test_a_box_on_a_fixed_body_is_a_wall_where_the_body_is():
+    assert found(f'<body pos="1 1 0">{WALL}</body>')[0] == [pytest.approx((2.5, 3.5, 0.0, 2.0))]
+
+
+@pytest.mark.parametrize(
+    ("world", "says"),
+    [
+        (WALL.replace("<geom", '<geom euler="0 0 20"'), "'wall' .box."),
+        ('<geom name="pillar" type="cylinder" pos="2 0 0" size="0.2 0.2"/>', "'pillar' .cylinder."),
+        ('<geom name="side" type="plane" size="1 1 1" euler="0 90 0" pos="2 0 0"/>', "'side' .plane."),
+        (f'<body mocap="true">{WALL}</body>', "'wall' can be run into and moves"),
+    ],
+)
+def test_what_is_no_wall_along_x_and_y_is_refused_by_name(world, says):
+    with pytest.raises(UnsupportedEnvError, match=f"(?s){says}.*Use Clearance"):
+        found(world)
+
+
+def test_the_reach_covers_every_geom_of_the_point():
+    offset = BALL + '<geom type="box" pos="0.3 0.4 0" size="0.03 0.04 0.01" margin="0.01"/>'
+    reach = found(WALL, ball=offset)[1]
+    assert reach == pytest.approx(0.5 + np.linalg.norm([0.03, 0.04, 0.01]) + 0.01 + 0.002)
+
+
+def test_a_point_without_a_colliding_geom_is_refused():
+    with pytest.raises(UnsupportedEnvError, match="'point' has no geom that collides"):
+        found(WALL, ball='<geom size="0.1" contype="0" conaffinity="0"/>')
