@@ -10,6 +10,8 @@ Array = NDArray[np.float64]
 
 _BRAKING = 0.5
 """Share of an actuated joint's own motion that braking takes away per control interval; more would chatter."""
+_RESETS = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
+"""The warnings after which MuJoCo resets the state."""
 
 
 class Poses(NamedTuple):
@@ -30,8 +32,8 @@ class Forecast:
     """The machine after every physics substep of a forecast.
 
     Attributes:
-        qpos: Positions, shape (k, nq).
-        qvel: Velocities, shape (k, nv).
+        qpos: Positions, shape (k, nq); NaN from the control interval on in which MuJoCo had to reset the state.
+        qvel: Velocities, shape (k, nv), likewise.
         published_frames: `data.xpos` as MuJoCo leaves it at the end of every control interval, shape (holds,
             nbody, 3), m. It is not the state's: after Euler steps it lags one substep behind, after
             Runge-Kutta steps it is that of the last point that was evaluated.
@@ -82,13 +84,15 @@ class Recorder:
         self._high = np.where(limited, model.actuator_ctrlrange[:, 1], np.inf)
         # A unit force accelerates its joints by acc0 (in the reference pose), a transmission by gear times that.
         hold_s = substeps * model.opt.timestep
-        gear = np.abs(model.actuator_gear).max(axis=1)
-        response = model.actuator_acc0 * gear * np.abs(model.actuator_gainprm[:, 0]) * hold_s
-        self._damping = np.where(response > 0.0, _BRAKING / np.where(response > 0.0, response, 1.0), 0.0)
-        # Servos stop by their own means: one for speed when asked for none, one for position where it is.
-        servo = model.actuator_biastype != int(mujoco.mjtBias.mjBIAS_NONE)
-        self._damping[servo] = 0.0
-        self._holds_position = servo & (model.actuator_biasprm[:, 1] != 0.0)
+        gain, gear = model.actuator_gainprm[:, 0], np.abs(model.actuator_gear).max(axis=1)
+        response = model.actuator_acc0 * gear * gain * hold_s
+        acts = response != 0.0
+        self._damping = np.where(acts, _BRAKING / np.where(acts, response, 1.0), 0.0)
+        # At rest a servo must push neither way: one for position is told where it is, one for speed zero.
+        biased = model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)
+        bias = np.where(biased[:, None], model.actuator_biasprm[:, :3], 0.0)
+        self._rest = -bias[:, :2] / np.where(acts, gain, 1.0)[:, None]
+        self._damping[bias[:, 2] != 0.0] = 0.0  # it has damping of its own
 
     def record(self, data: mujoco.MjData, control: Array, holds: int) -> Forecast:
         """Hold a control for one control interval; in the others each actuator brakes its own joints.
@@ -101,6 +105,9 @@ class Recorder:
         m, n = self._model, self._substeps
         qpos, qvel = np.empty((holds * n, m.nq)), np.empty((holds * n, m.nv))
         frames, centres = np.empty((holds, m.nbody, 3)), np.empty((holds, m.nbody, 3))
+        data.warning.number[_RESETS] = 0
+        if m.nmocap:  # bodies that the env moves by hand stay where they are
+            self._still.mocap_pos[:], self._still.mocap_quat[:] = data.mocap_pos, data.mocap_quat
         data.ctrl[:] = control
         for hold in range(holds):
             if hold:
@@ -109,13 +116,16 @@ class Recorder:
                 mujoco.mj_step(m, data)
                 qpos[i], qvel[i] = data.qpos, data.qvel
             frames[hold], centres[hold] = data.xpos, data.xipos
+            if data.warning.number[_RESETS].any():
+                # MuJoCo answers numbers out of bounds with a reset, after which all may look well.
+                qpos[hold * n :] = qvel[hold * n :] = frames[hold:] = centres[hold:] = np.nan
+                break
         return Forecast(self, qpos, qvel, frames, centres)
 
     def _braking(self, data: mujoco.MjData) -> Array:
         """Read once per control interval, as a controller would."""
-        control = -self._damping * data.actuator_velocity
-        if self._holds_position.any():
-            control = np.where(self._holds_position, data.actuator_length, control)
+        at_rest = self._rest[:, 0] + self._rest[:, 1] * data.actuator_length
+        control = at_rest - self._damping * data.actuator_velocity
         return np.minimum(np.maximum(control, self._low), self._high)
 
     def poses(self, qpos: Array) -> Poses:

@@ -127,6 +127,7 @@ class MujocoPlant:
         self.model.body_inertia *= mass
         self.model.dof_damping *= damping
         mujoco.mj_setConst(self.model, self.data)
+        self._recorder = Recorder(self.model, self.substeps)  # its braking depends on the masses
         self._loaded = self._forwarded = False
         self._forecasts.clear()
 

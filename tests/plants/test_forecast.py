@@ -1,0 +1,418 @@
+"""Forecasts against MuJoCo itself: every substep of the env's own step, its poses, and braking after it."""
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+
+import safe_wrappers as sw
+
+ROBOTS = [
+    "InvertedPendulum",
+    "InvertedDoublePendulum",
+    "Reacher",
+    "Pusher",
+    "HalfCheetah",
+    "Hopper",
+    "Walker2d",
+    "Swimmer",
+    "Ant",
+    "Humanoid",
+    "HumanoidStandup",
+]
+versions = pytest.mark.parametrize("version", ["v5", "v4"])
+
+
+def make(robot, version="v5"):
+    if (robot, version) == ("Pusher", "v4"):
+        pytest.skip("Gymnasium makes Pusher-v4 with MuJoCo 2 only")
+    return gym.make(f"{robot}-{version}", disable_env_checker=True)
+
+
+class Scene(gym.Env):
+    """Any MJCF as an env."""
+
+    def __init__(self, xml, frame_skip=5):
+        self.model = mujoco.MjModel.from_xml_string(xml)
+        self.data = mujoco.MjData(self.model)
+        self.frame_skip = frame_skip
+        limited = self.model.actuator_ctrllimited.astype(bool)
+        low = np.where(limited, self.model.actuator_ctrlrange[:, 0], -np.inf)
+        high = np.where(limited, self.model.actuator_ctrlrange[:, 1], np.inf)
+        self.action_space = gym.spaces.Box(low, high, dtype=np.float64)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (1,))
+
+
+def bound(env, **options):
+    plant = sw.MujocoPlant(**options)
+    plant.bind(env)
+    plant.observe()
+    return plant
+
+
+def integrate(raw, control, substeps):
+    """The truth: positions and velocities after each substep of a copy of the env's own data."""
+    data = mujoco.MjData(raw.model)
+    mujoco.mj_copyData(data, raw.model, raw.data)
+    data.ctrl[:] = control
+    qpos, qvel = [], []
+    for _ in range(substeps):
+        mujoco.mj_step(raw.model, data)
+        qpos.append(data.qpos.copy())
+        qvel.append(data.qvel.copy())
+    return np.array(qpos), np.array(qvel)
+
+
+# The held control ---------------------------------------------------------------------------------------------
+
+
+@versions
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.filterwarnings("ignore:.*is out of date")
+def test_every_substep_is_what_the_env_does_to_the_last_bit(robot, version):
+    env = make(robot, version)
+    raw, n = env.unwrapped, env.unwrapped.frame_skip
+    rng = np.random.default_rng(0)
+    env.reset(seed=0)
+    plant = bound(env)
+    truth = mujoco.MjData(raw.model)
+    for k in range(24):
+        action = rng.uniform(env.action_space.low, env.action_space.high).astype(np.float32)
+        plant.observe()
+        if k % 3 == 1:  # other questions between do not disturb it
+            _ = plant.acceleration
+            plant.forecast(-action.astype(float), 2).poses()
+        forecast = plant.forecast(action.astype(float), 2)
+        qpos, qvel = integrate(raw, action, n)
+        assert forecast.qpos.shape == (2 * n, raw.model.nq) and forecast.qvel.shape == (2 * n, raw.model.nv)
+        assert forecast.qpos[:n].tobytes() == qpos.tobytes()
+        assert forecast.qvel[:n].tobytes() == qvel.tobytes()
+        poses = forecast.poses()
+        for i in range(2 * n) if k % 8 == 7 else ():
+            truth.qpos[:], truth.qvel[:] = forecast.qpos[i], forecast.qvel[i]
+            mujoco.mj_forward(raw.model, truth)
+            np.testing.assert_allclose(poses.frames[i], truth.xpos, atol=1e-12)
+            np.testing.assert_allclose(poses.axes[i].reshape(-1, 9), truth.xmat, atol=1e-12)
+            np.testing.assert_allclose(poses.centres[i], truth.xipos, atol=1e-12)
+        env.step(action)
+        assert forecast.qpos[n - 1].tobytes() == raw.data.qpos.tobytes()
+        # what the env publishes lags behind its state; the forecast knows that too
+        assert forecast.published_frames[0].tobytes() == raw.data.xpos.tobytes()
+        assert forecast.published_centres[0].tobytes() == raw.data.xipos.tobytes()
+
+
+FALLING = """<mujoco><option timestep="0.004" integrator="{}"/><worldbody><geom type="plane" size="5 5 1"/>
+<body name="ball" pos="0 0 .2" quat="1 .2 .1 0"><freejoint/><geom type="capsule" size=".05 .1"/>
+<body name="arm" pos=".1 0 0"><joint name="elbow" axis="0 1 0" damping=".1"/>
+<geom type="capsule" size=".03" fromto="0 0 0 .2 0 0"/>
+<site name="tip" pos=".2 0 0"/></body></body></worldbody>
+<actuator><motor joint="elbow" gear="2" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicit", "implicitfast"])
+def test_every_integrator_through_contact_and_under_applied_forces(integrator):
+    env = Scene(FALLING.format(integrator))
+    mujoco.mj_forward(env.model, env.data)
+    plant = bound(env)
+    env.data.qfrc_applied[2], env.data.xfrc_applied[2, 0] = 0.5, 0.3  # both belong to the state
+    rng = np.random.default_rng(0)
+    touched = 0
+    for _ in range(40):
+        u = rng.uniform(-1.0, 1.0, 1)
+        plant.observe()
+        forecast = plant.forecast(u)
+        qpos, qvel = integrate(env, u, 5)
+        assert forecast.qpos.tobytes() == qpos.tobytes() and forecast.qvel.tobytes() == qvel.tobytes()
+        env.data.ctrl[:] = u
+        mujoco.mj_step(env.model, env.data, nstep=5)
+        touched += env.data.ncon > 0
+    assert touched > 10
+
+
+def test_poses_of_every_nth_substep_are_a_part_of_all():
+    env = make("HalfCheetah")
+    env.reset(seed=0)
+    forecast = bound(env).forecast(np.full(6, 0.3), 3)
+    every, ends = forecast.poses(), forecast.poses(5)
+    for one, other in zip(ends, every, strict=True):
+        np.testing.assert_array_equal(one, other[4::5])
+    assert forecast.poses() is every and forecast.poses(5) is ends  # computed once
+
+
+def test_bodies_that_the_env_moves_by_hand_stay_where_they_are():
+    hand = '<body name="hand" mocap="true" pos="1 0 0"><geom size=".1" mass="2" contype="0" conaffinity="0"/></body>'
+    env = Scene(FALLING.format("Euler").replace("</worldbody>", f"{hand}</worldbody>"))
+    env.data.mocap_pos[0], env.data.mocap_quat[0] = [3.0, 1.0, 2.0], [0.0, 1.0, 0.0, 0.0]
+    poses = bound(env).forecast(np.zeros(1)).poses()
+    for frames in (poses.frames, poses.centres):
+        np.testing.assert_allclose(frames[:, env.model.body("hand").id], np.tile([3.0, 1.0, 2.0], (5, 1)))
+    np.testing.assert_allclose(poses.axes[0, env.model.body("hand").id], np.diag([1.0, -1.0, -1.0]))
+
+
+# What is kept, and what is left alone -------------------------------------------------------------------------
+
+
+def test_a_short_forecast_is_the_beginning_of_a_long_one():
+    env = make("Ant")
+    env.reset(seed=0)
+    env.step(env.action_space.high)
+    plant, other = bound(env), bound(env)
+    for u in (np.full(8, 0.5), np.full(8, -1.0)):
+        long = plant.forecast(u, 4)
+        for holds in (1, 2, 4):
+            short, alone = long.first(holds), other.forecast(u, holds)
+            for name in ("qpos", "qvel", "published_frames", "published_centres"):
+                assert getattr(short, name).tobytes() == getattr(alone, name).tobytes()
+            np.testing.assert_array_equal(short.poses().frames, alone.poses().frames)
+
+
+def simulated(monkeypatch):
+    """Counts the physics substeps of everything that is stepped from now on."""
+    count, step = [0], mujoco.mj_step
+
+    def counted(model, data, nstep=1):
+        count[0] += nstep
+        step(model, data, nstep)
+
+    monkeypatch.setattr(mujoco, "mj_step", counted)
+    return count
+
+
+def test_one_control_is_simulated_once_until_something_changes(monkeypatch):
+    env = make("HalfCheetah")
+    env.reset(seed=0)
+    plant, count = bound(env), simulated(monkeypatch)
+    u = np.full(6, 0.3)
+
+    def asked(control, holds):
+        before = count[0]
+        forecast = plant.forecast(control, holds)
+        return forecast, count[0] - before
+
+    long, first = asked(u, 3)
+    assert first == 15
+    assert asked(u.copy(), 3) == (long, 0)
+    assert asked(u, 2)[1] == asked(u, 1)[1] == 0  # a shorter one is its beginning
+    assert asked(u, 4)[1] == 20
+    assert asked(-u, 1)[1] == 5
+    assert asked(u, 4)[1] == 0  # and other controls in between do not matter
+    plant.observe()
+    same, again = asked(u, 3)
+    assert again == 15
+    np.testing.assert_array_equal(same.qpos, long.qpos)
+    plant.perturb(mass=2.0)
+    heavy, again = asked(u, 3)
+    assert again == 15 and not np.array_equal(heavy.qpos, long.qpos)
+    env.step(u.astype(np.float32))
+    plant.observe()
+    assert not np.array_equal(asked(u, 3)[0].qpos, heavy.qpos)
+
+
+def test_the_present_state_is_as_before_a_forecast():
+    env = make("Ant")
+    env.reset(seed=0)
+    plant = bound(env)
+    state, drift, time = plant.state.copy(), plant.acceleration[0].copy(), plant.time
+    plant.forecast(np.ones(8), 3)
+    np.testing.assert_array_equal(plant.state, state)
+    np.testing.assert_array_equal(plant.acceleration[0], drift)
+    assert plant.time == time == env.unwrapped.data.time
+    np.testing.assert_array_equal(plant.pose().xpos, fresh(env.unwrapped).xpos)
+
+
+def fresh(raw):
+    """Data at the env's state with everything up to date."""
+    data = mujoco.MjData(raw.model)
+    data.qpos[:], data.qvel[:] = raw.data.qpos, raw.data.qvel
+    mujoco.mj_forward(raw.model, data)
+    return data
+
+
+@pytest.mark.parametrize("robot", ["Humanoid", "Pusher"])
+def test_nothing_of_the_envs_data_is_written(robot):
+    env, twin = make(robot), make(robot)
+    env.reset(seed=0), twin.reset(seed=0)
+    raw, plant = env.unwrapped, bound(env)
+    rng = np.random.default_rng(0)
+    fields = [f for f in dir(raw.data) if isinstance(getattr(raw.data, f), np.ndarray)]
+    assert {"qpos", "ctrl", "xpos", "qacc_warmstart", "mocap_pos", "warning"} - {"warning"} <= set(fields)
+    for _ in range(8):
+        u = rng.uniform(env.action_space.low, env.action_space.high)
+        before = {f: getattr(raw.data, f).tobytes() for f in fields}
+        plant.observe()
+        plant.forecast(u, 3).poses()
+        plant.pose()
+        assert plant.published() is raw.data
+        assert [f for f in fields if getattr(raw.data, f).tobytes() != before[f]] == []
+        assert env.step(u)[0].tobytes() == twin.step(u)[0].tobytes()
+
+
+def test_the_pose_is_that_of_the_state_where_mujocos_lags():
+    env = make("HalfCheetah")
+    env.reset(seed=0)
+    plant = bound(env)
+    for k in range(6):
+        env.step(np.full(6, 0.8, np.float32))
+        plant.observe()
+        if k % 2:  # whatever was asked before
+            _ = plant.acceleration
+        truth = fresh(env.unwrapped)
+        np.testing.assert_allclose(plant.pose().xpos, truth.xpos, atol=1e-12)
+        np.testing.assert_allclose(plant.pose().xipos, truth.xipos, atol=1e-12)
+    assert np.abs(plant.published().xpos - truth.xpos).max() > 1e-4
+
+
+@pytest.mark.parametrize("delay_s", [0.05, 0.03, 0.12])
+def test_under_a_delay_it_starts_where_the_commands_in_flight_lead(delay_s):
+    env = make("HalfCheetah")  # a physics step of 0.01 s, a control step of 0.05 s
+    env.reset(seed=0)
+    plant = bound(env, delay_s=delay_s)
+    plant.executed(None)
+    rng = np.random.default_rng(0)
+    sent = []
+    for _ in range(8):
+        u = rng.uniform(-1.0, 1.0, 6)
+        plant.observe()
+        data = mujoco.MjData(env.unwrapped.model)
+        mujoco.mj_copyData(data, env.unwrapped.model, env.unwrapped.data)
+        for i in range(round(delay_s / 0.01)):  # each command acts from delay_s after it was sent
+            age = round(delay_s / 0.01) - i
+            command = -(-age // 5)
+            if command <= len(sent):
+                data.ctrl[:] = sent[-command]
+            mujoco.mj_step(env.unwrapped.model, data)
+        assert plant.time == pytest.approx(data.time, abs=1e-12)
+        np.testing.assert_allclose(plant.qpos, data.qpos, atol=1e-9)
+        data.ctrl[:] = u
+        for i in range(5):
+            mujoco.mj_step(env.unwrapped.model, data)
+            np.testing.assert_allclose(plant.forecast(u).qpos[i], data.qpos, atol=1e-9)
+        assert plant.published() is None  # what the env shows is older than the state
+        plant.executed(u)
+        sent.append(u)
+        env.step(u)
+
+
+# Braking ------------------------------------------------------------------------------------------------------
+
+SLIDER = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody><body>
+<joint name="x" type="slide" axis="1 0 0"/><geom size=".1" mass="{mass}"/></body></worldbody><actuator>{actuator}</actuator></mujoco>"""
+MOTORS = {
+    "motor": '<motor joint="x" ctrlrange="-9999 9999"/>',
+    "gear": '<motor joint="x" gear="20" ctrlrange="-9999 9999"/>',
+    "turned round": '<motor joint="x" gear="-3" ctrlrange="-9999 9999"/>',
+    "negative gain": '<general joint="x" gainprm="-2" ctrlrange="-9999 9999"/>',
+    "unlimited": '<motor joint="x" ctrllimited="false"/>',
+    "with a constant force": '<general joint="x" gainprm="2" biastype="affine" biasprm=".5 0 0" ctrlrange="-9e3 9e3"/>',
+    "position servo without damping": '<position joint="x" kp="0.2" ctrlrange="-9999 9999"/>',
+}
+
+
+@pytest.mark.parametrize("mass", [0.1, 1.0, 30.0])
+@pytest.mark.parametrize("kind", MOTORS)
+def test_braking_halves_the_speed_of_a_driven_slide_in_every_control_step(kind, mass):
+    env = Scene(SLIDER.format(mass=mass, actuator=MOTORS[kind]))
+    plant = bound(env)
+    for speed in (2.0, -0.7):
+        env.data.qpos[0], env.data.qvel[0] = 0.3, speed
+        plant.observe()
+        unforced = {"with a constant force": -0.25, "position servo without damping": 0.3}.get(kind, 0.0)
+        speeds = plant.forecast(np.array([unforced]), 8).qvel[4::5, 0]
+        # The speed that is read is one substep old, hence not exactly a half.
+        assert (np.abs(speeds[1:]) < 0.62 * np.abs(speeds[:-1])).all(), speeds
+        assert (speeds / speeds[0] > -0.01).all(), speeds  # nor does it turn back
+
+
+@pytest.mark.parametrize(
+    "actuator",
+    [
+        '<velocity joint="x" kv="8" ctrlrange="-1 1"/>',
+        '<position joint="x" kp="20" kv="8" ctrlrange="-9 9"/>',
+        '<general joint="x" gainprm="4" biastype="affine" biasprm="1 -20 -8" ctrlrange="-9999 9999"/>',
+    ],
+)
+def test_a_servo_is_left_to_its_own_damping(actuator):
+    env = Scene(SLIDER.format(mass=1.0, actuator=actuator))
+    env.data.qpos[0], env.data.qvel[0] = 0.3, 1.0
+    held = bound(env).forecast(np.zeros(1), 12)
+    speeds = np.abs(held.qvel[4::5, 0])
+    assert speeds[-1] < 0.1 * speeds[0]
+    after = held.qpos[5:, 0]
+    assert np.ptp(after) < 0.2  # it stays where it is instead of returning to where it is zero
+
+
+def test_braking_stays_in_the_control_range(monkeypatch):
+    given, step = [], mujoco.mj_step
+
+    def watched(model, data, nstep=1):
+        given.append(float(data.ctrl[0]))
+        step(model, data, nstep)
+
+    monkeypatch.setattr(mujoco, "mj_step", watched)
+    for low, high in ((-1.0, 1.0), (0.5, 2.0), (-0.2, 0.0)):
+        env = Scene(SLIDER.format(mass=1.0, actuator=f'<motor joint="x" ctrlrange="{low} {high}"/>'))
+        plant = bound(env)
+        for speed in (30.0, -30.0):
+            env.data.qvel[0] = speed
+            plant.observe()
+            given.clear()
+            plant.forecast(np.array([high]), 3)
+            assert given == [high] * 5 + [low if speed > 0 else high] * 10
+
+
+@pytest.mark.parametrize("robot", ["Reacher", "Pusher"])
+def test_braking_stops_the_driven_joints_of_an_arm(robot):
+    env = make(robot)
+    rng = np.random.default_rng(0)
+    driven = [int(j) for j in env.unwrapped.model.jnt_dofadr[env.unwrapped.model.actuator_trnid[:, 0]]]
+    for seed in range(4):
+        env.reset(seed=seed)
+        for _ in range(5):
+            env.step(rng.choice([-0.4, 0.4], env.action_space.shape).astype(np.float32))
+        plant = bound(env)
+        held = plant.forecast(np.zeros(env.action_space.shape), 25)
+        speeds = np.abs(held.qvel[:, driven])
+        first, last = speeds[env.unwrapped.frame_skip - 1], speeds[-1]
+        assert first.max() > 0.3
+        assert last.max() < 0.15 * first.max(), (first, last)
+
+
+def test_braking_knows_of_a_perturbed_mass():
+    env = Scene(SLIDER.format(mass=1.0, actuator=MOTORS["motor"]))
+    env.data.qvel[0] = 1.0
+    plant = bound(env)
+    plant.perturb(mass=50.0)
+    speeds = plant.forecast(np.zeros(1), 6).qvel[4::5, 0]
+    assert (speeds[1:] < 0.62 * speeds[:-1]).all()
+
+
+# A simulation that breaks down --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("qpos", "qvel", "control"), [(np.nan, 0.0, 0.0), (0.0, np.nan, 0.0), (0.0, 0.0, 1e9), (1e11, 0.0, 0.0)]
+)
+def test_what_mujoco_resets_is_not_a_number(qpos, qvel, control, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
+    env = Scene(SLIDER.format(mass=1.0, actuator='<motor joint="x" gear="1000" ctrllimited="false"/>'))
+    env.data.qpos[0], env.data.qvel[0] = qpos, qvel
+    plant = bound(env)
+    forecast = plant.forecast(np.array([control]), 2)
+    for values in (forecast.qpos, forecast.qvel, forecast.published_frames, forecast.poses().centres[:, 1]):
+        assert np.isnan(values).all()
+    env.data.qpos[0], env.data.qvel[0] = 0.0, 1.0
+    plant.observe()
+    assert np.isfinite(plant.forecast(np.array([0.0]), 2).qpos).all()  # the next one is whole again
+
+
+def test_only_what_comes_after_a_break_down_is_lost(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    runaway = SLIDER.format(mass=1.0, actuator=MOTORS["motor"]).replace(
+        'axis="1 0 0"', 'axis="1 0 0" stiffness="-1e6"'
+    )
+    env = Scene(runaway)
+    env.data.qpos[0] = 1e-8  # a hundredfold with every substep
+    long, short = bound(env).forecast(np.zeros(1), 4), bound(env).forecast(np.zeros(1), 1)
+    assert np.isfinite(short.qpos).all() and short.qpos[-1] > 1.0
+    assert long.qpos[:5].tobytes() == short.qpos.tobytes()
+    assert np.isnan(long.qpos[5:]).all() and np.isnan(long.published_frames[1:]).all()
