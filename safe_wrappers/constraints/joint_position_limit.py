@@ -80,15 +80,19 @@ class JointPositionLimit(Predicted):
                 f"nothing is left of the range of joint {model.joint(ids[j]).name!r}: {self._low[j]:g} to "
                 f"{self._high[j]:g} with a margin of {self.margin:g} at both ends"
             )
-        if not (np.isfinite(self._low).any() or np.isfinite(self._high).any()):
+        self._below, self._above = np.isfinite(self._low), np.isfinite(self._high)
+        if not (self._below.any() or self._above.any()):
             raise ConfigurationError("none of these joints has a range in the model: pass lower and upper")
 
     def _now(self, plant: MujocoPlant) -> Array:
         return self._left(plant.qpos)
 
     def _left(self, qpos: Array) -> Array:
+        """Room to every bound that there is, the lower ones first, shape (..., n)."""
         q = qpos[..., self._qpos]
-        return np.minimum(q - self._low, self._high - q)
+        return np.concatenate(
+            [(q - self._low)[..., self._below], (self._high - q)[..., self._above]], axis=-1
+        )
 
     def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
         return self._left(forecast.qpos)
