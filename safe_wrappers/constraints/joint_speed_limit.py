@@ -111,9 +111,11 @@ class JointSpeedLimit(Predicted):
         drift, effect = plant.acceleration
         v = plant.qvel[self._dofs]
         a0, a = drift[self._dofs], effect[self._dofs]
-        reach = np.abs(v) + plant.hold_s * (
-            np.abs(a0) + np.abs(a) @ np.maximum(np.abs(plant.lower), np.abs(plant.upper))
-        )
+        strongest = np.maximum(np.abs(plant.lower), np.abs(plant.upper))
+        pushes = np.abs(a) * np.where(
+            a == 0.0, 0.0, strongest
+        )  # no push, however strong the actuator may get
+        reach = np.abs(v) + plant.hold_s * (np.abs(a0) + pushes.sum(axis=1))
         near = reach > self._bound
         normals = np.vstack([a[near], -a[near]])
         room = self._bound[near] / plant.hold_s
