@@ -48,7 +48,8 @@ class Predicted(ABC):
         return 1.0
 
     def _check_shared(self) -> None:
-        if isinstance(self.holds, bool) or self.holds != int(self.holds) or self.holds < 1:
+        whole = isinstance(self.holds, int | float | np.number) and not isinstance(self.holds, bool)
+        if not (whole and np.isfinite(self.holds) and self.holds == int(self.holds) and self.holds >= 1):
             raise ConfigurationError(
                 f"holds is a whole number of control intervals to look ahead, >= 1; got {self.holds!r}"
             )
@@ -89,11 +90,11 @@ class Predicted(ABC):
         if self._stamp == plant.stamp:
             return
         self._value = self._now(plant)
-        self._least = float(self._value.min())
+        self._least = float(self._value.min(initial=np.inf))
         self._stamp = plant.stamp
         if self._reach is not None:
             self._check_reach(self._reach)
-        self._outside = self._violation(self._least)
+        self._outside = self._violation(self._value)
         self._far = self._reach is not None and self._least - self._reach >= self.margin + _ROUNDING
 
     def _check_reach(self, reach: float) -> None:
@@ -108,18 +109,18 @@ class Predicted(ABC):
             self._reach = None
         self._recent.append(self._least)
 
-    def _violation(self, least: float) -> float:
-        """The present violation that a forecast starts from, <= 0."""
-        return min(0.0, least - self.margin)
+    def _violation(self, value: Array) -> Array:
+        """The present violations that a forecast starts from, <= 0, shape (n,)."""
+        return np.minimum(value - self.margin, 0.0)
 
     def slacks(self, plant: MujocoPlant, control: Array) -> Array:
         """What is left of what is asked for along the forecast of a control, shape (k,); wanted >= 0."""
         self._look(plant)
         left = self._room(plant, plant.forecast(control, self.holds)) - self.margin
-        if self._outside == 0.0:
+        if not self._outside.any():
             return np.asarray(left.min(axis=0))
-        # From outside: no farther out on the way, and closer at the end.
-        closer = self._outside * float(np.exp(-self.holds * plant.hold_s / RECOVERY_S))
+        # From outside, bound by bound: no farther out on the way, and closer at the end.
+        closer = self._outside * np.exp(-self.holds * plant.hold_s / RECOVERY_S)
         return np.concatenate([left.min(axis=0) - self._outside, left[-1] - closer])
 
     def admits(self, plant: MujocoPlant, control: Array) -> bool:
@@ -129,7 +130,7 @@ class Predicted(ABC):
 
     def shortfall(self, plant: MujocoPlant, control: Array) -> float:
         """By how much the forecast of a control misses what is asked for, in the value's units; <= 0: not at all."""
-        least = float(self.slacks(plant, control).min())
+        least = float(self.slacks(plant, control).min(initial=np.inf))
         return -least if least == least else np.inf
 
     def cut(self, plant: MujocoPlant, control: Array) -> HalfSpaces:

@@ -125,8 +125,8 @@ class SpeedLimit(Predicted):
             return self.limit - self._sign * velocity[:, 0]
         return np.asarray(self.limit - np.sqrt((velocity * velocity).sum(axis=1)))
 
-    def _violation(self, least: float) -> float:
-        return 0.0  # the next step's displacement starts afresh: there is no way back to allow for
+    def _violation(self, value: Array) -> Array:
+        return np.zeros(1)  # the next step's displacement starts afresh: there is no way back to allow for
 
     def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
         assert self._here is not None

@@ -113,7 +113,9 @@ class Workspace(Predicted):
             (self._high - points)[:, :, high].reshape(k, -1),
         ]
         every = points.reshape(-1, 3)
-        left += [distances(o, every, plant).reshape(k, -1) for o in self.keep_out]
+        for obstacle in self.keep_out:
+            surfaces = distances(obstacle, every, plant)
+            left.append(surfaces.reshape(k, points.shape[1] * surfaces.shape[1]))
         return np.concatenate(left, axis=1) - self.radius
 
     def _now(self, plant: MujocoPlant) -> Array:
