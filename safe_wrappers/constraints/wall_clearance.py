@@ -37,8 +37,8 @@ _HAIR_M = 1e-7
 what is lost beyond it counts as outside."""
 _NOISE_M = 1e-12
 """What float64 may lose between a path and the rest of it."""
-_RECOVERY_RATE = 1.0
-"""1/s: from outside, the violation must shrink at least this fast, or as fast as the backup can."""
+_RECOVERY_S = 0.1
+"""Time constant, s, with which a violation must shrink from outside; less where the backup cannot."""
 _TURNS = 4
 """How many walls, one after another, a correction may have to turn away from."""
 _HALVINGS = 5
@@ -150,7 +150,7 @@ class WallClearance:
         """What a control must leave from outside the safe set."""
         if self._needed is None:
             axis = self._among.x_axis
-            target = self._least * (1.0 - _RECOVERY_RATE * axis.timestep * axis.substeps)
+            target = self._least * math.exp(-axis.timestep * axis.substeps / _RECOVERY_S)
             self._needed = min(target, self._left_after(self._backup()))
         return self._needed
 

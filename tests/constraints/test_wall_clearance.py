@@ -1,0 +1,317 @@
+"""WallClearance against MuJoCo itself: what is admitted stays clear, and is as close to what was asked as can be."""
+
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from point_worlds import BLOCKS, RADIUS, PointWorld
+
+import safe_wrappers as sw
+from safe_wrappers.constraints.plain_data import constraint_data, constraint_from
+from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+
+MARGIN = 0.001
+ROOM = RADIUS + 2 * 0.002 + MARGIN
+"""From the ball's centre to a wall: radius, both contact margins, the constraint's own."""
+
+
+def filtered(world=None, more=(), **options):
+    env = sw.CBFActionFilter(world or PointWorld(clip=5.0), [sw.WallClearance(**options), *more])
+    env.reset(seed=0)
+    return env
+
+
+def placed(env, at, velocity=(0.0, 0.0)):
+    """Observe the ball somewhere; the constraint and the plant are returned."""
+    env.unwrapped.place(at, velocity)
+    env.plant.observe()
+    return env.constraints[0], env.plant
+
+
+ENVS = {
+    "clip known": (5.0, dict(velocity_clip=5.0), 1),
+    "clip not known": (5.0, {}, 1),
+    "any clip": (1.3, {}, 1),
+    "no clip": (None, {}, 1),
+    "four physics steps": (5.0, dict(velocity_clip=5.0), 4),
+    "four, not known": (None, {}, 4),
+}
+
+
+@pytest.fixture(scope="module", params=ENVS)
+def world(request):
+    clip, options, substeps = ENVS[request.param]
+    return filtered(PointWorld(substeps, clip), **options)
+
+
+PLACES = st.tuples(st.floats(-1.9, 1.9), st.floats(-1.9, 1.9))
+SPEEDS = st.tuples(st.floats(-6.0, 6.0), st.floats(-6.0, 6.0))
+ACTIONS = st.lists(
+    st.tuples(st.sampled_from([-1.0, 0.0, 1.0, 0.37]), st.sampled_from([-0.8, 0.0, 1.0, -0.2])),
+    min_size=1,
+    max_size=12,
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(PLACES, SPEEDS, ACTIONS, st.integers(1, 5))
+def test_from_every_safe_state_any_actions_stay_clear_in_mujoco(world, at, velocity, actions, hold):
+    limit, plant = placed(world, at, velocity)
+    assume(limit.value(plant)[0] >= limit.margin)
+    for action in actions:
+        for _ in range(hold):
+            info = world.step(np.array(action, np.float32))[4]
+            assert not info["touched"]
+            assert info["nearest"] >= MARGIN + 0.004 - 1e-6
+            assert not (info["cbf/infeasible"] or info["cbf/fallback"] or info["cbf/unsafe"])
+            world.plant.observe()
+            assert limit.value(plant)[0] >= limit.margin - 1e-7
+
+
+@settings(max_examples=100, deadline=None)
+@given(PLACES, SPEEDS)
+def test_the_backup_is_admitted_and_loses_nothing(world, at, velocity):
+    limit, plant = placed(world, at, velocity)
+    before = limit.value(plant)[0]
+    assume(before >= limit.margin)
+    backup = limit.backup(plant)
+    assert limit.admits(plant, backup)
+    world.unwrapped.step(backup)
+    plant.observe()
+    assert limit.value(plant)[0] >= before - 1e-9
+
+
+@settings(max_examples=60, deadline=None)
+@given(PLACES, SPEEDS, st.tuples(st.floats(-1, 1), st.floats(-0.8, 1)))
+def test_what_is_suggested_and_what_the_rows_allow_is_admitted(world, at, velocity, asked):
+    limit, plant = placed(world, at, velocity)
+    assume(limit.value(plant)[0] >= limit.margin + 1e-6)
+    asked = np.array(asked)
+    for control in limit.suggestions(plant, asked):
+        assert limit.admits(plant, control)
+    rows = limit.rows(plant)
+    assert (rows.normals @ limit.backup(plant) <= rows.offsets + 1e-9).all()
+    if limit.velocity_clip is None:
+        # The rows are a part of what is admitted; where the clip is known, a few states have no such part.
+        control = sw.project(asked, rows.normals, rows.offsets, plant.lower, plant.upper).control
+        assert limit.admits(plant, control)
+
+
+def test_the_nearest_admitted_control_is_found():
+    # Against every control of a fine grid, at states that a rough driver comes to.
+    env = filtered(PointWorld(clip=5.0))
+    grid = np.array([(x, y) for x in np.linspace(-1, 1, 41) for y in np.linspace(-0.8, 1, 37)])
+    rng = np.random.default_rng(0)
+    checked = 0
+    while checked < 60:
+        action = rng.choice([-1.0, 1.0], 2) * [1.0, 0.8]
+        for _ in range(15):
+            env.plant.observe()
+            limit, plant = env.constraints[0], env.plant
+            if not limit.admits(plant, action) and rng.random() < 0.2:
+                best = limit.suggestions(plant, action)[0]
+                distance = np.linalg.norm(grid - action, axis=1)
+                order = np.argsort(distance)
+                found = next(k for k in order if limit.admits(plant, grid[k]))
+                assert np.linalg.norm(best - action) <= distance[found] + 1e-6
+                checked += 1
+            env.step(action.astype(np.float32))
+
+
+def test_along_a_wall_it_slides():
+    env = filtered(velocity_clip=5.0)
+    placed(env, (1.0, -1.2))
+    for _ in range(60):
+        info = env.step(np.array([1.0, 0.5], np.float32))[4]
+        if info["cbf/intervened"]:
+            assert info["executed_action"][1] == np.float32(0.5)
+    x, y = env.unwrapped.data.qpos[::-1]
+    assert x == pytest.approx(2.0 - ROOM, abs=1e-5)  # as close as the margin allows
+    assert y > 0.0  # and not held up along it
+
+
+def test_it_stops_in_a_corner_and_leaves_it_freely():
+    env = filtered(velocity_clip=5.0)
+    placed(env, (1.5, -1.5))
+    for _ in range(120):
+        env.step(np.array([1.0, -0.8], np.float32))
+    assert env.unwrapped.data.qpos[::-1] == pytest.approx([2.0 - ROOM, -2.0 + ROOM], abs=1e-5)
+    assert np.abs(env.unwrapped.data.qvel).max() < 1e-4
+    info = env.step(np.array([-1.0, 1.0], np.float32))[4]
+    assert not info["cbf/intervened"]
+
+
+def test_knowing_the_clip_lets_it_pass_a_corner_that_it_would_stop_at():
+    # Up and to the left past the upper right corner of the block at (1, 1), at 3.5 m/s along each axis.
+    at, velocity, asked = (1.3, 1.0), (-3.5, 3.5), np.array([0.0, 1.0])
+    known, plant = placed(filtered(velocity_clip=5.0), at, velocity)
+    assert known.value(plant)[0] > 0.05 and known.admits(plant, asked)
+    unknown, plant = placed(filtered(), at, velocity)
+    assert unknown.value(plant)[0] < 0.0
+
+
+def test_far_from_walls_actions_pass_bit_for_bit():
+    env = filtered(PointWorld(blocks=[(50, 0, 1, 1)]))
+    action = np.array([0.1234567, -0.7654321], np.float32)
+    for _ in range(20):
+        info = env.step(action)[4]
+        assert not info["cbf/intervened"]
+        assert (info["executed_action"] == action.astype(np.float64)).all()
+
+
+def test_without_walls_there_is_no_value():
+    env = filtered(PointWorld(blocks=[]))
+    assert env.constraints[0].value(env.plant).shape == (0,)
+    info = env.step(np.array([1.0, 1.0], np.float32))[4]
+    assert info["cbf/margin"] == 0.0 and not info["cbf/intervened"]
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.05])
+def test_the_margin_is_kept_and_not_taken_off_the_value(margin):
+    env = filtered(velocity_clip=5.0, margin=margin)
+    placed(env, (1.0, -1.2))
+    for _ in range(100):
+        info = env.step(np.array([1.0, 0.0], np.float32))[4]
+    assert info["cbf/margin"] == pytest.approx(margin, abs=1e-6)
+    assert info["nearest"] == pytest.approx(margin + 0.004, abs=1e-5)
+
+
+# Outside the safe set -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("options", [{"velocity_clip": 5.0}, {}])
+@pytest.mark.parametrize("asked", [(1.0, 0.0), (0.0, 0.0), (-1.0, 0.3)])
+@pytest.mark.parametrize(
+    ("gap", "lost"), [(0.03, False), (0.001, True)], ids=["inside the margin", "at the wall"]
+)
+def test_from_outside_it_comes_back_and_stays(options, asked, gap, lost):
+    env = filtered(margin=0.05, **options)
+    placed(env, (2.0 - RADIUS - gap, -1.2))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        infos = [env.step(np.array(asked, np.float32))[4] for _ in range(200)]
+    margins = np.array([info["cbf/margin"] for info in infos])
+    assert infos[0]["cbf/unsafe"] == lost and not infos[-1]["cbf/unsafe"]
+    assert margins.min() >= margins[0] - 1e-9 and margins[-1] >= 0.05 - 1e-6
+    back = int(np.argmax(margins >= 0.05 - 1e-6))
+    assert back < 120 and margins[back:].min() >= 0.05 - 1e-6
+
+
+def test_too_fast_to_stop_it_brakes_as_hard_as_it_can():
+    env = filtered(velocity_clip=5.0)
+    limit, plant = placed(env, (1.6, -1.2), (5.0, 0.0))
+    assert limit.value(plant)[0] < 0.0
+    with pytest.warns(sw.UnsafeStateWarning):
+        info = env.step(np.array([1.0, 0.4], np.float32))[4]
+    assert info["executed_action"] == pytest.approx([-1.0, 0.4])
+
+
+# Composition --------------------------------------------------------------------------------------------------
+
+
+class SlowAlongY:
+    """Rows only: the speed along y stays below 0.5 m/s after the step."""
+
+    def rows(self, plant):
+        axis = plant.model.opt.timestep * 90.0 / (plant.model.body_mass[1] + 0.01)
+        v = plant.qvel[0]
+        return sw.HalfSpaces(np.array([[0.0, axis], [0.0, -axis]]), np.array([0.5 - v, 0.5 + v]))
+
+
+def test_with_another_constraint_both_hold():
+    env = filtered(PointWorld(clip=5.0), more=[SlowAlongY()], velocity_clip=5.0)
+    rng = np.random.default_rng(1)
+    fastest = 0.0
+    for _ in range(80):
+        action = rng.choice([-1.0, 1.0], 2) * [1.0, 0.8]
+        for _ in range(10):
+            info = env.step(action.astype(np.float32))[4]
+            assert not (info["touched"] or info["cbf/infeasible"] or info["cbf/fallback"])
+            fastest = max(fastest, abs(env.unwrapped.data.qvel[0]))
+    assert 0.45 < fastest <= 0.5 + 1e-5
+
+
+def test_several_constraints_where_only_rows_can_agree():
+    # Held along y by rows, the suggestions of the walls are not enough: the projection on all rows decides.
+    env = filtered(PointWorld(clip=5.0), more=[SlowAlongY()])
+    placed(env, (1.8, -1.0), (0.5, 0.5))
+    for _ in range(40):
+        info = env.step(np.array([1.0, 1.0], np.float32))[4]
+        assert not (info["touched"] or info["cbf/infeasible"] or info["cbf/fallback"])
+    assert env.unwrapped.data.qvel[0] == pytest.approx(0.5, abs=2e-3)
+
+
+# What the constraint itself is asked for ----------------------------------------------------------------------
+
+
+def test_a_plant_of_another_mass_is_read_anew():
+    env = filtered()
+    limit, plant = placed(env, (1.2, -1.2), (2.0, 0.0))
+    before = limit.value(plant)[0]
+    plant.perturb(mass=2.0)
+    plant.observe()
+    assert limit.value(plant)[0] < before - 0.05
+
+
+def test_a_delay_is_predicted():
+    env = sw.CBFActionFilter(PointWorld(), [sw.WallClearance()], plant=sw.MujocoPlant(delay_s=0.05))
+    env.reset(seed=0)
+    at_once, plant = placed(filtered(PointWorld()), (1.2, -1.2), (2.0, 0.0))
+    late, late_plant = placed(env, (1.2, -1.2), (2.0, 0.0))
+    assert late.value(late_plant)[0] < at_once.value(plant)[0] - 0.08
+
+
+def test_a_state_that_is_not_a_number_admits_nothing():
+    env = filtered(velocity_clip=5.0)
+    limit, plant = placed(env, (np.nan, 0.0))
+    assert np.isnan(limit.value(plant)).all()
+    assert not limit.admits(plant, np.zeros(2))
+    assert np.isfinite(limit.backup(plant)).all()
+    limit.rows(plant), limit.suggestions(plant, np.ones(2))
+
+
+def test_as_plain_data_it_is_the_same():
+    limit = sw.WallClearance(margin=0.02, velocity_clip=4.0)
+    data = constraint_data(limit)
+    assert data == {"kind": "WallClearance", "margin": 0.02, "velocity_clip": 4.0}
+    assert constraint_from(data) == limit
+    assert limit.promise == "proved"
+    with pytest.raises(UnknownNameError, match="velocity_clip"):
+        constraint_from(data | {"bodies": ["ball"]})
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"margin": -0.1}, "margin.*m, got -0.1"),
+        ({"margin": "wide"}, "margin.*a number"),
+        ({"velocity_clip": 0.0}, "velocity_clip.*m/s, got 0.0"),
+        ({"velocity_clip": np.inf}, "velocity_clip.*finite"),
+    ],
+)
+def test_bad_numbers_are_refused(options, says):
+    with pytest.raises(ConfigurationError, match=says):
+        sw.WallClearance(**options)
+
+
+def test_other_plants_and_machines_are_refused_with_the_alternative():
+    plant = sw.AnalyticPlant(
+        f=lambda x: np.zeros(4),
+        g=lambda x: np.zeros((4, 2)),
+        state=lambda env: np.zeros(4),
+        lower=-1.0,
+        upper=1.0,
+        hold_s=0.01,
+    )
+    with pytest.raises(UnsupportedEnvError, match=r"MujocoPlant.*Clearance"):
+        sw.CBFActionFilter(PointWorld(), [sw.WallClearance()], plant=plant)
+    with pytest.raises(UnsupportedEnvError, match=r"two slides.*Use Clearance"):
+        sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.WallClearance()])
+
+
+def test_the_blocks_are_where_the_tests_think():
+    env = filtered()
+    assert len(env.constraints[0]._among.walls) == len(BLOCKS)
