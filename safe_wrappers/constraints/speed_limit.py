@@ -108,11 +108,10 @@ class SpeedLimit(Predicted):
         data = plant.published()
         self._shown = None if data is None else self._point(data.xpos, data.xipos)
         before, self._here = self._here, self._point(pose.xpos, pose.xipos)
-        if before is None:
-            # Nothing has moved yet that could be measured: the first physics substep shows the speed.
-            standing = np.clip(np.zeros(plant.lower.size), plant.lower, plant.upper)
-            ahead = plant.forecast(standing).poses()
-            moved = self._point(ahead.frames[0], ahead.centres[0]) - self._here
+        if before is None or self.average == "substep":
+            # What the last substep shows; at a reset nothing else has moved yet that could be measured.
+            earlier = plant.substep_ago()
+            moved = self._here - self._point(earlier.frames[0], earlier.centres[0])
             self._last = self._left(moved[None], 1, plant)
         elif plant.time != self._time:  # the first step looks at the state of the reset again
             self._last = self._left((self._here - before)[None], plant.substeps, plant)

@@ -106,8 +106,7 @@ class Recorder:
         qpos, qvel = np.empty((holds * n, m.nq)), np.empty((holds * n, m.nv))
         frames, centres = np.empty((holds, m.nbody, 3)), np.empty((holds, m.nbody, 3))
         data.warning.number[_RESETS] = 0
-        if m.nmocap:  # bodies that the env moves by hand stay where they are
-            self._still.mocap_pos[:], self._still.mocap_quat[:] = data.mocap_pos, data.mocap_quat
+        self.place(data)
         data.ctrl[:] = control
         for hold in range(holds):
             if hold:
@@ -127,6 +126,11 @@ class Recorder:
         at_rest = self._rest[:, 0] + self._rest[:, 1] * data.actuator_length
         control = at_rest - self._damping * data.actuator_velocity
         return np.minimum(np.maximum(control, self._low), self._high)
+
+    def place(self, data: mujoco.MjData) -> None:
+        """Put the bodies that the env moves by hand (mocap) where they are, for the poses asked for from now on."""
+        if self._model.nmocap:
+            self._still.mocap_pos[:], self._still.mocap_quat[:] = data.mocap_pos, data.mocap_quat
 
     def poses(self, qpos: Array) -> Poses:
         """Forward kinematics of positions of shape (k, nq)."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.actuators import AffineActuators
-from safe_wrappers.plants.forecast import Forecast, Recorder
+from safe_wrappers.plants.forecast import Forecast, Poses, Recorder
 from safe_wrappers.plants.plant import (
     check_timing,
     read_attribute,
@@ -344,6 +344,14 @@ class MujocoPlant:
             self._load()
             mujoco.mj_kinematics(self.model, self.data)
         return self.data
+
+    def substep_ago(self) -> Poses:
+        """Poses one physics substep before the present state, by its velocities; exact after an Euler step."""
+        self._load()
+        self._recorder.place(self.data)
+        before = self.qpos.copy()
+        mujoco.mj_integratePos(self.model, before, self.qvel, -self.model.opt.timestep)
+        return self._recorder.poses(before[None])
 
     def published(self) -> mujoco.MjData | None:
         """The env's own data, to read what it publishes; None under a delay, when the present is predicted.

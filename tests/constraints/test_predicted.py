@@ -289,7 +289,7 @@ def test_a_plant_without_a_model_is_refused(kind):
     plant = sw.AnalyticPlant(
         f=lambda x: np.zeros(2), g=lambda x: np.ones((2, 1)), state=lambda e: np.zeros(2), hold_s=HOLD_S
     )
-    with pytest.raises(UnsupportedEnvError, match="on an AnalyticPlant (use|write)"):
+    with pytest.raises(UnsupportedEnvError, match=r"on an AnalyticPlant (use|write)"):
         sw.CBFActionFilter(sliders(), [LIMITS[kind]()], plant=plant)
 
 

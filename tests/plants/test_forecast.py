@@ -296,14 +296,17 @@ def test_under_a_delay_it_starts_where_the_commands_in_flight_lead(delay_s):
 # Braking ------------------------------------------------------------------------------------------------------
 
 SLIDER = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody><body>
-<joint name="x" type="slide" axis="1 0 0"/><geom size=".1" mass="{mass}"/></body></worldbody><actuator>{actuator}</actuator></mujoco>"""
+<joint name="x" type="slide" axis="1 0 0"/><geom size=".1" mass="{mass}"/></body></worldbody>
+<actuator>{actuator}</actuator></mujoco>"""
 MOTORS = {
     "motor": '<motor joint="x" ctrlrange="-9999 9999"/>',
     "gear": '<motor joint="x" gear="20" ctrlrange="-9999 9999"/>',
     "turned round": '<motor joint="x" gear="-3" ctrlrange="-9999 9999"/>',
     "negative gain": '<general joint="x" gainprm="-2" ctrlrange="-9999 9999"/>',
     "unlimited": '<motor joint="x" ctrllimited="false"/>',
-    "with a constant force": '<general joint="x" gainprm="2" biastype="affine" biasprm=".5 0 0" ctrlrange="-9e3 9e3"/>',
+    "with a constant force": (
+        '<general joint="x" gainprm="2" biastype="affine" biasprm=".5 0 0" ctrlrange="-9e3 9e3"/>'
+    ),
     "position servo without damping": '<position joint="x" kp="0.2" ctrlrange="-9999 9999"/>',
 }
 
