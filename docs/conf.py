@@ -17,6 +17,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "docstrings",
     "drawn",
+    "info_keys",
     "mathml",
 ]
 default_role = "code"  # single backticks in docstrings
@@ -60,3 +61,4 @@ add_module_names = False
 python_maximum_signature_line_length = 90
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
+napoleon_attr_annotations = False

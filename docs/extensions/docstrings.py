@@ -1,4 +1,4 @@
-"""What the library's docstrings mean and reStructuredText does not: absolute values, and long type names."""
+"""What the library's docstrings mean and Sphinx does not: absolute values, colons in prose, NumPy's type aliases."""
 
 import re
 from typing import Any
@@ -16,8 +16,13 @@ _ARRAY = re.compile(
 def _escape(
     app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]
 ) -> None:
-    """`|x|` is an absolute value here, and a substitution there."""
+    """`|x|` is an absolute value here and a substitution there; types of returns are in the signature."""
     for i, line in enumerate(lines):
+        if i and lines[i - 1].strip() == "Returns:":
+            # What stands before a colon would be taken for a type: let that be nothing.
+            indent = len(line) - len(line.lstrip())
+            line = line[:indent] + ": " + line[indent:]
+            lines[i] = line
         if not line.lstrip().startswith((">>>", "...")):
             lines[i] = _BAR.sub(lambda m: m[0] if m[0] != "|" else r"\|", line)
 
@@ -44,6 +49,6 @@ def _shorten(
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Register both."""
-    app.connect("autodoc-process-docstring", _escape)
+    app.connect("autodoc-process-docstring", _escape, priority=400)  # before napoleon
     app.connect("autodoc-process-signature", _shorten)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -10,6 +10,7 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 import safe_wrappers as sw
+from safe_wrappers import interventions
 
 pytestmark = pytest.mark.slow
 DOCS = Path(__file__).parents[2] / "docs"
@@ -73,6 +74,13 @@ def test_every_link_inside_the_site_leads_somewhere(site, pages):
             assert target.exists(), (path, address)
             if parts.fragment and target in pages and target.name not in ("search.html", "genindex.html"):
                 assert unquote(parts.fragment) in pages[target].ids, (path, address)
+
+
+def test_every_info_key_is_explained(site):
+    shown = (site / "info.html").read_text(encoding="utf-8")
+    constants = {k: v for k, v in vars(interventions).items() if k.isupper() and isinstance(v, str)}
+    keys = {v for k, v in constants.items() if not k.endswith("PREFIX")} | set(interventions.RUNNING)
+    assert {key for key in keys if f">{key}<" not in shown} == set()
 
 
 def test_every_public_name_is_in_the_api(pages):
