@@ -60,6 +60,8 @@ class JointPositionLimit(Predicted):
             if isinstance(self.joints, str):
                 raise ConfigurationError(f"joints is a list of names, got the string {self.joints!r}")
             self.joints = list(self.joints)
+            if not self.joints:
+                raise ConfigurationError("joints is a list of names, or None for every driven joint; got []")
         self._check_shared()
 
     def bind(self, plant: Plant) -> None:
@@ -101,15 +103,16 @@ class JointPositionLimit(Predicted):
 def _positions(name: str, given: float | Sequence[float] | None) -> float | list[float] | None:
     if given is None:
         return None
+    listed = isinstance(given, Sequence | np.ndarray) and not isinstance(given, str)
     try:
-        many = [float(v) for v in given] if isinstance(given, Sequence | np.ndarray) else [float(given)]
+        many = [float(v) for v in given] if listed else [float(given)]
     except (TypeError, ValueError):
         raise ConfigurationError(
             f"{name} is a position in rad or m, or one per joint; got {given!r}"
         ) from None
     if not many or np.isnan(many).any():
         raise ConfigurationError(f"{name} is a position in rad or m, or one per joint; got {given!r}")
-    return many if isinstance(given, Sequence | np.ndarray) else many[0]
+    return many if listed else many[0]
 
 
 def _per_joint(name: str, given: float | Sequence[float] | None, own: Array) -> Array:
