@@ -1,0 +1,202 @@
+"""Upright: heights and tilts by hand, falls that are refused, and what is refused at construction."""
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from judged_loops import DRIVERS, Scene, drive
+from scipy.spatial.transform import Rotation
+
+import safe_wrappers as sw
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
+
+
+def bound(env, limit):
+    plant = sw.MujocoPlant()
+    plant.bind(env)
+    limit.bind(plant)
+    limit.reset()
+    plant.observe()
+    return plant
+
+
+BOX = """<mujoco><option timestep="0.01"/><worldbody><body name="box"><freejoint/><geom type="box" size=".1 .2 .3"/>
+<body name="tail"><joint name="t" axis="0 1 0"/><geom size=".01" pos="0 0 .4"/></body></body></worldbody>
+<actuator><motor joint="t" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    height=st.floats(-2.0, 3.0),
+    turn=st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1),
+)
+def test_height_and_tilt_of_any_pose(height, turn):
+    env = Scene(BOX)
+    env.data.qpos[:7] = [0.3, -0.2, height, *(np.array(turn) / np.linalg.norm(turn))]
+    mujoco.mj_forward(env.model, env.data)
+    limit = sw.Upright("box", lowest=-1.0, highest=2.0, tilt=0.5)
+    w, x, y, z = turn
+    up = Rotation.from_quat([x, y, z, w]).apply([0.0, 0.0, 1.0])
+    angle = np.arctan2(np.hypot(up[0], up[1]), up[2])
+    plant = bound(env, limit)
+    # arccos of a cosine near one loses half of the digits
+    np.testing.assert_allclose(limit.value(plant), [height + 1.0, 2.0 - height, 0.5 - angle], atol=1e-7)
+
+
+def test_only_what_is_given_counts():
+    env = Scene(BOX)
+    env.data.qpos[:7] = [0.0, 0.0, 1.2, np.cos(0.2), np.sin(0.2), 0.0, 0.0]
+    mujoco.mj_forward(env.model, env.data)
+    for arguments, left in (
+        ({"lowest": 1.0}, [0.2]),
+        ({"highest": 1.0}, [-0.2]),
+        ({"tilt": 0.5}, [0.1]),
+        ({"highest": 2.0, "tilt": 0.5}, [0.8, 0.1]),
+    ):
+        limit = sw.Upright("box", **arguments)
+        np.testing.assert_allclose(limit.value(bound(env, limit)), left, atol=1e-7)
+
+
+def test_the_forecast_is_followed_substep_by_substep():
+    env = Scene(BOX)
+    env.data.qpos[:4] = [0.0, 0.0, 2.0, 1.0]
+    env.data.qvel[3] = 2.0  # turning about x at 2 rad/s, and falling
+    mujoco.mj_forward(env.model, env.data)
+    limit = sw.Upright("box", lowest=1.0, tilt=1.0, holds=4)
+    plant = bound(env, limit)
+    room = limit._room(plant, plant.forecast(np.zeros(1), 4))
+    assert room.shape == (20, 2)
+    data = mujoco.MjData(env.model)
+    mujoco.mj_copyData(data, env.model, env.data)
+    for k in range(20):
+        mujoco.mj_step(env.model, data)
+        x, y, z = data.qpos[4:7]
+        up = Rotation.from_quat([x, y, z, data.qpos[3]]).apply([0.0, 0.0, 1.0])
+        expected = [data.qpos[2] - 1.0, 1.0 - np.arctan2(np.hypot(up[0], up[1]), up[2])]
+        np.testing.assert_allclose(room[k], expected, atol=1e-7)
+
+
+CASES = {
+    "poles": (
+        "InvertedDoublePendulum-v5",
+        sw.Upright("pole2", lowest=0.5),
+        lambda model, data: data.body("pole2").xpos[2] - 0.5,
+    ),
+    "a hopper": (
+        "Hopper-v5",
+        sw.Upright("torso", lowest=0.9, tilt=0.15),
+        lambda model, data: np.array(
+            [data.body("torso").xpos[2] - 0.9, 0.15 - abs(data.qpos[2])]  # rooty turns about y alone
+        ),
+    ),
+}
+
+
+def check_closed_loop(case, driver, steps, seeds):
+    env_id, limit, room = CASES[case]
+    filtered = sw.CBFActionFilter(gym.make(env_id, disable_env_checker=True), [limit])
+    seen = drive(filtered, room, driver, steps, seeds)
+    assert seen["intervened"] > 0
+    if case == "poles":
+        assert seen["flagged"] == seen["outside"] == 0
+
+
+@pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning")
+@pytest.mark.parametrize("driver", DRIVERS)
+@pytest.mark.parametrize("case", CASES)
+def test_no_step_that_is_not_flagged_falls(case, driver):
+    check_closed_loop(case, driver, 60, [0])
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning")
+@pytest.mark.parametrize("driver", DRIVERS)
+@pytest.mark.parametrize("case", CASES)
+def test_no_step_that_is_not_flagged_falls_for_long(case, driver):
+    check_closed_loop(case, driver, 500, range(4))
+
+
+def test_it_stands_longer_with_the_filter():
+    stood = {}
+    for filtered in (False, True):
+        env = gym.make("Hopper-v5", disable_env_checker=True)
+        if filtered:
+            env = sw.CBFActionFilter(env, [sw.Upright("torso", lowest=0.8, tilt=0.18)])
+        env.reset(seed=0)
+        rng, stood[filtered], terminated = np.random.default_rng(0), 0, False
+        while not terminated and stood[filtered] < 60:
+            terminated = env.step(rng.uniform(-1.0, 1.0, 3).astype(np.float32))[2]
+            stood[filtered] += 1
+    assert stood[False] < 30 < stood[True]
+
+
+def test_an_upright_robot_is_left_alone_bit_for_bit():
+    bare = gym.make("Humanoid-v5")
+    filtered = sw.CBFActionFilter(gym.make("Humanoid-v5"), [sw.Upright("torso", lowest=-5.0, tilt=np.pi)])
+    rng = np.random.default_rng(0)
+    a, b = bare.reset(seed=3)[0], filtered.reset(seed=3)[0]
+    for _ in range(15):
+        assert a.tobytes() == b.tobytes()
+        action = rng.uniform(-0.4, 0.4, 17).astype(np.float32)
+        a, reward, *_ = bare.step(action)
+        b, same, _, _, info = filtered.step(action)
+        assert reward == same and not info["cbf/intervened"]
+
+
+def test_a_fall_that_nothing_stops_is_infeasible():
+    env = Scene(BOX)
+    env.start = [0.0, 0.0, 1.02, 1.0, 0.0, 0.0, 0.0, 0.0], np.zeros(7)
+    filtered = sw.CBFActionFilter(env, [sw.Upright("box", lowest=1.0, holds=2)])
+    filtered.reset(seed=0)
+    info = filtered.step(np.array([0.3]))[4]
+    assert info["cbf/infeasible"] and info["cbf/refused"].all() and not info["cbf/unsafe"]
+    assert np.isfinite(info["executed_action"]).all()
+
+
+def test_it_is_rebuilt_from_the_spec_and_from_json():
+    limit = sw.Upright("torso", lowest=0.4, tilt=0.5, margin=0.05, holds=6, reach=0.2)
+    filtered = sw.CBFActionFilter(gym.make("Walker2d-v5"), [limit])
+    for spec in (filtered.spec, EnvSpec.from_json(filtered.spec.to_json())):
+        again = gym.make(spec).constraints
+        assert again == [limit] and type(again[0]) is sw.Upright
+    assert limit.promise == "best effort"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({}, ConfigurationError, r"give at least one of lowest \(m\), highest \(m\) and tilt \(rad\)"),
+        ({"lowest": np.nan}, ConfigurationError, "lowest is a height in m or None, got nan"),
+        ({"highest": np.inf}, ConfigurationError, "highest is a height in m or None, got inf"),
+        ({"lowest": "low"}, ConfigurationError, "lowest is a height in m or None, got 'low'"),
+        (
+            {"lowest": 1.0, "highest": 1.0},
+            ConfigurationError,
+            "nothing is left between lowest = 1.0 m and highest",
+        ),
+        (
+            {"lowest": 0.0, "highest": 1.0, "margin": 0.5},
+            ConfigurationError,
+            "nothing is left .* margin of 0.5 m",
+        ),
+        ({"tilt": 0.0}, ConfigurationError, "tilt must be a finite number > 0 in rad, got 0.0"),
+        (
+            {"tilt": 3.2},
+            ConfigurationError,
+            r"tilt is an angle above the margin \(0.0\) and at most pi, got 3.2",
+        ),
+        ({"tilt": 0.1, "margin": 0.1}, ConfigurationError, r"tilt is an angle above the margin \(0.1\)"),
+        (
+            {"tilt": 0.1, "margin": -0.1},
+            ConfigurationError,
+            "margin must be a finite number >= 0 in m and rad",
+        ),
+        ({"body": "head", "tilt": 1.0}, UnknownNameError, "no body 'head'; it has: world, torso"),
+    ],
+)
+def test_nonsense_is_refused(arguments, error, message):
+    with pytest.raises(error, match=message):
+        sw.CBFActionFilter(gym.make("Walker2d-v5"), [sw.Upright(**arguments)])

@@ -1,0 +1,317 @@
+"""Workspace: its points against MuJoCo's own, every bound and obstacle by hand, and attacked closed loops."""
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from judged_loops import DRIVERS, Judge, Scene, drive, flagged
+
+import safe_wrappers as sw
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
+
+
+def bound(env, limit):
+    plant = sw.MujocoPlant()
+    plant.bind(env)
+    limit.bind(plant)
+    limit.reset()
+    plant.observe()
+    return plant
+
+
+# Where the points are -----------------------------------------------------------------------------------------
+
+ARM = """<mujoco><option timestep="0.01"/><worldbody><body name="upper" pos="0 0 1" quat=".9 .1 .3 .2">
+<joint name="a" axis="0 1 0"/>
+<geom name="bone" type="capsule" fromto="0 0 0 .3 .1 0" size=".02"/>
+<body name="lower" pos=".3 .1 0" euler="20 30 40"><joint name="b" axis=".3 0 1"/><joint name="c" axis="1 0 0"/>
+<geom name="shin" type="box" pos=".1 .05 .02" quat=".5 .5 .1 .2" size=".05 .02 .03"/>
+<site name="tip" pos=".2 -.1 .05" euler="10 0 70"/></body></body></worldbody>
+<actuator><motor joint="a" ctrlrange="-1 1"/><motor joint="b" ctrlrange="-1 1"/></actuator></mujoco>"""
+"""Frames that are turned against each other: bodies, geoms off their body's origin, a site."""
+
+
+def true_points(data):
+    """Of lower, upper (bodies), tip (site), bone, shin (geoms)."""
+    return np.array(
+        [
+            data.body("lower").xpos,
+            data.body("upper").xpos,
+            data.site("tip").xpos,
+            data.geom("bone").xpos,
+            data.geom("shin").xpos,
+        ]
+    )
+
+
+def test_bodies_sites_and_geoms_are_where_mujoco_has_them_now_and_ahead():
+    env = Scene(ARM)
+    names = {"bodies": ["lower", "upper"], "sites": ["tip"], "geoms": ["bone", "shin"]}
+    limit = sw.Workspace(low=[0.0, 0.0, 0.0], holds=2, **names)
+    plant = bound(env, limit)
+    rng = np.random.default_rng(0)
+    truth = mujoco.MjData(env.model)
+    for _ in range(10):
+        env.data.qpos[:], env.data.qvel[:] = rng.uniform(-3.0, 3.0, (2, 3))
+        plant.observe()
+        truth.qpos[:] = env.data.qpos
+        mujoco.mj_forward(env.model, truth)
+        np.testing.assert_allclose(limit.value(plant).reshape(5, 3), true_points(truth), atol=1e-12)
+        forecast = plant.forecast(rng.uniform(-1.0, 1.0, 2), 2)
+        room = limit._room(plant, forecast)
+        assert room.shape == (10, 15)
+        for k in range(10):
+            truth.qpos[:] = forecast.qpos[k]
+            mujoco.mj_forward(env.model, truth)
+            np.testing.assert_allclose(room[k].reshape(5, 3), true_points(truth), atol=1e-12)
+
+
+def test_every_bound_that_there_is_and_every_obstacle_counts_by_itself():
+    env = Scene(ARM)
+    env.data.qpos[:] = [0.4, -0.7, 0.2]
+    mujoco.mj_forward(env.model, env.data)
+    (x, y, z), (p, q, r) = tip, bone = env.data.site("tip").xpos.copy(), env.data.geom("bone").xpos.copy()
+
+    def left(**arguments):
+        limit = sw.Workspace(sites=["tip"], geoms=["bone"], **arguments)
+        return limit.value(bound(env, limit))
+
+    np.testing.assert_allclose(left(low=[-1.0, None, None]), [x + 1.0, p + 1.0])
+    np.testing.assert_allclose(
+        left(low=[None, -1.0, None], high=[2.0, None, 3.0], radius=0.1),
+        np.array([y + 1.0, q + 1.0, 2.0 - x, 3.0 - z, 2.0 - p, 3.0 - r]) - 0.1,
+    )
+    disc, ball = sw.Disc([0.1, 0.2], 0.05), sw.Sphere([0.1, 0.2, 0.9], 0.05)
+    wall, block = sw.Plane([0.0, 0.0, 0.5], [0.0, 3.0, 4.0]), sw.Box([9.0, 0.0, 0.0], [1.0, 99.0, 99.0])
+    np.testing.assert_allclose(
+        left(keep_out=[disc, ball, wall, block], radius=0.01),
+        np.concatenate(
+            [
+                [np.hypot(a - 0.1, b - 0.2) - 0.05 for a, b in (tip[:2], bone[:2])],
+                [np.linalg.norm(each - [0.1, 0.2, 0.9]) - 0.05 for each in (tip, bone)],
+                [0.6 * each[1] + 0.8 * (each[2] - 0.5) for each in (tip, bone)],
+                [8.0 - x, 8.0 - p],
+            ]
+        )
+        - 0.01,
+    )
+
+
+def test_published_obstacles_are_taken_where_they_are():
+    env = gym.make("SafePointGoal1-v0", disable_env_checker=True)
+    limit = sw.Workspace(keep_out=[sw.Discs("hazard_positions", 0.2)], bodies=["agent"])
+    plant = bound(env, limit)
+    for seed in (0, 1):
+        env.reset(seed=seed)
+        plant.observe()
+        raw = env.unwrapped
+        away = np.linalg.norm(raw.hazard_positions - raw.data.body("agent").xpos[:2], axis=1) - 0.2
+        np.testing.assert_allclose(limit.value(plant), away, atol=1e-12)
+
+
+def test_where_nothing_stands_nothing_is_refused():
+    env = gym.make("SafePointGoal0-v0", disable_env_checker=True)  # a level without hazards
+    limit = sw.Workspace(keep_out=[sw.Discs("hazard_positions", 0.2)], bodies=["agent"], reach=0.1)
+    filtered = sw.CBFActionFilter(env, [limit])
+    filtered.reset(seed=0)
+    for _ in range(5):
+        info = filtered.step(np.ones(2, np.float32))[4]
+        assert info["cbf/margin"] == 0.0 and not info["cbf/intervened"] and not info["cbf/unsafe"]
+
+
+# Closed loops -------------------------------------------------------------------------------------------------
+
+FINGER_LOW, FINGER_HIGH = np.array([-0.22, -0.15]), np.array([0.22, 0.15])
+TABLE_LOW, TABLE_HIGH = np.array([0.3, -0.8, -0.3]), np.array([0.9, 0.0, 0.3])
+
+
+def in_box(body, low, high):
+    def room(model, data):
+        p = data.body(body).xpos[: low.size]
+        return np.concatenate([p - low, high - p])
+
+    return room
+
+
+CASES = {
+    "a box on Reacher": (
+        "Reacher-v5",
+        sw.Workspace([*FINGER_LOW, None], [*FINGER_HIGH, None], bodies=["fingertip"], holds=10),
+        in_box("fingertip", FINGER_LOW, FINGER_HIGH),
+    ),
+    "a disc on Reacher": (
+        "Reacher-v5",
+        sw.Workspace(keep_out=[sw.Disc([0.0, 0.15], 0.06)], geoms=["fingertip"], radius=0.01, holds=10),
+        lambda model, data: np.linalg.norm(data.geom("fingertip").xpos[:2] - [0.0, 0.15]) - 0.07,
+    ),
+    "a box on Pusher": (
+        "Pusher-v5",
+        sw.Workspace(list(TABLE_LOW), list(TABLE_HIGH), bodies=["tips_arm"], holds=8),
+        in_box("tips_arm", TABLE_LOW, TABLE_HIGH),
+    ),
+}
+
+
+def check_closed_loop(case, driver, steps, seeds):
+    env_id, limit, room = CASES[case]
+    filtered = sw.CBFActionFilter(gym.make(env_id, disable_env_checker=True), [limit])
+    seen = drive(filtered, room, driver, steps, seeds)
+    assert seen["intervened"] > 0 or driver != "bang_bang"  # the others may stay away from it
+    assert seen["least"] > -1e-3
+    assert seen["outside"] <= seen["flagged"] <= 0.1 * seen["steps"]
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+@pytest.mark.parametrize("case", CASES)
+def test_no_step_that_is_not_flagged_leaves_the_workspace(case, driver):
+    check_closed_loop(case, driver, 80, [1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("driver", DRIVERS)
+@pytest.mark.parametrize("case", CASES)
+def test_no_step_that_is_not_flagged_leaves_the_workspace_for_long(case, driver):
+    check_closed_loop(case, driver, 500, range(4))
+
+
+def test_without_the_filter_it_is_left():
+    env = gym.make("Reacher-v5")
+    env.reset(seed=0)
+    rooms = []
+    for _ in range(60):
+        env.step(np.array([0.2, 0.0], np.float32))
+        rooms.append(in_box("fingertip", FINGER_LOW, FINGER_HIGH)(None, env.unwrapped.data).min())
+    assert min(rooms) < -0.04
+
+
+def test_far_inside_the_actions_pass_bit_for_bit():
+    bare = gym.make("Pusher-v5")
+    limit = sw.Workspace([-9.0] * 3, [9.0] * 3, [sw.Sphere([9.0, 0.0, 0.0], 1.0)], bodies=["tips_arm"])
+    filtered = sw.CBFActionFilter(gym.make("Pusher-v5"), [limit])
+    rng = np.random.default_rng(0)
+    a, b = bare.reset(seed=3)[0], filtered.reset(seed=3)[0]
+    for _ in range(30):
+        assert a.tobytes() == b.tobytes()
+        action = rng.uniform(-2.0, 2.0, 7).astype(np.float32)
+        a, reward, *_ = bare.step(action)
+        b, same, _, _, info = filtered.step(action)
+        assert reward == same and not info["cbf/intervened"]
+
+
+def test_from_inside_an_obstacle_it_goes_out():
+    disc = sw.Disc([0.21, 0.0], 0.04)  # Reacher starts with its arm along x, the tip at 0.21
+    filtered = sw.CBFActionFilter(
+        gym.make("Reacher-v5"), [sw.Workspace(keep_out=[disc], bodies=["fingertip"], holds=10)]
+    )
+    raw = filtered.unwrapped
+    judge = Judge(
+        filtered, lambda model, data: np.linalg.norm(data.body("fingertip").xpos[:2] - [0.21, 0.0]) - 0.04
+    )
+    with pytest.warns(sw.UnsafeStateWarning):
+        filtered.reset(seed=0)
+        qpos = raw.data.qpos.copy()
+        qpos[:2] = [0.1, -0.05]
+        raw.set_state(qpos, np.zeros(4))
+        rooms = [judge.at(raw.data)]
+        assert rooms[0] < -0.01
+        for _ in range(60):
+            least, end, _, info = judge.step(filtered, np.array([0.0, 0.02], np.float32))
+            assert least >= min(rooms[-1], 0.0) - 1e-6 or flagged(info)
+            rooms.append(end)
+    assert np.argmax(np.array(rooms) >= -1e-6) in range(1, 25)
+    assert rooms[-1] >= -1e-6
+
+
+def test_conflicting_workspaces_are_infeasible_and_the_action_stays_sound():
+    left = sw.Workspace(high=[-0.05, None, None], bodies=["fingertip"])
+    right = sw.Workspace(low=[0.05, None, None], bodies=["fingertip"])
+    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [left, right])
+    with pytest.warns(sw.UnsafeStateWarning):
+        filtered.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        info = filtered.step(rng.uniform(-1.0, 1.0, 2).astype(np.float32))[4]
+        assert info["cbf/infeasible"] and info["cbf/fallback"]
+        assert np.isfinite(info["executed_action"]).all() and (np.abs(info["executed_action"]) <= 1.0).all()
+
+
+# Plain data, and what is refused ------------------------------------------------------------------------------
+
+
+def test_it_is_rebuilt_from_the_spec_and_from_json():
+    limit = sw.Workspace(
+        [None, -0.5, None],
+        [0.5, None, None],
+        [sw.Disc([0.1, 0.2], 0.05), sw.Box([1.0, 0.0, 0.0], [0.1, 0.2, 0.3]), sw.Discs("centres", 0.1)],
+        bodies=["fingertip"],
+        geoms=["link0"],
+        radius=0.01,
+        margin=0.02,
+        holds=7,
+        reach=0.3,
+    )
+    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [limit])
+    for spec in (filtered.spec, EnvSpec.from_json(filtered.spec.to_json())):
+        again = gym.make(spec).constraints
+        assert again == [limit] and type(again[0]) is sw.Workspace
+        assert [type(o) for o in again[0].keep_out] == [sw.Disc, sw.Box, sw.Discs]
+    assert limit.promise == "best effort"
+
+
+FINGER = {"bodies": ["fingertip"]}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        (FINGER, ConfigurationError, r"give a bound in low or high \(m\), or something to keep_out of"),
+        ({**FINGER, "low": [None] * 3}, ConfigurationError, "give a bound in low or high"),
+        ({"low": [0.0] * 3}, ConfigurationError, "name the bodies, sites or geoms to keep inside.*fingertip"),
+        (
+            {**FINGER, "low": [0.0, 1.0]},
+            ConfigurationError,
+            r"low is \[x, y, z\] in m, None where there is no",
+        ),
+        ({**FINGER, "high": 1.0}, ConfigurationError, r"high is \[x, y, z\] in m.*; got 1.0"),
+        ({**FINGER, "low": [np.inf, 0.0, 0.0]}, ConfigurationError, r"low is \[x, y, z\] in m"),
+        ({**FINGER, "high": [np.nan, 0.0, 0.0]}, ConfigurationError, r"high is \[x, y, z\] in m"),
+        (
+            {**FINGER, "low": [0.0] * 3, "high": [1.0, 0.0, 1.0]},
+            ConfigurationError,
+            "nothing is left of the box",
+        ),
+        (
+            {**FINGER, "low": [0.0] * 3, "high": [1.0] * 3, "radius": 0.3, "margin": 0.2},
+            ConfigurationError,
+            "nothing is left of the box .* with a radius of 0.3 m and a margin of 0.2 m on each side",
+        ),
+        (
+            {**FINGER, "low": [0.0] * 3, "radius": -1.0},
+            ConfigurationError,
+            "radius must be a finite number >= 0",
+        ),
+        (
+            {**FINGER, "low": [0.0] * 3, "margin": np.nan},
+            ConfigurationError,
+            "margin must be a finite number >= 0",
+        ),
+        (
+            {**FINGER, "keep_out": sw.Disc([0.0, 0.0], 1.0)},
+            ConfigurationError,
+            "keep_out is a list of obstacles",
+        ),
+        ({**FINGER, "keep_out": ["wall"]}, ConfigurationError, "expected an obstacle"),
+        (
+            {"bodies": "fingertip", "low": [0.0] * 3},
+            ConfigurationError,
+            "bodies is a list of names, got the string",
+        ),
+        ({"bodies": ["hand"], "low": [0.0] * 3}, UnknownNameError, "no body 'hand'; it has: world, body0"),
+        ({"sites": ["tip"], "low": [0.0] * 3}, UnknownNameError, "no site 'tip'; it has: "),
+        ({"geoms": ["tip"], "low": [0.0] * 3}, UnknownNameError, "no geom 'tip'; it has: .*fingertip"),
+    ],
+)
+def test_nonsense_is_refused(arguments, error, message):
+    with pytest.raises(error, match=message):
+        sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.Workspace(**arguments)])
