@@ -45,13 +45,16 @@ bench: .venv/bench
 	$(BIN)/python -m benchmarks.filter_call
 	$(BIN)/python -m benchmarks.env_step
 	$(BIN)/python -m benchmarks.env_task_step
+	$(BIN)/python -m benchmarks.training_time
 
-# Every long figure of the README: about an hour on two cores.
+# Every long figure of the README: about an hour and a half on two cores.
 figures: .venv/installed
 	$(BIN)/python -m benchmarks.adversarial
 	$(BIN)/python -m benchmarks.adversarial --mismatch
 	$(BIN)/python -m benchmarks.adversarial --price --steps 50000
 	$(BIN)/python -m benchmarks.adversarial --off --steps 100000
+	$(BIN)/python -m benchmarks.protected
+	$(BIN)/python -m benchmarks.protected --hard --steps 100000
 	$(BIN)/safe-wrappers compare configs/pointgoal1_300k.yaml --report
 
 .venv/docs: .venv/installed

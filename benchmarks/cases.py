@@ -1,0 +1,202 @@
+"""What is measured on which env: the filter, the judge and the drivers of each row of the README's tables."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+
+import safe_wrappers as sw
+from benchmarks import judges
+from benchmarks import mujoco_drivers as drivers
+from benchmarks.drivers import DRIVERS as POINT_GOAL
+from benchmarks.judges import Judge, Replay, Reported
+from benchmarks.mujoco_drivers import Maker
+
+
+@dataclass(frozen=True)
+class Case:
+    """One env under one filter.
+
+    Attributes:
+        env_id: Of the env.
+        judge: Makes the judge of an unwrapped env.
+        drivers: By name.
+        protect: Puts the filter on.
+        also: Ids of envs with the same physics and the same constraints.
+        note: What is different from the plain env, in words.
+        past_termination: An episode goes on when the env says that it is over, to its time limit.
+        max_episode_steps: Time limit; None is the env's own.
+    """
+
+    env_id: str
+    judge: Callable[[Any], Judge]
+    drivers: dict[str, Maker]
+    protect: Callable[[gym.Env[Any, Any]], sw.CBFActionFilter] = sw.protect
+    also: tuple[str, ...] = ()
+    note: str = ""
+    past_termination: bool = False
+    max_episode_steps: int | None = None
+
+    @property
+    def name(self) -> str:
+        """Of its row."""
+        return f"{self.env_id}, {self.note}" if self.note else self.env_id
+
+    def make(self) -> gym.Env[Any, Any]:
+        """The env without the filter."""
+        if "Maze" in self.env_id:
+            import gymnasium_robotics
+
+            gym.register_envs(gymnasium_robotics)
+        return gym.make(self.env_id, max_episode_steps=self.max_episode_steps)
+
+
+_BLIND: dict[str, Maker] = {
+    "random": drivers.random,
+    "bang-bang": drivers.bang_bang,
+    "pulse": drivers.pulse,
+}
+_RAIL = _BLIND | {"end-seeking": drivers.end_seeking, "carrying": drivers.carrying}
+_SPEED = _BLIND | {"speed-seeking": drivers.speed_seeking}
+
+_DISC, _DISC_RADIUS = (-0.1, 0.1), 0.05
+_TABLE_LOW, _TABLE_HIGH = (-0.2, -1.2, -0.3), (0.9, 0.15, 0.4)
+
+
+def _rail(env: Any) -> Judge:
+    return Replay(env, judges.joint_beyond(env.model, "slider", 0.95))
+
+
+def _joint_speeds(limit: float) -> Callable[[Any], Judge]:
+    return lambda env: Replay(env, judges.joints_too_fast(env.model, limit))
+
+
+def _reacher_and_disc(env: gym.Env[Any, Any]) -> sw.CBFActionFilter:
+    speeds = sw.JointSpeedLimit(5.0, margin=0.01, reach=4.5)
+    disc = sw.Workspace(
+        keep_out=[sw.Disc(list(_DISC), _DISC_RADIUS)], bodies=["fingertip"], margin=0.001, holds=3
+    )
+    return sw.CBFActionFilter(env, [speeds, disc])
+
+
+def _judge_reacher_and_disc(env: Any) -> Judge:
+    return Replay(
+        env,
+        judges.any_of(
+            judges.joints_too_fast(env.model, 5.0),
+            judges.inside_disc(env.model, "fingertip", _DISC, _DISC_RADIUS),
+        ),
+    )
+
+
+def _judge_pusher(env: Any) -> Judge:
+    return Replay(
+        env,
+        judges.any_of(
+            judges.joints_too_fast(env.model, 6.0),
+            judges.outside_box(env.model, "tips_arm", _TABLE_LOW, _TABLE_HIGH),
+        ),
+    )
+
+
+# Beyond every side of the tip's box: past the table's edges, through its top, behind the shoulder, up.
+_OFF_THE_TABLE = drivers.point_seeking(
+    "tips_arm",
+    [
+        (0.4, -0.3, -0.6),
+        (0.4, 0.5, -0.2),
+        (1.3, -0.3, 0.0),
+        (-0.6, -0.3, 0.0),
+        (0.3, -0.4, 0.9),
+        (0.3, -1.6, 0.0),
+    ],
+)
+
+
+def _velocity(robot: str, limit: float, plane: bool = False) -> Case:
+    sprint = drivers.sprinting if plane else drivers.sprinting_along_x
+    return Case(
+        f"Safe{robot}Velocity-v0",
+        judge=lambda env: Reported(judges.faster_than(limit, plane)),
+        drivers={"random": drivers.random, "pulse": drivers.pulse, "sprinting": sprint},
+        also=(f"{robot}-v5",),
+    )
+
+
+def _point_goal(level: int) -> Case:
+    # Level 0 has nothing to seek or to drift into.
+    blind = {name: POINT_GOAL[name] for name in ("random", "goal-seeking", "bang-bang")}
+    return Case(
+        f"SafePointGoal{level}-v0",
+        judge=lambda env: Reported(judges.costs),
+        drivers=dict(POINT_GOAL) if level else blind,
+    )
+
+
+def _point_maze(maze: str) -> Case:
+    def judge(env: Any) -> Judge:
+        touch = judges.touches_wall(env.model, "particle_geom")
+        return Replay(env, touch, prepare=judges.clip_speed(5.0))
+
+    return Case(f"PointMaze_{maze}-v3", judge=judge, drivers=_BLIND | {"wall-seeking": drivers.wall_seeking})
+
+
+def _ant_maze(maze: str) -> Case:
+    return Case(
+        f"AntMaze_{maze}-v5",
+        judge=lambda env: Replay(env, judges.near_wall(env.model, "torso", 0.4)),
+        drivers={
+            "random": drivers.random,
+            "pulse": drivers.pulse,
+            "wall-seeking": drivers.running_into_walls,
+        },
+    )
+
+
+def _fallen(env_id: str) -> Case:
+    """A pendulum whose episodes go on after the fall: the cart goes far before the pole does only by chance."""
+    return Case(env_id, _rail, _RAIL, note="on after the fall", past_termination=True, max_episode_steps=500)
+
+
+def _by_name(*cases: Case) -> dict[str, Case]:
+    return {case.name: case for case in cases}
+
+
+PROTECTED: dict[str, Case] = _by_name(
+    *(_point_goal(level) for level in range(3)),
+    _fallen("InvertedPendulum-v5"),
+    _fallen("InvertedDoublePendulum-v5"),
+    Case("Reacher-v5", _joint_speeds(5.0), _SPEED),
+    Case("Pusher-v5", _judge_pusher, _SPEED | {"off the table": _OFF_THE_TABLE}),
+    _velocity("HalfCheetah", 3.2096),
+    _velocity("Hopper", 0.7402),
+    _velocity("Walker2d", 2.3415),
+    _velocity("Swimmer", 0.2282),
+    _velocity("Ant", 2.6222, plane=True),
+    _velocity("Humanoid", 1.4149, plane=True),
+    Case("HumanoidStandup-v5", _joint_speeds(20.0), _SPEED),
+    _point_maze("UMaze"),
+    _ant_maze("UMaze"),
+)
+"""Every env that `protect` knows, by the name of its row."""
+
+HARD: dict[str, Case] = _by_name(
+    Case("InvertedPendulum-v5", _rail, _RAIL),
+    _fallen("InvertedPendulum-v5"),
+    Case("InvertedDoublePendulum-v5", _rail, _RAIL),
+    _fallen("InvertedDoublePendulum-v5"),
+    Case(
+        "Reacher-v5",
+        _judge_reacher_and_disc,
+        _SPEED | {"disc-seeking": drivers.point_seeking("fingertip", [(*_DISC, 0.01)])},
+        _reacher_and_disc,
+        note="with a disc",
+    ),
+    PROTECTED["Pusher-v5"],
+    PROTECTED["PointMaze_UMaze-v3"],
+    _point_maze("Large"),
+)
+"""The envs with a hard limit, likewise; one row per driver."""
+
+CASES: dict[str, Case] = PROTECTED | HARD

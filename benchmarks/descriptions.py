@@ -1,0 +1,85 @@
+"""What a filter constrains, in the words of a table: from its own constraints, their limits and margins."""
+
+from typing import Any
+
+import safe_wrappers as sw
+
+
+def constrained(env: sw.CBFActionFilter) -> str:
+    """What the filter keeps, one phrase per constraint."""
+    return "; ".join(_phrase(c) for c in env.constraints)
+
+
+def promised(env: sw.CBFActionFilter) -> str:
+    """Proved if every constraint is."""
+    promises = {getattr(c, "promise", "best effort") for c in env.constraints}
+    return "proved" if promises == {"proved"} else "best effort"
+
+
+def reserve(env: sw.CBFActionFilter) -> str:
+    """The constraints' margins, each in its unit."""
+    return ", ".join(_margin(c) for c in env.constraints)
+
+
+def _phrase(constraint: Any) -> str:
+    match constraint:
+        case sw.JointSpeedLimit():
+            return f"joint speeds below {constraint.limit:g} rad/s"
+        case sw.SpeedLimit():
+            point = constraint.body or "centre of mass"
+            return f"speed of the {point} ({constraint.direction}) below {constraint.limit:g} m/s"
+        case sw.Workspace():
+            parts = []
+            if constraint.low is not None or constraint.high is not None:
+                parts.append(f"inside {_numbers(constraint.low)} to {_numbers(constraint.high)} m")
+            if constraint.keep_out:
+                room = f"{constraint.radius:g} m " if constraint.radius else ""
+                parts.append(f"{room}clear of {_obstacles(constraint.keep_out)}")
+            return f"{_points(constraint)} {' and '.join(parts)}"
+        case sw.Clearance():
+            return f"{_points(constraint)} clear of {_obstacles(constraint.obstacles)}, with room to brake"
+        case sw.HeadingDriveClearance():
+            return f"stopping path clear of {_obstacles(constraint.obstacles)}"
+        case sw.WallClearance():
+            return "braking path clear of the walls"
+    return type(constraint).__name__
+
+
+def _margin(constraint: Any) -> str:
+    margin = float(getattr(constraint, "margin", 0.0))
+    match constraint:
+        case sw.JointSpeedLimit():
+            return f"{margin:g} rad/s"
+        case sw.SpeedLimit():
+            return f"{margin:g} m/s"
+    return f"{1e3 * margin:g} mm"
+
+
+def _points(constraint: Any) -> str:
+    return ", ".join([*constraint.bodies, *constraint.sites, *constraint.geoms])
+
+
+def _numbers(corner: Any) -> str:
+    return (
+        "anywhere"
+        if corner is None
+        else "(" + ", ".join("-" if v is None else f"{v:g}" for v in corner) + ")"
+    )
+
+
+def _obstacles(obstacles: Any) -> str:
+    kinds = {type(o) for o in obstacles}
+    if len(obstacles) > 2 and len(kinds) == 1:
+        return f"{len(obstacles)} {kinds.pop().__name__.lower()}es"
+    return " and ".join(_obstacle(o) for o in obstacles)
+
+
+def _obstacle(obstacle: Any) -> str:
+    match obstacle:
+        case sw.Discs():
+            return f"{obstacle.attribute} ({obstacle.radius:g} m)"
+        case sw.Disc():
+            return f"a disc of {obstacle.radius:g} m at {_numbers(obstacle.center)} m"
+        case sw.Plane():
+            return f"the end at {_numbers(obstacle.point).strip('()')} m"
+    return f"a {type(obstacle).__name__.lower()}"

@@ -1,0 +1,199 @@
+"""Who says what a violation is: each env's truth, on the env's own model, with no code of a constraint in it.
+
+A judge looks at the env before and after each step and answers by how much the requirement was missed, in the
+requirement's own unit: above 0, or not a number, is a violation.
+"""
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import mujoco
+import numpy as np
+
+Truth = Callable[[mujoco.MjData], float]
+"""By how much a state misses a requirement; the positions of bodies are up to date."""
+
+_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+
+
+class Judge(Protocol):
+    """What says whether a step broke the requirement."""
+
+    def start(self) -> float:
+        """By how much the env's present state, of a reset, misses it."""
+
+    def before(self) -> None:
+        """Called before each step."""
+
+    def after(self, executed: np.ndarray, info: dict[str, Any]) -> float:
+        """By how much the step missed it: what the env was given, and the info that it returned."""
+
+
+class Replay:
+    """Makes every step once more on data of its own and evaluates a truth after each physics substep.
+
+    Args:
+        env: Unwrapped.
+        truth: Evaluated on the states.
+        prepare: What the env does to its data at the start of a step, before it sets the control.
+
+    Raises:
+        RuntimeError: The replay does not end in the env's own state, bit for bit.
+    """
+
+    def __init__(
+        self, env: Any, truth: Truth, prepare: Callable[[mujoco.MjModel, mujoco.MjData], None] | None = None
+    ) -> None:
+        self._env, self._truth, self._prepare = env, truth, prepare
+        self._model: mujoco.MjModel = env.model
+        self._data = mujoco.MjData(self._model)
+        self._state = np.zeros(mujoco.mj_stateSize(self._model, _STATE))
+        self._substeps = stepped(env).frame_skip
+
+    def start(self) -> float:
+        """The truth of the env's present state."""
+        self.before()
+        mujoco.mj_setState(self._model, self._data, self._state, _STATE)
+        return self._present()
+
+    def before(self) -> None:
+        """Keep the state that the step starts from."""
+        mujoco.mj_getState(self._model, self._env.data, self._state, _STATE)
+
+    def after(self, executed: np.ndarray, info: dict[str, Any]) -> float:
+        """The worst of the step's substeps."""
+        model, data = self._model, self._data
+        mujoco.mj_setState(model, data, self._state, _STATE)
+        if self._prepare is not None:
+            self._prepare(model, data)
+        data.ctrl[:] = executed
+        missed = []
+        for _ in range(self._substeps):
+            mujoco.mj_step(model, data)
+            missed.append(self._present())
+        there = self._env.data
+        if not (np.array_equal(data.qpos, there.qpos) and np.array_equal(data.qvel, there.qvel)):
+            raise RuntimeError(
+                "the replayed step does not end where the env's did: this judge would be wrong"
+            )
+        return float(np.max(missed))
+
+    def _present(self) -> float:
+        # mj_step leaves the poses of the state before. The next one computes them anew: nothing is disturbed.
+        mujoco.mj_kinematics(self._model, self._data)
+        return self._truth(self._data)
+
+
+class Reported:
+    """Reads what the task itself reports of a step.
+
+    Args:
+        missed: By how much the info of a step misses the requirement.
+    """
+
+    def __init__(self, missed: Callable[[dict[str, Any]], float]) -> None:
+        self._missed = missed
+
+    def start(self) -> float:
+        """Nothing has been reported yet: safe."""
+        return 0.0
+
+    def before(self) -> None:
+        """Nothing to keep."""
+
+    def after(self, executed: np.ndarray, info: dict[str, Any]) -> float:
+        """What the step's info says."""
+        return self._missed(info)
+
+
+def stepped(env: Any) -> Any:
+    """The env that steps the physics: this one, or the robot that a maze holds."""
+    return next(e for e in (env, *vars(env).values()) if hasattr(e, "frame_skip"))
+
+
+def any_of(*truths: Truth) -> Truth:
+    """Several requirements at once: the worst of them."""
+    return lambda data: max(truth(data) for truth in truths)
+
+
+def joint_beyond(model: mujoco.MjModel, joint: str, limit: float) -> Truth:
+    """A joint farther than `limit` (m or rad) from its zero, on either side."""
+    address = int(model.joint(joint).qposadr[0])
+    return lambda data: abs(float(data.qpos[address])) - limit
+
+
+def joints_too_fast(model: mujoco.MjModel, limit: float) -> Truth:
+    """A joint with a motor faster than `limit`, rad/s."""
+    driven = model.jnt_dofadr[model.actuator_trnid[:, 0]]
+    return lambda data: float(np.abs(data.qvel[driven]).max()) - limit
+
+
+def inside_disc(model: mujoco.MjModel, body: str, center: tuple[float, float], radius: float) -> Truth:
+    """A body's origin inside an upright cylinder, m."""
+    index, middle = model.body(body).id, np.array(center)
+    return lambda data: radius - float(np.linalg.norm(data.xpos[index, :2] - middle))
+
+
+def outside_box(model: mujoco.MjModel, body: str, low: tuple[float, ...], high: tuple[float, ...]) -> Truth:
+    """A body's origin outside a box, m."""
+    index, least, most = model.body(body).id, np.array(low), np.array(high)
+
+    def truth(data: mujoco.MjData) -> float:
+        place = data.xpos[index]
+        return float(max((least - place).max(), (place - most).max()))
+
+    return truth
+
+
+def touches_wall(model: mujoco.MjModel, geom: str) -> Truth:
+    """A geom in contact with a box of the world: 1 if MuJoCo reports it (from the contact margin on), else -1."""
+    own, walls = model.geom(geom).id, set(wall_geoms(model).tolist())
+
+    def truth(data: mujoco.MjData) -> float:
+        mujoco.mj_collision(model, data)
+        pairs = data.contact.geom[: data.ncon].tolist()
+        return 1.0 if any((a == own and b in walls) or (b == own and a in walls) for a, b in pairs) else -1.0
+
+    return truth
+
+
+def near_wall(model: mujoco.MjModel, body: str, distance: float) -> Truth:
+    """A body's origin closer than `distance` to a box of the world, seen from above, m."""
+    index, geoms = model.body(body).id, wall_geoms(model)
+    middle, half = model.geom_pos[geoms, :2], model.geom_size[geoms, :2]
+
+    def truth(data: mujoco.MjData) -> float:
+        beyond = np.maximum(np.abs(data.xpos[index, :2] - middle) - half, 0.0)
+        return distance - float(np.sqrt((beyond**2).sum(axis=1)).min())
+
+    return truth
+
+
+def wall_geoms(model: mujoco.MjModel) -> np.ndarray:
+    """Indices of the boxes that stand in the world."""
+    return np.flatnonzero((model.geom_bodyid == 0) & (model.geom_type == int(mujoco.mjtGeom.mjGEOM_BOX)))
+
+
+def faster_than(limit: float, plane: bool) -> Callable[[dict[str, Any]], float]:
+    """The published speed of a step, displacement over time along x or in the plane, above `limit`, m/s."""
+
+    def missed(info: dict[str, Any]) -> float:
+        x = float(info["x_velocity"])
+        return (float(np.hypot(x, info["y_velocity"])) if plane else x) - limit
+
+    return missed
+
+
+def costs(info: dict[str, Any]) -> float:
+    """A cost at some physics substep, as the task judges itself: 1 or -1."""
+    return 1.0 if info["cost_substep"] else -1.0
+
+
+def clip_speed(limit: float) -> Callable[[mujoco.MjModel, mujoco.MjData], None]:
+    """What PointMaze does at the start of a step: no velocity beyond `limit`, and all derived quantities anew."""
+
+    def prepare(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        data.qvel[:] = np.clip(data.qvel, -limit, limit)
+        mujoco.mj_forward(model, data)
+
+    return prepare

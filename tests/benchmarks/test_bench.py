@@ -1,0 +1,59 @@
+"""The timed benchmarks: what they compare takes the same steps, and they report what they looked for."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import safe_wrappers as sw
+from benchmarks import env_step, mujoco_drivers
+from benchmarks.cases import PROTECTED
+
+
+def test_inactive_and_active_steps_are_told_apart():
+    quiet = env_step.measure("Reacher-v5", env_step.gentle, sw.protect, active=False, steps=60)
+    pushed = env_step.measure("Reacher-v5", mujoco_drivers.speed_seeking, sw.protect, active=True, steps=60)
+    assert quiet.share == 1.0 and pushed.share > 0.5
+    assert 1.0 < quiet.ratio < pushed.ratio
+    assert 0.0 < quiet.without_us < quiet.with_us
+
+
+def test_both_envs_take_the_same_steps(monkeypatch):
+    made = []
+    case = PROTECTED["Reacher-v5"]
+
+    def make():
+        made.append(gym.make(case.env_id))
+        return made[-1]
+
+    monkeypatch.setitem(env_step.PROTECTED, "Reacher-v5", FakeCase(make))
+    env_step.measure("Reacher-v5", mujoco_drivers.pulse, sw.protect, active=True, steps=120)
+    one, other = (env.unwrapped.data for env in made)
+    assert np.array_equal(one.qpos, other.qpos) and np.array_equal(one.qvel, other.qvel)
+
+
+class FakeCase:
+    past_termination = False
+
+    def __init__(self, make):
+        self.make = make
+
+
+def test_runners_get_a_lower_limit_and_nothing_else():
+    env = gym.make("SafeAntVelocity-v0")
+    (usual,), (lower,) = sw.protect(env).constraints, env_step.slower(0.3)(env).constraints
+    assert lower.limit == 0.3 and usual.limit == 2.6222
+    assert (lower.direction, lower.holds, lower.margin) == (usual.direction, usual.holds, usual.margin)
+
+
+def test_every_timed_env_is_a_case():
+    assert set(env_step.ACTIVE) <= set(PROTECTED)
+
+
+def test_trainings_in_turn():
+    pytest.importorskip("stable_baselines3")
+    from benchmarks import training_time
+
+    found = training_time.compare("pointgoal1_300k", steps=1)
+    assert found["steps"] == 1024
+    assert found["filtered_s"] > 0.0 and found["without_s"] > 0.0
+    assert found["median"] == pytest.approx(found["filtered_s"] / found["without_s"])

@@ -1,0 +1,138 @@
+"""The cases of the benchmarks: every recipe has one, its judge means the recipe's limits, its drivers are seeded."""
+
+import numpy as np
+import pytest
+
+import safe_wrappers as sw
+from benchmarks.cases import HARD, PROTECTED
+from benchmarks.descriptions import constrained, promised, reserve
+from benchmarks.judges import Reported
+from safe_wrappers.recipes import RECIPES
+
+CASES = PROTECTED | HARD
+BLIND = ("random", "bang-bang", "pulse")
+
+
+def make(case):
+    if "Maze" in case.env_id:
+        pytest.importorskip("gymnasium_robotics")
+    return case.make()
+
+
+def family(env_id):
+    plain = env_id.rpartition("-v")[0].partition("_")[0]
+    return plain.removeprefix("Safe").removesuffix("Velocity") if plain.endswith("Velocity") else plain
+
+
+def test_every_recipe_has_a_case():
+    assert {family(case.env_id) for case in PROTECTED.values()} == set(RECIPES)
+
+
+@pytest.mark.parametrize("name", [n for n in CASES if not n.startswith("SafePointGoal")])
+def test_the_judge_means_the_limit_that_the_filter_keeps(name):
+    case = CASES[name]
+    env = case.protect(make(case))
+    env.reset(seed=0)
+    raw = env.unwrapped
+    for constraint in env.constraints:
+        judge = case.judge(raw)
+        match constraint:
+            case sw.SpeedLimit():
+                assert isinstance(judge, Reported)
+                info = {"x_velocity": constraint.limit, "y_velocity": 0.0}
+                assert judge.after(np.zeros(1), info) == 0.0
+                plane = judge.after(np.zeros(1), {"x_velocity": 0.0, "y_velocity": constraint.limit})
+                assert (plane == 0.0) == (constraint.direction == "xy")
+            case sw.JointSpeedLimit():
+                raw.data.qvel[raw.model.jnt_dofadr[raw.model.actuator_trnid[:, 0]]] = constraint.limit
+                assert judge.start() == pytest.approx(0.0, abs=1e-12)
+                raw.data.qvel[:] = 0.0
+            case sw.Clearance():
+                ends = sorted(o.point[0] for o in constraint.obstacles)
+                for end in ends:
+                    raw.data.qpos[0] = end
+                    assert judge.start() == pytest.approx(0.0, abs=1e-12)
+                assert len(ends) == 2
+            case sw.Workspace():
+                # Somewhere along random poses: what the constraint calls negative, the judge calls missed.
+                seen = set()
+                rng = np.random.default_rng(0)
+                for _ in range(300):
+                    if "Maze" in name:
+                        raw.data.qpos[:2] = rng.uniform(-6.0, 6.0, 2)
+                    else:
+                        joints = raw.model.actuator_trnid[:, 0]
+                        low, high = raw.model.jnt_range[joints].T
+                        unlimited = low == high
+                        raw.data.qpos[raw.model.jnt_qposadr[joints]] = rng.uniform(
+                            np.where(unlimited, -3.0, low), np.where(unlimited, 3.0, high)
+                        )
+                    env.plant.observe()
+                    constraint.reset()  # it was carried there, it did not move
+                    h, missed = float(constraint.value(env.plant).min()), judge.start()
+                    if "disc" in name or "Maze" in name:
+                        assert (h < 0.0) == (missed > 0.0)
+                    else:
+                        assert h == pytest.approx(-missed, abs=1e-9)
+                    seen.add(h < 0.0)
+                assert seen == {True, False}
+            case sw.WallClearance():
+                pass  # both read the walls from the model; tests/benchmarks/test_judges.py places the ball
+            case _:
+                raise AssertionError(f"no check for {constraint}")
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_drivers_are_deterministic_by_seed_and_inside_the_box(name):
+    case = CASES[name]
+    if name in HARD and name in PROTECTED:
+        pytest.skip("the same case")
+
+    def actions(driver, seed):
+        env.reset(seed=3)
+        act = case.drivers[driver](env.unwrapped, np.random.default_rng(seed))
+        found = []
+        for _ in range(8):
+            found.append(np.array(act(), dtype=env.action_space.dtype))
+            env.step(found[-1])
+        return np.array(found)
+
+    env = make(case)
+    for driver in case.drivers:
+        first = actions(driver, 5)
+        assert np.isfinite(first).all()
+        assert (first >= env.action_space.low).all() and (first <= env.action_space.high).all()
+        assert np.array_equal(first, actions(driver, 5)), driver
+        if driver in BLIND:
+            assert any(not np.array_equal(first, actions(driver, seed)) for seed in (6, 7, 8)), driver
+
+
+TABLE = "inside (-0.2, -1.2, -0.3) to (0.9, 0.15, 0.4) m"
+DISCS = "hazard_positions (0.2 m) and vase_positions (0.3 m)"
+
+
+@pytest.mark.parametrize("name, words, promise, margin", [
+    ("SafePointGoal2-v0", f"stopping path clear of {DISCS}", "proved", "4 mm"),
+    ("InvertedPendulum-v5, on after the fall",
+     "cart clear of the end at -0.95 m and the end at 0.95 m, with room to brake", "best effort", "10 mm"),
+    ("Reacher-v5", "joint speeds below 5 rad/s", "best effort", "0.01 rad/s"),
+    ("Pusher-v5", f"joint speeds below 6 rad/s; tips_arm {TABLE}", "best effort", "0.05 rad/s, 5 mm"),
+    ("SafeHumanoidVelocity-v0", "speed of the centre of mass (xy) below 1.4149 m/s", "best effort", "0.02 m/s"),
+    ("PointMaze_UMaze-v3", "braking path clear of the walls", "proved", "1 mm"),
+    ("Reacher-v5, with a disc",
+     "joint speeds below 5 rad/s; fingertip clear of a disc of 0.05 m at (-0.1, 0.1) m", "best effort",
+     "0.01 rad/s, 1 mm"),
+])  # fmt: skip
+def test_a_filter_in_words(name, words, promise, margin):
+    case = CASES[name]
+    env = case.protect(make(case))
+    assert (constrained(env), promised(env), reserve(env)) == (words, promise, margin)
+
+
+def test_every_constraint_of_a_case_has_words():
+    for case in CASES.values():
+        if "Maze" not in case.env_id:
+            words = constrained(case.protect(case.make()))
+            assert "sw." not in words and not any(
+                word in words for word in ("Limit", "Clearance", "Workspace")
+            )
