@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,12 +17,18 @@ _MOST_BINS = 40
 
 @dataclass(frozen=True)
 class Curve:
-    """One arm's metric over steps; no interval with one seed."""
+    """One arm's metric over B bins of steps; no interval with one seed."""
 
     steps: NDArray[np.float64]
+    """(B,)"""
     iqm: NDArray[np.float64]
+    """(B,): over seeds."""
     low: NDArray[np.float64] | None
+    """(B,)"""
     high: NDArray[np.float64] | None
+    """(B,)"""
+    seeds: NDArray[np.float64]
+    """(seeds, B): each seed's own."""
 
 
 def learning_curve(experiment: ExperimentConfig, arm: ArmConfig, metric: str) -> Curve | None:
@@ -51,7 +56,40 @@ def learning_curve(experiment: ExperimentConfig, arm: ArmConfig, metric: str) ->
         means = np.array([_bin_means(run, edges) for run in runs])
         if np.isfinite(means).all():
             break
-    return Curve((edges[:-1] + edges[1:]) / 2, interquartile_mean(means, axis=0), *_interval(means))
+    low, high = _interval(means)
+    return Curve((edges[:-1] + edges[1:]) / 2, interquartile_mean(means, axis=0), low, high, means)
+
+
+def event_rate(
+    experiment: ExperimentConfig, arm: ArmConfig, event: str
+) -> tuple[NDArray[np.float64], NDArray[np.float64], int] | None:
+    """How often something happened while training, all seeds together.
+
+    Args:
+        experiment: Where the runs lie.
+        arm: Which arm.
+        event: A column of `episodes.csv` that counts steps, such as `infeasible`.
+
+    Returns:
+        Edges of bins of training steps, shape (B + 1,), events per 1000 steps in each, shape (B,), NaN where
+        no episode ended, and their number in all; None without any episode.
+    """
+    rows = np.array(
+        [
+            (row["timesteps"], row[event], row["length"])
+            for seed in experiment.seeds
+            for row in read_rows(experiment.run_folder(arm, seed) / "episodes.csv")
+        ]
+    )
+    if not rows.size:
+        return None
+    ends, events, lengths = rows.T
+    edges = np.linspace(0, ends.max(), _MOST_BINS + 1)
+    at = np.searchsorted(edges[1:-1], ends)
+    counts, steps = (np.bincount(at, weights=values, minlength=_MOST_BINS) for values in (events, lengths))
+    rates = np.full(_MOST_BINS, np.nan)
+    np.divide(1000 * counts, steps, out=rates, where=steps > 0)
+    return edges, rates, int(events.sum())
 
 
 def _bin_means(run: NDArray[np.float64], edges: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -63,7 +101,7 @@ def _bin_means(run: NDArray[np.float64], edges: NDArray[np.float64]) -> NDArray[
     return means
 
 
-def _interval(means: NDArray[np.float64]) -> Sequence[NDArray[np.float64] | None]:
+def _interval(means: NDArray[np.float64]) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
     if len(means) < 2:
         return None, None
     interval = stats.bootstrap(

@@ -8,28 +8,38 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from safe_wrappers import interventions as keys
 from safe_wrappers.wrappers.record_interventions import COLUMNS
 
 from .atomic import write_json
-from .checkpoint import Checkpoint
 from .config import ArmConfig, EvaluationConfig, FilterConfig
+from .policy import TrainedPolicy
 from .run import Progress, finished_checkpoint
 from .scene import Scene, SceneRecorder, save_scenes
 from .stack import make_stack
+from .step_log import StepLog, StepRecorder, load_steps, save_steps
 from .tables import write_rows
 
 EVALUATION_COLUMNS: Final = ("episode_seed", *COLUMNS)
 STATE_FILE: Final = "evaluation.json"
+_RECORDING: Final = 1
+"""What is kept of an evaluation; a folder that another version filled is evaluated anew when asked to."""
 
 
 def evaluation_folder(run_folder: Path) -> Path:
-    """Where a run's evaluation lies: `filter_off.csv`, `filter_on.csv`, and the scenes beside them."""
+    """Where a run's evaluation lies.
+
+    Per condition (`filter_off`, `filter_on`) a table of episodes `.csv`, the steps `_steps.npz`
+    (`safe_wrappers.train.step_log`), and for tasks seen from above the scenes `.npz`.
+    """
     return run_folder / "evaluation"
+
+
+def evaluated_steps(run_folder: Path, condition: str) -> StepLog | None:
+    """The steps of a run's evaluation; None if it was not evaluated, or by a version that kept none."""
+    return load_steps(evaluation_folder(run_folder) / f"{condition}_steps.npz")
 
 
 def evaluate_run(
@@ -66,15 +76,18 @@ def evaluate_run(
         "settings": asdict(settings),
         "filter": asdict(action_filter),
         "timesteps": checkpoint.timesteps,
+        "recording": _RECORDING,
     }
     if (out / STATE_FILE).exists() and json.loads((out / STATE_FILE).read_text()) == state:
         return
     (out / STATE_FILE).unlink(missing_ok=True)  # from here on the rows may be of two settings
+    policy = TrainedPolicy(arm, checkpoint)
     logger = configure(str(folder / "tensorboard"), ["tensorboard"])
     for at, (condition, used) in enumerate(conditions.items()):
+        evaluation = _Evaluation(arm, used)
         rows: list[dict[str, Any]] = []
         scenes: dict[int, Scene] = {}
-        for row, scene in _episodes(arm, checkpoint, settings, used):
+        for row, scene in evaluation.episodes(policy, settings):
             rows.append(row)
             if scene is not None:
                 scenes[int(row["episode_seed"])] = scene
@@ -85,39 +98,37 @@ def evaluate_run(
         logger.dump(checkpoint.timesteps)
         write_rows(out / f"{condition}.csv", EVALUATION_COLUMNS, rows)
         save_scenes(out / f"{condition}.npz", scenes)
+        save_steps(out / f"{condition}_steps.npz", evaluation.steps.finish())
     logger.close()
     write_json(out / STATE_FILE, state)
 
 
-def _episodes(
-    arm: ArmConfig, checkpoint: Checkpoint, settings: EvaluationConfig, used: FilterConfig
-) -> Iterator[tuple[dict[str, Any], Scene | None]]:
-    policy = _Policy(arm, checkpoint)
-    env = make_stack(arm.env, used)
-    try:
-        for episode_seed in range(settings.seed, settings.seed + settings.episodes):
-            observation, _ = env.reset(seed=episode_seed)
-            scene = SceneRecorder(env)
-            done = False
-            while not done:
-                observation, _, terminated, truncated, info = env.step(policy(observation))
-                scene.step(info)
-                done = terminated or truncated
-            yield {"episode_seed": episode_seed, **info[keys.EPISODE_SUMMARY]}, scene.finish()
-    finally:
-        env.close()
+class _Evaluation:
+    """The episodes of one condition, and the steps recorded on the way."""
 
+    def __init__(self, arm: ArmConfig, used: FilterConfig) -> None:
+        self._env = make_stack(arm.env, used)
+        self.steps = StepRecorder(self._env)
 
-class _Policy:
-    """The trained policy with the observation scaling that it was trained with, frozen."""
+    def episodes(
+        self, policy: TrainedPolicy, settings: EvaluationConfig
+    ) -> Iterator[tuple[dict[str, Any], Scene | None]]:
+        try:
+            for episode_seed in range(settings.seed, settings.seed + settings.episodes):
+                yield self._episode(policy, episode_seed)
+        finally:
+            self._env.close()
 
-    def __init__(self, arm: ArmConfig, checkpoint: Checkpoint) -> None:
-        self.model: BaseAlgorithm = checkpoint.load_model(arm.algorithm, None, arm.device)
-        scaled = checkpoint.load_normalize(DummyVecEnv([lambda: make_stack(arm.env, FilterConfig())]))
-        self.normalize = scaled if isinstance(scaled, VecNormalize) else None
-        scaled.close()
-
-    def __call__(self, observation: Any) -> Any:
-        if self.normalize is not None:
-            observation = self.normalize.normalize_obs(observation)
-        return self.model.predict(observation, deterministic=True)[0]
+    def _episode(self, policy: TrainedPolicy, episode_seed: int) -> tuple[dict[str, Any], Scene | None]:
+        observation, _ = self._env.reset(seed=episode_seed)
+        self.steps.begin(episode_seed)
+        scene = SceneRecorder(self._env)
+        done = False
+        while not done:
+            self.steps.before(observation)
+            action = policy(observation)
+            observation, _, terminated, truncated, info = self._env.step(action)
+            self.steps.after(action, info)
+            scene.step(info)
+            done = terminated or truncated
+        return {"episode_seed": episode_seed, **info[keys.EPISODE_SUMMARY]}, scene.finish()

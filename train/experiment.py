@@ -13,6 +13,7 @@ from .parallel import Job, run_jobs
 from .run import check_finished, claim_folder, train_run
 from .stack import make_stack
 from .summary import Summary, summarize, write_summary
+from .videos import record_videos
 
 
 def train_experiment(experiment: ExperimentConfig, console: Console) -> None:
@@ -32,7 +33,7 @@ def train_experiment(experiment: ExperimentConfig, console: Console) -> None:
 
 
 def evaluate_experiment(experiment: ExperimentConfig, console: Console) -> None:
-    """Evaluates every trained run on the same episode seeds, filter off and on.
+    """Evaluates every trained run on the same episode seeds, filter off and on, and films one episode.
 
     Raises:
         RunStateError: A run is not trained to its end; nothing has been started.
@@ -45,6 +46,7 @@ def evaluate_experiment(experiment: ExperimentConfig, console: Console) -> None:
     episodes = conditions * experiment.evaluation.episodes
     arguments = (experiment.evaluation, experiment.evaluation_filter)
     _run(experiment, console, "Evaluation", lambda _: episodes, "episodes", evaluate_run, arguments)
+    record_videos(experiment, console)
 
 
 def summarize_experiment(experiment: ExperimentConfig) -> Summary:

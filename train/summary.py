@@ -21,7 +21,7 @@ CONDITIONS: Final = {
     "filter_off": "Evaluation, filter off",
     "filter_on": "Evaluation, filter on",
 }
-TOTALS: Final = ("violations", "infeasible", "fallback")
+TOTALS: Final = ("violations", "infeasible", "fallback", "unsafe")
 METRICS: Final = {
     "return": "Return / episode",
     "cost": "Cost / episode",
@@ -32,13 +32,21 @@ METRICS: Final = {
     "correction_p95": "Correction, 95th pct.",
     "infeasible": "Infeasible steps, total",
     "fallback": "Fallback steps, total",
+    "unsafe": "Steps begun with h < 0, total",
     "goals_reached": "Goals / episode",
 }
 """What is reported. Totals are over a condition's episodes; all else is the mean over its episodes of the
 episode's value (so `correction_p95` is the mean of the episodes' percentiles)."""
 
 
-OF_THE_FILTER: Final = ("intervention_rate", "correction_mean", "correction_p95", "infeasible", "fallback")
+OF_THE_FILTER: Final = (
+    "intervention_rate",
+    "correction_mean",
+    "correction_p95",
+    "infeasible",
+    "fallback",
+    "unsafe",
+)
 """Left out where no filter is on: a zero there would say nothing."""
 
 

@@ -5,7 +5,6 @@ import time
 
 import gymnasium as gym
 import numpy as np
-import torch
 from gymnasium.spaces import Box
 
 from safe_wrappers import interventions as keys
@@ -85,6 +84,8 @@ gym.register("FakeGoal-v0", "fake_task:FakeGoal")
 
 def count(steps, progress):
     """A job for `run_jobs`."""
+    import torch  # only here: a process that draws one frame should not wait for it
+
     for at in range(0, steps + 1, max(steps // 4, 1)):
         progress.steps(at)
         time.sleep(0.05)
@@ -101,3 +102,29 @@ def fail(progress):
 def crash(progress):
     """A job with a mistake in it."""
     raise ValueError("nobody expected this")
+
+
+class FilmedGoal(FakeGoal):
+    """The same task seen from above in 60 by 80 pixels: the background tells the step, a dot the place."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+
+    def __init__(self, render_mode=None, trouble=""):
+        super().__init__()
+        self.render_mode = render_mode
+        self.trouble = trouble
+
+    def render(self):
+        if self.trouble == "raise":
+            raise RuntimeError("no display")
+        if self.trouble == "abort":
+            os.abort()
+        if self.trouble == "hang":
+            time.sleep(60)
+        frame = np.full((60, 80, 3), 5 * self._steps, np.uint8)
+        column, row = (np.clip(self._at * (20, 15) + (40, 30), 1, 58)).astype(int)
+        frame[row - 1 : row + 2, column - 1 : column + 2] = (255, 0, 0)
+        return frame
+
+
+gym.register("FilmedGoal-v0", "fake_task:FilmedGoal", max_episode_steps=20)

@@ -33,7 +33,7 @@ def wait_for(condition, seconds=60.0):
 
 def test_compare_from_nothing_to_the_report_in_parallel_processes(tmp_path):
     process = start("compare", f"output={tmp_path}", "seeds=[0]", "workers=2", "--report")
-    out, err = process.communicate(timeout=120)
+    out, err = process.communicate(timeout=300)
     assert process.returncode == 0, err
     assert "training filtered seed 0: done" in out
     assert "evaluation unfiltered seed 0: done" in out

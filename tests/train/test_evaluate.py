@@ -5,7 +5,7 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from safe_wrappers.errors import RunStateError
-from safe_wrappers.train.evaluate import evaluate_run
+from safe_wrappers.train.evaluate import evaluate_run, evaluated_steps
 from safe_wrappers.train.run import Progress, train_run
 from safe_wrappers.train.scene import load_scenes
 from safe_wrappers.train.tables import read_rows
@@ -52,6 +52,40 @@ def test_scenes_hold_what_the_picture_needs(fake_experiment):
     assert scene.vases.tolist() == [[0.5, 0.6]]
 
 
+def test_the_steps_agree_with_the_table(fake_experiment):
+    experiment = fake_experiment("arms.filtered.filter.kwargs.margin=0.6")  # so wide that it acts at once
+    folder = evaluate(experiment, 1)
+    changed = 0
+    for condition in ("filter_off", "filter_on"):
+        log = evaluated_steps(folder.parent, condition)
+        rows = read_rows(folder / f"{condition}.csv")
+        assert len(log) == sum(row["length"] for row in rows)
+        for row in rows:
+            at = log.episode_seed == row["episode_seed"]
+            assert log.step[at].tolist() == list(range(int(row["length"])))
+            assert log.intervened[at].mean() == pytest.approx(row["intervention_rate"])
+            assert log.correction[at].mean() == pytest.approx(row["correction_mean"])
+            assert log.violated[at].sum() == row["violations"]
+            assert log.cost[at].sum() == row["cost"]
+            changed += log.intervened[at].sum()
+        # Where the steps began is where the scenes were.
+        scenes = load_scenes(folder / f"{condition}.npz")
+        assert log.coordinates[:20, :2] == pytest.approx(scenes[100].agent[:-1], abs=1e-6)
+    assert list(log.coordinate_names[:2]) == ["x (m)", "y (m)"]
+    assert changed > 0
+
+
+def test_an_evaluation_of_an_earlier_version_is_made_anew(fake_experiment):
+    folder = evaluate(fake_experiment(), 1)
+    state = json.loads((folder / "evaluation.json").read_text())
+    del state["recording"]
+    (folder / "evaluation.json").write_text(json.dumps(state))
+    (folder / "filter_on_steps.npz").unlink()
+    assert evaluated_steps(folder.parent, "filter_on") is None
+    evaluate(fake_experiment(), 1)
+    assert len(evaluated_steps(folder.parent, "filter_on")) == 60
+
+
 def test_done_once_and_again_when_its_settings_change(fake_experiment):
     folder = evaluate(fake_experiment(), 1)
     before = (folder / "filter_on.csv").stat().st_mtime_ns
@@ -93,6 +127,7 @@ def test_without_any_filter_only_one_condition(fake_experiment):
         "evaluation.json",
         "filter_off.csv",
         "filter_off.npz",
+        "filter_off_steps.npz",
     ]
 
 

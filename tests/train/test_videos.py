@@ -1,0 +1,139 @@
+import io
+import os
+
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+
+from safe_wrappers.train import videos
+from safe_wrappers.train.evaluate import evaluate_run, evaluation_folder
+from safe_wrappers.train.film import HEIGHT
+from safe_wrappers.train.parallel import RunsFailedError
+from safe_wrappers.train.rendering import Rendering
+from safe_wrappers.train.run import Progress, train_run
+from safe_wrappers.train.shown import shown_episode
+from safe_wrappers.train.tables import read_rows
+from safe_wrappers.train.videos import load_video, record_videos, video_path, video_problem
+
+SILENT = Progress(lambda steps: None, pytest.fail)
+ENV = "env=fake_task:FilmedGoal-v0"
+
+
+@pytest.fixture
+def evaluated(fake_experiment):
+    """The fake experiment with a task that draws frames, trained and evaluated, one seed."""
+
+    def make(*overrides):
+        experiment = fake_experiment(ENV, "seeds=[0]", "normalize.observation=false", *overrides)
+        for arm in experiment.arms:
+            folder = experiment.run_folder(arm, 0)
+            train_run(arm, 0, folder, SILENT)
+            evaluate_run(arm, 0, folder, experiment.evaluation, experiment.evaluation_filter, SILENT)
+        return experiment
+
+    return make
+
+
+@pytest.fixture
+def inline(monkeypatch):
+    """Jobs run in this process, without GL; returns their names as they come."""
+    names = []
+
+    def run(jobs, workers, console, title):
+        for job in jobs:
+            names.append(job.name)
+            job.call(*job.arguments, SILENT)
+
+    monkeypatch.setattr(videos, "run_jobs", run)
+    monkeypatch.setattr(videos, "find_rendering", lambda env: Rendering({}))
+    return names
+
+
+def said(experiment):
+    console = Console(file=io.StringIO(), width=400)
+    record_videos(experiment, console)
+    return console.file.getvalue()
+
+
+def test_every_arm_is_filmed_in_the_same_episode_with_the_filter_off_and_on(evaluated, inline):
+    experiment = evaluated()
+    assert said(experiment) == ""
+    shown = shown_episode(experiment)
+    assert sorted(inline) == [
+        f"video {arm} filter {state}" for arm in ("filtered", "unfiltered") for state in ("off", "on")
+    ]
+    for arm in experiment.arms:
+        for condition in ("filter_off", "filter_on"):
+            video = load_video(video_path(experiment, arm, condition))
+            rows = read_rows(evaluation_folder(experiment.run_folder(arm, 0)) / f"{condition}.csv")
+            (row,) = [row for row in rows if row["episode_seed"] == shown.episode_seed]
+            # The film is of the very episode that was evaluated.
+            assert (video.steps, video.violations) == (row["length"], row["violations"])
+            assert video.changed == pytest.approx(row["intervention_rate"] * row["length"])
+            frames = Image.open(io.BytesIO(video.animation))
+            assert frames.n_frames == 20
+            frames.seek(19)
+            background = np.asarray(frames.convert("RGB"))[10, 10]
+            assert background == pytest.approx([5 * 19] * 3, abs=6)
+            assert frames.height > HEIGHT
+            assert video.speed == 0.5  # 20 steps at 10 a second take 2 s; shown in 4
+    assert video_problem(experiment) == ""
+
+
+def test_a_film_is_made_once_and_again_for_another_episode(evaluated, inline):
+    experiment = evaluated()
+    said(experiment)
+    inline.clear()
+    said(experiment)
+    assert inline == []
+    video_path(experiment, experiment.arms[0], "filter_on").unlink()
+    said(experiment)
+    assert inline == ["video unfiltered filter on"]
+    inline.clear()
+    said(evaluated("evaluation.seed=500"))
+    assert len(inline) == 4
+
+
+def test_films_of_another_episode_are_gone_even_where_none_can_be_made(evaluated, inline, monkeypatch):
+    experiment = evaluated()
+    said(experiment)
+    monkeypatch.setattr(videos, "find_rendering", lambda env: Rendering({}, "no screen"))
+    again = evaluated("evaluation.seed=500")
+    assert said(again) == "No videos: no screen\n"
+    assert load_video(video_path(again, again.arms[0], "filter_off")) is None
+    assert video_problem(again) == "no screen"
+
+
+def test_a_task_without_frames_is_not_asked_for_any(evaluated, inline):
+    experiment = evaluated("env=fake_task:FakeGoal-v0")
+    line = "fake_task:FakeGoal-v0 draws no frames (it has no render mode rgb_array)."
+    assert said(experiment) == f"No videos: {line}\n"
+    assert video_problem(experiment) == line
+    assert inline == []
+
+
+def test_a_crash_while_filming_does_not_fail_the_evaluation(evaluated, inline, monkeypatch):
+    experiment = evaluated()
+
+    def crash(jobs, workers, console, title):
+        raise RunsFailedError("Videos: 1 of 4 failed.\nvideo: its process ended with exit code -6")
+
+    monkeypatch.setattr(videos, "run_jobs", crash)
+    assert said(experiment).startswith(
+        "No videos: filming fake_task:FilmedGoal-v0 failed: video: its process"
+    )
+
+
+def test_nothing_is_filmed_before_the_evaluation(fake_experiment, inline):
+    assert said(fake_experiment(ENV)) == ""
+    assert inline == []
+
+
+def test_in_processes_of_its_own_with_the_variables_of_the_rendering(evaluated, monkeypatch):
+    experiment = evaluated("arms={unfiltered: {filter: none}}")
+    monkeypatch.setattr(videos, "find_rendering", lambda env: Rendering({"MUJOCO_GL": "disabled"}))
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    assert "video unfiltered filter off: done" in said(experiment)
+    assert load_video(video_path(experiment, experiment.arms[0], "filter_off")).steps == 20
+    assert os.environ["MUJOCO_GL"] == "egl"

@@ -1,0 +1,33 @@
+"""A trained policy as it acts outside training: deterministic, with frozen observation scaling."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from .checkpoint import Checkpoint
+from .config import ArmConfig, FilterConfig
+from .stack import make_stack
+
+
+class TrainedPolicy:
+    """The policy of a checkpoint with the observation scaling that it was trained with.
+
+    Args:
+        arm: The arm that was trained.
+        checkpoint: Its policy.
+    """
+
+    def __init__(self, arm: ArmConfig, checkpoint: Checkpoint) -> None:
+        self._model: BaseAlgorithm = checkpoint.load_model(arm.algorithm, None, arm.device)
+        scaled = checkpoint.load_normalize(DummyVecEnv([lambda: make_stack(arm.env, FilterConfig())]))
+        self._normalize = scaled if isinstance(scaled, VecNormalize) else None
+        scaled.close()
+
+    def __call__(self, observation: Any) -> Any:
+        """The action for an observation as the env gives it."""
+        if self._normalize is not None:
+            observation = self._normalize.normalize_obs(observation)
+        return self._model.predict(observation, deterministic=True)[0]

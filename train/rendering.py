@@ -1,0 +1,69 @@
+"""Whether a task can draw frames on this machine, found out without risking this process."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from typing import Final
+
+from .config import EnvConfig
+
+_SECONDS: Final = 60.0
+"""A GL library that waits for a display never comes back."""
+_INSTALL: Final = (
+    "On Debian or Ubuntu: apt install libosmesa6, then safe-wrappers evaluate again with MUJOCO_GL=osmesa."
+)
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """Either the environment variables under which frames are drawn, or one line that says why none are."""
+
+    variables: dict[str, str]
+    problem: str = ""
+
+
+def find_rendering(env: EnvConfig) -> Rendering:
+    """Makes the task in a process of its own and asks it for a frame.
+
+    A GL library may abort the process, hang, or raise as soon as it is imported. MUJOCO_GL is respected where
+    it is set, "disabled" too; else Linux tries EGL, then OSMesa.
+
+    Args:
+        env: The task.
+    """
+    given = os.environ.get("MUJOCO_GL")
+    tried = [given] if given else (["egl", "osmesa"] if sys.platform == "linux" else [""])
+    reasons = []
+    for choice in tried:
+        variables = {"MUJOCO_GL": choice} if choice else {}
+        reason = _probe(env, variables)
+        if not reason:
+            return Rendering(variables)
+        reasons.append(f"MUJOCO_GL={choice}: {reason}" if choice else reason)
+    return Rendering({}, f"{env.id} could not draw a frame here ({'; '.join(reasons)}). {_INSTALL}")
+
+
+def _probe(env: EnvConfig, variables: dict[str, str]) -> str:
+    """What went wrong; empty if a frame was drawn."""
+    command = [sys.executable, "-m", f"{__package__}.render_probe", json.dumps([env.id, env.kwargs])]
+    try:
+        done = subprocess.run(
+            command,
+            env={**os.environ, **variables},
+            capture_output=True,
+            text=True,
+            timeout=_SECONDS,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return f"no frame within {_SECONDS:.0f} s"
+    if done.returncode == 0:
+        return ""
+    lines = done.stderr.strip().splitlines()
+    if done.returncode < 0 or not lines:
+        return f"the process ended with status {done.returncode}"
+    return lines[-1][:120]

@@ -1,0 +1,100 @@
+"""The numbers that the headline compares: one side without the filter, one with it."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..config import ArmConfig, ExperimentConfig
+from ..evaluate import evaluated_steps
+from ..run import FINISHED_FILE
+from ..shown import Pair, compared_pairs
+from ..summary import Estimate, Summary
+from ..truth import reports_cost
+
+
+@dataclass(frozen=True)
+class Side:
+    """One side: training where the arms differ there, and evaluation; totals over all seeds."""
+
+    steps: int
+    violations: int
+    infeasible: int
+    fallback: int
+    unsafe: int
+    returns: tuple[Estimate, ...]
+    """Of evaluation, one per compared arm; empty if one is missing."""
+    changed: float | None
+    """Share of evaluation steps that the filter changed."""
+
+    @property
+    def share(self) -> float:
+        """Of steps in violation."""
+        return self.violations / self.steps if self.steps else 0.0
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Both sides, and what they are of."""
+
+    pairs: tuple[Pair, ...]
+    off: Side
+    on: Side
+    judged: bool
+    """The task reports a cost, so that violations mean something."""
+
+    @property
+    def same_policies(self) -> bool:
+        """The two sides differ only in the filter at evaluation."""
+        return self.pairs[0].same_policy
+
+
+def compare(experiment: ExperimentConfig, summary: Summary) -> Comparison | None:
+    """The headline's comparison; None where the experiment has no filter, or nothing of a side is there.
+
+    An arm without a filter and one with it count with all their training and the evaluation that is theirs
+    (filter off, filter on). Where the policies are the same, only their evaluation is compared.
+    """
+    pairs = tuple(compared_pairs(experiment))
+    if not pairs:
+        return None
+    training = not pairs[0].same_policy
+    off = side(summary, [pair.bare for pair in pairs], "filter_off", training)
+    on = side(summary, [pair.filtered for pair in pairs], "filter_on", training)
+    return Comparison(pairs, off, on, reports_cost(experiment)) if off.steps and on.steps else None
+
+
+def side(summary: Summary, arms: Sequence[ArmConfig], condition: str, training: bool) -> Side:
+    """Totals and returns of some arms under a condition, with or without their training."""
+    names = [arm.name for arm in arms]
+    wanted = (condition, "training") if training else (condition,)
+    rows = [row for row in summary.per_seed if row["arm"] in names and row["condition"] in wanted]
+    totals = {
+        key: int(sum(row.get(key, 0) for row in rows))
+        for key in ("steps", "violations", "infeasible", "fallback", "unsafe")
+    }
+    cells = [summary.table[name][condition] for name in names]
+    rates = [cell["intervention_rate"].iqm for cell in cells if "intervention_rate" in cell]
+    return Side(
+        **totals,
+        returns=tuple(cell["return"] for cell in cells) if all("return" in cell for cell in cells) else (),
+        changed=float(np.mean(rates)) if rates else None,
+    )
+
+
+def filter_time_us(experiment: ExperimentConfig, pairs: Sequence[Pair]) -> float | None:
+    """The mean filter call of the filtered side, in training if it was there, else in evaluation."""
+    trained, evaluated = [], []
+    for pair in pairs:
+        for seed in experiment.seeds:
+            folder = experiment.run_folder(pair.filtered, seed)
+            if (folder / FINISHED_FILE).exists():
+                trained.append(json.loads((folder / FINISHED_FILE).read_text()).get("filter_time_us"))
+            log = evaluated_steps(folder, "filter_on")
+            evaluated.append(log.filter_time_us if log is not None else math.nan)
+    times = [time for time in trained if time is not None] or [time for time in evaluated if time == time]
+    return float(np.mean(times)) if times else None

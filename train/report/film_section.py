@@ -1,0 +1,57 @@
+"""The same episode on film, without and with the filter."""
+
+from __future__ import annotations
+
+from ..config import ArmConfig, ExperimentConfig
+from ..film import HEIGHT, STRIP, first_frame
+from ..videos import Video, load_video, video_path, video_problem
+from .markup import data_uri, keys, text
+
+_CONDITIONS = {"filter_off": "filter off", "filter_on": "filter on"}
+
+
+def films(experiment: ExperimentConfig) -> str:
+    """The videos that are there, or one line that says why there are none."""
+    found = [
+        (arm, words, video)
+        for arm in experiment.arms
+        for condition, words in _CONDITIONS.items()
+        if (video := load_video(video_path(experiment, arm, condition))) is not None
+    ]
+    problem = video_problem(experiment)
+    if not found:
+        why = (
+            problem
+            or "nothing has been filmed yet; safe-wrappers evaluate does, where the task can draw frames."
+        )
+        return f'<p class="line"><b>No videos.</b> {text(why[:1].upper() + why[1:])}</p>'
+    marks = keys(
+        {
+            "strip below: changed by the filter": ("film-changed", "fill"),
+            "in violation": ("film-violated", "fill"),
+            "left alone": ("film-bare", "fill"),
+        }
+    )
+    parts = "".join(_film(*item) for item in found)
+    more = f'<p class="line">{text(problem)}</p>' if problem else ""
+    return f'{marks}<div class="films">{parts}</div>{more}'
+
+
+def _film(arm: ArmConfig, words: str, video: Video) -> str:
+    title = f"{arm.name}, {words}"
+    hurt = "" if video.violations is None else f"{video.violations:,} in violation, "
+    said = f"Of {video.steps:,} steps {hurt}{video.changed:,} changed; shown {_speed(video.speed)}."
+    still = data_uri("image/webp", first_frame(video.animation))
+    moving = data_uri("image/webp", video.animation)
+    return (
+        f"<figure><h3>{text(title)}</h3><picture>"
+        f'<source media="(prefers-reduced-motion: reduce), print" srcset="{still}">'
+        f'<img src="{moving}" height="{HEIGHT + STRIP}" alt="{text(f"Video: {title}. {said}")}"></picture>'
+        f"<figcaption>{text(said)}</figcaption></figure>"
+    )
+
+
+def _speed(times: float) -> str:
+    if 0.95 <= times <= 1.05:
+        return "in real time"
+    return f"{times:.1f} times faster than real" if times > 1 else f"{1 / times:.1f} times slower than real"

@@ -1,0 +1,60 @@
+"""How a page was made: the command, the versions, every setting."""
+
+from __future__ import annotations
+
+import platform
+from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
+from typing import Final
+
+import yaml
+
+from ..config import ExperimentConfig
+from .markup import details, table, text
+
+_PACKAGES: Final = (
+    "safe-wrappers",
+    "gymnasium",
+    "mujoco",
+    "stable-baselines3",
+    "torch",
+    "numpy",
+    "qpsolvers",
+    "daqp",
+)
+
+
+def how_it_was_made(command: str) -> str:
+    """The command, if it is known, and the versions that wrote the page."""
+    rows = [("python", platform.python_version())]
+    for package in _PACKAGES:
+        try:
+            rows.append((package, version(package)))
+        except PackageNotFoundError:
+            continue
+    made = f"<pre>{text(command)}</pre>" if command else ""
+    versions = table(["package", "version"], rows)
+    return made + details("Versions that wrote this page", versions)
+
+
+def settings(experiment: ExperimentConfig) -> str:
+    """Every setting, as YAML."""
+    values = asdict(experiment)
+    values |= {
+        "output": str(experiment.output),
+        "arms": list(values["arms"]),
+        "seeds": list(experiment.seeds),
+    }
+    return f"<pre>{text(yaml.safe_dump(values, sort_keys=False))}</pre>"
+
+
+def about(experiment: ExperimentConfig) -> str:
+    """What was trained on what, for how long, and how it was judged; one sentence."""
+    kinds = ", ".join(dict.fromkeys(f"{arm.algorithm} on {arm.env.id}" for arm in experiment.arms))
+    steps = sorted({arm.total_steps for arm in experiment.arms})
+    how_long = f"{steps[0]:,}" if len(steps) == 1 else f"{steps[0]:,} to {steps[-1]:,}"
+    seeds = len(experiment.seeds)
+    return (
+        f"{kinds}, {how_long} steps, {seeds} seed{'s' * (seeds > 1)}; evaluation on"
+        f" {experiment.evaluation.episodes} episodes, the same ones for every arm and seed."
+    )

@@ -1,0 +1,223 @@
+"""The same episode on film: every arm's policy, without and with the filter."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from rich.console import Console
+
+from safe_wrappers import interventions as keys
+from safe_wrappers.errors import ConfigurationError
+
+from .atomic import write_bytes, write_json
+from .config import ArmConfig, EnvConfig, ExperimentConfig, FilterConfig
+from .film import Film, encode, speed_of, stride_of
+from .parallel import Job, RunsFailedError, run_jobs
+from .policy import TrainedPolicy
+from .rendering import find_rendering
+from .run import Progress, finished_checkpoint
+from .shown import ShownEpisode, shown_episode
+from .stack import make_stack
+
+_PROBLEM: Final = "problem.json"
+
+
+@dataclass(frozen=True)
+class Video:
+    """One episode on film and what is to be said of it."""
+
+    animation: bytes
+    steps: int
+    speed: float
+    changed: int
+    violations: int | None
+    """None for a task that reports no cost."""
+
+
+def video_path(experiment: ExperimentConfig, arm: ArmConfig, condition: str) -> Path:
+    """Where a video lies; its facts are beside it, `.json`."""
+    return experiment.folder / "videos" / f"{arm.name}_{condition}.webp"
+
+
+def load_video(path: Path) -> Video | None:
+    """Reads a video back; None if there is none."""
+    facts = path.with_suffix(".json")
+    if not (path.exists() and facts.exists()):
+        return None
+    values = json.loads(facts.read_text())
+    return Video(
+        path.read_bytes(), **{key: values[key] for key in ("steps", "speed", "changed", "violations")}
+    )
+
+
+def video_problem(experiment: ExperimentConfig) -> str:
+    """The one line that says why there are no videos; empty if nothing is known to stand against them."""
+    path = experiment.folder / "videos" / _PROBLEM
+    return str(json.loads(path.read_text())["problem"]) if path.exists() else ""
+
+
+def record_videos(experiment: ExperimentConfig, console: Console) -> None:
+    """Films the shown episode for every arm and condition that is not on film yet.
+
+    Nothing here fails an evaluation: where no frame can be drawn, one line says why, on the console and later
+    in the report.
+    """
+    shown = shown_episode(experiment)
+    if shown is None:
+        return
+    problem = ""
+    for env in dict.fromkeys(json.dumps(asdict(arm.env)) for arm in experiment.arms):
+        config = EnvConfig(**json.loads(env))
+        arms = [arm for arm in experiment.arms if arm.env == config]
+        problem = _record_arms(experiment, arms, config, shown, console) or problem
+    path = experiment.folder / "videos" / _PROBLEM
+    path.unlink(missing_ok=True)
+    if problem:
+        write_json(path, {"problem": problem})
+        console.print(f"No videos: {problem}", highlight=False, soft_wrap=True, markup=False)
+
+
+def _record_arms(
+    experiment: ExperimentConfig, arms: list[ArmConfig], env: EnvConfig, shown: ShownEpisode, console: Console
+) -> str:
+    """Films arms of one env; returns what stood against it."""
+    jobs = [
+        Job(
+            f"video {arm.name} {condition.replace('_', ' ')}",
+            1,
+            "episodes",
+            record_video,
+            (
+                arm,
+                shown,
+                experiment.run_folder(arm, shown.seed),
+                used,
+                video_path(experiment, arm, condition),
+            ),
+        )
+        for arm in arms
+        for condition, used in _conditions(experiment, arm).items()
+        if not _up_to_date(experiment, arm, condition, used, shown)
+    ]
+    if not jobs:
+        return ""
+    for job in jobs:  # a film of another policy or episode must not be taken for this one
+        job.arguments[-1].unlink(missing_ok=True)
+    if "rgb_array" not in _render_modes(env):
+        return f"{env.id} draws no frames (it has no render mode rgb_array)."
+    rendering = find_rendering(env)
+    if rendering.problem:
+        return rendering.problem
+    try:
+        with _environment(rendering.variables):
+            run_jobs(jobs, experiment.workers, console, "Videos")
+    except RunsFailedError as error:
+        return f"filming {env.id} failed: {str(error).strip().splitlines()[-1]}"
+    return ""
+
+
+def record_video(
+    arm: ArmConfig, shown: ShownEpisode, run_folder: Path, used: FilterConfig, path: Path, progress: Progress
+) -> None:
+    """Runs one episode and writes its film and its facts.
+
+    Args:
+        arm: Whose policy.
+        shown: Which seed and episode.
+        run_folder: The run's folder.
+        used: The filter that is on.
+        path: The film's.
+        progress: Where to report to.
+    """
+    checkpoint = finished_checkpoint(arm, shown.seed, run_folder)
+    policy = TrainedPolicy(arm, checkpoint)
+    env = make_stack(EnvConfig(arm.env.id, {**arm.env.kwargs, "render_mode": "rgb_array"}), used)
+    # One speed for all conditions, also where one of them ends early.
+    longest = env.spec.max_episode_steps if env.spec is not None else None
+    judged = False
+    film = Film(stride=stride_of(longest or 1))
+    try:
+        observation, _ = env.reset(seed=shown.episode_seed)
+        done = False
+        while not done:
+            if film.wants_frame:
+                film.add_frame(env.render())  # type: ignore[arg-type]
+            observation, _, terminated, truncated, info = env.step(policy(observation))
+            film.add_step(
+                bool(info.get(keys.CBF_INTERVENED, False)),
+                info.get(keys.COST, 0) > 0 or info.get(keys.COST_SUBSTEP, 0) > 0,
+            )
+            judged |= keys.COST in info
+            done = terminated or truncated
+        fps = float(env.metadata.get("render_fps") or 30.0)
+    finally:
+        env.close()
+    speed = speed_of(longest or len(film.changed), fps)
+    write_bytes(path, encode(film, fps, speed))
+    facts = {
+        "state": _state(arm, used, shown, checkpoint.timesteps),
+        "steps": len(film.changed),
+        "speed": speed,
+        "changed": sum(film.changed),
+        "violations": sum(film.violated) if judged else None,
+    }
+    write_json(path.with_suffix(".json"), facts)
+    progress.steps(1)
+
+
+def _conditions(experiment: ExperimentConfig, arm: ArmConfig) -> dict[str, FilterConfig]:
+    used = arm.filter if arm.filter.kind != "none" else experiment.evaluation_filter
+    return {"filter_off": FilterConfig()} | ({"filter_on": used} if used.kind != "none" else {})
+
+
+def _state(arm: ArmConfig, used: FilterConfig, shown: ShownEpisode, timesteps: int) -> dict[str, Any]:
+    return {
+        "arm": arm.fingerprint(),
+        "filter": asdict(used),
+        "seed": shown.seed,
+        "episode_seed": shown.episode_seed,
+        "timesteps": timesteps,
+    }
+
+
+def _up_to_date(
+    experiment: ExperimentConfig, arm: ArmConfig, condition: str, used: FilterConfig, shown: ShownEpisode
+) -> bool:
+    path = video_path(experiment, arm, condition)
+    facts = path.with_suffix(".json")
+    if not (path.exists() and facts.exists()):
+        return False
+    timesteps = finished_checkpoint(arm, shown.seed, experiment.run_folder(arm, shown.seed)).timesteps
+    expected = json.loads(json.dumps(_state(arm, used, shown, timesteps)))
+    return bool(json.loads(facts.read_text())["state"] == expected)
+
+
+def _render_modes(env: EnvConfig) -> tuple[str, ...]:
+    try:
+        made = make_stack(env, FilterConfig())
+    except ConfigurationError:
+        return ()
+    modes = tuple(made.unwrapped.metadata.get("render_modes") or ())
+    made.close()
+    return modes
+
+
+@contextmanager
+def _environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Environment variables for the processes that are started inside."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
