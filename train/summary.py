@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -24,26 +24,33 @@ CONDITIONS: Final = {
 TOTALS: Final = ("violations", "infeasible", "fallback", "unsafe")
 METRICS: Final = {
     "return": "Return / episode",
+    "length": "Steps / episode",
     "cost": "Cost / episode",
     "cost_substep": "Cost in substeps / episode",
     "violations": "Steps in violation, total",
+    "violations_per_1000": "Steps in violation / 1000",
     "intervention_rate": "Share of steps changed",
     "correction_mean": "Correction, mean",
     "correction_p95": "Correction, 95th pct.",
     "infeasible": "Infeasible steps, total",
+    "infeasible_per_1000": "Infeasible steps / 1000",
     "fallback": "Fallback steps, total",
     "unsafe": "Steps begun with h < 0, total",
     "goals_reached": "Goals / episode",
 }
-"""What is reported. Totals are over a condition's episodes; all else is the mean over its episodes of the
-episode's value (so `correction_p95` is the mean of the episodes' percentiles)."""
+"""What is reported. Totals and rates per 1000 steps are over a condition's episodes; all else is the mean over its
+episodes of the episode's value (so `correction_p95` is the mean of the episodes' percentiles)."""
 
+
+PER_1000: Final = {"violations_per_1000": "violations", "infeasible_per_1000": "infeasible"}
+"""Episodes that end early have less time for violations: rates are over all steps, whatever the episodes."""
 
 OF_THE_FILTER: Final = (
     "intervention_rate",
     "correction_mean",
     "correction_p95",
     "infeasible",
+    "infeasible_per_1000",
     "fallback",
     "unsafe",
 )
@@ -170,15 +177,14 @@ def _episode_file(run_folder: Path, condition: str) -> Path:
 
 
 def _seed_row(episodes: Sequence[Mapping[str, float]]) -> dict[str, Any]:
-    combine: dict[str, Callable[..., Any]] = {
-        metric: np.sum if metric in TOTALS else np.mean for metric in METRICS
-    }
-    return {
-        "episodes": len(episodes),
-        "steps": int(sum(episode["length"] for episode in episodes)),
-        **{
-            metric: float(function([episode[metric] for episode in episodes]))
-            for metric, function in combine.items()
-            if all(metric in episode for episode in episodes)
-        },
-    }
+    steps = sum(episode["length"] for episode in episodes)
+    row: dict[str, Any] = {"episodes": len(episodes), "steps": int(steps)}
+    for metric in METRICS:
+        source = PER_1000.get(metric, metric)
+        if all(source in episode for episode in episodes):
+            values = [episode[source] for episode in episodes]
+            if metric in PER_1000:
+                row[metric] = 1000.0 * float(np.sum(values)) / steps
+            else:
+                row[metric] = float(np.sum(values) if metric in TOTALS else np.mean(values))
+    return row

@@ -88,7 +88,10 @@ def test_summary_of_rows(fake_experiment):
     bare, filtered = summary.table["unfiltered"], summary.table["filtered"]
     assert bare["training"]["cost"] == Estimate(1.5, 1.0, 2.0, 2)  # mean over episodes, then over seeds
     assert bare["training"]["violations"].iqm == 4.0  # a total
+    assert bare["training"]["violations_per_1000"].iqm == 1000.0 * 4 / 20  # over all steps, not over episodes
     assert "intervention_rate" not in bare["training"]  # no filter was on
+    assert "infeasible_per_1000" not in bare["training"]
+    assert filtered["training"]["infeasible_per_1000"].iqm == 0.0
     assert filtered["training"]["intervention_rate"].iqm == 0.5
     assert bare["filter_on"]["return"] == Estimate(7.0, None, None, 1)
     assert filtered["filter_on"] == bare["filter_off"] == {}
