@@ -181,6 +181,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
             self._warn_once("nonfinite", f"the policy's action is not finite ({proposed}); the fallback acts")
             proposed = np.where(np.isfinite(proposed), proposed, 0.0)
             decision = self._decider.without_proposal(self._last)
+        intervened = decision.changed
         if inside and not decision.changed:
             # Bit for bit the policy's own action wherever the filter has nothing to say.
             sent, executed, correction = action, proposed.copy(), 0.0
@@ -188,12 +189,15 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
             sent = cast_inside(decision.control, self._dtype, *decision.rows, self._low, self._high)
             executed = sent.astype(np.float64)
             correction = float(np.linalg.norm(executed - proposed))
+            if finite and readable:
+                # What fails least may be the proposal itself, and a change may be lost in rounding.
+                intervened &= bool((executed != np.clip(proposed, self._low, self._high)).any())
         self._last = executed
         self.plant.executed(executed)
         self.filter_seconds += time.perf_counter() - started
         self.filter_calls += 1
         observation, reward, terminated, truncated, info = self.env.step(sent)
-        info[keys.CBF_INTERVENED] = decision.changed
+        info[keys.CBF_INTERVENED] = intervened
         info[keys.CBF_INFEASIBLE] = decision.infeasible
         info[keys.CBF_FALLBACK] = decision.fallback
         info[keys.CBF_NONFINITE] = not finite

@@ -198,6 +198,7 @@ class Decider:
         """The fallback's control, filtered like a policy's: for a proposal that is not finite."""
         decision = self.decide(self._fallback_control(None, last), last)
         decision.fallback = decision.changed = True
+        decision.refused = None  # of the fallback's control; there was no proposal to refuse
         return decision
 
     def unreadable(self, last: Array) -> Decision:
