@@ -1,32 +1,108 @@
 """protect: the recommended stack for known envs, and lines that work for the others."""
 
+import copy
 import textwrap
+import warnings
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env
+from scipy.linalg import solve_discrete_are
 
 import safe_wrappers as sw
+from safe_wrappers import interventions as keys
+from safe_wrappers.envs.speed_limits import SPEED_LIMITS
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 
+RUNNERS = ["HalfCheetah", "Hopper", "Walker2d", "Swimmer", "Ant", "Humanoid"]
 KNOWN = {
-    "SafePointGoal1-v0": sw.HeadingDriveClearance,
-    "SafePointGoal2-v0": sw.HeadingDriveClearance,
-    "InvertedPendulum-v5": sw.Clearance,
-    "Reacher-v5": sw.JointSpeedLimit,
+    "SafePointGoal1-v0": [sw.HeadingDriveClearance],
+    "SafePointGoal2-v0": [sw.HeadingDriveClearance],
+    "InvertedPendulum-v5": [sw.Clearance],
+    "InvertedDoublePendulum-v5": [sw.Clearance],
+    "Reacher-v5": [sw.JointSpeedLimit],
+    "Pusher-v5": [sw.JointSpeedLimit, sw.Workspace],
+    "HumanoidStandup-v5": [sw.JointSpeedLimit],
+    "PointMaze_UMaze-v3": [sw.WallClearance],
+    "AntMaze_UMaze-v5": [sw.Workspace],
+    **{f"{robot}-{version}": [sw.SpeedLimit] for robot in RUNNERS for version in ("v4", "v5")},
+    **{f"Safe{robot}Velocity-v0": [sw.SpeedLimit] for robot in RUNNERS},
 }
+known = pytest.mark.parametrize("env_id", KNOWN)
 
 
-@pytest.mark.parametrize("env_id", KNOWN)
-def test_known_envs_get_their_recipe(env_id):
-    env = sw.protect(gym.make(env_id))
+def make(env_id, **options):
+    if "Maze" in env_id:
+        gym.register_envs(pytest.importorskip("gymnasium_robotics"))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*is out of date")
+        return gym.make(env_id, **options)
+
+
+@known
+def test_known_envs_get_their_recipe_and_run(env_id):
+    env = sw.protect(make(env_id, disable_env_checker=True))
     assert isinstance(env, sw.CBFActionFilter)
-    assert isinstance(env.constraints[0], KNOWN[env_id])
-    env.reset(seed=0)
-    info = env.step(env.action_space.sample())[4]
-    assert "cbf/intervened" in info
+    assert [type(c) for c in env.constraints] == KNOWN[env_id]
+    rng = np.random.default_rng(0)
+    _, first = env.reset(seed=0)
+    ours = {*keys.CBF_BOOLS, *keys.CBF_FLOATS, keys.CBF_REFUSED, keys.PROPOSED_ACTION, keys.EXECUTED_ACTION}
+    for _ in range(200):
+        action = rng.uniform(env.action_space.low, env.action_space.high).astype(env.action_space.dtype)
+        *_, terminated, truncated, info = env.step(action)
+        assert ours <= info.keys() and ours <= first.keys()
+        assert all(type(info[key]) is bool for key in keys.CBF_BOOLS)
+        assert all(type(info[key]) is float and np.isfinite(info[key]) for key in keys.CBF_FLOATS)
+        for key, shape in ((keys.PROPOSED_ACTION, action.shape), (keys.EXECUTED_ACTION, action.shape)):
+            assert info[key].shape == shape and info[key].dtype == np.float64
+        assert info[keys.CBF_REFUSED].shape == (len(env.constraints),)
+        assert env.action_space.contains(info[keys.EXECUTED_ACTION].astype(env.action_space.dtype))
+        assert not (info[keys.CBF_INFEASIBLE] or info[keys.CBF_UNSAFE])  # random actions are no attack
+        if terminated or truncated:
+            env.reset()
 
 
+@known
+def test_a_protected_env_passes_gymnasiums_checks(env_id):
+    env = sw.protect(make(env_id))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        expected = (
+            "A Box observation space|is different from the unwrapped|symmetric and normalized|out of date"
+        )
+        warnings.filterwarnings("ignore", message=f".*({expected})")
+        check_env(env, skip_render_check=True)
+
+
+@known
+@pytest.mark.filterwarnings("ignore:.*is out of date")
+def test_protect_is_recorded_in_the_spec_and_in_json(env_id):
+    env = sw.protect(make(env_id))
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    assert isinstance(again, sw.CBFActionFilter) and again.constraints == env.constraints
+    assert again.constraint_names == env.constraint_names
+
+
+@pytest.mark.parametrize("robot", RUNNERS)
+def test_runners_keep_the_limit_that_their_task_publishes(robot):
+    task = make(f"Safe{robot}Velocity-v0")
+    limits = [
+        sw.protect(make(env_id)).constraints[0]
+        for env_id in (f"{robot}-v4", f"{robot}-v5", f"Safe{robot}Velocity-v0")
+    ]
+    assert limits[0] == limits[1] == limits[2]
+    limit = limits[0]
+    assert limit.limit == task.unwrapped.speed_limit == SPEED_LIMITS[robot]
+    assert 0.0 < limit.margin < 0.05 * limit.limit and limit.average == "step"
+    # as the task measures: along x, but in the plane for two of them, and Humanoid's centre of mass
+    assert limit.direction == ("xy" if robot in ("Ant", "Humanoid") else "+x")
+    assert limit.body == (None if robot == "Humanoid" else "torso")
+
+
+@pytest.mark.filterwarnings("ignore:.*is out of date")
 @pytest.mark.parametrize("version", ["v4", "v5"])
 def test_the_version_does_not_matter(version):
     try:
@@ -78,15 +154,25 @@ def test_unknown_options_are_refused_with_the_list(options):
         sw.protect(gym.make("Reacher-v5"), **options)
 
 
-@pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Swimmer-v5"])
-def test_an_unknown_env_is_refused_with_lines_that_work(env_id):
-    env = gym.make(env_id)
-    with pytest.raises(UnsupportedEnvError, match=rf"no recipe for '?{env_id}") as caught:
+@pytest.fixture
+def lab():
+    """An env of MuJoCo that nobody knows, under an id of its own."""
+    gym.register("lab/Crawler-v3", entry_point="gymnasium.envs.mujoco.swimmer_v5:SwimmerEnv")
+    yield "lab/Crawler-v3"
+    gym.registry.pop("lab/Crawler-v3")
+
+
+def test_an_unknown_env_is_refused_with_lines_that_work(lab):
+    env = gym.make(lab)
+    with pytest.raises(UnsupportedEnvError, match=rf"no recipe for '?{lab}") as caught:
         sw.protect(env)
     message = str(caught.value)
-    assert all(
-        name in message for name in ("SafePointGoal1", "SafePointGoal2", "InvertedPendulum", "Reacher")
-    )
+    listed = message.partition("there are recipes for ")[2].partition(". By hand")[0].split(", ")
+    families = {env_id.rpartition("-v")[0].partition("_")[0] for env_id in KNOWN}
+    families = {
+        f.removeprefix("Safe").removesuffix("Velocity") if f.endswith("Velocity") else f for f in families
+    }
+    assert set(listed) == families | {"SafePointGoal0"}
     lines = textwrap.dedent("\n".join(message.splitlines()[1:]))
     assert len(lines.splitlines()) == 3
     scope = {"env": env}
@@ -110,26 +196,64 @@ def test_a_discrete_env_is_refused():
         sw.protect(gym.make("CartPole-v1"))
 
 
-def test_protect_is_recorded_in_the_spec():
-    env = sw.protect(gym.make("SafePointGoal1-v0"))
-    again = gym.make(env.spec)
-    assert isinstance(again, sw.CBFActionFilter) and again.constraints == env.constraints
-
-
+@pytest.mark.filterwarnings(
+    "ignore::safe_wrappers.UnsafeStateWarning"
+)  # its falling pole takes from the reserve
 @pytest.mark.parametrize("policy", [1.0, -1.0, "sway"])
 def test_inverted_pendulum_stays_on_its_rail(policy):
-    # The whole of what the rail has, whatever the pole does: it may fall, the cart must not hit the end.
+    # The whole of what the rail has, whatever the pole does: it falls, and the cart must not hit the end.
     env = sw.protect(gym.make("InvertedPendulum-v5"))
     farthest = 0.0
-    for seed in range(4):
+    for seed in range(3):
         env.reset(seed=seed)
         for k in range(120):
             u = policy if policy != "sway" else float(np.sign(np.sin(0.15 * k + seed)))
-            _, _, terminated, _, _ = env.step(np.array([3.0 * u], np.float32))
+            info = env.step(np.array([3.0 * u], np.float32))[4]
+            assert not info["cbf/infeasible"]
             farthest = max(farthest, abs(env.unwrapped.data.qpos[0]))
+    assert 0.9 < farthest <= 0.95
+
+
+def balancing(raw):
+    """Gains that keep the poles upright and bring the cart to where its position counts as zero."""
+    model, nv = copy.copy(raw.model), raw.model.nv
+    model.opt.integrator = int(mujoco.mjtIntegrator.mjINT_EULER)  # MuJoCo linearises this one
+    a, b = np.zeros((2 * nv, 2 * nv)), np.zeros((2 * nv, 1))
+    mujoco.mjd_transitionFD(model, mujoco.MjData(model), 1e-6, True, a, b, None, None)
+    held = b
+    for _ in range(raw.frame_skip - 1):
+        held = a @ held + b
+    a = np.linalg.matrix_power(a, raw.frame_skip)
+    cost = solve_discrete_are(a, held, np.diag([1.0] + [10.0] * (nv - 1) + [0.1] * nv), [[1e-3]])
+    return np.linalg.solve([[1e-3]] + held.T @ cost @ held, held.T @ cost @ a)
+
+
+@pytest.mark.parametrize("env_id", ["InvertedPendulum-v5", "InvertedDoublePendulum-v5"])
+def test_a_cart_that_balances_its_poles_stays_on_the_rail(env_id):
+    # A driver who keeps the poles up has the speed to hit the end of the rail, where it wants to go.
+    env = sw.protect(gym.make(env_id))
+    raw, gains = env.unwrapped, balancing(env.unwrapped)
+    judge = mujoco.MjData(raw.model)
+    farthest, intervened = 0.0, 0
+    for seed in range(6):
+        env.reset(seed=seed)
+        target = (-1.0) ** seed * (1.0 + 0.4 * seed)
+        for k in range(200):
+            state = np.concatenate([raw.data.qpos, raw.data.qvel])
+            state[0] -= target * (min(1.0, k / 60.0) if seed % 3 else 1.0)
+            action = np.clip(-gains @ state, env.action_space.low, env.action_space.high)
+            mujoco.mj_copyData(judge, raw.model, raw.data)
+            *_, terminated, _, info = env.step(action.astype(np.float32))
+            assert not (info["cbf/infeasible"] or info["cbf/fallback"])
+            intervened += info["cbf/intervened"]
+            judge.ctrl[:] = info["executed_action"]
+            for _ in range(raw.frame_skip):
+                mujoco.mj_step(raw.model, judge)
+                farthest = max(farthest, abs(judge.qpos[0]))
             if terminated:
                 break
-    assert farthest <= 0.95 + 1e-3
+    assert intervened > 10
+    assert 0.9 < farthest <= 0.95
 
 
 def test_reacher_stays_under_its_speed():
