@@ -116,7 +116,7 @@ RECIPES: dict[str, Callable[..., list[Constraint]]] = {
     "HumanoidStandup": _humanoid_standup,
     "PointMaze": _point_maze,
     "AntMaze": _ant_maze,
-    # A policy trained through it found states from which three steps ahead was not enough (1 violation in 1000 steps).
+    # A policy trained through three steps ahead found states with no way out (1 violation in 1000 steps).
     "HalfCheetah": _velocity("HalfCheetah", margin=0.02, holds=5),
     "Hopper": _velocity("Hopper", margin=0.02),
     "Walker2d": _velocity("Walker2d", margin=0.02),
