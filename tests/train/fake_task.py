@@ -1,6 +1,7 @@
 """A tiny goal task and a tiny filter, so that runs of the whole machinery take a second."""
 
 import os
+import sys
 import time
 
 import gymnasium as gym
@@ -118,12 +119,15 @@ class FilmedGoal(FakeGoal):
         if self.trouble == "raise":
             raise RuntimeError("no display")
         if self.trouble == "abort":
+            print("a warning before", file=sys.stderr, flush=True)
             os.abort()
         if self.trouble == "hang":
             time.sleep(60)
         frame = np.full((60, 80, 3), 5 * self._steps, np.uint8)
         column, row = (np.clip(self._at * (20, 15) + (40, 30), 1, 58)).astype(int)
         frame[row - 1 : row + 2, column - 1 : column + 2] = (255, 0, 0)
+        if "FILMED_BLUE" in os.environ:
+            frame[..., 2] = 255
         return frame
 
 

@@ -42,6 +42,12 @@ def test_a_mujoco_task_with_gl_switched_off_says_so(monkeypatch):
     )
 
 
+def test_a_mujoco_task_is_drawn_or_the_reason_is_said(monkeypatch):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    found = find_rendering(EnvConfig("Reacher-v5"))
+    assert found.problem == "" or "Reacher-v5 could not draw a frame here (" in found.problem
+
+
 def test_without_a_choice_linux_tries_egl_and_then_osmesa(monkeypatch):
     tried = []
     monkeypatch.delenv("MUJOCO_GL", raising=False)

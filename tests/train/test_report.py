@@ -215,6 +215,16 @@ def test_infeasible_steps_constraints_and_what_was_left_out(fake_experiment):
         assert expected in said, expected
 
 
+def test_a_task_without_a_cost_shows_none(fake_experiment):
+    experiment = fake_experiment()
+    silent = steps(cost=steps().cost * float("nan"))
+    fill(experiment, {"return": 20}, {"return": 10}, silent, silent)
+    said = words(Page(write_report(experiment, summarize(experiment)).read_text()))
+    assert "The task reports no cost, so nothing can be counted as a violation." in said
+    for absent in ("Return against cost", "Cost of the trained policies", "cost per episode", "0 of 1,000"):
+        assert absent not in said.partition("How to read this")[0], absent
+
+
 def test_arms_of_several_tasks_are_reported_without_being_mixed_up(fake_experiment):
     experiment = fake_experiment("seeds=[0]", "arms.filtered.env=Pendulum-v1", "arms.filtered.total_steps=64")
     for arm, names in ((0, ["x (m)", "y (m)", "z (m)"]), (1, ["a", "b", "c"])):

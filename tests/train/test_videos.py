@@ -12,6 +12,7 @@ from safe_wrappers.train.film import HEIGHT
 from safe_wrappers.train.parallel import RunsFailedError
 from safe_wrappers.train.rendering import Rendering
 from safe_wrappers.train.run import Progress, train_run
+from safe_wrappers.train.scene import load_scenes
 from safe_wrappers.train.shown import shown_episode
 from safe_wrappers.train.tables import read_rows
 from safe_wrappers.train.videos import load_video, record_videos, video_path, video_problem
@@ -57,9 +58,10 @@ def said(experiment):
 
 
 def test_every_arm_is_filmed_in_the_same_episode_with_the_filter_off_and_on(evaluated, inline):
-    experiment = evaluated()
+    experiment = evaluated("arms.filtered.filter.kwargs.margin=0.6")  # so wide that it acts at once
     assert said(experiment) == ""
     shown = shown_episode(experiment)
+    changed = 0
     assert sorted(inline) == [
         f"video {arm} filter {state}" for arm in ("filtered", "unfiltered") for state in ("off", "on")
     ]
@@ -71,13 +73,20 @@ def test_every_arm_is_filmed_in_the_same_episode_with_the_filter_off_and_on(eval
             # The film is of the very episode that was evaluated.
             assert (video.steps, video.violations) == (row["length"], row["violations"])
             assert video.changed == pytest.approx(row["intervention_rate"] * row["length"])
+            changed += video.changed
             frames = Image.open(io.BytesIO(video.animation))
             assert frames.n_frames == 20
+            scenes = load_scenes(evaluation_folder(experiment.run_folder(arm, 0)) / f"{condition}.npz")
+            start = (scenes[shown.episode_seed].agent[0] * (20, 15) + (40, 30)).astype(int) * 4 + 2
+            red, green, _ = np.moveaxis(np.asarray(frames.convert("RGB"), dtype=int)[:HEIGHT], -1, 0)
+            dot = np.argwhere(red - green > 100).mean(axis=0)[::-1]
+            assert dot == pytest.approx(start, abs=2)  # where this episode starts, to half a pixel of the task's
             frames.seek(19)
             background = np.asarray(frames.convert("RGB"))[10, 10]
             assert background == pytest.approx([5 * 19] * 3, abs=6)
             assert frames.height > HEIGHT
             assert video.speed == 0.5  # 20 steps at 10 a second take 2 s; shown in 4
+    assert changed > 0
     assert video_problem(experiment) == ""
 
 
@@ -132,8 +141,9 @@ def test_nothing_is_filmed_before_the_evaluation(fake_experiment, inline):
 
 def test_in_processes_of_its_own_with_the_variables_of_the_rendering(evaluated, monkeypatch):
     experiment = evaluated("arms={unfiltered: {filter: none}}")
-    monkeypatch.setattr(videos, "find_rendering", lambda env: Rendering({"MUJOCO_GL": "disabled"}))
-    monkeypatch.setenv("MUJOCO_GL", "egl")
+    monkeypatch.setattr(videos, "find_rendering", lambda env: Rendering({"FILMED_BLUE": "1"}))
     assert "video unfiltered filter off: done" in said(experiment)
-    assert load_video(video_path(experiment, experiment.arms[0], "filter_off")).steps == 20
-    assert os.environ["MUJOCO_GL"] == "egl"
+    video = load_video(video_path(experiment, experiment.arms[0], "filter_off"))
+    pixel = np.asarray(Image.open(io.BytesIO(video.animation)).convert("RGB"))[10, 10]
+    assert pixel[2] > 200 > 50 > pixel[0]  # black, but for the blue that the variable asks for
+    assert "FILMED_BLUE" not in os.environ

@@ -100,6 +100,9 @@ pre { overflow-x: auto; font-size: 14px; }
   figure, .card, tr { break-inside: avoid; }
   h2 { break-after: avoid; }
   body { font-size: 12px; }
+  .wide { overflow: visible; }
+  table, small, thead th { font-size: 10px; }
+  th, td { padding: 3px 5px; }
 }
 """
 )
