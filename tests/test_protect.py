@@ -22,7 +22,7 @@ KNOWN = {
     "SafePointGoal1-v0": [sw.HeadingDriveClearance],
     "SafePointGoal2-v0": [sw.HeadingDriveClearance],
     "InvertedPendulum-v5": [sw.Clearance],
-    "InvertedDoublePendulum-v5": [sw.Clearance],
+    "InvertedDoublePendulum-v5": [sw.Clearance, sw.JointPositionLimit],
     "Reacher-v5": [sw.JointSpeedLimit],
     "Pusher-v5": [sw.JointSpeedLimit, sw.Workspace],
     "HumanoidStandup-v5": [sw.JointSpeedLimit],
