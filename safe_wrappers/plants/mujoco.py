@@ -80,6 +80,12 @@ class MujocoPlant:
                 f"{(raw.model.nq, raw.model.nv, raw.model.nu)}, "
                 f"got {(self.model.nq, self.model.nv, self.model.nu)}"
             )
+        expected, timestep = raw.model.opt.timestep, self.model.opt.timestep
+        if not np.isclose(timestep, expected, rtol=1e-9):
+            raise ConfigurationError(
+                f"the plant's model must take the env's physics steps: expected a timestep of {expected} s, "
+                f"got {timestep} s"
+            )
         self.data = mujoco.MjData(self.model)
         self._nq, self._nv = int(self.model.nq), int(self.model.nv)
         self._actuators = AffineActuators(self.model)

@@ -1,11 +1,14 @@
 """Forecasts against MuJoCo itself: every substep of the env's own step, its poses, and braking after it."""
 
+import copy
+
 import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
 
 import safe_wrappers as sw
+from safe_wrappers.errors import ConfigurationError
 
 ROBOTS = [
     "InvertedPendulum",
@@ -291,6 +294,15 @@ def test_under_a_delay_it_starts_where_the_commands_in_flight_lead(delay_s):
         plant.executed(u)
         sent.append(u)
         env.step(u)
+
+
+def test_a_model_of_another_timestep_is_refused():
+    # A control step would be another stretch of time for the forecast than for the env.
+    env = make("HalfCheetah")
+    model = copy.copy(env.unwrapped.model)
+    model.opt.timestep = 0.02
+    with pytest.raises(ConfigurationError, match=r"expected a timestep of 0.01 s, got 0.02 s"):
+        bound(env, model=model)
 
 
 # Braking ------------------------------------------------------------------------------------------------------
