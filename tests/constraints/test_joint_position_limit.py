@@ -46,7 +46,7 @@ def test_no_step_that_is_not_flagged_leaves_the_range(env_id, driver):
 @pytest.mark.parametrize("driver", DRIVERS)
 @pytest.mark.parametrize("env_id", CASES)
 def test_no_step_that_is_not_flagged_leaves_the_range_for_long(env_id, driver):
-    check_closed_loop(env_id, driver, 400, range(5))
+    check_closed_loop(env_id, driver, 300, range(3))
 
 
 def test_without_the_filter_the_range_is_left():

@@ -180,7 +180,34 @@ def test_what_is_executed_fails_no_more_than_the_brake_and_the_proposal(make, mo
     assert (failed[:, 0] < failed[:, 1] - 1e-3).any()
 
 
-def test_shortfalls_are_compared_in_shares_of_the_limit():
+class Refusing:
+    """Admits nothing; how much a control misses is given."""
+
+    def __init__(self, shortfall, scale):
+        self._shortfall, self.scale = shortfall, scale
+
+    def rows(self, plant):
+        return sw.HalfSpaces.none(1)
+
+    def admits(self, plant, control):
+        return False
+
+    def shortfall(self, plant, control):
+        return self._shortfall(control[0])
+
+
+@pytest.mark.parametrize(("scale", "executed"), [(100.0, 1.0), (1.0, 0.0)])
+def test_what_fails_least_is_judged_in_shares_of_the_scales(scale, executed):
+    # More control is worse for the first and better for the second: the scale says which counts.
+    limits = [Refusing(lambda u: 10.0 * (1.0 + u), scale), Refusing(lambda u: 1.0 - 0.5 * u, 1.0)]
+    env = made("InvertedPendulum-v5", limits)
+    env.reset(seed=0)
+    info = env.step(np.array([1.0], np.float32))[4]
+    assert info["cbf/infeasible"] and info["cbf/refused"].all()
+    assert info["executed_action"][0] == pytest.approx(executed, abs=0.1)
+
+
+def test_scales_are_the_limits_where_there_is_one():
     scales = {
         "SpeedLimit": (sw.SpeedLimit(2.5), 2.5),
         "JointSpeedLimit": (sw.JointSpeedLimit([4.0, 3.0]), 3.0),
