@@ -61,28 +61,42 @@ def shown_episode(experiment: ExperimentConfig) -> ShownEpisode | None:
     Where there is no violation, the one in which the filter changed most. Not an arbitrary one, which may show
     nothing at all, and not the best one: the page says which it is.
     """
-    pair = next(iter(compared_pairs(experiment)), None)
-    bare = pair.bare if pair is not None else experiment.arms[0]
+    pairs = compared_pairs(experiment)
     seed = experiment.seeds[0]
-    rows = _rows(experiment, bare, seed, "filter_off")
-    if not rows:
+    bare = [pair.bare for pair in pairs] or list(experiment.arms)
+    violations = _totals(experiment, bare, seed, "filter_off", "violations")
+    if not violations:
         return None
-    worst = max(rows, key=lambda row: row["violations"])  # the first of equals
-    of = f"of the {len(rows)} evaluation episodes"
-    chosen = f"{of} the one in which {bare.name} had most violations with the filter off"
-    if not worst["violations"]:
+    acting = [pair.filtered for pair in pairs]
+    changes = _totals(experiment, acting, seed, "filter_on", "intervention_rate")
+    of = f"of the {len(violations)} evaluation episodes"
+    if any(violations.values()):
+        episode_seed = max(violations, key=violations.__getitem__)  # the first of equals
+        chosen = f"{of} the one in which {_named(bare)} had most violations with the filter off"
+    elif any(changes.values()):
+        episode_seed = max(changes, key=changes.__getitem__)
+        chosen = f"{of} the one in which the filter changed most of what {_named(acting)} did"
+    else:
+        episode_seed = next(iter(violations))
         chosen = f"the first {of}"
-        acting = _rows(experiment, pair.filtered, seed, "filter_on") if pair is not None else []
-        if pair is not None and any(row["intervention_rate"] for row in acting):
-            worst = max(acting, key=lambda row: row["intervention_rate"])
-            chosen = f"{of} the one in which the filter changed most of what {pair.filtered.name} proposed"
-        else:
-            worst = rows[0]
-    episode_seed = int(worst["episode_seed"])
     return ShownEpisode(
         seed, episode_seed, f"Episode seed {episode_seed}, policies of training seed {seed}: {chosen}."
     )
 
 
-def _rows(experiment: ExperimentConfig, arm: ArmConfig, seed: int, condition: str) -> list[dict[str, float]]:
-    return read_rows(evaluation_folder(experiment.run_folder(arm, seed)) / f"{condition}.csv")
+def _totals(
+    experiment: ExperimentConfig, arms: list[ArmConfig], seed: int, condition: str, column: str
+) -> dict[int, float]:
+    """A column's sum over arms, by episode seed."""
+    totals: dict[int, float] = {}
+    for arm in arms:
+        path = evaluation_folder(experiment.run_folder(arm, seed)) / f"{condition}.csv"
+        for row in read_rows(path):
+            episode_seed = int(row["episode_seed"])
+            totals[episode_seed] = totals.get(episode_seed, 0.0) + row[column]
+    return totals
+
+
+def _named(arms: list[ArmConfig]) -> str:
+    names = [arm.name for arm in arms]
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]} together"

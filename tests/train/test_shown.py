@@ -14,7 +14,7 @@ def evaluated(experiment, violations=(0, 0, 0), changed=(0.0, 0.0, 0.0)):
     ("violations", "changed", "episode_seed", "reason"),
     [
         ((1, 9, 9), (0.9, 0, 0), 101, "in which unfiltered had most violations with the filter off"),
-        ((0, 0, 0), (0.1, 0.1, 0.5), 102, "in which the filter changed most of what filtered proposed"),
+        ((0, 0, 0), (0.1, 0.1, 0.5), 102, "in which the filter changed most of what filtered did"),
         ((0, 0, 0), (0, 0, 0), 100, "the first of the 3 evaluation episodes"),
     ],
 )
@@ -23,6 +23,17 @@ def test_the_episode_that_shows_most(fake_experiment, violations, changed, episo
     assert (shown.seed, shown.episode_seed) == (0, episode_seed)
     assert shown.reason.startswith(f"Episode seed {episode_seed}, policies of training seed 0: ")
     assert reason in shown.reason
+
+
+def test_policies_of_several_tasks_are_shown_where_all_of_them_hurt_most(fake_experiment):
+    experiment = fake_experiment(
+        "arms={one: {filter: none}, two: {filter: none}}", "evaluation.filter={factory: 'fake_task:shield'}"
+    )
+    for arm, counts in ((0, (4, 3, 0)), (1, (0, 3, 4))):
+        write_evaluation(experiment, arm, 0, "filter_off", [episode(violations=count) for count in counts])
+    shown = shown_episode(experiment)
+    assert shown.episode_seed == 101
+    assert "in which one and two together had most violations" in shown.reason
 
 
 def test_before_any_evaluation_there_is_none(fake_experiment):
