@@ -56,7 +56,7 @@ def looking(scene, limit, qpos, qvel):
 # What is asked ------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     x=st.floats(-1.6, 1.6),
     v=st.floats(-4.0, 4.0),

@@ -103,7 +103,7 @@ def velocities(v, u, timestep, substeps):
     return out
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(
     v=st.lists(st.floats(-3.0, 3.0), min_size=4, max_size=4),
     u=st.lists(st.floats(-20.0, 20.0), min_size=2, max_size=2),

@@ -108,7 +108,7 @@ def check_closed_loop(case, driver, steps, seeds):
 @pytest.mark.parametrize("driver", DRIVERS)
 @pytest.mark.parametrize("case", CASES)
 def test_no_step_that_is_not_flagged_falls(case, driver):
-    check_closed_loop(case, driver, 60, [0])
+    check_closed_loop(case, driver, 40, [0])
 
 
 @pytest.mark.slow

@@ -165,7 +165,7 @@ def check_closed_loop(case, driver, steps, seeds):
 @pytest.mark.parametrize("driver", DRIVERS)
 @pytest.mark.parametrize("case", CASES)
 def test_no_step_that_is_not_flagged_leaves_the_workspace(case, driver):
-    check_closed_loop(case, driver, 80, [1])
+    check_closed_loop(case, driver, 60, [1])
 
 
 @pytest.mark.slow
