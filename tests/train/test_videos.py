@@ -80,7 +80,8 @@ def test_every_arm_is_filmed_in_the_same_episode_with_the_filter_off_and_on(eval
             start = (scenes[shown.episode_seed].agent[0] * (20, 15) + (40, 30)).astype(int) * 4 + 2
             red, green, _ = np.moveaxis(np.asarray(frames.convert("RGB"), dtype=int)[:HEIGHT], -1, 0)
             dot = np.argwhere(red - green > 100).mean(axis=0)[::-1]
-            assert dot == pytest.approx(start, abs=2)  # where this episode starts, to half a pixel of the task's
+            # Where this episode starts, to half a pixel of the task's.
+            assert dot == pytest.approx(start, abs=2)
             frames.seek(19)
             background = np.asarray(frames.convert("RGB"))[10, 10]
             assert background == pytest.approx([5 * 19] * 3, abs=6)
