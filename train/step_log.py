@@ -155,10 +155,12 @@ def save_steps(path: Path, log: StepLog) -> None:
 
 
 def load_steps(path: Path) -> StepLog | None:
-    """Reads the steps back; None where an evaluation of an earlier version kept none."""
+    """Reads the steps back; None where an evaluation of another version kept none, or kept something else."""
     if not path.exists():
         return None
     with np.load(path) as arrays:
+        if set(arrays.files) != {field.name for field in fields(StepLog)}:
+            return None
         values = {name: arrays[name] for name in arrays.files}
     scalars = {"left_out": int(values["left_out"]), "filter_time_us": float(values["filter_time_us"])}
     return StepLog(**{**values, **scalars})
