@@ -25,6 +25,9 @@ def _phrase(constraint: Any) -> str:
     match constraint:
         case sw.JointSpeedLimit():
             return f"joint speeds below {constraint.limit:g} rad/s"
+        case sw.JointPositionLimit():
+            where = ", ".join(constraint.joints or ["driven joints"])
+            return f"{where} between {constraint.lower} and {constraint.upper}"
         case sw.SpeedLimit():
             point = constraint.body or "centre of mass"
             return f"speed of the {point} ({constraint.direction}) below {constraint.limit:g} m/s"

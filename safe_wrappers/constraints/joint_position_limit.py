@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -103,16 +103,17 @@ class JointPositionLimit(Predicted):
 def _positions(name: str, given: float | Sequence[float] | None) -> float | list[float] | None:
     if given is None:
         return None
-    listed = isinstance(given, Sequence | np.ndarray) and not isinstance(given, str)
+    per_joint = isinstance(given, Sequence | np.ndarray) and not isinstance(given, str)
+    listed: list[Any] = list(given) if per_joint else [given]  # type: ignore[arg-type]
     try:
-        many = [float(v) for v in given] if listed else [float(given)]
+        many = [float(v) for v in listed]
     except (TypeError, ValueError):
         raise ConfigurationError(
             f"{name} is a position in rad or m, or one per joint; got {given!r}"
         ) from None
     if not many or np.isnan(many).any():
         raise ConfigurationError(f"{name} is a position in rad or m, or one per joint; got {given!r}")
-    return many if listed else many[0]
+    return many if per_joint else many[0]
 
 
 def _per_joint(name: str, given: float | Sequence[float] | None, own: Array) -> Array:

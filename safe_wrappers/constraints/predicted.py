@@ -3,7 +3,7 @@
 import warnings
 from abc import ABC, abstractmethod
 from collections import deque
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,7 @@ class Predicted(ABC):
     margin: float
     holds: int
     reach: float | None
-    unit: str = "units of the value"
+    unit: ClassVar[str] = "units of the value"
 
     @property
     def scale(self) -> float:

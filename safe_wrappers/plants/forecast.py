@@ -125,7 +125,7 @@ class Recorder:
         """Read once per control interval, as a controller would."""
         at_rest = self._rest[:, 0] + self._rest[:, 1] * data.actuator_length
         control = at_rest - self._damping * data.actuator_velocity
-        return np.minimum(np.maximum(control, self._low), self._high)
+        return np.asarray(np.minimum(np.maximum(control, self._low), self._high))
 
     def place(self, data: mujoco.MjData) -> None:
         """Put the bodies that the env moves by hand (mocap) where they are, for the poses asked for from now on."""

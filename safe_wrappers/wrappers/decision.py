@@ -184,7 +184,7 @@ class Decider:
         kept = [u for u in self._tried if bool((strict[0] @ u <= strict[1] + _ROW_TOLERANCE).all())]
 
         def failing(control: Array) -> float:
-            return max(c.shortfall(self._plant, control) / c.scale for c in self._certifying)
+            return max(float(c.shortfall(self._plant, control) / c.scale) for c in self._certifying)
 
         return min([target, *kept], key=failing)
 
