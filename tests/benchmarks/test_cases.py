@@ -53,6 +53,10 @@ def test_the_judge_means_the_limit_that_the_filter_keeps(name):
                     raw.data.qpos[0] = end
                     assert judge.start() == pytest.approx(0.0, abs=1e-12)
                 assert len(ends) == 2
+            case sw.JointPositionLimit():
+                for end in (constraint.lower, constraint.upper):
+                    raw.data.qpos[0] = end
+                    assert judge.start() == pytest.approx(0.0, abs=1e-12)
             case sw.Workspace():
                 # Somewhere along random poses: what the constraint calls negative, the judge calls missed.
                 seen = set()
