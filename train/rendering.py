@@ -14,7 +14,8 @@ from .config import EnvConfig
 _SECONDS: Final = 60.0
 """A GL library that waits for a display never comes back."""
 _INSTALL: Final = (
-    "On Debian or Ubuntu: apt install libosmesa6, then safe-wrappers evaluate again with MUJOCO_GL=osmesa."
+    "Run safe-wrappers evaluate again with MUJOCO_GL=egl, or with MUJOCO_GL=osmesa after apt install libosmesa6"
+    " (Debian, Ubuntu)."
 )
 
 

@@ -72,10 +72,10 @@ def shown_episode(experiment: ExperimentConfig) -> ShownEpisode | None:
     of = f"of the {len(violations)} evaluation episodes"
     if any(violations.values()):
         episode_seed = max(violations, key=violations.__getitem__)  # the first of equals
-        chosen = f"{of} the one in which {_named(bare)} had most violations with the filter off"
+        chosen = f"{of} the one with most violations of {_named(bare)} with the filter off"
     elif any(changes.values()):
         episode_seed = max(changes, key=changes.__getitem__)
-        chosen = f"{of} the one in which the filter changed most of what {_named(acting)} did"
+        chosen = f"{of} the one in which the filter changed most steps of {_named(acting)}"
     else:
         episode_seed = next(iter(violations))
         chosen = f"the first {of}"
@@ -98,5 +98,5 @@ def _totals(
 
 
 def _named(arms: list[ArmConfig]) -> str:
-    names = [arm.name for arm in arms]
+    names = [f"“{arm.name}”" for arm in arms]
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]} together"

@@ -181,7 +181,7 @@ def test_a_folder_of_an_earlier_version_still_has_its_report(fake_experiment):
     page = Page(write_report(experiment, summarize(experiment)).read_text())
     said = words(page)
     assert "none of 2,400 steps was in violation" in said
-    assert "No recorded steps with a filter on. They are kept by every evaluation" in said
+    assert "No recorded steps with a filter on. Run safe-wrappers evaluate (again)" in said
     assert "No videos. Nothing has been filmed yet" in said
     assert "How large the corrections were" not in said
     assert len(page.svg_texts()) == 7  # the plane, three finals, three learning curves

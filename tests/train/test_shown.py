@@ -13,8 +13,8 @@ def evaluated(experiment, violations=(0, 0, 0), changed=(0.0, 0.0, 0.0)):
 @pytest.mark.parametrize(
     ("violations", "changed", "episode_seed", "reason"),
     [
-        ((1, 9, 9), (0.9, 0, 0), 101, "in which unfiltered had most violations with the filter off"),
-        ((0, 0, 0), (0.1, 0.1, 0.5), 102, "in which the filter changed most of what filtered did"),
+        ((1, 9, 9), (0.9, 0, 0), 101, "with most violations of “unfiltered” with the filter off"),
+        ((0, 0, 0), (0.1, 0.1, 0.5), 102, "in which the filter changed most steps of “filtered”"),
         ((0, 0, 0), (0, 0, 0), 100, "the first of the 3 evaluation episodes"),
     ],
 )
@@ -33,7 +33,7 @@ def test_policies_of_several_tasks_are_shown_where_all_of_them_hurt_most(fake_ex
         write_evaluation(experiment, arm, 0, "filter_off", [episode(violations=count) for count in counts])
     shown = shown_episode(experiment)
     assert shown.episode_seed == 101
-    assert "in which one and two together had most violations" in shown.reason
+    assert "with most violations of “one” and “two” together" in shown.reason
 
 
 def test_before_any_evaluation_there_is_none(fake_experiment):
