@@ -110,9 +110,8 @@ def interventions(experiment: ExperimentConfig) -> str:
     acting = dict(_logs(experiment, "filter_on"))
     if not acting:
         return (
-            '<p class="line"><b>No recorded steps with a filter on.</b> They are kept by every evaluation from'
-            " version 0.2 on: run <code>safe-wrappers evaluate</code> (again) to see corrections, places,"
-            " constraints and times.</p>"
+            '<p class="line"><b>No recorded steps with a filter on.</b> Run <code>safe-wrappers evaluate'
+            "</code> (again) to see corrections, places, constraints and times.</p>"
         )
     places = list(_places(experiment, acting))
     items = [
