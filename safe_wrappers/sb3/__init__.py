@@ -1,5 +1,12 @@
 """Stable-Baselines3 glue: what the filter did, in the log and the replay buffer. The only room that imports SB3."""
 
+try:
+    import stable_baselines3  # noqa: F401
+except ImportError as missing:
+    raise ImportError(
+        "safe_wrappers.sb3 needs stable_baselines3 and torch: pip install 'safe-wrappers[train]'"
+    ) from missing
+
 from safe_wrappers.sb3.executed_action_replay_buffer import (
     ExecutedActionDictReplayBuffer,
     ExecutedActionReplayBuffer,

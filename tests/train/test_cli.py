@@ -52,7 +52,7 @@ def test_compare_from_nothing_to_the_report_in_parallel_processes(tmp_path):
 
 
 def test_a_killed_comparison_leaves_no_process_behind_and_goes_on(tmp_path):
-    overrides = (f"output={tmp_path}", "total_steps=8000", "checkpoint_every=1000", "seeds=[0]", FILTERED)
+    overrides = (f"output={tmp_path}", "total_steps=24000", "checkpoint_every=1000", "seeds=[0]", FILTERED)
     folder = tmp_path / "fake" / "filtered" / "seed_0"
     process = start("train", *overrides)
     wait_for(lambda: list(folder.glob("checkpoints/step_*/state.json")))
@@ -66,7 +66,7 @@ def test_a_killed_comparison_leaves_no_process_behind_and_goes_on(tmp_path):
     # The workers notice and end: the rows stop growing, and the folder is free again.
     wait_for(lambda: not _held(folder / ".lock"), 20)
     at = max(int(path.name[5:]) for path in (folder / "checkpoints").glob("step_*"))
-    assert 1000 <= at < 8000
+    assert 1000 <= at < 24000
     early = [row for row in read_rows(folder / "episodes.csv") if row["timesteps"] <= at]
     assert not (folder / "finished.json").exists()
     out, err = start("train", *overrides).communicate(timeout=120)
@@ -75,8 +75,8 @@ def test_a_killed_comparison_leaves_no_process_behind_and_goes_on(tmp_path):
     assert rows[: len(early)] == early
     steps = [row["timesteps"] for row in rows]
     assert steps == sorted(steps)
-    assert sum(row["length"] for row in rows) <= 8064  # nothing counted twice; whole rollouts
-    assert json.loads((folder / "finished.json").read_text())["timesteps"] == 8064
+    assert sum(row["length"] for row in rows) <= 24_000  # nothing counted twice; whole rollouts
+    assert json.loads((folder / "finished.json").read_text())["timesteps"] == 24_000
 
 
 def test_a_killed_worker_is_reported_and_the_others_go_on(tmp_path):
