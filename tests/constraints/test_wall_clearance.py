@@ -100,6 +100,35 @@ def test_what_is_suggested_and_what_the_rows_allow_is_admitted(world, at, veloci
         assert limit.admits(plant, control)
 
 
+@pytest.mark.parametrize("options", [{"velocity_clip": 5.0}, {}])
+def test_corrections_leave_a_hair_for_rounding(options):
+    env = filtered(PointWorld(clip=5.0), **options)
+    rng, corrected = np.random.default_rng(2), 0
+    for k in range(1500):
+        if k % 12 == 0:
+            action = rng.choice([-1.0, 0.3, 1.0], 2) * [1.0, 0.8]
+        env.plant.observe()
+        limit, plant = env.constraints[0], env.plant
+        before = limit.value(plant)[0]
+        nearest = action if limit.admits(plant, action) else limit.suggestions(plant, action)[0]
+        env.unwrapped.step(nearest)  # in float64: nothing is rounded here
+        env.plant.observe()
+        if nearest is not action:
+            corrected += 1
+            assert limit.value(plant)[0] >= min(limit.margin + 0.4e-7, before - 1e-12)
+    assert corrected > 300
+
+
+@pytest.mark.parametrize("options", [{"velocity_clip": 5.0}, {}])
+def test_a_hair_lost_to_rounding_is_no_reason_to_refuse_braking(options):
+    limit, plant = placed(filtered(**options), (2.0 - ROOM + 5e-8, -1.2), (0.0, 1.0))
+    assert limit.value(plant)[0] < limit.margin
+    assert limit.admits(plant, limit.backup(plant))
+    assert limit.admits(plant, np.array([0.0, 1.0]))  # along the wall
+    assert limit.admits(plant, np.array([-1.0, 0.0]))  # away from it
+    assert not limit.admits(plant, np.array([1e-4, 0.0]))
+
+
 def test_the_nearest_admitted_control_is_found():
     # Against every control of a fine grid, at states that a rough driver comes to.
     env = filtered(PointWorld(clip=5.0))
