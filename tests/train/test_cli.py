@@ -64,7 +64,7 @@ def test_a_killed_comparison_leaves_no_process_behind_and_goes_on(tmp_path):
     process.send_signal(signal.SIGKILL)
     process.communicate()
     # The workers notice and end: the rows stop growing, and the folder is free again.
-    wait_for(lambda: not _held(folder / ".lock"), 20)
+    wait_for(lambda: not _held(folder / ".lock"))
     at = max(int(path.name[5:]) for path in (folder / "checkpoints").glob("step_*"))
     assert 1000 <= at < 24000
     early = [row for row in read_rows(folder / "episodes.csv") if row["timesteps"] <= at]
