@@ -127,6 +127,8 @@ def test_a_hair_lost_to_rounding_is_no_reason_to_refuse_braking(options):
     assert limit.admits(plant, np.array([0.0, 1.0]))  # along the wall
     assert limit.admits(plant, np.array([-1.0, 0.0]))  # away from it
     assert not limit.admits(plant, np.array([1e-4, 0.0]))
+    rows = limit.rows(plant)
+    assert rows.offsets.size and (rows.normals @ limit.backup(plant) <= rows.offsets).all()
 
 
 def test_the_nearest_admitted_control_is_found():
@@ -180,6 +182,33 @@ def test_knowing_the_clip_lets_it_pass_a_corner_that_it_would_stop_at():
     assert known.value(plant)[0] > 0.05 and known.admits(plant, asked)
     unknown, plant = placed(filtered(), at, velocity)
     assert unknown.value(plant)[0] < 0.0
+
+
+def test_at_a_corner_the_rows_leave_each_axis_its_share():
+    # The block's upper right corner is at (1, 1), the ball diagonally above it, a little farther away than needed.
+    limit, plant = placed(filtered(), (1.0 + 0.075, 1.0 + 0.075))
+    rows = limit.rows(plant)
+    towards = sw.project(np.array([-0.8, -0.8]), rows.normals, rows.offsets, plant.lower, plant.upper).control
+    assert rows.offsets.size == 2 and (-0.5 < towards).all() and (towards < -0.1).all()
+    assert limit.admits(plant, towards)
+
+
+@pytest.mark.parametrize(
+    ("at", "velocity", "asked"),
+    [
+        ((1.395, 0.972), (-3.79, 1.96), (-1.0, 0.0)),
+        ((1.302, 0.809), (-3.09, 3.02), (0.0, 0.0)),
+        ((1.365, 0.897), (-3.46, 2.06), (-1.0, 1.0)),
+    ],
+)
+def test_past_a_corner_a_correction_goes_as_far_as_the_path_allows(at, velocity, asked):
+    # Up and to the left past the block's upper right corner.
+    limit, plant = placed(filtered(velocity_clip=5.0), at, velocity)
+    asked = np.array(asked)
+    assert limit.value(plant)[0] > limit.margin and not limit.admits(plant, asked)
+    grid = [np.array([x, y]) for x in np.linspace(-1, 1, 41) for y in np.linspace(-0.8, 1, 37)]
+    closest = min(np.linalg.norm(u - asked) for u in grid if limit.admits(plant, u))
+    assert np.linalg.norm(limit.suggestions(plant, asked)[0] - asked) < closest + 0.15
 
 
 def test_far_from_walls_actions_pass_bit_for_bit():
