@@ -9,7 +9,10 @@ from typing import Final
 import gymnasium as gym
 
 EPISODE_STEPS: Final = 1000
-"""Control steps per episode of every task, after which `TimeLimit` truncates (20 s at PointGoal's 50 Hz)."""
+"""Control steps per episode, after which `TimeLimit` truncates (20 s at PointGoal's 50 Hz)."""
+
+REACH_EPISODE_STEPS: Final = 200
+"""The same for the arm with elastic joints: 2 s at 100 Hz."""
 
 POINT_GOAL_IDS: Final = tuple(f"SafePointGoal{level}-v0" for level in range(3))
 """Ids of the goal task with the point robot, by level."""
@@ -19,6 +22,9 @@ VELOCITY_IDS: Final = tuple(
 )
 """Ids of the velocity tasks: Gymnasium's robots with a published speed limit."""
 
+FLEX_JOINT_REACH_ID: Final = "FlexJointReach-v0"
+"""Id of the reaching task with elastic joints."""
+
 
 def register_envs() -> None:
     """Register every task of this package with Gymnasium; ids already there are left alone."""
@@ -27,11 +33,20 @@ def register_envs() -> None:
     for env_id in VELOCITY_IDS:
         robot = env_id.removeprefix("Safe").removesuffix("Velocity-v0")
         _register(env_id, "safe_wrappers.envs.velocity:make_velocity_env", {"robot": robot})
+    reach = "safe_wrappers.envs.flex_joint_reach:FlexJointReachEnv"
+    _register(FLEX_JOINT_REACH_ID, reach, {}, steps=REACH_EPISODE_STEPS)
 
 
-def _register(env_id: str, entry_point: str, kwargs: dict[str, object]) -> None:
+def _register(env_id: str, entry_point: str, kwargs: dict[str, object], steps: int = EPISODE_STEPS) -> None:
     if env_id not in gym.registry:
-        gym.register(env_id, entry_point=entry_point, kwargs=kwargs, max_episode_steps=EPISODE_STEPS)
+        gym.register(env_id, entry_point=entry_point, kwargs=kwargs, max_episode_steps=steps)
 
 
-__all__ = ["EPISODE_STEPS", "POINT_GOAL_IDS", "VELOCITY_IDS", "register_envs"]
+__all__ = [
+    "EPISODE_STEPS",
+    "FLEX_JOINT_REACH_ID",
+    "POINT_GOAL_IDS",
+    "REACH_EPISODE_STEPS",
+    "VELOCITY_IDS",
+    "register_envs",
+]
