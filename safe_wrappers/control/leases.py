@@ -1,0 +1,188 @@
+"""Watchdog leases: how long a command may stay in force when nothing renews it.
+
+Source: appendix "Kinematic derivation of watchdog validity leases". From the moment that a reading was taken to the
+moment that the brakes hold, five intervals pass one after the other: the lease itself, the detection of its end, a
+window of confirmation, the age of the reading and the onset of the actuator. What is travelled in them, and the way
+of braking after them, must fit into the measured clearance:
+
+    way(lease + detect + hold + age + act) + stopping distance + localisation + margin <= clearance
+
+The appendix lets the machine cruise at constant speed until it brakes. `acceleration` drops that assumption: the
+machine may speed up by as much until then, which is what a policy that dies with the throttle open does.
+
+`braking` is a *verified lower bound* on the deceleration. Nothing here can check it.
+
+A lease of zero or less means: revoke now. Rounding only ever shortens a lease, and what is not finite revokes.
+"""
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from safe_wrappers.errors import ConfigurationError
+
+Array = NDArray[np.float64]
+
+_ROUNDING = 16.0 * float(np.finfo(np.float64).eps)
+"""Relative; more than the roundings of any formula below can add up to."""
+
+
+@dataclass(frozen=True)
+class LeaseDelays:
+    """The delays beside the lease itself, in s.
+
+    Attributes:
+        detect_s: T_detect, until the end of the lease is recognised.
+        hold_s: T_hold, a window of confirmation in which the last command goes on.
+        age_s: t_age, how old the reading of the clearance is when the lease is granted.
+        act_s: T_act, until the full deceleration is there.
+
+    Raises:
+        ConfigurationError: For a delay that is negative or not finite.
+    """
+
+    detect_s: float = 0.0
+    hold_s: float = 0.0
+    age_s: float = 0.0
+    act_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ConfigurationError(f"{field.name} must be a finite time of at least 0 s, got {value!r}")
+
+    @property
+    def total_s(self) -> float:
+        """Their sum, s."""
+        return self.detect_s + self.hold_s + self.age_s + self.act_s
+
+
+def stopping_distance(speed: ArrayLike, braking: ArrayLike) -> Array:
+    """`v^2 / (2 a_brake)`, 0 for a machine that stands or recedes.
+
+    Args:
+        speed: Approach speed v in m/s (or rad/s), shape (...).
+        braking: Verified deceleration a_brake in m/s^2, shape (...).
+
+    Returns:
+        Distance in m, shape (...); inf where the braking is not positive or an input is not finite.
+    """
+    v, b = np.asarray(speed, dtype=np.float64), np.asarray(braking, dtype=np.float64)
+    known = np.isfinite(v) & np.isfinite(b) & (b > 0.0)
+    with np.errstate(over="ignore"):
+        way = np.maximum(np.where(known, v, 0.0), 0.0) ** 2 / (2.0 * np.where(known, b, 1.0))
+    return np.asarray(np.where(known, way, np.inf))
+
+
+def longest_lease(
+    clearance: ArrayLike,
+    speed: ArrayLike,
+    braking: ArrayLike,
+    delays_s: ArrayLike,
+    localisation: ArrayLike = 0.0,
+    margin: ArrayLike = 0.0,
+    acceleration: ArrayLike = 0.0,
+    top_speed: ArrayLike = np.inf,
+) -> Array:
+    """The longest T_lease for which a machine that nobody renews still stops inside the clearance.
+
+    The largest tau = T_lease + delays_s with, for approach speed v, acceleration a and braking b,
+
+        v tau + a tau^2 / 2 + (v + a tau)^2 / (2 b) + localisation + margin <= clearance
+
+    (a = 0 is the appendix's formula), where the speed v + a tau stops growing at `top_speed`. It is solved exactly:
+    with w the speed at brake onset, `w^2 = (2 a room + v^2) b / (a + b)`.
+
+    A receding machine (v < 0) that cannot accelerate, or one that stands still and cannot, never uses up positive
+    room: its lease is inf. With acceleration it may turn round, and that is counted.
+
+    Args:
+        clearance: D_clear as measured `age` ago, m, shape (...).
+        speed: Approach speed as measured then, m/s, positive towards the obstacle, shape (...).
+        braking: Verified lower bound on the deceleration, m/s^2, shape (...).
+        delays_s: T_detect + T_hold + t_age + T_act (`LeaseDelays.total_s`), s, shape (...).
+        localisation: delta_loc, bound on the error of the clearance, m, shape (...).
+        margin: delta_margin, clearance to be kept at rest, m, shape (...).
+        acceleration: Largest approach acceleration that any command may cause until the brakes hold, m/s^2.
+        top_speed: Bound on the approach speed that this acceleration may lead to, m/s; a measured speed above it
+            counts as the bound. inf: none.
+
+    Returns:
+        Lease in s, shape (...). Zero or less: revoke. -inf where an input (but `top_speed`) is not finite, where the
+        braking is not positive, and where a machine that does not approach has no room left. Never NaN.
+
+    Raises:
+        ConfigurationError: For a negative delay, localisation bound, margin, acceleration or top speed.
+    """
+    d, v, b, delays, loc, gap, a, top = np.broadcast_arrays(
+        *(
+            np.asarray(x, dtype=np.float64)
+            for x in (clearance, speed, braking, delays_s, localisation, margin, acceleration, top_speed)
+        )
+    )
+    _not_negative(delays_s=delays, localisation=loc, margin=gap, acceleration=a, top_speed=top)
+    known = np.all([np.isfinite(x) for x in (d, v, b, delays, loc, gap, a)], axis=0)
+    known &= ~np.isnan(top) & (b > 0.0)
+    d, v, b, loc, gap, a = (
+        np.where(known, x, y) for x, y in zip((d, v, b, loc, gap, a), _NOTHING, strict=True)
+    )
+    top = np.maximum(np.where(np.isnan(top), np.inf, top), v)
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        braking_way = stopping_distance(v, b)
+        room = d - loc - gap
+        room = room - _ROUNDING * (np.abs(d) + loc + gap + braking_way)
+        share = 1.0 / (1.0 + a / b)
+        onset = np.hypot(np.sqrt(2.0 * a) * np.sqrt(np.maximum(room, 0.0)), v) * np.sqrt(share)
+        # (w - v) / a without the difference of two nearly equal speeds, and right for a = 0 too.
+        free = np.where(v < 0.0, (onset - v) / a, 2.0 * share * (room - braking_way) / (onset + v))
+        way_to_top = 0.5 * (top - v) * ((top + v) / a)
+        at_top = way_to_top + stopping_distance(top, b)
+        left = room - at_top - _ROUNDING * (0.5 * top * top / a + at_top)
+        tau = np.where(onset > top, (top - v) / a + left / top, free)
+        lease = tau - delays - _ROUNDING * (np.abs(tau) + delays)
+        still = v <= 0.0
+        lease = np.where(still & ((a == 0.0) | (top == 0.0)), np.inf, lease)
+    lease = np.where(known & ~(still & (room <= 0.0)), lease, -np.inf)
+    return np.asarray(np.where(np.isnan(lease), -np.inf, lease))
+
+
+_NOTHING = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+"""Stand-ins for what is not known, so that its arithmetic stays quiet; the result there is -inf anyway."""
+
+
+def longest_lease_of_room(room: ArrayLike, closing_speed: ArrayLike, delays_s: ArrayLike) -> Array:
+    """The longest lease from a barrier that already counts the stopping distance: `room / closing - delays`.
+
+    Args:
+        room: Value h of the barrier, in any unit U, shape (...): what is left after braking.
+        closing_speed: Bound on how fast h may fall under any command until the brakes hold, U/s, shape (...).
+        delays_s: The other four delays, s, shape (...).
+
+    Returns:
+        Lease in s, shape (...). inf where h cannot fall (closing speed <= 0) and is positive; -inf where it cannot
+        fall and is not, and where an input is not finite.
+
+    Raises:
+        ConfigurationError: For a negative delay.
+    """
+    h, closing, delays = np.broadcast_arrays(
+        *(np.asarray(x, dtype=np.float64) for x in (room, closing_speed, delays_s))
+    )
+    _not_negative(delays_s=delays)
+    known = np.isfinite(h) & np.isfinite(closing) & np.isfinite(delays)
+    falls = known & (closing > 0.0)
+    with np.errstate(over="ignore"):
+        tau = np.where(falls, h, 0.0) / np.where(falls, closing, 1.0)
+        known_delays = np.where(known, delays, 0.0)
+        lease = tau - known_delays - _ROUNDING * (np.abs(tau) + known_delays)
+    lease = np.where(falls, lease, np.where(known & (h > 0.0), np.inf, -np.inf))
+    return np.asarray(np.where(np.isnan(lease), -np.inf, lease))
+
+
+def _not_negative(**values: Array) -> None:
+    for name, value in values.items():
+        if np.any(value < 0.0):
+            raise ConfigurationError(f"{name} must not be negative, got {float(np.min(value)):g}")

@@ -1,0 +1,362 @@
+"""How far a machine can get in a time, and how long it takes: idealised, and with limited jerk.
+
+Source: appendix "Trajectory transit time and reachable distance". Two kinds of answers, for two uses:
+
+* Necessary bounds (`transit_time`, `reach`, `furthest`, `admits`): every further limit only shrinks what can be
+  reached, so what lies outside is refused before anything else is computed, and nothing that is possible ever is.
+* The constrained profile itself (`jerk_limited_time`, `jerk_limited_reach`), solved by ruckig for the stated velocity
+  and acceleration at both ends. It is not the trapezoid plus an offset: a minimum-time profile may have four or seven
+  phases of jerk.
+
+Metres stand for any unit of length: radians do as well.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import ruckig
+from numpy.typing import ArrayLike, NDArray
+
+from safe_wrappers.errors import ConfigurationError
+
+Array = NDArray[np.float64]
+State = tuple[ArrayLike, ArrayLike, ArrayLike]
+"""Position (m), velocity (m/s), acceleration (m/s^2), each of shape (..., axes) or scalar."""
+
+_ROUNDING = 32.0 * float(np.finfo(np.float64).eps)
+"""Relative; more than the roundings below can add up to, and nothing that a machine would notice."""
+_HALVINGS = 60
+"""Bisections until an interval is as small as rounding."""
+
+
+@dataclass(frozen=True)
+class MotionLimits:
+    """Symmetric limits of every axis; scalars count for all of them.
+
+    Attributes:
+        max_acceleration: m/s^2, finite.
+        max_speed: m/s; inf: none.
+        max_jerk: m/s^3; inf: none.
+
+    Raises:
+        ConfigurationError: For a limit that is not positive, or an acceleration that is not finite.
+    """
+
+    max_acceleration: float | Sequence[float]
+    max_speed: float | Sequence[float] = math.inf
+    max_jerk: float | Sequence[float] = math.inf
+    _arrays: tuple[Array, Array, Array] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        checked = _limits(self.max_acceleration, self.max_speed, self.max_jerk)
+        object.__setattr__(self, "_arrays", checked)
+
+    @property
+    def arrays(self) -> tuple[Array, Array, Array]:
+        """Acceleration, speed, jerk."""
+        return self._arrays
+
+
+def transit_time(distance: ArrayLike, max_acceleration: ArrayLike, max_speed: ArrayLike = np.inf) -> Array:
+    """The shortest time of a move from rest to rest: triangular up to `d = v_max^2 / a_max`, then trapezoidal.
+
+    A lower bound for a machine that has other limits besides.
+
+    Args:
+        distance: m, of either sign, shape (...).
+        max_acceleration: a_max for speeding up and for braking, m/s^2, shape (...).
+        max_speed: v_max, m/s, shape (...).
+
+    Returns:
+        Time in s, shape (...); inf for a distance that is not finite.
+
+    Raises:
+        ConfigurationError: For a limit that is not positive, or an acceleration that is not finite.
+    """
+    a, v, _ = _limits(max_acceleration, max_speed, np.inf)
+    d = np.abs(np.asarray(distance, dtype=np.float64))
+    d = np.where(np.isfinite(d), d, np.inf)
+    with np.errstate(invalid="ignore"):
+        time = np.where(d <= v * (v / a), 2.0 * np.sqrt(d / a), d / v + v / a)
+    return np.asarray(np.where(np.isinf(d), np.inf, time))
+
+
+def reach(duration: ArrayLike, max_acceleration: ArrayLike, max_speed: ArrayLike = np.inf) -> Array:
+    """The longest move from rest to rest within a time, the inverse of `transit_time`.
+
+    Args:
+        duration: s, shape (...).
+        max_acceleration: a_max, m/s^2, shape (...).
+        max_speed: v_max, m/s, shape (...).
+
+    Returns:
+        Distance in m, shape (...); 0 for a duration that is negative or NaN.
+
+    Raises:
+        ConfigurationError: For a limit that is not positive, or an acceleration that is not finite.
+    """
+    a, v, _ = _limits(max_acceleration, max_speed, np.inf)
+    time = np.asarray(duration, dtype=np.float64)
+    time = np.maximum(np.where(np.isnan(time), 0.0, time), 0.0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.asarray(np.where(time <= 2.0 * (v / a), 0.25 * a * time**2, v * (time - v / a)))
+
+
+def furthest(
+    duration: ArrayLike,
+    velocity: ArrayLike,
+    acceleration: ArrayLike,
+    max_speed: ArrayLike,
+    max_acceleration: ArrayLike,
+    max_jerk: ArrayLike = np.inf,
+) -> tuple[Array, Array]:
+    """Bounds on the displacement at any moment within a time, from a moving start to any speed at the end.
+
+    Upwards the acceleration grows by the largest jerk up to its limit, and the speed to its limit, without the
+    winding down of the acceleration that a real machine needs before it: no admissible motion gets farther, and the
+    bound is exact where the speed limit is not met or the jerk not limited. A start outside the limits moves them: a
+    machine that is too fast may stay as fast, and one whose acceleration carries it over the limit may go there.
+
+    Args:
+        duration: s, shape (...).
+        velocity: At the start, m/s, shape (...).
+        acceleration: At the start, m/s^2, shape (...); without a limit on the jerk it does not matter.
+        max_speed: m/s, shape (...); inf: none.
+        max_acceleration: m/s^2, shape (...).
+        max_jerk: m/s^3, shape (...); inf: none.
+
+    Returns:
+        Lowest (<= 0) and highest (>= 0) displacement in m, shape (...). Where the duration is negative or anything
+        is not finite, the empty interval (inf, -inf).
+
+    Raises:
+        ConfigurationError: For a limit that is not positive, or an acceleration limit that is not finite.
+    """
+    a_max, v_max, jerk = _limits(max_acceleration, max_speed, max_jerk)
+    time, v, a = (np.asarray(x, dtype=np.float64) for x in (duration, velocity, acceleration))
+    known = np.isfinite(time) & np.isfinite(v) & np.isfinite(a) & (time >= 0.0)
+    time, v, a = (np.where(known, x, 0.0) for x in (time, v, a))
+    up, down = _highest(time, v, a, v_max, a_max, jerk), _highest(time, -v, -a, v_max, a_max, jerk)
+    known = np.broadcast_to(known, up.shape)
+    return np.where(known, -down, np.inf), np.where(known, up, -np.inf)
+
+
+def _highest(time: Array, v: Array, a: Array, v_max: Array, a_max: Array, jerk: Array) -> Array:
+    """The largest displacement of the upper envelope within the time."""
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        # Without a limit on the jerk the envelope starts at full acceleration: a ramp of no length.
+        free = np.isinf(jerk)
+        a = np.where(free, a_max, a)
+        j = np.where(free, 1.0, jerk)
+        a_max = np.maximum(a_max, a)
+        v_max = np.maximum(
+            v_max, v + np.where(free, 0.0, 0.5 * np.maximum(a, 0.0) * (np.maximum(a, 0.0) / j))
+        )
+        ramp = (a_max - a) / j
+        gain = v_max - v
+        root = np.sqrt(a * a + 2.0 * j * gain)
+        rising = np.where(a > 0.0, 2.0 * gain / (a + root), (root - a) / j)
+        after = v + ramp * (a + 0.5 * j * ramp)
+        full = np.where(rising <= ramp, rising, ramp + (v_max - after) / a_max)
+        climb = np.minimum(time, full)
+        first = np.minimum(climb, ramp)
+        second = climb - first
+        at_end = first * (v + first * (0.5 * a + j / 6.0 * first))
+        at_end = at_end + second * (v + first * (a + 0.5 * j * first) + 0.5 * a_max * second)
+        cruise = time - climb
+        at_end = at_end + np.where(cruise > 0.0, v_max * cruise, 0.0)
+        # Braking at the start: the body may be highest where it turns, before it comes back.
+        square = a * a - 2.0 * j * v
+        turn = 2.0 * v / (np.sqrt(np.maximum(square, 0.0)) - a)
+        turns = (v > 0.0) & (a < 0.0) & (square > 0.0)
+        turn = np.minimum(np.where(turns, turn, 0.0), time)
+        at_turn = turn * (v + turn * (0.5 * a + j / 6.0 * turn))
+        peak = np.maximum(np.maximum(at_end, at_turn), 0.0)
+        speeds = np.abs(v) + climb * (np.abs(a) + a_max)
+        size = speeds * climb + np.where(cruise > 0.0, v_max * cruise, 0.0)
+        return np.asarray(peak + _ROUNDING * size)
+
+
+def admits(
+    goal: ArrayLike,
+    position: ArrayLike,
+    velocity: ArrayLike,
+    duration: ArrayLike,
+    max_speed: ArrayLike,
+    max_acceleration: ArrayLike,
+    max_jerk: ArrayLike = np.inf,
+    acceleration: ArrayLike = 0.0,
+) -> NDArray[np.bool_]:
+    """Whether a position may be reached within a time, at any speed: a necessary condition, axis by axis.
+
+    False means that no admissible motion gets there (`furthest`). True promises nothing: path, torque and stopping
+    still need their check.
+
+    Args:
+        goal: m, shape (...).
+        position: At the start, m, shape (...).
+        velocity: At the start, m/s, shape (...).
+        duration: s, shape (...).
+        max_speed: m/s, shape (...); inf: none.
+        max_acceleration: m/s^2, shape (...).
+        max_jerk: m/s^3, shape (...); inf: none. Only with a measured `acceleration`: a machine that is already
+            accelerating gets farther than one that is not.
+        acceleration: At the start, m/s^2, shape (...).
+
+    Returns:
+        Shape (...). False where anything is not finite or the duration is negative.
+
+    Raises:
+        ConfigurationError: For a limit that is not positive, or an acceleration limit that is not finite.
+    """
+    lowest, highest = furthest(duration, velocity, acceleration, max_speed, max_acceleration, max_jerk)
+    end, start = np.asarray(goal, dtype=np.float64), np.asarray(position, dtype=np.float64)
+    with np.errstate(invalid="ignore"):
+        way, slack = end - start, _ROUNDING * (np.abs(end) + np.abs(start))
+        return np.asarray((lowest - slack <= way) & (way <= highest + slack) & np.isfinite(way))
+
+
+def jerk_limited_time(start: State, end: State, limits: MotionLimits) -> Array:
+    """The shortest time in which all axes arrive at their end state together.
+
+    At rest ends it is the slowest axis's own time; with moving ends it may be longer, since an axis cannot wait. A
+    start outside the limits is first led back inside, as fast as they allow.
+
+    Args:
+        start: Position, velocity, acceleration.
+        end: Likewise; the last axis holds the axes of the machine (a scalar is one axis), those before it the batch.
+        limits: Of every axis.
+
+    Returns:
+        Time in s, shape (...). inf where a state is not finite, and where the end state cannot be arrived at inside
+        the limits: too fast, too strongly accelerated, or braking from a speed that was over the limit.
+
+    Raises:
+        ConfigurationError: Where the shapes do not fit together, or ruckig finds no profile for other reasons.
+    """
+    a_max, v_max, jerk = limits.arrays
+    given = [np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in (*start, *end, a_max, v_max, jerk)]
+    try:
+        p0, v0, a0, p1, v1, a1, a_lim, v_lim, j_lim = np.broadcast_arrays(*given)
+    except ValueError:
+        shapes = ", ".join(str(x.shape) for x in given)
+        raise ConfigurationError(
+            f"states and limits must have shapes that fit together, got {shapes}"
+        ) from None
+    possible = np.all([np.isfinite(x) for x in (p0, v0, a0, p1, v1, a1)], axis=0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        # Arriving with an acceleration against the motion, the speed was higher before.
+        before = np.where(v1 * a1 < 0.0, 0.5 * a1 * (a1 / j_lim), 0.0)
+        possible &= (np.abs(v1) + before <= v_lim) & (np.abs(a1) <= a_lim)
+    whole = possible.all(axis=-1)
+    times = np.full(whole.shape, np.inf)
+    for i in np.ndindex(whole.shape):
+        if whole[i]:
+            states = ((p0[i], v0[i], a0[i]), (p1[i], v1[i], a1[i]))
+            times[i] = _profile(*states, (a_lim[i], v_lim[i], j_lim[i])).duration
+    return times
+
+
+def jerk_limited_reach(
+    duration: ArrayLike, start_velocity: ArrayLike, start_acceleration: ArrayLike, limits: MotionLimits
+) -> tuple[Array, Array]:
+    """The lowest and the highest displacement at which an axis can be at rest within a time.
+
+    All rest positions between the two can be reached as well, as long as the start keeps the limits: the motions are
+    a convex set. Found by bisection over ruckig's times, on the inner side.
+
+    Args:
+        duration: s, shape (...).
+        start_velocity: m/s, shape (...).
+        start_acceleration: m/s^2, shape (...).
+        limits: Of every axis.
+
+    Returns:
+        Lowest and highest displacement in m, shape (...). Where the time does not suffice to stop at all, or an input
+        is not finite, the empty interval (inf, -inf).
+
+    Raises:
+        ConfigurationError: Where ruckig finds no profile.
+    """
+    given = [np.asarray(x, dtype=np.float64) for x in (duration, start_velocity, start_acceleration)]
+    time, v, a, a_max, v_max, jerk = np.broadcast_arrays(*given, *limits.arrays)
+    lowest, highest = np.full(time.shape, np.inf), np.full(time.shape, -np.inf)
+    for i in np.ndindex(time.shape):
+        if np.isfinite([time[i], v[i], a[i]]).all():
+            ends = _rest_ends(
+                float(time[i]), float(v[i]), float(a[i]), (float(a_max[i]), float(v_max[i]), float(jerk[i]))
+            )
+            if ends is not None:
+                lowest[i], highest[i] = ends
+    return lowest, highest
+
+
+def _rest_ends(
+    time: float, v: float, a: float, limits: tuple[float, float, float]
+) -> tuple[float, float] | None:
+    a_max, v_max, jerk = limits
+    axis = tuple(np.array([x]) for x in limits)
+    start = (np.zeros(1), np.array([v]), np.array([a]))
+    nothing = np.zeros(1)
+    stop = _profile(start, (nothing, nothing, nothing), axis, ruckig.ControlInterface.Velocity)
+    if stop.duration > time:
+        return None
+    at_stop = float(stop.at_time(stop.duration)[0][0])
+
+    def inside(position: float) -> bool:
+        return bool(_profile(start, (np.array([position]), nothing, nothing), axis).duration <= time)
+
+    ends = []
+    for beyond in furthest(time, v, a, v_max, a_max, jerk):
+        reached, missed = at_stop, float(beyond)
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (reached + missed)
+            reached, missed = (middle, missed) if inside(middle) else (reached, middle)
+        ends.append(reached)
+    return ends[0], ends[1]
+
+
+def _profile(
+    start: tuple[Array, ...],
+    end: tuple[Array, ...],
+    limits: tuple[Array, ...],
+    interface: ruckig.ControlInterface = ruckig.ControlInterface.Position,
+) -> ruckig.Trajectory:
+    """Ruckig's profile between two finite states, axes along the only axis of the arrays."""
+    axes = len(start[0])
+    request = ruckig.InputParameter(axes)
+    request.control_interface = interface
+    request.current_position, request.current_velocity, request.current_acceleration = start
+    request.target_position, request.target_velocity, request.target_acceleration = end
+    request.max_acceleration, request.max_velocity, request.max_jerk = limits
+    trajectory = ruckig.Trajectory(axes)
+    try:
+        ruckig.Ruckig(axes).calculate(request, trajectory)
+    except ruckig.RuckigError as error:
+        reason = str(error).strip().splitlines()[0]
+        raise ConfigurationError(
+            f"ruckig found no profile from (position, velocity, acceleration) {_told(start)} to {_told(end)} within "
+            f"(acceleration, speed, jerk) {_told(limits)}: {reason}"
+        ) from error
+    return trajectory
+
+
+def _told(values: tuple[Array, ...]) -> str:
+    return str(tuple(np.round(v, 6).tolist() for v in values))
+
+
+def _limits(
+    max_acceleration: ArrayLike, max_speed: ArrayLike, max_jerk: ArrayLike
+) -> tuple[Array, Array, Array]:
+    named = {"max_acceleration": max_acceleration, "max_speed": max_speed, "max_jerk": max_jerk}
+    checked = []
+    for name, value in named.items():
+        array = np.asarray(value, dtype=np.float64)
+        finite = name == "max_acceleration"
+        if not np.all((array > 0.0) & (np.isfinite(array) if finite else True)):
+            kind = "positive and finite" if finite else "positive (inf: no limit)"
+            raise ConfigurationError(f"{name} must be {kind}, got {value!r}")
+        checked.append(array)
+    return checked[0], checked[1], checked[2]
