@@ -130,7 +130,7 @@ def evaluate(coefficients: ArrayLike, t: ArrayLike, derivative: int = 0) -> Arra
         raise ConfigurationError(f"derivative is an integer >= 0, got {derivative!r}")
     at = np.asarray(t, dtype=np.float64)
     c = differentiate(coefficients, int(derivative))
-    return value(c.reshape(*c.shape[:-1], *[1] * at.ndim, c.shape[-1]), at)
+    return value(c.reshape((*c.shape[:-1], *[1] * at.ndim, c.shape[-1])), at)
 
 
 def jerk_profile(coefficients: ArrayLike) -> Array:
@@ -221,7 +221,7 @@ def hermite(
     """
     span, (q0, v0, q1, v1) = _boundary(duration, q0=q0, v0=v0, q1=q1, v1=v1)
     at = np.asarray(t, dtype=np.float64)
-    q0, v0, q1, v1, span = (x.reshape(*x.shape, *[1] * at.ndim) for x in (q0, v0, q1, v1, span))
+    q0, v0, q1, v1, span = (x.reshape((*x.shape, *[1] * at.ndim)) for x in (q0, v0, q1, v1, span))
     return _hermite((q0, v0, q1, v1), span, at, derivative)
 
 
