@@ -29,6 +29,12 @@ _ROUNDING = 16.0 * float(np.finfo(np.float64).eps)
 """Relative; more than the roundings of any formula below can add up to."""
 
 
+_TINY = 1e-300
+"""The same for numbers so small that their relative precision is gone."""
+_LONGEST = 1e300
+"""s; a machine that creeps has no longer lease: the next number may be no number."""
+
+
 @dataclass(frozen=True)
 class LeaseDelays:
     """The delays beside the lease itself, in s.
@@ -139,10 +145,11 @@ def longest_lease(
         # (w - v) / a without the difference of two nearly equal speeds, and right for a = 0 too.
         free = np.where(v < 0.0, (onset - v) / a, 2.0 * share * (room - braking_way) / (onset + v))
         way_to_top = 0.5 * (top - v) * ((top + v) / a)
-        at_top = way_to_top + stopping_distance(top, b)
-        left = room - at_top - _ROUNDING * (0.5 * top * top / a + at_top)
-        tau = np.where(onset > top, (top - v) / a + left / top, free)
-        lease = tau - delays - _ROUNDING * (np.abs(tau) + delays)
+        stop_from_top = stopping_distance(top, b)
+        left = room - way_to_top - stop_from_top
+        left = left - _ROUNDING * (np.abs(way_to_top) + stop_from_top)
+        tau = np.minimum(np.where(onset > top, (top - v) / a + left / top, free), _LONGEST)
+        lease = tau - delays - _ROUNDING * (np.abs(tau) + delays) - _TINY
         still = v <= 0.0
         lease = np.where(still & ((a == 0.0) | (top == 0.0)), np.inf, lease)
     lease = np.where(known & ~(still & (room <= 0.0)), lease, -np.inf)
@@ -175,9 +182,9 @@ def longest_lease_of_room(room: ArrayLike, closing_speed: ArrayLike, delays_s: A
     known = np.isfinite(h) & np.isfinite(closing) & np.isfinite(delays)
     falls = known & (closing > 0.0)
     with np.errstate(over="ignore"):
-        tau = np.where(falls, h, 0.0) / np.where(falls, closing, 1.0)
+        tau = np.minimum(np.where(falls, h, 0.0) / np.where(falls, closing, 1.0), _LONGEST)
         known_delays = np.where(known, delays, 0.0)
-        lease = tau - known_delays - _ROUNDING * (np.abs(tau) + known_delays)
+        lease = tau - known_delays - _ROUNDING * (np.abs(tau) + known_delays) - _TINY
     lease = np.where(falls, lease, np.where(known & (h > 0.0), np.inf, -np.inf))
     return np.asarray(np.where(np.isnan(lease), -np.inf, lease))
 
