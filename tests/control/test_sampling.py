@@ -1,0 +1,111 @@
+"""Hold lag and phase budget against python-control's margins, exact sampled loops and their stability limits."""
+
+import control as ct
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from safe_wrappers.control.sampling import hold_lag_s, margin_left, phase_lag
+from safe_wrappers.errors import ConfigurationError
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.floats(0.01, 100), st.floats(0.01, 0.49))
+def test_a_hold_lags_by_half_its_interval(crossover, share_of_the_sampling_rate):
+    hold = share_of_the_sampling_rate * 2 * np.pi / crossover
+    hold_response = (1 - np.exp(-1j * crossover * hold)) / (1j * crossover * hold)
+    assert phase_lag(crossover, hold) == pytest.approx(-np.angle(hold_response), rel=1e-9)
+    assert crossover * hold_lag_s(hold) == pytest.approx(-np.angle(hold_response), rel=1e-9)
+
+
+def test_the_printed_number():
+    crossover, rate = 7.0, 50.0
+    assert np.degrees(phase_lag(crossover, 1 / rate)) == pytest.approx(28.65 * crossover / rate, rel=1e-4)
+
+
+def test_every_part_counts_and_arguments_broadcast():
+    hold, compute, bus = 0.02, np.array([0.0, 0.003]), 0.001
+    lag = phase_lag(5.0, hold, compute, bus)
+    np.testing.assert_allclose(lag, 5.0 * (np.array([0.0, 0.003]) + 0.001 + 0.01), rtol=1e-14)
+    np.testing.assert_allclose(margin_left(1.0, 5.0, hold, compute, bus), 1.0 - lag, rtol=1e-14)
+    assert phase_lag(5.0, 0.0) == 0.0
+    assert margin_left(0.1, 5.0, hold, 0.1) < 0.0
+
+
+S = ct.tf("s")
+LOOPS = {
+    "speed of a cart": 4 / S,
+    "position of a cart, PD": (4 + 5 * S) / S**2,
+    "servo with a motor's lag": 30 / (S * (S + 8)),
+    "three lags": 12 / ((S + 1) * (S + 2) * (S + 3)),
+}
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning:control", "ignore:stability_margins:UserWarning")
+@pytest.mark.parametrize("name", LOOPS)
+@pytest.mark.parametrize("late_by", [0, 1, 3])
+def test_the_margin_that_is_left_is_the_sampled_loop_s(name, late_by):
+    loop = LOOPS[name]
+    _, margin, _, crossover = ct.margin(loop)
+    hold = 0.02 * 2 * np.pi / crossover  # crossover at a fiftieth of the sampling rate
+    z = ct.tf([1, 0], [1], hold)
+    sampled = ct.sample_system(loop, hold, "zoh") * z**-late_by
+    # margin() reports the worst phase margin of a sampled loop: these cross over once below Nyquist
+    _, found, _, at = ct.margin(sampled)
+    predicted = margin_left(np.radians(margin), crossover, hold, compute_s=late_by * hold)
+    assert at == pytest.approx(crossover, rel=0.01)
+    assert np.radians(found) == pytest.approx(predicted, abs=0.012)
+    assert np.radians(margin) - predicted > 0.06 * (1 + 2 * late_by)  # what the two agree on is not small
+
+
+@pytest.mark.parametrize(("late_by", "off"), [(0, 0.6), (1, 0.06), (3, 0.01), (10, 0.001)])
+def test_the_loop_turns_unstable_where_nothing_is_left_in_the_baseband_only(late_by, off):
+    """k / s, held and n samples late: z^n (z - 1) + k T has its first roots on the circle at a known gain."""
+    hold = 0.01
+
+    def radius(gain):
+        polynomial = np.zeros(late_by + 2)
+        polynomial[:2] = 1.0, -1.0
+        polynomial[-1] += gain * hold
+        return np.abs(np.roots(polynomial)).max()
+
+    exact = 2 * np.sin(np.pi / (2 * (2 * late_by + 1))) / hold
+    assert radius(exact * 0.999) < 1 < radius(exact * 1.001)
+    predicted = np.pi / (2 * late_by + 1) / hold  # where pi / 2 is used up
+    if late_by:
+        assert margin_left(np.pi / 2, predicted, hold, late_by * hold) == pytest.approx(0.0, abs=1e-12)
+    else:  # Nyquist already: the formula says nothing there, and refuses
+        with pytest.raises(ConfigurationError, match="Nyquist"):
+            margin_left(np.pi / 2, predicted, hold)
+    assert 0 < predicted / exact - 1 < off
+
+
+def test_the_figures_of_the_module_s_docstring():
+    """k / s, held: z - 1 + k T. On the unit circle |z - 1| = 2 sin(angle / 2), and its phase is the hold's lag."""
+    hold = 0.01
+    for crossover, short_of in ((0.1 * 2 * np.pi / hold, 0.3), (1.999 / hold, 32.7)):
+        angle = 2 * np.arcsin(crossover * hold / 2)
+        truly_left = np.degrees(np.pi / 2 - angle / 2)
+        said = np.degrees(margin_left(np.pi / 2, crossover, hold))
+        assert said - truly_left == pytest.approx(short_of, abs=2.0 if short_of > 1 else 0.05)
+    assert np.degrees(margin_left(np.pi / 2, 2 / hold, hold)) == pytest.approx(33, abs=0.5)
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: hold_lag_s(-0.01), "hold_s must be >= 0"),
+        (lambda: hold_lag_s("slow"), "hold_s is a number in s"),
+        (lambda: phase_lag(0.0, 0.01), "crossover must be > 0"),
+        (lambda: phase_lag(np.nan, 0.01), "crossover must be > 0"),
+        (lambda: phase_lag(1.0, 0.01, compute_s=-1e-3), "compute_s must be >= 0"),
+        (lambda: phase_lag(1.0, 0.01, bus_s=np.inf), "bus_s must be >= 0"),
+        (lambda: phase_lag(315.0, 0.01), "below the Nyquist frequency"),
+        (lambda: phase_lag([1.0, 400.0], 0.01), "below the Nyquist frequency"),
+        (lambda: margin_left(np.nan, 1.0, 0.01), "phase_margin must be finite"),
+    ],
+)
+def test_bad_input_is_refused_in_words(call, says):
+    with pytest.raises(ConfigurationError, match=says):
+        call()
