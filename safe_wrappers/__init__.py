@@ -34,6 +34,8 @@ from safe_wrappers.plants.plant import Plant
 from safe_wrappers.protect import protect
 from safe_wrappers.wrappers.adaption_penalty import AdaptionPenalty
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
+from safe_wrappers.wrappers.chunk_handover import ChunkHandover
+from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
 
 __all__ = [
@@ -42,6 +44,7 @@ __all__ = [
     "Barrier",
     "Box",
     "CBFActionFilter",
+    "ChunkHandover",
     "Clearance",
     "Constraint",
     "Disc",
@@ -50,6 +53,7 @@ __all__ = [
     "HeadingDriveClearance",
     "JointPositionLimit",
     "JointSpeedLimit",
+    "LeaseExpiry",
     "MujocoPlant",
     "Plane",
     "Plant",

@@ -63,3 +63,37 @@ ADAPTION_PENALTY: Final = "adaption/penalty"
 """float64: what was taken off this step's reward because the filter changed the action, in reward units; else 0."""
 ADAPTION_TASK_REWARD: Final = "adaption/task_reward"
 """float64: the task's own reward of this step, before the penalty."""
+
+# ChunkHandover, every step: of its chunk of control steps --------------------------------------------------------
+HANDOVER_SEAM_JUMP: Final = "handover/seam_jump"
+"""float64, shape (3,): the largest first, second and third difference of the executed commands over this step's
+seams, in action units: a difference counts if its newest command is one of the blend's or of the three after it."""
+HANDOVER_PEAK_JERK: Final = "handover/peak_jerk"
+"""float64: the largest |du/dt| of any component of the executed commands, seam or not, in action units per second."""
+HANDOVER_BLEND_TIME: Final = "handover/blend_time"
+"""float64: s, how long the longest blend takes that began in this step; 0 where none did."""
+HANDOVER_STARVED: Final = "handover/starved"
+"""int64: control steps of this step at which the queue was dry and the fallback gave the command."""
+HANDOVER_LIMITED: Final = "handover/limited"
+"""int64: control steps of this step at which a command was held back, beyond the blend, to keep `jerk_limit`."""
+HANDOVER_REFUSED: Final = "handover/refused"
+"""bool: a chunk was refused: not finite, not newer than the one in force, too late, or out of reach."""
+HANDOVER_LATENCY: Final = "handover/latency"
+"""int64: control steps that went by between the observation and the takeover of the chunk that took over in this
+step, as consumed; -1 where none did."""
+HANDOVER_STEPS: Final = "handover/steps"
+"""int64: control steps executed in this step (fewer than the execution horizon where the episode ended)."""
+
+# LeaseExpiry, every control step ---------------------------------------------------------------------------------
+LEASE_REMAINING_S: Final = "lease/remaining_s"
+"""float64: s that the lease in force has left after this control step; 0 where there is none."""
+LEASE_EXPIRED: Final = "lease/expired"
+"""bool: a lease ran out at this control step (once per lease)."""
+LEASE_REFUSED: Final = "lease/refused"
+"""bool: a fresh command came and was not granted a lease, or a chunk was refused as out of reach."""
+LEASE_BRAKING: Final = "lease/braking"
+"""bool: the fallback acted at this control step."""
+
+# The faults of safe_wrappers.wrappers.faults, every step --------------------------------------------------------
+FAULT_ACTIVE: Final = "fault/active"
+"""bool: what the policy gave at this step did not arrive as it was: it was lost, late, or replaced."""

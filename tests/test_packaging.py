@@ -108,7 +108,7 @@ def test_metadata(wheel):
     assert metadata["License-Expression"] == "MIT"
     plain = [r for r in metadata.get_all("Requires-Dist") if "extra ==" not in r]
     needed = {re.split(r"[\s<>=\[;!~]", r)[0].lower() for r in plain}
-    assert needed == {"numpy", "scipy", "gymnasium", "mujoco", "qpsolvers", "daqp", "clarabel"}
+    assert needed == {"numpy", "scipy", "gymnasium", "mujoco", "qpsolvers", "daqp", "clarabel", "ruckig"}
     (scripts,) = [n for n in archive.namelist() if n.endswith("entry_points.txt")]
     assert "safe-wrappers = safe_wrappers.train.cli:main" in archive.read(scripts).decode()
 

@@ -21,7 +21,7 @@ CONDITIONS: Final = {
     "filter_off": "Evaluation, filter off",
     "filter_on": "Evaluation, filter on",
 }
-TOTALS: Final = ("violations", "infeasible", "fallback", "unsafe")
+TOTALS: Final = ("violations", "infeasible", "fallback", "unsafe", "lease_braking", "lease_expired")
 METRICS: Final = {
     "return": "Return / episode",
     "length": "Steps / episode",
@@ -36,6 +36,8 @@ METRICS: Final = {
     "infeasible_per_1000": "Infeasible steps / 1000",
     "fallback": "Fallback steps, total",
     "unsafe": "Steps begun with h < 0, total",
+    "lease_braking": "Steps braked by the lease, total",
+    "lease_expired": "Leases run out, total",
     "goals_reached": "Goals / episode",
 }
 """What is reported. Totals and rates per 1000 steps are over a condition's episodes; all else is the mean over its

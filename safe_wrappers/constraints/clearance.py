@@ -146,6 +146,14 @@ class Clearance:
             [sampled_inset(s.clearance, s.approach, self.braking, plant.hold_s) for s in self._look(plant)]
         )
 
+    def approach(self, plant: Plant) -> tuple[Array, Array]:
+        """Clearances (m) and approach speeds (m/s, towards the obstacle), one per point and surface.
+
+        As measured: neither margin, nor state error, nor the way of braking is taken off.
+        """
+        seen = self._look(plant)
+        return np.concatenate([s.clearance for s in seen]), np.concatenate([s.approach for s in seen])
+
     def rows(self, plant: Plant) -> HalfSpaces:
         """One row per point and surface whose limit the actuators could exceed."""
         normals, offsets = [], []

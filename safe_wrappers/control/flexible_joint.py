@@ -11,7 +11,8 @@ the manifold z0: with W = J^-1 + M^-1, the deflection's deviation d = K^-1 (z - 
 
     dv/dt = -W K d        and        E = (d . K d + v . W^-1 v) / 2,
 
-and E, in J, is kept but for damping. A torque change moves the manifold; what it leaves in E rings on at the `resonances`.
+and E, in J, is kept but for damping. A torque change moves the manifold; what it leaves in E rings on at the
+`resonances`.
 
 **Frozen** means: over some periods of the resonances the pose, velocities and bias hardly change. The figures of
 energy are the boundary layer's, exact in that limit; the tests say how far off they are on a moving arm. A bound on

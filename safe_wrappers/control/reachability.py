@@ -151,9 +151,8 @@ def _highest(time: Array, v: Array, a: Array, v_max: Array, a_max: Array, jerk: 
         a = np.where(free, a_max, a)
         j = np.where(free, 1.0, jerk)
         a_max = np.maximum(a_max, a)
-        v_max = np.maximum(
-            v_max, v + np.where(free, 0.0, 0.5 * np.maximum(a, 0.0) * (np.maximum(a, 0.0) / j))
-        )
+        growing = np.where(free, 0.0, np.maximum(a, 0.0))
+        v_max = np.maximum(v_max, v + 0.5 * growing * (growing / j))
         ramp = (a_max - a) / j
         gain = v_max - v
         root = np.sqrt(a * a + 2.0 * j * gain)

@@ -8,6 +8,7 @@ from safe_wrappers import interventions as keys
 from safe_wrappers.constraints.constraint import non_negative
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
+from safe_wrappers.wrappers.chunk_handover import ChunkHandover
 
 
 class AdaptionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
@@ -94,6 +95,11 @@ def _check_inside(env: gym.Env[Any, Any]) -> None:
         if isinstance(inner, AdaptionPenalty):
             raise ConfigurationError(
                 "this env has an AdaptionPenalty already; its penalty would be taken twice"
+            )
+        if isinstance(inner, ChunkHandover):
+            raise ConfigurationError(
+                "AdaptionPenalty outside of ChunkHandover would see one step per chunk; put it inside: "
+                "ChunkHandover(AdaptionPenalty(...), ...)"
             )
         filtered = filtered or isinstance(inner, CBFActionFilter)
         inner = inner.env

@@ -21,6 +21,8 @@ from safe_wrappers.plants.mujoco import MujocoPlant
 from safe_wrappers.plants.plant import Plant, check_actions
 from safe_wrappers.wrappers.decision import Decider
 from safe_wrappers.wrappers.fallback import Fallback, FallbackFunction
+from safe_wrappers.wrappers.own_plant import PlantOfSpec, own_plant
+from safe_wrappers.wrappers.receiver import CommandReceiver
 from safe_wrappers.wrappers.rounding import cast_inside
 
 Array = NDArray[np.float64]
@@ -85,22 +87,17 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         margin: float = 0.0,
     ) -> None:
         space = check_actions(env)
-        if isinstance(plant, _PlantOfSpec):
-            plant = plant.fresh()
+        plant = own_plant(plant)
         if isinstance(constraints, str | dict) or not isinstance(constraints, Sequence) or not constraints:
             raise ConfigurationError(f"constraints is a list with at least one, got {constraints!r}")
         _refuse_nesting(env)
-        if plant is not None and (isinstance(plant, type) or not callable(getattr(plant, "observe", None))):
-            raise ConfigurationError(
-                f"plant is a MujocoPlant, an AnalyticPlant or another object with the Plant protocol, got {plant!r}"
-            )
         own = [copy.deepcopy(constraint_from(c)) for c in constraints]
         margin = non_negative("margin", margin, "the constraints' own units")
         check_solver(solver)
         gym.utils.RecordConstructorArgs.__init__(
             self,
             constraints=[constraint_data(c) for c in own],
-            plant=None if plant is None else _PlantOfSpec(plant),
+            plant=None if plant is None else PlantOfSpec(plant),
             fallback=fallback,
             solver=solver,
             margin=margin,
@@ -255,16 +252,6 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
             warnings.warn(message, category, stacklevel=stacklevel)
 
 
-class _PlantOfSpec:
-    """A plant as an env's spec keeps it: every env that is made from the spec gets one of its own."""
-
-    def __init__(self, plant: Plant) -> None:
-        self._plant = plant
-
-    def fresh(self) -> Plant:
-        return copy.deepcopy(self._plant)
-
-
 def _unique(kinds: list[str]) -> list[str]:
     """A number behind every kind that occurs more than once."""
     return [
@@ -289,6 +276,11 @@ def _refuse_nesting(env: gym.Env[Any, Any]) -> None:
             raise ConfigurationError(
                 "this env is filtered already; constraints compose in one projection, so pass all of them to one "
                 "filter: CBFActionFilter(env, [*inner.constraints, more])"
+            )
+        if isinstance(inner, CommandReceiver):
+            raise ConfigurationError(
+                f"{type(inner).__name__} inside the filter changes the actions that the filter has checked; the filter "
+                "has the last word, so it belongs inside: ChunkHandover(LeaseExpiry(CBFActionFilter(env, ...), ...), ...)"
             )
         inner = inner.env
 

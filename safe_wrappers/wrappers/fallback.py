@@ -45,7 +45,7 @@ class Fallback:
 
     def __call__(
         self,
-        plant: Plant,
+        plant: Plant | None,
         last: Array,
         low: Array,
         high: Array,
@@ -55,7 +55,7 @@ class Fallback:
         """The control, finite and clipped to the box; one that is not finite is replaced by zero.
 
         Args:
-            plant: Observed.
+            plant: Observed; "hold" and "zero" need none.
             last: What was executed before, shape (m,).
             low: Action box, shape (m,).
             high: Likewise.
@@ -63,6 +63,7 @@ class Fallback:
             readable: False if the state is not a number: braking is then no control, for want of a motion to brake.
         """
         if callable(self._choice):
+            assert plant is not None
             control = np.asarray(self._choice(plant), dtype=np.float64)
             if control.shape != low.shape:
                 raise ConfigurationError(

@@ -14,6 +14,7 @@ import numpy as np
 
 from safe_wrappers import interventions as keys
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.chunk_handover import ChunkHandover
 
 COLUMNS: Final = (
     "length",
@@ -25,6 +26,9 @@ COLUMNS: Final = (
     "fallback",
     "nonfinite",
     "unsafe",
+    "lease_expired",
+    "lease_refused",
+    "lease_braking",
     "margin_min",
     "violations",
     "cost",
@@ -35,13 +39,25 @@ COLUMNS: Final = (
 """The CSV file's columns. `goals_reached` and `success` stay empty for tasks that do not report them."""
 
 
+_COUNTED: Final = {
+    "infeasible": keys.CBF_INFEASIBLE,
+    "fallback": keys.CBF_FALLBACK,
+    "nonfinite": keys.CBF_NONFINITE,
+    "unsafe": keys.CBF_UNSAFE,
+    "lease_expired": keys.LEASE_EXPIRED,
+    "lease_refused": keys.LEASE_REFUSED,
+    "lease_braking": keys.LEASE_BRAKING,
+}
+"""Steps at which a flag was up, by the summary's name for it."""
+
+
 class RecordInterventions(
     gym.Wrapper[Any, Any, Any, Any],
     gym.utils.RecordConstructorArgs,
 ):
     """Counts interventions, corrections and costs; changes neither actions, rewards nor observations.
 
-    Put it outside the filter and inside SB3's `Monitor`. Without a filter inside (the unfiltered arm of a
+    Put it outside the filter and `LeaseExpiry`, and inside `ChunkHandover` and SB3's `Monitor`. Without a filter inside (the unfiltered arm of a
     comparison) the missing `cbf/*` keys count as zero, and so do `cost` and `cost_substep` of a task that has
     none.
 
@@ -52,6 +68,7 @@ class RecordInterventions(
     - `intervention_rate`: intervened steps / length;
     - `correction_mean`, `correction_p95`: over all steps of the episode, also those with no correction;
     - `infeasible`, `fallback`, `nonfinite`, `unsafe`: numbers of steps;
+    - `lease_expired`, `lease_refused`, `lease_braking`: numbers of steps, all 0 without `LeaseExpiry`;
     - `margin_min`: the smallest finite `cbf/margin` (0 when there was none);
     - `violations`: steps with `cost` or `cost_substep` above 0;
     - `cost`, `cost_substep`: sums;
@@ -80,6 +97,7 @@ class RecordInterventions(
     """
 
     def __init__(self, env: gym.Env[Any, Any], path: str | os.PathLike[str] | None = None) -> None:
+        _refuse_chunks(env)
         text = None if path is None else os.fspath(path)
         if text is not None:
             _continue_file(Path(text))
@@ -125,7 +143,7 @@ class RecordInterventions(
         self._corrections: list[float] = []
         self._correction_sum = 0.0
         self._intervened = 0
-        self._counts = dict.fromkeys(("infeasible", "fallback", "nonfinite", "unsafe"), 0)
+        self._counts = dict.fromkeys(_COUNTED, 0)
         self._margin_min = math.inf
         self._violations = 0
         self._cost = 0.0
@@ -139,7 +157,7 @@ class RecordInterventions(
         self._correction_sum += correction
         self._intervened += bool(info.get(keys.CBF_INTERVENED, False))
         for name in self._counts:
-            self._counts[name] += bool(info.get(f"cbf/{name}", False))
+            self._counts[name] += bool(info.get(_COUNTED[name], False))
         margin = float(info.get(keys.CBF_MARGIN, math.inf))
         if math.isfinite(margin):
             self._margin_min = min(self._margin_min, margin)
@@ -185,6 +203,17 @@ class RecordInterventions(
 
     def _finite_margin(self) -> float:
         return self._margin_min if math.isfinite(self._margin_min) else 0.0
+
+
+def _refuse_chunks(env: gym.Env[Any, Any]) -> None:
+    inner: Any = env
+    while isinstance(inner, gym.Wrapper):
+        if isinstance(inner, ChunkHandover):
+            raise ConfigurationError(
+                "RecordInterventions outside of ChunkHandover would count chunks, not control steps; put it inside: "
+                "ChunkHandover(RecordInterventions(...), ...)"
+            )
+        inner = inner.env
 
 
 def read_episodes(path: str | os.PathLike[str]) -> list[dict[str, float]]:

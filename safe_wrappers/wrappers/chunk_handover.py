@@ -1,0 +1,312 @@
+"""ChunkHandover: the policy gives chunks, the robot gets one smooth stream of commands."""
+
+import math
+import warnings
+from collections.abc import Sequence
+from typing import Any, Final, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers import interventions as keys
+from safe_wrappers.constraints.constraint import non_negative
+from safe_wrappers.control.seams import BLENDS, DIFFERENCES
+from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError
+from safe_wrappers.plants.plant import Plant, check_actions
+from safe_wrappers.wrappers.chunk_queue import BASELINES, ChunkQueue, Command
+from safe_wrappers.wrappers.chunk_sizes import ChunkSizes, blend_bounds
+from safe_wrappers.wrappers.control_interval import control_interval
+from safe_wrappers.wrappers.fallback import FallbackFunction
+from safe_wrappers.wrappers.lease_expiry import lease_inside
+from safe_wrappers.wrappers.macro_info import macro_info
+from safe_wrappers.wrappers.own_plant import PlantOfSpec, own_plant
+from safe_wrappers.wrappers.own_random import OwnRandom
+from safe_wrappers.wrappers.receiver import CommandReceiver, receiver_inside
+from safe_wrappers.wrappers.stand_in import StandIn
+
+Array = NDArray[np.float64]
+
+_SAME_STEP: Final = 1e-6
+"""Control steps: a stamp that falls short of a step by less is meant to be that step's."""
+_REST: Final = {
+    keys.HANDOVER_PEAK_JERK: 0.0,
+    keys.HANDOVER_BLEND_TIME: 0.0,
+    keys.HANDOVER_STARVED: 0,
+    keys.HANDOVER_LIMITED: 0,
+    keys.HANDOVER_STEPS: 0,
+    keys.HANDOVER_REFUSED: False,
+    keys.HANDOVER_LATENCY: -1,
+}
+"""What a reset reports beside `handover/seam_jump`."""
+
+
+class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, CommandReceiver):
+    """Executes action chunks that come late, over seams that keep a rate limit.
+
+    The action space becomes the chunk, shape (H, m). One `step(chunk)` is `execution_horizon` control steps (fewer
+    where the episode ends); rewards are summed up. A chunk's entry j is meant for the j-th control step after the
+    observation that it was made from; with an `inference_delay` of d control steps the left-over of the chunk before
+    goes on for d steps, then the new chunk takes over at its entry d. At the start of an episode, with no left-over
+    yet, and whenever the queue runs dry, the fallback acts.
+
+    **Seams.** The new chunk is blended in over the shortest time that keeps `jerk_limit`, and at least over
+    `blend_time`; with neither given, over the left-over. See `control/seams.py`. A chunk whose step at the seam
+    keeps the limit anyhow is executed bit for bit (without a `blend_time`).
+
+    **What it guarantees.** With `jerk_limit`, no two commands that this wrapper sends within an episode differ by
+    more than `jerk_limit` times the control interval in any component, whatever the chunks: where no blend can keep
+    the limit the commands are held back, which is counted (`handover/limited`), and are late. No entry of a chunk
+    that is not finite is executed: such a chunk is refused as a whole, the left-over goes on, then the fallback.
+
+    **What it does not.** The limit is on commands: a filter inside may have to break it, and then
+    `handover/peak_jerk`, measured on what was executed, shows it. Measured jerk, tracking and stopping are the
+    plant's. It does not check that a chunk is safe: `LeaseExpiry` and `CBFActionFilter` belong inside.
+
+    **Chunks of one** (`chunk_size=1, execution_horizon=1`) are for ordinary policies: commands pass as they are,
+    held back by `jerk_limit` alone, and only a change of who gives them is blended: call `switch("human")`, give
+    the human's actions, `switch("policy")`. The fallback is such a change, too.
+
+    **Baselines** without any bound: blend="replace" takes the new chunk at once, blend="ensemble" averages all
+    chunks at hand with weights exp(-decay i), i = 0 the oldest (temporal ensembling, Zhao et al., RSS 2023).
+
+    Args:
+        env: With a one-dimensional Box action space.
+        chunk_size: H, entries of a chunk.
+        execution_horizon: s, control steps from one chunk's observation to the next; `d <= s <= H - d`.
+        inference_delay: d, control steps; or [least, most], drawn anew for every chunk.
+        blend: "smoothstep", "quintic", "hermite", or a baseline.
+        blend_time: s, the least duration of a blend.
+        jerk_limit: Bound on |du/dt| of every action component, action units per second (the jerk, where the
+            command is an acceleration or a torque).
+        fallback: "brake", "hold", "zero", or a function of the plant; "brake" needs MuJoCo or a plant.
+        plant: For the fallback; None reads the env's MuJoCo model.
+        hold_s: Control interval, s; None reads the env's `dt`.
+        decay: Of the ensemble's weights.
+
+    Info, at every step (see `safe_wrappers.interventions`): ``handover/seam_jump``, ``handover/peak_jerk``,
+    ``handover/blend_time``, ``handover/starved``, ``handover/limited``, ``handover/refused``,
+    ``handover/latency``, ``handover/steps``. The inner layers' costs are summed over the control steps, their flags
+    are True if they were at any of them (`wrappers/macro_info.py`).
+
+    Raises:
+        ConfigurationError: Sizes that do not fit together, times or limits that are not positive, nothing to blend
+            over, or not a Box action space.
+        ActionError: A chunk of the wrong shape; the env was not stepped.
+
+    Example:
+        >>> import gymnasium as gym, safe_wrappers as sw
+        >>> env = sw.ChunkHandover(gym.make("Reacher-v5"), chunk_size=16, execution_horizon=8, jerk_limit=20.0)
+        >>> _ = env.reset(seed=0)
+        >>> info = env.step(env.action_space.sample())[4]
+        >>> info["handover/peak_jerk"] <= 20.0
+        True
+
+    Change log:
+        * v0.1.0: added.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        chunk_size: int,
+        execution_horizon: int,
+        inference_delay: int | Sequence[int] = 0,
+        blend: str = "smoothstep",
+        blend_time: float | None = None,
+        jerk_limit: float | None = None,
+        fallback: str | FallbackFunction = "brake",
+        plant: Plant | None = None,
+        hold_s: float | None = None,
+        decay: float = 0.01,
+    ) -> None:
+        space = check_actions(env)
+        _refuse_order(env)
+        plant = own_plant(plant)
+        sizes = ChunkSizes.checked(chunk_size, execution_horizon, inference_delay)
+        if blend not in (*BLENDS, *BASELINES):
+            raise UnknownNameError(f"no blend {blend!r}; choose {', '.join((*BLENDS, *BASELINES))}")
+        decay = non_negative("decay", decay, "a number")
+        gym.utils.RecordConstructorArgs.__init__(
+            self,
+            chunk_size=sizes.chunk,
+            execution_horizon=sizes.horizon,
+            inference_delay=sizes.delay[0] if sizes.delay[0] == sizes.delay[1] else list(sizes.delay),
+            blend=blend,
+            blend_time=blend_time,
+            jerk_limit=jerk_limit,
+            fallback=fallback,
+            plant=None if plant is None else PlantOfSpec(plant),
+            hold_s=hold_s,
+            decay=decay,
+        )
+        gym.Wrapper.__init__(self, env)
+        self.chunk_size, self.execution_horizon, self.blend = sizes.chunk, sizes.horizon, blend
+        self.hold_s = control_interval(env, hold_s)
+        self._delay = sizes.delay
+        self._low, self._high = np.asarray(space.low, np.float64), np.asarray(space.high, np.float64)
+        self._dtype = space.dtype
+        self.action_space = gym.spaces.Box(
+            np.repeat(space.low[None], sizes.chunk, axis=0),
+            np.repeat(space.high[None], sizes.chunk, axis=0),
+            dtype=space.dtype,  # type: ignore[arg-type]
+        )
+        self._stand_in = StandIn(env, fallback, plant)
+        fewest, rate_limit = blend_bounds(sizes, space, self.hold_s, blend, blend_time, jerk_limit)
+        self._queue = ChunkQueue(
+            self._low.size,
+            self.hold_s,
+            blend=blend,
+            fewest=fewest,
+            rate_limit=rate_limit,
+            low=self._low,
+            high=self._high,
+            decay=decay,
+        )
+        self._inside = receiver_inside(env)
+        lease = lease_inside(env)
+        self._admit = lease.admits if lease is not None else None
+        self._random = OwnRandom(type(self).__name__)
+        self._warned = False
+        self._forget()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Reset the env and forget all chunks; the delays' random numbers start anew with a seed."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._random.reset(self.env, seed)
+        self._stand_in.reset()
+        self._queue.reset()
+        self._forget()
+        info.update(_REST)
+        info[keys.HANDOVER_SEAM_JUMP] = np.zeros(DIFFERENCES)
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Execute the next `execution_horizon` control steps, with this chunk from when it is there."""
+        refused = not self._submit(self._checked(action))
+        total, infos, commands, latency = 0.0, [], [], -1
+        terminated = truncated = False
+        for _ in range(self.execution_horizon):
+            now = self._queue.now
+            command = self._queue.next(self._stand_in.command, self._admit)
+            if command.took_over:
+                latency = now - command.observed
+            if self._inside is not None:
+                self._inside.deliver(None if command.observed < 0 else command.observed * self.hold_s)
+            sent = command.control.astype(self._dtype)
+            observation, reward, terminated, truncated, info = self.env.step(sent)
+            executed = np.asarray(info.get(keys.EXECUTED_ACTION, sent), dtype=np.float64)
+            self._stand_in.executed(executed)
+            self._executed = np.concatenate([self._executed, executed[None]])
+            self._in_seam.append(self._seams_at(now, command))
+            total += float(reward)
+            infos.append(info)
+            commands.append(command)
+            if terminated or truncated:
+                break
+        self._evidence = self.now_s
+        info = macro_info(infos)
+        info.update(self._measured(commands))
+        info[keys.HANDOVER_REFUSED] = refused or any(c.refused for c in commands)
+        info[keys.HANDOVER_LATENCY] = latency
+        return observation, total, terminated, truncated, info
+
+    # How others tell what a chunk is made from --------------------------------------------------------------------
+
+    @property
+    def now_s(self) -> float:
+        """Seconds of the episode so far, on the clock of control steps."""
+        return self._queue.now * self.hold_s
+
+    def deliver(self, observed_s: float | None) -> None:
+        """Say what the next chunk is made from; without a word it is made from the newest observation.
+
+        Args:
+            observed_s: When its observation was made, on the clock of `now_s`; a chunk that is not newer than the
+                newest one before, or is from the future, is refused. None: nothing arrives, the next step's
+                chunk is disregarded.
+        """
+        if observed_s is not None and not math.isfinite(observed_s):
+            raise ActionError(f"observed_s is a time in seconds, or None for nothing; got {observed_s!r}")
+        self._evidence = observed_s
+
+    def switch(self, source: str) -> None:
+        """Somebody else gives the commands from now on: the change is blended, from the last command.
+
+        Args:
+            source: Any name, such as "human" or "policy".
+        """
+        self._queue.switch(source)
+
+    def _checked(self, action: Any) -> Array:
+        try:
+            chunk = np.array(action, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ActionError(
+                f"expected a chunk of shape {self.action_space.shape}, got {action!r}"
+            ) from None
+        if chunk.shape != self.action_space.shape:
+            raise ActionError(
+                f"expected a chunk of shape {self.action_space.shape} (chunk_size, controls), got {chunk.shape}"
+            )
+        return chunk
+
+    def _submit(self, chunk: Array) -> bool:
+        """Send the chunk on its way; False if one came and was refused."""
+        delay = int(self._random.draw.integers(self._delay[0], self._delay[1] + 1))
+        if self._evidence is None:
+            return True
+        observed = math.floor(self._evidence / self.hold_s + _SAME_STEP)
+        return self._queue.submit(chunk, observed, self._queue.now + delay)
+
+    def _forget(self) -> None:
+        self._evidence: float | None = 0.0
+        self._executed = np.zeros((0, self._low.size))
+        self._in_seam: list[bool] = []
+        self._seam_until = -1
+
+    def _seams_at(self, now: int, command: Command) -> bool:
+        """Whether this control step's differences are a seam's: from its first command to three after its blend."""
+        if command.seam:
+            self._seam_until = max(self._seam_until, now + command.blend_steps + DIFFERENCES - 1)
+        return now <= self._seam_until
+
+    def _measured(self, commands: list[Command]) -> dict[str, Any]:
+        counted = np.array(self._in_seam)
+        jump = np.zeros(DIFFERENCES)
+        peak = 0.0
+        for order in range(1, DIFFERENCES + 1):
+            steps = np.abs(np.diff(self._executed, n=order, axis=0))[-len(counted) :].max(axis=1, initial=0.0)
+            at_seam = steps[counted[len(counted) - len(steps) :]]
+            jump[order - 1] = at_seam.max(initial=0.0)
+            if order == 1:
+                peak = float(steps.max(initial=0.0)) / self.hold_s
+        self._executed, self._in_seam = self._executed[-DIFFERENCES:], []
+        blends = [c.blend_steps for c in commands if c.blend_steps]
+        limited = sum(c.limited for c in commands)
+        if limited and not self._warned:
+            self._warned = True
+            warnings.warn(
+                "a command was held back to keep jerk_limit: the chunk is too short for a blend that keeps it, or "
+                "moves too fast by itself (handover/limited counts the control steps)",
+                UserWarning,
+                stacklevel=3,
+            )
+        return {
+            keys.HANDOVER_SEAM_JUMP: jump,
+            keys.HANDOVER_PEAK_JERK: peak,
+            keys.HANDOVER_BLEND_TIME: (max(blends) + 1) * self.hold_s if blends else 0.0,
+            keys.HANDOVER_STARVED: sum(c.starved for c in commands),
+            keys.HANDOVER_LIMITED: limited,
+            keys.HANDOVER_STEPS: len(commands),
+        }
+
+
+def _refuse_order(env: gym.Env[Any, Any]) -> None:
+    inner: Any = env
+    while isinstance(inner, gym.Wrapper):
+        if isinstance(inner, ChunkHandover):
+            raise ConfigurationError("this env takes chunks already; a chunk of chunks has no meaning")
+        inner = inner.env

@@ -1,0 +1,235 @@
+"""ChunkQueue: the commands that a robot executes while chunks arrive, late, broken or not at all."""
+
+import math
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.control.seams import BLENDS, DIFFERENCES, join, limit_rate
+from safe_wrappers.control.smoothstep import shortest_latched_blend, smoothstep
+
+Array = NDArray[np.float64]
+
+REPLACE: Final = "replace"
+ENSEMBLE: Final = "ensemble"
+BASELINES: Final = (REPLACE, ENSEMBLE)
+"""What is done without a bound on the seam: the new chunk at once, or the mean of all chunks at hand."""
+
+_FALLBACK: Final = "fallback"
+
+
+class Command(NamedTuple):
+    """What to send now.
+
+    Attributes:
+        control: Shape (m,), float64.
+        observed: Control step whose observation the command was made from; -1 before there was any.
+        starved: The queue is dry: the fallback gave it.
+        limited: It was held back beyond the blend to keep the rate limit.
+        took_over: A chunk took over with it.
+        seam: There is a seam before it: another chunk, another source, or the fallback began.
+        blend_steps: Control steps of the blend that begins with this command; 0 if none does.
+        refused: A chunk was there and could not take over: it came too late, or was not admitted.
+    """
+
+    control: Array
+    observed: int
+    starved: bool
+    limited: bool
+    took_over: bool
+    seam: bool
+    blend_steps: int
+    refused: bool
+
+
+class _Chunk(NamedTuple):
+    commands: Array
+    observed: int
+    due: int
+
+
+class _Fade(NamedTuple):
+    """A mode switch under way: out of a latched command, into whatever comes now."""
+
+    latched: Array
+    steps: int
+    done: int
+
+
+class ChunkQueue:
+    """Which command comes next. It counts control steps; it knows no clock and no env.
+
+    A chunk's entry j is meant for the j-th control step after its observation. A chunk that was observed at step k
+    and is there at step t is consumed from its entry t - k on: latency is what has been consumed, never an
+    estimate. It takes over from the left-over of the chunk before it, over a seam (`control/seams.py`); "replace"
+    takes the new chunk at once, and "ensemble" averages what all chunks at hand ask for at a step. A queue that has
+    run dry asks the fallback.
+
+    A chunk of one has no left-over to blend with: what it asks for is sent as it is, and only a change of its
+    source (`switch`), to and from the fallback too, is faded over.
+
+    Args:
+        controls: m.
+        hold_s: Control interval, s.
+        blend: A blend of `control/seams.py`, "replace" or "ensemble".
+        fewest: A blend takes at least so many control steps.
+        rate_limit: Largest |du/dt| of every component, action units per second; infinite for none.
+        low: Action box, shape (m,).
+        high: Likewise.
+        decay: Ensembling weighs the i-th oldest chunk by exp(-decay i).
+    """
+
+    def __init__(
+        self,
+        controls: int,
+        hold_s: float,
+        *,
+        blend: str,
+        fewest: int,
+        rate_limit: float,
+        low: Array,
+        high: Array,
+        decay: float,
+    ) -> None:
+        self._hold_s, self._blend, self._fewest, self._rate_limit = hold_s, blend, fewest, rate_limit
+        self._low, self._high, self._decay = low, high, decay
+        self._none = np.zeros((0, controls))
+        self._source = ""
+        self.reset()
+
+    def reset(self) -> None:
+        """A new episode: nothing sent, nothing planned; the source stays the one that was named last."""
+        self.now = 0
+        self._observed = -1
+        self._sent = self._none
+        self._plan, self._limited = self._none, np.zeros(0, dtype=bool)
+        self._coming: list[_Chunk] = []
+        self._averaged: list[_Chunk] = []
+        self._acting = self._source
+        self._fade: _Fade | None = None
+
+    def submit(self, commands: Array, observed: int, due: int) -> bool:
+        """A chunk is on its way; False if it is refused.
+
+        Refused are a chunk with an entry that is not finite, and one whose observation is not newer than the
+        newest one heard of (a repeat), or lies in the future.
+
+        Args:
+            commands: Shape (h, m).
+            observed: Control step of its observation.
+            due: Control step at which it is there.
+        """
+        newest = max([self._observed, *(c.observed for c in self._coming)])
+        if not newest < observed <= self.now or not np.isfinite(commands).all():
+            return False
+        self._coming.append(_Chunk(commands, observed, due))
+        return True
+
+    def switch(self, source: str) -> None:
+        """From now on somebody else gives the commands; the next one is blended over from the last command."""
+        self._source = source
+
+    def next(
+        self, fallback: Callable[[], Array], admit: Callable[[Array, int], bool] | None = None
+    ) -> Command:
+        """The command of this control step.
+
+        Args:
+            fallback: Asked when nothing is planned; returns a finite control of shape (m,).
+            admit: Asked before a chunk takes over: its last command, shape (m,), and the control steps from now to
+                the end of that command; False refuses the chunk.
+        """
+        newest = self._observed
+        seam, blend_steps, refused = self._take_over(admit)
+        control, limited = self._planned()
+        starved = control is None
+        if control is None:
+            control = fallback()
+        acting = _FALLBACK if starved else self._source
+        if acting != self._acting and len(self._sent) and self._blend in BLENDS:
+            # Out of the fallback a longer chunk blends by itself; everything else starts from the last command.
+            if starved or not seam:
+                blend_steps = self._fade_steps(control)
+                self._fade = _Fade(self._sent[-1], blend_steps, 0)
+            else:
+                self._fade = None
+            seam = True
+        self._acting = acting
+        if self._blend in BLENDS:
+            control = self._faded(control)
+            if len(self._sent):
+                kept, held = limit_rate(control[None], self._sent[-1], self._rate_limit * self._hold_s)
+                control, limited = kept[0], limited or bool(held[0])
+        self._sent = np.concatenate([self._sent[-DIFFERENCES + 1 :], control[None]])
+        self.now += 1
+        return Command(
+            control, self._observed, starved, limited, self._observed > newest, seam, blend_steps, refused
+        )
+
+    def _take_over(self, admit: Callable[[Array, int], bool] | None) -> tuple[bool, int, bool]:
+        """Let the newest chunk that is there take over: is it a seam, how long is its blend, is it refused."""
+        there = [c for c in self._coming if c.due <= self.now]
+        if not there:
+            return False, 0, False
+        newest = max(there, key=lambda c: c.observed)
+        self._coming = [c for c in self._coming if c.observed > newest.observed]
+        fresh = newest.commands[self.now - newest.observed :]
+        if not len(fresh) or (admit is not None and not admit(fresh[-1], len(fresh))):
+            return False, 0, True
+        self._observed = newest.observed
+        if self._blend == ENSEMBLE:
+            self._averaged.append(newest)
+            return len(self._sent) > 0, 0, False
+        if self._blend == REPLACE or len(newest.commands) == 1:
+            self._plan, self._limited = fresh, np.zeros(len(fresh), dtype=bool)
+            return self._blend == REPLACE and len(self._sent) > 0, 0, False
+        joined = join(
+            self._sent,
+            self._plan,
+            fresh,
+            self._hold_s,
+            blend=self._blend,  # type: ignore[arg-type]  # checked by the wrapper
+            fewest=self._fewest,
+            rate_limit=self._rate_limit,
+            low=self._low,
+            high=self._high,
+        )
+        self._plan, self._limited = joined.plan, joined.limited
+        self._fade = None
+        return len(self._sent) > 0, joined.steps, False
+
+    def _planned(self) -> tuple[Array | None, bool]:
+        if self._blend == ENSEMBLE:
+            self._averaged = [c for c in self._averaged if c.observed + len(c.commands) > self.now]
+            if not self._averaged:
+                return None, False
+            votes = np.array([c.commands[self.now - c.observed] for c in self._averaged])
+            weights = np.exp(-self._decay * np.arange(len(votes)))
+            return np.asarray(weights @ votes / weights.sum()), False
+        if not len(self._plan):
+            return None, False
+        control, limited = self._plan[0], bool(self._limited[0])
+        self._plan, self._limited = self._plan[1:], self._limited[1:]
+        return control, limited
+
+    def _fade_steps(self, target: Array) -> int:
+        """Control steps between the latched command and the new one that keep the limit, were both at rest."""
+        steps = self._fewest
+        if math.isfinite(self._rate_limit):
+            change = float(np.abs(target - self._sent[-1]).max())
+            shortest = float(shortest_latched_blend(change, self._rate_limit))
+            steps = max(steps, math.ceil(shortest / self._hold_s) - 1)
+        return steps
+
+    def _faded(self, control: Array) -> Array:
+        if self._fade is None:
+            return control
+        latched, steps, done = self._fade
+        if done >= steps:
+            self._fade = None
+            return control
+        self._fade = _Fade(latched, steps, done + 1)
+        weight = float(smoothstep((done + 1.0) / (steps + 1.0)))
+        return np.asarray(latched + weight * (control - latched))

@@ -1,0 +1,117 @@
+"""The sizes of chunks and the bounds on their blends, checked against each other at construction."""
+
+import math
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+from safe_wrappers.constraints.constraint import positive
+from safe_wrappers.control.seams import BLENDS
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.chunk_queue import BASELINES
+
+
+class ChunkSizes(NamedTuple):
+    """In control steps, by the names of real-time chunking: H, s, and the least and the most of d.
+
+    Attributes:
+        chunk: chunk_size H.
+        horizon: execution_horizon s.
+        delay: The least and the largest inference_delay d; `d <= s <= H - d` holds for the largest.
+    """
+
+    chunk: int
+    horizon: int
+    delay: tuple[int, int]
+
+    @classmethod
+    def checked(cls, chunk_size: Any, execution_horizon: Any, inference_delay: Any) -> "ChunkSizes":
+        """The sizes as the user gave them, or an error that says what would fit."""
+        size, horizon = _count("chunk_size", chunk_size, 1), _count("execution_horizon", execution_horizon, 1)
+        delay = _delay(inference_delay)
+        if horizon > size:
+            raise ConfigurationError(
+                f"execution_horizon = {horizon} is more than a chunk has, chunk_size = {size}: it would run dry"
+            )
+        if not delay[1] <= horizon <= size - delay[1]:
+            raise ConfigurationError(
+                f"inference_delay d = {delay[1]}, execution_horizon s = {horizon} and chunk_size H = {size} break "
+                f"d <= s <= H - d: a chunk that comes {delay[1]} control steps late has {size - delay[1]} commands "
+                f"left, for the {horizon} until the next; choose s from {delay[1]} to {size - delay[1]}, or longer "
+                "chunks"
+            )
+        return cls(size, horizon, delay)
+
+    @property
+    def leftover(self) -> int:
+        """What is left of a chunk when the next one takes over, at the least."""
+        return self.chunk - self.horizon - self.delay[1]
+
+
+def blend_bounds(
+    sizes: ChunkSizes,
+    space: gym.spaces.Box,
+    hold_s: float,
+    blend: str,
+    blend_time: float | None,
+    jerk_limit: float | None,
+) -> tuple[int, float]:
+    """The fewest steps of a blend, and the rate limit less what rounding to the actions' dtype may add.
+
+    Raises:
+        ConfigurationError: Bounds for a baseline, that are not positive, that do not fit into a chunk, or nothing to
+            blend over.
+    """
+    if blend in BASELINES:
+        if blend_time is not None or jerk_limit is not None:
+            raise ConfigurationError(
+                f"blend={blend!r} is a baseline that bounds nothing: leave blend_time and jerk_limit out, or choose "
+                f"{', '.join(BLENDS)}"
+            )
+        return 0, math.inf
+    fewest, rate_limit = 0, math.inf
+    if blend_time is not None:
+        fewest = max(round(positive("blend_time", blend_time, "s") / hold_s) - 1, 1)
+        available = sizes.chunk - sizes.delay[1]
+        if fewest >= available and sizes.chunk > 1:
+            raise ConfigurationError(
+                f"blend_time = {blend_time} s is longer than what a chunk has left when it takes over, {available} "
+                f"control steps of {hold_s} s: choose a longer chunk_size or a shorter blend_time"
+            )
+    if jerk_limit is not None:
+        rounding = _rounding(space) / hold_s
+        rate_limit = positive("jerk_limit", jerk_limit, "action units per second") - rounding
+        if rate_limit <= 0.0:
+            raise ConfigurationError(
+                f"jerk_limit = {jerk_limit} per second is below what {space.dtype} resolves, {rounding:.3g}"
+            )
+    if blend_time is None and jerk_limit is None:
+        fewest = sizes.leftover
+        if fewest == 0:
+            raise ConfigurationError(
+                f"chunk_size = {sizes.chunk}, execution_horizon = {sizes.horizon} and inference_delay = "
+                f"{sizes.delay[1]} leave no left-over to blend with: pass jerk_limit or blend_time"
+            )
+    return fewest, rate_limit
+
+
+def _count(name: str, value: Any, least: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ConfigurationError(f"{name} is a number of control steps, at least {least}; got {value!r}")
+    return int(value)
+
+
+def _delay(value: Any) -> tuple[int, int]:
+    if not isinstance(value, list | tuple):
+        return (_count("inference_delay", value, 0),) * 2
+    if len(value) != 2 or value[0] > value[1]:
+        raise ConfigurationError(f"inference_delay is d control steps or [least, most], got {value!r}")
+    return _count("inference_delay", value[0], 0), _count("inference_delay", value[1], 0)
+
+
+def _rounding(space: gym.spaces.Box) -> float:
+    """The most that rounding to the actions' dtype may add to the difference of two commands in the box."""
+    ends = np.abs(np.concatenate([space.low, space.high]).astype(np.float64))
+    largest = float(ends[np.isfinite(ends)].max(initial=1.0))
+    return 2.0 * float(np.finfo(space.dtype).eps) * largest

@@ -1,0 +1,26 @@
+"""What goes wrong between a policy and a robot, as seeded wrappers: to test with, and to train against."""
+
+from safe_wrappers.wrappers.faults.clock_skew import ClockSkew
+from safe_wrappers.wrappers.faults.dropped_refreshes import DroppedRefreshes
+from safe_wrappers.wrappers.faults.fault import Fault
+from safe_wrappers.wrappers.faults.frozen_policy import FrozenPolicy
+from safe_wrappers.wrappers.faults.jitter import Jitter
+from safe_wrappers.wrappers.faults.outages import Outages
+from safe_wrappers.wrappers.faults.repeated_commands import RepeatedCommands
+
+FAULTS: dict[str, type[Fault]] = {
+    kind.__name__: kind
+    for kind in (ClockSkew, DroppedRefreshes, FrozenPolicy, Jitter, Outages, RepeatedCommands)
+}
+"""By name, for configs."""
+
+__all__ = [
+    "FAULTS",
+    "ClockSkew",
+    "DroppedRefreshes",
+    "Fault",
+    "FrozenPolicy",
+    "Jitter",
+    "Outages",
+    "RepeatedCommands",
+]

@@ -1,0 +1,106 @@
+"""Fault: something between the policy and the robot that loses, repeats or delays commands."""
+
+import copy
+from abc import abstractmethod
+from typing import Any, NamedTuple, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+
+from safe_wrappers import interventions as keys
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.control_interval import control_interval
+from safe_wrappers.wrappers.own_random import OwnRandom
+from safe_wrappers.wrappers.receiver import CommandReceiver, receiver_inside
+
+
+class Carried(NamedTuple):
+    """A command on its way.
+
+    Attributes:
+        action: What the policy gave.
+        observed_s: When the observation was made that it was made from, s.
+    """
+
+    action: Any
+    observed_s: float
+
+
+class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, CommandReceiver):
+    """Carries every action of the policy to the robot, and does it badly.
+
+    Put it outermost: outside `LeaseExpiry` and `ChunkHandover`, which it tells how old a command is, or that none has
+    come. Without either of them inside nobody notices: the robot goes on with the last command, as a motor drive that
+    holds its setpoint does. Faults may be nested. A chunk is carried, lost or repeated as a whole.
+
+    Info, at every step: ``fault/active`` (bool).
+
+    Args:
+        env: Any env; it must say how long a step lasts (`dt`) if nothing inside counts the time.
+        hold_s: The time that a step lasts, s; None reads the env's.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], hold_s: float | None) -> None:
+        gym.Wrapper.__init__(self, env)
+        self._inside = receiver_inside(env)
+        self._hold_s = 0.0 if self._inside is not None else control_interval(env, hold_s)
+        if self._inside is not None and hold_s is not None:
+            raise ConfigurationError(
+                f"{type(self._inside).__name__} inside counts the time: leave hold_s out"
+            )
+        self.random = OwnRandom(type(self).__name__)
+        self._forget()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Reset the env, and what is on its way; the random numbers start anew with a seed."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self.random.reset(self.env, seed)
+        self._forget()
+        self.begin()
+        info[keys.FAULT_ACTIVE] = info.get(keys.FAULT_ACTIVE, False)
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Carry the action, or not, and step the env with what arrives."""
+        now_s = self.now_s
+        given = None if self._evidence is None else Carried(copy.copy(action), self._evidence)
+        arrived = self.carry(given, now_s)
+        active = arrived is not given or arrived is None
+        if arrived is not None:
+            self._last = arrived.action
+        if self._inside is not None:
+            self._inside.deliver(None if arrived is None else arrived.observed_s)
+        observation, reward, terminated, truncated, info = self.env.step(self._last)
+        self._steps_done += 1
+        self._evidence = self.now_s
+        info[keys.FAULT_ACTIVE] = bool(active or info.get(keys.FAULT_ACTIVE, False))
+        return observation, reward, terminated, truncated, info
+
+    @property
+    def now_s(self) -> float:
+        """Seconds of the episode so far."""
+        return self._inside.now_s if self._inside is not None else self._steps_done * self._hold_s
+
+    def deliver(self, observed_s: float | None) -> None:
+        """What a fault outside of this one says of the next action."""
+        self._evidence = observed_s
+
+    def begin(self) -> None:
+        """A new episode; `random` is ready."""
+
+    @abstractmethod
+    def carry(self, given: Carried | None, now_s: float) -> Carried | None:
+        """What arrives at the robot now.
+
+        Args:
+            given: What the policy gave now; None if a fault outside lost it.
+            now_s: Seconds of the episode so far.
+        """
+
+    def _forget(self) -> None:
+        self._steps_done = 0
+        self._evidence: float | None = 0.0
+        space: Any = self.env.action_space
+        self._last: Any = np.clip(np.zeros(space.shape), space.low, space.high).astype(space.dtype)

@@ -1,0 +1,30 @@
+"""The info of many control steps as the info of one step of a chunked policy."""
+
+from typing import Any, Final
+
+import numpy as np
+
+from safe_wrappers import interventions as keys
+
+_SUMS: Final = (keys.COST, keys.COST_SUBSTEP)
+_ANY: Final = (*keys.CBF_BOOLS, keys.CBF_REFUSED, keys.LEASE_EXPIRED, keys.LEASE_REFUSED, keys.LEASE_BRAKING)
+_LARGEST: Final = (keys.CBF_CORRECTION, keys.CBF_CLIPPED)
+_SMALLEST: Final = (keys.CBF_MARGIN,)
+
+
+def macro_info(infos: list[dict[str, Any]]) -> dict[str, Any]:
+    """The last control step's info, in which costs are summed up and no intervention of the others is lost.
+
+    Costs are sums; what is a flag is True if it was at any control step; corrections are the largest, the margin is
+    the smallest. Everything else is the last control step's, the running counts of `RecordInterventions` too.
+    """
+    last = infos[-1]
+    if len(infos) == 1:
+        return last
+    for names, merge in ((_SUMS, np.sum), (_ANY, np.any), (_LARGEST, np.max), (_SMALLEST, np.min)):
+        for name in names:
+            if name in last:
+                kind = np.asarray(last[name])
+                merged = merge([info[name] for info in infos], axis=0)
+                last[name] = merged.astype(kind.dtype) if kind.ndim else type(last[name])(merged)
+    return last

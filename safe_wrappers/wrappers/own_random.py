@@ -1,0 +1,40 @@
+"""OwnRandom: a wrapper's random numbers, which never touch the env's."""
+
+import zlib
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+
+class OwnRandom:
+    """A generator that starts anew with the seed of a reset, and goes on from one episode to the next without one.
+
+    Drawing from the env's generator would change its next episodes, and ruin paired runs. The env's first seed is
+    used where none was ever given.
+
+    Args:
+        stream: A name, such as the wrapper's, that keeps it apart from other generators of the same seed.
+    """
+
+    def __init__(self, stream: str) -> None:
+        self._stream = zlib.crc32(stream.encode())
+        self._generator: np.random.Generator | None = None
+
+    def reset(self, env: gym.Env[Any, Any], seed: int | None) -> None:
+        """Call it after the env's own reset."""
+        if seed is None and self._generator is None:
+            seed = env.unwrapped.np_random_seed
+        if seed is not None:
+            self._generator = np.random.default_rng([self._stream, abs(int(seed))])
+
+    @property
+    def draw(self) -> np.random.Generator:
+        """The generator.
+
+        Raises:
+            gymnasium.error.ResetNeeded: Before the first reset.
+        """
+        if self._generator is None:
+            raise gym.error.ResetNeeded("call reset before step")
+        return self._generator

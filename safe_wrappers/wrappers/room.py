@@ -1,0 +1,146 @@
+"""Room: the clearance that a lease is granted from, read from a constraint or by the user's function."""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from safe_wrappers.constraints.constraint import Constraint, non_negative, positive
+from safe_wrappers.constraints.plain_data import constraint_from
+from safe_wrappers.control.leases import longest_lease, longest_lease_of_room
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.plant import Plant
+
+Array = NDArray[np.float64]
+
+ClearanceFunction = Callable[[gym.Env[Any, Any]], tuple[ArrayLike, ArrayLike]]
+"""The user's own: takes the env, returns clearances (m) and the approach speeds towards them (m/s), shapes (k,)."""
+
+
+class Room:
+    """How long a command may stay in force from here.
+
+    Args:
+        env: What is wrapped.
+        clearance: A constraint with `approach(plant)` (clearances and approach speeds), any other constraint with a
+            `value(plant)` and a `closing_speed`, or the user's function.
+        braking: Verified lower bound on the deceleration, m/s^2; None takes the constraint's own.
+        acceleration: Largest approach acceleration of any command, m/s^2.
+        closing_speed: The fastest that the constraint's value may fall, in its unit per second, stopping distance
+            and all, under any command.
+        top_speed: Bound on the approach speed, m/s; None for none.
+        localisation: Bound on the error of the clearance, m.
+        margin: Clearance to be kept at rest, m.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        clearance: Constraint | dict[str, Any] | ClearanceFunction,
+        *,
+        braking: float | None,
+        acceleration: float | None,
+        closing_speed: float | None,
+        top_speed: float | None,
+        localisation: float,
+        margin: float,
+    ) -> None:
+        self._env = env
+        is_constraint = isinstance(clearance, dict) or hasattr(clearance, "rows")
+        if not is_constraint and (isinstance(clearance, type) or not callable(clearance)):
+            raise ConfigurationError(
+                "clearance is a constraint, such as sw.Clearance(...), or a function of the env that returns the "
+                f"clearance in m and the approach speed in m/s; got {clearance!r}"
+            )
+        self.constraint: Any = constraint_from(clearance) if is_constraint else None
+        self._function: Any = None if is_constraint else clearance
+        self._localisation = non_negative("localisation", localisation, "m")
+        self._margin = non_negative("margin", margin, "m")
+        self._approach = hasattr(self.constraint, "approach")
+        if self.constraint is None or self._approach:
+            self._braking = self._declared_braking(braking)
+            if acceleration is None:
+                raise ConfigurationError(
+                    "acceleration is missing: the largest approach acceleration that any command may cause, in "
+                    "m/s^2; 0 only for a machine that cruises at constant speed"
+                )
+            self._acceleration = non_negative("acceleration", acceleration, "m/s^2")
+            self._top_speed = np.inf if top_speed is None else positive("top_speed", top_speed, "m/s")
+            if closing_speed is not None:
+                raise ConfigurationError(
+                    "closing_speed is for constraints whose value is all that is known; here the approach speed is "
+                    "measured: give acceleration (and top_speed)"
+                )
+            if self._approach:
+                self._localisation += float(getattr(self.constraint, "state_error", 0.0))
+                self._margin += float(getattr(self.constraint, "margin", 0.0))
+            return
+        name = type(self.constraint).__name__
+        if not hasattr(self.constraint, "value"):
+            raise ConfigurationError(
+                f"{name} has no value(plant), so no room that a lease could be made from"
+            )
+        if closing_speed is None:
+            raise ConfigurationError(
+                f"{name} does not say how fast it is approached: give closing_speed, the fastest that its value may "
+                "fall, in its unit per second"
+            )
+        if any(given is not None for given in (braking, acceleration, top_speed)):
+            raise ConfigurationError(
+                f"the value of {name} counts braking already: give closing_speed alone, without braking, "
+                "acceleration and top_speed"
+            )
+        self._closing_speed = positive("closing_speed", closing_speed, "the constraint's unit per second")
+        self._margin += float(getattr(self.constraint, "margin", 0.0))
+
+    def bind(self, plant: Plant) -> None:
+        """Resolve the constraint's names."""
+        self._plant = plant
+        if hasattr(self.constraint, "bind"):
+            self.constraint.bind(plant)
+
+    def reset(self) -> None:
+        """Forget the episode."""
+        if hasattr(self.constraint, "reset"):
+            self.constraint.reset()
+
+    def longest_lease(self, delays_s: float) -> float:
+        """The longest lease from here, s; zero or less, or -inf where a reading is no number: revoke.
+
+        Args:
+            delays_s: All delays beside the lease, s.
+        """
+        if self.constraint is not None:
+            self._plant.observe()
+        if self.constraint is not None and not self._approach:
+            room = np.asarray(self.constraint.value(self._plant), dtype=np.float64)
+            room = room - self._margin - self._localisation
+            return _least(longest_lease_of_room(room, self._closing_speed, delays_s))
+        read = self._function(self._env) if self.constraint is None else self.constraint.approach(self._plant)
+        clearance, speed = (np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in read)
+        leases = longest_lease(
+            clearance,
+            speed,
+            self._braking,
+            delays_s,
+            localisation=self._localisation,
+            margin=self._margin,
+            acceleration=self._acceleration,
+            top_speed=self._top_speed,
+        )
+        return _least(leases)
+
+    def _declared_braking(self, braking: float | None) -> float:
+        own = getattr(self.constraint, "braking", None)
+        if braking is None and own is None:
+            raise ConfigurationError(
+                "braking is missing: a verified lower bound on the deceleration of the fallback, in m/s^2"
+            )
+        return positive("braking", own if braking is None else braking, "m/s^2")
+
+
+def _least(leases: Array) -> float:
+    """Nothing near: no end to it."""
+    return float(leases.min(initial=np.inf))
