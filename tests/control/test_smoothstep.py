@@ -173,6 +173,11 @@ def test_commands_that_meet_are_switched_at_once():
     assert moving_blend_interval(1.0, 0.0, 1.0, 0.0, 2.0) == (0.0, np.inf)
     assert moving_blend_interval(1.0, 1.0, 1.0, 2.0, 2.0) == (0.0, 0.0)  # any blend would overshoot
     assert shortest_latched_blend(0.0, 1.0) == 0.0
+    # two commands that leave one point at rates 0 and r: a blend goes at up to 16/9 r
+    assert moving_blend_interval(1.0, 0.0, 1.0, 2.0 * 9 / 16 * 1.001, 2.0) == (0.0, 0.0)
+    assert moving_blend_interval(1.0, 0.0, 1.0, 2.0 * 9 / 16 * 0.999, 2.0) == (0.0, np.inf)
+    s, rate = np.linspace(0, 1, 30_001), 1.0
+    assert blend_rate(0.0, 0.0, rate * s, rate, s, 1.0).max() == pytest.approx(16 / 9 * rate, rel=1e-8)
 
 
 def test_an_endpoint_exactly_at_the_limit():

@@ -221,6 +221,12 @@ def test_a_series_passes_through_its_samples_with_their_velocities():
     assert hermite_series(times, q, v, times[3]).shape == (3,)
 
 
+def test_at_a_knot_the_acceleration_is_that_of_the_segment_after_it():
+    times, q, v = np.array([0.0, 1.0, 2.0]), np.array([0.0, 1.0, 1.0]), np.zeros(3)
+    np.testing.assert_allclose(hermite_series(times, q, v, times, 2), [6.0, 0.0, 0.0], atol=1e-12)
+    assert hermite_series(times, q, v, 1.0 - 1e-9, 2) == pytest.approx(-6.0)
+
+
 def test_the_torque_steps_at_inner_knots_are_those_of_the_spline():
     times, q, v, _ = frames()
     v = v + np.random.default_rng(2).normal(0, 0.2, v.shape)  # measured velocities do not fit the positions
