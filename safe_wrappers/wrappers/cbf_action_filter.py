@@ -279,8 +279,8 @@ def _refuse_nesting(env: gym.Env[Any, Any]) -> None:
             )
         if isinstance(inner, CommandReceiver):
             raise ConfigurationError(
-                f"{type(inner).__name__} inside the filter changes the actions that the filter has checked; the filter "
-                "has the last word, so it belongs inside: ChunkHandover(LeaseExpiry(CBFActionFilter(env, ...), ...), ...)"
+                f"{type(inner).__name__} inside the filter changes the actions that the filter has checked; the "
+                "filter has the last word: ChunkHandover(LeaseExpiry(CBFActionFilter(env, ...), ...), ...)"
             )
         inner = inner.env
 

@@ -57,9 +57,9 @@ class RecordInterventions(
 ):
     """Counts interventions, corrections and costs; changes neither actions, rewards nor observations.
 
-    Put it outside the filter and `LeaseExpiry`, and inside `ChunkHandover` and SB3's `Monitor`. Without a filter inside (the unfiltered arm of a
-    comparison) the missing `cbf/*` keys count as zero, and so do `cost` and `cost_substep` of a task that has
-    none.
+    Put it outside the filter and `LeaseExpiry`, and inside `ChunkHandover` and SB3's `Monitor`. Without a filter
+    inside (the unfiltered arm of a comparison) the missing `cbf/*` keys count as zero, and so do `cost` and
+    `cost_substep` of a task that has none.
 
     At every step `info` gains the keys of `safe_wrappers.interventions.RUNNING` (float64, the episode so
     far), and at an episode's last step `info["interventions"]`, a dict:
