@@ -1,0 +1,425 @@
+"""The arm with elastic joints: MuJoCo against the two-mass model, measured vibration against the declared one."""
+
+import copy
+import itertools
+import math
+import pickle
+import subprocess
+import sys
+import warnings
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env
+from scipy.stats import kstest
+
+from safe_wrappers.control.flexible_joint import (
+    accelerations,
+    boundary_layer_energy,
+    damping_ratios,
+    manifold,
+    resonances,
+    smoothstep_energy,
+    step_energy,
+    torque_slew_limit,
+)
+from safe_wrappers.envs import FLEX_JOINT_REACH_ID, REACH_EPISODE_STEPS
+from safe_wrappers.envs.flex_joint_reach import SUCCESS_RADIUS, TORQUE_RATING
+from safe_wrappers.errors import ActionError, ConfigurationError
+
+MOTORS, SPRINGS = [0, 2], [1, 3]
+ELBOWS = [0.0, 0.7, 1.5, 2.4, math.pi]
+FLOATS = (
+    "vibration_energy",
+    "deflection",
+    "tracking_error",
+    "reward_dist",
+    "reward_ctrl",
+    "cost",
+    "cost_substep",
+)
+
+
+@pytest.fixture
+def env():
+    made = gym.make(FLEX_JOINT_REACH_ID)
+    made.reset(seed=0)
+    return made
+
+
+@pytest.fixture
+def bare(env):
+    return env.unwrapped
+
+
+def pose(bare, elbow):
+    """At rest, springs relaxed."""
+    bare.set_state(np.array([0.3, 0.0, elbow, 0.0]), np.zeros(4))
+    return bare.arm.link_inertia(np.array([0.3, elbow]))
+
+
+def machine(bare, inertia):
+    return bare.arm.stiffness, bare.arm.rotor_inertia, inertia
+
+
+def random_state(rng):
+    return rng.uniform([-3, -0.05, -3, -0.05], [3, 0.05, 3, 0.05]), rng.uniform(
+        [-8, -3, -8, -3], [8, 3, 8, 3]
+    )
+
+
+def independent_energy(bare, qpos, qvel, torque):
+    arm = bare.arm
+    q, q_dot = qpos[MOTORS] + qpos[SPRINGS], qvel[MOTORS] + qvel[SPRINGS]
+    m = arm.link_inertia(q)
+    friction = arm.motor_damping * qvel[MOTORS]
+    z0 = manifold(torque, arm.rotor_inertia, m, bias=arm.link_bias(q, q_dot), motor_friction=friction)
+    return float(boundary_layer_energy(-qpos[SPRINGS], -qvel[SPRINGS], z0, *machine(bare, m)))
+
+
+# The machine: Spong's model ------------------------------------------------------------------------------
+
+
+def test_mujoco_moves_as_the_two_mass_model(bare):
+    arm, rng = bare.arm, np.random.default_rng(1)
+    for _ in range(20):
+        qpos, qvel = random_state(rng)
+        torque = rng.uniform([-3, -1], [3, 1])
+        bare.data.qpos[:], bare.data.qvel[:], bare.data.ctrl[:] = qpos, qvel, torque
+        mujoco.mj_forward(bare.model, bare.data)
+        q, q_dot = qpos[MOTORS] + qpos[SPRINGS], qvel[MOTORS] + qvel[SPRINGS]
+        motors, links = accelerations(
+            qpos[MOTORS],
+            q,
+            qvel[MOTORS],
+            q_dot,
+            torque,
+            *machine(bare, arm.link_inertia(q)),
+            bias=arm.link_bias(q, q_dot),
+            motor_damping=arm.motor_damping,
+            joint_damping=arm.joint_damping,
+        )
+        found = bare.data.qacc
+        np.testing.assert_allclose(found[MOTORS], motors, rtol=1e-9, atol=1e-7)
+        np.testing.assert_allclose(found[MOTORS] + found[SPRINGS], links, rtol=1e-9, atol=1e-7)
+        np.testing.assert_allclose(bare.fingertip_position, bare.data.site("fingertip").xpos[:2], atol=1e-12)
+
+
+def mode(bare, elbow, which, size=0.01):
+    """Release one mode's deflection at rest, both masses' momentum zero; its frequency and damping ratio."""
+    m = pose(bare, elbow)
+    k, j, _ = machine(bare, m)
+    root = np.sqrt(k)
+    symmetric = root[:, None] * (np.diag(1 / j) + np.linalg.inv(m)) * root
+    shape = np.linalg.eigh(symmetric)[1][:, which]
+    deflection = shape / root
+    deflection *= size / np.abs(deflection).max()
+    both = m + np.diag(j)
+    theta = np.linalg.solve(both, m @ deflection)
+    qpos = bare.data.qpos.copy()
+    qpos[MOTORS] += theta
+    qpos[SPRINGS] = -deflection
+    bare.set_state(qpos, np.zeros(4))
+    trace = []
+    for _ in range(600):
+        mujoco.mj_step(bare.model, bare.data)
+        trace.append(shape @ (-root * bare.data.qpos[SPRINGS]))
+    y = np.array(trace)
+    i = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0))
+    crossings = (i - y[i] / (y[i + 1] - y[i])) * bare.model.opt.timestep
+    peaks = np.array([y[a : b + 1].max() for a, b in itertools.pairwise(i)])
+    decrement = math.log(peaks[0] / peaks[-1]) / (len(peaks) - 1)
+    return 1.0 / np.diff(crossings).mean(), decrement / math.hypot(2 * math.pi, decrement), m
+
+
+@pytest.mark.parametrize("which", [0, 1])
+@pytest.mark.parametrize("elbow", ELBOWS)
+def test_resonances_and_damping_measured_are_those_declared(bare, elbow, which):
+    frequency, ratio, m = mode(bare, elbow, which)
+    k, j, _ = machine(bare, m)
+    assert frequency == pytest.approx(resonances(k, j, m)[which] / (2 * math.pi), rel=0.01)
+    assert 10.0 < frequency < 19.0
+    declared = damping_ratios(k, j, m, bare.arm.motor_damping, bare.arm.joint_damping)[which]
+    assert ratio == pytest.approx(declared, rel=0.03)
+    assert 0.005 < ratio < 0.02
+
+
+def test_the_integrator_damps_nothing(bare):
+    bare.model.dof_damping[:] = 0.0
+    _, ratio, _ = mode(bare, 0.0, 1)  # the fastest there is
+    assert abs(ratio) < 1e-6
+
+
+# Vibration energy ----------------------------------------------------------------------------------------
+
+
+def test_vibration_energy_is_the_boundary_layers(bare):
+    rng = np.random.default_rng(2)
+    states = [random_state(rng) for _ in range(50)]
+    torque = np.array([1.7, -0.6])
+    qpos, qvel = (np.array(x) for x in zip(*states, strict=True))
+    expected = [independent_energy(bare, *state, torque) for state in states]
+    np.testing.assert_allclose(bare.arm.vibration_energy(qpos, qvel, torque), expected, rtol=1e-9)
+    assert bare.arm.vibration_energy(*states[0], torque) == pytest.approx(expected[0])
+    batch = bare.arm.vibration_energy(qpos.reshape(5, 10, 4), qvel.reshape(5, 10, 4), torque)
+    np.testing.assert_allclose(batch.ravel(), expected, rtol=1e-9)
+
+
+def test_info_judges_every_substep(env, bare):
+    env.action_space.seed(3)
+    seen = set()
+    for _ in range(60):
+        before = bare.data.qpos.copy(), bare.data.qvel.copy()
+        action = env.action_space.sample() * 1.5  # beyond the bounds: the motors clip
+        info = env.step(action)[4]
+        data = mujoco.MjData(bare.model)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = *before, action
+        energies, deflections = [], []
+        for _ in range(10):
+            mujoco.mj_step(bare.model, data)
+            torque = np.clip(action.astype(float), [-3, -1], [3, 1])
+            energies.append(independent_energy(bare, data.qpos, data.qvel, torque))
+            deflections.append(np.abs(data.qpos[SPRINGS]))
+        over = (np.array(deflections) * bare.arm.stiffness > TORQUE_RATING).any(axis=1)
+        assert info["vibration_energy"] == pytest.approx(max(energies), rel=1e-9)
+        assert info["deflection"] == pytest.approx(np.max(deflections), rel=1e-12)
+        assert info["cost"] == info["cost_substep"] == over.any()
+        seen.add((bool(over.any()), bool(over[-1])))
+    assert seen == {(False, False), (True, False), (True, True)}
+
+
+@pytest.mark.parametrize("elbow", ELBOWS)
+@pytest.mark.parametrize("torque", [(3.0, 0.0), (0.0, 1.0), (2.0, -1.0)])
+def test_a_torque_step_injects_what_the_formula_says(bare, elbow, torque):
+    m = pose(bare, elbow)
+    info = bare.step(np.array(torque))[4]
+    assert info["vibration_energy"] == pytest.approx(float(step_energy(torque, *machine(bare, m))), rel=0.01)
+
+
+def play(bare, torques):
+    return max(bare.step(torque)[4]["vibration_energy"] for torque in torques)
+
+
+@pytest.mark.parametrize("elbow", ELBOWS)
+def test_a_smoothstep_over_two_periods_injects_a_tenth_of_a_step_at_most(bare, elbow):
+    torque = np.array([2.0, 0.7])
+    m = pose(bare, elbow)
+    stepped = play(bare, [torque] * 40)
+    duration = 4 * math.pi / float(resonances(*machine(bare, m))[0])
+    x = np.minimum(np.arange(1, 41) * bare.dt / duration, 1.0)
+    pose(bare, elbow)
+    blended = play(bare, np.outer(10 * x**3 - 15 * x**4 + 6 * x**5, torque))
+    assert blended < stepped / 10
+    # The bound is for frozen poses and a continuous torque; here the arm sets off and each torque is held.
+    assert blended < 1.1 * smoothstep_energy(torque, duration, *machine(bare, m), cut_short=True)
+
+
+@pytest.mark.parametrize("elbow", ELBOWS)
+def test_ramps_within_the_slew_limit_stay_below_the_energy(bare, elbow):
+    m = pose(bare, elbow)
+    allowed = 1e-3
+    limit = torque_slew_limit(allowed, *machine(bare, m), weights=[3.0, 1.0], hold_s=bare.dt)
+    worst = 0.0
+    for signs in itertools.product((1.0, -1.0), repeat=2):
+        pose(bare, elbow)
+        ramp = np.outer(np.minimum(np.arange(1, 31) * bare.dt, 1.0 / limit[1]), limit * signs)
+        worst = max(worst, play(bare, ramp))
+    assert 0.5 * allowed < worst < 1.05 * allowed
+
+
+def test_full_torque_at_once_overloads_a_spring_and_a_blend_does_not(bare):
+    full = np.array([3.0, 1.0])
+    costs = {}
+    for name, steps in (("step", 1), ("blend", 12)):
+        pose(bare, 1.5)
+        x = np.minimum(np.arange(1, 26) / steps, 1.0)
+        costs[name] = sum(bare.step(s * full)[4]["cost"] for s in 10 * x**3 - 15 * x**4 + 6 * x**5)
+    assert costs["step"] > 0
+    assert costs["blend"] == 0
+
+
+# The task ------------------------------------------------------------------------------------------------
+
+
+def reach_torque(bare):
+    """Two damped motors towards the inverse kinematics of the target."""
+    x, y = bare.target_position
+    elbow = math.acos((x * x + y * y - 0.18) / 0.18)
+    shoulder = math.atan2(y, x) - math.atan2(0.3 * math.sin(elbow), 0.3 + 0.3 * math.cos(elbow))
+    motors, speeds = bare.data.qpos[MOTORS], bare.data.qvel[MOTORS]
+    error = np.array([math.remainder(shoulder - motors[0], math.tau), elbow - motors[1]])
+    return np.array([8.0, 2.5]) * error - np.array([2.0, 0.5]) * speeds
+
+
+def test_the_task_can_be_done_in_an_episode(env, bare):
+    for seed in range(8):
+        env.reset(seed=seed)
+        steps, truncated, terminated = 0, False, False
+        while not truncated:
+            _, _, terminated, truncated, info = env.step(reach_torque(bare))
+            assert not terminated
+            steps += 1
+        assert steps == REACH_EPISODE_STEPS == 200
+        assert info["is_success"] is True
+        assert info["tracking_error"] < SUCCESS_RADIUS
+
+
+def test_spaces_and_timing(env, bare):
+    assert env.action_space == gym.spaces.Box(np.float32([-3, -1]), np.float32([3, 1]), dtype=np.float32)
+    assert env.observation_space.shape == (14,)
+    assert env.observation_space.dtype == np.float64
+    assert bare.dt == pytest.approx(0.01)
+    assert bare.model.opt.timestep == 0.001
+    assert env.metadata["render_fps"] == 100
+
+
+def test_observation_and_reward(bare):
+    qpos, qvel = np.array([0.4, 0.01, 1.2, -0.02]), np.array([1.0, 0.3, -2.0, 0.4])
+    bare.set_state(qpos, qvel)
+    bare.place_target(np.array([0.1, -0.3]))
+    observation, reward, terminated, truncated, info = bare.step(np.array([1.5, 9.0]))
+    assert (terminated, truncated) == (False, False)
+    qpos, qvel = bare.data.qpos.copy(), bare.data.qvel.copy()
+    first = qpos[0] + qpos[1]
+    tip = 0.3 * np.array([math.cos(first), math.sin(first)])
+    tip += 0.3 * np.array([math.cos(first + qpos[2] + qpos[3]), math.sin(first + qpos[2] + qpos[3])])
+    expected = np.concatenate(
+        [np.cos(qpos[MOTORS]), np.sin(qpos[MOTORS]), qvel[MOTORS], -qpos[SPRINGS], -qvel[SPRINGS]]
+    )
+    np.testing.assert_allclose(observation[:10], expected)
+    np.testing.assert_allclose(observation[10:], np.r_[0.1, -0.3, tip - [0.1, -0.3]])
+    distance = math.dist(tip, (0.1, -0.3))
+    assert info["tracking_error"] == pytest.approx(distance)
+    assert info["reward_dist"] == pytest.approx(-distance)
+    assert info["reward_ctrl"] == pytest.approx(-0.01 * (0.5**2 + 1.0))  # clipped at full torque
+    assert reward == info["reward_dist"] + info["reward_ctrl"]
+    weighted = gym.make(FLEX_JOINT_REACH_ID, reward_dist_weight=2.0, reward_control_weight=0.5).unwrapped
+    weighted.reset(seed=0)
+    info = weighted.step(np.array([3.0, 0.0]))[4]
+    assert info["reward_dist"] == pytest.approx(-2.0 * info["tracking_error"])
+    assert info["reward_ctrl"] == pytest.approx(-0.5)
+
+
+def test_a_start_is_at_rest_and_targets_fill_the_ring(env, bare):
+    radii, angles = [], []
+    for seed in range(2000):
+        observation, info = env.reset(seed=seed)
+        assert info["vibration_energy"] == info["deflection"] == info["cost"] == info["reward_dist"] == 0.0
+        np.testing.assert_array_equal(bare.data.qvel, 0.0)
+        assert np.abs(bare.data.qpos[MOTORS] - [0.0, 1.5]).max() <= 0.1
+        x, y = observation[10:12]
+        radii.append(math.hypot(x, y))
+        angles.append(math.atan2(y, x))
+        assert info["tracking_error"] == pytest.approx(math.hypot(*observation[12:]))
+    # Uniform by area: squared radii and angles are.
+    assert kstest(np.square(radii), "uniform", (0.2**2, 0.55**2 - 0.2**2)).pvalue > 1e-3
+    assert kstest(angles, "uniform", (-math.pi, math.tau)).pvalue > 1e-3
+
+
+def test_targets_move_when_asked(env):
+    still = env
+    moving = gym.make(FLEX_JOINT_REACH_ID, target_moves_every_s=0.25)
+    courses = []
+    for run in (still, moving, moving):
+        observation, _ = run.reset(seed=5)
+        targets = [observation[10:12].copy()]
+        for _ in range(200):
+            observation, *_, info = run.step(np.array([0.2, -0.1]))
+            tip = run.unwrapped.fingertip_position
+            assert info["tracking_error"] == pytest.approx(math.dist(tip, targets[-1]))  # to the one aimed at
+            targets.append(observation[10:12].copy())
+            np.testing.assert_array_equal(run.unwrapped.data.mocap_pos[0, :2], targets[-1])
+        courses.append(np.array(targets))
+    np.testing.assert_array_equal(courses[1], courses[2])
+    np.testing.assert_array_equal(courses[0], courses[0][:1].repeat(201, axis=0))
+    changes = np.flatnonzero(np.abs(np.diff(courses[1], axis=0)).max(axis=1)) + 1
+    assert changes.tolist() == list(range(25, 201, 25))
+
+
+@pytest.mark.parametrize("seconds", [0.0, -1.0, 0.004, 0.255, math.nan, math.inf])
+def test_a_target_cannot_move_between_control_steps(seconds):
+    with pytest.raises(ConfigurationError, match=r"positive multiple of the control step 0\.01 s"):
+        gym.make(FLEX_JOINT_REACH_ID, target_moves_every_s=seconds)
+
+
+@pytest.mark.parametrize("action", [[np.nan, 0.0], [0.0, np.inf], [0.0], [[0.0, 0.0]]])
+def test_a_bad_action_does_not_move_the_arm(bare, action):
+    before = bare.data.time, bare.data.qpos.copy()
+    with pytest.raises(ActionError, match="2 finite numbers"):
+        bare.step(np.array(action))
+    assert bare.data.time == before[0]
+    np.testing.assert_array_equal(bare.data.qpos, before[1])
+
+
+# What Gymnasium asks of an env ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kwargs", [{}, {"target_moves_every_s": 0.01}])
+def test_check_env_passes_with_the_usual_warnings_alone(kwargs):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*A Box observation space .* value is -?infinity")
+        warnings.filterwarnings("ignore", message=".*we recommend using a symmetric and normalized space")
+        check_env(gym.make(FLEX_JOINT_REACH_ID, **kwargs).unwrapped, skip_render_check=True)
+
+
+def test_info_has_the_same_keys_and_types_at_every_step(env):
+    _, first = env.reset(seed=1)
+    for info in (first, env.step(env.action_space.high)[4], env.step(env.action_space.low)[4]):
+        assert {key: type(value) for key, value in info.items()} == {
+            **dict.fromkeys(FLOATS, float),
+            "is_success": bool,
+        }
+
+
+def test_copies_are_the_same_task():
+    env = gym.make(FLEX_JOINT_REACH_ID, target_moves_every_s=0.02, reward_control_weight=0.1)
+    action = np.array([2.0, -0.5], dtype=np.float32)
+    observation, _ = env.reset(seed=9)
+    expected = [env.step(action) for _ in range(6)]
+    copies = (
+        gym.make(env.spec),
+        gym.make(EnvSpec.from_json(env.spec.to_json())),
+        pickle.loads(pickle.dumps(env)),
+        copy.deepcopy(env),
+    )
+    for again in copies:
+        np.testing.assert_array_equal(again.reset(seed=9)[0], observation)
+        for step in expected:
+            got = again.step(action)
+            np.testing.assert_array_equal(got[0], step[0])
+            assert got[1:] == step[1:]
+
+
+@pytest.mark.parametrize("mode", ["sync", "async"])
+def test_vector_envs_report_whole_arrays(mode):
+    envs = gym.make_vec(FLEX_JOINT_REACH_ID, num_envs=2, vectorization_mode=mode)
+    _, infos = envs.reset(seed=0)
+    assert all(infos[key].dtype == np.float64 for key in FLOATS)
+    infos = envs.step(np.float32([[0.0, 0.0], [3.0, 1.0]]))[4]
+    assert infos["vibration_energy"][0] == pytest.approx(0.0, abs=1e-12)
+    assert infos["vibration_energy"][1] > 0.01
+    assert infos["is_success"].dtype == np.bool_
+    envs.close()
+
+
+def gl_works():
+    code = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 32, 32).render()"
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
+
+
+def test_frames_show_the_target():
+    if not gl_works():
+        pytest.skip("no working GL here (libosmesa6 and MUJOCO_GL=osmesa, or MUJOCO_GL=egl, are enough)")
+    env = gym.make(FLEX_JOINT_REACH_ID, render_mode="rgb_array", width=120, height=120, camera_name="top")
+    env.reset(seed=0)
+    env.unwrapped.place_target(np.array([-0.4, 0.4]))
+    env.step(np.zeros(2))
+    red, green, blue = np.moveaxis(env.render().astype(int), -1, 0)
+    row, column = np.argwhere((red > green + 60) & (red > blue + 60)).mean(axis=0)
+    assert row < 50
+    assert column < 50  # y grows upwards in the picture
+    env.close()
