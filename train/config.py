@@ -15,6 +15,8 @@ from stable_baselines3 import PPO, SAC
 
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.protect import protect_options
+from safe_wrappers.wrappers.faults import FAULTS
+from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 
 from .names import check_name
 
@@ -26,6 +28,11 @@ _NOT_HYPERPARAMETERS: Final = {"self", "env", "seed", "device", "verbose", "tens
 }
 # What a YAML file can hold of what `protect` takes.
 _PROTECT_OPTIONS: Final = protect_options() - {"plant"}
+_LEASE_OPTIONS: Final = [
+    name
+    for name in inspect.signature(LeaseExpiry).parameters
+    if name not in ("env", "plant", "measured")  # what a YAML file cannot hold
+]
 _ARM_KEYS: Final = (
     "filter",
     "learner",
@@ -46,19 +53,29 @@ _EXECUTED: Final = ("safe_action", "both")
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """Which env: `env: Id-v0`, or `env: {id: Id-v0, kwargs: {...}}`."""
+    """Which env: `env: Id-v0`, or `env: {id: Id-v0, kwargs: {...}, faults: {Outages: {...}}}`.
+
+    `faults` go wrong between the policy and the robot in all arms, filtered or not, in training and evaluation:
+    names and arguments of `safe_wrappers.wrappers.faults`, the innermost first.
+    """
 
     id: str
     kwargs: dict[str, Any] = field(default_factory=dict)
+    faults: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class FilterConfig:
-    """Which filter: `none`, `protect`, `{protect: {...}}`, `{factory: "module:function", kwargs: {...}}`."""
+    """Which filter: `none`, `protect`, `{protect: {...}}`, `{factory: "module:function", kwargs: {...}}`.
+
+    With `lease: {...}` beside it, the arguments of a `LeaseExpiry` around the filter; its clearance, if it is left
+    out, is the filter's own constraint.
+    """
 
     kind: str = "none"
     kwargs: dict[str, Any] = field(default_factory=dict)
     factory: str = ""
+    lease: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -130,8 +147,13 @@ class ArmConfig:
         values = asdict(self)
         for harmless in ("name", "checkpoint_every", "device"):
             del values[harmless]
+        # As in the folders of runs that were made before there was a choice.
         if self.learner == NAIVE:
-            del values["learner"]  # as in the folders of runs that were made before there was a choice
+            del values["learner"]
+        if not self.env.faults:
+            del values["env"]["faults"]
+        if self.filter.lease is None:
+            del values["filter"]["lease"]
         return values
 
 
@@ -252,23 +274,32 @@ def _hyperparameters(algorithm: str, given: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _filter(value: Any, where: str) -> FilterConfig:
-    expected = "expected none, protect, {protect: {...}} or {factory: 'module:function', kwargs: {...}}"
+    expected = (
+        "expected none, protect, {protect: {...}} or {factory: 'module:function', kwargs: {...}}, with lease: {...} "
+        "beside it if there is one"
+    )
     if value is None or isinstance(value, str):
         return FilterConfig(kind=check_name(value or "none", ("none", "protect"), where))
     if not isinstance(value, dict):
         raise ConfigurationError(f"{where}: {expected}; got {value!r}.")
     for key in value:
-        check_name(key, ("protect", "factory", "kwargs"), where)
+        check_name(key, ("protect", "factory", "kwargs", "lease"), where)
+    lease = None
+    if "lease" in value:
+        lease = dict(_mapping(value["lease"], f"{where}.lease"))
+        for key in lease:
+            check_name(key, _LEASE_OPTIONS, f"{where}.lease")
+    value = {key: given for key, given in value.items() if key != "lease"}
     if set(value) == {"protect"}:
         options = dict(_mapping(value["protect"], f"{where}.protect"))
         for key in options:
             check_name(key, _PROTECT_OPTIONS, f"{where}.protect")
-        return FilterConfig("protect", options)
+        return FilterConfig("protect", options, lease=lease)
     if "factory" in value and "protect" not in value:
         factory = _text(value["factory"], f"{where}.factory")
         if not re.fullmatch(r"[\w.]+:\w+", factory):
             raise ConfigurationError(f"{where}.factory: expected 'module:function', got {factory!r}.")
-        return FilterConfig("factory", dict(_mapping(value.get("kwargs"), f"{where}.kwargs")), factory)
+        return FilterConfig("factory", dict(_mapping(value.get("kwargs"), f"{where}.kwargs")), factory, lease)
     raise ConfigurationError(f"{where}: {expected}; got {value!r}.")
 
 
@@ -324,14 +355,25 @@ def _env(value: Any) -> EnvConfig:
         value = {"id": value}
     value = _mapping(value, "env")
     for key in value:
-        check_name(key, ("id", "kwargs"), "env")
+        check_name(key, ("id", "kwargs", "faults"), "env")
     env_id = _text(value.get("id"), "env.id")
     if ":" not in env_id:  # `module:Id-v0` is registered by importing the module, when the env is made
         try:
             gym.spec(env_id)
         except gym.error.Error:
             check_name(env_id, gym.registry, "env.id")
-    return EnvConfig(env_id, dict(_mapping(value.get("kwargs"), "env.kwargs")))
+    return EnvConfig(env_id, dict(_mapping(value.get("kwargs"), "env.kwargs")), _faults(value.get("faults")))
+
+
+def _faults(value: Any) -> dict[str, dict[str, Any]]:
+    faults = {}
+    for name, arguments in _mapping(value, "env.faults").items():
+        check_name(name, FAULTS, "env.faults")
+        where = f"env.faults.{name}"
+        faults[name] = dict(_mapping(arguments, where))
+        for key in faults[name]:
+            check_name(key, [p for p in inspect.signature(FAULTS[name]).parameters if p != "env"], where)
+    return faults
 
 
 def _normalize(value: Any) -> NormalizeConfig:

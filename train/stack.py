@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -12,6 +14,8 @@ import safe_wrappers
 from safe_wrappers import interventions as keys
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.adaption_penalty import AdaptionPenalty
+from safe_wrappers.wrappers.faults import FAULTS
+from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
 
 from .config import NAIVE, EnvConfig, FilterConfig, LearnerConfig
@@ -21,7 +25,7 @@ from .names import check_name
 def make_stack(
     env: EnvConfig, action_filter: FilterConfig, learner: LearnerConfig = NAIVE
 ) -> gym.Env[Any, Any]:
-    """Makes the task, its filter if there is one, the recorder and Monitor; AdaptionPenalty outermost if asked for.
+    """Makes the task, filter and lease if there are any, the recorder, faults and Monitor, and AdaptionPenalty.
 
     The recorder and Monitor see the task's own reward, whatever the learner sees.
 
@@ -47,10 +51,28 @@ def make_stack(
             raise ConfigurationError(
                 f"filter: {action_filter.factory} refuses its kwargs: {error}"
             ) from error
-    monitored = Monitor(RecordInterventions(task), info_keywords=keys.RUNNING)
+    if action_filter.lease is not None:
+        task = _leased(task, action_filter.lease)
+    recorded: gym.Env[Any, Any] = RecordInterventions(task)
+    for name, arguments in env.faults.items():
+        recorded = FAULTS[name](recorded, **arguments)
+    monitored = Monitor(recorded, info_keywords=keys.RUNNING)
     if not learner.penalised:
         return monitored
     return AdaptionPenalty(monitored, penalty=learner.penalty, per_correction=learner.per_correction)
+
+
+def _leased(task: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> LeaseExpiry:
+    """The lease around a filter; its clearance, if none is given, is what the filter keeps."""
+    if "clearance" in arguments:
+        return LeaseExpiry(task, **arguments)
+    constraints = getattr(task, "constraints", [])
+    if len(constraints) != 1:
+        raise ConfigurationError(
+            f"lease: the filter has {len(constraints)} constraints; say which room the "
+            "lease is to be made from with clearance: {kind: ..., ...}"
+        )
+    return LeaseExpiry(task, copy.deepcopy(constraints[0]), **arguments)
 
 
 def _factory(action_filter: FilterConfig) -> Any:

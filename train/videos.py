@@ -6,7 +6,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -137,7 +137,7 @@ def record_video(
     """
     checkpoint = finished_checkpoint(arm, shown.seed, run_folder)
     policy = TrainedPolicy(arm, checkpoint)
-    env = make_stack(EnvConfig(arm.env.id, {**arm.env.kwargs, "render_mode": "rgb_array"}), used)
+    env = make_stack(replace(arm.env, kwargs={**arm.env.kwargs, "render_mode": "rgb_array"}), used)
     # One speed for all conditions, also where one of them ends early.
     longest = env.spec.max_episode_steps if env.spec is not None else None
     judged = False

@@ -268,6 +268,16 @@ def _nothing(plant: Plant) -> None:
     """A constraint without `bind` resolves no names, one without `check` needs no state to be refused."""
 
 
+def is_filtered(env: gym.Env[Any, Any]) -> bool:
+    """Whether there is a filter among an env's wrappers."""
+    inner: Any = env
+    while isinstance(inner, gym.Wrapper):
+        if isinstance(inner, CBFActionFilter):
+            return True
+        inner = inner.env
+    return False
+
+
 def _refuse_nesting(env: gym.Env[Any, Any]) -> None:
     """Layers that filter one after another undo each other, and the outer one's report would be wrong."""
     inner: Any = env

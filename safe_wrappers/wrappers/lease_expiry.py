@@ -17,6 +17,7 @@ from safe_wrappers.control.smoothstep import smoothstep
 from safe_wrappers.errors import ActionError, ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco import MujocoPlant
 from safe_wrappers.plants.plant import Plant, check_actions
+from safe_wrappers.wrappers.cbf_action_filter import is_filtered
 from safe_wrappers.wrappers.control_interval import control_interval
 from safe_wrappers.wrappers.fallback import FallbackFunction
 from safe_wrappers.wrappers.own_plant import PlantOfSpec, own_plant
@@ -46,7 +47,8 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
     could not. While nothing fresh comes, the command in force goes on: repeated if it is a single one, step by step
     if it is a chunk's (`ChunkHandover` outside). A control step is executed only if the lease covers all of it.
     When it does not, or where a fresh command would get no lease for a whole step, the fallback brakes at once.
-    Authority comes back with a fresh command alone, over a blend of `blend_time`, and only if its lease outlasts it.
+    Authority comes back with a fresh command alone, over a blend of `blend_time`; a lease that ends on the way back
+    brakes at once, too.
 
     **What is fresh.** Without a word every action is made from the newest observation. A wrapper outside may
     `deliver` the time of the observation instead, or None for nothing; `ChunkHandover` does, and so do the faults of
@@ -57,6 +59,11 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
     **What it guarantees.** If braking, acceleration, delays and bounds are what they are declared to be and the
     clearance does not shrink by itself, the machine stops inside it whenever commands stop coming, whatever the
     commands did. No command that is not finite passes. With leases left the commands pass bit for bit.
+
+    **Close to an obstacle** the worst command would use up the room within one control step: there no command gets a
+    lease, the one that leads away neither. With a `CBFActionFilter` inside, which admits only what is safe for the
+    next step, `least_s` of one control step lets every fresh command through to it; the lease then only ends stale
+    ones.
 
     **What it does not.** It does not look at what a fresh command does: a policy that lives may drive into the
     obstacle until the clearance is too small for a lease of one control step; then it brakes. Obstacles that come
@@ -77,6 +84,7 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         localisation: Bound on the error of the clearance, m.
         margin: Clearance to be kept at rest, m; a constraint's own is added.
         longest_s: No lease is longer, s, however large the clearance.
+        least_s: Every fresh command gets a lease of at least so long, s; above 0 only with a CBFActionFilter inside.
         blend_time: s, of the way back from the fallback to a fresh command.
         brake_blend_time: s, of the way to the fallback; it counts in the budget. 0: at once.
         clock_error_s: Bound on how wrong the stamps of commands may be, s; it counts in the budget.
@@ -124,6 +132,7 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         localisation: float = 0.0,
         margin: float = 0.0,
         longest_s: float = 1.0,
+        least_s: float = 0.0,
         blend_time: float = 0.1,
         brake_blend_time: float = 0.0,
         clock_error_s: float = 0.0,
@@ -161,6 +170,7 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
             localisation=localisation,
             margin=margin,
             longest_s=longest_s,
+            least_s=least_s,
             blend_time=blend_time,
             brake_blend_time=brake_blend_time,
             clock_error_s=clock_error_s,
@@ -172,7 +182,10 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         )
         gym.Wrapper.__init__(self, env)
         self.hold_s = control_interval(env, hold_s)
-        self._longest_s = positive("longest_s", longest_s, "s")
+        self._longest_s, self._least_s = (
+            positive("longest_s", longest_s, "s"),
+            _least(env, least_s, longest_s),
+        )
         self._blend_steps = self._steps("blend_time", blend_time)
         self._brake_steps = self._steps("brake_blend_time", brake_blend_time)
         self._clock_error_s = non_negative("clock_error_s", clock_error_s, "s")
@@ -314,9 +327,8 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
     def _grant(self, now: float) -> bool:
         """A new lease for the command in hand; False, and none at all, where it would not last."""
         delays_s = self._delays_s + max(now - self._newest_s, 0.0)
-        lease = min(self._room.longest_lease(delays_s), self._longest_s)
-        needed = self.hold_s * (1 + (self._blend_steps if self._braking else 0))
-        granted = lease + _SAME_TIME * self.hold_s >= needed
+        lease = max(min(self._room.longest_lease(delays_s), self._longest_s), self._least_s)
+        granted = lease + _SAME_TIME * self.hold_s >= self.hold_s
         self._until_s = now + lease if granted else -math.inf
         return granted
 
@@ -345,6 +357,18 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         self._executed: Array | None = None
         self._braking = self._chunk_refused = False
         self._fade: tuple[Array, int, int] | None = None
+
+
+def _least(env: gym.Env[Any, Any], least_s: float, longest_s: float) -> float:
+    least_s = non_negative("least_s", least_s, "s")
+    if least_s > longest_s:
+        raise ConfigurationError(f"least_s = {least_s} s is more than longest_s = {longest_s} s")
+    if least_s > 0.0 and not is_filtered(env):
+        raise ConfigurationError(
+            f"least_s = {least_s} s without a CBFActionFilter inside would let a command drive into the obstacle: "
+            "leave it 0, or put the filter inside, LeaseExpiry(sw.protect(env), ...)"
+        )
+    return least_s
 
 
 def _refuse_order(env: gym.Env[Any, Any]) -> None:

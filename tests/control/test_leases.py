@@ -39,12 +39,15 @@ def used(lease, speed, braking, delays, localisation, margin, acceleration, top=
     st.floats(-50.0, 50.0),
     POSITIVE,
     SMALL,
-    SMALL,
+    st.one_of(SMALL, st.floats(0.0, 1e4)),
     SMALL,
     st.one_of(st.just(0.0), st.floats(1e-9, 1e3)),
     st.one_of(st.none(), st.floats(0.0, 60.0)),
 )
 @example(10.0, 2.0, 1.0, 0.5, 0.0, 0.0, 1e-12, None)
+@example(1.0, 3.0, 7.0, 0.1, 0.1, 0.2571, 0.0, None)
+@example(1e4, 1e-3, 1e3, 0.0, 9999.9, 1.0 / 30.0, 0.0, None)
+@example(1e4, 1e-3, 1e3, 0.0, 9999.7, 1.0 / 7.0, 0.0, None)
 @example(1e-300, 0.0, 1.0, 0.0, 0.0, 0.0, 1e-200, None)
 def test_the_lease_is_the_longest_that_keeps_the_inequality(d, v, b, delays, loc, gap, a, top):
     lease = float(longest_lease(d, v, b, delays, loc, gap, a, np.inf if top is None else top))
@@ -97,6 +100,11 @@ def test_a_lease_of_the_formula_stops_at_the_margin_and_five_percent_more_hits(a
     bare = float(longest_lease(clearance, *rest, acceleration=acceleration, top_speed=top))
     assert stop_by_simulation(bare, clearance, *rest, acceleration, top) > -1e-6
     assert stop_by_simulation(1.05 * bare, clearance, *rest, acceleration, top) < -1e-3
+
+
+def test_a_machine_that_creeps_has_a_long_lease():
+    assert 1e299 < longest_lease(1.0, 5e-324, 1.0, 0.1) < np.inf
+    assert 1e299 < longest_lease_of_room(1.0, 5e-324, 0.1) < np.inf
 
 
 def test_standing_and_receding():
