@@ -1,0 +1,436 @@
+"""Reachability: against ruckig, bang-bang motion, linear programs over the jerk, and random admissible motions."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import ruckig
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import linprog
+
+from safe_wrappers.control import reachability
+from safe_wrappers.control.reachability import (
+    MotionLimits,
+    admits,
+    furthest,
+    jerk_limited_reach,
+    jerk_limited_time,
+    reach,
+    transit_time,
+)
+from safe_wrappers.errors import ConfigurationError
+
+POSITIVE = st.floats(0.1, 10.0)
+SHARE = st.floats(-1.0, 1.0)
+
+
+def ruckig_time(start, end, acceleration, speed, jerk):
+    """One axis, written without our code."""
+    request, trajectory = ruckig.InputParameter(1), ruckig.Trajectory(1)
+    request.current_position, request.current_velocity, request.current_acceleration = ([x] for x in start)
+    request.target_position, request.target_velocity, request.target_acceleration = ([x] for x in end)
+    request.max_acceleration, request.max_velocity, request.max_jerk = [acceleration], [speed], [jerk]
+    ruckig.Ruckig(1).calculate(request, trajectory)
+    return trajectory.duration
+
+
+def most(time, v0, a0, a_max, v_max, jerk, at_rest=False, count=160, sign=1.0):
+    """The largest displacement at the end of the time, by a linear program over piecewise constant jerk."""
+    h = time / count
+    n = count
+    ones = np.tril(np.ones((n, n)))  # knot k after intervals 0 .. k
+    acc = h * ones
+    vel = h * np.tril(np.ones((n, n)), -1) @ acc + 0.5 * h * h * ones
+    acc0, vel0 = np.full(n, a0), v0 + a0 * h * np.arange(1, n + 1)
+    before_v = np.vstack([np.zeros(n), vel[:-1]])
+    before_a = np.vstack([np.zeros(n), acc[:-1]])
+    pos = (h * before_v + 0.5 * h * h * before_a + np.eye(n) * h**3 / 6).sum(axis=0)
+    pos0 = v0 * time + 0.5 * a0 * time**2
+    upper = np.concatenate([a_max - acc0, a_max + acc0, v_max - vel0, v_max + vel0])
+    equal = (np.array([vel[-1], acc[-1]]), np.array([-vel0[-1], -a0])) if at_rest else (None, None)
+    done = linprog(
+        -sign * pos,
+        A_ub=np.vstack([acc, -acc, vel, -vel]),
+        b_ub=upper + 1e-12,
+        A_eq=equal[0],
+        b_eq=equal[1],
+        bounds=(-jerk, jerk),
+        method="highs",
+    )
+    return pos0 + pos @ done.x if done.status == 0 else None
+
+
+# Rest to rest, idealised.
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.floats(-20, 20), POSITIVE, POSITIVE)
+def test_transit_time_is_ruckigs_without_a_limit_on_the_jerk(distance, acceleration, speed):
+    expected = ruckig_time((0, 0, 0), (distance, 0, 0), acceleration, speed, np.inf)
+    assert transit_time(distance, acceleration, speed) == pytest.approx(expected, abs=1e-6, rel=1e-9)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.floats(0, 30), POSITIVE, POSITIVE)
+def test_reach_is_the_inverse_of_the_transit_time(time, acceleration, speed):
+    assert transit_time(reach(time, acceleration, speed), acceleration, speed) == pytest.approx(
+        time, abs=1e-6
+    )
+
+
+@pytest.mark.parametrize("time, distance", [(1.0, 0.5), (2.0, 2.0), (4.0, 6.0), (0.0, 0.0)])
+def test_both_regimes_by_hand(time, distance):
+    # 2 m/s^2, 2 m/s: triangular up to 2 s and 2 m, then 2 m per second
+    assert reach(time, 2.0, 2.0) == pytest.approx(distance)
+    assert transit_time([distance, -distance], 2.0, 2.0) == pytest.approx([time, time])
+
+
+def test_bang_bang_gets_as_far_as_reach():
+    for time, speed in ((1.7, 0.6), (1.7, 5.0)):
+        steps, x, v = 20000, 0.0, 0.0
+        h = time / steps
+        for k in range(steps):
+            left = time - (k + 0.5) * h
+            faster = min(v + 1.3 * h, speed, max(0.0, 1.3 * (left - 0.5 * h)))
+            x, v = x + 0.5 * h * (v + faster), faster
+        assert reach(time, 1.3, speed) == pytest.approx(x, rel=1e-3)
+        assert v == pytest.approx(0.0, abs=1e-3)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.floats(-5, 5), POSITIVE, POSITIVE, POSITIVE)
+def test_the_idealised_time_is_a_lower_bound(distance, acceleration, speed, jerk):
+    limits = MotionLimits(acceleration, speed, jerk)
+    constrained = jerk_limited_time((0, 0, 0), (distance, 0, 0), limits)
+    assert transit_time(distance, acceleration, speed) <= constrained * (1 + 1e-9) + 1e-6
+
+
+def test_times_and_reaches_of_the_unknown():
+    with np.errstate(all="raise"):
+        assert transit_time([np.nan, np.inf, -np.inf], 1.0).tolist() == [np.inf] * 3
+        assert transit_time([np.inf, 3.0], 1.0, 1.0).tolist() == [np.inf, 4.0]
+        assert reach([np.nan, -1.0, 0.0, np.inf], 1.0, 2.0).tolist() == [0.0, 0.0, 0.0, np.inf]
+        assert reach(4.0, 1.0) == 4.0
+
+
+# With limited jerk.
+
+
+@pytest.mark.parametrize(
+    "distance, time",
+    [(10.0, 10 / 2 + 2 / 1 + 1 / 0.5), (0.1, 4 * (0.1 / (2 * 0.5)) ** (1 / 3))],
+)
+def test_seven_and_four_phases_by_hand(distance, time):
+    limits = MotionLimits(max_acceleration=1.0, max_speed=2.0, max_jerk=0.5)
+    assert float(jerk_limited_time((0, 0, 0), (distance, 0, 0), limits)) == pytest.approx(time, rel=1e-9)
+
+
+def test_the_trapezoid_plus_an_offset_is_no_substitute():
+    # 0.1 m: a_max / j_max added to the idealised time would be too much, half of it for both ramps too little.
+    limits = MotionLimits(1.0, 2.0, 0.5)
+    ideal, true = float(transit_time(0.1, 1.0, 2.0)), float(jerk_limited_time((0, 0, 0), (0.1, 0, 0), limits))
+    assert ideal < true < ideal + 2.0 - 0.5
+    assert float(transit_time(10, 1.0, 2.0)) + 2.0 == pytest.approx(
+        float(jerk_limited_time((0, 0, 0), (10, 0, 0), limits))
+    )  # where it happens to be right
+
+
+states = st.tuples(st.floats(-3, 3), SHARE, SHARE)
+
+
+def inside(state, acceleration, speed, jerk):
+    """Scaled so that neither its past nor its future must leave the limits."""
+    p, v, a = state
+    a *= min(acceleration, np.sqrt(jerk * speed))
+    v *= speed - 0.5 * a * a / jerk
+    return p, v, a
+
+
+@settings(max_examples=150, deadline=None)
+@given(states, states, POSITIVE, POSITIVE, POSITIVE)
+def test_time_backwards_is_the_same_time(start, end, acceleration, speed, jerk):
+    start, end = (inside(s, acceleration, speed, jerk) for s in (start, end))
+    limits = MotionLimits(acceleration, speed, jerk)
+    forwards = float(jerk_limited_time(start, end, limits))
+    # Reversed, velocities change sign and accelerations keep it; our own call against ruckig's.
+    back = ruckig_time((end[0], -end[1], end[2]), (start[0], -start[1], start[2]), acceleration, speed, jerk)
+    assert forwards == pytest.approx(back, rel=1e-6, abs=1e-6)
+    assert forwards == pytest.approx(ruckig_time(start, end, acceleration, speed, jerk))
+
+
+def test_several_axes_take_the_slowest_ones_time():
+    limits = MotionLimits([1.0, 2.0], [1.0, 3.0], 4.0)
+    ends = np.array([[1.0, 0.1], [0.1, 6.0], [-2.0, 2.0]])
+    times = jerk_limited_time((0.0, 0.0, 0.0), (ends, 0.0, 0.0), limits)
+    assert times.shape == (3,)
+    for time, (x, y) in zip(times, ends, strict=True):
+        alone = ruckig_time((0, 0, 0), (x, 0, 0), 1, 1, 4), ruckig_time((0, 0, 0), (y, 0, 0), 2, 3, 4)
+        assert time == pytest.approx(max(alone))
+
+
+def test_axes_that_end_in_motion_arrive_together():
+    # The first axis passes the end at full speed early or after turning round, but cannot wait there.
+    limits = MotionLimits(1.0, 1.0, 50.0)
+    start, end = ([0.0, 0.0], [1.0, 0.0], 0.0), ([1.0, 0.8], [1.0, 0.0], 0.0)
+    alone = [
+        float(jerk_limited_time((0, 1, 0), (1, 1, 0), limits)),
+        float(jerk_limited_time((0, 0, 0), (0.8, 0, 0), limits)),
+    ]
+    assert max(alone) < float(jerk_limited_time(start, end, limits))
+
+
+@pytest.mark.parametrize(
+    "end",
+    [(1, 1.01, 0), (1, 0, 2.01), (1, 0.9, -2.0), (1, -0.9, 2.0), (np.nan, 0, 0), (1, np.inf, 0)],
+)
+def test_ends_that_no_motion_inside_the_limits_has(end):
+    assert jerk_limited_time((0, 0, 0), end, MotionLimits(2.0, 1.0, 5.0)) == np.inf
+
+
+def test_a_bad_row_or_axis_does_not_take_the_others_along():
+    limits = MotionLimits(1.0)
+    times = jerk_limited_time((0, 0, 0), ([[1.0, 1.0], [np.nan, 1.0]], 0, 0), limits)
+    assert times == pytest.approx([2.0, np.inf])
+
+
+def test_a_start_outside_the_limits_is_led_back_inside():
+    # 2 m/s with a limit of 1: braked for a second (1.5 m), then 0.5 m back
+    time = float(jerk_limited_time((0, 2, 0), (1, 0, 0), MotionLimits(1.0, 1.0)))
+    assert time == pytest.approx(2.0 + 2.0)
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.floats(0.2, 4.0), SHARE, SHARE, st.floats(0.5, 3), st.floats(0.5, 3), st.floats(0.5, 6))
+def test_jerk_limited_reach_is_the_optimum_of_a_linear_program(time, v, a, acceleration, speed, jerk):
+    _, v, a = inside((0, v, a), acceleration, speed, jerk)
+    lowest, highest = jerk_limited_reach(time, v, a, MotionLimits(acceleration, speed, jerk))
+    for found, sign in ((float(lowest), -1.0), (float(highest), 1.0)):
+        expected = most(time, v, a, acceleration, speed, jerk, at_rest=True, sign=sign)
+        # The program's jerk is constant over 1/160 of the time, so it gets a little less far.
+        room = 8 * (speed + acceleration * time) * time / 160
+        if expected is None:
+            assert not np.isfinite(found) or float(highest - lowest) < room
+        else:
+            assert sign * found >= sign * expected - 1e-4 * time
+            assert sign * found <= sign * expected + room
+
+
+def test_what_is_within_reach_takes_no_longer_and_what_is_beyond_does():
+    rng = np.random.default_rng(5)
+    limits = MotionLimits(1.2, 0.9, 3.0)
+    for _ in range(50):
+        v, a = inside((0, *rng.uniform(-1, 1, 2)), 1.2, 0.9, 3.0)[1:]
+        time = rng.uniform(0.2, 4.0)
+        lowest, highest = (float(x) for x in jerk_limited_reach(time, v, a, limits))
+        if lowest > highest:
+            continue
+        for goal in (lowest, highest, rng.uniform(lowest, highest)):
+            assert ruckig_time((0, v, a), (goal, 0, 0), 1.2, 0.9, 3.0) <= time + 1e-9
+        for goal in (lowest - 1e-6, highest + 1e-6):
+            assert ruckig_time((0, v, a), (goal, 0, 0), 1.2, 0.9, 3.0) > time
+
+
+def test_no_time_to_stop_is_an_empty_reach():
+    limits = MotionLimits(1.0, 2.0, 100.0)
+    lowest, highest = jerk_limited_reach([0.9, 1.2, np.nan, np.inf, -1.0], 1.0, 0.0, limits)
+    assert (lowest > highest).tolist() == [True, False, True, True, True]
+    # a tenth of a second faster by 0.1 m/s, then braking from 1.1 m/s: a little less with ramps
+    assert 0.69 < highest[1] < 0.1 * 1.05 + 1.1**2 / 2
+
+
+# The bound with a free end.
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.floats(0, 5), st.floats(-3, 3), POSITIVE, POSITIVE)
+def test_without_a_jerk_limit_the_bound_is_bang_bang(time, v, acceleration, speed):
+    lowest, highest = (float(x) for x in furthest(time, v, 0.0, speed, acceleration))
+
+    def up(v0):
+        top = max(speed, v0)
+        until = min(time, (top - v0) / acceleration)
+        return max(0.0, v0 * until + acceleration * until**2 / 2 + top * (time - until))
+
+    assert highest == pytest.approx(up(v), rel=1e-9, abs=1e-12)
+    assert -lowest == pytest.approx(up(-v), rel=1e-9, abs=1e-12)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.floats(0.2, 3.0), SHARE, SHARE, st.floats(0.5, 3), st.floats(0.5, 3), st.floats(0.5, 6))
+def test_no_linear_program_gets_beyond_the_bound_and_without_a_speed_limit_it_gets_there(
+    time, v, a, acceleration, speed, jerk
+):
+    _, v, a = inside((0, v, a), acceleration, speed, jerk)
+    for sign, limit in ((1.0, speed), (-1.0, speed), (1.0, 100.0), (-1.0, 100.0)):
+        lowest, highest = (float(x) for x in furthest(time, v, a, limit, acceleration, jerk))
+        bound = highest if sign > 0 else -lowest
+        optimum = sign * most(time, v, a, acceleration, limit, jerk, sign=sign)
+        assert optimum <= bound + 2e-4 * jerk * time**3
+        if limit == 100.0 and sign * v >= 0.0 and sign * a >= 0.0:
+            assert optimum == pytest.approx(bound, rel=0.02, abs=0.01)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.floats(0.1, 4.0), st.floats(-3, 3), st.floats(-3, 3), POSITIVE, POSITIVE, POSITIVE)
+def test_the_bound_is_its_envelope_summed_up_in_fine_steps(time, v, a, acceleration, speed, jerk):
+    lowest, highest = (float(x) for x in furthest(time, v, a, speed, acceleration, jerk))
+    t = np.linspace(0.0, time, 20001)
+    for bound, v0, a0 in ((highest, v, a), (-lowest, -v, -a)):
+        top = max(speed, v0, v0 + max(a0, 0.0) ** 2 / (2 * jerk))
+        accelerations = np.minimum(max(acceleration, a0), a0 + jerk * t)
+        gained = np.diff(t) * 0.5 * (accelerations[1:] + accelerations[:-1])
+        v_t = np.minimum(top, v0 + np.concatenate([[0.0], np.cumsum(gained)]))
+        x_t = np.concatenate([[0.0], np.cumsum(np.diff(t) * 0.5 * (v_t[1:] + v_t[:-1]))])
+        assert bound == pytest.approx(x_t.max(), abs=1e-5)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.floats(0.1, 4.0), st.floats(0, 3), st.floats(0, 1), st.floats(0.1, 1))
+def test_rounding_never_refuses(time, v, a, jerk):
+    # Limits too far to be met: the way is v t + a t^2 / 2 + j t^3 / 6, here in exact fractions.
+    t, exact_v, exact_a, j = (Fraction(x) for x in (time, v, a, jerk))
+    way = exact_v * t + exact_a * t**2 / 2 + j * t**3 / 6
+    _, highest = furthest(time, v, a, 1e3, 1e3, jerk)
+    assert Fraction(float(highest)) >= way
+    assert -Fraction(float(furthest(time, -v, -a, 1e3, 1e3, jerk)[0])) >= way
+
+
+def random_motion(rng, acceleration, speed, jerk, start, steps, dt):
+    """Positions of an admissible motion: random jerk, cut where it would leave the limits now or later."""
+    x, v, a = start
+    xs, wanted = [x], 0.0
+    for _ in range(steps):
+        if rng.random() < 0.1:
+            wanted = rng.choice([-jerk, 0.0, jerk, rng.uniform(-jerk, jerk)])
+        for j in (wanted, 0.0, -np.sign(a) * min(jerk, abs(a) / dt), -np.sign(a) * jerk):
+            a1, v1 = a + j * dt, v + a * dt + 0.5 * j * dt * dt
+            if abs(a1) <= acceleration and abs(v1 + a1 * abs(a1) / (2 * jerk)) <= speed and abs(v1) <= speed:
+                break
+        x, v, a = x + v * dt + 0.5 * a * dt**2 + j * dt**3 / 6, v1, a1
+        xs.append(x)
+    return np.array(xs), abs(v) <= speed and abs(a) <= acceleration
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_no_admissible_motion_is_refused(seed):
+    rng = np.random.default_rng(seed)
+    acceleration, speed, jerk = rng.uniform(0.3, 3.0, 3) * [1, 1, 3]
+    start = inside((rng.normal(), *rng.uniform(-1, 1, 2)), acceleration, speed, jerk)
+    xs, kept = random_motion(rng, acceleration, speed, jerk, start, 400, 0.005)
+    assert kept
+    times = 0.005 * np.arange(len(xs))
+    assert admits(xs, start[0], start[1], times, speed, acceleration, jerk, start[2]).all()
+    assert admits(xs, start[0], start[1], times, speed, acceleration).all()
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_no_motion_of_ruckig_is_refused_however_it_starts(seed):
+    # Starts over every limit too: ruckig leads them back inside.
+    rng = np.random.default_rng(seed)
+    acceleration, speed, jerk = rng.uniform(0.3, 3.0, 3) * [1, 1, 3]
+    request, trajectory = ruckig.InputParameter(1), ruckig.Trajectory(1)
+    position, velocity, accelerated = rng.normal(), rng.normal() * 2 * speed, rng.normal() * acceleration
+    request.current_position, request.current_velocity = [position], [velocity]
+    request.current_acceleration = [accelerated]
+    request.target_position = [rng.normal() * 3]
+    request.max_acceleration, request.max_velocity, request.max_jerk = [acceleration], [speed], [jerk]
+    ruckig.Ruckig(1).calculate(request, trajectory)
+    times = np.linspace(0.0, trajectory.duration, 200)
+    xs = np.array([trajectory.at_time(t)[0][0] for t in times])
+    assert admits(xs, position, velocity, times, speed, acceleration, jerk, accelerated).all()
+
+
+def test_coasting_above_the_speed_limit_is_not_refused():
+    times = np.linspace(0, 3, 50)
+    assert admits(5.0 * times, 0.0, 5.0, times, 1.0, 2.0).all()
+    assert admits(-5.0 * times, 0.0, -5.0, times, 1.0, 2.0, 4.0).all()
+    assert not admits(5.0 * times[1:] + 0.01, 0.0, 5.0, times[1:], 1.0, 2.0).any()
+    # Accelerating at the limit: 1 m/s^2 cannot end before 0.1 s more, at 0.05 m/s over it.
+    xs = times * 1.0 + 0.5 * times**2 - 10.0 * times**3 / 6
+    assert admits(xs[times < 0.1], 0.0, 1.0, times[times < 0.1], 1.0, 1.0, 10.0, 1.0).all()
+
+
+def test_a_body_that_turns_round_was_farther_before():
+    # Thrown up at 1 m/s with -2 m/s^2, jerk 0.1: highest before the end
+    lowest, highest = furthest(2.0, 1.0, -2.0, 10.0, 2.0, 0.1)
+    t = np.linspace(0, 2, 200001)
+    best = (t - t**2 + 0.1 * t**3 / 6).max()
+    assert highest == pytest.approx(best, abs=1e-9) and lowest < 0
+
+
+@pytest.mark.parametrize("name", ["goal", "position", "velocity", "duration", "acceleration"])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_is_refused(name, bad):
+    given_ = {"goal": 0.1, "position": 0.0, "velocity": 0.1, "duration": 1.0, "acceleration": 0.0}
+    limits = {"max_speed": 1.0, "max_acceleration": 1.0, "max_jerk": 5.0}
+    assert admits(**given_, **limits)
+    assert admits(**(given_ | {name: np.array([bad, given_[name]])}), **limits).tolist() == [False, True]
+
+
+def test_no_time_is_no_way_and_negative_time_is_none():
+    assert admits([0.0, 1e-9], 0.0, 1.0, 0.0, 1.0, 1.0).tolist() == [True, False]
+    assert not admits(0.0, 0.0, 0.0, -1e-9, 1.0, 1.0)
+    lowest, highest = furthest(-1.0, 0.0, 0.0, 1.0, 1.0)
+    assert (lowest, highest) == (np.inf, -np.inf)
+
+
+def test_extreme_limits_give_numbers():
+    with np.errstate(all="raise"):
+        for jerk in (np.inf, 1e-6, 1e12):
+            for speed in (np.inf, 1e-9, 1e9):
+                for a in (-1.0, 0.0, 1.0):
+                    low, high = furthest(1.0, 0.5, a, speed, 1.0, jerk)
+                    assert -1.01 <= low <= 0.0 <= high <= 1.01
+
+
+def test_batches_and_axes_are_element_by_element():
+    rng = np.random.default_rng(0)
+    time, v, a = rng.uniform(0, 2, (4, 1)), rng.normal(size=(4, 3)), rng.normal(size=(4, 3))
+    speed, acceleration, jerk = rng.uniform(0.5, 2, 3), rng.uniform(0.5, 2, 3), np.array([1.0, 5.0, np.inf])
+    low, high = furthest(time, v, a, speed, acceleration, jerk)
+    near, far = jerk_limited_reach(time, v, 0.0, MotionLimits(acceleration, speed, jerk))
+    assert low.shape == high.shape == near.shape == (4, 3)
+    for i, k in np.ndindex(4, 3):
+        one = furthest(time[i, 0], v[i, k], a[i, k], speed[k], acceleration[k], jerk[k])
+        assert (low[i, k], high[i, k]) == one
+        limits = MotionLimits(acceleration[k], speed[k], jerk[k])
+        assert (near[i, k], far[i, k]) == jerk_limited_reach(time[i, 0], v[i, k], 0.0, limits)
+
+
+# Mistakes.
+
+
+@pytest.mark.parametrize("name", ["max_acceleration", "max_speed", "max_jerk"])
+@pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, [1.0, 0.0]])
+def test_limits_must_be_positive(name, bad):
+    good = {"max_acceleration": 1.0, "max_speed": 1.0, "max_jerk": 1.0}
+    with pytest.raises(ConfigurationError, match=f"{name} must be positive"):
+        MotionLimits(**(good | {name: bad}))
+    with pytest.raises(ConfigurationError, match=name):
+        furthest(1.0, 0.0, 0.0, **(good | {name: bad}))
+
+
+def test_an_acceleration_limit_must_be_finite():
+    with pytest.raises(ConfigurationError, match="max_acceleration must be positive and finite, got inf"):
+        transit_time(1.0, np.inf)
+
+
+def test_shapes_that_do_not_fit():
+    with pytest.raises(ConfigurationError, match=r"shapes that fit together, got \(2,\).*\(3,\)"):
+        jerk_limited_time(([0, 0], 0, 0), ([1, 1, 1], 0, 0), MotionLimits(1.0))
+
+
+def test_ruckigs_own_refusals_are_told(monkeypatch):
+    class Broken:
+        def __init__(self, axes):
+            pass
+
+        def calculate(self, request, trajectory):
+            raise ruckig.RuckigError("\n[ruckig] error in step 1, dof: 0\ninput: ...")
+
+    monkeypatch.setattr(reachability.ruckig, "Ruckig", Broken)
+    with pytest.raises(
+        ConfigurationError, match=r"found no profile from .* to .*: \[ruckig\] error in step 1"
+    ):
+        jerk_limited_time((0, 0, 0), (1, 0, 0), MotionLimits(1.0))
