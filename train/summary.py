@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 from .atomic import write_json
-from .config import ExperimentConfig
+from .config import ExperimentConfig, FilterConfig
 from .evaluate import evaluation_folder
 from .tables import read_rows, write_rows
 
@@ -57,6 +57,9 @@ OF_THE_FILTER: Final = (
     "unsafe",
 )
 """Left out where no filter is on: a zero there would say nothing."""
+
+OF_THE_LEASE: Final = ("lease_braking", "lease_expired")
+"""Left out where there is no lease."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +126,17 @@ def summarize(experiment: ExperimentConfig) -> Summary:
     for arm in experiment.arms:
         table[arm.name] = {}
         for condition in CONDITIONS:
-            filtered = condition == "filter_on" or (condition == "training" and arm.filter.kind != "none")
+            own = condition == "training" or arm.filter.kind != "none"
+            used = (
+                FilterConfig()
+                if condition == "filter_off"
+                else arm.filter
+                if own
+                else experiment.evaluation_filter
+            )
+            left_out = (OF_THE_FILTER if used.kind == "none" else ()) + (
+                OF_THE_LEASE if used.lease is None else ()
+            )
             rows = []
             for seed in experiment.seeds:
                 episodes = read_rows(_episode_file(experiment.run_folder(arm, seed), condition))
@@ -135,7 +148,7 @@ def summarize(experiment: ExperimentConfig) -> Summary:
             table[arm.name][condition] = {
                 metric: estimate([row[metric] for row in rows])
                 for metric in METRICS
-                if rows and all(metric in row for row in rows) and (filtered or metric not in OF_THE_FILTER)
+                if rows and all(metric in row for row in rows) and metric not in left_out
             }
     return Summary(per_seed, table)
 

@@ -29,6 +29,10 @@ def test_every_config_of_the_repo_is_valid(path):
     if path.stem == "velocity_experts":  # trained without a filter, driven through one afterwards
         assert set(kinds.values()) == {"none"}
         assert experiment.evaluation_filter.kind == "protect"
+    elif path.stem == "outages":
+        assert kinds == {"unfiltered": "none", "filter_alone": "protect", "filtered": "protect"}
+        assert [arm.name for arm in experiment.arms if arm.filter.lease is not None] == ["filtered"]
+        assert all(list(arm.env.faults) == ["Outages"] for arm in experiment.arms)
     else:
         assert kinds == {"unfiltered": "none", "filtered": "protect"}
 
