@@ -268,6 +268,8 @@ def test_the_task_can_be_done_in_an_episode(env, bare):
 
 
 def test_spaces_and_timing(env, bare):
+    assert bare.arm.rotor_inertia.tolist() == [0.05, 0.02]
+    assert bare.arm.stiffness.tolist() == [160.0, 70.0]
     assert env.action_space == gym.spaces.Box(np.float32([-3, -1]), np.float32([3, 1]), dtype=np.float32)
     assert env.observation_space.shape == (14,)
     assert env.observation_space.dtype == np.float64
@@ -324,6 +326,8 @@ def test_targets_move_when_asked(env):
     moving = gym.make(FLEX_JOINT_REACH_ID, target_moves_every_s=0.25)
     courses = []
     for run in (still, moving, moving):
+        run.reset(seed=4)
+        run.step(np.array([0.2, -0.1]))  # an episode broken off leaves no count behind
         observation, _ = run.reset(seed=5)
         targets = [observation[10:12].copy()]
         for _ in range(200):
