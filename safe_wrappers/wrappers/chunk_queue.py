@@ -17,8 +17,6 @@ ENSEMBLE: Final = "ensemble"
 BASELINES: Final = (REPLACE, ENSEMBLE)
 """What is done without a bound on the seam: the new chunk at once, or the mean of all chunks at hand."""
 
-_FALLBACK: Final = "fallback"
-
 
 class Command(NamedTuple):
     """What to send now.
@@ -48,6 +46,7 @@ class _Chunk(NamedTuple):
     commands: Array
     observed: int
     due: int
+    source: str
 
 
 class _Fade(NamedTuple):
@@ -107,7 +106,8 @@ class ChunkQueue:
         self._plan, self._limited = self._none, np.zeros(0, dtype=bool)
         self._coming: list[_Chunk] = []
         self._averaged: list[_Chunk] = []
-        self._acting = self._source
+        self._in_force = self._source
+        self._acting: str | None = None
         self._fade: _Fade | None = None
 
     def submit(self, commands: Array, observed: int, due: int) -> bool:
@@ -124,11 +124,11 @@ class ChunkQueue:
         newest = max([self._observed, *(c.observed for c in self._coming)])
         if not newest < observed <= self.now or not np.isfinite(commands).all():
             return False
-        self._coming.append(_Chunk(commands, observed, due))
+        self._coming.append(_Chunk(commands, observed, due, self._source))
         return True
 
     def switch(self, source: str) -> None:
-        """From now on somebody else gives the commands; the next one is blended over from the last command."""
+        """Chunks from now on are somebody else's; the first of them is blended over from the last command."""
         self._source = source
 
     def next(
@@ -147,14 +147,12 @@ class ChunkQueue:
         starved = control is None
         if control is None:
             control = fallback()
-        acting = _FALLBACK if starved else self._source
-        if acting != self._acting and len(self._sent) and self._blend in BLENDS:
-            # Out of the fallback a longer chunk blends by itself; everything else starts from the last command.
-            if starved or not seam:
+        acting = None if starved else self._in_force
+        if acting != self._acting and len(self._sent):
+            # A longer chunk that takes over blends by itself; everything else starts from the last command.
+            if not seam and self._blend in BLENDS:
                 blend_steps = self._fade_steps(control)
                 self._fade = _Fade(self._sent[-1], blend_steps, 0)
-            else:
-                self._fade = None
             seam = True
         self._acting = acting
         if self._blend in BLENDS:
@@ -178,7 +176,7 @@ class ChunkQueue:
         fresh = newest.commands[self.now - newest.observed :]
         if not len(fresh) or (admit is not None and not admit(fresh[-1], len(fresh))):
             return False, 0, True
-        self._observed = newest.observed
+        self._observed, self._in_force = newest.observed, newest.source
         if self._blend == ENSEMBLE:
             self._averaged.append(newest)
             return len(self._sent) > 0, 0, False
