@@ -58,6 +58,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
     more than `jerk_limit` times the control interval in any component, whatever the chunks: where no blend can keep
     the limit the commands are held back, which is counted (`handover/limited`), and are late. No entry of a chunk
     that is not finite is executed: such a chunk is refused as a whole, the left-over goes on, then the fallback.
+    Entries outside the env's action box are clipped to it.
 
     **What it does not.** The limit is on commands: a filter inside may have to break it, and then
     `handover/peak_jerk`, measured on what was executed, shows it. Measured jerk, tracking and stopping are the
@@ -144,23 +145,26 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         self.chunk_size, self.execution_horizon, self.blend = sizes.chunk, sizes.horizon, blend
         self.hold_s = control_interval(env, hold_s)
         self._delay = sizes.delay
-        self._low, self._high = np.asarray(space.low, np.float64), np.asarray(space.high, np.float64)
-        self._dtype = space.dtype
+        self._controls = space.shape[0]
         self.action_space = gym.spaces.Box(
             np.repeat(space.low[None], sizes.chunk, axis=0),
             np.repeat(space.high[None], sizes.chunk, axis=0),
             dtype=space.dtype,  # type: ignore[arg-type]
         )
         self._stand_in = StandIn(env, fallback, plant)
-        fewest, rate_limit = blend_bounds(sizes, space, self.hold_s, blend, blend_time, jerk_limit)
+        fewest, rate_limit, resolution = blend_bounds(
+            sizes, space, self.hold_s, blend, blend_time, jerk_limit
+        )
         self._queue = ChunkQueue(
-            self._low.size,
+            self._controls,
             self.hold_s,
             blend=blend,
             fewest=fewest,
             rate_limit=rate_limit,
-            low=self._low,
-            high=self._high,
+            resolution=resolution,
+            low=np.asarray(space.low, np.float64),
+            high=np.asarray(space.high, np.float64),
+            dtype=space.dtype,
             decay=decay,
         )
         self._inside = receiver_inside(env)
@@ -195,9 +199,8 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
                 latency = now - command.observed
             if self._inside is not None:
                 self._inside.deliver(None if command.observed < 0 else command.observed * self.hold_s)
-            sent = command.control.astype(self._dtype)
-            observation, reward, terminated, truncated, info = self.env.step(sent)
-            executed = np.asarray(info.get(keys.EXECUTED_ACTION, sent), dtype=np.float64)
+            observation, reward, terminated, truncated, info = self.env.step(command.control)
+            executed = np.array(info.get(keys.EXECUTED_ACTION, command.control), dtype=np.float64)
             self._stand_in.executed(executed)
             self._executed = np.concatenate([self._executed, executed[None]])
             self._in_seam.append(self._seams_at(now, command))
@@ -263,7 +266,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
 
     def _forget(self) -> None:
         self._evidence: float | None = 0.0
-        self._executed = np.zeros((0, self._low.size))
+        self._executed = np.zeros((0, self._controls))
         self._in_seam: list[bool] = []
         self._seam_until = -1
 

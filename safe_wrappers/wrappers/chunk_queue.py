@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ class Command(NamedTuple):
     """What to send now.
 
     Attributes:
-        control: Shape (m,), float64.
+        control: Shape (m,), in the env's dtype and inside its box.
         observed: Control step whose observation the command was made from; -1 before there was any.
         starved: The queue is dry: the fallback gave it.
         limited: It was held back beyond the blend to keep the rate limit.
@@ -32,7 +32,7 @@ class Command(NamedTuple):
         refused: A chunk was there and could not take over: it came too late, or was not admitted.
     """
 
-    control: Array
+    control: NDArray[Any]
     observed: int
     starved: bool
     limited: bool
@@ -75,8 +75,12 @@ class ChunkQueue:
         blend: A blend of `control/seams.py`, "replace" or "ensemble".
         fewest: A blend takes at least so many control steps.
         rate_limit: Largest |du/dt| of every component, action units per second; infinite for none.
-        low: Action box, shape (m,).
+        resolution: What rounding to the dtype may add to the difference of two commands, action units: plans stay
+            this far below the limit.
+        low: Action box, shape (m,); what is outside of it is clipped to it. Where it is infinite it ends at the
+            largest number of the dtype.
         high: Likewise.
+        dtype: Of the commands.
         decay: Ensembling weighs the i-th oldest chunk by exp(-decay i).
     """
 
@@ -88,12 +92,19 @@ class ChunkQueue:
         blend: str,
         fewest: int,
         rate_limit: float,
+        resolution: float,
         low: Array,
         high: Array,
+        dtype: Any,
         decay: float,
     ) -> None:
-        self._hold_s, self._blend, self._fewest, self._rate_limit = hold_s, blend, fewest, rate_limit
-        self._low, self._high, self._decay = low, high, decay
+        self._hold_s, self._blend, self._fewest, self._decay = hold_s, blend, fewest, decay
+        # So that the difference of two commands, divided by the interval again, is not above the limit.
+        self._step = float(np.nextafter(rate_limit * hold_s, 0.0))
+        self._rate_limit = rate_limit - resolution / hold_s
+        largest = min(float(np.finfo(dtype).max), float(np.finfo(np.float32).max))
+        self._low, self._high = np.maximum(low, -largest), np.minimum(high, largest)
+        self._dtype = np.dtype(dtype)
         self._none = np.zeros((0, controls))
         self._source = ""
         self.reset()
@@ -124,7 +135,8 @@ class ChunkQueue:
         newest = max([self._observed, *(c.observed for c in self._coming)])
         if not newest < observed <= self.now or not np.isfinite(commands).all():
             return False
-        self._coming.append(_Chunk(commands, observed, due, self._source))
+        boxed = np.clip(commands, self._low, self._high)
+        self._coming.append(_Chunk(boxed, observed, due, self._source))
         return True
 
     def switch(self, source: str) -> None:
@@ -155,15 +167,18 @@ class ChunkQueue:
                 self._fade = _Fade(self._sent[-1], blend_steps, 0)
             seam = True
         self._acting = acting
-        if self._blend in BLENDS:
-            control = self._faded(control)
-            if len(self._sent):
-                kept, held = limit_rate(control[None], self._sent[-1], self._rate_limit * self._hold_s)
-                control, limited = kept[0], limited or bool(held[0])
-        self._sent = np.concatenate([self._sent[-DIFFERENCES + 1 :], control[None]])
+        sent, held = self._sendable(self._faded(control))
+        self._sent = np.concatenate([self._sent[-DIFFERENCES + 1 :], sent[None].astype(np.float64)])
         self.now += 1
         return Command(
-            control, self._observed, starved, limited, self._observed > newest, seam, blend_steps, refused
+            sent,
+            self._observed,
+            starved,
+            limited or held,
+            self._observed > newest,
+            seam,
+            blend_steps,
+            refused,
         )
 
     def _take_over(self, admit: Callable[[Array, int], bool] | None) -> tuple[bool, int, bool]:
@@ -231,3 +246,15 @@ class ChunkQueue:
         self._fade = _Fade(latched, steps, done + 1)
         weight = float(smoothstep((done + 1.0) / (steps + 1.0)))
         return np.asarray(latched + weight * (control - latched))
+
+    def _sendable(self, control: Array) -> tuple[NDArray[Any], bool]:
+        """The command in the env's dtype, within the box and the limit, and whether it had to be held back."""
+        control = np.clip(control, self._low, self._high)
+        if self._blend not in BLENDS or not len(self._sent):
+            return control.astype(self._dtype), False
+        last = self._sent[-1]
+        kept, held = limit_rate(control[None], last, self._step)
+        sent = kept[0].astype(self._dtype)
+        # Where numbers are as coarse as the limit, rounding alone may break it.
+        too_far = np.abs(sent - last) > self._step
+        return np.where(too_far, np.nextafter(sent, last.astype(self._dtype)), sent), bool(held[0])

@@ -56,8 +56,8 @@ def blend_bounds(
     blend: str,
     blend_time: float | None,
     jerk_limit: float | None,
-) -> tuple[int, float]:
-    """The fewest steps of a blend, and the rate limit less what rounding to the actions' dtype may add.
+) -> tuple[int, float, float]:
+    """The fewest steps of a blend, the rate limit, and what rounding may add to the difference of two commands.
 
     Raises:
         ConfigurationError: Bounds for a baseline, that are not positive, that do not fit into a chunk, or nothing to
@@ -69,8 +69,8 @@ def blend_bounds(
                 f"blend={blend!r} is a baseline that bounds nothing: leave blend_time and jerk_limit out, or choose "
                 f"{', '.join(BLENDS)}"
             )
-        return 0, math.inf
-    fewest, rate_limit = 0, math.inf
+        return 0, math.inf, 0.0
+    fewest, rate_limit, resolution = 0, math.inf, _rounding(space)
     if blend_time is not None:
         fewest = max(round(positive("blend_time", blend_time, "s") / hold_s) - 1, 1)
         available = sizes.chunk - sizes.delay[1]
@@ -80,11 +80,11 @@ def blend_bounds(
                 f"control steps of {hold_s} s: choose a longer chunk_size or a shorter blend_time"
             )
     if jerk_limit is not None:
-        rounding = _rounding(space) / hold_s
-        rate_limit = positive("jerk_limit", jerk_limit, "action units per second") - rounding
-        if rate_limit <= 0.0:
+        rate_limit = positive("jerk_limit", jerk_limit, "action units per second")
+        if rate_limit * hold_s <= resolution:
             raise ConfigurationError(
-                f"jerk_limit = {jerk_limit} per second is below what {space.dtype} resolves, {rounding:.3g}"
+                f"jerk_limit = {jerk_limit} per second is not above what {space.dtype} resolves in steps of {hold_s} "
+                f"s, {resolution / hold_s:.3g}: choose a larger one"
             )
     if blend_time is None and jerk_limit is None:
         fewest = sizes.leftover
@@ -93,7 +93,7 @@ def blend_bounds(
                 f"chunk_size = {sizes.chunk}, execution_horizon = {sizes.horizon} and inference_delay = "
                 f"{sizes.delay[1]} leave no left-over to blend with: pass jerk_limit or blend_time"
             )
-    return fewest, rate_limit
+    return fewest, rate_limit, resolution
 
 
 def _count(name: str, value: Any, least: int) -> int:
