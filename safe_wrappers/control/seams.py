@@ -50,7 +50,7 @@ def join(
     *,
     blend: Blend = "smoothstep",
     fewest: int = 0,
-    rate_limit: float = np.inf,
+    rate_limit: Array | float = np.inf,
     low: Array | float = -np.inf,
     high: Array | float = np.inf,
 ) -> Seam:
@@ -72,16 +72,16 @@ def join(
         hold_s: Control interval, s.
         blend: Which blend.
         fewest: The blend takes at least so many steps (fewer only if the new stream is shorter).
-        rate_limit: Largest |du/dt| of every component, action units per second.
+        rate_limit: Largest ``|du/dt|``, action units per second: of every component, or of each, shape (m,).
         low: Action box, for the bridges, shape (m,) or a number.
         high: Likewise.
     """
+    step = np.asarray(rate_limit * hold_s)
     if not len(sent):
-        plan, limited = limit_rate(new, None, rate_limit * hold_s)
+        plan, limited = limit_rate(new, None, step)
         return Seam(plan, 0, limited)
     fewest = min(fewest, len(new) - 1)
-    step = rate_limit * hold_s
-    if fewest == 0 and _peak(new[:1], sent[-1]) <= step:
+    if fewest == 0 and (np.abs(new[0] - sent[-1]) <= step).all():
         candidates, first = new[None, :], 0
     else:
         first = max(fewest, 1) if len(new) > 1 else 0
@@ -89,8 +89,8 @@ def join(
             candidates = _mixed(sent, prior, new, first)
         else:
             candidates = np.clip(_bridged(sent, new, blend, first), low, high)
-    peaks = _peaks(candidates, sent[-1], first)
-    kept = np.flatnonzero(peaks <= step)
+    peaks = _peaks(candidates, sent[-1], first, step)
+    kept = np.flatnonzero(peaks <= 1.0)
     chosen = int(kept[0]) if kept.size else int(np.argmin(peaks))
     steps = first + chosen
     plan = np.concatenate([candidates[chosen, :steps], new[steps:]])
@@ -98,7 +98,7 @@ def join(
     return Seam(plan, steps, limited)
 
 
-def limit_rate(commands: Array, before: Array | None, step: float) -> tuple[Array, NDArray[np.bool_]]:
+def limit_rate(commands: Array, before: Array | None, step: Array | float) -> tuple[Array, NDArray[np.bool_]]:
     """Hold commands back so that no two neighbours differ by more than `step`; and which of them it had to.
 
     Commands that keep the limit come back bit for bit.
@@ -106,11 +106,11 @@ def limit_rate(commands: Array, before: Array | None, step: float) -> tuple[Arra
     Args:
         commands: Shape (n, m).
         before: The command before the first, shape (m,), or None.
-        step: Largest difference of neighbours, action units; may be infinite.
+        step: Largest difference of neighbours, action units, a number or shape (m,); may be infinite.
     """
     limited = np.zeros(len(commands), dtype=bool)
     whole = commands if before is None else np.concatenate([before[None], commands])
-    if len(whole) < 2 or float(np.abs(np.diff(whole, axis=0)).max()) <= step:
+    if len(whole) < 2 or (np.abs(np.diff(whole, axis=0)) <= step).all():
         return commands, limited
     kept = commands.copy()
     last = kept[0] if before is None else before
@@ -121,32 +121,16 @@ def limit_rate(commands: Array, before: Array | None, step: float) -> tuple[Arra
     return kept, limited
 
 
-def differences(commands: Array, newest: slice) -> Array:
-    """The largest |first|, |second| and |third| difference of neighbouring commands, shape (3,), action units.
+def _peaks(candidates: Array, before: Array, first: int, step: Array) -> Array:
+    """The largest difference inside each blend, in units of the largest allowed one, shape (c,).
 
-    Args:
-        commands: Oldest first, shape (n, m).
-        newest: Which commands count: a difference counts if its newest command is among them.
+    From the last command to the first one that is not mixed any more.
     """
-    found = np.zeros(DIFFERENCES)
-    start, stop, _ = newest.indices(len(commands))
-    for order in range(1, DIFFERENCES + 1):
-        diff = np.diff(commands[max(start - order, 0) : stop], n=order, axis=0)
-        if diff.size:
-            found[order - 1] = np.abs(diff).max()
-    return found
-
-
-def _peak(commands: Array, before: Array) -> float:
-    return float(np.abs(np.diff(np.concatenate([before[None], commands]), axis=0)).max())
-
-
-def _peaks(candidates: Array, before: Array, first: int) -> Array:
-    """The largest difference inside each blend, from the last command to the first unmixed one, shape (c,)."""
     start = np.broadcast_to(before, (len(candidates), 1, before.size))
-    steps = np.abs(np.diff(np.concatenate([start, candidates], axis=1), axis=1)).max(axis=2)
+    steps = (np.abs(np.diff(np.concatenate([start, candidates], axis=1), axis=1)) / step).max(axis=2)
     mixed = np.arange(steps.shape[1]) <= first + np.arange(len(candidates))[:, None]
     return np.asarray(np.where(mixed, steps, 0.0).max(axis=1))
+
 
 
 def _phases(steps: int, longest: int) -> Array:
