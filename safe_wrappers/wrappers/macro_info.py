@@ -6,8 +6,9 @@ import numpy as np
 
 from safe_wrappers import interventions as keys
 
-_SUMS: Final = (keys.COST, keys.COST_SUBSTEP)
-_ANY: Final = (*keys.CBF_BOOLS, keys.CBF_REFUSED, keys.LEASE_EXPIRED, keys.LEASE_REFUSED, keys.LEASE_BRAKING)
+_SUMS: Final = (keys.COST, keys.COST_SUBSTEP, keys.ADAPTION_PENALTY, keys.ADAPTION_TASK_REWARD)
+_LEASE_BOOLS: Final = (keys.LEASE_EXPIRED, keys.LEASE_REFUSED, keys.LEASE_BRAKING)
+_ANY: Final = (*keys.CBF_BOOLS, keys.CBF_REFUSED, *_LEASE_BOOLS, keys.FAULT_ACTIVE)
 _LARGEST: Final = (keys.CBF_CORRECTION, keys.CBF_CLIPPED)
 _SMALLEST: Final = (keys.CBF_MARGIN,)
 
@@ -15,16 +16,18 @@ _SMALLEST: Final = (keys.CBF_MARGIN,)
 def macro_info(infos: list[dict[str, Any]]) -> dict[str, Any]:
     """The last control step's info, in which costs are summed up and no intervention of the others is lost.
 
-    Costs are sums; what is a flag is True if it was at any control step; corrections are the largest, the margin is
+    Costs, and what `AdaptionPenalty` says of the reward, are sums; what is a flag is True if it was at any control step; corrections are the largest, the margin is
     the smallest. Everything else is the last control step's, the running counts of `RecordInterventions` too.
+    A key that only some control steps have counts where it is there.
     """
     last = infos[-1]
     if len(infos) == 1:
         return last
     for names, merge in ((_SUMS, np.sum), (_ANY, np.any), (_LARGEST, np.max), (_SMALLEST, np.min)):
         for name in names:
-            if name in last:
-                kind = np.asarray(last[name])
-                merged = merge([info[name] for info in infos], axis=0)
-                last[name] = merged.astype(kind.dtype) if kind.ndim else type(last[name])(merged)
+            values = [info[name] for info in infos if name in info]
+            if values:
+                merged = merge(values, axis=0)
+                array = isinstance(values[-1], np.ndarray)
+                last[name] = np.asarray(merged, values[-1].dtype) if array else type(values[-1])(merged)
     return last
