@@ -1,7 +1,7 @@
 """The sizes of chunks and the bounds on their blends, checked against each other at construction."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -10,6 +10,10 @@ from safe_wrappers.constraints.constraint import positive
 from safe_wrappers.control.seams import BLENDS
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.chunk_queue import BASELINES
+
+
+_WHOLE: Final = 1e-6
+"""Control steps: a time that is longer than whole steps by less is meant to be those."""
 
 
 class ChunkSizes(NamedTuple):
@@ -32,14 +36,19 @@ class ChunkSizes(NamedTuple):
         delay = _delay(inference_delay)
         if horizon > size:
             raise ConfigurationError(
-                f"execution_horizon = {horizon} is more than a chunk has, chunk_size = {size}: it would run dry"
+                f"execution_horizon = {horizon} is more than a chunk has, chunk_size = {size}: it would run dry; "
+                f"choose it up to {size}, or longer chunks"
             )
         if not delay[1] <= horizon <= size - delay[1]:
+            fits = (
+                f"choose s from {max(delay[1], 1)} to {size - delay[1]}, or longer chunks"
+                if 2 * delay[1] <= size
+                else f"no s fits, choose H >= {2 * delay[1]}"
+            )
             raise ConfigurationError(
                 f"inference_delay d = {delay[1]}, execution_horizon s = {horizon} and chunk_size H = {size} break "
-                f"d <= s <= H - d: a chunk that comes {delay[1]} control steps late has {size - delay[1]} commands "
-                f"left, for the {horizon} until the next; choose s from {delay[1]} to {size - delay[1]}, or longer "
-                "chunks"
+                f"d <= s <= H - d: a chunk that comes {delay[1]} control steps late has {max(size - delay[1], 0)} "
+                f"commands left, for the {horizon} until the next; {fits}"
             )
         return cls(size, horizon, delay)
 
@@ -72,7 +81,7 @@ def blend_bounds(
         return 0, math.inf, 0.0
     fewest, rate_limit, resolution = 0, math.inf, _rounding(space)
     if blend_time is not None:
-        fewest = max(round(positive("blend_time", blend_time, "s") / hold_s) - 1, 1)
+        fewest = max(math.ceil(positive("blend_time", blend_time, "s") / hold_s - _WHOLE) - 1, 1)
         available = sizes.chunk - sizes.delay[1]
         if fewest >= available and sizes.chunk > 1:
             raise ConfigurationError(
@@ -105,9 +114,10 @@ def _count(name: str, value: Any, least: int) -> int:
 def _delay(value: Any) -> tuple[int, int]:
     if not isinstance(value, list | tuple):
         return (_count("inference_delay", value, 0),) * 2
-    if len(value) != 2 or value[0] > value[1]:
+    counts = [_count("inference_delay", delay, 0) for delay in value]
+    if len(counts) != 2 or counts[0] > counts[1]:
         raise ConfigurationError(f"inference_delay is d control steps or [least, most], got {value!r}")
-    return _count("inference_delay", value[0], 0), _count("inference_delay", value[1], 0)
+    return counts[0], counts[1]
 
 
 def _rounding(space: gym.spaces.Box) -> float:
