@@ -186,15 +186,18 @@ class ChunkQueue:
         there = [c for c in self._coming if c.due <= self.now]
         if not there:
             return False, 0, False
-        newest = max(there, key=lambda c: c.observed)
+        newest = there[-1]  # they are in the order of their observations
         self._coming = [c for c in self._coming if c.observed > newest.observed]
-        fresh = newest.commands[self.now - newest.observed :]
-        if not len(fresh) or (admit is not None and not admit(fresh[-1], len(fresh))):
+        wanted = there if self._blend == ENSEMBLE else [newest]
+        admitted = [c for c in wanted if self._is_admitted(c, admit)]
+        if not admitted:
             return False, 0, True
+        newest = admitted[-1]
         self._observed, self._in_force = newest.observed, newest.source
         if self._blend == ENSEMBLE:
-            self._averaged.append(newest)
-            return len(self._sent) > 0, 0, False
+            self._averaged += admitted
+            return len(self._sent) > 0, 0, len(admitted) < len(wanted)
+        fresh = newest.commands[self.now - newest.observed :]
         if self._blend == REPLACE or len(newest.commands) == 1:
             self._plan, self._limited = fresh, np.zeros(len(fresh), dtype=bool)
             return self._blend == REPLACE and len(self._sent) > 0, 0, False
@@ -212,6 +215,10 @@ class ChunkQueue:
         self._plan, self._limited = joined.plan, joined.limited
         self._fade = None
         return len(self._sent) > 0, joined.steps, False
+
+    def _is_admitted(self, chunk: _Chunk, admit: Callable[[Array, int], bool] | None) -> bool:
+        fresh = chunk.commands[self.now - chunk.observed :]
+        return len(fresh) > 0 and (admit is None or admit(fresh[-1], len(fresh)))
 
     def _planned(self) -> tuple[Array | None, bool]:
         if self._blend == ENSEMBLE:
