@@ -121,8 +121,8 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         hold_s: float | None = None,
         decay: float = 0.01,
     ) -> None:
+        _refuse_order(env)  # first: with a handover inside the actions are no vector either
         space = check_actions(env)
-        _refuse_order(env)
         plant = own_plant(plant)
         sizes = ChunkSizes.checked(chunk_size, execution_horizon, inference_delay)
         if blend not in (*BLENDS, *BASELINES):
@@ -205,7 +205,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             self._executed = np.concatenate([self._executed, executed[None]])
             self._in_seam.append(self._seams_at(now, command))
             total += float(reward)
-            infos.append(info)
+            infos.append(dict(info))  # the env may use the same one again
             commands.append(command)
             if terminated or truncated:
                 break
@@ -311,5 +311,7 @@ def _refuse_order(env: gym.Env[Any, Any]) -> None:
     inner: Any = env
     while isinstance(inner, gym.Wrapper):
         if isinstance(inner, ChunkHandover):
-            raise ConfigurationError("this env takes chunks already; a chunk of chunks has no meaning")
+            raise ConfigurationError(
+                "this env takes chunks already, from a ChunkHandover inside; a chunk of chunks has no meaning: use one"
+            )
         inner = inner.env
