@@ -312,6 +312,6 @@ def _refuse_order(env: gym.Env[Any, Any]) -> None:
     while isinstance(inner, gym.Wrapper):
         if isinstance(inner, ChunkHandover):
             raise ConfigurationError(
-                "this env takes chunks already, from a ChunkHandover inside; a chunk of chunks has no meaning: use one"
+                "this env takes chunks already, from a ChunkHandover inside, and a chunk of chunks has no meaning"
             )
         inner = inner.env

@@ -11,7 +11,6 @@ from safe_wrappers.control.seams import BLENDS
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.chunk_queue import BASELINES
 
-
 _WHOLE: Final = 1e-6
 """Control steps: a time that is longer than whole steps by less is meant to be those."""
 

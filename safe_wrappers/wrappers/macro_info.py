@@ -16,9 +16,9 @@ _SMALLEST: Final = (keys.CBF_MARGIN,)
 def macro_info(infos: list[dict[str, Any]]) -> dict[str, Any]:
     """The last control step's info, in which costs are summed up and no intervention of the others is lost.
 
-    Costs, and what `AdaptionPenalty` says of the reward, are sums; what is a flag is True if it was at any control step; corrections are the largest, the margin is
-    the smallest. Everything else is the last control step's, the running counts of `RecordInterventions` too.
-    A key that only some control steps have counts where it is there.
+    Costs, and what `AdaptionPenalty` says of the reward, are sums; what is a flag is True if it was at any control
+    step; corrections are the largest, the margin is the smallest. Everything else is the last control step's, the
+    running counts of `RecordInterventions` too. A key that only some control steps have counts where it is there.
     """
     last = infos[-1]
     if len(infos) == 1:
