@@ -152,16 +152,13 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             dtype=space.dtype,  # type: ignore[arg-type]
         )
         self._stand_in = StandIn(env, fallback, plant)
-        fewest, rate_limit, resolution = blend_bounds(
-            sizes, space, self.hold_s, blend, blend_time, jerk_limit
-        )
+        fewest, rate_limit = blend_bounds(sizes, space, self.hold_s, blend, blend_time, jerk_limit)
         self._queue = ChunkQueue(
             self._controls,
             self.hold_s,
             blend=blend,
             fewest=fewest,
             rate_limit=rate_limit,
-            resolution=resolution,
             low=np.asarray(space.low, np.float64),
             high=np.asarray(space.high, np.float64),
             dtype=space.dtype,

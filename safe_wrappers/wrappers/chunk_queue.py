@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.control.seams import BLENDS, DIFFERENCES, join, limit_rate
+from safe_wrappers.control.seams import BLENDS, DIFFERENCES, join
 from safe_wrappers.control.smoothstep import shortest_latched_blend, smoothstep
 
 Array = NDArray[np.float64]
@@ -75,8 +75,6 @@ class ChunkQueue:
         blend: A blend of `control/seams.py`, "replace" or "ensemble".
         fewest: A blend takes at least so many control steps.
         rate_limit: Largest |du/dt| of every component, action units per second; infinite for none.
-        resolution: What rounding to the dtype may add to the difference of two commands, action units: plans stay
-            this far below the limit.
         low: Action box, shape (m,); what is outside of it is clipped to it. Where it is infinite it ends at the
             largest number of the dtype.
         high: Likewise.
@@ -92,16 +90,16 @@ class ChunkQueue:
         blend: str,
         fewest: int,
         rate_limit: float,
-        resolution: float,
         low: Array,
         high: Array,
         dtype: Any,
         decay: float,
     ) -> None:
         self._hold_s, self._blend, self._fewest, self._decay = hold_s, blend, fewest, decay
-        # So that the difference of two commands, divided by the interval again, is not above the limit.
-        self._step = float(np.nextafter(rate_limit * hold_s, 0.0))
-        self._rate_limit = rate_limit - resolution / hold_s
+        self._rate_limit = rate_limit
+        step = np.asarray(rate_limit * hold_s)
+        # The difference of two commands, divided by the interval again, must not come out above the limit.
+        self._step = np.where(step / hold_s > rate_limit, np.nextafter(step, 0.0), step)
         largest = min(float(np.finfo(dtype).max), float(np.finfo(np.float32).max))
         self._low, self._high = np.maximum(low, -largest), np.minimum(high, largest)
         self._dtype = np.dtype(dtype)
@@ -260,8 +258,10 @@ class ChunkQueue:
         if self._blend not in BLENDS or not len(self._sent):
             return control.astype(self._dtype), False
         last = self._sent[-1]
-        kept, held = limit_rate(control[None], last, self._step)
-        sent = kept[0].astype(self._dtype)
-        # Where numbers are as coarse as the limit, rounding alone may break it.
+        kept = np.clip(control, last - self._step, last + self._step)
+        sent = kept.astype(self._dtype)
+        # Rounding alone may break the limit by a hair: one number back, which is not called holding back.
         too_far = np.abs(sent - last) > self._step
-        return np.where(too_far, np.nextafter(sent, last.astype(self._dtype)), sent), bool(held[0])
+        sent = np.where(too_far, np.nextafter(sent, last.astype(self._dtype)), sent)
+        hair = 2.0 * np.spacing(np.maximum(np.abs(control), np.abs(last)).astype(self._dtype))
+        return sent, bool((np.abs(control - kept) > hair).any())

@@ -64,8 +64,8 @@ def blend_bounds(
     blend: str,
     blend_time: float | None,
     jerk_limit: float | None,
-) -> tuple[int, float, float]:
-    """The fewest steps of a blend, the rate limit, and what rounding may add to the difference of two commands.
+) -> tuple[int, float]:
+    """The fewest steps of a blend, and the rate limit.
 
     Raises:
         ConfigurationError: Bounds for a baseline, that are not positive, that do not fit into a chunk, or nothing to
@@ -77,8 +77,8 @@ def blend_bounds(
                 f"blend={blend!r} is a baseline that bounds nothing: leave blend_time and jerk_limit out, or choose "
                 f"{', '.join(BLENDS)}"
             )
-        return 0, math.inf, 0.0
-    fewest, rate_limit, resolution = 0, math.inf, _rounding(space)
+        return 0, math.inf
+    fewest, rate_limit = 0, math.inf
     if blend_time is not None:
         fewest = max(math.ceil(positive("blend_time", blend_time, "s") / hold_s - _WHOLE) - 1, 1)
         available = sizes.chunk - sizes.delay[1]
@@ -89,6 +89,7 @@ def blend_bounds(
             )
     if jerk_limit is not None:
         rate_limit = positive("jerk_limit", jerk_limit, "action units per second")
+        resolution = _rounding(space)
         if rate_limit * hold_s <= resolution:
             raise ConfigurationError(
                 f"jerk_limit = {jerk_limit} per second is not above what {space.dtype} resolves in steps of {hold_s} "
@@ -101,7 +102,7 @@ def blend_bounds(
                 f"chunk_size = {sizes.chunk}, execution_horizon = {sizes.horizon} and inference_delay = "
                 f"{sizes.delay[1]} leave no left-over to blend with: pass jerk_limit or blend_time"
             )
-    return fewest, rate_limit, resolution
+    return fewest, rate_limit
 
 
 def _count(name: str, value: Any, least: int) -> int:
