@@ -186,7 +186,7 @@ def admits(
     max_speed: ArrayLike,
     max_acceleration: ArrayLike,
     max_jerk: ArrayLike = np.inf,
-    acceleration: ArrayLike = 0.0,
+    acceleration: ArrayLike | None = 0.0,
 ) -> NDArray[np.bool_]:
     """Whether a position may be reached within a time, at any speed: a necessary condition, axis by axis.
 
@@ -200,9 +200,10 @@ def admits(
         duration: s, shape (...).
         max_speed: m/s, shape (...); inf: none.
         max_acceleration: m/s^2, shape (...).
-        max_jerk: m/s^3, shape (...); inf: none. Only with a measured `acceleration`: a machine that is already
-            accelerating gets farther than one that is not.
-        acceleration: At the start, m/s^2, shape (...).
+        max_jerk: m/s^3, shape (...); inf: none.
+        acceleration: At the start, m/s^2, shape (...); a machine that is already accelerating gets farther than one
+            that is not. None: not measured. Then the most is counted on at once, which leaves the limit on the jerk
+            a say only over how far a start that is too fast may go.
 
     Returns:
         Shape (...). False where anything is not finite or the duration is negative.
@@ -210,11 +211,29 @@ def admits(
     Raises:
         ConfigurationError: For a limit that is not positive, or an acceleration limit that is not finite.
     """
-    lowest, highest = furthest(duration, velocity, acceleration, max_speed, max_acceleration, max_jerk)
+    if acceleration is None:
+        lowest, highest = _furthest_unmeasured(duration, velocity, max_speed, max_acceleration, max_jerk)
+    else:
+        lowest, highest = furthest(duration, velocity, acceleration, max_speed, max_acceleration, max_jerk)
     end, start = np.asarray(goal, dtype=np.float64), np.asarray(position, dtype=np.float64)
     with np.errstate(invalid="ignore"):
         way, slack = end - start, _ROUNDING * (np.abs(end) + np.abs(start))
         return np.asarray((lowest - slack <= way) & (way <= highest + slack) & np.isfinite(way))
+
+
+def _furthest_unmeasured(
+    duration: ArrayLike,
+    velocity: ArrayLike,
+    max_speed: ArrayLike,
+    max_acceleration: ArrayLike,
+    max_jerk: ArrayLike,
+) -> tuple[Array, Array]:
+    """`furthest` for whatever acceleration at the start: a start inside the limits is never carried over them."""
+    a_max, v_max, jerk = _limits(max_acceleration, max_speed, max_jerk)
+    v = np.asarray(velocity, dtype=np.float64)
+    _, highest = furthest(duration, v, a_max, v_max, a_max, np.where(v > v_max, jerk, np.inf))
+    lowest, _ = furthest(duration, v, -a_max, v_max, a_max, np.where(v < -v_max, jerk, np.inf))
+    return lowest, highest
 
 
 def jerk_limited_time(start: State, end: State, limits: MotionLimits) -> Array:

@@ -322,6 +322,7 @@ def test_no_admissible_motion_is_refused(seed):
     times = 0.005 * np.arange(len(xs))
     assert admits(xs, start[0], start[1], times, speed, acceleration, jerk, start[2]).all()
     assert admits(xs, start[0], start[1], times, speed, acceleration).all()
+    assert admits(xs, start[0], start[1], times, speed, acceleration, jerk, acceleration=None).all()
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -339,6 +340,10 @@ def test_no_motion_of_ruckig_is_refused_however_it_starts(seed):
     times = np.linspace(0.0, trajectory.duration, 200)
     xs = np.array([trajectory.at_time(t)[0][0] for t in times])
     assert admits(xs, position, velocity, times, speed, acceleration, jerk, accelerated).all()
+    if abs(accelerated) <= acceleration and (
+        abs(velocity) > speed or abs(velocity + accelerated * abs(accelerated) / (2 * jerk)) <= speed
+    ):
+        assert admits(xs, position, velocity, times, speed, acceleration, jerk, acceleration=None).all()
 
 
 def test_coasting_above_the_speed_limit_is_not_refused():
@@ -349,6 +354,16 @@ def test_coasting_above_the_speed_limit_is_not_refused():
     # Accelerating at the limit: 1 m/s^2 cannot end before 0.1 s more, at 0.05 m/s over it.
     xs = times * 1.0 + 0.5 * times**2 - 10.0 * times**3 / 6
     assert admits(xs[times < 0.1], 0.0, 1.0, times[times < 0.1], 1.0, 1.0, 10.0, 1.0).all()
+
+
+def test_an_unmeasured_acceleration_counts_as_the_most_and_no_more():
+    # From 1 m/s with 1 m/s^2 at once, whatever the jerk: 1.5 m in a second, then 2 m/s; 3 s until -2 m/s
+    for jerk in (0.1, 10.0, np.inf):
+        ends = np.array([1.5 + 1.0, -1.5 - 2.0 * 7])
+        times = np.array([1.5, 10.0])
+        given_ = {"max_speed": 2.0, "max_acceleration": 1.0, "max_jerk": jerk, "acceleration": None}
+        assert admits(ends, 0.0, 1.0, times, **given_).all()
+        assert not admits(ends + np.array([1e-6, -1e-6]), 0.0, 1.0, times, **given_).any()
 
 
 def test_a_body_that_turns_round_was_farther_before():
