@@ -132,10 +132,9 @@ def _peaks(candidates: Array, before: Array, first: int, step: Array) -> Array:
     return np.asarray(np.where(mixed, steps, 0.0).max(axis=1))
 
 
-
 def _phases(steps: int, longest: int) -> Array:
     """Normalised time of every step of a blend of so many, shape (longest + 1,); 1 from its end on."""
-    return np.minimum((np.arange(longest + 1) + 1.0) / (steps + 1.0), 1.0)
+    return np.asarray(np.minimum((np.arange(longest + 1) + 1.0) / (steps + 1.0), 1.0))
 
 
 @lru_cache(maxsize=256)
@@ -156,7 +155,11 @@ def _basis(order: int, first: int, longest: int) -> Array:
     basis = []
     for n in range(first, longest + 1):
         s = _phases(n, longest)
-        bridge = hermite(*unit, 1.0, s) if order == 2 else evaluate(quintic_coefficients(*unit, 1.0), s)
+        bridge = (
+            hermite(unit[0], unit[1], unit[2], unit[3], 1.0, s)
+            if order == 2
+            else evaluate(quintic_coefficients(unit[0], unit[1], unit[2], unit[3], unit[4], unit[5], 1.0), s)
+        )
         basis.append(bridge.T)
     weights = np.array(basis)
     weights.flags.writeable = False

@@ -78,8 +78,8 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         inference_delay: d, control steps; or [least, most], drawn anew for every chunk.
         blend: "smoothstep", "quintic", "hermite", or a baseline.
         blend_time: s, the least duration of a blend.
-        jerk_limit: Bound on |du/dt| of every action component, action units per second (the jerk, where the
-            command is an acceleration or a torque).
+        jerk_limit: Bound on |du/dt| of every action component, or a list with one for each, action units per second
+            (the jerk, where the command is an acceleration or a torque).
         fallback: "brake", "hold", "zero", or a function of the plant; "brake" needs MuJoCo or a plant.
         plant: For the fallback; None reads the env's MuJoCo model.
         hold_s: Control interval, s; None reads the env's `dt`.
@@ -107,6 +107,9 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         * v0.1.0: added.
     """
 
+    _evidence: float | None
+    _executed: Array
+
     def __init__(
         self,
         env: gym.Env[Any, Any],
@@ -115,7 +118,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         inference_delay: int | Sequence[int] = 0,
         blend: str = "smoothstep",
         blend_time: float | None = None,
-        jerk_limit: float | None = None,
+        jerk_limit: float | Sequence[float] | None = None,
         fallback: str | FallbackFunction = "brake",
         plant: Plant | None = None,
         hold_s: float | None = None,
@@ -135,7 +138,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             inference_delay=sizes.delay[0] if sizes.delay[0] == sizes.delay[1] else list(sizes.delay),
             blend=blend,
             blend_time=blend_time,
-            jerk_limit=jerk_limit,
+            jerk_limit=list(jerk_limit) if isinstance(jerk_limit, Sequence | np.ndarray) else jerk_limit,
             fallback=fallback,
             plant=None if plant is None else PlantOfSpec(plant),
             hold_s=hold_s,
@@ -149,7 +152,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         self.action_space = gym.spaces.Box(
             np.repeat(space.low[None], sizes.chunk, axis=0),
             np.repeat(space.high[None], sizes.chunk, axis=0),
-            dtype=space.dtype,  # type: ignore[arg-type]
+            dtype=space.dtype,
         )
         self._stand_in = StandIn(env, fallback, plant)
         fewest, rate_limit = blend_bounds(sizes, space, self.hold_s, blend, blend_time, jerk_limit)
@@ -262,7 +265,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         return self._queue.submit(chunk, observed, self._queue.now + delay)
 
     def _forget(self) -> None:
-        self._evidence: float | None = 0.0
+        self._evidence = 0.0
         self._executed = np.zeros((0, self._controls))
         self._in_seam: list[bool] = []
         self._seam_until = -1

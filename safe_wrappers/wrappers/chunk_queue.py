@@ -74,7 +74,7 @@ class ChunkQueue:
         hold_s: Control interval, s.
         blend: A blend of `control/seams.py`, "replace" or "ensemble".
         fewest: A blend takes at least so many control steps.
-        rate_limit: Largest |du/dt| of every component, action units per second; infinite for none.
+        rate_limit: Largest |du/dt| of every component, shape (m,), action units per second; infinite for none.
         low: Action box, shape (m,); what is outside of it is clipped to it. Where it is infinite it ends at the
             largest number of the dtype.
         high: Likewise.
@@ -89,7 +89,7 @@ class ChunkQueue:
         *,
         blend: str,
         fewest: int,
-        rate_limit: float,
+        rate_limit: Array,
         low: Array,
         high: Array,
         dtype: Any,
@@ -235,9 +235,10 @@ class ChunkQueue:
     def _fade_steps(self, target: Array) -> int:
         """Control steps between the latched command and the new one that keep the limit, were both at rest."""
         steps = self._fewest
-        if math.isfinite(self._rate_limit):
-            change = float(np.abs(target - self._sent[-1]).max())
-            shortest = float(shortest_latched_blend(change, self._rate_limit))
+        bounded = np.isfinite(self._rate_limit)
+        if bounded.any():
+            change = np.abs(target - self._sent[-1])[bounded]
+            shortest = float(shortest_latched_blend(change, self._rate_limit[bounded]).max())
             steps = max(steps, math.ceil(shortest / self._hold_s) - 1)
         return steps
 

@@ -1,10 +1,12 @@
 """The sizes of chunks and the bounds on their blends, checked against each other at construction."""
 
 import math
+from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
 from safe_wrappers.constraints.constraint import positive
 from safe_wrappers.control.seams import BLENDS
@@ -13,6 +15,8 @@ from safe_wrappers.wrappers.chunk_queue import BASELINES
 
 _WHOLE: Final = 1e-6
 """Control steps: a time that is longer than whole steps by less is meant to be those."""
+
+Array = NDArray[np.float64]
 
 
 class ChunkSizes(NamedTuple):
@@ -63,9 +67,9 @@ def blend_bounds(
     hold_s: float,
     blend: str,
     blend_time: float | None,
-    jerk_limit: float | None,
-) -> tuple[int, float]:
-    """The fewest steps of a blend, and the rate limit.
+    jerk_limit: float | Sequence[float] | None,
+) -> tuple[int, Array]:
+    """The fewest steps of a blend, and the rate limit of every component, shape (m,), infinite where there is none.
 
     Raises:
         ConfigurationError: Bounds for a baseline, that are not positive, that do not fit into a chunk, or nothing to
@@ -77,8 +81,8 @@ def blend_bounds(
                 f"blend={blend!r} is a baseline that bounds nothing: leave blend_time and jerk_limit out, or choose "
                 f"{', '.join(BLENDS)}"
             )
-        return 0, math.inf
-    fewest, rate_limit = 0, math.inf
+        return 0, np.full(space.shape, np.inf)
+    fewest, rate_limit = 0, np.full(space.shape, np.inf)
     if blend_time is not None:
         fewest = max(math.ceil(positive("blend_time", blend_time, "s") / hold_s - _WHOLE) - 1, 1)
         available = sizes.chunk - sizes.delay[1]
@@ -88,9 +92,9 @@ def blend_bounds(
                 f"control steps of {hold_s} s: choose a longer chunk_size or a shorter blend_time"
             )
     if jerk_limit is not None:
-        rate_limit = positive("jerk_limit", jerk_limit, "action units per second")
+        rate_limit = _rate_limit(jerk_limit, rate_limit.size)
         resolution = _rounding(space)
-        if rate_limit * hold_s <= resolution:
+        if (rate_limit * hold_s <= resolution).any():
             raise ConfigurationError(
                 f"jerk_limit = {jerk_limit} per second is not above what {space.dtype} resolves in steps of {hold_s} "
                 f"s, {resolution / hold_s:.3g}: choose a larger one"
@@ -120,8 +124,20 @@ def _delay(value: Any) -> tuple[int, int]:
     return counts[0], counts[1]
 
 
+def _rate_limit(jerk_limit: Any, controls: int) -> Array:
+    unit = "action units per second"
+    if not isinstance(jerk_limit, list | tuple | np.ndarray):
+        return np.full(controls, positive("jerk_limit", jerk_limit, unit))
+    if len(jerk_limit) != controls:
+        raise ConfigurationError(
+            f"jerk_limit is one number, or one for each of the {controls} action components; got {jerk_limit!r}"
+        )
+    return np.array([positive("jerk_limit", each, unit) for each in jerk_limit])
+
+
 def _rounding(space: gym.spaces.Box) -> float:
     """The most that rounding to the actions' dtype may add to the difference of two commands in the box."""
     ends = np.abs(np.concatenate([space.low, space.high]).astype(np.float64))
     largest = float(ends[np.isfinite(ends)].max(initial=1.0))
-    return 2.0 * float(np.finfo(space.dtype).eps) * largest
+    dtype: Any = space.dtype
+    return 2.0 * float(np.finfo(dtype).eps) * largest

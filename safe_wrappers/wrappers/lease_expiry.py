@@ -117,6 +117,14 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         * v0.1.0: added.
     """
 
+    _until_s: float
+    _newest_s: float
+    _evidence: float | None
+    _executed: Array | None
+    _braking: bool
+    _chunk_refused: bool
+    _fade: tuple[Array, int, int] | None
+
     def __init__(
         self,
         env: gym.Env[Any, Any],
@@ -352,11 +360,11 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
     def _forget(self) -> None:
         self._steps_done = 0
         self._until_s = self._newest_s = -math.inf
-        self._evidence: float | None = 0.0
+        self._evidence = 0.0
         self._command = np.clip(np.zeros(self._low.shape), self._low, self._high).astype(self._dtype)
-        self._executed: Array | None = None
+        self._executed = None
         self._braking = self._chunk_refused = False
-        self._fade: tuple[Array, int, int] | None = None
+        self._fade = None
 
 
 def _least(env: gym.Env[Any, Any], least_s: float, longest_s: float) -> float:

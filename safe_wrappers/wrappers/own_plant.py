@@ -26,4 +26,4 @@ def own_plant(plant: Any) -> Plant | None:
         raise ConfigurationError(
             f"plant is a MujocoPlant, an AnalyticPlant or another object with the Plant protocol, got {plant!r}"
         )
-    return plant  # type: ignore[no-any-return]
+    return plant

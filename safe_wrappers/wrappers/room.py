@@ -138,7 +138,8 @@ class Room:
             raise ConfigurationError(
                 "braking is missing: a verified lower bound on the deceleration of the fallback, in m/s^2"
             )
-        return positive("braking", own if braking is None else braking, "m/s^2")
+        declared: Any = own if braking is None else braking
+        return positive("braking", declared, "m/s^2")
 
 
 def _least(leases: Array) -> float:

@@ -40,6 +40,9 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
         hold_s: The time that a step lasts, s; None reads the env's.
     """
 
+    _evidence: float | None
+    _last: Any
+
     def __init__(self, env: gym.Env[Any, Any], hold_s: float | None) -> None:
         gym.Wrapper.__init__(self, env)
         self._inside = receiver_inside(env)
@@ -101,6 +104,6 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
 
     def _forget(self) -> None:
         self._steps_done = 0
-        self._evidence: float | None = 0.0
+        self._evidence = 0.0
         space: Any = self.env.action_space
-        self._last: Any = np.clip(np.zeros(space.shape), space.low, space.high).astype(space.dtype)
+        self._last = np.clip(np.zeros(space.shape), space.low, space.high).astype(space.dtype)
