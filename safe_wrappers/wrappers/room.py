@@ -1,5 +1,6 @@
 """Room: the clearance that a lease is granted from, read from a constraint or by the user's function."""
 
+import copy
 from collections.abc import Callable
 from typing import Any
 
@@ -54,7 +55,8 @@ class Room:
                 "clearance is a constraint, such as sw.Clearance(...), or a function of the env that returns the "
                 f"clearance in m and the approach speed in m/s; got {clearance!r}"
             )
-        self.constraint: Any = constraint_from(clearance) if is_constraint else None
+        # A copy: a filter may hold the same one, and a constraint remembers what it saw on its plant.
+        self.constraint: Any = copy.deepcopy(constraint_from(clearance)) if is_constraint else None
         self._function: Any = None if is_constraint else clearance
         self._localisation = non_negative("localisation", localisation, "m")
         self._margin = non_negative("margin", margin, "m")
@@ -74,8 +76,7 @@ class Room:
                     "measured: give acceleration (and top_speed)"
                 )
             if self._approach:
-                self._localisation += float(getattr(self.constraint, "state_error", 0.0))
-                self._margin += float(getattr(self.constraint, "margin", 0.0))
+                self._add_own_reserve()
             return
         name = type(self.constraint).__name__
         if not hasattr(self.constraint, "value"):
@@ -93,7 +94,7 @@ class Room:
                 "acceleration and top_speed"
             )
         self._closing_speed = positive("closing_speed", closing_speed, "the constraint's unit per second")
-        self._margin += float(getattr(self.constraint, "margin", 0.0))
+        self._add_own_reserve()
 
     def bind(self, plant: Plant) -> None:
         """Resolve the constraint's names."""
@@ -118,8 +119,7 @@ class Room:
             room = np.asarray(self.constraint.value(self._plant), dtype=np.float64)
             room = room - self._margin - self._localisation
             return _least(longest_lease_of_room(room, self._closing_speed, delays_s))
-        read = self._function(self._env) if self.constraint is None else self.constraint.approach(self._plant)
-        clearance, speed = (np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in read)
+        clearance, speed = self._read()
         leases = longest_lease(
             clearance,
             speed,
@@ -131,6 +131,26 @@ class Room:
             top_speed=self._top_speed,
         )
         return _least(leases)
+
+    def _add_own_reserve(self) -> None:
+        """A constraint's clearance or value is to the limit itself: its own reserve is not taken off yet."""
+        self._localisation += float(getattr(self.constraint, "state_error", 0.0))
+        self._margin += float(getattr(self.constraint, "margin", 0.0))
+
+    def _read(self) -> tuple[Array, Array]:
+        if self.constraint is not None:
+            clearance, speed = self.constraint.approach(self._plant)
+            return clearance, speed
+        answer = self._function(self._env)
+        try:
+            clearance, speed = (np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in answer)
+            clearance, speed = np.broadcast_arrays(clearance, speed)
+        except (TypeError, ValueError):
+            raise ConfigurationError(
+                "the clearance function must return two things of the same shape, clearances in m and approach "
+                f"speeds in m/s; got {answer!r}"
+            ) from None
+        return clearance, speed
 
     def _declared_braking(self, braking: float | None) -> float:
         own = getattr(self.constraint, "braking", None)
