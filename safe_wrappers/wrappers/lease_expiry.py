@@ -1,6 +1,7 @@
 """LeaseExpiry: a command is in force only as long as the machine could still stop behind it."""
 
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from typing import Any, Final, SupportsFloat
 
@@ -16,7 +17,7 @@ from safe_wrappers.control.reachability import MotionLimits, admits
 from safe_wrappers.control.smoothstep import smoothstep
 from safe_wrappers.errors import ActionError, ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco import MujocoPlant
-from safe_wrappers.plants.plant import Plant, check_actions
+from safe_wrappers.plants.plant import Plant, check_actions, refuse_changed_actions
 from safe_wrappers.wrappers.cbf_action_filter import is_filtered
 from safe_wrappers.wrappers.control_interval import control_interval
 from safe_wrappers.wrappers.fallback import FallbackFunction
@@ -150,8 +151,9 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         plant: Plant | None = None,
         hold_s: float | None = None,
     ) -> None:
-        space = check_actions(env)
         _refuse_order(env)
+        space = check_actions(env)
+        refuse_changed_actions(env)
         plant = own_plant(plant)
         self._room = Room(
             env,
@@ -182,7 +184,7 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
             blend_time=blend_time,
             brake_blend_time=brake_blend_time,
             clock_error_s=clock_error_s,
-            reach=None if reach is None else dict(reach),
+            reach=dict(reach) if isinstance(reach, Mapping) else reach,
             measured=measured,
             fallback=fallback,
             plant=None if plant is None else PlantOfSpec(plant),
@@ -190,10 +192,13 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         )
         gym.Wrapper.__init__(self, env)
         self.hold_s = control_interval(env, hold_s)
-        self._longest_s, self._least_s = (
-            positive("longest_s", longest_s, "s"),
-            _least(env, least_s, longest_s),
-        )
+        self._longest_s = positive("longest_s", longest_s, "s")
+        if self._longest_s < (1.0 - _SAME_TIME) * self.hold_s:
+            raise ConfigurationError(
+                f"longest_s = {longest_s} s is less than one control step, {self.hold_s} s: no command would ever be "
+                "executed"
+            )
+        self._least_s = _least(env, least_s, self._longest_s)
         self._blend_steps = self._steps("blend_time", blend_time)
         self._brake_steps = self._steps("brake_blend_time", brake_blend_time)
         self._clock_error_s = non_negative("clock_error_s", clock_error_s, "s")
@@ -202,6 +207,7 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         self._delays_s = (
             LeaseDelays(*of_formula).total_s + self._brake_steps * self.hold_s + self._clock_error_s
         )
+        self._delays_s += _SAME_TIME * self.hold_s  # what a step may last beyond its lease
         if plant is None and constraint is not None:
             plant = MujocoPlant()
         backups = [constraint] if hasattr(constraint, "backup") else []
@@ -210,15 +216,20 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
             assert plant is not None
             plant.bind(env)
             self._room.bind(plant)
-        self._reach = None if reach is None else MotionLimits(**reach)
+        self._reach = None if reach is None else _motion_limits(reach, space.shape[0])
         self._measured = measured
+        if self._reach is None and measured is not None:
+            raise ConfigurationError("measured is for reach, which is missing: give both, or neither")
         if self._reach is not None and measured is None and not hasattr(env.unwrapped, "data"):
             raise UnsupportedEnvError(
                 "reach needs to know where the machine is: pass measured, a function of the env that returns the "
                 "positions that the actions are setpoints of, and their velocities"
             )
         self._shape, self._dtype = space.shape, space.dtype
-        self._low, self._high = np.asarray(space.low, np.float64), np.asarray(space.high, np.float64)
+        self._box = tuple(
+            np.nan_to_num(np.asarray(end)).astype(np.float64) for end in (space.low, space.high)
+        )
+        self._warned = False
         self._forget()
 
     def reset(
@@ -230,6 +241,7 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         self._room.reset()
         self._forget()
         info[keys.LEASE_REMAINING_S] = 0.0
+        info.setdefault(keys.EXECUTED_ACTION, np.zeros(self._shape))
         info.update(dict.fromkeys((keys.LEASE_EXPIRED, keys.LEASE_REFUSED, keys.LEASE_BRAKING), False))
         return observation, info
 
@@ -245,17 +257,19 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         expired = not covered and self._until_s > -math.inf
         if covered:
             if arrived:
-                self._command = np.asarray(action)
+                self._command = np.array(action)  # its own copy: a policy may reuse its buffer
             if self._braking:
                 self._braking, self._fade = False, self._fade_over(self._blend_steps)
-            sent = self._command if self._fade is None else self._faded(self._command.astype(np.float64))
+            # The env gets a copy as well: it may scale in place what is still in force.
+            sent = self._command.copy() if self._fade is None else self._faded(self._command)
         else:
             self._until_s = -math.inf
             if not self._braking:
                 self._braking, self._fade = True, self._fade_over(self._brake_steps)
             sent = self._faded(self._stand_in.command())
+        executed = sent.astype(np.float64)
         observation, reward, terminated, truncated, info = self.env.step(sent)
-        self._executed = np.asarray(info.get(keys.EXECUTED_ACTION, sent), dtype=np.float64)
+        self._executed = np.array(info.get(keys.EXECUTED_ACTION, executed), dtype=np.float64)
         self._stand_in.executed(self._executed)
         self._steps_done += 1
         self._evidence = self.now_s
@@ -263,6 +277,7 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         info[keys.LEASE_EXPIRED] = expired
         info[keys.LEASE_REFUSED] = refused
         info[keys.LEASE_BRAKING] = not covered
+        info.setdefault(keys.EXECUTED_ACTION, executed)
         return observation, reward, terminated, truncated, info
 
     @property
@@ -325,7 +340,15 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         slack = _SAME_TIME * self.hold_s
         newest = self._newest_s
         from_future = evidence > now + self._clock_error_s + slack
-        if from_future or evidence < newest - slack or not np.isfinite(command).all():
+        finite = bool(np.isfinite(command).all())
+        if not finite and not self._warned:
+            self._warned = True
+            warnings.warn(
+                f"the policy's action is not finite ({command}); the command in force goes on under its lease",
+                UserWarning,
+                stacklevel=4,
+            )
+        if from_future or evidence < newest - slack or not finite:
             return False, False, True
         fresh = evidence > newest + slack
         if fresh:
@@ -342,14 +365,17 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
 
     def _fade_over(self, steps: int) -> tuple[Array, int, int] | None:
         """From what was executed last, over so many steps; None where nothing was executed yet."""
-        return None if self._executed is None or steps == 0 else (self._executed, steps, 0)
+        if self._executed is None or steps == 0:
+            return None
+        return np.clip(self._executed, *self._box), steps, 0
 
-    def _faded(self, target: Array) -> Any:
-        control = target
+    def _faded(self, target: Any) -> Any:
+        """Blended, and in the box, so that rounding to its dtype makes no infinity of anything."""
+        control = np.clip(np.asarray(target, dtype=np.float64), *self._box)
         if self._fade is not None:
             latched, steps, done = self._fade
             weight = float(smoothstep((done + 1.0) / (steps + 1.0)))
-            control = latched + weight * (target - latched)
+            control = latched * (1.0 - weight) + weight * control
             self._fade = (latched, steps, done + 1) if done + 1 < steps else None
         return control.astype(self._dtype)
 
@@ -361,10 +387,24 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         self._steps_done = 0
         self._until_s = self._newest_s = -math.inf
         self._evidence = 0.0
-        self._command = np.clip(np.zeros(self._low.shape), self._low, self._high).astype(self._dtype)
+        self._command = np.clip(np.zeros(self._shape), *self._box).astype(self._dtype)
         self._executed = None
         self._braking = self._chunk_refused = False
         self._fade = None
+
+
+def _motion_limits(reach: Mapping[str, Any], controls: int) -> MotionLimits:
+    try:
+        limits = MotionLimits(**reach)
+        np.broadcast_to(np.broadcast_arrays(*limits.arrays)[0], (controls,))
+    except (TypeError, ValueError) as error:
+        if isinstance(error, ConfigurationError):
+            raise
+        raise ConfigurationError(
+            'reach is {"max_acceleration": ..., "max_speed": ..., "max_jerk": ...}, the last two at will, each a '
+            f"number or one for each of the {controls} action components; got {reach!r}"
+        ) from None
+    return limits
 
 
 def _least(env: gym.Env[Any, Any], least_s: float, longest_s: float) -> float:
