@@ -1,0 +1,671 @@
+"""LeaseExpiry against a book-keeping written from its words, on carts that are driven at walls."""
+
+import math
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from braked_cart import Book, BrakedCart, cart_plant, lease_by_bisection, read_cart, stop, worst_way
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import safe_wrappers as sw
+from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.wrappers.room import Room
+
+pytestmark = pytest.mark.filterwarnings("ignore:the policy's action is not finite")
+FULL = np.array([1.0, 0.0])
+
+
+def leased(env, **more):
+    """The cart under a lease that knows its drive and brake."""
+    cart = env.unwrapped
+    known = {"braking": cart.braking, "acceleration": cart.drive, "fallback": stop}
+    return sw.LeaseExpiry(env, read_cart, **{**known, "plant": cart_plant(cart.dt), **more})
+
+
+def lease_info(info):
+    return tuple(info[f"lease/{k}"] for k in ("expired", "refused", "braking"))
+
+
+def draw(rng):
+    """A cart somewhere in front of a wall, and the lease's arguments, all at random."""
+    dt = float(rng.choice([0.02, 0.1]))
+    cart = {
+        "dt": dt,
+        "drive": float(rng.choice([0.0, rng.uniform(0.2, 3.0)])),
+        "braking": rng.uniform(0.5, 6.0),
+        "top": float(rng.choice([math.inf, rng.uniform(0.5, 4.0)])),
+        "age_s": float(rng.choice([0.0, rng.uniform(0.0, 4 * dt)])),
+        "noise": float(rng.choice([0.0, rng.uniform(0.0, 0.2)])),
+    }
+    v = rng.uniform(0.0, min(cart["top"], 4.0))
+    detect, confirm, act = rng.uniform(0.0, 1.5 * dt, 3) * rng.integers(0, 2)
+    cart["delay_s"] = detect + confirm + act
+    options = {
+        "detect_s": detect,
+        "confirm_s": confirm,
+        "act_s": act,
+        "age_s": cart["age_s"],
+        "localisation": cart["noise"],
+        "margin": float(rng.choice([0.0, rng.uniform(0.0, 0.2)])),
+        "longest_s": float(rng.choice([2 * dt, 5 * dt, rng.uniform(2 * dt, 1.0), 1.0])),
+        "blend_time": float(rng.choice([0.0, dt, rng.uniform(0.0, 5 * dt)])),
+        "brake_blend_time": float(rng.choice([0.0, dt, rng.uniform(0.0, 3 * dt)])),
+        "clock_error_s": float(rng.choice([0.0, rng.uniform(0.0, 2 * dt)])),
+        "top_speed": None if math.isinf(cart["top"]) else cart["top"],
+    }
+    options["longest_s"] = max(options["longest_s"], options["blend_time"] + 2 * dt)
+    # Wherever it starts, it can still stop, if the brakes are put on now, with all their delays.
+    fades = math.ceil(options["brake_blend_time"] / dt) * dt
+    way, speed = worst_way(cart["delay_s"] + fades, v, cart["drive"], cart["top"])
+    reserve = options["margin"] + 2.0 * cart["noise"]
+    cart["wall"] = way + speed**2 / (2.0 * cart["braking"]) + reserve + rng.exponential(1.5)
+    cart["v"] = v
+    return cart, options
+
+
+def said(rng, env, t):
+    """What the policy says at a step, and the stamp that comes with it."""
+    action = np.where(rng.random(2) < 0.5, rng.uniform([-1.0, 0.0], 1.0), FULL)
+    what = rng.choice(["fresh", "fresh", "fresh", "none", "repeat", "late", "old", "future", "sick"])
+    now = t * env.hold_s
+    stamps = {"none": None, "late": now - rng.uniform(0.0, 2.0) * env.hold_s, "old": now - 3.0 * env.hold_s}
+    stamps["future"] = now + rng.uniform(0.1, 2.0) * env.hold_s
+    if what == "repeat" and t:
+        stamps["repeat"] = env.repeated
+    if what == "sick":
+        action[rng.integers(2)] = rng.choice([np.nan, np.inf, -np.inf])
+    env.repeated = stamps.get(what, now) if what != "none" else now
+    return action.astype(env.action_space.dtype), stamps.get(what, now)
+
+
+# Against the book ---------------------------------------------------------------------------------------------
+
+
+def follow(seed, steps=60):
+    """One random episode of wrapper and book side by side; how often each thing happened."""
+    rng = np.random.default_rng(seed)
+    arguments, options = draw(rng)
+    cart = BrakedCart(**arguments)
+    env = leased(cart, **options)
+    env.reset(seed=seed)
+    reserve = options["localisation"] + options["margin"]
+    fixed = sum(options[k] for k in ("detect_s", "confirm_s", "age_s", "act_s"))
+
+    def lease(clearance, speed, more):
+        return lease_by_bisection(clearance, speed, cart.braking, cart.drive, cart.top, reserve, fixed + more)
+
+    book = Book(
+        env.hold_s,
+        lease,
+        longest=options["longest_s"],
+        blend=options["blend_time"],
+        brake_blend=options["brake_blend_time"],
+        clock_error=options["clock_error_s"],
+    )
+    read = []
+
+    def see():
+        read.append(True)
+        return cart.seen  # what the wrapper saw: the book runs after it
+
+    dead_from = rng.integers(5, steps)
+    counts = np.zeros(3, int)
+    for t in range(steps):
+        action, stamp = said(rng, env, t)
+        if t >= dead_from:
+            stamp = None
+        if stamp != t * env.hold_s or rng.random() < 0.5:
+            env.deliver(stamp)
+        asked = len(read)
+        before = cart.readings
+        info = env.step(action)[4]
+        wanted, *flags, remaining = book.step(action, stamp, see)
+        assert cart.readings - before == len(read) - asked  # the clearance is read for fresh commands alone
+        assert lease_info(info) == tuple(flags), f"step {t}"
+        # Never longer than the book's, and shorter by no more than what counts as the same time.
+        assert remaining - 2e-6 * env.hold_s <= info["lease/remaining_s"] <= remaining + 1e-9
+        np.testing.assert_allclose(cart.given[-1], wanted, rtol=0, atol=2e-7)
+        counts += flags
+    assert cart.farthest <= cart.wall - options["margin"] + 1e-9
+    return counts
+
+
+@settings(max_examples=120, deadline=None, suppress_health_check=list(HealthCheck))
+@given(seed=st.integers(0, 2**32 - 1))
+def test_every_step_is_what_the_book_says_and_nothing_is_hit(seed):
+    follow(seed)
+
+
+def test_the_random_episodes_have_everything_in_them():
+    counts = sum(follow(seed) for seed in range(30))
+    assert (counts > 20).all(), counts
+
+
+@pytest.mark.slow
+def test_every_step_is_what_the_book_says_in_many_episodes():
+    for seed in range(5000):
+        follow(seed)
+
+
+# The bound is tight -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dt", [0.02, 0.1])
+@pytest.mark.parametrize("drive", [0.0, 1.5])
+def test_the_lease_is_just_long_enough_and_one_five_percent_longer_hits(dt, drive, monkeypatch):
+    rng = np.random.default_rng(int(100 * dt + 10 * drive))
+    true = Room.longest_lease
+    hits = 0
+    for _ in range(20):
+        braking, v, steps = rng.uniform(1.0, 6.0), rng.uniform(0.3, 3.0), int(rng.integers(20, 40))
+        detect, confirm, act, age = rng.uniform(0.0, 2.0 * dt, 4)
+        tau = steps * dt + detect + confirm + act + age
+        way, speed = worst_way(tau, v, drive, math.inf)
+        # The lease is worth exactly so many steps. It is granted `age` late: the cart has sped up by nothing, then.
+        wall = way + speed**2 / (2.0 * braking) + 1e-7
+        for stretch in (1.0, 1.05):
+            monkeypatch.setattr(Room, "longest_lease", lambda self, d, s=stretch: s * true(self, d))
+            cart = BrakedCart(dt, wall, drive, braking, v=v, delay_s=detect + confirm + act)
+            # The worst case of an old reading: full drive from the moment on at which it was taken.
+            cart.reset()
+            x, now = worst_way(age, v, drive, math.inf)
+            env = leased(cart, detect_s=detect, confirm_s=confirm, age_s=age, act_s=act, longest_s=10.0)
+            env.reset(options={"start": (x, now)})
+            cart.applied = (1.0, 0.0)
+            cart.measured = lambda w=wall, v=v: (w, v)
+            braked = [env.step(FULL)[4]["lease/braking"]]
+            while cart.v > 0.0 and len(braked) < 2000:
+                env.deliver(None)
+                braked.append(env.step(FULL)[4]["lease/braking"])
+            assert cart.v == 0.0
+            if stretch == 1.0:
+                assert braked.index(True) == steps
+                assert 0.0 <= cart.wall - cart.farthest <= 2e-7
+            else:
+                assert braked.index(True) > steps
+                hits += cart.farthest > cart.wall
+    assert hits == 20
+
+
+@pytest.mark.parametrize("part", ["act_s", "age_s", "localisation", "brake_blend_time"])
+def test_every_part_of_the_budget_is_needed(part):
+    # Among random worlds none is hit with it, and some are without it.
+    hits = {True: 0, False: 0}
+    for seed in range(200):
+        for counted in hits:
+            rng = np.random.default_rng(seed)
+            dt = 0.02
+            size = 0.3 if part == "localisation" else rng.uniform(3.0, 10.0) * dt
+            cart = BrakedCart(
+                dt,
+                drive=3.0,
+                braking=2.0,
+                v=1.0,
+                wall=rng.uniform(1.5, 4.0),
+                delay_s=size if part == "act_s" else 0.0,
+                age_s=size if part == "age_s" else 0.0,
+                noise=size if part == "localisation" else 0.0,
+            )
+            # The fallback fades in whether that is counted or not.
+            fades = part == "brake_blend_time"
+            env = leased(cart, longest_s=2.0, **({part: size} if counted or fades else {}))
+            if fades and not counted:
+                env._delays_s = 0.0
+            env.reset(seed=seed)
+            dead_from = rng.integers(1, 20)
+            for t in range(80):
+                if t >= dead_from:
+                    env.deliver(None)
+                env.step(FULL)
+            hits[counted] += cart.farthest > cart.wall
+    assert hits[True] == 0 and hits[False] > 5, hits
+
+
+# Authority ----------------------------------------------------------------------------------------------------
+
+
+def far(**more):
+    """A cart with all the room in the world."""
+    cart = BrakedCart(wall=1e6, drive=1.0, **more)
+    return cart, leased(cart, longest_s=0.5, blend_time=0.3, brake_blend_time=0.2)
+
+
+def test_expired_once_then_braking_until_something_fresh_comes_and_smoothly_back():
+    cart, env = far()
+    env.reset()
+    infos = [env.step(FULL)[4]]
+    for _ in range(9):
+        env.deliver(None)
+        infos.append(env.step(FULL)[4])
+    assert [i["lease/expired"] for i in infos] == [False] * 5 + [True] + [False] * 4
+    assert [i["lease/braking"] for i in infos] == [False] * 5 + [True] * 5
+    np.testing.assert_allclose(
+        [i["lease/remaining_s"] for i in infos[:6]], [0.4, 0.3, 0.2, 0.1, 0, 0], atol=1e-12
+    )
+    for stamp in (0.0, -1.0, 0.05, 99.0):  # in force before, older, older than the newest, from the future
+        env.deliver(0.0 if stamp == 0.05 else stamp)
+        assert env.step(FULL)[4]["lease/braking"]
+    assert not env.step(FULL)[4]["lease/braking"]
+    for _ in range(4):
+        env.step(FULL)
+    given_ = np.array(cart.given, np.float64)
+    into, back = given_[5:8, 1], given_[14:19, 1]
+    weights = [smooth_step(i / 3.0) for i in (1, 2, 3)]
+    np.testing.assert_allclose(into, weights, atol=1e-6)
+    np.testing.assert_allclose(back, [1.0 - smooth_step(i / 4.0) for i in (1, 2, 3, 4, 4)], atol=1e-6)
+    # No difference is larger than the steepest of the smoothstep.
+    assert np.abs(np.diff(given_[4:], axis=0)).max() <= 1.875 / 3.0
+
+
+def gently(plant):
+    return np.zeros(2)
+
+
+def smooth_step(s):
+    return 6 * s**5 - 15 * s**4 + 10 * s**3
+
+
+def test_refused_brakes_at_once_though_the_old_lease_would_run_on():
+    cart = BrakedCart(wall=1e6, drive=1.0)
+    env = leased(cart, longest_s=1.0)
+    env.reset()
+    assert env.step(FULL)[4]["lease/remaining_s"] == pytest.approx(0.9)
+    cart.wall = cart.x + 0.01
+    info = env.step(FULL)[4]
+    assert lease_info(info) == (False, True, True) and info["lease/remaining_s"] == 0.0
+    assert cart.given[-1].tolist() == [0.0, 1.0]
+    cart.wall = 1e6
+    env.deliver(0.1)  # the refused one again, when there is room: still not fresh
+    assert env.step(FULL)[4]["lease/braking"]
+    assert not env.step(FULL)[4]["lease/braking"]
+
+
+def test_a_lease_of_one_step_gives_authority_back_and_its_end_on_the_way_brakes_at_once():
+    cart = BrakedCart(wall=1e6, drive=0.0, v=1.0, braking=1e6)
+    env = leased(cart, longest_s=5.0, blend_time=0.5, fallback=gently)
+    env.reset()
+    env.deliver(None)
+    env.step(FULL)
+    cart.wall = cart.x + 0.09
+    assert lease_info(env.step(FULL)[4]) == (False, True, True)
+    cart.wall = cart.x + 0.21
+    assert lease_info(env.step(FULL)[4]) == (False, False, False)
+    for wanted in ((False, False, False), (True, False, True)):
+        env.deliver(None)
+        assert lease_info(env.step(FULL)[4]) == wanted
+    weights = [smooth_step(i / 6.0) for i in (1, 2)]
+    np.testing.assert_allclose([g[0] for g in cart.given], [0.0, 0.0, *weights, 0.0], atol=1e-7)
+
+
+def test_nothing_yet_is_braking_and_not_expired():
+    cart, env = far()
+    info = env.reset()[1]
+    assert lease_info(info) == (False, False, False) and info["lease/remaining_s"] == 0.0
+    env.deliver(None)
+    info = env.step(FULL)[4]
+    assert lease_info(info) == (False, False, True)
+    assert cart.given[-1].tolist() == [0.0, 1.0] and cart.readings == 0
+
+
+def test_none_holds_the_command_in_force():
+    cart, env = far()
+    env.reset()
+    env.step(np.array([0.25, 0.0]))
+    for junk in (np.array([np.nan, 0.0]), FULL, np.array([-1.0, 1.0])):
+        env.deliver(None)
+        env.step(junk)
+        assert cart.given[-1].tolist() == [0.25, 0.0]
+
+
+def test_the_age_of_a_command_counts():
+    for age in (0.0, 0.15):
+        cart = BrakedCart(wall=10.0, drive=0.0, v=1.0, braking=1e9)
+        env = leased(cart, longest_s=1e3)
+        env.reset()
+        for stamp in (0.0, None, None):
+            env.deliver(stamp)
+            env.step(FULL)
+        env.deliver(0.3 - age)
+        left = cart.wall - cart.x
+        assert env.step(FULL)[4]["lease/remaining_s"] == pytest.approx(left - age - 0.1)
+
+
+def test_clock_error_counts_and_lets_stamps_be_that_wrong():
+    cart = BrakedCart(wall=10.0, drive=0.0, v=1.0, braking=1e9)
+    env = leased(cart, longest_s=1e3, clock_error_s=0.25)
+    env.reset()
+    assert env.step(FULL)[4]["lease/remaining_s"] == pytest.approx(10.0 - 0.25 - 0.1)
+    env.deliver(0.1 + 0.24)
+    assert not env.step(FULL)[4]["lease/refused"]
+    env.deliver(0.2 + 0.26)
+    assert env.step(FULL)[4]["lease/refused"]
+
+
+def test_an_older_stamp_is_refused_and_the_command_in_force_goes_on():
+    cart, env = far()
+    env.reset()
+    for u in (0.1, 0.2, 0.3):
+        env.step(np.array([u, 0.0]))
+    env.deliver(0.1)
+    info = env.step(FULL)[4]
+    assert lease_info(info) == (False, True, False)
+    assert cart.given[-1][0] == pytest.approx(0.3)
+    env.deliver(0.2)  # the evidence in force: executed, on the old lease
+    before = cart.readings
+    info = env.step(np.array([-0.5, 0.0]))[4]
+    assert cart.given[-1][0] == -0.5 and cart.readings == before
+    assert info["lease/remaining_s"] == pytest.approx(0.2)
+
+
+def test_a_chunks_commands_share_one_lease():
+    cart = BrakedCart(wall=1e6)
+    env = sw.ChunkHandover(
+        leased(cart, longest_s=0.6), 6, 3, 2, jerk_limit=1e3, fallback="zero", plant=cart_plant(0.1)
+    )
+    env.reset(seed=0)
+    infos = [env.step(np.tile([u, 0.0], (6, 1)))[4] for u in (0.1, 0.2, 0.3)]
+    # The first chunk comes at step 2; the leases are of 0.6 s from the takeover on, the chunk's age is cut off it.
+    assert cart.readings == 3
+    assert [i["lease/braking"] for i in infos] == [True, False, False]
+
+
+# Bit for bit ---------------------------------------------------------------------------------------------------
+
+
+class Witness(gym.Wrapper):
+    """Keeps what is sent, and spoils it afterwards, as an env that scales in place does."""
+
+    def step(self, action):
+        self.sent = np.array(action)
+        result = super().step(action)
+        if isinstance(action, np.ndarray) and action.flags.writeable:
+            action *= np.nan
+        return result
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_commands_pass_bit_for_bit_while_leases_last(dtype):
+    cart = BrakedCart(wall=1e6, dtype=dtype)
+    env = leased(Witness(cart))
+    env.reset(seed=0)
+    rng = np.random.default_rng(1)
+    for given_as in (np.float32, np.float64):
+        for _ in range(30):
+            action = (rng.uniform([-1.0, 0.0], 1.0) * rng.choice([1.0, 1e-30, 7.0])).astype(given_as)
+            before = action.tobytes()
+            env.step(action)
+            assert env.env.sent.tobytes() == before and env.env.sent.dtype == given_as
+            env.deliver(None)  # held: the same bits again
+            env.step(np.zeros(2))
+            assert env.env.sent.tobytes() == before and env.env.sent.dtype == given_as
+    assert env.step([0.5, 0.25])[4]["lease/braking"] is False
+    assert env.env.sent.tolist() == [0.5, 0.25]
+
+
+def test_what_the_policy_does_with_its_array_afterwards_does_not_matter():
+    cart, env = far()
+    env.reset()
+    buffer = np.array([0.25, 0.0])
+    env.step(buffer)
+    buffer[:] = np.nan
+    env.step(buffer)
+    assert cart.given[-1].tolist() == [0.25, 0.0]
+
+
+def test_actions_are_not_changed_in_place():
+    env = leased(Witness(BrakedCart(wall=1e6)))
+    env.reset()
+    action = np.array([0.5, 0.0], np.float32)
+    env.step(action)
+    assert action.tolist() == [0.5, 0.0]
+
+
+@pytest.mark.parametrize("huge", [1e300, -1e300, 1.7e308])
+def test_what_is_finite_stays_finite_in_a_blend(huge):
+    cart = BrakedCart(wall=1e9, drive=1.0)
+    env = leased(Witness(cart), longest_s=0.4, blend_time=0.2, brake_blend_time=0.2)
+    env.reset()
+    rng = np.random.default_rng(0)
+    for t in range(30):
+        if rng.random() < 0.7 or t < 4:
+            env.deliver(None)
+        env.step(np.array([huge if t % 2 else -huge, huge]))
+        assert np.isfinite(env.env.sent).all()
+
+
+# Info ----------------------------------------------------------------------------------------------------------
+
+
+def test_keys_and_types_are_the_same_at_resets_and_steps():
+    kinds = {"lease/remaining_s": float, "lease/expired": bool, "lease/refused": bool, "lease/braking": bool}
+    cart = BrakedCart(wall=3.0)
+    env = leased(cart)
+    infos = [env.reset()[1]]
+    for t in range(40):
+        if t % 5 == 3:
+            env.deliver(None)
+        infos.append(env.step(np.array([np.nan, 0.0]) if t % 7 == 6 else FULL)[4])
+    for info in infos:
+        assert {k: type(v) for k, v in info.items() if k.startswith("lease/")} == kinds
+        assert info["executed_action"].dtype == np.float64 and info["executed_action"].shape == (2,)
+    assert any(i["lease/braking"] for i in infos) and any(i["lease/refused"] for i in infos)
+
+
+def test_it_says_what_was_executed():
+    cart = BrakedCart(wall=1.5, drive=1.0, v=0.5)
+    env = leased(cart, brake_blend_time=0.2)
+    env.reset()
+    for t in range(20):
+        if t > 3:
+            env.deliver(None)
+        info = env.step(FULL)[4]
+        np.testing.assert_array_equal(info["executed_action"], cart.given[-1].astype(np.float64))
+    assert info["executed_action"].tolist() == [0.0, 1.0]
+
+
+def test_a_filter_inside_has_the_last_word_on_what_was_executed():
+    env = gym.make("InvertedPendulum-v5")
+    rail = [sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])]
+    inside = sw.CBFActionFilter(env, [sw.Clearance(rail, bodies=["cart"], braking=8.0)])
+    env = sw.LeaseExpiry(inside, sw.Clearance(rail, bodies=["cart"], braking=8.0), acceleration=30.0)
+    env.reset(seed=0)
+    changed = 0
+    for _ in range(40):
+        info = env.step(np.array([3.0], np.float32))[4]
+        changed += info["executed_action"][0] != 3.0 and not info["lease/braking"]
+        if info["cbf/intervened"]:
+            assert info["executed_action"] != info["proposed_action"]
+    assert changed > 0
+
+
+def test_a_command_that_is_not_finite_is_warned_of_once_and_refused():
+    cart, env = far()
+    env.reset()
+    env.step(np.array([0.25, 0.0]))
+    with pytest.warns(UserWarning, match="not finite"):
+        info = env.step(np.array([np.nan, 0.0]))[4]
+    assert lease_info(info) == (False, True, False) and cart.given[-1].tolist() == [0.25, 0.0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env.step(np.array([np.inf, 0.0]))
+
+
+def test_reset_forgets_the_episode():
+    def trace(env):
+        seen = [env.reset(seed=0)]
+        for t in range(20):
+            if t % 4 == 1:
+                env.deliver(None)
+            *rest, info = env.step(FULL)
+            seen.append((*map(str, rest), str(info)))
+        return str(seen)
+
+    fresh_, used = leased(BrakedCart(wall=4.0)), leased(BrakedCart(wall=4.0))
+    first = trace(fresh_)
+    used.reset()
+    for _ in range(7):
+        used.step(-FULL)
+    used.deliver(None)
+    assert trace(used) == first
+    # An action before the episode's first observation is one of the new episode.
+    used.reset()
+    assert not used.step(FULL)[4]["lease/braking"]
+
+
+@pytest.mark.parametrize("dt", [0.05, 0.1])
+def test_the_clock_is_the_envs(dt):
+    env = leased(BrakedCart(dt, wall=1e6), longest_s=0.5)
+    env.reset()
+    assert env.hold_s == dt and env.now_s == 0.0
+    env.step(FULL)
+    granted, lasted = env.now_s, 0
+    assert granted == dt
+    while True:
+        env.deliver(None)
+        if env.step(FULL)[4]["lease/braking"]:
+            break
+        lasted += 1
+    assert lasted == round(0.5 / dt) - 1
+
+
+# Bad input -----------------------------------------------------------------------------------------------------
+
+TIMES = ["detect_s", "confirm_s", "age_s", "act_s", "blend_time", "brake_blend_time", "clock_error_s"]
+BAD = [-0.1, math.nan, math.inf, "soon", [1.0, 2.0], None]
+
+
+@pytest.mark.parametrize("name", [*TIMES, "localisation", "margin", "acceleration"])
+@pytest.mark.parametrize("value", BAD)
+def test_bounds_and_times_are_finite_and_not_negative(name, value):
+    with pytest.raises(ConfigurationError, match=name):
+        leased(BrakedCart(), **{name: value})
+
+
+@pytest.mark.parametrize("name", ["braking", "longest_s", "top_speed", "hold_s"])
+@pytest.mark.parametrize("value", [*BAD[:-1], 0.0])
+def test_what_must_be_positive(name, value):
+    with pytest.raises(ConfigurationError, match=name):
+        leased(BrakedCart(), **{name: value})
+
+
+def test_missing_bounds():
+    for name in ("braking", "acceleration"):
+        with pytest.raises(ConfigurationError, match=f"{name} is missing"):
+            leased(BrakedCart(), **{name: None})
+    with pytest.raises(ConfigurationError, match="closing_speed is for constraints"):
+        leased(BrakedCart(), closing_speed=1.0)
+
+
+@pytest.mark.parametrize("clearance", [1.0, None, "wall", [1.0], sw.Clearance, sw.Plane([0.0], [1.0])])
+def test_a_clearance_that_is_neither(clearance):
+    with pytest.raises(ConfigurationError, match="a constraint"):
+        sw.LeaseExpiry(BrakedCart(), clearance, braking=1.0, acceleration=1.0, fallback="zero")
+
+
+def test_an_unknown_kind_of_constraint_or_fallback():
+    with pytest.raises(UnknownNameError, match="Clearance"):
+        sw.LeaseExpiry(BrakedCart(), {"kind": "Room"}, braking=1.0, acceleration=1.0, fallback="zero")
+    with pytest.raises(UnknownNameError, match="brake, hold, zero"):
+        leased(BrakedCart(), fallback="stop")
+
+
+def test_brake_needs_a_machine_that_says_what_moves():
+    with pytest.raises(ConfigurationError, match="hold"):
+        leased(BrakedCart(), fallback="brake")
+    with pytest.raises(UnsupportedEnvError):
+        leased(BrakedCart(), fallback="brake", plant=None)
+
+
+def test_leases_that_could_never_be_used_are_refused():
+    with pytest.raises(ConfigurationError, match="longest_s"):
+        leased(BrakedCart(dt=0.1), longest_s=0.05)
+    leased(BrakedCart(dt=0.1), longest_s=0.1)
+
+
+@pytest.mark.parametrize(
+    "reach",
+    [
+        {"max_speed": 1.0},
+        {"max_acceleration": -1.0},
+        {"max_acceleration": 1.0, "speed": 1.0},
+        {"max_acceleration": "much"},
+        {"max_acceleration": [1.0, 1.0, 1.0]},
+        3.0,
+    ],
+)
+def test_limits_of_reach_that_are_none(reach):
+    with pytest.raises(ConfigurationError, match=r"reach|max_acceleration"):
+        leased(BrakedCart(), reach=reach, measured=lambda env: ([0.0, 0.0], [0.0, 0.0]))
+
+
+def test_reach_needs_to_know_where_the_machine_is():
+    with pytest.raises(UnsupportedEnvError, match="measured"):
+        leased(BrakedCart(), reach={"max_acceleration": 1.0})
+    with pytest.raises(ConfigurationError, match="reach"):
+        leased(BrakedCart(), measured=lambda env: ([0.0, 0.0], [0.0, 0.0]))
+
+
+@pytest.mark.parametrize("seen", [1.0, None, "far", ([1.0, 2.0, 3.0], [1.0, 2.0]), (1.0,), (1.0, 2.0, 3.0)])
+def test_a_function_that_returns_something_else(seen):
+    env = leased(BrakedCart())
+    env.close()
+    env = sw.LeaseExpiry(BrakedCart(), lambda env: seen, braking=1.0, acceleration=1.0, fallback="zero")
+    env.reset()
+    with pytest.raises(ConfigurationError, match="clearance"):
+        env.step(FULL)
+
+
+def test_orders_that_are_refused():
+    once = leased(BrakedCart())
+    with pytest.raises(ConfigurationError, match="inside LeaseExpiry"):
+        sw.LeaseExpiry(once, read_cart, braking=1.0, acceleration=1.0, fallback="zero")
+    chunked = sw.ChunkHandover(BrakedCart(), 4, 2, jerk_limit=10.0, fallback="zero")
+    with pytest.raises(ConfigurationError, match=r"ChunkHandover\(LeaseExpiry"):
+        sw.LeaseExpiry(chunked, read_cart, braking=1.0, acceleration=1.0, fallback="zero")
+    with pytest.raises(ConfigurationError, match=r"ChunkHandover\(LeaseExpiry"):
+        sw.CBFActionFilter(once, [sw.Barrier(lambda x: 1.0 - x[1])], plant=cart_plant(0.1))
+    with pytest.raises(ConfigurationError, match="outside"):
+        changed = gym.wrappers.RescaleAction(BrakedCart(), 0.0, 1.0)
+        sw.LeaseExpiry(changed, read_cart, braking=1.0, acceleration=1.0, fallback="zero")
+    with pytest.raises(ConfigurationError, match="outside"):
+        changed = gym.wrappers.StickyAction(BrakedCart(), 0.5)
+        sw.LeaseExpiry(changed, read_cart, braking=1.0, acceleration=1.0, fallback="zero")
+
+
+def test_an_env_that_takes_no_box_of_actions():
+    with pytest.raises(ConfigurationError, match="Box"):
+        sw.LeaseExpiry(gym.make("CartPole-v1"), read_cart, braking=1.0, acceleration=1.0)
+
+
+def test_actions_of_the_wrong_shape_do_not_step_the_env():
+    cart, env = far()
+    env.reset()
+    for action in (np.zeros(3), 0.5, "go", [[0.0, 1.0]]):
+        with pytest.raises(ActionError, match=r"\(2,\)"):
+            env.step(action)
+    for stamp in (math.nan, math.inf):
+        with pytest.raises(ActionError, match="observed_s"):
+            env.deliver(stamp)
+    assert cart.given == []
+
+
+def test_a_fallback_of_the_wrong_shape_is_named():
+    env = leased(BrakedCart(), fallback=lambda plant: [0.0])
+    env.reset()
+    env.deliver(None)
+    with pytest.raises(ConfigurationError, match=r"shape \(2,\)"):
+        env.step(FULL)
+
+
+def test_a_fallback_that_is_not_finite_or_outside_the_box_is_made_so():
+    cart = BrakedCart()
+    answers = iter([[np.nan, 1.0], [9.0, -9.0]])
+    env = leased(cart, fallback=lambda plant: next(answers))
+    env.reset()
+    for wanted in ([0.0, 0.0], [1.0, 0.0]):
+        env.deliver(None)
+        env.step(FULL)
+        assert cart.given[-1].tolist() == wanted
