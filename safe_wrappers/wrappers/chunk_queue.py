@@ -264,5 +264,5 @@ class ChunkQueue:
         # Rounding alone may break the limit by a hair: one number back, which is not called holding back.
         too_far = np.abs(sent - last) > self._step
         sent = np.where(too_far, np.nextafter(sent, last.astype(self._dtype)), sent)
-        hair = 2.0 * np.spacing(np.maximum(np.abs(control), np.abs(last)).astype(self._dtype))
+        hair = 2.0 * float(np.finfo(self._dtype).eps) * np.maximum(np.abs(control), np.abs(last))
         return sent, bool((np.abs(control - kept) > hair).any())

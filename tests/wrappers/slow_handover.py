@@ -1,0 +1,266 @@
+"""What ChunkHandover's docstrings say, once more: slow, in plain Python, one number at a time."""
+
+import itertools
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.interpolate import BPoly
+
+BLENDS = ("smoothstep", "quintic", "hermite")
+
+
+def smooth(s):
+    return s * s * s * (10.0 - 15.0 * s + 6.0 * s * s)
+
+
+@dataclass
+class Tick:
+    """One control step."""
+
+    control: list
+    exact: bool = False
+    """The bits are a chunk's own."""
+    starved: bool = False
+    limited: bool = False
+    seam: bool = False
+    blend_steps: int = 0
+    refused: bool = False
+    latency: int = -1
+    entry: int = -1
+    """Which entry of which chunk it is made from, where no ensemble and no fallback made it."""
+    observed: int = -1
+
+
+@dataclass
+class Slow:
+    hold: float
+    blend: str = "smoothstep"
+    fewest: int = 0
+    limit: float = math.inf
+    low: float = -math.inf
+    high: float = math.inf
+    decay: float = 0.01
+    dtype: type = np.float32
+    close_calls: int = 0
+    """Decisions that rounding might turn: the comparison ends there."""
+    coming: list = field(default_factory=list)
+    at_hand: list = field(default_factory=list)
+    sent: list = field(default_factory=list)
+    plan: list = field(default_factory=list)
+    now: int = 0
+    newest_heard: int = -1
+    in_force: int = -1
+    source: str = ""
+    source_in_force: str = ""
+    acting: str = ""
+    fade: tuple | None = None
+
+    @property
+    def step(self):
+        return self.limit * self.hold
+
+    def box(self, command):
+        return [min(max(float(x), self.low), self.high) for x in command]
+
+    def submit(self, chunk, observed, due):
+        """True if it is on its way."""
+        chunk = [[float(x) for x in row] for row in chunk]
+        waiting = [c["observed"] for c in self.coming]
+        if observed <= max([self.in_force, *waiting]) or observed > self.now:
+            return False
+        if not all(math.isfinite(x) for row in chunk for x in row):
+            return False
+        rows = [self.box(row) for row in chunk]
+        self.coming.append({"rows": rows, "observed": observed, "due": due, "source": self.source})
+        return True
+
+    def tick(self, fallback):
+        tick = Tick(control=[])
+        self.arrive(tick)
+        control, exact, limited = self.planned(tick)
+        tick.starved = control is None
+        if tick.starved:
+            control, exact, limited = self.box(fallback), True, False
+        tick.limited = limited
+        acting = "the fallback" if tick.starved else "source " + self.source_in_force
+        if self.sent and acting != self.acting:
+            if self.blend in BLENDS and not tick.seam:
+                change = max(abs(a - b) for a, b in zip(control, self.sent[-1], strict=True))
+                tick.blend_steps = self.fade_steps(change)
+                self.fade = (list(self.sent[-1]), tick.blend_steps, 1)
+            tick.seam = True
+        self.acting = acting
+        if self.fade is not None:
+            start, steps, i = self.fade
+            if i <= steps:
+                alpha = smooth(i / (steps + 1))
+                control = [(1 - alpha) * a + alpha * b for a, b in zip(start, control, strict=True)]
+                exact = False
+                self.fade = (start, steps, i + 1)
+            else:
+                self.fade = None
+        if self.blend in BLENDS and self.sent:
+            held = [
+                min(max(b, a - self.step), a + self.step) for a, b in zip(self.sent[-1], control, strict=True)
+            ]
+            for a, b in zip(self.sent[-1], control, strict=True):
+                excess = abs(b - a) - self.step
+                self.close_calls += -1e-5 < excess < 1e-5 and not (exact and excess <= 0)
+                if excess > 0:
+                    tick.limited, exact = True, False
+            control = held
+        tick.control = [float(self.dtype(x)) for x in control]
+        tick.exact = exact
+        self.sent.append(tick.control)
+        self.now += 1
+        tick.observed = self.in_force
+        return tick
+
+    def fade_steps(self, change):
+        """As many as a blend between two latched commands needs: 1.875 |change| / limit is its time."""
+        if math.isinf(self.limit):
+            return self.fewest
+        needed = 1.875 * change / self.limit / self.hold
+        self.close_calls += 1e-9 < abs(needed - round(needed)) < 1e-5
+        return max(self.fewest, math.ceil(needed - 1e-9) - 1)
+
+    def arrive(self, tick):
+        there = [c for c in self.coming if c["due"] <= self.now]
+        if not there:
+            return
+        newest = max(there, key=lambda c: c["observed"])
+        self.coming = [c for c in self.coming if c["observed"] > newest["observed"]]
+        candidates = there if self.blend == "ensemble" else [newest]
+        alive = [c for c in candidates if self.now - c["observed"] < len(c["rows"])]
+        tick.refused = len(alive) < len(candidates)
+        if not alive:
+            return
+        newest = max(alive, key=lambda c: c["observed"])
+        age = self.now - newest["observed"]
+        tick.latency = age
+        self.in_force, self.source_in_force = newest["observed"], newest["source"]
+        if self.blend == "ensemble":
+            self.at_hand += alive
+            tick.seam = bool(self.sent)
+            return
+        fresh = newest["rows"][age:]
+        if self.blend == "replace":
+            self.plan = [(row, True, False) for row in fresh]
+            tick.seam = bool(self.sent)
+        elif len(newest["rows"]) == 1:
+            self.plan = [(row, True, False) for row in fresh]
+        else:
+            tick.blend_steps = self.join(fresh)
+            tick.seam = bool(self.sent)
+            self.fade = None
+
+    def planned(self, tick):
+        if self.blend == "ensemble":
+            voices = []
+            for c in sorted(self.at_hand, key=lambda c: c["observed"]):
+                j = self.now - c["observed"]
+                if j < len(c["rows"]):
+                    voices.append(c["rows"][j])
+            if not voices:
+                return None, False, False
+            weights = [math.exp(-self.decay * i) for i in range(len(voices))]
+            total = sum(weights)
+            mean = [
+                sum(w * v[k] for w, v in zip(weights, voices, strict=True)) / total
+                for k in range(len(voices[0]))
+            ]
+            return mean, len(voices) == 1, False
+        if not self.plan:
+            return None, False, False
+        tick.entry = self.now - self.in_force
+        return self.plan.pop(0)
+
+    def join(self, new):
+        """Replace the plan by a blend into the new stream; its steps."""
+        prior = [row for row, _, _ in self.plan]
+        if not self.sent:
+            steps, plan = 0, list(new)
+        else:
+            steps, plan = self.shortest(prior, new)
+        self.plan = []
+        last = self.sent[-1] if self.sent else None
+        for i, row in enumerate(plan):
+            held = (
+                row
+                if last is None
+                else [min(max(b, a - self.step), a + self.step) for a, b in zip(last, row, strict=True)]
+            )
+            if last is not None:
+                for a, b in zip(last, row, strict=True):
+                    self.close_calls += 0 < abs(b - a) - self.step < 1e-5
+            limited = held != row
+            self.plan.append((held, i >= steps and not limited, limited))
+            last = held
+        return steps
+
+    def shortest(self, prior, new):
+        last = self.sent[-1]
+        fewest = min(self.fewest, len(new) - 1)
+        jump = max(abs(a - b) for a, b in zip(new[0], last, strict=True))
+        if fewest == 0 and jump <= self.step:
+            return 0, list(new)
+        self.close_calls += 0 < jump - self.step < 1e-5
+        best = None
+        for n in range(max(fewest, 1) if len(new) > 1 else 0, len(new)):
+            plan = self.blended(n, prior, new)
+            chain = [last, *plan[: n + 1]]
+            peak = max(abs(b[k] - a[k]) for a, b in itertools.pairwise(chain) for k in range(len(last)))
+            self.close_calls += math.isfinite(self.step) and abs(peak - self.step) < 1e-5
+            if best is None or (best[0] > self.step and peak < best[0]):
+                self.close_calls += best is not None and best[0] - peak < 1e-6
+                best = peak, n, plan
+            elif best[0] > self.step:
+                self.close_calls += peak - best[0] < 1e-6
+            if peak <= self.step:
+                break
+        return best[1], best[2]
+
+    def blended(self, n, prior, new):
+        last = self.sent[-1]
+        plan = [list(row) for row in new]
+        for k in range(len(last)):
+            if self.blend == "smoothstep":
+                for i in range(n):
+                    before = prior[i][k] if n <= len(prior) else last[k]
+                    alpha = smooth((i + 1) / (n + 1))
+                    plan[i][k] = (1 - alpha) * before + alpha * new[i][k]
+                continue
+            past = [row[k] for row in self.sent]
+            rate = past[-1] - past[-2] if len(past) > 1 else 0.0
+            second = past[-1] - 2 * past[-2] + past[-3] if len(past) > 2 else 0.0
+            ahead = [row[k] for row in new]
+            final = len(ahead) - 1
+            if 0 < n < final:
+                slope, bend = (ahead[n + 1] - ahead[n - 1]) / 2, ahead[n + 1] - 2 * ahead[n] + ahead[n - 1]
+            else:
+                slope, bend = (ahead[n] - ahead[n - 1] if n else 0.0), 0.0
+            kept = 2 if self.blend == "hermite" else 3
+            ends = [[last[k], rate, second][:kept], [ahead[n], slope, bend][:kept]]
+            bridge = BPoly.from_derivatives([0.0, n + 1.0], ends)
+            for i in range(n):
+                plan[i][k] = min(max(float(bridge(i + 1.0)), self.low), self.high)
+        return plan
+
+
+def measured(commands, ticks, hold):
+    """Per control step: the three differences that end there, and whether they are a seam's."""
+    until, found = -1, []
+    for t, tick in enumerate(ticks):
+        if tick.seam:
+            until = max(until, t + tick.blend_steps + 2)
+        orders = []
+        for order in (1, 2, 3):
+            if t < order:
+                orders.append(0.0)
+                continue
+            past = [np.asarray(c, dtype=np.float64) for c in commands[t - order : t + 1]]
+            weights = [(-1) ** (order - j) * math.comb(order, j) for j in range(order + 1)]
+            orders.append(float(np.abs(sum(w * c for w, c in zip(weights, past, strict=True))).max()))
+        found.append((orders, t <= until, orders[0] / hold))
+    return found
