@@ -272,6 +272,7 @@ def by_wrapper(case: Case) -> bool:
         acceleration=0.0,
         reach={name: limit.tolist() for name, limit in limits.items()},
         measured=lambda env: (m.position, m.velocity),
+        longest_s=max(1.0, case.hold_s),
         fallback="zero",
         hold_s=case.hold_s,
     )
