@@ -123,41 +123,57 @@ def longest_lease(
     Raises:
         ConfigurationError: For a negative delay, localisation bound, margin, acceleration or top speed.
     """
-    d, v, b, delays, loc, gap, a, top = np.broadcast_arrays(
-        *(
-            np.asarray(x, dtype=np.float64)
-            for x in (clearance, speed, braking, delays_s, localisation, margin, acceleration, top_speed)
-        )
+    given = (clearance, speed, braking, delays_s, localisation, margin, acceleration, top_speed)
+    # One lease at a time: a control step asks for a few, and for those NumPy's overhead is the larger part.
+    several = np.broadcast(*(np.asarray(x, dtype=np.float64) for x in given))
+    _not_negative(
+        delays_s=delays_s,
+        localisation=localisation,
+        margin=margin,
+        acceleration=acceleration,
+        top_speed=top_speed,
     )
-    _not_negative(delays_s=delays, localisation=loc, margin=gap, acceleration=a, top_speed=top)
-    known = np.all([np.isfinite(x) for x in (d, v, b, delays, loc, gap, a)], axis=0)
-    known &= ~np.isnan(top) & (b > 0.0)
-    d, v, b, loc, gap, a = (
-        np.where(known, x, y) for x, y in zip((d, v, b, loc, gap, a), _NOTHING, strict=True)
-    )
-    top = np.maximum(np.where(np.isnan(top), np.inf, top), v)
-    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        braking_way = stopping_distance(v, b)
-        room = d - loc - gap
-        room = room - _ROUNDING * (np.abs(d) + loc + gap + braking_way)
-        share = 1.0 / (1.0 + a / b)
-        onset = np.hypot(np.sqrt(2.0 * a) * np.sqrt(np.maximum(room, 0.0)), v) * np.sqrt(share)
-        # (w - v) / a without the difference of two nearly equal speeds, and right for a = 0 too.
-        free = np.where(v < 0.0, (onset - v) / a, 2.0 * share * (room - braking_way) / (onset + v))
+    return np.array([_lease_or_none(*map(float, one)) for one in several]).reshape(several.shape)
+
+
+def _lease_or_none(*machine: float) -> float:
+    try:
+        return _lease(*machine)
+    except ZeroDivisionError:  # a speed that has underflowed: not known, so no lease
+        return -math.inf
+
+
+def _lease(
+    d: float, v: float, b: float, delays: float, loc: float, gap: float, a: float, top: float
+) -> float:
+    """`longest_lease` of one machine."""
+    if not (all(map(math.isfinite, (d, v, b, delays, loc, gap, a))) and b > 0.0) or math.isnan(top):
+        return -math.inf
+    top = max(top, v)
+    braking_way = max(v, 0.0) * max(v, 0.0) / (2.0 * b)
+    room = d - loc - gap
+    room -= _ROUNDING * (abs(d) + loc + gap + braking_way)
+    if v <= 0.0:
+        if room <= 0.0:
+            return -math.inf
+        if a == 0.0 or top == 0.0:
+            return math.inf
+    share = 1.0 / (1.0 + a / b)
+    onset = math.hypot(math.sqrt(2.0 * a) * math.sqrt(max(room, 0.0)), v) * math.sqrt(share)
+    if onset > top:
         way_to_top = 0.5 * (top - v) * ((top + v) / a)
-        stop_from_top = stopping_distance(top, b)
+        stop_from_top = top * top / (2.0 * b)
         left = room - way_to_top - stop_from_top
-        left = left - _ROUNDING * (np.abs(way_to_top) + stop_from_top)
-        tau = np.minimum(np.where(onset > top, (top - v) / a + left / top, free), _LONGEST)
-        lease = tau - delays - _ROUNDING * (np.abs(tau) + delays) - _TINY
-        still = v <= 0.0
-        lease = np.where(still & ((a == 0.0) | (top == 0.0)), np.inf, lease)
-    lease = np.where(known & ~(still & (room <= 0.0)), lease, -np.inf)
-    return np.asarray(np.where(np.isnan(lease), -np.inf, lease))
-
-
-_NOTHING = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-"""Stand-ins for what is not known, so that its arithmetic stays quiet; the result there is -inf anyway."""
+        left -= _ROUNDING * (abs(way_to_top) + stop_from_top)
+        tau = (top - v) / a + left / top
+    elif v < 0.0:
+        tau = (onset - v) / a
+    else:
+        # Without the difference of two nearly equal speeds, and right for a = 0 too.
+        tau = 2.0 * share * (room - braking_way) / (onset + v)
+    tau = min(tau, _LONGEST)
+    lease = tau - delays - _ROUNDING * (abs(tau) + delays) - _TINY
+    return -math.inf if math.isnan(lease) else lease
 
 
 def longest_lease_of_room(room: ArrayLike, closing_speed: ArrayLike, delays_s: ArrayLike) -> Array:
@@ -189,7 +205,8 @@ def longest_lease_of_room(room: ArrayLike, closing_speed: ArrayLike, delays_s: A
     return np.asarray(np.where(np.isnan(lease), -np.inf, lease))
 
 
-def _not_negative(**values: Array) -> None:
+def _not_negative(**values: ArrayLike) -> None:
     for name, value in values.items():
-        if np.any(value < 0.0):
-            raise ConfigurationError(f"{name} must not be negative, got {float(np.min(value)):g}")
+        least = value if isinstance(value, float) else float(np.min(np.asarray(value, dtype=np.float64)))
+        if least < 0.0:
+            raise ConfigurationError(f"{name} must not be negative, got {least:g}")
