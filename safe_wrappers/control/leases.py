@@ -207,6 +207,7 @@ def longest_lease_of_room(room: ArrayLike, closing_speed: ArrayLike, delays_s: A
 
 def _not_negative(**values: ArrayLike) -> None:
     for name, value in values.items():
-        least = value if isinstance(value, float) else float(np.min(np.asarray(value, dtype=np.float64)))
+        # Of nothing, too: no surface near.
+        least = value if isinstance(value, float) else float(np.min(np.asarray(value), initial=np.inf))
         if least < 0.0:
             raise ConfigurationError(f"{name} must not be negative, got {least:g}")
