@@ -358,8 +358,10 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
     def _grant(self, now: float) -> bool:
         """A new lease for the command in hand; False, and none at all, where it would not last."""
         delays_s = self._delays_s + max(now - self._newest_s, 0.0)
-        lease = max(min(self._room.longest_lease(delays_s), self._longest_s), self._least_s)
-        granted = lease + _SAME_TIME * self.hold_s >= self.hold_s
+        longest_s = self._room.longest_lease(delays_s)
+        lease = max(min(longest_s, self._longest_s), self._least_s)
+        # What cannot be read gives no lease at all: a filter inside knows no better.
+        granted = longest_s == longest_s and lease + _SAME_TIME * self.hold_s >= self.hold_s
         self._until_s = now + lease if granted else -math.inf
         return granted
 

@@ -1,6 +1,7 @@
 """Room: the clearance that a lease is granted from, read from a constraint or by the user's function."""
 
 import copy
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -108,7 +109,10 @@ class Room:
             self.constraint.reset()
 
     def longest_lease(self, delays_s: float) -> float:
-        """The longest lease from here, s; zero or less, or -inf where a reading is no number: revoke.
+        """The longest lease from here, s; zero or less: revoke.
+
+        NaN where a reading is not finite: revoke in any case. inf where nothing is near: there are no clearances,
+        or a constraint's value is inf.
 
         Args:
             delays_s: All delays beside the lease, s.
@@ -117,9 +121,14 @@ class Room:
             self._plant.observe()
         if self.constraint is not None and not self._approach:
             room = np.asarray(self.constraint.value(self._plant), dtype=np.float64)
+            room = room[room != np.inf]
+            if not np.isfinite(room).all():
+                return math.nan
             room = room - self._margin - self._localisation
             return _least(longest_lease_of_room(room, self._closing_speed, delays_s))
         clearance, speed = self._read()
+        if not (np.isfinite(clearance).all() and np.isfinite(speed).all()):
+            return math.nan
         leases = longest_lease(
             clearance,
             speed,
