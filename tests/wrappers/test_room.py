@@ -1,0 +1,389 @@
+"""Where leases come from: constraints with an approach speed, constraints with a value, functions of the env."""
+
+import copy
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from braked_cart import BrakedCart, cart_plant, lease_by_bisection, read_cart
+from worlds import SpeedRow
+
+import safe_wrappers as sw
+from safe_wrappers.errors import ConfigurationError
+
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
+RAIL = [sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])]
+FULL = np.array([1.0, 0.0])
+
+
+def rail(**more):
+    return sw.Clearance(RAIL, bodies=["cart"], braking=8.0, **more)
+
+
+def granted(env, action):
+    """The lease that the next fresh command gets, s; None if it is refused."""
+    info = env.step(action)[4]
+    return None if info["lease/refused"] else info["lease/remaining_s"] + env.hold_s
+
+
+# Clearance ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("reserve", [(0.0, 0.0), (0.05, 0.02)])
+def test_a_clearance_on_a_mujoco_cart(reserve):
+    margin, error = reserve
+    env = sw.LeaseExpiry(
+        gym.make("InvertedPendulum-v5"),
+        rail(margin=margin, state_error=error),
+        acceleration=20.0,
+        top_speed=3.0,
+        act_s=0.01,
+        margin=0.01,
+        localisation=0.005,
+        longest_s=5.0,
+        blend_time=0.0,
+    )
+    data = env.unwrapped.data
+    rng = np.random.default_rng(0)
+    leases, refused = 0, 0
+    for _ in range(60):
+        env.reset(seed=0)
+        x, v = rng.uniform(-0.9, 0.9), rng.uniform(-3.0, 3.0)
+        env.unwrapped.set_state(np.array([x, 0.0]), np.array([v, 0.0]))
+        away = margin + error + 0.01 + 0.005
+        wanted = min(
+            lease_by_bisection(0.9 - x, v, 8.0, 20.0, 3.0, away, 0.01),
+            lease_by_bisection(0.9 + x, -v, 8.0, 20.0, 3.0, away, 0.01),
+        )
+        got = granted(env, np.zeros(1, np.float32))
+        if got is None:
+            assert wanted < env.hold_s
+            refused += 1
+        else:
+            assert got == pytest.approx(wanted, abs=1e-6)
+            leases += 1
+        assert data.time > 0.0
+    assert leases > 5 and refused > 5
+
+
+def test_its_own_braking_unless_another_is_given():
+    def lease(**more):
+        cart = BrakedCart(wall=5.0, v=2.0, drive=0.0)
+        near = sw.Clearance([sw.Plane([5.0], [-1.0])], braking=1.0, position=[0], velocity=[1])
+        env = sw.LeaseExpiry(
+            cart, near, acceleration=0.0, plant=cart_plant(0.1), fallback="zero", longest_s=9.0, **more
+        )
+        env.reset()
+        return granted(env, FULL)
+
+    assert lease() == pytest.approx((5.0 - 2.0) / 2.0, abs=1e-6)
+    assert lease(braking=4.0) == pytest.approx((5.0 - 0.5) / 2.0, abs=1e-6)
+
+
+def test_a_delayed_plants_prediction_is_used():
+    # It sees the clearance after the delay, with the commands in flight: less of it.
+    def lease(delay):
+        cart = BrakedCart(wall=5.0, v=2.0, drive=1.0)
+        plant = cart_plant(0.1)
+        plant.delay_s = delay
+        near = sw.Clearance([sw.Plane([5.0], [-1.0])], braking=4.0, position=[0], velocity=[1])
+        env = sw.LeaseExpiry(cart, near, acceleration=0.0, plant=plant, fallback="zero", longest_s=9.0)
+        env.reset()
+        for _ in range(3):
+            found = granted(env, np.zeros(2))
+        return found
+
+    assert lease(0.2) == pytest.approx(lease(0.0) - 0.2, abs=1e-6)
+
+
+# Other constraints --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("env_id", ["InvertedPendulum-v5", "Reacher-v5"])
+def test_a_joint_position_limit_with_a_closing_speed(env_id):
+    joint = {"InvertedPendulum-v5": "slider", "Reacher-v5": "joint1"}[env_id]
+    limit = sw.JointPositionLimit(-0.8, 0.8, [joint], margin=0.05)
+    env = sw.LeaseExpiry(
+        gym.make(env_id),
+        limit,
+        closing_speed=4.0,
+        detect_s=0.015,
+        margin=0.02,
+        localisation=0.01,
+        longest_s=2.0,
+    )
+    again, plant = copy.deepcopy(limit), sw.MujocoPlant()
+    plant.bind(env.env)
+    again.bind(plant)
+    env.reset(seed=3)
+    rng, seen = np.random.default_rng(0), set()
+    for _ in range(60):
+        plant.observe()
+        value = again.value(plant).min()
+        assert value <= 0.8 - abs(env.unwrapped.data.joint(joint).qpos[0]) + 1e-12
+        wanted = (value - 0.05 - 0.02 - 0.01) / 4.0 - 0.015
+        got = granted(env, env.action_space.high * rng.choice([-1.0, 1.0]))
+        if got is None:
+            assert wanted < env.hold_s
+        else:
+            assert got == pytest.approx(wanted, abs=1e-6)
+        seen.add(got is None)
+    assert seen == {True, False}
+
+
+HAZARDS = [sw.Discs("hazard_positions", radius=0.2)]
+
+
+def at_hazard(robot):
+    """Full drive at the nearest hazard."""
+    to = robot.hazard_positions - robot.agent_position
+    dx, dy = to[np.argmin((to**2).sum(1))]
+    angle = math.remainder(math.atan2(dy, dx) - robot.agent_heading, math.tau)
+    return np.array([1.0, np.clip(4.0 * angle, -1.0, 1.0)], np.float32)
+
+
+def test_a_heading_drive_brakes_by_its_own_backup():
+    clearance = sw.HeadingDriveClearance(HAZARDS, margin=0.01)
+    env = sw.LeaseExpiry(gym.make("SafePointGoal1-v0"), clearance, closing_speed=4.0, longest_s=0.2)
+    again, plant = copy.deepcopy(clearance), sw.MujocoPlant()
+    plant.bind(env.env)
+    again.bind(plant)
+    layout = {"layout": {"agent": [0.0, 0.0, 0.0], "hazards": [[1.5, 0.0]]}}
+    env.reset(seed=0, options=layout)
+    braked = 0
+    for t in range(120):
+        if t > 25:
+            env.deliver(None)
+        plant.observe()
+        wanted = again.backup(plant)
+        info = env.step(np.array([1.0, 0.0], np.float32))[4]
+        if info["lease/braking"]:
+            braked += 1
+            np.testing.assert_allclose(info["executed_action"], np.clip(wanted, -1.0, 1.0), atol=1e-6)
+    assert braked > 50 and float(np.linalg.norm(env.unwrapped.data.qvel[:2])) < 1e-2
+
+
+def test_a_heading_drive_never_violates_when_commands_stop():
+    # The lease alone, no filter inside. The closing speed is measured first: the fastest that the value ever falls.
+    clearance = sw.HeadingDriveClearance(HAZARDS, margin=0.01)
+    bare = gym.make("SafePointGoal1-v0")
+    plant, watch = sw.MujocoPlant(), copy.deepcopy(clearance)
+    plant.bind(bare)
+    watch.bind(plant)
+    rng, fastest = np.random.default_rng(0), 0.0
+    for seed in range(4):
+        bare.reset(seed=seed)
+        before = None
+        for t in range(200):
+            plant.observe()
+            value = float(watch.value(plant)[0])
+            if before is not None:
+                fastest = max(fastest, (before - value) / 0.02)
+            before = value
+            bare.step(at_hazard(bare.unwrapped) if t % 60 < 40 else np.float32(rng.choice([-1.0, 1.0], 2)))
+    env = sw.LeaseExpiry(gym.make("SafePointGoal1-v0"), clearance, closing_speed=1.3 * fastest, longest_s=0.3)
+    braked, entered = 0, 0
+    for seed in range(6):
+        env.reset(seed=seed)
+        for t in range(250):
+            if t % 40 >= 20:
+                env.deliver(None)
+            info = env.step(at_hazard(env.unwrapped))[4]
+            braked += info["lease/braking"]
+            entered += info["cost_hazards"] > 0.0
+    assert entered == 0 and braked > 100
+
+
+class Far(SpeedRow):
+    """Whose value says that nothing is near, or that nothing can be read."""
+
+    def value(self, plant):
+        return np.array(self.values)
+
+
+@pytest.mark.parametrize(
+    ("values", "wanted"),
+    [([], 0.4), ([math.inf], 0.4), ([math.inf, 0.3], 0.3), ([math.nan], None), ([-math.inf, 1.0], None)],
+)
+def test_a_value_of_nothing_near_is_no_limit(values, wanted):
+    far = Far(1.0)
+    far.values = values
+    env = sw.LeaseExpiry(
+        BrakedCart(), far, closing_speed=1.0, longest_s=0.4, plant=cart_plant(0.1), fallback="zero"
+    )
+    env.reset()
+    got = granted(env, FULL)
+    assert got is None if wanted is None else got == pytest.approx(wanted, abs=1e-6)
+
+
+def test_a_state_error_counts_for_values_too():
+    def lease(error):
+        clearance = sw.HeadingDriveClearance(HAZARDS, margin=0.01, state_error=error)
+        env = sw.LeaseExpiry(gym.make("SafePointGoal1-v0"), clearance, closing_speed=4.0, longest_s=5.0)
+        env.reset(seed=0, options={"layout": {"agent": [0.0, 0.0, 0.0], "hazards": [[1.0, 0.0]]}})
+        return granted(env, np.zeros(2, np.float32))
+
+    assert lease(0.08) == pytest.approx(lease(0.0) - 0.08 / 4.0, abs=1e-6)
+
+
+# Functions ----------------------------------------------------------------------------------------------------
+
+
+def told(answer, **more):
+    env = sw.LeaseExpiry(
+        BrakedCart(),
+        lambda env: answer,
+        braking=1.0,
+        acceleration=0.0,
+        fallback="zero",
+        longest_s=2.0,
+        **more,
+    )
+    env.reset()
+    return env
+
+
+@pytest.mark.parametrize(
+    ("answer", "wanted"),
+    [
+        ((1.5, 1.0), 1.0),
+        (([1.5, 9.0], [1.0, 1.0]), 1.0),
+        ((np.array([9.0, 1.5]), 1.0), 1.0),
+        (([9.0, -1.5, 3.5], [-9.0, -2.0, 2.0]), None),  # behind the surface, though it leaves
+        (([], []), 2.0),
+        ((np.zeros((0,)), np.zeros((0,))), 2.0),
+        ((1.0, 0.0), 2.0),
+        ((1.0, -3.0), 2.0),
+        ((0.4, 1.0), None),
+    ],
+)
+def test_the_shortest_lease_of_all_surfaces_counts(answer, wanted):
+    got = granted(told(answer), FULL)
+    assert got is None if wanted is None else got == pytest.approx(wanted, abs=1e-6)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("where", [0, 1])
+def test_a_reading_that_is_not_finite_revokes(bad, where):
+    answer = [[9.0, 9.0], [0.1, 0.1]]
+    env = told(answer)
+    assert granted(env, FULL) is not None
+    answer[where][1] = bad
+    info = env.step(FULL)[4]
+    assert info["lease/refused"] and info["lease/braking"] and info["lease/remaining_s"] == 0.0
+    answer[where][1] = 0.1
+    assert granted(env, FULL) is not None
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_it_revokes_whatever_the_least_lease_is(bad):
+    readings = [[9.0], [0.1]]
+    inside = sw.CBFActionFilter(gym.make("InvertedPendulum-v5"), [rail()])
+    env = sw.LeaseExpiry(
+        inside, lambda env: readings, braking=1.0, acceleration=1.0, least_s=0.04, longest_s=1.0
+    )
+    env.reset(seed=0)
+    action = np.zeros(1, np.float32)
+    assert granted(env, action) is not None
+    readings[0][0] = 1e-9  # no room at all: the filter inside vouches for the step
+    assert granted(env, action) == pytest.approx(0.04)
+    readings[0][0] = bad
+    assert granted(env, action) is None
+
+
+@pytest.mark.parametrize(
+    ("clearance", "more"),
+    [
+        (rail(), {"acceleration": 1.0}),
+        (sw.JointPositionLimit(-0.8, 0.8, ["slider"]), {"closing_speed": 4.0}),
+    ],
+)
+def test_a_mujoco_state_that_is_not_a_number_revokes_and_nothing_else_passes(clearance, more):
+    env = sw.LeaseExpiry(gym.make("InvertedPendulum-v5"), clearance, **more)
+    env.reset(seed=0)
+    env.step(np.zeros(1, np.float32))
+    env.unwrapped.data.qpos[0] = np.nan
+    sent = []
+    env.env.step = lambda action: (sent.append(action), (None, 0.0, False, False, {}))[1]
+    info = env.step(np.ones(1, np.float32))[4]
+    assert info["lease/refused"] and info["lease/braking"]
+    assert sent[0].tolist() == [0.0]
+
+
+# Sharing ------------------------------------------------------------------------------------------------------
+
+
+def test_a_constraint_may_serve_the_filter_inside_and_a_second_env_too():
+    def run(share):
+        mine = [sw.HeadingDriveClearance(HAZARDS, margin=0.01) for _ in range(3)]
+        if share:
+            mine = mine[:1] * 3
+        env = sw.CBFActionFilter(gym.make("SafePointGoal1-v0"), [mine[0]])
+        env = sw.LeaseExpiry(env, mine[1], closing_speed=4.0, longest_s=0.3)
+        other = sw.LeaseExpiry(gym.make("SafePointGoal1-v0"), mine[2], closing_speed=4.0)
+        env.reset(seed=0)
+        other.reset(seed=5)
+        seen = []
+        for t in range(120):
+            if t % 30 > 15:
+                env.deliver(None)
+            info = env.step(at_hazard(env.unwrapped))[4]
+            theirs = other.step(at_hazard(other.unwrapped))[4]
+            seen.append(
+                (info["lease/remaining_s"], info["executed_action"].tobytes(), theirs["lease/remaining_s"])
+            )
+        return seen
+
+    assert run(True) == run(False)
+
+
+# Bad input ----------------------------------------------------------------------------------------------------
+
+
+def test_what_constraints_with_a_value_need():
+    def lease(constraint, **more):
+        return sw.LeaseExpiry(gym.make("Reacher-v5"), constraint, **more)
+
+    limit = sw.JointPositionLimit(-1.0, 1.0, ["joint1"])
+    with pytest.raises(ConfigurationError, match=r"JointPositionLimit does not say how fast.*closing_speed"):
+        lease(limit)
+    for value in (0.0, -1.0, math.nan, math.inf, "fast"):
+        with pytest.raises(ConfigurationError, match="closing_speed"):
+            lease(limit, closing_speed=value)
+    for name in ("braking", "acceleration", "top_speed"):
+        with pytest.raises(ConfigurationError, match="closing_speed alone"):
+            lease(limit, closing_speed=1.0, **{name: 1.0})
+    with pytest.raises(ConfigurationError, match="no value"):
+        lease(SpeedRow(1.0), closing_speed=1.0)
+
+
+def test_a_clearance_still_needs_the_acceleration():
+    with pytest.raises(ConfigurationError, match="acceleration is missing"):
+        sw.LeaseExpiry(gym.make("InvertedPendulum-v5"), rail())
+    with pytest.raises(ConfigurationError, match="closing_speed is for constraints"):
+        sw.LeaseExpiry(gym.make("InvertedPendulum-v5"), rail(), acceleration=1.0, closing_speed=1.0)
+
+
+def test_least_s_needs_a_filter_inside_and_no_more_than_longest_s():
+    with pytest.raises(ConfigurationError, match=r"least_s.*CBFActionFilter"):
+        told((1.0, 0.0), least_s=0.1)
+    inside = sw.CBFActionFilter(gym.make("InvertedPendulum-v5"), [rail()])
+    with pytest.raises(ConfigurationError, match="least_s"):
+        sw.LeaseExpiry(inside, rail(), acceleration=1.0, least_s=2.0)
+    with pytest.raises(ConfigurationError, match="least_s"):
+        sw.LeaseExpiry(inside, rail(), acceleration=1.0, least_s=-0.1)
+
+
+def test_reading_is_of_the_env_that_it_wraps():
+    seen = []
+
+    def look(env):
+        seen.append(env)
+        return read_cart(env)
+
+    inner = gym.wrappers.TimeLimit(BrakedCart(), 100)
+    env = sw.LeaseExpiry(inner, look, braking=1.0, acceleration=1.0, fallback="zero")
+    env.reset()
+    env.step(FULL)
+    assert seen == [inner]
