@@ -156,7 +156,7 @@ class ChunkQueue:
         control, limited = self._planned()
         starved = control is None
         if control is None:
-            control = fallback()
+            control = np.clip(fallback(), self._low, self._high)
         acting = None if starved else self._in_force
         if acting != self._acting and len(self._sent):
             # A longer chunk that takes over blends by itself; everything else starts from the last command.
@@ -180,25 +180,29 @@ class ChunkQueue:
         )
 
     def _take_over(self, admit: Callable[[Array, int], bool] | None) -> tuple[bool, int, bool]:
-        """Let the newest chunk that is there take over: is it a seam, how long is its blend, is it refused."""
+        """Let the newest chunk that is there and may take over: is it a seam, its blend's steps, is one refused."""
         there = [c for c in self._coming if c.due <= self.now]
-        if not there:
-            return False, 0, False
-        newest = there[-1]  # they are in the order of their observations
-        self._coming = [c for c in self._coming if c.observed > newest.observed]
-        wanted = there if self._blend == ENSEMBLE else [newest]
-        admitted = [c for c in wanted if self._is_admitted(c, admit)]
+        self._coming = [c for c in self._coming if c.due > self.now]
+        refused, admitted = False, []
+        for chunk in reversed(there):  # they came in the order of their observations
+            if not self._is_admitted(chunk, admit):
+                refused = True
+                continue
+            admitted.insert(0, chunk)
+            if self._blend != ENSEMBLE:
+                break
         if not admitted:
-            return False, 0, True
+            return False, 0, refused
         newest = admitted[-1]
+        self._coming = [c for c in self._coming if c.observed > newest.observed]
         self._observed, self._in_force = newest.observed, newest.source
         if self._blend == ENSEMBLE:
             self._averaged += admitted
-            return len(self._sent) > 0, 0, len(admitted) < len(wanted)
+            return len(self._sent) > 0, 0, refused
         fresh = newest.commands[self.now - newest.observed :]
         if self._blend == REPLACE or len(newest.commands) == 1:
             self._plan, self._limited = fresh, np.zeros(len(fresh), dtype=bool)
-            return self._blend == REPLACE and len(self._sent) > 0, 0, False
+            return self._blend == REPLACE and len(self._sent) > 0, 0, refused
         joined = join(
             self._sent,
             self._plan,
@@ -212,7 +216,7 @@ class ChunkQueue:
         )
         self._plan, self._limited = joined.plan, joined.limited
         self._fade = None
-        return len(self._sent) > 0, joined.steps, False
+        return len(self._sent) > 0, joined.steps, refused
 
     def _is_admitted(self, chunk: _Chunk, admit: Callable[[Array, int], bool] | None) -> bool:
         fresh = chunk.commands[self.now - chunk.observed :]

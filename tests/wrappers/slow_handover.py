@@ -129,14 +129,14 @@ class Slow:
         there = [c for c in self.coming if c["due"] <= self.now]
         if not there:
             return
-        newest = max(there, key=lambda c: c["observed"])
-        self.coming = [c for c in self.coming if c["observed"] > newest["observed"]]
-        candidates = there if self.blend == "ensemble" else [newest]
-        alive = [c for c in candidates if self.now - c["observed"] < len(c["rows"])]
-        tick.refused = len(alive) < len(candidates)
+        self.coming = [c for c in self.coming if c["due"] > self.now]
+        alive = [c for c in there if self.now - c["observed"] < len(c["rows"])]
+        best = max([c["observed"] for c in alive], default=-1)
+        tick.refused = any(c["observed"] > best or self.blend == "ensemble" for c in there if c not in alive)
         if not alive:
             return
         newest = max(alive, key=lambda c: c["observed"])
+        self.coming = [c for c in self.coming if c["observed"] > newest["observed"]]
         age = self.now - newest["observed"]
         tick.latency = age
         self.in_force, self.source_in_force = newest["observed"], newest["source"]
