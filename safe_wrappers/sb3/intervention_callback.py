@@ -18,6 +18,14 @@ _STEP_KEYS = {
     keys.COST: "step_cost",
     keys.COST_SUBSTEP: "step_cost_substep",
     keys.ADAPTION_PENALTY: "step_penalty",
+    keys.LEASE_EXPIRED: "step_lease_expired",
+    keys.LEASE_REFUSED: "step_lease_refused",
+    keys.LEASE_BRAKING: "step_lease_braking",
+    keys.HANDOVER_PEAK_JERK: "step_peak_jerk",
+    keys.HANDOVER_BLEND_TIME: "step_blend_time",
+    keys.HANDOVER_STARVED: "step_starved",
+    keys.HANDOVER_LIMITED: "step_limited",
+    keys.FAULT_ACTIVE: "step_fault",
 }
 
 
@@ -27,11 +35,13 @@ class InterventionCallback(BaseCallback):
     Two kinds of values reach the logger (stdout, TensorBoard, CSV), both as means since its last dump:
 
     - `interventions/step_rate`, `step_infeasible`, `step_fallback`, `step_correction`, `step_cost`,
-      `step_cost_substep`, `step_penalty` (AdaptionPenalty's): over all steps of all envs, from the keys that the
-      filter and the task write at every step;
+      `step_cost_substep`, `step_penalty` (AdaptionPenalty's), `step_lease_expired`, `step_lease_refused`,
+      `step_lease_braking` (LeaseExpiry's), `step_peak_jerk`, `step_blend_time`, `step_starved`, `step_limited`
+      (ChunkHandover's, per chunk), `step_fault`: over all steps of all envs, from the keys that the wrappers and the
+      task write at every step;
     - `interventions/rate`, `correction_mean`, `correction_p95`, `infeasible`, `fallback`, `nonfinite`,
-      `unsafe`, `margin_min`, `violations`, `cost`, `cost_substep`, `goals_reached`, `success`: over the
-      episodes that ended, from `RecordInterventions`.
+      `unsafe`, `lease_expired`, `lease_refused`, `lease_braking`, `margin_min`, `violations`, `cost`,
+      `cost_substep`, `goals_reached`, `success`: over the episodes that ended, from `RecordInterventions`.
 
     It reads infos only, so it works the same with `DummyVecEnv` and `SubprocVecEnv`. For evaluation use
     `InterventionEvalCallback`.

@@ -7,8 +7,10 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+import safe_wrappers as sw
 from safe_wrappers import interventions as keys
 from safe_wrappers.sb3 import InterventionCallback, InterventionEvalCallback
+from safe_wrappers.wrappers.faults import DroppedRefreshes
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
 
 
@@ -54,6 +56,29 @@ EXPECTED = {
     "interventions/cost_substep": 4.0,
     "interventions/violations": 4.0,
 }
+
+
+def lost_now_and_then():
+    """The whole stack, whose policy is never heard at all."""
+    cart = gym.make("InvertedPendulum-v5", max_episode_steps=16)
+    rail = [sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])]
+    lease = sw.LeaseExpiry(cart, sw.Clearance(rail, bodies=["cart"], braking=8.0), acceleration=1.0)
+    stack = sw.ChunkHandover(sw.RecordInterventions(lease), 8, 4, jerk_limit=10.0)
+    return Monitor(DroppedRefreshes(stack, share=1.0))
+
+
+def test_handover_lease_and_faults_reach_tensorboard(tmp_path):
+    model = PPO("MlpPolicy", lost_now_and_then(), n_steps=32, n_epochs=1, batch_size=32, device="cpu", seed=0)
+    model.set_logger(configure(str(tmp_path), ["tensorboard"]))
+    model.learn(32, callback=InterventionCallback())
+    logged = scalars(tmp_path)
+    assert logged["interventions/step_fault"] == [1.0]
+    assert logged["interventions/step_starved"] == [4.0]  # all control steps of a chunk
+    assert logged["interventions/step_lease_braking"] == [1.0]
+    assert logged["interventions/step_lease_expired"] == [0.0]  # there never was one
+    assert logged["interventions/lease_braking"] == [16.0]
+    for name in ("step_lease_refused", "step_peak_jerk", "step_blend_time", "step_limited"):
+        assert np.isfinite(logged[f"interventions/{name}"]).all()
 
 
 @pytest.mark.parametrize("vec_env", [DummyVecEnv, SubprocVecEnv])
