@@ -116,7 +116,7 @@ def bang(env, steps, seed=0):
 
 
 def test_no_intervention_of_the_filter_is_lost_and_penalties_explain_the_reward():
-    env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(2.0)])
+    env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(6.0)])
     recorder = Recorder(sw.AdaptionPenalty(env, penalty=0.5, per_correction=0.25))
     env = sw.ChunkHandover(recorder, 6, 5, jerk_limit=1000.0)
     env.reset(seed=0)
