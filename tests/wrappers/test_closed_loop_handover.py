@@ -1,0 +1,160 @@
+"""ChunkHandover in closed loops on real envs: hundreds of seams, the limit kept, and what a seam leaves ringing."""
+
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from slow_handover import BLENDS
+
+import safe_wrappers as sw
+from safe_wrappers.envs.flex_joint_reach import VIBRATION_ENERGY
+
+pytestmark = pytest.mark.filterwarnings("ignore:a command was held back:UserWarning")
+ENVS = {"FlexJointReach-v0": 30.0, "Reacher-v5": 8.0}
+"""Env -> limit, action units per second."""
+
+
+class Recorder(gym.Wrapper):
+    """Commands and infos of every control step, episodes apart."""
+
+    def reset(self, **how):
+        self.commands, self.infos = [], []
+        return self.env.reset(**how)
+
+    def step(self, action):
+        assert self.action_space.contains(action) and np.isfinite(action).all()
+        found = self.env.step(action)
+        self.commands.append(np.array(action, np.float64))
+        self.infos.append(dict(found[4]))
+        return found
+
+
+def smooth_chunks(env, rng, step_of=0.05):
+    """Chunks that move slowly in themselves, and have nothing to do with each other."""
+    space = env.action_space
+    size, controls = space.shape
+    while True:
+        start, swing = rng.uniform(-0.8, 0.8, controls), rng.uniform(-step_of, step_of, controls)
+        j = np.arange(size)[:, None]
+        wave = np.sin(0.2 * j + rng.uniform(0, 6))
+        yield (space.high * np.clip(start + swing * wave, -1, 1)).astype(np.float32)
+
+
+def episodes(env, chunks, steps, seed=0, late=None):
+    """Steps over as many episodes as it takes; the infos, and the recorder's commands and infos per episode."""
+    recorder, seams, infos, done = env, 0, [], True
+    while not isinstance(recorder, Recorder):
+        recorder = recorder.env
+    found = []
+    for k in range(steps):
+        if done:
+            if k:
+                found.append((np.array(recorder.commands), recorder.infos))
+            env.reset(seed=seed if not k else None)
+        if late is not None and late.random() < 0.2:
+            env.deliver(None)
+        _, _, terminated, truncated, info = env.step(next(chunks))
+        infos.append(info)
+        seams += info["handover/latency"] >= 0
+        done = terminated or truncated
+    found.append((np.array(recorder.commands), recorder.infos))
+    return infos, found, seams
+
+
+@pytest.mark.parametrize("env_id", ENVS)
+@pytest.mark.parametrize("blend", BLENDS)
+def test_hundreds_of_seams_and_not_one_beyond_the_limit(env_id, blend):
+    """Late by chance, lost by chance, with the brake as the fallback."""
+    limit = ENVS[env_id]
+    recorder = Recorder(gym.make(env_id))
+    env = sw.ChunkHandover(recorder, 24, 8, [0, 5], blend=blend, jerk_limit=limit)
+    rng = np.random.default_rng(0)
+    infos, found, seams = episodes(env, smooth_chunks(env, rng), 150, late=rng)
+    assert seams > 100 and len(found) >= 6
+    assert sum(i["handover/starved"] for i in infos) > 0, "the fallback had its turn"
+    for commands, _ in found:
+        assert np.abs(np.diff(commands, axis=0)).max() <= limit * env.hold_s
+    assert max(i["handover/peak_jerk"] for i in infos) <= limit
+    assert sum(i["handover/steps"] for i in infos) == sum(len(c) for c, _ in found)
+    in_time = sum(i["handover/limited"] == 0 for i in infos) / len(infos)
+    assert in_time > 0.5, "a blend that fits is the rule"
+
+
+def vibration(blend, limit, rng_seed=0):
+    """Mean over the steps of the largest vibration energy of each, J, with the same chunks for every blend."""
+    bounds = {"jerk_limit": limit} if blend in BLENDS else {}
+    recorder = Recorder(gym.make("FlexJointReach-v0"))
+    env = sw.ChunkHandover(recorder, 48, 16, 2, blend=blend, fallback="hold", **bounds)
+    infos, found, _ = episodes(env, smooth_chunks(env, np.random.default_rng(rng_seed)), 52)
+    energies = np.concatenate([[i[VIBRATION_ENERGY] for i in of_episode] for _, of_episode in found])
+    return float(energies.mean()), float(energies.max()), max(i["handover/peak_jerk"] for i in infos)
+
+
+def test_blended_seams_leave_the_joints_ringing_less_than_replacement():
+    """Over 0.3 s from rest to full torque, three periods of the slowest joint: a tenth of the mean energy is left."""
+    replaced_mean, replaced_peak, replaced_jerk = vibration("replace", None)
+    limit = 20.0
+    assert replaced_jerk > 10 * limit
+    for blend in BLENDS:
+        mean, peak, jerk = vibration(blend, limit)
+        assert jerk <= limit
+        assert mean < replaced_mean / 10 and peak < replaced_peak / 5, (blend, mean, peak)
+
+
+def test_a_filter_inside_may_break_the_limit_and_then_it_shows():
+    """What is sent keeps it; what is executed is the filter's, and that is what is reported."""
+    recorder = Recorder(sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(6.0)]))
+    limit = 4.0
+    env = sw.ChunkHandover(recorder, 24, 8, 2, jerk_limit=limit)
+    rng = np.random.default_rng(0)
+    env.reset(seed=0)
+    above, last = 0, None
+    for chunk, _ in zip(smooth_chunks(env, rng), range(6), strict=False):
+        info = env.step(chunk)[4]
+        executed = np.array([i["executed_action"] for i in recorder.infos[-8:]], np.float64)
+        whole = executed if last is None else np.vstack([last, executed])
+        last = executed[-1:]
+        peak = np.abs(np.diff(whole, axis=0)).max() / env.hold_s
+        assert info["handover/peak_jerk"] == pytest.approx(peak)
+        above += peak > limit
+    assert np.abs(np.diff(recorder.commands, axis=0)).max() <= limit * env.hold_s
+    assert above > 0
+
+
+def test_control_goes_from_a_policy_to_a_human_and_back_on_an_arm():
+    """Single actions as chunks of one: the policy swings, the human pulls the other way."""
+    limit = 30.0
+    recorder = Recorder(gym.make("FlexJointReach-v0"))
+    env = sw.ChunkHandover(recorder, 1, 1, jerk_limit=limit)
+    env.reset(seed=0)
+    high = env.action_space.high
+    asked = np.array(
+        [high * (-0.9 if 40 <= t < 80 else 0.7 * math.sin(0.01 * t)) for t in range(120)], np.float32
+    )
+    for t, chunk in enumerate(asked):
+        if t in (40, 80):
+            env.switch("human" if t == 40 else "policy")
+        env.step(chunk)
+    commands = np.array(recorder.commands)
+    assert np.abs(np.diff(commands, axis=0)).max() <= limit * env.hold_s
+    executed = commands.astype(np.float32)
+    assert executed[:40].tobytes() == asked[:40, 0].tobytes()
+    for start in (40, 80):
+        assert (executed[start] != asked[start, 0]).any(), "blended"
+        assert executed[start + 39].tobytes() == asked[start + 39, 0].tobytes(), "and handed over"
+
+
+def test_a_stack_of_handover_lease_and_filter_keeps_its_figures():
+    """The whole stack on the arm of Reacher, with commands that are lost."""
+    inner = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(6.0)])
+    lease = sw.LeaseExpiry(inner, lambda env: ([1.0], [0.0]), braking=1.0, acceleration=1.0, longest_s=0.3)
+    recorder = Recorder(lease)
+    env = sw.ChunkHandover(recorder, 16, 4, [0, 3], jerk_limit=8.0)
+    rng = np.random.default_rng(1)
+    infos, found, seams = episodes(env, smooth_chunks(env, rng), 60, late=rng)
+    assert seams > 30
+    for commands, of_steps in found:
+        assert np.abs(np.diff(commands, axis=0)).max() <= 8.0 * env.hold_s
+        assert len(commands) == len(of_steps)
+    assert {frozenset(i) for i in infos} == {frozenset(infos[0])}
