@@ -2,22 +2,22 @@
 
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Final, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from safe_wrappers import interventions as keys
 from safe_wrappers.constraints.constraint import Constraint, non_negative, positive
 from safe_wrappers.constraints.plain_data import constraint_data
 from safe_wrappers.control.leases import LeaseDelays
-from safe_wrappers.control.reachability import MotionLimits, admits
 from safe_wrappers.control.smoothstep import smoothstep
-from safe_wrappers.errors import ActionError, ConfigurationError, UnsupportedEnvError
+from safe_wrappers.errors import ActionError, ConfigurationError
 from safe_wrappers.plants.mujoco import MujocoPlant
 from safe_wrappers.plants.plant import Plant, check_actions, refuse_changed_actions
+from safe_wrappers.wrappers.admission import Admission, Measured
 from safe_wrappers.wrappers.cbf_action_filter import is_filtered
 from safe_wrappers.wrappers.control_interval import control_interval
 from safe_wrappers.wrappers.fallback import FallbackFunction
@@ -27,9 +27,6 @@ from safe_wrappers.wrappers.room import ClearanceFunction, Room
 from safe_wrappers.wrappers.stand_in import StandIn
 
 Array = NDArray[np.float64]
-
-Measured = Callable[[gym.Env[Any, Any]], tuple[ArrayLike, ArrayLike]]
-"""Takes the env, returns what the actions are setpoints of, and its velocity, shapes (m,)."""
 
 _SAME_TIME: Final = 1e-6
 """Control steps: times that are closer are meant to be the same."""
@@ -89,11 +86,11 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         blend_time: s, of the way back from the fallback to a fresh command.
         brake_blend_time: s, of the way to the fallback; it counts in the budget. 0: at once.
         clock_error_s: Bound on how wrong the stamps of commands may be, s; it counts in the budget.
-        reach: Limits on the motion, {"max_speed": ..., "max_acceleration": ..., "max_jerk": ...}, for actions that
-            are position setpoints: `ChunkHandover` then has a chunk refused whose end is out of idealised reach in
-            its time (`control/reachability.py`).
-        measured: For `reach`: a function of the env that returns positions and velocities; None reads the lengths of
-            the MuJoCo actuators.
+        reach: Limits on the motion, {"max_acceleration": ..., "max_speed": ..., "max_jerk": ..., "arrival": "moving"
+            or "rest"}, for actions that are position setpoints: `ChunkHandover` then has a chunk refused whose end is
+            out of reach in its time (`wrappers/admission.py`).
+        measured: For `reach`: a function of the env that returns positions, velocities and, for an arrival at rest
+            with limited jerk, accelerations; None reads the lengths of the MuJoCo actuators.
         fallback: "brake", "hold", "zero", or a function of the plant.
         plant: For the constraint and the fallback; None reads the env's MuJoCo model.
         hold_s: Control interval, s; None reads the env's `dt`.
@@ -216,15 +213,9 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
             assert plant is not None
             plant.bind(env)
             self._room.bind(plant)
-        self._reach = None if reach is None else _motion_limits(reach, space.shape[0])
-        self._measured = measured
-        if self._reach is None and measured is not None:
+        if reach is None and measured is not None:
             raise ConfigurationError("measured is for reach, which is missing: give both, or neither")
-        if self._reach is not None and measured is None and not hasattr(env.unwrapped, "data"):
-            raise UnsupportedEnvError(
-                "reach needs to know where the machine is: pass measured, a function of the env that returns the "
-                "positions that the actions are setpoints of, and their velocities"
-            )
+        self._admission = None if reach is None else Admission(env, reach, measured, space.shape[0])
         self._shape, self._dtype = space.shape, space.dtype
         self._box = tuple(
             np.nan_to_num(np.asarray(end)).astype(np.float64) for end in (space.low, space.high)
@@ -305,20 +296,7 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
             end: The chunk's last command, shape (m,).
             steps: Control steps from now to the end of that command.
         """
-        if self._reach is None:
-            return True
-        if self._measured is not None:
-            position, velocity = self._measured(self.env)
-        else:
-            data: Any = getattr(self.env.unwrapped, "data")  # noqa: B009
-            position, velocity = data.actuator_length, data.actuator_velocity
-        a_max, v_max, jerk = self._reach.arrays
-        # Without a measured acceleration a limit on the jerk would refuse what is possible: it starts at the most.
-        inside = admits(end, position, velocity, steps * self.hold_s, v_max, a_max, jerk, acceleration=a_max)
-        opposite = admits(
-            end, position, velocity, steps * self.hold_s, v_max, a_max, jerk, acceleration=-a_max
-        )
-        admitted = bool((inside | opposite).all())
+        admitted = self._admission is None or self._admission.admits(end, steps * self.hold_s)
         self._chunk_refused |= not admitted
         return admitted
 
@@ -393,20 +371,6 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         self._executed = None
         self._braking = self._chunk_refused = False
         self._fade = None
-
-
-def _motion_limits(reach: Mapping[str, Any], controls: int) -> MotionLimits:
-    try:
-        limits = MotionLimits(**reach)
-        np.broadcast_to(np.broadcast_arrays(*limits.arrays)[0], (controls,))
-    except (TypeError, ValueError) as error:
-        if isinstance(error, ConfigurationError):
-            raise
-        raise ConfigurationError(
-            'reach is {"max_acceleration": ..., "max_speed": ..., "max_jerk": ...}, the last two at will, each a '
-            f"number or one for each of the {controls} action components; got {reach!r}"
-        ) from None
-    return limits
 
 
 def _least(env: gym.Env[Any, Any], least_s: float, longest_s: float) -> float:
