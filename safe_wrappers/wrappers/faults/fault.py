@@ -36,7 +36,7 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
     Info, at every step: ``fault/active`` (bool).
 
     Args:
-        env: Any env; it must say how long a step lasts (`dt`) if nothing inside counts the time.
+        env: With a Box action space; it must say how long a step lasts (`dt`) if nothing inside counts the time.
         hold_s: The time that a step lasts, s; None reads the env's.
     """
 
@@ -45,13 +45,17 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
 
     def __init__(self, env: gym.Env[Any, Any], hold_s: float | None) -> None:
         gym.Wrapper.__init__(self, env)
+        if not isinstance(env.action_space, gym.spaces.Box):
+            raise ConfigurationError(f"a fault carries actions of a Box action space, got {env.action_space}")
         self._inside = receiver_inside(env)
         self._hold_s = 0.0 if self._inside is not None else control_interval(env, hold_s)
         if self._inside is not None and hold_s is not None:
             raise ConfigurationError(
                 f"{type(self._inside).__name__} inside counts the time: leave hold_s out"
             )
-        self.random = OwnRandom(type(self).__name__)
+        # Two of a kind, one around the other, must not strike together.
+        same = _count(env, type(self))
+        self.random = OwnRandom(type(self).__name__ + (f" {same + 1}" if same else ""))
         self._forget()
 
     def reset(
@@ -75,7 +79,7 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
             self._last = arrived.action
         if self._inside is not None:
             self._inside.deliver(None if arrived is None else arrived.observed_s)
-        observation, reward, terminated, truncated, info = self.env.step(self._last)
+        observation, reward, terminated, truncated, info = self.env.step(copy.copy(self._last))
         self._steps_done += 1
         self._evidence = self.now_s
         info[keys.FAULT_ACTIVE] = bool(active or info.get(keys.FAULT_ACTIVE, False))
@@ -107,3 +111,11 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
         self._evidence = 0.0
         space: Any = self.env.action_space
         self._last = np.clip(np.zeros(space.shape), space.low, space.high).astype(space.dtype)
+
+
+def _count(env: gym.Env[Any, Any], kind: type[gym.Wrapper[Any, Any, Any, Any]]) -> int:
+    inner, count = env, 0
+    while isinstance(inner, gym.Wrapper):
+        count += type(inner) is kind
+        inner = inner.env
+    return count

@@ -40,6 +40,7 @@ class FrozenPolicy(Fault):
 
     def carry(self, given: Carried | None, now_s: float) -> Carried | None:
         """The command, or the one from before the spell."""
-        if not self._spells.bad(now_s, self.random):
-            self._frozen = given
-        return self._frozen
+        if self._spells.bad(now_s, self.random):
+            return self._frozen
+        self._frozen = given if given is not None else self._frozen
+        return given
