@@ -1,0 +1,545 @@
+"""The faults: what arrives, when, with which stamp; that they are seeded and touch nothing else; that leases hold."""
+
+import math
+from types import SimpleNamespace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from braked_cart import BrakedCart, cart_plant, read_cart, stop
+from gymnasium.utils.env_checker import check_env
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import safe_wrappers as sw
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.faults import (
+    FAULTS,
+    ClockSkew,
+    DroppedRefreshes,
+    Fault,
+    FrozenPolicy,
+    Jitter,
+    Outages,
+    RepeatedCommands,
+)
+from safe_wrappers.wrappers.receiver import CommandReceiver
+
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
+FULL = np.array([1.0, 0.0], np.float32)
+EXAMPLES = {
+    "ClockSkew": {"offset_s": -0.3, "drift": 0.01},
+    "DroppedRefreshes": {"share": 0.4},
+    "FrozenPolicy": {"mean_between_s": 1.0, "mean_length_s": 0.8},
+    "Jitter": {"longest_s": 0.5},
+    "Outages": {"mean_between_s": 1.0, "mean_length_s": 0.8},
+    "RepeatedCommands": {"share": 0.4},
+}
+every_fault = pytest.mark.parametrize("kind", EXAMPLES)
+
+
+def faulty(kind, env, **more):
+    return FAULTS[kind](env, **{**EXAMPLES[kind], **more})
+
+
+class Ear(gym.Wrapper, CommandReceiver):
+    """Writes down what arrives: the stamp (None: nothing) and the action, of a step of `hold_s`."""
+
+    def __init__(self, env, hold_s=0.1):
+        super().__init__(env)
+        self.hold_s = hold_s
+
+    def reset(self, **kwargs):
+        self.heard, self.stamp = [], "none given"
+        return self.env.reset(**kwargs)
+
+    def step(self, action):
+        self.heard.append((self.stamp, None if self.stamp is None else np.array(action).ravel()[0]))
+        return self.env.step(action)
+
+    @property
+    def now_s(self):
+        return len(self.heard) * self.hold_s
+
+    def deliver(self, observed_s):
+        self.stamp = observed_s
+
+
+def numbered(t):
+    """An action that says at which step it was made."""
+    return np.array([t / 1000.0, 0.0])
+
+
+def hear(env, ear, steps, seed=0):
+    """What arrives of the actions 0, 1, 2, ...: (stamp, number) or (None, None), and whether the fault was active."""
+    env.reset(seed=seed)
+    active = [env.step(numbered(t))[4]["fault/active"] for t in range(steps)]
+    return [(s, None if a is None else round(1000.0 * a)) for s, a in ear.heard], active
+
+
+def listened(kind, *, steps=200, seed=0, **more):
+    ear = Ear(BrakedCart())
+    return hear(faulty(kind, ear, **more), ear, steps, seed)
+
+
+def test_every_fault_has_an_example():
+    assert set(FAULTS) == set(EXAMPLES)
+    assert all(issubclass(FAULTS[name], Fault) and FAULTS[name].__name__ == name for name in FAULTS)
+
+
+# What arrives -------------------------------------------------------------------------------------------------
+
+
+def scripted(env, numbers):
+    """The fault draws these instead of random numbers."""
+    left = list(numbers)
+
+    def pop(*_):
+        return left.pop(0)
+
+    env.random = SimpleNamespace(
+        reset=lambda *_: None, draw=SimpleNamespace(random=pop, uniform=pop, exponential=pop)
+    )
+    return env
+
+
+def test_dropped_refreshes_are_those_below_the_share():
+    ear = Ear(BrakedCart())
+    env = scripted(DroppedRefreshes(ear, 0.4), [0.39, 0.4, 0.9, 0.0, 0.5])
+    heard, active = hear(env, ear, 5)
+    assert heard == [(None, None), (0.1, 1), (0.2, 2), (None, None), (0.4, 4)]
+    assert active == [True, False, False, True, False]
+
+
+@given(
+    numbers=st.lists(st.floats(0.0, 1.0, exclude_max=True), min_size=1, max_size=30),
+    share=st.floats(0.0, 1.0),
+)
+def test_repeated_commands_keep_their_stamp(numbers, share):
+    ear = Ear(BrakedCart())
+    heard, active = hear(scripted(RepeatedCommands(ear, share), numbers), ear, len(numbers))
+    before = (None, None)
+    for t, number in enumerate(numbers):
+        if number >= share:
+            before = (t * 0.1, t)
+        assert heard[t] == before
+        assert active[t] == (number < share)
+
+
+@settings(deadline=None)
+@given(delays=st.lists(st.floats(0.0, 0.7), min_size=1, max_size=30))
+def test_jitter_brings_the_newest_that_is_there_and_never_an_older_one(delays):
+    ear = Ear(BrakedCart())
+    heard, active = hear(scripted(Jitter(ear, 0.7), delays), ear, len(delays))
+    newest = -1
+    for t in range(len(delays)):
+        there = [i for i in range(newest + 1, t + 1) if i * 0.1 + delays[i] <= t * 0.1]
+        wanted = (None, None)
+        if there:
+            newest = max(there)
+            wanted = (newest * 0.1, newest)
+        assert heard[t] == wanted
+        assert active[t] == (wanted[1] != t)
+
+
+SPELLS = [0.25, 0.3, 0.1, 0.0, 0.4, 9.0]
+"""Well until 0.25, ill until 0.55, well until 0.65, ill for no time, well until 1.05, ill for the rest."""
+ILL = [3, 4, 5, 11, 12, 13, 14]
+
+
+def test_outages_lose_everything():
+    ear = Ear(BrakedCart())
+    heard, active = hear(scripted(Outages(ear, 1.0, 1.0), SPELLS), ear, 15)
+    assert [t for t, h in enumerate(heard) if h == (None, None)] == ILL == [t for t in range(15) if active[t]]
+    assert all(heard[t] == (t * 0.1, t) for t in range(15) if t not in ILL)
+
+
+def test_a_frozen_policy_sends_the_last_one_from_before():
+    ear = Ear(BrakedCart())
+    heard, active = hear(scripted(FrozenPolicy(ear, 1.0, 1.0), SPELLS), ear, 15)
+    held = {3: 2, 4: 2, 5: 2, 11: 10, 12: 10, 13: 10, 14: 10}
+    for t in range(15):
+        sent = held.get(t, t)
+        assert heard[t] == (sent * 0.1, sent) and active[t] == (t in held)
+
+
+def test_a_frozen_policy_repeats_the_last_that_there_was_though_the_one_before_was_lost():
+    ear = Ear(BrakedCart())
+    frozen = scripted(FrozenPolicy(ear, 1.0, 1.0), SPELLS)
+    env = scripted(DroppedRefreshes(frozen, 0.5), [0.9, 0.9, 0.1, 0.1] + 11 * [0.9])
+    heard, _ = hear(env, ear, 15)
+    assert heard[:6] == [(0.0, 0), (0.1, 1), (None, None), (0.1, 1), (0.1, 1), (0.1, 1)]
+
+
+@pytest.mark.parametrize(("offset", "drift"), [(0.35, 0.0), (-0.35, 0.0), (0.0, 0.1), (-0.05, -0.2)])
+def test_clock_skew_stamps_wrongly_and_changes_nothing_else(offset, drift):
+    heard, active = listened("ClockSkew", steps=30, offset_s=offset, drift=drift)
+    for t, (stamp, number) in enumerate(heard):
+        assert number == t and stamp == pytest.approx((1.0 + drift) * 0.1 * t + offset, abs=1e-12)
+    assert all(active)
+
+
+# Random -------------------------------------------------------------------------------------------------------
+
+
+@every_fault
+def test_the_same_seed_gives_the_same_faults_and_the_next_episode_goes_on(kind):
+    def episodes(seed):
+        ear = Ear(BrakedCart())
+        env = faulty(kind, ear)
+        first = hear(env, ear, 150, seed)[0]
+        return first, hear(env, ear, 150, None)[0], hear(env, ear, 150, None)[0]
+
+    a, b = episodes(7), episodes(7)
+    assert a == b
+    if kind != "ClockSkew":
+        assert a[0] != a[1] and a[1] != a[2]
+        assert episodes(8)[0] != a[0]
+    ear = Ear(BrakedCart())
+    env = faulty(kind, ear)
+    hear(env, ear, 40, 3)
+    assert hear(env, ear, 150, 7)[0] == a[0]
+
+
+@every_fault
+def test_without_a_seed_the_envs_first_one_counts(kind):
+    ear = Ear(BrakedCart())
+    env = faulty(kind, ear)
+    env.unwrapped.reset(seed=7)
+    assert hear(env, ear, 50, None)[0] == listened(kind, steps=50, seed=7)[0]
+
+
+@every_fault
+def test_the_envs_own_random_numbers_stay_as_they_are(kind):
+    env, bare = faulty(kind, gym.make("SafePointGoal1-v0")), gym.make("SafePointGoal1-v0")
+    for seed in (5, None, None):
+        a, b = env.reset(seed=seed)[0], bare.reset(seed=seed)[0]
+        assert a.tobytes() == b.tobytes()
+        for _ in range(15):
+            env.step(env.action_space.high)
+    assert env.unwrapped.np_random.bit_generator.state == bare.unwrapped.np_random.bit_generator.state
+
+
+def test_two_of_a_kind_are_independent():
+    ear = Ear(BrakedCart())
+    env = DroppedRefreshes(DroppedRefreshes(ear, 0.5), 0.5)
+    heard, _ = hear(env, ear, 4000)
+    assert sum(h[1] is not None for h in heard) / 4000 == pytest.approx(0.25, abs=0.03)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.7, 1.0])
+@pytest.mark.parametrize("kind", ["DroppedRefreshes", "RepeatedCommands"])
+def test_the_share(kind, share):
+    heard, active = listened(kind, steps=4000, share=share)
+    lost = sum(h[1] != t for t, h in enumerate(heard)) / 4000
+    assert lost == pytest.approx(share, abs=5.0 * math.sqrt(share * (1.0 - share) / 4000) + 1e-12)
+    assert sum(active) == round(4000 * lost)
+
+
+@pytest.mark.parametrize("kind", ["Outages", "FrozenPolicy"])
+def test_spells_are_as_long_and_as_far_apart_as_declared(kind):
+    heard, _ = listened(kind, steps=40_000, mean_between_s=3.0, mean_length_s=1.5)
+    ill = np.array([h[1] != t for t, h in enumerate(heard)])
+    assert ill.mean() == pytest.approx(1.5 / 4.5, abs=0.03)
+    starts = np.flatnonzero(~ill[:-1] & ill[1:])
+    assert len(starts) == pytest.approx(4000.0 / 4.5, rel=0.15)
+    lengths = np.diff(np.flatnonzero(np.diff(ill.astype(int)) != 0))
+    assert lengths.max() > 40  # exponential: some last three times the mean
+
+
+def test_jitter_is_uniform():
+    ear = Ear(BrakedCart(dt=0.1))
+    env = Jitter(ear, 0.1)  # at most one step: every command arrives at the next one
+    heard, _ = hear(env, ear, 100)
+    assert heard[0] == (None, None) and [h[1] for h in heard[1:]] == list(range(99))
+    ages = [
+        round(t - h[1])
+        for t, h in enumerate(listened("Jitter", steps=4000, longest_s=1.0)[0])
+        if h[1] is not None
+    ]
+    assert min(ages) >= 1 and max(ages) <= 10 and len(set(ages)) > 5
+
+
+# Nobody inside to tell ----------------------------------------------------------------------------------------
+
+
+@every_fault
+def test_without_a_receiver_the_robot_goes_on_with_the_last_command(kind):
+    cart = BrakedCart()
+    env = faulty(kind, cart)
+    expected, active = listened(kind, steps=80, seed=3)
+    env.reset(seed=3)
+    last = 0
+    for t in range(80):
+        info = env.step(numbered(t))[4]
+        last = last if expected[t][1] is None else expected[t][1]
+        assert cart.given[t][0] == pytest.approx(last / 1000.0)
+        assert info["fault/active"] == active[t]
+
+
+def test_before_the_first_command_it_is_zero_or_the_nearest_to_it():
+    cart = BrakedCart()
+    cart.action_space = gym.spaces.Box(np.array([0.5, -1.0]), np.array([1.0, -0.25]), dtype=np.float32)
+    cart.step = lambda action: (cart.given.append(action), (np.zeros(2), 0.0, False, False, {}))[1]
+    env = DroppedRefreshes(cart, 1.0)
+    env.reset(seed=0)
+    env.step(np.array([0.7, -0.7]))
+    assert cart.given[0].tolist() == [0.5, -0.25] and cart.given[0].dtype == np.float32
+
+
+def test_a_held_command_is_not_the_policys_buffer():
+    cart = BrakedCart()
+    env = scripted(DroppedRefreshes(cart, 0.5), [0.9, 0.1, 0.1])
+    env.reset()
+    buffer = np.array([0.25, 0.0])
+    env.step(buffer)
+    buffer[:] = 0.75
+    env.step(buffer)
+    assert cart.given[1].tolist() == [0.25, 0.0]
+    spoil = BrakedCart.step
+    cart.step = lambda action: (spoil(cart, action), action.fill(np.nan))[0]
+    env.step(buffer)
+    cart.given.clear()
+    env.random.draw.random = lambda: 0.0
+    env.step(buffer)
+    assert cart.given[0].tolist() == [0.25, 0.0]
+
+
+def test_info_is_there_at_resets_and_steps():
+    for kind in EXAMPLES:
+        env = faulty(kind, BrakedCart())
+        infos = [env.reset(seed=0)[1]] + [env.step(FULL)[4] for _ in range(40)]
+        assert all(type(info["fault/active"]) is bool for info in infos) and infos[0]["fault/active"] is False
+
+
+# Nested -------------------------------------------------------------------------------------------------------
+
+
+def test_the_outer_one_comes_first():
+    # The outer drops 1 and 2; the inner repeats at 2 and 3: the last that arrived at it was 0.
+    ear = Ear(BrakedCart())
+    inner = scripted(RepeatedCommands(ear, 0.5), [0.9, 0.9, 0.1, 0.1, 0.9])
+    outer = scripted(DroppedRefreshes(inner, 0.5), [0.9, 0.1, 0.1, 0.9, 0.9])
+    heard, active = hear(outer, ear, 5)
+    assert heard == [(0.0, 0), (None, None), (0.0, 0), (0.0, 0), (0.4, 4)]
+    assert active == [False, True, True, True, False]
+    # The other way round: what the outer repeats may get lost.
+    ear = Ear(BrakedCart())
+    inner = scripted(DroppedRefreshes(ear, 0.5), [0.9, 0.1, 0.9, 0.9, 0.9])
+    outer = scripted(RepeatedCommands(inner, 0.5), [0.9, 0.9, 0.1, 0.9, 0.1])
+    assert [h[1] for h in hear(outer, ear, 5)[0]] == [0, None, 1, 3, 3]
+
+
+def test_a_skewed_clock_outside_of_jitter():
+    ear = Ear(BrakedCart())
+    env = ClockSkew(scripted(Jitter(ear, 0.5), [0.05, 0.25, 0.0, 0.0]), offset_s=0.5)
+    assert hear(env, ear, 4)[0] == [
+        (None, None),
+        (0.5, 0),
+        (pytest.approx(0.7), 2),
+        (pytest.approx(0.8), 3),
+    ]
+
+
+def test_now_is_the_receivers_clock():
+    ear = Ear(BrakedCart(dt=0.1), hold_s=0.25)
+    env = DroppedRefreshes(Outages(ear, 1.0, 1.0), 0.0)
+    env.reset(seed=0)
+    for t in range(4):
+        assert env.now_s == env.env.now_s == 0.25 * t
+        env.step(FULL)
+    alone = DroppedRefreshes(Outages(BrakedCart(dt=0.1), 1.0, 1.0), 0.0)
+    alone.reset(seed=0)
+    alone.step(FULL)
+    assert alone.now_s == alone.env.now_s == pytest.approx(0.1)
+
+
+# With a lease -------------------------------------------------------------------------------------------------
+
+
+def leased(cart, **more):
+    given_ = {"braking": cart.braking, "acceleration": cart.drive, "fallback": stop}
+    return sw.LeaseExpiry(cart, read_cart, plant=cart_plant(cart.dt), **{**given_, **more})
+
+
+NESTED = [
+    *([kind] for kind in EXAMPLES),
+    ["DroppedRefreshes", "Outages"],
+    ["Jitter", "RepeatedCommands", "Outages"],
+    ["ClockSkew", "Jitter", "FrozenPolicy"],
+    list(EXAMPLES),
+    list(EXAMPLES)[::-1],
+]
+
+
+def drive(rng, cart, t):
+    """Fast and careful: full throttle until it would have to brake, then brakes. What kills is a stale throttle."""
+    room = cart.wall - cart.x - cart.v * 0.3 - 0.05
+    if cart.v**2 / (2.0 * cart.braking) > room:
+        return np.array([0.0, 1.0])
+    return np.array([1.0, 0.0]) if rng.random() < 0.8 else np.array([rng.uniform(-1.0, 1.0), 0.0])
+
+
+@pytest.mark.parametrize("kinds", NESTED, ids="+".join)
+def test_nothing_is_hit_whatever_goes_wrong(kinds):
+    hits, expired, moved = {True: 0, False: 0}, 0, 0
+    for seed in range(25):
+        for guarded in hits:
+            rng = np.random.default_rng(seed)
+            dt = float(rng.choice([0.02, 0.1]))
+            delay, age = rng.uniform(0.0, 2.0 * dt, 2)
+            cart = BrakedCart(
+                dt,
+                rng.uniform(2.0, 8.0),
+                rng.uniform(0.5, 3.0),
+                rng.uniform(1.0, 5.0),
+                delay_s=delay,
+                age_s=age,
+            )
+            env = cart
+            if guarded:
+                env = leased(cart, act_s=delay, age_s=age, blend_time=float(rng.choice([0.0, 0.2])))
+            for kind in reversed(kinds):
+                env = faulty(kind, env)
+            env.reset(seed=seed)
+            for t in range(round(6.0 / dt)):
+                info = env.step(drive(rng, cart, t))[4]
+                expired += info.get("lease/expired", False)
+            hits[guarded] += cart.farthest >= cart.wall
+            moved += guarded and cart.x > 0.3
+    assert hits[True] == 0
+    assert moved > 0 or "ClockSkew" in kinds
+    if kinds != ["ClockSkew"]:
+        assert expired > 0
+    if len(set(kinds) & {"Outages", "FrozenPolicy"}):
+        assert hits[False] > 3, hits
+
+
+@pytest.mark.parametrize("kind", ["FrozenPolicy", "RepeatedCommands"])
+def test_repeats_are_caught_though_commands_keep_coming(kind):
+    cart = BrakedCart(wall=1e6)
+    ear = Ear(leased(cart, longest_s=0.3))
+    more = {"share": 0.97} if kind == "RepeatedCommands" else {"mean_between_s": 0.5, "mean_length_s": 5.0}
+    env = faulty(kind, ear.env, **more)
+    env.reset(seed=1)
+    braking = [env.step(FULL)[4]["lease/braking"] for _ in range(100)]
+    assert sum(braking) > 40 and not all(braking)
+
+
+@pytest.mark.parametrize(
+    "kind", ["Outages", "DroppedRefreshes", "FrozenPolicy", "RepeatedCommands", "Jitter"]
+)
+def test_chunks_are_carried_lost_and_repeated_as_a_whole(kind):
+    cart = BrakedCart()
+    chunks = sw.ChunkHandover(cart, 6, 2, blend="replace", fallback="zero")
+    heard = []
+    true = chunks.step
+    chunks.step = lambda action: (heard.append((chunks._evidence, np.array(action))), true(action))[1]
+    env = faulty(kind, chunks)
+    env.reset(seed=2)
+    sent = [np.full((6, 2), 0.01 * t) + np.arange(6)[:, None] * 0.001 for t in range(40)]
+    infos = [env.step(chunk)[4] for chunk in sent]
+    refused = 0
+    for t, (stamp, chunk) in enumerate(heard):
+        if stamp is None:
+            assert infos[t]["fault/active"]
+            continue
+        made = round(stamp / 0.2)
+        assert chunk.tobytes() == sent[made].tobytes() and infos[t]["fault/active"] == (made != t)
+        refused += infos[t]["handover/refused"]
+    lost = sum(info["fault/active"] for info in infos)
+    assert 5 < lost <= 40
+    starved = sum(info["handover/starved"] for info in infos)
+    assert starved > 0 or kind in ("DroppedRefreshes", "RepeatedCommands", "Jitter")
+    if kind in ("FrozenPolicy", "RepeatedCommands"):
+        assert refused > 0  # a repeated chunk is not newer than the one in force
+
+
+def test_a_clock_that_is_ahead_is_refused_and_one_within_the_declared_error_is_not():
+    for offset, error, refused in ((0.3, 0.0, True), (0.3, 0.35, False), (-0.3, 0.0, False)):
+        env = ClockSkew(leased(BrakedCart(wall=1e6), clock_error_s=error, longest_s=0.9), offset_s=offset)
+        env.reset(seed=0)
+        assert [env.step(FULL)[4]["lease/refused"] for _ in range(5)] == [refused] * 5
+
+
+# Contract and bad input ---------------------------------------------------------------------------------------
+
+
+@every_fault
+def test_the_gymnasium_contract(kind):
+    def trace(env):
+        seen = [env.reset(seed=4)[0].tobytes()]
+        for t in range(40):
+            o, r, *_, info = env.step(np.float32([np.cos(t), np.sin(t)]))
+            seen.append((o.tobytes(), r, info["fault/active"]))
+        return seen
+
+    env = faulty(kind, gym.make("SafePointGoal1-v0"))
+    check_env(env, skip_render_check=True)
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert type(again) is FAULTS[kind]
+    assert trace(again) == trace(env)
+
+
+BAD = {
+    "ClockSkew": [{}, {"offset_s": math.nan}, {"drift": math.inf}, {"offset_s": "late"}, {"offset_s": True}],
+    "DroppedRefreshes": [{"share": -0.1}, {"share": 1.1}, {"share": math.nan}, {"share": "half"}],
+    "RepeatedCommands": [{"share": -0.1}, {"share": 1.1}, {"share": math.nan}, {"share": None}],
+    "Jitter": [{"longest_s": 0.0}, {"longest_s": -1.0}, {"longest_s": math.inf}, {"longest_s": "long"}],
+    "Outages": [
+        {"mean_between_s": 0.0, "mean_length_s": 1.0},
+        {"mean_between_s": 1.0, "mean_length_s": -1.0},
+        {"mean_between_s": math.nan, "mean_length_s": 1.0},
+    ],
+    "FrozenPolicy": [
+        {"mean_between_s": 1.0, "mean_length_s": math.inf},
+        {"mean_between_s": "never", "mean_length_s": 1.0},
+    ],
+}
+
+
+@pytest.mark.parametrize(("kind", "bad"), [(kind, bad) for kind, all_ in BAD.items() for bad in all_])
+def test_numbers_that_make_no_sense(kind, bad):
+    name = next((k for k, v in bad.items() if v not in (1.0,)), "offset_s")
+    with pytest.raises(ConfigurationError, match=name):
+        FAULTS[kind](BrakedCart(), **bad)
+
+
+def test_a_clock_that_is_right():
+    with pytest.raises(ConfigurationError, match="give one of them"):
+        ClockSkew(BrakedCart())
+
+
+def test_who_counts_the_time():
+    with pytest.raises(ConfigurationError, match="LeaseExpiry inside counts the time"):
+        DroppedRefreshes(leased(BrakedCart()), 0.5, hold_s=0.1)
+    with pytest.raises(ConfigurationError, match="hold_s"):
+        DroppedRefreshes(_timeless(), 0.5)
+    DroppedRefreshes(_timeless(), 0.5, hold_s=0.1)
+    with pytest.raises(ConfigurationError, match="hold_s"):
+        DroppedRefreshes(BrakedCart(dt=0.1), 0.5, hold_s=0.2)
+
+
+def _timeless():
+    cart = BrakedCart()
+    del cart.dt
+    return cart
+
+
+def test_orders_that_are_refused():
+    with pytest.raises(ConfigurationError, match="Outages inside LeaseExpiry"):
+        leased_over = faulty("Outages", BrakedCart())
+        sw.LeaseExpiry(leased_over, read_cart, braking=1.0, acceleration=1.0, fallback="zero")
+    with pytest.raises(ConfigurationError, match="Outages inside the filter"):
+        sw.CBFActionFilter(faulty("Outages", gym.make("Reacher-v5")), [sw.JointSpeedLimit(4.0)])
+
+
+def test_actions_that_are_no_box():
+    with pytest.raises(ConfigurationError, match="Box"):
+        DroppedRefreshes(gym.make("CartPole-v1"), 0.5, hold_s=0.02)
+
+
+def test_a_step_before_the_first_reset():
+    env = DroppedRefreshes(BrakedCart(), 0.5)
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(FULL)
