@@ -17,6 +17,9 @@ ENSEMBLE: Final = "ensemble"
 BASELINES: Final = (REPLACE, ENSEMBLE)
 """What is done without a bound on the seam: the new chunk at once, or the mean of all chunks at hand."""
 
+_WHOLE: Final = 1e-6
+"""Control steps: a time that is longer than whole steps by less is meant to be those."""
+
 
 class Command(NamedTuple):
     """What to send now.
@@ -243,7 +246,7 @@ class ChunkQueue:
         if bounded.any():
             change = np.abs(target - self._sent[-1])[bounded]
             shortest = float(shortest_latched_blend(change, self._rate_limit[bounded]).max())
-            steps = max(steps, math.ceil(shortest / self._hold_s) - 1)
+            steps = max(steps, math.ceil(shortest / self._hold_s - _WHOLE) - 1)
         return steps
 
     def _faded(self, control: Array) -> Array:

@@ -49,12 +49,35 @@ EXAMPLES = {
             },
         ),
     },
+    "ChunkHandover": {
+        "a delay drawn for every chunk": (
+            "Reacher-v5",
+            lambda: {
+                "chunk_size": 8,
+                "execution_horizon": 3,
+                "inference_delay": [0, 2],
+                "blend": "quintic",
+                "jerk_limit": [20.0, 30.0],
+            },
+        ),
+        "chunks of one": (
+            TASK,
+            lambda: {"chunk_size": 1, "execution_horizon": 1, "blend_time": 0.5, "fallback": "hold"},
+        ),
+        "temporal ensembling": (
+            TASK,
+            lambda: {"chunk_size": 6, "execution_horizon": 2, "blend": "ensemble", "decay": 0.1},
+        ),
+    },
     "RecordInterventions": {"no arguments": (TASK, dict)},
 }
 """Wrapper name -> what it shows -> (env id, function of its arguments): plain data or what becomes it."""
 
 INSIDE = {"AdaptionPenalty": lambda env: sw.CBFActionFilter(env, [_clearance()])}
 """Wrapper name -> the wrapper that it needs inside."""
+
+CHUNKED = ("ChunkHandover",)
+"""Wrappers whose action is a chunk, shape (chunk_size, controls), executed over several control steps."""
 
 EXPORTED = sorted(
     name
@@ -167,7 +190,12 @@ def test_check_env_passes_on_the_wrapped_env(name, case):
 @every_wrapper
 def test_spaces_are_the_envs_own(name, case):
     env = build(name, case)
-    assert env.action_space == env.env.action_space
+    if name in CHUNKED:
+        own = env.env.action_space
+        low, high = (np.stack([end] * env.chunk_size) for end in (own.low, own.high))
+        assert env.action_space == gym.spaces.Box(low, high, dtype=own.dtype)
+    else:
+        assert env.action_space == env.env.action_space
     assert env.observation_space == env.env.observation_space
     observation = env.reset(seed=0)[0]
     assert env.observation_space.contains(observation)
@@ -261,8 +289,13 @@ def test_info_has_the_same_keys_and_types_at_every_step(name, case):
         if name == "CBFActionFilter":
             seen.append(types(env.step(np.full(env.action_space.shape, np.nan))[4]))
             seen.append(types(env.step(np.full(env.action_space.shape, 9.0))[4]))
+        if name in CHUNKED:
+            for value in (np.nan, 9.0):
+                seen.append(types(env.step(np.full(env.action_space.shape, value))[4]))
+            env.deliver(None)
+            seen.append(types(env.step(env.action_space.low)[4]))
     assert all(s == seen[0] for s in seen)
-    added = seen[0].keys() - env.unwrapped.step(env.action_space.low)[4].keys()
+    added = seen[0].keys() - env.unwrapped.step(env.unwrapped.action_space.low)[4].keys()
     assert added, "a wrapper of ours reports something"
     assert all("/" in key or key.endswith("_action") for key in added)
 
@@ -366,6 +399,8 @@ def harmless(name, case):
     """The wrapper over a witness, with limits that nothing reaches."""
     if name == "CBFActionFilter":
         return sw.CBFActionFilter(Witness(gym.make("Reacher-v5")), [sw.JointSpeedLimit(1e9)])
+    if name in CHUNKED:
+        return getattr(sw, name)(Witness(gym.make("Reacher-v5", max_episode_steps=500)), 5, 3, jerk_limit=1e6)
     env_id, arguments = example(name, case)
     return getattr(sw, name)(Witness(inside(name, gym.make(env_id))), **arguments())
 
@@ -380,7 +415,11 @@ def test_inactive_is_bit_identical(name, case):
             action = rng.uniform(-1, 1, env.action_space.shape).astype(dtype)
             before = action.tobytes()
             env.step(action)
-            assert env.env.action.tobytes() == before and env.env.action.dtype == dtype
+            if name in CHUNKED:  # the env gets its own dtype, and the last entry that was executed last
+                row = action[env.execution_horizon - 1].astype(env.env.action_space.dtype)
+                assert env.env.action.tobytes() == row.tobytes() and env.env.action.dtype == row.dtype
+            else:
+                assert env.env.action.tobytes() == before and env.env.action.dtype == dtype
             assert action.tobytes() == before
 
 
@@ -396,7 +435,11 @@ def test_a_non_finite_action_does_not_get_through(name, case, bad):
         with pytest.raises(sw.SafeWrappersError, match="finite"):
             env.step(action)
         return
-    with pytest.warns(UserWarning, match="not finite"):
-        env.step(action)
+    if name in CHUNKED:  # it is refused, which the info says: the fallback acts
+        info = env.step(action)[4]
+        assert info["handover/refused"] and info["handover/starved"] == env.execution_horizon
+    else:
+        with pytest.warns(UserWarning, match="not finite"):
+            env.step(action)
     assert np.isfinite(witness.action).all()
-    assert env.action_space.contains(witness.action)
+    assert witness.action_space.contains(witness.action)

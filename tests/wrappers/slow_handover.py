@@ -122,8 +122,8 @@ class Slow:
         if math.isinf(self.limit):
             return self.fewest
         needed = 1.875 * change / self.limit / self.hold
-        self.close_calls += 1e-9 < abs(needed - round(needed)) < 1e-5
-        return max(self.fewest, math.ceil(needed - 1e-9) - 1)
+        self.close_calls += 1e-7 < abs(needed - round(needed)) < 1e-5
+        return max(self.fewest, math.ceil(needed - 1e-6) - 1)
 
     def arrive(self, tick):
         there = [c for c in self.coming if c["due"] <= self.now]

@@ -705,7 +705,7 @@ def handover(env, **changed):
 @pytest.mark.parametrize(
     ("changed", "says"),
     [
-        ({"execution_horizon": 9}, "chunk_size = 8.*choose it up to 8"),
+        ({"execution_horizon": 9}, "chunk_size .*= 8.*choose it up to 8"),
         ({"inference_delay": 5}, "d <= s <= H - d.*no s fits, choose H >= 10"),
         ({"inference_delay": [0, 5], "execution_horizon": 8}, "d <= s <= H - d"),
         ({"inference_delay": 3, "execution_horizon": 6}, "choose s from 3 to 5"),
