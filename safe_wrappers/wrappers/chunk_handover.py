@@ -24,6 +24,7 @@ from safe_wrappers.wrappers.own_plant import PlantOfSpec, own_plant
 from safe_wrappers.wrappers.own_random import OwnRandom
 from safe_wrappers.wrappers.receiver import CommandReceiver, receiver_inside
 from safe_wrappers.wrappers.stand_in import StandIn
+from safe_wrappers.wrappers.upsampling import Upsampling
 
 Array = NDArray[np.float64]
 
@@ -84,6 +85,9 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         plant: For the fallback; None reads the env's MuJoCo model.
         hold_s: Control interval, s; None reads the env's `dt`.
         decay: Of the ensemble's weights.
+        steps_per_entry: Control steps from one entry of a chunk to the next, for policies that are slower than the
+            control loop: the commands between are a cubic Hermite spline's (`wrappers/upsampling.py`). H then is
+            `(chunk_size - 1) * steps_per_entry + 1` control steps.
 
     Info, at every step (see `safe_wrappers.interventions`): ``handover/seam_jump``, ``handover/peak_jerk``,
     ``handover/blend_time``, ``handover/starved``, ``handover/limited``, ``handover/refused``,
@@ -123,17 +127,18 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         plant: Plant | None = None,
         hold_s: float | None = None,
         decay: float = 0.01,
+        steps_per_entry: int = 1,
     ) -> None:
         _refuse_order(env)  # first: with a handover inside the actions are no vector either
         space = check_actions(env)
         plant = own_plant(plant)
-        sizes = ChunkSizes.checked(chunk_size, execution_horizon, inference_delay)
+        sizes = ChunkSizes.checked(chunk_size, execution_horizon, inference_delay, steps_per_entry)
         if blend not in (*BLENDS, *BASELINES):
             raise UnknownNameError(f"no blend {blend!r}; choose {', '.join((*BLENDS, *BASELINES))}")
         decay = non_negative("decay", decay, "a number")
         gym.utils.RecordConstructorArgs.__init__(
             self,
-            chunk_size=sizes.chunk,
+            chunk_size=sizes.entries,
             execution_horizon=sizes.horizon,
             inference_delay=sizes.delay[0] if sizes.delay[0] == sizes.delay[1] else list(sizes.delay),
             blend=blend,
@@ -143,15 +148,17 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             plant=None if plant is None else PlantOfSpec(plant),
             hold_s=hold_s,
             decay=decay,
+            steps_per_entry=sizes.steps_per_entry,
         )
         gym.Wrapper.__init__(self, env)
-        self.chunk_size, self.execution_horizon, self.blend = sizes.chunk, sizes.horizon, blend
+        self.chunk_size, self.execution_horizon, self.blend = sizes.entries, sizes.horizon, blend
         self.hold_s = control_interval(env, hold_s)
         self._delay = sizes.delay
+        self._upsampling = Upsampling(sizes.entries, sizes.steps_per_entry)
         self._controls = space.shape[0]
         self.action_space = gym.spaces.Box(
-            np.repeat(space.low[None], sizes.chunk, axis=0),
-            np.repeat(space.high[None], sizes.chunk, axis=0),
+            np.repeat(space.low[None], sizes.entries, axis=0),
+            np.repeat(space.high[None], sizes.entries, axis=0),
             dtype=space.dtype,
         )
         self._stand_in = StandIn(env, fallback, plant)
@@ -262,7 +269,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         if self._evidence is None:
             return True
         observed = math.floor(self._evidence / self.hold_s + _SAME_STEP)
-        return self._queue.submit(chunk, observed, self._queue.now + delay)
+        return self._queue.submit(self._upsampling.commands(chunk), observed, self._queue.now + delay)
 
     def _forget(self) -> None:
         self._evidence = 0.0

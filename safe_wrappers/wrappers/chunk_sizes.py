@@ -23,23 +23,38 @@ class ChunkSizes(NamedTuple):
     """In control steps, by the names of real-time chunking: H, s, and the least and the most of d.
 
     Attributes:
-        chunk: chunk_size H.
+        entries: chunk_size.
+        steps_per_entry: Control steps from one entry to the next.
+        chunk: H, the control steps that a chunk has a command for; with one step per entry its entries.
         horizon: execution_horizon s.
         delay: The least and the largest inference_delay d; `d <= s <= H - d` holds for the largest.
     """
 
+    entries: int
+    steps_per_entry: int
     chunk: int
     horizon: int
     delay: tuple[int, int]
 
     @classmethod
-    def checked(cls, chunk_size: Any, execution_horizon: Any, inference_delay: Any) -> "ChunkSizes":
+    def checked(
+        cls, chunk_size: Any, execution_horizon: Any, inference_delay: Any, steps_per_entry: Any
+    ) -> "ChunkSizes":
         """The sizes as the user gave them, or an error that says what would fit."""
-        size, horizon = _count("chunk_size", chunk_size, 1), _count("execution_horizon", execution_horizon, 1)
+        entries, horizon = (
+            _count("chunk_size", chunk_size, 1),
+            _count("execution_horizon", execution_horizon, 1),
+        )
+        apart = _count("steps_per_entry", steps_per_entry, 1)
+        if entries == 1 and apart > 1:
+            raise ConfigurationError(
+                f"steps_per_entry = {apart}, but one entry leads to no other: choose a longer chunk_size"
+            )
+        size = (entries - 1) * apart + 1
         delay = _delay(inference_delay)
         if horizon > size:
             raise ConfigurationError(
-                f"execution_horizon = {horizon} is more than a chunk has, chunk_size = {size}: it would run dry; "
+                f"execution_horizon = {horizon} is more than a chunk has, {_size(entries, apart, '')}: it would run dry; "
                 f"choose it up to {size}, or longer chunks"
             )
         if not delay[1] <= horizon <= size - delay[1]:
@@ -49,11 +64,11 @@ class ChunkSizes(NamedTuple):
                 else f"no s fits, choose H >= {2 * delay[1]}"
             )
             raise ConfigurationError(
-                f"inference_delay d = {delay[1]}, execution_horizon s = {horizon} and chunk_size H = {size} break "
+                f"inference_delay d = {delay[1]}, execution_horizon s = {horizon} and {_size(entries, apart, ' H')} break "
                 f"d <= s <= H - d: a chunk that comes {delay[1]} control steps late has {max(size - delay[1], 0)} "
                 f"commands left, for the {horizon} until the next; {fits}"
             )
-        return cls(size, horizon, delay)
+        return cls(entries, apart, size, horizon, delay)
 
     @property
     def leftover(self) -> int:
@@ -107,6 +122,12 @@ def blend_bounds(
                 f"{sizes.delay[1]} leave no left-over to blend with: pass jerk_limit or blend_time"
             )
     return fewest, rate_limit
+
+
+def _size(entries: int, apart: int, letter: str) -> str:
+    if apart == 1:
+        return f"chunk_size{letter} = {entries}"
+    return f"chunk_size {entries} at {apart} control steps per entry, H = {(entries - 1) * apart + 1} control steps"
 
 
 def _count(name: str, value: Any, least: int) -> int:

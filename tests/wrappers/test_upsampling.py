@@ -1,0 +1,85 @@
+"""Chunks at the policy's rate on a faster loop, against scipy's splines."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from scipy.interpolate import CubicHermiteSpline
+
+import safe_wrappers as sw
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.upsampling import Upsampling
+
+
+@pytest.mark.parametrize(("entries", "steps"), [(2, 3), (5, 4), (9, 33)])
+def test_commands_between_entries_are_the_spline_through_them(entries, steps):
+    chunk = np.random.default_rng(0).normal(size=(entries, 3))
+    commands = Upsampling(entries, steps).commands(chunk)
+    times = np.arange(entries) * steps
+    spline = CubicHermiteSpline(times, chunk, np.gradient(chunk, steps, axis=0))
+    assert commands == pytest.approx(spline(np.arange(times[-1] + 1)), abs=1e-12)
+    assert np.array_equal(commands[::steps], chunk)
+
+
+def test_one_step_per_entry_changes_nothing():
+    chunk = np.random.default_rng(0).normal(size=(4, 2))
+    assert Upsampling(4, 1).commands(chunk) is chunk
+
+
+class Sent(gym.Wrapper):
+    def __init__(self, env):
+        super().__init__(env)
+        self.sent = []
+
+    def step(self, action):
+        self.sent.append(np.array(action))
+        return self.env.step(action)
+
+
+def test_a_slow_chunk_drives_a_fast_loop_late_and_within_the_limit():
+    inner = Sent(gym.make("FlexJointReach-v0"))
+    env = sw.ChunkHandover(inner, 5, 10, inference_delay=3, steps_per_entry=5, jerk_limit=[30.0, 10.0])
+    assert env.action_space.shape == (5, 2)
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    chunks = [
+        0.4 * rng.uniform(env.action_space.low, env.action_space.high).astype(np.float32) for _ in range(3)
+    ]
+    for chunk in chunks:
+        info = env.step(chunk)[4]
+    assert info["handover/latency"] == 3
+    sent = np.array(inner.sent, dtype=np.float64)
+    assert (np.abs(np.diff(sent, axis=0)) <= np.array([30.0, 10.0]) * 0.01 + 1e-12).all()
+    # 21 commands of a chunk, consumed from its fourth on; where neither blend nor limit acts they are the spline's.
+    expected = Upsampling(5, 5).commands(chunks[2].astype(np.float64))
+    assert sent[29] == pytest.approx(expected[9], abs=1e-6) or info["handover/limited"] > 0
+
+
+def test_entries_of_a_chunk_are_executed_bit_for_bit():
+    inner = Sent(gym.make("Reacher-v5"))
+    env = sw.ChunkHandover(inner, 3, 4, steps_per_entry=2, blend="replace")
+    env.reset(seed=0)
+    chunk = env.action_space.sample()
+    env.step(chunk)
+    assert np.array_equal(inner.sent[0], chunk[0]) and np.array_equal(inner.sent[2], chunk[1])
+    assert len(inner.sent) == 4
+
+
+def test_it_is_recorded():
+    env = sw.ChunkHandover(gym.make("Reacher-v5"), 3, 4, steps_per_entry=2, blend="replace")
+    assert gym.make(env.spec).action_space == env.action_space
+
+
+@pytest.mark.parametrize(
+    ("sizes", "words"),
+    [
+        ({"steps_per_entry": 0}, "steps_per_entry"),
+        ({"steps_per_entry": 1.5}, "steps_per_entry"),
+        ({"chunk_size": 1, "execution_horizon": 1, "steps_per_entry": 2}, "one entry leads"),
+        ({"execution_horizon": 20, "steps_per_entry": 4}, "H = 17 control steps"),
+    ],
+)
+def test_bad_sizes(sizes, words):
+    with pytest.raises(ConfigurationError, match=words):
+        sw.ChunkHandover(
+            gym.make("Reacher-v5"), **{"chunk_size": 5, "execution_horizon": 3, "jerk_limit": 5.0, **sizes}
+        )
