@@ -54,8 +54,8 @@ class ChunkSizes(NamedTuple):
         delay = _delay(inference_delay)
         if horizon > size:
             raise ConfigurationError(
-                f"execution_horizon = {horizon} is more than a chunk has, {_size(entries, apart, '')}: it would run dry; "
-                f"choose it up to {size}, or longer chunks"
+                f"execution_horizon = {horizon} is more than a chunk has, {_size(entries, apart, '')}: it would run "
+                f"dry; choose it up to {size}, or longer chunks"
             )
         if not delay[1] <= horizon <= size - delay[1]:
             fits = (
@@ -64,8 +64,8 @@ class ChunkSizes(NamedTuple):
                 else f"no s fits, choose H >= {2 * delay[1]}"
             )
             raise ConfigurationError(
-                f"inference_delay d = {delay[1]}, execution_horizon s = {horizon} and {_size(entries, apart, ' H')} break "
-                f"d <= s <= H - d: a chunk that comes {delay[1]} control steps late has {max(size - delay[1], 0)} "
+                f"inference_delay d = {delay[1]}, execution_horizon s = {horizon} and {_size(entries, apart, ' H')} "
+                f"break d <= s <= H - d: a chunk that comes {delay[1]} control steps late has {max(size - delay[1], 0)} "
                 f"commands left, for the {horizon} until the next; {fits}"
             )
         return cls(entries, apart, size, horizon, delay)

@@ -13,8 +13,8 @@ class Upsampling:
 
     So a chunk at 30 Hz drives a loop at 1 kHz without a staircase. The commands' rate is continuous, with the rates
     at the entries taken from their neighbours; nothing is extrapolated: a chunk ends with its last entry, at which
-    one command is left. Between entries the spline may leave their range by up to a quarter of a step between entries;
-    what leaves the action box is clipped by who sends it.
+    one command is left. Between entries the spline may overshoot their range; what leaves the action box is clipped
+    by who sends it.
 
     Args:
         entries: H.
