@@ -45,6 +45,7 @@ bench: .venv/bench
 	$(BIN)/python -m benchmarks.filter_call
 	$(BIN)/python -m benchmarks.env_step
 	$(BIN)/python -m benchmarks.env_task_step
+	$(BIN)/python -m benchmarks.wrapper_cost
 	$(BIN)/python -m benchmarks.training_time
 
 # Every long figure of the README and docs/results.md: about four hours on two cores.
@@ -55,8 +56,10 @@ figures: .venv/installed
 	$(BIN)/python -m benchmarks.adversarial --off --steps 100000
 	$(BIN)/python -m benchmarks.protected --steps 3000
 	$(BIN)/python -m benchmarks.protected --hard --steps 100000
+	$(BIN)/python -m benchmarks.admission
+	$(BIN)/python -m benchmarks.leases
 	for config in pointgoal1_300k velocity_experts halfcheetah_velocity_ppo swimmer_velocity_ppo ant_velocity_ppo \
-		halfcheetah_velocity_sac; do $(BIN)/safe-wrappers compare configs/$$config.yaml --report || exit 1; done
+		halfcheetah_velocity_sac outages; do $(BIN)/safe-wrappers compare configs/$$config.yaml --report || exit 1; done
 
 .venv/docs: .venv/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
