@@ -65,8 +65,8 @@ class ChunkSizes(NamedTuple):
             )
             raise ConfigurationError(
                 f"inference_delay d = {delay[1]}, execution_horizon s = {horizon} and {_size(entries, apart, ' H')} "
-                f"break d <= s <= H - d: a chunk that comes {delay[1]} control steps late has {max(size - delay[1], 0)} "
-                f"commands left, for the {horizon} until the next; {fits}"
+                f"break d <= s <= H - d: a chunk that comes {delay[1]} control steps late has "
+                f"{max(size - delay[1], 0)} commands left, for the {horizon} until the next; {fits}"
             )
         return cls(entries, apart, size, horizon, delay)
 
