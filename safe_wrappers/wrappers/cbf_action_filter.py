@@ -86,11 +86,11 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         solver: str = "daqp",
         margin: float = 0.0,
     ) -> None:
+        _refuse_nesting(env)
         space = check_actions(env)
         plant = own_plant(plant)
         if isinstance(constraints, str | dict) or not isinstance(constraints, Sequence) or not constraints:
             raise ConfigurationError(f"constraints is a list with at least one, got {constraints!r}")
-        _refuse_nesting(env)
         own = [copy.deepcopy(constraint_from(c)) for c in constraints]
         margin = non_negative("margin", margin, "the constraints' own units")
         check_solver(solver)

@@ -394,6 +394,13 @@ def _refuse_order(env: gym.Env[Any, Any]) -> None:
                 f"{type(inner).__name__} inside LeaseExpiry: the lease must be inside of what hands commands over, "
                 "once: ChunkHandover(LeaseExpiry(CBFActionFilter(env, ...), ...), ...)"
             )
+        if (
+            type(inner).__name__ == "RecordInterventions"
+        ):  # by name: it imports ChunkHandover, which imports this
+            raise ConfigurationError(
+                "RecordInterventions inside LeaseExpiry would count no lease that expires; put it outside: "
+                "RecordInterventions(LeaseExpiry(...))"
+            )
         inner = inner.env
 
 
