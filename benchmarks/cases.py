@@ -168,6 +168,7 @@ PROTECTED: dict[str, Case] = _by_name(
     _fallen("InvertedPendulum-v5"),
     _fallen("InvertedDoublePendulum-v5"),
     Case("Reacher-v5", _joint_speeds(5.0), _SPEED),
+    Case("FlexJointReach-v0", _joint_speeds(8.0), _SPEED),
     Case("Pusher-v5", _judge_pusher, _SPEED | {"off the table": _OFF_THE_TABLE}),
     _velocity("HalfCheetah", 3.2096),
     _velocity("Hopper", 0.7402),

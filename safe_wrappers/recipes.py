@@ -61,6 +61,11 @@ def _reacher(env: gym.Env[Any, Any]) -> list[Constraint]:
     return [JointSpeedLimit(limit=5.0, margin=0.01, reach=4.5)]
 
 
+def _flex_joint_reach(env: gym.Env[Any, Any]) -> list[Constraint]:
+    # What a torque does to a joint that rings shows within one and a half periods of the lowest resonance.
+    return [JointSpeedLimit(limit=8.0, margin=0.3, holds=15)]
+
+
 def _pusher(env: gym.Env[Any, Any]) -> list[Constraint]:
     # The tip stays over the table, clear of its top by 2.5 cm, and in front of the shoulder.
     table = Workspace([-0.2, -1.2, -0.3], [0.9, 0.15, 0.4], bodies=["tips_arm"], margin=0.005, holds=8)
@@ -113,6 +118,7 @@ RECIPES: dict[str, Callable[..., list[Constraint]]] = {
     "SafePointGoal2": _point_goal,
     "InvertedPendulum": _inverted_pendulum,
     "InvertedDoublePendulum": _inverted_double_pendulum,
+    "FlexJointReach": _flex_joint_reach,
     "Reacher": _reacher,
     "Pusher": _pusher,
     "HumanoidStandup": _humanoid_standup,

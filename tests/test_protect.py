@@ -24,6 +24,7 @@ KNOWN = {
     "InvertedPendulum-v5": [sw.Clearance],
     "InvertedDoublePendulum-v5": [sw.Clearance, sw.JointPositionLimit],
     "Reacher-v5": [sw.JointSpeedLimit],
+    "FlexJointReach-v0": [sw.JointSpeedLimit],
     "Pusher-v5": [sw.JointSpeedLimit, sw.Workspace],
     "HumanoidStandup-v5": [sw.JointSpeedLimit],
     "PointMaze_UMaze-v3": [sw.WallClearance],
