@@ -136,6 +136,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         if blend not in (*BLENDS, *BASELINES):
             raise UnknownNameError(f"no blend {blend!r}; choose {', '.join((*BLENDS, *BASELINES))}")
         decay = non_negative("decay", decay, "a number")
+        blend_time, jerk_limit, hold_s = _plain(blend_time), _plain(jerk_limit), _plain(hold_s)
         gym.utils.RecordConstructorArgs.__init__(
             self,
             chunk_size=sizes.entries,
@@ -143,7 +144,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             inference_delay=sizes.delay[0] if sizes.delay[0] == sizes.delay[1] else list(sizes.delay),
             blend=blend,
             blend_time=blend_time,
-            jerk_limit=list(jerk_limit) if isinstance(jerk_limit, Sequence | np.ndarray) else jerk_limit,
+            jerk_limit=[_plain(x) for x in jerk_limit] if isinstance(jerk_limit, Sequence) else jerk_limit,
             fallback=fallback,
             plant=None if plant is None else PlantOfSpec(plant),
             hold_s=hold_s,
@@ -268,6 +269,8 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         delay = int(self._random.draw.integers(self._delay[0], self._delay[1] + 1))
         if self._evidence is None:
             return True
+        if not np.isfinite(chunk).all():
+            return False
         observed = math.floor(self._evidence / self.hold_s + _SAME_STEP)
         return self._queue.submit(self._upsampling.commands(chunk), observed, self._queue.now + delay)
 
@@ -312,6 +315,11 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             keys.HANDOVER_LIMITED: limited,
             keys.HANDOVER_STEPS: len(commands),
         }
+
+
+def _plain(value: Any) -> Any:
+    """A spec is written as JSON, which knows no NumPy."""
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
 def _refuse_order(env: gym.Env[Any, Any]) -> None:

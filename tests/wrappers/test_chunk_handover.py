@@ -739,6 +739,10 @@ def handover(env, **changed):
         ({"jerk_limit": math.nan}, "jerk_limit .*finite"),
         ({"jerk_limit": math.inf}, "jerk_limit .*finite"),
         ({"jerk_limit": "fast"}, "jerk_limit .*number"),
+        ({"jerk_limit": [5.0, 5.0]}, "one for each of the 1 action components"),
+        ({"jerk_limit": []}, "one for each of the 1 action components"),
+        ({"jerk_limit": [-1.0]}, "jerk_limit .*> 0"),
+        ({"jerk_limit": [[1.0]]}, "jerk_limit .*number"),
         ({"jerk_limit": 1e-7}, "float32 resolves.*choose a larger one"),
         ({"blend_time": 0.0}, "blend_time .*> 0"),
         ({"blend_time": -0.1}, "blend_time .*> 0"),
@@ -870,6 +874,47 @@ def test_a_spec_holds_plain_data():
     assert (
         gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json())).action_space == env.action_space
     )
+
+
+@pytest.mark.parametrize(
+    "limit",
+    [
+        5,
+        np.float32(5),
+        np.array(5.0),
+        np.array([5.0, 6.0], np.float32),
+        [5, 6.0],
+        (5.0, 6.0),
+        [np.float32(5), 6],
+    ],
+)
+def test_limits_may_be_numpys_and_are_recorded_as_plain_numbers(limit):
+    env = sw.ChunkHandover(
+        gym.make("Reacher-v5"), 8, 4, jerk_limit=limit, blend_time=np.float32(0.1), hold_s=np.float64(0.02)
+    )
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert (
+        np.ravel(again._queue._rate_limit).tolist() == np.broadcast_to(np.asarray(limit, float), 2).tolist()
+    )
+
+
+def test_each_component_keeps_its_own_limit():
+    limits = np.array([2.0, 0.5])
+    env = sw.ChunkHandover(Line(2), 8, 4, 2, jerk_limit=limits, fallback="zero")
+    rng = np.random.default_rng(0)
+    commands, _ = run(env, rng.uniform(-1, 1, (20, 8, 2)).astype(np.float32))
+    steps = np.abs(np.diff(commands.astype(np.float64), axis=0)).max(axis=0)
+    assert (steps <= limits * HOLD).all() and (steps > 0.8 * limits * HOLD).all()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_bad_entry_of_a_slower_policy_refuses_its_chunk(bad):
+    env = sw.ChunkHandover(Line(), 4, 3, jerk_limit=5.0, fallback="zero", steps_per_entry=3)
+    env.reset(seed=0)
+    chunk = numbered(1, 4)
+    chunk[3] = bad
+    info = env.step(chunk)[4]
+    assert info["handover/refused"] and info["handover/starved"] == 3
 
 
 def test_in_the_middle_of_an_episode_it_can_be_pickled():
