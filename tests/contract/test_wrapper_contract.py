@@ -69,6 +69,33 @@ EXAMPLES = {
             lambda: {"chunk_size": 6, "execution_horizon": 2, "blend": "ensemble", "decay": 0.1},
         ),
     },
+    "LeaseExpiry": {
+        "a Clearance": (
+            "InvertedPendulum-v5",
+            lambda: {
+                "clearance": sw.Clearance(
+                    [sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])], bodies=["cart"], braking=8.0
+                ),
+                "acceleration": 20.0,
+                "top_speed": 5.0,
+                "act_s": 0.01,
+                "brake_blend_time": 0.04,
+            },
+        ),
+        "a value with a closing speed": (
+            TASK,
+            lambda: {"clearance": _clearance(), "closing_speed": 4.0, "blend_time": 0.0},
+        ),
+        "limits of reach": (
+            "Reacher-v5",
+            lambda: {
+                "clearance": sw.JointPositionLimit(-2.0, 2.0, ["joint1"], margin=0.01),
+                "closing_speed": 10.0,
+                "reach": {"max_acceleration": [8.0, 20.0], "max_speed": 4.0},
+                "fallback": "hold",
+            },
+        ),
+    },
     "RecordInterventions": {"no arguments": (TASK, dict)},
 }
 """Wrapper name -> what it shows -> (env id, function of its arguments): plain data or what becomes it."""
@@ -401,6 +428,9 @@ def harmless(name, case):
         return sw.CBFActionFilter(Witness(gym.make("Reacher-v5")), [sw.JointSpeedLimit(1e9)])
     if name in CHUNKED:
         return getattr(sw, name)(Witness(gym.make("Reacher-v5", max_episode_steps=500)), 5, 3, jerk_limit=1e6)
+    if name == "LeaseExpiry":
+        far = sw.JointSpeedLimit(1e9)
+        return sw.LeaseExpiry(Witness(gym.make("Reacher-v5")), far, closing_speed=1.0)
     env_id, arguments = example(name, case)
     return getattr(sw, name)(Witness(inside(name, gym.make(env_id))), **arguments())
 
