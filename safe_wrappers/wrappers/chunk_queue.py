@@ -49,7 +49,6 @@ class _Chunk(NamedTuple):
     commands: Array
     observed: int
     due: int
-    source: str
 
 
 class _Fade(NamedTuple):
@@ -137,11 +136,11 @@ class ChunkQueue:
         if not newest < observed <= self.now or not np.isfinite(commands).all():
             return False
         boxed = np.clip(commands, self._low, self._high)
-        self._coming.append(_Chunk(boxed, observed, due, self._source))
+        self._coming.append(_Chunk(boxed, observed, due))
         return True
 
     def switch(self, source: str) -> None:
-        """Chunks from now on are somebody else's; the first of them is blended over from the last command."""
+        """Chunks that take over from now on are somebody else's; the change is blended, from the last command."""
         self._source = source
 
     def next(
@@ -198,7 +197,7 @@ class ChunkQueue:
             return False, 0, refused
         newest = admitted[-1]
         self._coming = [c for c in self._coming if c.observed > newest.observed]
-        self._observed, self._in_force = newest.observed, newest.source
+        self._observed, self._in_force = newest.observed, self._source
         if self._blend == ENSEMBLE:
             self._averaged += admitted
             return len(self._sent) > 0, 0, refused

@@ -79,7 +79,7 @@ def test_a_policy_of_whole_chunks_learns_and_predicts(name):
     assert {e["l"] for e in episodes} == {13}, "50 control steps are 13 chunks of 4"
 
 
-@pytest.mark.parametrize("kind", [DummyVecEnv, SubprocVecEnv])
+@pytest.mark.parametrize("kind", [DummyVecEnv, pytest.param(SubprocVecEnv, marks=pytest.mark.slow)])
 def test_in_both_vector_modes_infos_come_whole(kind):
     torch.set_num_threads(1)
     envs = make_vec_env(chunked, 2, vec_env_cls=kind, seed=0)

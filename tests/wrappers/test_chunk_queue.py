@@ -241,6 +241,15 @@ def test_a_fade_ends_on_a_target_that_moves():
     assert controls(commands)[4:] == [0.1 * i for i in (4, 5, 6)]
 
 
+def test_a_fade_is_as_long_as_the_way_inside_the_box():
+    q = queue("smoothstep", limit=1.875, low=-0.5, high=0.5)
+    q.submit(np.array([[-0.5]]), 0, 0)
+    run(q, 1)
+    into = run(q, 10, lambda: np.array([1e30]))
+    assert into[0].blend_steps == 9, "1 unit at 1.875 per second: a second, ten control steps"
+    assert controls(into)[-1] == 0.5 and not any(c.limited for c in into)
+
+
 def test_coming_back_in_the_middle_of_a_fade_starts_from_where_it_is():
     q = queue("smoothstep", fewest=4)
     q.submit(np.array([[1.0]]), 0, 0)
