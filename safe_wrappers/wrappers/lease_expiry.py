@@ -61,7 +61,8 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
     **Close to an obstacle** the worst command would use up the room within one control step: there no command gets a
     lease, the one that leads away neither. With a `CBFActionFilter` inside, which admits only what is safe for the
     next step, `least_s` of one control step lets every fresh command through to it; the lease then only ends stale
-    ones.
+    ones. Behind a `ChunkHandover` a fresh command comes once per `execution_horizon`: give `least_s` that time, or
+    brake and chunks take turns.
 
     **What it does not.** It does not look at what a fresh command does: a policy that lives may drive into the
     obstacle until the clearance is too small for a lease of one control step; then it brakes. Obstacles that come
