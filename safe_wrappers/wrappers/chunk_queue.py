@@ -185,7 +185,8 @@ class ChunkQueue:
         """Let the newest chunk that is there and may take over: is it a seam, its blend's steps, is one refused."""
         there = [c for c in self._coming if c.due <= self.now]
         self._coming = [c for c in self._coming if c.due > self.now]
-        refused, admitted = False, []
+        refused = False
+        admitted: list[_Chunk] = []
         for chunk in reversed(there):  # they came in the order of their observations
             if not self._is_admitted(chunk, admit):
                 refused = True

@@ -227,6 +227,38 @@ def test_commands_stay_in_the_box_and_the_limit_whatever_the_fallback_does(blend
     assert np.abs(np.diff(sent.astype(np.float64), axis=0)).max() <= 0.1
 
 
+def test_rounding_to_the_dtype_is_not_called_holding_back():
+    """A blend that just keeps the limit, in numbers that float32 has to round: kept, and nothing is reported."""
+    rng = np.random.default_rng(0)
+    alpha = np.array([10 * s**3 - 15 * s**4 + 6 * s**5 for s in np.arange(6) / 5])
+    rounded_over = 0
+    for _ in range(50):
+        a, b = rng.uniform(-1, 1, 2).astype(np.float32).astype(np.float64)
+        exact = a + alpha * (b - a)
+        limit = np.abs(np.diff(exact)).max() / HOLD * (1 + 1e-14)
+        q = queue("smoothstep", limit=limit, dtype=np.float32)
+        q.submit(np.full((2, 1), a), 0, 0)
+        run(q, 1)
+        q.submit(np.full((9, 1), b), 1, 1)
+        commands = run(q, 9, never)
+        assert commands[0].blend_steps == 4 and not any(c.limited for c in commands)
+        sent = np.array([a, *controls(commands)])
+        assert np.abs(np.diff(sent)).max() <= limit * HOLD
+        rounded_over += np.abs(np.diff(exact.astype(np.float32).astype(np.float64))).max() > limit * HOLD
+    assert rounded_over > 5, "else this shows nothing"
+
+
+def test_a_difference_divided_by_the_interval_is_never_above_the_limit():
+    rng = np.random.default_rng(0)
+    limits = rng.uniform(0.1, 5.0, 300)
+    assert any(limit * HOLD / HOLD > limit for limit in limits), "else this shows nothing"
+    for limit in limits:
+        q = queue("smoothstep", limit=float(limit))
+        q.submit(np.array([[0.0], [50.0]]), 0, 0)
+        first, second = controls(run(q, 2, never))
+        assert (second - first) / HOLD <= limit and second - first >= limit * HOLD * (1 - 1e-15)
+
+
 def test_a_fade_ends_on_a_target_that_moves():
     """Into a fallback that goes on moving: latched start, weights of the smoothstep, then the fallback itself."""
     q, step = queue("smoothstep", fewest=4), itertools.count()
