@@ -18,6 +18,7 @@ from slow_handover import BLENDS, Slow, measured
 import safe_wrappers as sw
 from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError
 from safe_wrappers.wrappers.faults import FrozenPolicy, RepeatedCommands
+from safe_wrappers.wrappers.receiver import CommandReceiver
 
 HOLD = 0.1
 TYPES = {
@@ -308,12 +309,15 @@ def test_chunks_outside_the_box_are_clipped_to_it_before_they_are_limited():
 
 @pytest.mark.parametrize("low", [-1.0, -np.inf])
 @pytest.mark.parametrize("blend", [*BLENDS, "replace", "ensemble"])
-def test_numbers_beyond_the_envs_dtype_stay_finite(low, blend):
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_numbers_beyond_the_envs_dtype_stay_finite(low, blend, dtype):
     bounds = {} if blend in ("replace", "ensemble") else {"jerk_limit": 5.0}
-    env = sw.ChunkHandover(Line(low=low, high=-low), 4, 2, blend=blend, fallback="zero", **bounds)
+    env = sw.ChunkHandover(
+        Line(low=low, high=-low, dtype=dtype), 4, 2, blend=blend, fallback="zero", **bounds
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
-        commands, _ = run(env, [np.full((4, 1), x) for x in (1e300, -1e300, 1e39, -3e38)])
+        commands, _ = run(env, [np.full((4, 1), x) for x in (1.7e308, -1.7e308, 1e39, -3e38)])
     assert np.isfinite(commands).all()  # and the line asserts that they are in its box
 
 
@@ -987,6 +991,59 @@ def test_bug_a_latency_spike_is_forgotten():
 def test_bug_negative_execution_horizons_are_refused(horizon):
     with pytest.raises(ConfigurationError, match="execution_horizon"):
         handover(Line(), execution_horizon=horizon)
+
+
+# What is told to those inside ---------------------------------------------------------------------------------
+
+
+class Listener(gym.Wrapper, CommandReceiver):
+    """Keeps the stamps that it is told, one per control step."""
+
+    now_s = 0.0
+
+    def reset(self, **how):
+        self.stamps = []
+        return self.env.reset(**how)
+
+    def deliver(self, observed_s):
+        self.stamps.append(observed_s)
+
+
+def test_whoever_is_inside_is_told_what_every_command_is_made_from():
+    """Nothing before the first chunk; the chunk in force for its commands, its left-over, and while it starves."""
+    env = sw.ChunkHandover(Listener(Line()), 6, 3, 1, jerk_limit=5.0, fallback="zero")
+    env.reset(seed=0)
+    env.step(numbered(1, 6))
+    env.step(numbered(2, 6))
+    for _ in range(2):
+        env.deliver(None)
+        env.step(numbered(3, 6))
+    env.deliver(1.1)  # made at control step 11, there at 13
+    env.step(numbered(4, 6))
+    wanted = [None, 0, 0, 0, 3, 3, 3, 3, 3, 3, 3, 3, 3, 11, 11]
+    told = [None if stamp is None else round(stamp / HOLD, 6) for stamp in env.env.stamps]
+    assert told == wanted
+
+
+def test_admission_inside_refuses_a_chunk_and_the_left_over_goes_on():
+    def reach(env):
+        return np.zeros(1), np.zeros(1)
+
+    lease = sw.LeaseExpiry(
+        Line(),
+        lambda env: ([9.0], [0.0]),
+        braking=1.0,
+        acceleration=1.0,
+        reach={"max_speed": 1.0, "max_acceleration": 10.0},
+        measured=reach,
+        fallback="zero",
+    )
+    env = sw.ChunkHandover(lease, 6, 3, jerk_limit=5.0, fallback="zero")
+    env.reset(seed=0)
+    assert not env.step(np.full((6, 1), 0.1, np.float32))[4]["handover/refused"]
+    far = env.step(np.full((6, 1), 0.9, np.float32))[4]  # 0.6 s at 1 per second
+    assert far["handover/refused"] and far["lease/refused"] and far["handover/latency"] == -1
+    assert [float(c[0]) for c in env.unwrapped.given] == [float(np.float32(0.1))] * 6
 
 
 # Faults outside -------------------------------------------------------------------------------------------------
