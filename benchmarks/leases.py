@@ -1,6 +1,6 @@
 """Leases on a cart that drives at a wall while its policy drops out: contacts with and without, and how tight.
 
-    python -m benchmarks.leases    # 4 x 10,000 episodes, 2 x 10,000 worst cases; half an hour; goes on where it was stopped
+    python -m benchmarks.leases    # 6 x 10,000 episodes, half an hour; goes on where it was stopped
 
 Episodes with outages. Speed, clearance, throttle, brakes, reading errors and all five delays are drawn for each. The
 policy knows where to brake for the wall, so that it never touches it while it lives; the commands that it sends are
