@@ -221,6 +221,7 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         self._box = tuple(
             np.nan_to_num(np.asarray(end)).astype(np.float64) for end in (space.low, space.high)
         )
+        self._filtered = is_filtered(env)  # then it says what was executed, else this one does
         self._warned = False
         self._forget()
 
@@ -233,7 +234,8 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         self._room.reset()
         self._forget()
         info[keys.LEASE_REMAINING_S] = 0.0
-        info.setdefault(keys.EXECUTED_ACTION, np.zeros(self._shape))
+        if not self._filtered:
+            info[keys.EXECUTED_ACTION] = np.zeros(self._shape)
         info.update(dict.fromkeys((keys.LEASE_EXPIRED, keys.LEASE_REFUSED, keys.LEASE_BRAKING), False))
         return observation, info
 
@@ -261,7 +263,11 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
             sent = self._faded(self._stand_in.command())
         executed = sent.astype(np.float64)
         observation, reward, terminated, truncated, info = self.env.step(sent)
-        self._executed = np.array(info.get(keys.EXECUTED_ACTION, executed), dtype=np.float64)
+        if self._filtered:
+            executed = np.array(info[keys.EXECUTED_ACTION], dtype=np.float64)
+        else:
+            info[keys.EXECUTED_ACTION] = executed.copy()
+        self._executed = executed
         self._stand_in.executed(self._executed)
         self._steps_done += 1
         self._evidence = self.now_s
@@ -269,7 +275,6 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         info[keys.LEASE_EXPIRED] = expired
         info[keys.LEASE_REFUSED] = refused
         info[keys.LEASE_BRAKING] = not covered
-        info.setdefault(keys.EXECUTED_ACTION, executed)
         return observation, reward, terminated, truncated, info
 
     @property

@@ -55,6 +55,7 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
             )
         # Two of a kind, one around the other, must not strike together.
         same = _count(env, type(self))
+        self._nested = _count(env, Fault) > 0
         self.random = OwnRandom(type(self).__name__ + (f" {same + 1}" if same else ""))
         self._forget()
 
@@ -66,7 +67,7 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
         self.random.reset(self.env, seed)
         self._forget()
         self.begin()
-        info[keys.FAULT_ACTIVE] = info.get(keys.FAULT_ACTIVE, False)
+        info[keys.FAULT_ACTIVE] = False
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -82,7 +83,7 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
         observation, reward, terminated, truncated, info = self.env.step(copy.copy(self._last))
         self._steps_done += 1
         self._evidence = self.now_s
-        info[keys.FAULT_ACTIVE] = bool(active or info.get(keys.FAULT_ACTIVE, False))
+        info[keys.FAULT_ACTIVE] = bool(active or (self._nested and info[keys.FAULT_ACTIVE]))
         return observation, reward, terminated, truncated, info
 
     @property
@@ -116,6 +117,6 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
 def _count(env: gym.Env[Any, Any], kind: type[gym.Wrapper[Any, Any, Any, Any]]) -> int:
     inner, count = env, 0
     while isinstance(inner, gym.Wrapper):
-        count += type(inner) is kind
+        count += isinstance(inner, kind)
         inner = inner.env
     return count
