@@ -8,6 +8,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from braked_cart import BrakedCart, cart_plant, read_cart, stop
 from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.utils.env_checker import check_env
 
@@ -305,6 +306,42 @@ def test_next_to_a_hazard_a_least_lease_lets_the_command_out_through_the_filter(
         moved[least] = -env.unwrapped.agent_position[0]
         assert info["lease/braking"] == (least == 0.0)
     assert moved[0.02] > 0.2 > moved[0.0]
+
+
+@pytest.mark.parametrize("blend", ["smoothstep", "quintic", "replace", "ensemble"])
+def test_chunks_under_a_lease_hit_nothing_whatever_is_lost(blend):
+    """A cart at a wall: chunks of full throttle that come late or not at all, and a queue that rolls on when dry."""
+    hits = {True: 0, False: 0}
+    for seed in range(30):
+        for guarded in hits:
+            rng = np.random.default_rng(seed)
+            dt = float(rng.choice([0.02, 0.1]))
+            delay = rng.uniform(0.0, 2.0 * dt)
+            cart = BrakedCart(
+                dt, rng.uniform(2.0, 6.0), rng.uniform(0.5, 2.0), rng.uniform(1.0, 5.0), delay_s=delay
+            )
+            env = cart
+            if guarded:
+                env = sw.LeaseExpiry(
+                    cart,
+                    read_cart,
+                    braking=cart.braking,
+                    acceleration=cart.drive,
+                    act_s=delay,
+                    brake_blend_time=float(rng.choice([0.0, 3.0 * dt])),
+                    fallback=stop,
+                    plant=cart_plant(dt),
+                )
+            bound = {} if blend in ("replace", "ensemble") else {"jerk_limit": 5.0 / dt}
+            env = sw.ChunkHandover(env, 8, 4, [0, 3], blend=blend, fallback="zero", **bound)
+            env = Outages(DroppedRefreshes(env, 0.2), 10.0 * dt, 10.0 * dt)
+            env.reset(seed=seed)
+            for _ in range(round(1.5 / dt)):
+                room = cart.wall - cart.x - 8.0 * dt * cart.v
+                full = cart.v**2 / (2.0 * cart.braking) < room
+                env.step(np.tile([1.0, 0.0] if full else [0.0, 1.0], (8, 1)).astype(np.float32))
+            hits[guarded] += cart.farthest >= cart.wall
+    assert hits[True] == 0 and hits[False] > 0, hits
 
 
 # Orders that are refused --------------------------------------------------------------------------------------

@@ -312,6 +312,15 @@ def test_info_is_there_at_resets_and_steps():
         assert all(type(info["fault/active"]) is bool for info in infos) and infos[0]["fault/active"] is False
 
 
+def test_an_env_that_hands_out_one_info_dict_makes_no_fault_last():
+    cart = BrakedCart()
+    one, true = {}, cart.step
+    cart.step = lambda action: (*true(action)[:4], one)
+    env = scripted(DroppedRefreshes(cart, 0.5), [0.1, 0.9, 0.1, 0.9])
+    env.reset()
+    assert [env.step(FULL)[4]["fault/active"] for _ in range(4)] == [True, False, True, False]
+
+
 # Nested -------------------------------------------------------------------------------------------------------
 
 

@@ -466,6 +466,32 @@ def test_it_says_what_was_executed():
     assert info["executed_action"].tolist() == [0.0, 1.0]
 
 
+class OneInfo(gym.Wrapper):
+    """An env that hands out the same dict at every step, as some do."""
+
+    def reset(self, **kwargs):
+        observation, info = super().reset(**kwargs)
+        self.info = info
+        return observation, info
+
+    def step(self, action):
+        return (*super().step(action)[:4], self.info)
+
+
+def test_an_env_that_hands_out_one_info_dict_makes_nothing_stale():
+    cart = BrakedCart(wall=1e6)
+    env = leased(OneInfo(cart), longest_s=0.3, brake_blend_time=0.2)
+    env.reset()
+    for t in range(12):
+        if t % 6 > 1:
+            env.deliver(None)
+        info = env.step(np.array([0.1 * t, 0.0]))[4]
+        np.testing.assert_array_equal(info["executed_action"], cart.given[-1].astype(np.float64))
+    assert (
+        max(np.abs(np.diff(np.array(cart.given), axis=0))[:, 1]) < 0.9
+    )  # blends start from what was executed
+
+
 def test_a_filter_inside_has_the_last_word_on_what_was_executed():
     env = gym.make("InvertedPendulum-v5")
     rail = [sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])]
