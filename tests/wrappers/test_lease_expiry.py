@@ -224,6 +224,19 @@ def test_every_part_of_the_budget_is_needed(part):
     assert hits[True] == 0 and hits[False] > 5, hits
 
 
+def test_a_hair_less_than_whole_steps_is_a_step_less():
+    # What counts as the same time is never taken from the clearance.
+    for hair, steps in ((5e-7, 4), (-2e-6, 5)):
+        cart = BrakedCart(wall=0.1 * (5.0 - hair), drive=0.0, v=1.0, braking=1e12)
+        env = leased(cart, longest_s=9.0)
+        env.reset()
+        braking = [env.step(FULL)[4]["lease/braking"]]
+        for _ in range(6):
+            env.deliver(None)
+            braking.append(env.step(FULL)[4]["lease/braking"])
+        assert braking.index(True) == steps and cart.farthest <= cart.wall
+
+
 # Authority ----------------------------------------------------------------------------------------------------
 
 
@@ -539,6 +552,21 @@ def test_reset_forgets_the_episode():
     # An action before the episode's first observation is one of the new episode.
     used.reset()
     assert not used.step(FULL)[4]["lease/braking"]
+
+
+def test_hold_holds_what_was_executed_last_and_nothing_after_a_reset():
+    cart = BrakedCart(wall=1e6)
+    env = leased(cart, longest_s=0.1, blend_time=0.0, fallback="hold", plant=None)
+    for wanted in ([0.3, 0.0], [-0.4, 0.0]):
+        env.reset()
+        env.deliver(None)
+        env.step(FULL)
+        assert cart.given[-1].tolist() == [0.0, 0.0]
+        env.step(np.array(wanted))
+        for _ in range(2):
+            env.deliver(None)
+            assert env.step(FULL)[4]["lease/braking"]
+            np.testing.assert_allclose(cart.given[-1], wanted, atol=1e-7)
 
 
 @pytest.mark.parametrize("dt", [0.05, 0.1])

@@ -81,20 +81,32 @@ def test_its_own_braking_unless_another_is_given():
     assert lease(braking=4.0) == pytest.approx((5.0 - 0.5) / 2.0, abs=1e-6)
 
 
-def test_a_delayed_plants_prediction_is_used():
-    # It sees the clearance after the delay, with the commands in flight: less of it.
-    def lease(delay):
-        cart = BrakedCart(wall=5.0, v=2.0, drive=1.0)
+def test_a_delayed_plants_prediction_is_used_with_the_commands_in_flight():
+    # It sees the clearance after the delay: the way of the commands that were sent is gone by then.
+    def lease(delay, throttle):
+        cart = BrakedCart(wall=9.0, v=2.0, drive=1.0, delay_s=delay)
         plant = cart_plant(0.1)
         plant.delay_s = delay
-        near = sw.Clearance([sw.Plane([5.0], [-1.0])], braking=4.0, position=[0], velocity=[1])
+        near = sw.Clearance([sw.Plane([9.0], [-1.0])], braking=4.0, position=[0], velocity=[1])
         env = sw.LeaseExpiry(cart, near, acceleration=0.0, plant=plant, fallback="zero", longest_s=9.0)
         env.reset()
         for _ in range(3):
-            found = granted(env, np.zeros(2))
-        return found
+            found = granted(env, np.array([throttle, 0.0]))
+        # Three steps have been granted, the last at 0.2 s; with the delay the command of 0 s just begins to act.
+        x, v = 2.0 * 0.2, 2.0
+        if delay:
+            x, v = x + v * 0.2 + 0.5 * throttle * 0.2**2, v + throttle * 0.2
+        else:
+            x, v = x + 0.5 * throttle * 0.2**2, v + throttle * 0.2
+        assert found == pytest.approx((9.0 - x - v**2 / 8.0) / v, abs=1e-6)
+        # The next episode knows nothing of these commands.
+        env.reset()
+        again = granted(env, np.zeros(2))
+        assert again == pytest.approx((9.0 - 2.0 * delay - 0.5) / 2.0, abs=1e-6)
 
-    assert lease(0.2) == pytest.approx(lease(0.0) - 0.2, abs=1e-6)
+    for delay in (0.0, 0.2):
+        for throttle in (0.0, 0.7, -0.7):
+            lease(delay, throttle)
 
 
 # Other constraints --------------------------------------------------------------------------------------------
@@ -225,6 +237,21 @@ def test_a_state_error_counts_for_values_too():
         return granted(env, np.zeros(2, np.float32))
 
     assert lease(0.08) == pytest.approx(lease(0.0) - 0.08 / 4.0, abs=1e-6)
+
+
+def test_a_constraint_forgets_the_episode():
+    class Counted(Far):
+        forgotten = 0
+
+        def reset(self):
+            Counted.forgotten += 1
+
+    counted = Counted(1.0)
+    counted.values = [1.0]
+    env = sw.LeaseExpiry(BrakedCart(), counted, closing_speed=1.0, plant=cart_plant(0.1), fallback="zero")
+    env.reset()
+    env.reset()
+    assert Counted.forgotten == 2
 
 
 # Functions ----------------------------------------------------------------------------------------------------
