@@ -283,7 +283,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
     def _seams_at(self, now: int, command: Command) -> bool:
         """Whether this control step's differences are a seam's: from its first command to three after its blend."""
         if command.seam:
-            self._seam_until = max(self._seam_until, now + command.blend_steps + DIFFERENCES - 1)
+            self._seam_until = now + command.blend_steps + DIFFERENCES - 1  # it ends a blend under way
         return now <= self._seam_until
 
     def _measured(self, commands: list[Command]) -> dict[str, Any]:

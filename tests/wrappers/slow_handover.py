@@ -253,7 +253,7 @@ def measured(commands, ticks, hold):
     until, found = -1, []
     for t, tick in enumerate(ticks):
         if tick.seam:
-            until = max(until, t + tick.blend_steps + 2)
+            until = t + tick.blend_steps + 2  # what was left of a blend before is not executed
         orders = []
         for order in (1, 2, 3):
             if t < order:

@@ -430,6 +430,13 @@ def test_a_reset_forgets_chunks_stamps_and_commands():
     assert infos[0]["handover/starved"] == 4
 
 
+def test_an_episode_does_not_begin_with_the_last_ones_command():
+    env = sw.ChunkHandover(Line(), 8, 4, 2, jerk_limit=50.0, fallback="hold")
+    run(env, [np.full((8, 1), 0.5, np.float32)] * 2)
+    commands, _ = run(env, [np.full((8, 1), 0.5, np.float32)])
+    assert commands[:, 0].tolist() == [0.0, 0.0, 0.5, 0.5]
+
+
 # Starvation -----------------------------------------------------------------------------------------------------
 
 
@@ -620,6 +627,26 @@ def test_what_was_executed_is_measured_not_what_was_sent():
     assert [i["handover/peak_jerk"] for i in infos] == [10.0] * 3
     assert infos[0]["handover/seam_jump"].tolist() == [0.0] * 3
     assert infos[1]["handover/seam_jump"].tolist() == [1.0, 2.0, 4.0]
+
+
+def test_a_seam_ends_the_blend_before_it_and_its_window():
+    """A blend of nine is cut off by a chunk that needs one of one: what comes later is nobody's seam."""
+    a, b = np.zeros((14, 1), np.float32), np.full((14, 1), 1.0, np.float32)
+    env = sw.ChunkHandover(Line(), 14, 2, jerk_limit=2.0, fallback="zero")
+    env.reset(seed=0)
+    env.step(a)
+    infos = [env.step(b)[4]]
+    at = float(env.unwrapped.given[-1][0])
+    late = np.full((14, 1), at, np.float32)
+    late[7:] += 0.1
+    infos += [env.step(late)[4]]
+    for _ in range(3):
+        env.deliver(None)
+        infos.append(env.step(late)[4])
+    assert infos[0]["handover/blend_time"] == pytest.approx(1.0)
+    assert infos[1]["handover/blend_time"] == 0.0
+    assert [bool(i["handover/peak_jerk"]) for i in infos] == [True, False, False, False, True]
+    assert not infos[4]["handover/seam_jump"].any(), "the chunk's own step, five control steps after the seam"
 
 
 def test_it_says_once_that_commands_are_held_back():
