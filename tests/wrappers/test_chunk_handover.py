@@ -800,6 +800,12 @@ def test_bad_arguments_are_refused_with_a_way_out(changed, says):
         handover(Line(), **changed)
 
 
+@pytest.mark.parametrize("limit", [[5.0, 1e-7], [1e-7, 5.0]])
+def test_every_component_needs_a_limit_that_its_numbers_resolve(limit):
+    with pytest.raises(ConfigurationError, match="float32 resolves"):
+        handover(Line(2), jerk_limit=limit)
+
+
 def test_the_longest_blend_time_that_fits_is_accepted():
     assert handover(Line(), blend_time=0.8, jerk_limit=None).hold_s == HOLD
     assert handover(Line(), blend_time=0.5, inference_delay=3, jerk_limit=None).chunk_size == 8
