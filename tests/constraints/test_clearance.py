@@ -9,7 +9,7 @@ import pytest
 from gymnasium.envs.mujoco import MujocoEnv
 
 import safe_wrappers as sw
-from safe_wrappers.control.stopping import sampled_acceleration_limit
+from safe_wrappers.control.stopping import sampled_acceleration_limit, sampled_inset
 from safe_wrappers.errors import ConfigurationError
 
 POINT_MASS = """<mujoco><option timestep="{timestep}" gravity="{pull}" integrator="RK4"/>
@@ -250,3 +250,23 @@ def test_on_an_analytic_plant_the_indices_are_asked_for():
     plant.bind(gym.make("Pendulum-v1"))
     with pytest.raises(ConfigurationError, match=r"say where the point is in the state: position=\[0, 1\]"):
         sw.Clearance([sw.Plane([1.0], [-1.0])], 1.0).bind(plant)
+
+
+@pytest.mark.parametrize("frame", [{"bodies": ["ball"]}, {"sites": ["nose"], "geoms": []}])
+def test_approach_is_what_the_barrier_counts_the_stopping_distance_from(tmp_path, frame):
+    env = PointMass(tmp_path)
+    plant = sw.MujocoPlant()
+    plant.bind(env)
+    clearance = sw.Clearance(DISCS, braking=2.0, radius=0.05, margin=0.3, state_error=0.1, **frame)
+    clearance.bind(plant)
+    env.reset(seed=0)
+    env.set_state(np.array([0.2, -0.1]), np.array([0.7, -0.4]))
+    plant.observe()
+    room, speed = clearance.approach(plant)
+    point = np.array([0.2, -0.1]) + (np.array([0.05, 0.0]) if "sites" in frame else 0.0)
+    for i, disc in enumerate(DISCS):
+        way = np.asarray(disc.center)[:2] - point
+        distance = np.linalg.norm(way)
+        assert room[i] == pytest.approx(distance - disc.radius - 0.05, abs=1e-12)
+        assert speed[i] == pytest.approx(np.array([0.7, -0.4]) @ way / distance, abs=1e-12)
+    assert clearance.value(plant) == pytest.approx(sampled_inset(room, speed, 2.0, env.dt), abs=1e-12)

@@ -501,3 +501,28 @@ def test_attributes_come_from_the_env():
     ):
         plant.attribute("hazards")
     assert isinstance(plant, sw.Plant)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "kind", "name"),
+    [("Ant-v5", "body", "torso"), ("Ant-v5", "geom", "left_ankle_geom"), ("Reacher-v5", "body", "fingertip")],
+)
+def test_motion_is_that_of_point_and_of_mujoco_and_leaves_the_plant_as_it_was(env_id, kind, name):
+    env = gym.make(env_id)
+    plant = bound(env)
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    for _ in range(20):
+        env.step(env.action_space.sample())
+    plant.observe()
+    p, v = plant.motion(kind, name)
+    again = plant.motion(kind, name)
+    truth = plant.point(kind, name)
+    assert np.array_equal(p, truth[0]) and np.array_equal(p, again[0])
+    assert v == pytest.approx(truth[1], abs=1e-12) and np.abs(v).max() > 1e-3
+    velocity = np.zeros(6)
+    handle = mujoco.mj_name2id(plant.model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
+    sort = mujoco.mjtObj.mjOBJ_XBODY if kind == "body" else mujoco.mjtObj.mjOBJ_GEOM
+    mujoco.mj_objectVelocity(plant.model, plant.forward(), sort, handle, velocity, 0)
+    assert v == pytest.approx(velocity[3:], abs=1e-9)
+    assert plant.motion(kind, name)[1] == pytest.approx(v, abs=1e-12)  # after the forward pass too
