@@ -170,6 +170,13 @@ def test_check_env_passes_and_the_spec_survives_json(task, layers):
     assert trace(again, 5)[0] == trace(env, 5)[0]
 
 
+@pytest.mark.slow
+@every_task
+@every_stack
+def test_check_env_passes_for_every_pair(task, layers):
+    check_env(TASKS[task].build(layers), skip_render_check=True)
+
+
 class Watch(gym.Wrapper):
     """Innermost: nothing but finite commands inside the box ever comes through."""
 
