@@ -79,8 +79,8 @@ HANDOVER_LIMITED: Final = "handover/limited"
 HANDOVER_REFUSED: Final = "handover/refused"
 """bool: a chunk was refused: not finite, not newer than the one in force, too late, or out of reach."""
 HANDOVER_LATENCY: Final = "handover/latency"
-"""int64: control steps that went by between the observation and the takeover of the chunk that took over in this
-step, as consumed; -1 where none did."""
+"""int64: control steps that went by between the observation and the takeover of the last chunk that took over in
+this step, as consumed; -1 where none did."""
 HANDOVER_STEPS: Final = "handover/steps"
 """int64: control steps executed in this step (fewer than the execution horizon where the episode ended)."""
 

@@ -67,7 +67,8 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
 
     **Chunks of one** (`chunk_size=1, execution_horizon=1`) are for ordinary policies: commands pass as they are,
     held back by `jerk_limit` alone, and only a change of who gives them is blended: call `switch("human")`, give
-    the human's actions, `switch("policy")`. The fallback is such a change, too.
+    the human's actions, `switch("policy")`. The fallback is such a change, too. An action of shape (m,) will do. A
+    single action has no left-over and is for one control step, so one that comes late is refused.
 
     **Baselines** without any bound: blend="replace" takes the new chunk at once, blend="ensemble" averages all
     chunks at hand with weights exp(-decay i), i = 0 the oldest (temporal ensembling, Zhao et al., RSS 2023).
@@ -258,6 +259,8 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             raise ActionError(
                 f"expected a chunk of shape {self.action_space.shape}, got {action!r}"
             ) from None
+        if self.chunk_size == 1 and chunk.shape == (self._controls,):
+            return chunk[None]  # an ordinary policy's action
         if chunk.shape != self.action_space.shape:
             raise ActionError(
                 f"expected a chunk of shape {self.action_space.shape} (chunk_size, controls), got {chunk.shape}"

@@ -74,6 +74,7 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
             clearances in m and approach speeds in m/s.
         braking: Verified lower bound on the deceleration of the fallback, m/s^2; a Clearance brings its own.
         acceleration: Largest approach acceleration that any command may cause, m/s^2; 0 for a machine that cruises.
+            The fallback's commands count too: braking a machine that recedes pushes it towards the obstacle.
         closing_speed: For constraints other than Clearance: the fastest that their value may fall, per second.
         top_speed: Bound on the approach speed, m/s.
         detect_s: T_detect, s, until the end of a lease is recognised.

@@ -26,7 +26,7 @@ class Upsampling:
         if steps > 1:
             times = np.arange(entries) * float(steps)
             unit = np.eye(entries)
-            rates = np.gradient(unit, axis=1) / steps
+            rates = np.asarray(np.gradient(unit, axis=1)) / steps
             # The spline is linear in the entries: one matrix for all chunks.
             self._weights = hermite_series(times, unit, rates, np.arange((entries - 1) * steps + 1)).T
 

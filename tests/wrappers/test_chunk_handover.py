@@ -1103,3 +1103,18 @@ def test_a_repeated_chunk_is_refused():
 def test_unknown_names_are_unknown_names():
     with pytest.raises(UnknownNameError):
         handover(Line(), blend="cubic")
+
+
+def test_an_ordinary_policys_action_is_a_chunk_of_one():
+    one = gym.make("Reacher-v5")
+    env = sw.ChunkHandover(gym.make("Reacher-v5"), 1, 1, jerk_limit=1e6)
+    one.reset(seed=0)
+    env.reset(seed=0)
+    one.action_space.seed(0)
+    for _ in range(10):
+        action = one.action_space.sample()
+        assert np.array_equal(one.step(action)[0], env.step(action)[0])
+    with pytest.raises(ActionError, match=r"\(1, 2\)"):
+        env.step(np.zeros(3))
+    with pytest.raises(ActionError, match=r"\(2, 2\)"):
+        sw.ChunkHandover(gym.make("Reacher-v5"), 2, 1, jerk_limit=1.0).step(np.zeros(2))

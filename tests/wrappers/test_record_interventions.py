@@ -47,9 +47,13 @@ def cbf(intervened=False, correction=0.0, margin=1.0, infeasible=False, fallback
     }
 
 
+def lease(expired=False, refused=False, braking=False):
+    return {keys.LEASE_EXPIRED: expired, keys.LEASE_REFUSED: refused, keys.LEASE_BRAKING: braking}
+
+
 SCRIPT = [
     cbf(cost=0.0, cost_substep=0.0, goals_reached=0),
-    cbf(True, 0.5, 0.2, cost=0.0, cost_substep=1.0, goals_reached=1),
+    cbf(True, 0.5, 0.2, cost=0.0, cost_substep=1.0, goals_reached=1, **lease(expired=True, braking=True)),
     cbf(
         True,
         1.5,
@@ -60,6 +64,7 @@ SCRIPT = [
         cost=1.0,
         cost_substep=1.0,
         goals_reached=1,
+        **lease(refused=True, braking=True),
     ),
     cbf(margin=float("inf"), cost=0.0, cost_substep=0.0, goals_reached=2, is_success=True),
 ]
@@ -94,6 +99,9 @@ def test_counts_of_an_episode():
         "fallback": 1,
         "nonfinite": 0,
         "unsafe": 1,
+        "lease_expired": 1,
+        "lease_refused": 1,
+        "lease_braking": 2,
         "margin_min": -0.1,
         "violations": 2,
         "cost": 1.0,
