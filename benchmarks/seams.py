@@ -1,0 +1,404 @@
+"""Seams between chunks: the same learned chunk policy, handed over in several ways, with delays of 0, 2 and 5 steps.
+
+    python -m benchmarks.seams                     # 200 episodes per row; trains the policies first, once
+    python -m benchmarks.seams --episodes 10       # quicker
+    python -m benchmarks.seams --envs Reacher      # of the envs whose id has one of these words
+
+Every row of an env is the same policy, deterministic, on the same episodes. The policies
+(`benchmarks/chunk_policy.py`) give a chunk as a few knots of a spline: with each entry an action by itself PPO's
+chunks are jagged inside, and their own inside shakes the arm, not the seam. They are trained with replacement and
+without any bound, so what a bound costs in return is what it costs a policy that does not know of it.
+
+Plain replacement and temporal ensembling bound nothing. The blends are measured with a bound on the command's rate
+alone (`jerk_limit`), and with a least duration too (`blend_time`): the shortest blend that keeps a rate may still
+ring, a longer one makes the command late. Both come from the arm, or from the action's range, as `bounds_of` says.
+A trial with blends of 0.12 s had been seen when the rule for the arm's `blend_time` was written down; it gives
+0.12 s. Reacher's rate limit is the second one tried: the first, 10 N m/s, lies above what any seam of the policy asks
+for, so that its rows were replacement's.
+
+The first command of an episode would be a step from no torque to the policy's, which is no seam, and on the arm it
+rings for a second. So for every method the policy's commands are faded in from zero over the first `blend_time` of
+an episode, and a seam is a chunk that takes over from the one before it.
+
+What is left of the vibration is not all from seams: the chunks move the arm, too. So every chunk that replacement
+executed is executed again by itself, from the same state but for the springs, which start without vibration.
+"""
+
+import argparse
+import json
+import math
+import warnings
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+import safe_wrappers as sw
+from benchmarks.chunk_policy import RUNS, TASKS, Policy, Task, policy
+from safe_wrappers.control.flexible_joint import manifold, resonances, torque_slew_limit
+from safe_wrappers.control.seams import BLENDS
+from safe_wrappers.control.smoothstep import smoothstep
+
+RESULTS = Path(__file__).parent / "results"
+Array = NDArray[np.float64]
+
+DELAYS = (0, 2, 5)
+"""Control steps."""
+RAMP_ENERGY = 1e-3
+"""J that one ramp of torque at the rate limit may leave ringing in the arm, in any pose."""
+PERIODS = 1.2
+"""Of the lowest resonance, that a blend takes at the least: over so long a smoothstep from one held torque to another
+leaves at most a tenth of the energy that the step itself would (`control.flexible_joint.smoothstep_energy`)."""
+RANGE_PER_SECOND = 1.0
+"""Action ranges per second, where no arm says more: from one end to the other takes a second."""
+RATE, RATE_AND_TIME = "rate", "rate + time"
+"""What bounds a blend."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Of the blends on one env.
+
+    Attributes:
+        jerk_limit: One for each control, action units per second.
+        blend_time: s.
+        reasons: How they were chosen, for the table.
+    """
+
+    jerk_limit: list[float]
+    blend_time: float
+    reasons: str
+
+
+def bounds_of(env: Any, task: Task) -> Bounds:
+    """From the arm's resonances, or, where there are none, from the action's range and the time between seams."""
+    hold, high = env.get_wrapper_attr("dt"), env.action_space.high
+    arm = getattr(env.unwrapped, "arm", None)
+    if arm is None:
+        rate = float(RANGE_PER_SECOND * (env.action_space.high - env.action_space.low).min())
+        span = task.horizon * hold
+        reasons = (
+            f"rate {rate:g} N m/s, {RANGE_PER_SECOND:g} action range per second; time {span:.3g} s, the time "
+            "between two seams, so that a blend ends when the next begins"
+        )
+        return Bounds([rate] * len(high), span, reasons)
+    angles = np.zeros((721, 2))
+    angles[:, 1] = np.linspace(-math.pi, math.pi, len(angles))
+    constants = arm.stiffness, arm.rotor_inertia, arm.link_inertia(angles)
+    limit = torque_slew_limit(RAMP_ENERGY, *constants, weights=high, hold_s=hold).min(axis=0)
+    lowest = float(resonances(*constants).min()) / (2.0 * math.pi)
+    span = PERIODS / lowest
+    reasons = (
+        f"rate {limit[0]:.2f} and {limit[1]:.2f} N m/s, with which a single ramp of torque leaves at most "
+        f"{1e3 * RAMP_ENERGY:g} mJ ringing in any pose; time {span:.3f} s, {PERIODS} periods of the lowest resonance "
+        f"({lowest:.1f} Hz), over which a smoothstep leaves at most a tenth of the energy that the step itself would"
+    )
+    return Bounds(limit.tolist(), span, reasons)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One way of handing over on one env, for some episodes.
+
+    Attributes:
+        blend: As `ChunkHandover` takes it.
+        bounds: `RATE`, `RATE_AND_TIME`, or "-" for a baseline.
+        delay: Control steps.
+    """
+
+    env: str
+    blend: str
+    bounds: str
+    delay: int
+    episodes: int
+    seed: int
+
+
+def jobs(env: str, episodes: int, seed: int) -> list[Job]:
+    """The rows of an env's table."""
+    ways = [("replace", "-"), ("ensemble", "-")]
+    ways += [(blend, bounds) for bounds in (RATE, RATE_AND_TIME) for blend in BLENDS]
+    return [Job(env, blend, bounds, delay, episodes, seed) for delay in DELAYS for blend, bounds in ways]
+
+
+class Recorder(gym.Wrapper[Any, Any, Any, Any]):
+    """Between the handover and the env: what was sent, control step by control step, and what came of it.
+
+    Attributes:
+        commands: Of this episode, each of shape (m,).
+        states: Positions and velocities before each of them.
+        energy: J, none where the env has no vibration.
+        error: m, from the fingertip to the target.
+    """
+
+    def reset(self, **options: Any) -> Any:
+        self.commands: list[Array] = []
+        self.states: list[tuple[Array, Array]] = []
+        self.energy: list[float] = []
+        self.error: list[float] = []
+        return super().reset(**options)
+
+    def step(self, action: Any) -> Any:
+        data: Any = self.env.unwrapped.data  # type: ignore[attr-defined]
+        self.states.append((data.qpos.copy(), data.qvel.copy()))
+        result = super().step(action)
+        info = result[4]
+        self.commands.append(np.array(action, dtype=np.float64))
+        if "vibration_energy" in info:
+            self.energy.append(info["vibration_energy"])
+        self.error.append(info["tracking_error"] if "tracking_error" in info else -info["reward_dist"])
+        return result
+
+
+def faded_in(chunk: Array, begins: int, steps: int) -> Array:
+    """The chunk with what it asks for in an episode's first control steps taken down to nothing, smoothly.
+
+    Args:
+        chunk: Shape (H, m), action units.
+        begins: Control step of its first entry, counted from the first command that the policy gives in the episode.
+        steps: Over how many of them.
+    """
+    phase = (begins + np.arange(len(chunk)) + 1.0) / (steps + 1.0)
+    return np.asarray(chunk * smoothstep(np.clip(phase, 0.0, 1.0))[:, None], dtype=np.float32)
+
+
+def alone(env: Any, qpos: Array, qvel: Array, commands: Array) -> float:
+    """The largest vibration energy, J, of commands from a state whose springs are made to carry no vibration.
+
+    Args:
+        env: A `FlexJointReach-v0` of its own, unwrapped.
+        qpos: Shape (4,): motor, spring, motor, spring.
+        qvel: Shape (4,).
+        commands: Shape (n, 2), N m.
+    """
+    arm, qpos, qvel = env.arm, qpos.copy(), qvel.copy()
+    motors, springs = slice(0, None, 2), slice(1, None, 2)
+    qvel[springs] = 0.0
+    for _ in range(5):  # the deflection turns the link, and with it what the spring carries
+        q = qpos[motors] + qpos[springs]
+        carried = manifold(
+            commands[0],
+            arm.rotor_inertia,
+            arm.link_inertia(q),
+            bias=arm.link_bias(q, qvel[motors]),
+            motor_friction=arm.motor_damping * qvel[motors],
+        )
+        qpos[springs] = -carried / arm.stiffness
+    env.set_state(qpos, qvel)
+    return max(env.step(command)[4]["vibration_energy"] for command in commands)
+
+
+@dataclass
+class Episode:
+    """What an episode's seams did.
+
+    Attributes:
+        differences: The largest first, second and third of the commands, per seam, shape (n, 3), action units.
+        rates: The largest `|du/dt|` from the seam to the next one, per seam, in units of the limit.
+        energies: The largest vibration energy from the seam to the next one, J; none where there is no vibration.
+        alone: The same of the commands `alone`; none but for replacement.
+        blend_times: s.
+        cut: Blends that the next seam came before the end of.
+        limited: Control steps of which the command had to be held back.
+        errors: m, of all control steps.
+        total: Return.
+    """
+
+    differences: Array
+    rates: Array
+    energies: Array
+    alone: list[float]
+    blend_times: Array
+    cut: int
+    limited: int
+    errors: list[float]
+    total: float
+
+
+def episode(env: Any, recorder: Recorder, act: Policy, job: Job, bounds: Bounds, seed: int) -> Episode:
+    """Run one."""
+    fade = math.ceil(bounds.blend_time / env.hold_s)
+    observation, _ = env.reset(seed=seed)
+    takeovers, infos, total, limited, over = [], [], 0.0, 0, False
+    while not over:
+        begins = len(recorder.commands)
+        chunk = faded_in(act(observation), begins - job.delay, fade)
+        observation, reward, terminated, truncated, info = env.step(chunk)
+        total, limited, over = total + reward, limited + info["handover/limited"], terminated or truncated
+        if info["handover/latency"] >= 0:
+            # A delay as long as the horizon takes over in the step after, at its start.
+            takeovers.append(begins + info["handover/latency"] % env.execution_horizon)
+            infos.append(info)
+    commands = np.array(recorder.commands)
+    step = np.abs(np.diff(commands, axis=0, prepend=commands[:1])) / env.hold_s
+    rates = (step / bounds.jerk_limit).max(axis=1)
+    blend_times = np.array([info["handover/blend_time"] for info in infos])
+    energy = np.array(recorder.energy)
+    ends = [*takeovers[1:], len(commands)]
+    by_itself = []
+    if job.blend == "replace" and len(energy):
+        again = gym.make(job.env).unwrapped
+        pairs = list(zip(takeovers, ends, strict=True))[1:]
+        by_itself = [alone(again, *recorder.states[start], commands[start:end]) for start, end in pairs]
+    return Episode(
+        np.array([info["handover/seam_jump"] for info in infos])[1:],
+        np.maximum.reduceat(rates, takeovers)[1:],
+        np.maximum.reduceat(energy, takeovers)[1:] if len(energy) else energy,
+        by_itself,
+        blend_times[1:],
+        int((np.rint(blend_times / env.hold_s) > np.diff(takeovers, append=len(commands)))[1:].sum()),
+        limited,
+        recorder.error,
+        float(total),
+    )
+
+
+def run(job: Job, task: Task, act: Policy) -> dict[str, Any]:
+    """Run the episodes; one row."""
+    warnings.filterwarnings("ignore", message="a command was held back")  # counted below
+    recorder = Recorder(gym.make(job.env))
+    bounds = bounds_of(recorder, task)
+    given: dict[str, Any] = {
+        "-": {},
+        RATE: {"jerk_limit": bounds.jerk_limit},
+        RATE_AND_TIME: {"jerk_limit": bounds.jerk_limit, "blend_time": bounds.blend_time},
+    }[job.bounds]
+    env = sw.ChunkHandover(recorder, task.chunk, task.horizon, job.delay, blend=job.blend, **given)
+    seeds = range(1000 * job.seed, 1000 * job.seed + job.episodes)
+    episodes = [episode(env, recorder, act, job, bounds, seed) for seed in seeds]
+    rates = np.concatenate([e.rates for e in episodes])
+    jumps = np.concatenate([e.differences for e in episodes])
+    energies = np.concatenate([e.energies for e in episodes])
+    alone_energies = [x for e in episodes for x in e.alone]
+    returns = np.array([e.total for e in episodes])
+    steps = sum(len(e.errors) for e in episodes)
+    return asdict(job) | {
+        "bounds_chosen": bounds.reasons,
+        "seams": len(rates),
+        "difference_peak": jumps.max(axis=0).tolist(),
+        "difference_mean": jumps.mean(axis=0).tolist(),
+        "rate_peak": float(rates.max()),
+        "within": int((rates <= 1.0).sum()),
+        "limited": sum(e.limited for e in episodes) / steps,
+        "blend_time_mean_s": float(np.concatenate([e.blend_times for e in episodes]).mean()),
+        "cut_short": sum(e.cut for e in episodes) / len(rates),
+        "energy_peak_J": float(energies.max()) if len(energies) else None,
+        "energy_mean_J": float(energies.mean()) if len(energies) else None,
+        "alone_peak_J": max(alone_energies) if alone_energies else None,
+        "alone_mean_J": float(np.mean(alone_energies)) if alone_energies else None,
+        "tracking_error_mean_m": float(np.mean([x for e in episodes for x in e.errors])),
+        "return_mean": float(returns.mean()),
+        "return_standard_error": float(returns.std(ddof=1) / math.sqrt(len(returns))),
+    }
+
+
+def measured(tasks: tuple[Task, ...], episodes: int, seed: int, runs: Path) -> Iterator[dict[str, Any]]:
+    """Train what is not there, then all rows."""
+    torch.set_num_threads(1)
+    for task in tasks:
+        act = policy(task, runs)
+        for job in jobs(task.env, episodes, seed):
+            yield run(job, task, act)
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Markdown: for each env one line per delay and way of handing over, and what the columns are."""
+    blended = [r for r in rows if r["bounds"] != "-"]
+    within, seams = (sum(r[key] for r in blended) for key in ("within", "seams"))
+    parts = [
+        _part(env, [r for r in rows if r["env"] == env]) for env in dict.fromkeys(r["env"] for r in rows)
+    ]
+    return "\n\n".join(
+        [
+            *parts,
+            f"Rate kept at {within:,} of {seams:,} blended seams.",
+            "Differences: the largest first, second and third differences of neighbouring commands (N m, the larger "
+            "of the two motors') over a seam's blend and three steps more, peak and mean over the seams. Rate: the "
+            "largest `|du/dt|` from a seam to the next, in units of the bound; kept: the share of seams at which it "
+            "is within the bound. Held back: control steps at which a command was held back beyond the blend to keep "
+            "the rate. Blend: its mean length as planned, and the share of blends that the next seam cuts short. "
+            "Vibration: the largest boundary-layer energy from a seam to the next, peak and mean over the seams, and "
+            "how many times lower than with replacement at the same delay. Tracking error: from the fingertip to the "
+            "target, mean over all control steps. Return: mean over the episodes, with its standard error.",
+        ]
+    )
+
+
+def _part(env: str, rows: list[dict[str, Any]]) -> str:
+    lines = [
+        f"**{env}**. Bounds: {rows[0]['bounds_chosen']}.",
+        "",
+        "| delay | blend | bounds | seams | first difference, peak / mean | second | third | rate, peak | kept "
+        "| held back | blend (ms), cut short | vibration, peak / mean (mJ) | times lower "
+        "| tracking error (mm) | return |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for r in rows:
+        base = next(x for x in rows if x["blend"] == "replace" and x["delay"] == r["delay"])
+        jumps = [
+            f"{p:.3f} / {m:.3f}" for p, m in zip(r["difference_peak"], r["difference_mean"], strict=True)
+        ]
+        energies, lower = "-", "-"
+        if r["energy_peak_J"] is not None:
+            peak, mean = r["energy_peak_J"], r["energy_mean_J"]
+            energies = f"{1e3 * peak:.3g} / {1e3 * mean:.3g}"
+            lower = f"{base['energy_peak_J'] / peak:.1f} / {base['energy_mean_J'] / mean:.1f}"
+        cells = [
+            str(r["delay"]),
+            r["blend"],
+            r["bounds"],
+            f"{r['seams']:,}",
+            *jumps,
+            f"{r['rate_peak']:.2f}",
+            f"{r['within'] / r['seams']:.1%}",
+            "-" if r["bounds"] == "-" else f"{r['limited']:.1%}",
+            "-" if r["bounds"] == "-" else f"{1e3 * r['blend_time_mean_s']:.0f}, {r['cut_short']:.0%}",
+            energies,
+            lower,
+            f"{1e3 * r['tracking_error_mean_m']:.1f}",
+            f"{r['return_mean']:.2f} ± {r['return_standard_error']:.2f}",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    floors = [
+        f"{1e3 * r['alone_peak_J']:.3g} / {1e3 * r['alone_mean_J']:.3g} mJ at a delay of {r['delay']}"
+        for r in rows
+        if r["alone_peak_J"] is not None
+    ]
+    if floors:
+        lines += [
+            "",
+            f"Vibration of replacement's chunks alone, each begun without any: {', '.join(floors)}.",
+        ]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Run all rows, each kept as it comes, and print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--episodes", type=int, default=200, help="per row")
+    parser.add_argument("--envs", nargs="+", help="words; an env whose id has one of them is run")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--runs", type=Path, default=RUNS, help="folder of the trained policies")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="folder for the rows and the tables")
+    arguments = parser.parse_args()
+    tasks = tuple(t for t in TASKS if not arguments.envs or any(word in t.env for word in arguments.envs))
+    if not tasks:
+        parser.error(f"nothing to run; the envs are: {', '.join(t.env for t in TASKS)}")
+    if arguments.episodes < 2:
+        parser.error("--episodes is at least 2, for a standard error")
+    arguments.results.mkdir(parents=True, exist_ok=True)
+    rows: list[dict[str, Any]] = []
+    for row in measured(tasks, arguments.episodes, arguments.seed, arguments.runs):
+        rows.append(row)
+        (arguments.results / "seams.json").write_text(json.dumps(rows, indent=1) + "\n")
+        (arguments.results / "seams.md").write_text(table(rows) + "\n")
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()
