@@ -58,6 +58,7 @@ figures: .venv/installed
 	$(BIN)/python -m benchmarks.protected --hard --steps 100000
 	$(BIN)/python -m benchmarks.admission
 	$(BIN)/python -m benchmarks.leases
+	$(BIN)/python -m benchmarks.seams
 	for config in pointgoal1_300k velocity_experts halfcheetah_velocity_ppo swimmer_velocity_ppo ant_velocity_ppo \
 		halfcheetah_velocity_sac outages; do $(BIN)/safe-wrappers compare configs/$$config.yaml --report || exit 1; done
 
