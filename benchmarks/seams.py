@@ -10,8 +10,9 @@ chunks are jagged inside, and their own inside shakes the arm, not the seam. The
 without any bound, so what a bound costs in return is what it costs a policy that does not know of it.
 
 Plain replacement and temporal ensembling bound nothing. The blends are measured with a bound on the command's rate
-alone (`jerk_limit`), and with a least duration too (`blend_time`): the shortest blend that keeps a rate may still
-ring, a longer one makes the command late. Both come from the arm, or from the action's range, as `bounds_of` says.
+alone (`jerk_limit`), with a least duration alone (`blend_time`), and with both: the shortest blend that keeps a rate
+may still ring, and a policy that asks for faster changes than the rate allows loses return. Both come from the arm,
+or from the action's range, as `bounds_of` says.
 A trial with blends of 0.12 s had been seen when the rule for the arm's `blend_time` was written down; it gives
 0.12 s. Reacher's rate limit is the second one tried: the first, 10 N m/s, lies above what any seam of the policy asks
 for, so that its rows were replacement's.
@@ -56,8 +57,8 @@ PERIODS = 1.2
 leaves at most a tenth of the energy that the step itself would (`control.flexible_joint.smoothstep_energy`)."""
 RANGE_PER_SECOND = 1.0
 """Action ranges per second, where no arm says more: from one end to the other takes a second."""
-RATE, RATE_AND_TIME = "rate", "rate + time"
-"""What bounds a blend."""
+RATE, TIME, RATE_AND_TIME = "rate", "time", "rate + time"
+"""What bounds a blend; `TIME` bounds no rate, and shows what the rate's bound costs."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,7 @@ class Job:
 
     Attributes:
         blend: As `ChunkHandover` takes it.
-        bounds: `RATE`, `RATE_AND_TIME`, or "-" for a baseline.
+        bounds: `RATE`, `TIME`, `RATE_AND_TIME`, or "-" for a baseline.
         delay: Control steps.
     """
 
@@ -122,7 +123,7 @@ class Job:
 def jobs(env: str, episodes: int, seed: int) -> list[Job]:
     """The rows of an env's table."""
     ways = [("replace", "-"), ("ensemble", "-")]
-    ways += [(blend, bounds) for bounds in (RATE, RATE_AND_TIME) for blend in BLENDS]
+    ways += [(blend, bounds) for bounds in (RATE, TIME, RATE_AND_TIME) for blend in BLENDS]
     return [Job(env, blend, bounds, delay, episodes, seed) for delay in DELAYS for blend, bounds in ways]
 
 
@@ -266,6 +267,7 @@ def run(job: Job, task: Task, act: Policy) -> dict[str, Any]:
     given: dict[str, Any] = {
         "-": {},
         RATE: {"jerk_limit": bounds.jerk_limit},
+        TIME: {"blend_time": bounds.blend_time},
         RATE_AND_TIME: {"jerk_limit": bounds.jerk_limit, "blend_time": bounds.blend_time},
     }[job.bounds]
     env = sw.ChunkHandover(recorder, task.chunk, task.horizon, job.delay, blend=job.blend, **given)
@@ -308,7 +310,7 @@ def measured(tasks: tuple[Task, ...], episodes: int, seed: int, runs: Path) -> I
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown: for each env one line per delay and way of handing over, and what the columns are."""
-    blended = [r for r in rows if r["bounds"] != "-"]
+    blended = [r for r in rows if r["bounds"] in (RATE, RATE_AND_TIME)]
     within, seams = (sum(r[key] for r in blended) for key in ("within", "seams"))
     parts = [
         _part(env, [r for r in rows if r["env"] == env]) for env in dict.fromkeys(r["env"] for r in rows)
@@ -316,7 +318,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n\n".join(
         [
             *parts,
-            f"Rate kept at {within:,} of {seams:,} blended seams.",
+            f"Rate kept at {within:,} of {seams:,} seams that were blended with a bound on it.",
             "Differences: the largest first, second and third differences of neighbouring commands (N m, the larger "
             "of the two motors') over a seam's blend and three steps more, peak and mean over the seams. Rate: the "
             "largest `|du/dt|` from a seam to the next, in units of the bound; kept: the share of seams at which it "
@@ -356,7 +358,7 @@ def _part(env: str, rows: list[dict[str, Any]]) -> str:
             *jumps,
             f"{r['rate_peak']:.2f}",
             f"{r['within'] / r['seams']:.1%}",
-            "-" if r["bounds"] == "-" else f"{r['limited']:.1%}",
+            f"{r['limited']:.1%}" if r["bounds"] in (RATE, RATE_AND_TIME) else "-",
             "-" if r["bounds"] == "-" else f"{1e3 * r['blend_time_mean_s']:.0f}, {r['cut_short']:.0%}",
             energies,
             lower,
