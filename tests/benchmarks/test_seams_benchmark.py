@@ -146,6 +146,8 @@ def test_alone_a_held_torque_shakes_nothing_and_a_step_does_what_its_energy_says
     env = gym.make("FlexJointReach-v0").unwrapped
     env.reset(seed=0)
     state = np.array([0.3, 0.02, 1.2, -0.03]), np.array([0.5, 3.0, -0.4, 2.0])  # ringing as it was
+    fast = state[0], np.array([4.0, 3.0, -3.0, 2.0])
+    assert alone(env, *fast, np.array([[1.0, 0.3]])) < 1e-7  # 3e-4 J without the links' bias or the friction
     held = np.tile([1.0, 0.3], (6, 1))
     step = np.concatenate([held[:1], np.tile([-0.5, 0.3], (5, 1))])
     arm = env.arm
