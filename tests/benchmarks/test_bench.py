@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from benchmarks import env_step, mujoco_drivers
+from benchmarks import env_step, mujoco_drivers, wrapper_cost
 from benchmarks.cases import PROTECTED
 
 
@@ -57,3 +57,24 @@ def test_trainings_in_turn():
     assert found["steps"] == 1024
     assert found["filtered_s"] > 0.0 and found["without_s"] > 0.0
     assert found["median"] == pytest.approx(found["filtered_s"] / found["without_s"])
+
+
+@pytest.mark.filterwarnings("ignore:a command was held back")
+@pytest.mark.parametrize(("env_id", "name", "wrap"), wrapper_cost.ROWS, ids=lambda part: str(part)[:50])
+def test_every_wrapper_is_timed_per_control_step(env_id, name, wrap):
+    without, with_it = wrapper_cost.measure(env_id, wrap, rounds=2, batch=16)
+    assert min(without, with_it) > 0.0
+    env = wrap(gym.make(env_id))
+    step, steps = wrapper_cost.driver(env)
+    step()
+    counted = round(env.unwrapped.data.time / env.unwrapped.dt)
+    assert counted == steps and name.startswith(type(env).__name__.replace("Outages", "LeaseExpiry"))
+
+
+def test_random_chunks_all_need_their_blend():
+    env = wrapper_cost.bounded("smoothstep")(gym.make("Reacher-v5"))
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    with pytest.warns(UserWarning, match="held back"):
+        infos = [env.step(env.action_space.sample())[4] for _ in range(5)]
+    assert all(info["handover/blend_time"] > 0.0 for info in infos[1:])
