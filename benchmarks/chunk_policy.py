@@ -1,11 +1,12 @@
 """Policies that give whole chunks, trained with SB3's PPO through `ChunkHandover`.
 
-    python -m benchmarks.chunk_policy    # trains both, or says that they are there; about half an hour on one core
+    python -m benchmarks.chunk_policy    # trains all, or says that they are there; about an hour on one core
 
 The policy's action is a few knots per control, which a clamped cubic B-spline turns into the chunk. With a chunk's
 entries as separate actions PPO's exploration noise is drawn for each of them and what it learns is jagged: then the
 chunk's own inside shakes the arm, not the seam between two chunks. It is trained with plain replacement at every
-chunk and a delay drawn anew for each, so no way of blending has an advantage.
+chunk and a delay drawn anew for each, so no way of blending has an advantage; one of them through the blend, to show
+what is gained where the policy knows it.
 """
 
 import argparse
@@ -26,6 +27,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import safe_wrappers as sw
+from benchmarks.seam_bounds import bounds_of
 
 RUNS = Path(__file__).parents[1] / "runs" / "seams"
 Array = NDArray[np.float64]
@@ -48,6 +50,8 @@ class Task:
         steps: Chunks given in training.
         knots: Per chunk and control.
         seed: Of the training.
+        range_per_second: Of the action, that the bound on the rate lets it go through, where no arm says more.
+        bounded: Trained through the blend and its bounds, not through replacement.
     """
 
     env: str
@@ -57,11 +61,23 @@ class Task:
     delays: tuple[int, int] = (0, 5)
     knots: int = 5
     seed: int = 0
+    range_per_second: float = 1.0
+    bounded: bool = False
+
+    @property
+    def name(self) -> str:
+        """For the table."""
+        through = ", trained through smoothstep with rate and time" if self.bounded else ""
+        return f"{self.env}, H = {self.chunk}, s = {self.horizon}{through}"
 
 
 TASKS = (
     Task("FlexJointReach-v0", chunk=24, horizon=8, steps=307_200),
     Task("Reacher-v5", chunk=16, horizon=5, steps=307_200),
+    Task("FlexJointReach-v0", chunk=32, horizon=16, steps=204_800),
+    Task("FlexJointReach-v0", chunk=32, horizon=16, steps=204_800, bounded=True),
+    # A running gait goes from one end of the range to the other in two control steps.
+    Task("HalfCheetah-v5", chunk=16, horizon=5, steps=1_024_000, range_per_second=10.0),
 )
 
 Policy = Callable[[Array], Array]
@@ -93,9 +109,12 @@ def train(task: Task) -> tuple[Any, VecNormalize]:
     """PPO, and the statistics of its observations."""
 
     def make() -> gym.Env[Any, Any]:
-        handover = sw.ChunkHandover(
-            gym.make(task.env), task.chunk, task.horizon, list(task.delays), blend="replace"
-        )
+        env = gym.make(task.env)
+        given: dict[str, Any] = {"blend": "replace"}
+        if task.bounded:
+            bounds = bounds_of(env, task.horizon, task.range_per_second)
+            given = {"jerk_limit": bounds.jerk_limit, "blend_time": bounds.blend_time}
+        handover = sw.ChunkHandover(env, task.chunk, task.horizon, list(task.delays), **given)
         return Monitor(Knots(handover, task.knots))
 
     torch.set_num_threads(1)
@@ -130,6 +149,7 @@ def policy(task: Task, runs: Path = RUNS) -> Policy:
     """The task's policy, deterministic; trained if it is not there yet."""
     runs.mkdir(parents=True, exist_ok=True)
     name = f"{task.env}_H{task.chunk}_s{task.horizon}_{task.knots}knots_{task.steps}_seed{task.seed}"
+    name += "_through" if task.bounded else ""
     weights, statistics = runs / f"{name}.zip", runs / f"{name}.pkl"
     if not weights.exists():
         model, envs = train(task)

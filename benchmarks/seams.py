@@ -41,7 +41,8 @@ from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from benchmarks.chunk_policy import RUNS, TASKS, Policy, Task, policy
-from safe_wrappers.control.flexible_joint import manifold, resonances, torque_slew_limit
+from benchmarks.seam_bounds import Bounds, bounds_of
+from safe_wrappers.control.flexible_joint import manifold
 from safe_wrappers.control.seams import BLENDS
 from safe_wrappers.control.smoothstep import smoothstep
 
@@ -50,56 +51,8 @@ Array = NDArray[np.float64]
 
 DELAYS = (0, 2, 5)
 """Control steps."""
-RAMP_ENERGY = 1e-3
-"""J that one ramp of torque at the rate limit may leave ringing in the arm, in any pose."""
-PERIODS = 1.2
-"""Of the lowest resonance, that a blend takes at the least: over so long a smoothstep from one held torque to another
-leaves at most a tenth of the energy that the step itself would (`control.flexible_joint.smoothstep_energy`)."""
-RANGE_PER_SECOND = 1.0
-"""Action ranges per second, where no arm says more: from one end to the other takes a second."""
 RATE, TIME, RATE_AND_TIME = "rate", "time", "rate + time"
 """What bounds a blend; `TIME` bounds no rate, and shows what the rate's bound costs."""
-
-
-@dataclass(frozen=True)
-class Bounds:
-    """Of the blends on one env.
-
-    Attributes:
-        jerk_limit: One for each control, action units per second.
-        blend_time: s.
-        reasons: How they were chosen, for the table.
-    """
-
-    jerk_limit: list[float]
-    blend_time: float
-    reasons: str
-
-
-def bounds_of(env: Any, task: Task) -> Bounds:
-    """From the arm's resonances, or, where there are none, from the action's range and the time between seams."""
-    hold, high = env.get_wrapper_attr("dt"), env.action_space.high
-    arm = getattr(env.unwrapped, "arm", None)
-    if arm is None:
-        rate = float(RANGE_PER_SECOND * (env.action_space.high - env.action_space.low).min())
-        span = task.horizon * hold
-        reasons = (
-            f"rate {rate:g} N m/s, {RANGE_PER_SECOND:g} action range per second; time {span:.3g} s, the time "
-            "between two seams, so that a blend ends when the next begins"
-        )
-        return Bounds([rate] * len(high), span, reasons)
-    angles = np.zeros((721, 2))
-    angles[:, 1] = np.linspace(-math.pi, math.pi, len(angles))
-    constants = arm.stiffness, arm.rotor_inertia, arm.link_inertia(angles)
-    limit = torque_slew_limit(RAMP_ENERGY, *constants, weights=high, hold_s=hold).min(axis=0)
-    lowest = float(resonances(*constants).min()) / (2.0 * math.pi)
-    span = PERIODS / lowest
-    reasons = (
-        f"rate {limit[0]:.2f} and {limit[1]:.2f} N m/s, with which a single ramp of torque leaves at most "
-        f"{1e3 * RAMP_ENERGY:g} mJ ringing in any pose; time {span:.3f} s, {PERIODS} periods of the lowest resonance "
-        f"({lowest:.1f} Hz), over which a smoothstep leaves at most a tenth of the energy that the step itself would"
-    )
-    return Bounds(limit.tolist(), span, reasons)
 
 
 @dataclass(frozen=True)
@@ -107,12 +60,15 @@ class Job:
     """One way of handing over on one env, for some episodes.
 
     Attributes:
+        env: Its id.
+        task: Its table's name.
         blend: As `ChunkHandover` takes it.
         bounds: `RATE`, `TIME`, `RATE_AND_TIME`, or "-" for a baseline.
         delay: Control steps.
     """
 
     env: str
+    task: str
     blend: str
     bounds: str
     delay: int
@@ -120,11 +76,15 @@ class Job:
     seed: int
 
 
-def jobs(env: str, episodes: int, seed: int) -> list[Job]:
+def jobs(task: Task, episodes: int, seed: int) -> list[Job]:
     """The rows of an env's table."""
     ways = [("replace", "-"), ("ensemble", "-")]
     ways += [(blend, bounds) for bounds in (RATE, TIME, RATE_AND_TIME) for blend in BLENDS]
-    return [Job(env, blend, bounds, delay, episodes, seed) for delay in DELAYS for blend, bounds in ways]
+    return [
+        Job(task.env, task.name, blend, bounds, delay, episodes, seed)
+        for delay in DELAYS
+        for blend, bounds in ways
+    ]
 
 
 class Recorder(gym.Wrapper[Any, Any, Any, Any]):
@@ -134,7 +94,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         commands: Of this episode, each of shape (m,).
         states: Positions and velocities before each of them.
         energy: J, none where the env has no vibration.
-        error: m, from the fingertip to the target.
+        error: m, from the fingertip to the target; not a number where there is no such thing.
     """
 
     def reset(self, **options: Any) -> Any:
@@ -152,7 +112,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         self.commands.append(np.array(action, dtype=np.float64))
         if "vibration_energy" in info:
             self.energy.append(info["vibration_energy"])
-        self.error.append(info["tracking_error"] if "tracking_error" in info else -info["reward_dist"])
+        self.error.append(info.get("tracking_error", -info.get("reward_dist", np.nan)))
         return result
 
 
@@ -263,7 +223,7 @@ def run(job: Job, task: Task, act: Policy) -> dict[str, Any]:
     """Run the episodes; one row."""
     warnings.filterwarnings("ignore", message="a command was held back")  # counted below
     recorder = Recorder(gym.make(job.env))
-    bounds = bounds_of(recorder, task)
+    bounds = bounds_of(recorder, task.horizon, task.range_per_second)
     given: dict[str, Any] = {
         "-": {},
         RATE: {"jerk_limit": bounds.jerk_limit},
@@ -279,6 +239,7 @@ def run(job: Job, task: Task, act: Policy) -> dict[str, Any]:
     alone_energies = [x for e in episodes for x in e.alone]
     returns = np.array([e.total for e in episodes])
     steps = sum(len(e.errors) for e in episodes)
+    error = float(np.mean([x for e in episodes for x in e.errors]))
     return asdict(job) | {
         "bounds_chosen": bounds.reasons,
         "seams": len(rates),
@@ -293,7 +254,7 @@ def run(job: Job, task: Task, act: Policy) -> dict[str, Any]:
         "energy_mean_J": float(energies.mean()) if len(energies) else None,
         "alone_peak_J": max(alone_energies) if alone_energies else None,
         "alone_mean_J": float(np.mean(alone_energies)) if alone_energies else None,
-        "tracking_error_mean_m": float(np.mean([x for e in episodes for x in e.errors])),
+        "tracking_error_mean_m": None if math.isnan(error) else error,
         "return_mean": float(returns.mean()),
         "return_standard_error": float(returns.std(ddof=1) / math.sqrt(len(returns))),
     }
@@ -304,7 +265,7 @@ def measured(tasks: tuple[Task, ...], episodes: int, seed: int, runs: Path) -> I
     torch.set_num_threads(1)
     for task in tasks:
         act = policy(task, runs)
-        for job in jobs(task.env, episodes, seed):
+        for job in jobs(task, episodes, seed):
             yield run(job, task, act)
 
 
@@ -313,7 +274,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     blended = [r for r in rows if r["bounds"] in (RATE, RATE_AND_TIME)]
     within, seams = (sum(r[key] for r in blended) for key in ("within", "seams"))
     parts = [
-        _part(env, [r for r in rows if r["env"] == env]) for env in dict.fromkeys(r["env"] for r in rows)
+        _part(name, [r for r in rows if r["task"] == name]) for name in dict.fromkeys(r["task"] for r in rows)
     ]
     return "\n\n".join(
         [
@@ -331,9 +292,9 @@ def table(rows: list[dict[str, Any]]) -> str:
     )
 
 
-def _part(env: str, rows: list[dict[str, Any]]) -> str:
+def _part(name: str, rows: list[dict[str, Any]]) -> str:
     lines = [
-        f"**{env}**. Bounds: {rows[0]['bounds_chosen']}.",
+        f"**{name}**. Bounds: {rows[0]['bounds_chosen']}.",
         "",
         "| delay | blend | bounds | seams | first difference, peak / mean | second | third | rate, peak | kept "
         "| held back | blend (ms), cut short | vibration, peak / mean (mJ) | times lower "
@@ -362,7 +323,7 @@ def _part(env: str, rows: list[dict[str, Any]]) -> str:
             "-" if r["bounds"] == "-" else f"{1e3 * r['blend_time_mean_s']:.0f}, {r['cut_short']:.0%}",
             energies,
             lower,
-            f"{1e3 * r['tracking_error_mean_m']:.1f}",
+            "-" if r["tracking_error_mean_m"] is None else f"{1e3 * r['tracking_error_mean_m']:.1f}",
             f"{r['return_mean']:.2f} ± {r['return_standard_error']:.2f}",
         ]
         lines.append("| " + " | ".join(cells) + " |")
@@ -383,21 +344,28 @@ def main() -> None:
     """Run all rows, each kept as it comes, and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--episodes", type=int, default=200, help="per row")
-    parser.add_argument("--envs", nargs="+", help="words; an env whose id has one of them is run")
+    parser.add_argument(
+        "--envs",
+        nargs="+",
+        help="words; a task whose name has one of them is run, and its rows take their place in the tables",
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--runs", type=Path, default=RUNS, help="folder of the trained policies")
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder for the rows and the tables")
     arguments = parser.parse_args()
-    tasks = tuple(t for t in TASKS if not arguments.envs or any(word in t.env for word in arguments.envs))
+    tasks = tuple(t for t in TASKS if not arguments.envs or any(word in t.name for word in arguments.envs))
     if not tasks:
         parser.error(f"nothing to run; the envs are: {', '.join(t.env for t in TASKS)}")
     if arguments.episodes < 2:
         parser.error("--episodes is at least 2, for a standard error")
     arguments.results.mkdir(parents=True, exist_ok=True)
-    rows: list[dict[str, Any]] = []
+    names = [task.name for task in tasks]
+    kept = arguments.results / "seams.json"
+    others = json.loads(kept.read_text()) if kept.exists() and arguments.envs else []
+    rows: list[dict[str, Any]] = [row for row in others if row["task"] not in names]
     for row in measured(tasks, arguments.episodes, arguments.seed, arguments.runs):
         rows.append(row)
-        (arguments.results / "seams.json").write_text(json.dumps(rows, indent=1) + "\n")
+        kept.write_text(json.dumps(rows, indent=1) + "\n")
         (arguments.results / "seams.md").write_text(table(rows) + "\n")
     print(table(rows))
 

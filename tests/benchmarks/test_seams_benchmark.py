@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from benchmarks import chunk_policy, seams
+from benchmarks import chunk_policy, seam_bounds, seams
 from benchmarks.chunk_policy import TASKS, basis
-from benchmarks.seams import Bounds, Job, Recorder, alone, bounds_of, episode, faded_in, jobs, table
+from benchmarks.seam_bounds import Bounds, bounds_of
+from benchmarks.seams import Job, Recorder, alone, episode, faded_in, jobs, table
 from safe_wrappers.control.flexible_joint import smoothstep_energy, step_energy
 
-FLEX, REACHER = TASKS
-TINY = tuple(dataclasses.replace(task, steps=1) for task in TASKS)  # one rollout
+FLEX, REACHER = TASKS[:2]
+TINY = tuple(dataclasses.replace(task, steps=1) for task in TASKS[:2])  # one rollout
 LONG_AGO = 10**6
 
 
@@ -71,7 +72,7 @@ def alternating():
 def run_scripted(delay, blend, bounds, **given):
     recorder = Recorder(Shaken())
     env = sw.ChunkHandover(recorder, 12, 4, delay, blend=blend, fallback="zero", **given)
-    job = Job("Shaken", "scripted", "-", delay, 2, 0)  # no arm to execute its chunks on alone
+    job = Job("Shaken", "Shaken", "scripted", "-", delay, 2, 0)  # no arm to execute its chunks on alone
     return episode(env, recorder, alternating(), job, bounds, seed=0), recorder
 
 
@@ -107,7 +108,10 @@ def test_a_blend_that_keeps_the_limit_and_is_cut_short():
 def test_every_method_fades_in_from_nothing_and_leaves_the_rest_alone(delay):
     recorder = Recorder(gym.make("FlexJointReach-v0"))
     env = sw.ChunkHandover(recorder, 24, 8, delay, blend="replace")
-    job, bounds = Job("FlexJointReach-v0", "replace", "-", delay, 2, 0), bounds_of(recorder, FLEX)
+    job, bounds = (
+        Job("FlexJointReach-v0", FLEX.name, "replace", "-", delay, 2, 0),
+        bounds_of(recorder, FLEX.horizon, 1.0),
+    )
     episode(env, recorder, lambda observation: np.ones((24, 2)), job, bounds, seed=0)
     sent = np.array(recorder.commands)[delay:, 0]
     assert (np.diff(sent[:13]) > 0.0).all()
@@ -119,7 +123,7 @@ def test_every_method_fades_in_from_nothing_and_leaves_the_rest_alone(delay):
 
 def test_the_arms_bounds_keep_what_they_say():
     env = gym.make("FlexJointReach-v0")
-    bounds = bounds_of(env, FLEX)
+    bounds = bounds_of(env, FLEX.horizon, 1.0)
     arm = env.unwrapped.arm
     angles = np.zeros((50, 2))
     angles[:, 1] = np.linspace(0.0, np.pi, 50)
@@ -139,7 +143,7 @@ def test_the_arms_bounds_keep_what_they_say():
                 torque = np.array(signs) * bounds.jerk_limit * min(k + 1, 6) * 0.01
                 energy = raw.step(torque)[4]["vibration_energy"]
                 worst = max(worst, energy if k >= 6 else 0.0)
-        assert worst < 1.1 * seams.RAMP_ENERGY
+        assert worst < 1.1 * seam_bounds.RAMP_ENERGY
 
 
 def test_alone_a_held_torque_shakes_nothing_and_a_step_does_what_its_energy_says():
@@ -159,7 +163,7 @@ def test_alone_a_held_torque_shakes_nothing_and_a_step_does_what_its_energy_says
 
 
 def test_reachers_bounds_come_from_the_action_and_the_time_between_seams():
-    bounds = bounds_of(gym.make("Reacher-v5"), REACHER)
+    bounds = bounds_of(gym.make("Reacher-v5"), REACHER.horizon, 1.0)
     assert bounds.jerk_limit == [2.0, 2.0]
     assert bounds.blend_time == pytest.approx(0.1)
 
@@ -179,7 +183,7 @@ def test_a_tiny_run_trains_once_and_writes_every_row(tmp_path, monkeypatch, caps
     monkeypatch.setattr(chunk_policy, "train", counted)
     seams.main()
     rows = json.loads((tmp_path / "seams.json").read_text())
-    assert len(rows) == sum(len(jobs(task.env, 2, 0)) for task in TINY) == 44
+    assert len(rows) == sum(len(jobs(task, 2, 0)) for task in TINY) == 44
     for row in rows:
         with_rate = row["bounds"] in ("rate", "rate + time")
         assert row["within"] == row["seams"] or not with_rate
@@ -199,6 +203,31 @@ def test_a_tiny_run_trains_once_and_writes_every_row(tmp_path, monkeypatch, caps
     assert len(trained) == 2
     assert (tmp_path / "seams.json").read_text() == before  # the same policy, the same episodes
     assert table(rows) == (tmp_path / "seams.md").read_text().rstrip("\n")
+
+    monkeypatch.setattr(sys, "argv", [*arguments, "--envs", "Flex"])
+    seams.main()  # the other task's rows stay, these are made anew
+    again = json.loads((tmp_path / "seams.json").read_text())
+    assert sorted(again, key=str) == sorted(rows, key=str) and again != rows
+
+
+def test_a_bounded_policy_is_trained_through_its_bounds(monkeypatch):
+    given = []
+    real = sw.ChunkHandover
+
+    def seen(env, *sizes, **options):
+        given.append(options)
+        return real(env, *sizes, **options)
+
+    monkeypatch.setattr(sw, "ChunkHandover", seen)
+    for task in (TINY[0], dataclasses.replace(TINY[0], bounded=True)):
+        chunk_policy.train(task)
+    bounds = bounds_of(gym.make("FlexJointReach-v0"), FLEX.horizon, 1.0)
+    assert {"jerk_limit": bounds.jerk_limit, "blend_time": bounds.blend_time} in given
+    assert {"blend": "replace"} in given and len(given) == 8
+
+
+def test_names_tell_tasks_apart():
+    assert len({task.name for task in TASKS}) == len(TASKS)
 
 
 @pytest.mark.parametrize("wrong", [["--episodes", "1"], ["--envs", "Walker"]])
