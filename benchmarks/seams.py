@@ -286,8 +286,8 @@ def table(rows: list[dict[str, Any]]) -> str:
             "share of seams at which it is within the bound. Held back: control steps at which a command was held "
             "back beyond the blend to keep the rate. Blend: its mean length as planned, and the share of blends that "
             "the next seam cuts short. Vibration: the largest boundary-layer energy from a seam to the next, peak "
-            "and mean over the seams, and how many times lower than with replacement at the same delay. Tracking error: "
-            "from the fingertip to the target, mean over all control steps. Return: mean over the episodes, with its "
+            "and mean over the seams, and how many times lower than with replacement at the same delay. Tracking "
+            "error: from the fingertip to the target, mean over all control steps. Return: mean over the episodes, with its "
             "standard error.",
         ]
     )
