@@ -280,15 +280,15 @@ def table(rows: list[dict[str, Any]]) -> str:
         [
             *parts,
             f"Rate kept at {within:,} of {seams:,} seams that were blended with a bound on it.",
-            "Differences: the largest first, second and third differences of neighbouring commands (action units, "
-            "N m on the arm; the component with the largest) over a seam's blend and three steps more, peak and mean "
-            "over the seams. Rate: the largest `|du/dt|` from a seam to the next, in units of the bound; kept: the "
-            "share of seams at which it is within the bound. Held back: control steps at which a command was held "
-            "back beyond the blend to keep the rate. Blend: its mean length as planned, and the share of blends that "
-            "the next seam cuts short. Vibration: the largest boundary-layer energy from a seam to the next, peak "
-            "and mean over the seams, and how many times lower than with replacement at the same delay. Tracking "
-            "error: from the fingertip to the target, mean over all control steps. Return: mean over the episodes, with its "
-            "standard error.",
+            "Differences: the largest first, second and third differences of neighbouring commands (action units,"
+            " N m on the arm; the component with the largest) over a seam's blend and three steps more, peak and "
+            "mean over the seams. Rate: the largest `|du/dt|` from a seam to the next, in units of the bound; "
+            "kept: the share of seams at which it is within the bound. Held back: control steps at which a "
+            "command was held back beyond the blend to keep the rate. Blend: its mean length as planned, and the "
+            "share of blends that the next seam cuts short. Vibration: the largest boundary-layer energy from a "
+            "seam to the next, peak and mean over the seams, and how many times lower than with replacement at "
+            "the same delay. Tracking error: from the fingertip to the target, mean over all control steps. "
+            "Return: mean over the episodes, with its standard error.",
         ]
     )
 

@@ -60,7 +60,11 @@ def test_trainings_in_turn():
 
 
 @pytest.mark.filterwarnings("ignore:a command was held back")
-@pytest.mark.parametrize(("env_id", "name", "wrap"), wrapper_cost.ROWS, ids=lambda part: str(part)[:50])
+@pytest.mark.parametrize(
+    ("env_id", "name", "wrap"),
+    wrapper_cost.ROWS,
+    ids=[f"{env}: {name}" for env, name, _ in wrapper_cost.ROWS],
+)
 def test_every_wrapper_is_timed_per_control_step(env_id, name, wrap):
     without, with_it = wrapper_cost.measure(env_id, wrap, rounds=2, batch=16)
     assert min(without, with_it) > 0.0
