@@ -89,6 +89,8 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         steps_per_entry: Control steps from one entry of a chunk to the next, for policies that are slower than the
             control loop: the commands between are a cubic Hermite spline's (`wrappers/upsampling.py`). H then is
             `(chunk_size - 1) * steps_per_entry + 1` control steps.
+        clock_error_s: Bound on how far ahead the clock of who stamps the chunks may be, s: a stamp that is ahead of
+            `now_s` by no more counts as now. One that is farther ahead is refused.
 
     Info, at every step (see `safe_wrappers.interventions`): ``handover/seam_jump``, ``handover/peak_jerk``,
     ``handover/blend_time``, ``handover/starved``, ``handover/limited``, ``handover/refused``,
@@ -129,6 +131,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         hold_s: float | None = None,
         decay: float = 0.01,
         steps_per_entry: int = 1,
+        clock_error_s: float = 0.0,
     ) -> None:
         _refuse_order(env)  # first: with a handover inside the actions are no vector either
         space = check_actions(env)
@@ -151,11 +154,13 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             hold_s=hold_s,
             decay=decay,
             steps_per_entry=sizes.steps_per_entry,
+            clock_error_s=clock_error_s,
         )
         gym.Wrapper.__init__(self, env)
         self.chunk_size, self.execution_horizon, self.blend = sizes.entries, sizes.horizon, blend
         self.hold_s = control_interval(env, hold_s)
         self._delay = sizes.delay
+        self._clock_error_s = non_negative("clock_error_s", clock_error_s, "s")
         self._upsampling = Upsampling(sizes.entries, sizes.steps_per_entry)
         self._controls = space.shape[0]
         self.action_space = gym.spaces.Box(
@@ -274,7 +279,10 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             return True
         if not np.isfinite(chunk).all():
             return False
-        observed = math.floor(self._evidence / self.hold_s + _SAME_STEP)
+        evidence = self._evidence
+        if self.now_s < evidence <= self.now_s + self._clock_error_s + _SAME_STEP * self.hold_s:
+            evidence = self.now_s
+        observed = math.floor(evidence / self.hold_s + _SAME_STEP)
         return self._queue.submit(self._upsampling.commands(chunk), observed, self._queue.now + delay)
 
     def _forget(self) -> None:

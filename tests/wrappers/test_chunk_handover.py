@@ -17,7 +17,7 @@ from slow_handover import BLENDS, Slow, measured
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError
-from safe_wrappers.wrappers.faults import FrozenPolicy, RepeatedCommands
+from safe_wrappers.wrappers.faults import ClockSkew, FrozenPolicy, RepeatedCommands
 from safe_wrappers.wrappers.receiver import CommandReceiver
 
 HOLD = 0.1
@@ -1118,3 +1118,21 @@ def test_an_ordinary_policys_action_is_a_chunk_of_one():
         env.step(np.zeros(3))
     with pytest.raises(ActionError, match=r"\(2, 2\)"):
         sw.ChunkHandover(gym.make("Reacher-v5"), 2, 1, jerk_limit=1.0).step(np.zeros(2))
+
+
+@pytest.mark.parametrize(("allowed_s", "refused"), [(0.0, True), (0.025, True), (0.03, False), (1.0, False)])
+def test_a_clock_that_is_ahead_is_forgiven_as_far_as_it_is_declared(allowed_s, refused):
+    arm = sw.ChunkHandover(gym.make("FlexJointReach-v0"), 8, 4, jerk_limit=50.0, clock_error_s=allowed_s)
+    env = ClockSkew(arm, offset_s=0.03)  # three control steps
+    env.reset(seed=0)
+    assert gym.make(arm.spec).get_wrapper_attr("_clock_error_s") == allowed_s
+    for _ in range(5):
+        info = env.step(np.zeros((8, 2), np.float32))[4]
+        assert info["handover/refused"] is refused
+        assert info["handover/starved"] == (4 if refused else 0)
+        assert info["handover/latency"] == (-1 if refused else 0)
+
+
+def test_a_clock_error_is_a_time():
+    with pytest.raises(ConfigurationError, match="clock_error_s"):
+        sw.ChunkHandover(gym.make("Reacher-v5"), 8, 4, jerk_limit=50.0, clock_error_s=-0.1)
