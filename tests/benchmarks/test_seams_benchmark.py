@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
+
+pytest.importorskip("stable_baselines3")  # the policies are SB3's
+
 from benchmarks import chunk_policy, seam_bounds, seams
 from benchmarks.chunk_policy import TASKS, basis
 from benchmarks.seam_bounds import Bounds, bounds_of
