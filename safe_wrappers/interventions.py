@@ -90,7 +90,8 @@ LEASE_REMAINING_S: Final = "lease/remaining_s"
 LEASE_EXPIRED: Final = "lease/expired"
 """bool: a lease ran out at this control step (once per lease)."""
 LEASE_REFUSED: Final = "lease/refused"
-"""bool: a fresh command came and was not granted a lease, or a chunk was refused as out of reach."""
+"""bool: a command was refused: a fresh one was not granted a lease, or it was not finite, older than the one in
+force or from the future, or a chunk's end was out of reach."""
 LEASE_BRAKING: Final = "lease/braking"
 """bool: the fallback acted at this control step."""
 

@@ -11,6 +11,7 @@ Source: appendix "Bumpless transfer and smoothstep blending".
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from safe_wrappers.control.finite import finite_arrays
 from safe_wrappers.control.polynomials import bracketed_root
 from safe_wrappers.errors import ConfigurationError
 
@@ -21,23 +22,6 @@ SMOOTHSTEP_PEAK_RATE = 1.875
 
 _ROUND_UP = 1.0 + 1e-12
 """Blend times are lengthened by this factor, so that rounding never makes them too short."""
-
-
-def _finite(**values: ArrayLike) -> list[Array]:
-    arrays = []
-    for name, given in values.items():
-        try:
-            array = np.asarray(given, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise ConfigurationError(f"{name} is a number or an array of numbers, got {given!r}") from None
-        if not np.isfinite(array).all():
-            raise ConfigurationError(f"{name} must be finite, got {array}")
-        arrays.append(array)
-    try:
-        return list(np.broadcast_arrays(*arrays))
-    except ValueError:
-        shapes = ", ".join(f"{name} {array.shape}" for name, array in zip(values, arrays, strict=True))
-        raise ConfigurationError(f"expected shapes that broadcast together, got {shapes}") from None
 
 
 def _positive(name: str, values: Array) -> None:
@@ -119,7 +103,7 @@ def shortest_latched_blend(step: ArrayLike, rate_limit: ArrayLike) -> Array:
     Raises:
         ConfigurationError: For a limit that is not positive, or input that is not finite.
     """
-    step, limit = _finite(step=step, rate_limit=rate_limit)
+    step, limit = finite_arrays(step=step, rate_limit=rate_limit)
     _positive("rate_limit", limit)
     return np.asarray(SMOOTHSTEP_PEAK_RATE * np.abs(step) / limit * _ROUND_UP)
 
@@ -184,7 +168,7 @@ def moving_blend_interval(
     Raises:
         ConfigurationError: For a limit that is not positive, or input that is not finite.
     """
-    prior, prior_rate, new, new_rate, limit = _finite(
+    prior, prior_rate, new, new_rate, limit = finite_arrays(
         prior=prior, prior_rate=prior_rate, new=new, new_rate=new_rate, rate_limit=rate_limit
     )
     _positive("rate_limit", limit)

@@ -14,6 +14,7 @@ Source: appendix "Smooth Trajectories and Bumpless Transfer".
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from safe_wrappers.control.finite import finite_arrays
 from safe_wrappers.control.polynomials import Extrema, differentiate, extrema, value
 from safe_wrappers.errors import ConfigurationError
 
@@ -31,22 +32,7 @@ def _positive_duration(duration: ArrayLike) -> Array:
 
 
 def _boundary(duration: ArrayLike, **values: ArrayLike) -> tuple[Array, list[Array]]:
-    span = _positive_duration(duration)
-    arrays = [span]
-    for name, given in values.items():
-        try:
-            array = np.asarray(given, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise ConfigurationError(f"{name} is a number or an array of numbers, got {given!r}") from None
-        if not np.isfinite(array).all():
-            raise ConfigurationError(f"{name} must be finite, got {array}")
-        arrays.append(array)
-    try:
-        span, *arrays = np.broadcast_arrays(*arrays)
-    except ValueError:
-        shapes = ", ".join(str(array.shape) for array in arrays)
-        names = ", ".join(["duration", *values])
-        raise ConfigurationError(f"{names} must have shapes that broadcast together, got {shapes}") from None
+    span, *arrays = finite_arrays(duration=_positive_duration(duration), **values)
     return span, arrays
 
 

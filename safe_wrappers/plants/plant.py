@@ -4,6 +4,7 @@ A Plant may be wrong on purpose (other masses, other damping): that is how misma
 violation is always the env, never the Plant.
 """
 
+from collections.abc import Iterator
 from typing import Any, Protocol, runtime_checkable
 
 import gymnasium as gym
@@ -89,19 +90,25 @@ def refuse_second_env(bound: gym.Env[Any, Any] | None, env: gym.Env[Any, Any]) -
         )
 
 
+def wrappers_of(env: gym.Env[Any, Any]) -> Iterator[Any]:
+    """All wrappers of an env, the outermost first."""
+    inner: Any = env
+    while isinstance(inner, gym.Wrapper):
+        yield inner
+        inner = inner.env
+
+
 _REPEATS = ("StickyAction", "MaxAndSkipObservation", "RepeatAction")
 
 
 def refuse_changed_actions(env: gym.Env[Any, Any]) -> None:
     """Refuse wrappers inside the filter that change, repeat or drop the action it has checked."""
-    inner: Any = env
-    while isinstance(inner, gym.Wrapper):
+    for inner in wrappers_of(env):
         if isinstance(inner, gym.ActionWrapper) or type(inner).__name__ in _REPEATS:
             raise ConfigurationError(
                 f"{type(inner).__name__} inside the filter changes the actions that the filter has checked; "
                 "put it outside (filter first, then this wrapper), so that the filter has the last word"
             )
-        inner = inner.env
 
 
 def seconds(name: str, value: Any) -> float:

@@ -7,6 +7,7 @@ import gymnasium as gym
 from safe_wrappers import interventions as keys
 from safe_wrappers.constraints.constraint import non_negative
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.plant import wrappers_of
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.chunk_handover import ChunkHandover
 
@@ -89,9 +90,8 @@ class AdaptionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
 
 
 def _check_inside(env: gym.Env[Any, Any]) -> None:
-    inner: Any = env
     filtered = False
-    while isinstance(inner, gym.Wrapper):
+    for inner in wrappers_of(env):
         if isinstance(inner, AdaptionPenalty):
             raise ConfigurationError(
                 "this env has an AdaptionPenalty already; its penalty would be taken twice"
@@ -102,7 +102,6 @@ def _check_inside(env: gym.Env[Any, Any]) -> None:
                 "ChunkHandover(AdaptionPenalty(...), ...)"
             )
         filtered = filtered or isinstance(inner, CBFActionFilter)
-        inner = inner.env
     if not filtered:
         raise ConfigurationError(
             "AdaptionPenalty needs a CBFActionFilter inside, which says when an action was changed:"

@@ -18,7 +18,7 @@ from safe_wrappers.constraints.plain_data import constraint_data, constraint_fro
 from safe_wrappers.control.projection import check_solver
 from safe_wrappers.errors import ActionError, ConfigurationError, UnsafeStateWarning
 from safe_wrappers.plants.mujoco import MujocoPlant
-from safe_wrappers.plants.plant import Plant, check_actions
+from safe_wrappers.plants.plant import Plant, check_actions, wrappers_of
 from safe_wrappers.wrappers.decision import Decider
 from safe_wrappers.wrappers.fallback import Fallback, FallbackFunction
 from safe_wrappers.wrappers.own_plant import PlantOfSpec, own_plant
@@ -270,18 +270,12 @@ def _nothing(plant: Plant) -> None:
 
 def is_filtered(env: gym.Env[Any, Any]) -> bool:
     """Whether there is a filter among an env's wrappers."""
-    inner: Any = env
-    while isinstance(inner, gym.Wrapper):
-        if isinstance(inner, CBFActionFilter):
-            return True
-        inner = inner.env
-    return False
+    return any(isinstance(inner, CBFActionFilter) for inner in wrappers_of(env))
 
 
 def _refuse_nesting(env: gym.Env[Any, Any]) -> None:
     """Layers that filter one after another undo each other, and the outer one's report would be wrong."""
-    inner: Any = env
-    while isinstance(inner, gym.Wrapper):
+    for inner in wrappers_of(env):
         if isinstance(inner, CBFActionFilter):
             raise ConfigurationError(
                 "this env is filtered already; constraints compose in one projection, so pass all of them to one "
@@ -292,7 +286,6 @@ def _refuse_nesting(env: gym.Env[Any, Any]) -> None:
                 f"{type(inner).__name__} inside the filter changes the actions that the filter has checked; the "
                 "filter has the last word: ChunkHandover(LeaseExpiry(CBFActionFilter(env, ...), ...), ...)"
             )
-        inner = inner.env
 
 
 def _with_margin(constraint: Constraint, margin: float) -> Constraint:

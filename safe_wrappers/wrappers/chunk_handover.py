@@ -13,7 +13,7 @@ from safe_wrappers import interventions as keys
 from safe_wrappers.constraints.constraint import non_negative
 from safe_wrappers.control.seams import BLENDS, DIFFERENCES
 from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError
-from safe_wrappers.plants.plant import Plant, check_actions
+from safe_wrappers.plants.plant import Plant, check_actions, wrappers_of
 from safe_wrappers.wrappers.chunk_queue import BASELINES, ChunkQueue, Command
 from safe_wrappers.wrappers.chunk_sizes import ChunkSizes, blend_bounds
 from safe_wrappers.wrappers.control_interval import control_interval
@@ -334,10 +334,8 @@ def _plain(value: Any) -> Any:
 
 
 def _refuse_order(env: gym.Env[Any, Any]) -> None:
-    inner: Any = env
-    while isinstance(inner, gym.Wrapper):
+    for inner in wrappers_of(env):
         if isinstance(inner, ChunkHandover):
             raise ConfigurationError(
                 "this env takes chunks already, from a ChunkHandover inside, and a chunk of chunks has no meaning"
             )
-        inner = inner.env

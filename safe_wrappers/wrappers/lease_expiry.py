@@ -16,7 +16,7 @@ from safe_wrappers.control.leases import LeaseDelays
 from safe_wrappers.control.smoothstep import smoothstep
 from safe_wrappers.errors import ActionError, ConfigurationError
 from safe_wrappers.plants.mujoco import MujocoPlant
-from safe_wrappers.plants.plant import Plant, check_actions, refuse_changed_actions
+from safe_wrappers.plants.plant import Plant, check_actions, refuse_changed_actions, wrappers_of
 from safe_wrappers.wrappers.admission import Admission, Measured
 from safe_wrappers.wrappers.cbf_action_filter import is_filtered
 from safe_wrappers.wrappers.control_interval import control_interval
@@ -394,28 +394,20 @@ def _least(env: gym.Env[Any, Any], least_s: float, longest_s: float) -> float:
 
 def _refuse_order(env: gym.Env[Any, Any]) -> None:
     """One lease, and inside whatever carries commands to it."""
-    inner: Any = env
-    while isinstance(inner, gym.Wrapper):
+    for inner in wrappers_of(env):
         if isinstance(inner, CommandReceiver):
             raise ConfigurationError(
                 f"{type(inner).__name__} inside LeaseExpiry: the lease must be inside of what hands commands over, "
                 "once: ChunkHandover(LeaseExpiry(CBFActionFilter(env, ...), ...), ...)"
             )
-        if (
-            type(inner).__name__ == "RecordInterventions"
-        ):  # by name: it imports ChunkHandover, which imports this
+        # By name: it imports ChunkHandover, which imports this.
+        if type(inner).__name__ == "RecordInterventions":
             raise ConfigurationError(
                 "RecordInterventions inside LeaseExpiry would count no lease that expires; put it outside: "
                 "RecordInterventions(LeaseExpiry(...))"
             )
-        inner = inner.env
 
 
 def lease_inside(env: gym.Env[Any, Any]) -> LeaseExpiry | None:
     """The LeaseExpiry among an env's wrappers, if there is one."""
-    inner: Any = env
-    while isinstance(inner, gym.Wrapper):
-        if isinstance(inner, LeaseExpiry):
-            return inner
-        inner = inner.env
-    return None
+    return next((inner for inner in wrappers_of(env) if isinstance(inner, LeaseExpiry)), None)

@@ -5,6 +5,8 @@ from typing import Any
 
 import gymnasium as gym
 
+from safe_wrappers.plants.plant import wrappers_of
+
 
 class CommandReceiver(ABC):
     """What `ChunkHandover` and `LeaseExpiry` have in common: they are told what the next action is made from.
@@ -31,9 +33,4 @@ class CommandReceiver(ABC):
 
 def receiver_inside(env: gym.Env[Any, Any]) -> CommandReceiver | None:
     """The outermost receiver of an env's wrappers."""
-    inner: Any = env
-    while isinstance(inner, gym.Wrapper):
-        if isinstance(inner, CommandReceiver):
-            return inner
-        inner = inner.env
-    return None
+    return next((inner for inner in wrappers_of(env) if isinstance(inner, CommandReceiver)), None)

@@ -14,6 +14,7 @@ import numpy as np
 
 from safe_wrappers import interventions as keys
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.plant import wrappers_of
 from safe_wrappers.wrappers.chunk_handover import ChunkHandover
 
 COLUMNS: Final = (
@@ -206,14 +207,12 @@ class RecordInterventions(
 
 
 def _refuse_chunks(env: gym.Env[Any, Any]) -> None:
-    inner: Any = env
-    while isinstance(inner, gym.Wrapper):
+    for inner in wrappers_of(env):
         if isinstance(inner, ChunkHandover):
             raise ConfigurationError(
                 "RecordInterventions outside of ChunkHandover would count chunks, not control steps; put it inside: "
                 "ChunkHandover(RecordInterventions(...), ...)"
             )
-        inner = inner.env
 
 
 def read_episodes(path: str | os.PathLike[str]) -> list[dict[str, float]]:

@@ -104,9 +104,12 @@ class Room:
             self.constraint.bind(plant)
 
     def reset(self) -> None:
-        """Forget the episode."""
+        """Forget the episode, and let the constraint refuse what only a state can show."""
         if hasattr(self.constraint, "reset"):
             self.constraint.reset()
+        if hasattr(self.constraint, "check"):
+            self._plant.observe()
+            self.constraint.check(self._plant)
 
     def longest_lease(self, delays_s: float) -> float:
         """The longest lease from here, s; zero or less: revoke.

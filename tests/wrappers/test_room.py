@@ -414,3 +414,26 @@ def test_reading_is_of_the_env_that_it_wraps():
     env.reset()
     env.step(FULL)
     assert seen == [inner]
+
+
+class Checked:
+    """A constraint that only a state can show to be wrong."""
+
+    def rows(self, plant):
+        raise AssertionError("a lease needs no rows")
+
+    def value(self, plant):
+        return np.ones(1)
+
+    def check(self, plant):
+        if plant.qpos[0] > 1.0:
+            raise ConfigurationError("too far out")
+
+
+def test_what_only_a_state_can_show_is_refused_at_the_reset():
+    cart = gym.make("InvertedPendulum-v5")
+    lease = sw.LeaseExpiry(cart, Checked(), closing_speed=1.0)
+    lease.reset(seed=0)
+    cart.unwrapped.reset_model = lambda: cart.unwrapped.set_state(np.array([2.0, 0.0]), np.zeros(2))
+    with pytest.raises(ConfigurationError, match="too far out"):
+        lease.reset(seed=0)

@@ -9,6 +9,7 @@ import numpy as np
 
 from safe_wrappers import interventions as keys
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.plant import wrappers_of
 from safe_wrappers.wrappers.control_interval import control_interval
 from safe_wrappers.wrappers.own_random import OwnRandom
 from safe_wrappers.wrappers.receiver import CommandReceiver, receiver_inside
@@ -115,8 +116,4 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
 
 
 def _count(env: gym.Env[Any, Any], kind: type[gym.Wrapper[Any, Any, Any, Any]]) -> int:
-    inner, count = env, 0
-    while isinstance(inner, gym.Wrapper):
-        count += isinstance(inner, kind)
-        inner = inner.env
-    return count
+    return sum(isinstance(inner, kind) for inner in wrappers_of(env))
