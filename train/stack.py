@@ -55,7 +55,10 @@ def make_stack(
         task = _leased(task, action_filter.lease)
     recorded: gym.Env[Any, Any] = RecordInterventions(task)
     for name, arguments in env.faults.items():
-        recorded = FAULTS[name](recorded, **arguments)
+        try:
+            recorded = FAULTS[name](recorded, **arguments)
+        except TypeError as error:
+            raise ConfigurationError(f"env.faults.{name}: {error}") from None
     monitored = Monitor(recorded, info_keywords=keys.RUNNING)
     if not learner.penalised:
         return monitored
