@@ -1,0 +1,417 @@
+"""A rover on dry, wet and icy ground: too much throttle spins its wheels, and a spun wheel does not steer."""
+
+import math
+from pathlib import Path
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+from gymnasium.envs.mujoco import MujocoEnv
+from gymnasium.spaces import Box
+from gymnasium.utils import EzPickle
+from numpy.typing import NDArray
+
+from safe_wrappers.control.traction_curves import MagicFormula
+from safe_wrappers.errors import ActionError, SafeWrappersError, UnknownNameError
+from safe_wrappers.interventions import COST, COST_SUBSTEP
+
+from .goal_env import GOAL_MET, GOALS_REACHED
+from .ground import Ground
+from .lidar import LIDAR_BINS, pseudo_lidar
+from .rover_layout import RoverLayout, parse_rover_layout, sample_rover_goal, sample_rover_layout
+from .tyre import tyre_force
+
+Array = NDArray[np.float64]
+
+WHEELS: Final = ("front_left", "front_right", "rear_left", "rear_right")
+"""The wheels' joints, bodies and geoms, in the order of every array of four."""
+SLIP: Final = "slip"
+"""float64, shape (4,): longitudinal slip of each wheel at the end of the step (`control.slip.slip_ratio`)."""
+SLIP_MAX: Final = "slip_max"
+"""float64: largest size of any loaded wheel's longitudinal slip at the ends of this step's physics substeps."""
+SPIN_OUT: Final = "spin_out"
+"""float64: 1 if a loaded wheel's slip was larger than `SPIN_OUT_SLIP` there, else 0."""
+YAW_RATE_ERROR: Final = "yaw_rate_error"
+"""float64, rad/s: how far the yaw rate was at most from the one that steering angle and speed ask for."""
+
+SPIN_OUT_SLIP: Final = 0.5
+ROVER_GOAL_RADIUS: Final = 0.4
+"""Distance from the goal's centre at which it counts as reached, m."""
+ROVER_HAZARD_RADIUS: Final = 0.3
+"""Radius of a hazard's disc, m: the chassis's centre must stay outside."""
+WHEELBASE: Final = 0.5
+"""Between the axles, m."""
+
+_FRAME_SKIP: Final = 5
+_LIDAR_RANGE: Final = 12.0  # m: across the field
+_PARKED: Final = 1000.0  # m: farther than the rover gets in an episode
+_UPRIGHT: Final = 0.5  # of the chassis's upward axis: below it has rolled over
+_SETTLING: Final = 12  # rounds until loads and tyre forces agree: each leaves a quarter of the difference
+_COLOURS: Final = {
+    "dry": (0.55, 0.5, 0.45, 0.6),
+    "wet": (0.25, 0.35, 0.45, 0.6),
+    "snow": (1.0, 1.0, 1.0, 0.9),
+    "ice": (0.65, 0.9, 1.0, 0.9),
+}
+_ASSET: Final = Path(__file__).parent / "assets" / "safe_rover.xml"
+_CAMERA: Final = {"distance": 11.0, "elevation": -55.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.4, 0.0])}
+_NOT_FINITE: Final = "the rover's state is not finite: a state that was set, or a changed model, broke it"
+
+
+class SafeRoverEnv(MujocoEnv, EzPickle):
+    """Drive a rover to goals, around hazards, over patches of wet and icy ground that it cannot see.
+
+    18 kg, 0.5 m between the axles and 0.4 m between the wheels, centre of mass 0.12 m high. Four wheels of
+    0.1 m, each with 0.05 kg m^2 about its axle and a motor of its own; the front ones are steered together. MuJoCo
+    gives each wheel its load; the tyre's force comes from its slip along and across, over the traction curve of
+    the ground under it (`control.traction_curves.MAGIC_FORMULA`), anew at every physics substep.
+
+    **Action**: ``Box(-1, 1, (5,), float32)``, held for 0.01 s (five physics substeps): the torques on the wheels in
+    the order of `WHEELS`, 15 N m at 1, and the steering angle, 0.5 rad at 1 (left), followed by a servo within about
+    0.1 s. Full throttle spins every wheel, on dry ground too, where 4.4 N m is what a wheel at rest can hold.
+
+    **Observation**, float64, shape (42,): forward and lateral velocity (m/s), yaw rate (rad/s), acceleration
+    forward and to the left (m/s^2), circumferential speed of each wheel (4, m/s), steering angle (rad), then
+    pseudo-lidars of 16 bins and a range of 12 m for the goal and for the hazards. Nothing in it tells the ground.
+
+    **Reward**: distance to the goal gained in this step (m), plus 1 on coming within 0.4 m of it; then a new goal
+    is sampled and the episode goes on.
+
+    **Info**, at every step and at reset: ``cost`` and its equal ``cost_substep`` (1.0 if the chassis's centre was
+    inside a hazard's disc at the end of any physics substep), ``slip``, ``slip_max``, ``spin_out``,
+    ``yaw_rate_error``, ``goal_met``, ``goals_reached``. At reset they judge the start state.
+
+    **Layout**: ``reset(options={"layout": {"agent": [x, y, heading], "goal": [x, y], "hazards": [[x, y], ...],
+    "patches": [{"ground": "ice", "center": [x, y], "radius": r}, ...], "ground": "dry", "speed": v}})``; any subset
+    of the keys. Agent, goal, 6 hazards, 4 wet and 4 icy patches are sampled where they are not given; ``ground``
+    is what lies everywhere else (dry without a word), ``speed`` the forward speed to start with (0).
+
+    **State**: the rover's pose and velocity as of a free joint, steering angles and wheel angles. `set_state` works
+    as in every Gymnasium MuJoCo env. The loads that the next tyre forces count with are those of the substep before
+    and lie in MuJoCo's ``userdata``, so ``mj_getState`` has the whole state.
+
+    **End**: an episode terminates only when the rover has rolled over; `gymnasium.make` truncates after 1000 steps.
+
+    Args:
+        kwargs: Passed to `gymnasium.envs.mujoco.MujocoEnv` (``render_mode``, ``width``, ``camera_name``, ...).
+
+    Example:
+        >>> import gymnasium as gym, numpy as np, safe_wrappers
+        >>> env = gym.make("SafeRover-v0")
+        >>> _ = env.reset(seed=0, options={"layout": {"patches": [], "ground": "ice"}})
+        >>> for _ in range(20):
+        ...     info = env.step(np.array([1, 1, 1, 1, 0]))[4]
+        >>> info["spin_out"]
+        1.0
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium declares it on the instance)
+        "render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"],
+        "render_fps": 100,
+    }
+
+    hazard_radius: Final = ROVER_HAZARD_RADIUS
+    goal_radius: Final = ROVER_GOAL_RADIUS
+    wheels: Final = WHEELS
+
+    def __init__(self, **kwargs: Any) -> None:
+        EzPickle.__init__(self, **kwargs)
+        kwargs.setdefault("default_camera_config", _CAMERA)
+        lidars = 2 * LIDAR_BINS
+        low = np.concatenate([np.full(10, -np.inf), np.zeros(lidars)])
+        high = np.concatenate([np.full(10, np.inf), np.ones(lidars)])
+        MujocoEnv.__init__(self, str(_ASSET), _FRAME_SKIP, Box(low, high, dtype=np.float64), **kwargs)
+        model = self.model
+        self.wheel_radius = float(model.geom(WHEELS[0]).size[0])
+        self._bodies = [int(model.body(wheel).id) for wheel in WHEELS]
+        self._joints = [int(model.joint(wheel).id) for wheel in WHEELS]
+        self._rates = [int(model.joint(wheel).dofadr[0]) for wheel in WHEELS]
+        self._steer = [int(model.joint(f"steer_{side}").qposadr[0]) for side in ("left", "right")]
+        self._floor = int(model.geom("floor").id)
+        self._floor_colour = model.geom_rgba[self._floor].copy()
+        self._patch_geoms = [g for g in range(model.ngeom) if model.geom(g).name.startswith("patch")]
+        self._n_bodies = max(self._bodies) + 1
+        self._forces = [[0.0] * 6 for _ in range(self._n_bodies)]
+        self._slips = [0.0] * 4
+        self._grounds = Ground("dry", ())
+        self._goal_met = False
+        self._goals_reached = 0
+        self._apply(RoverLayout(np.zeros(3), np.zeros(2), np.zeros((0, 2)), (), "dry", 0.0))
+
+    # What a constraint or a judge may read: from qpos, never a substep behind ------------------------------
+
+    @property
+    def agent_position(self) -> Array:
+        """The chassis's centre, midway between the wheels, shape (2,), m."""
+        return np.array(self.data.qpos[:2])
+
+    @property
+    def agent_heading(self) -> float:
+        """Heading in [-pi, pi], rad."""
+        w, x, y, z = self.data.qpos[3:7].tolist()
+        return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+    @property
+    def forward_speed(self) -> float:
+        """Speed of the chassis's centre along the heading, m/s."""
+        heading = self.agent_heading
+        vx, vy = self.data.qvel[:2].tolist()
+        return float(vx * math.cos(heading) + vy * math.sin(heading))
+
+    @property
+    def goal_position(self) -> Array:
+        """Goal's centre, shape (2,), m."""
+        return np.array(self._targets[0])
+
+    @property
+    def hazard_positions(self) -> Array:
+        """Centres of the hazards, shape (n, 2), m."""
+        return np.array(self._targets[1:])
+
+    @property
+    def ground(self) -> Ground:
+        """The grounds of this episode: the truth that no driver may see."""
+        return self._grounds
+
+    @property
+    def wheel_loads(self) -> Array:
+        """Load F_z of each wheel, shape (4,), N."""
+        return np.array(self.data.userdata)
+
+    def ground_under(self, wheel: str) -> str:
+        """Name of the ground under a wheel now.
+
+        Raises:
+            UnknownNameError: There is no such wheel.
+        """
+        return self._grounds.at(*self._contact(wheel))
+
+    def curve_under(self, wheel: str) -> MagicFormula:
+        """Traction curve of the ground under a wheel now.
+
+        Raises:
+            UnknownNameError: There is no such wheel.
+        """
+        return self._grounds.curve_at(*self._contact(wheel))
+
+    def _contact(self, wheel: str) -> list[float]:
+        if wheel not in WHEELS:
+            raise UnknownNameError(f"unknown wheel {wheel!r}: valid wheels are {', '.join(WHEELS)}")
+        position: list[float] = self.data.xpos[self._bodies[WHEELS.index(wheel)], :2].tolist()
+        return position
+
+    # Gymnasium ---------------------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Start an episode; ``options["layout"]`` fixes parts of the scenario.
+
+        Raises:
+            UnknownNameError: An unknown layout key or ground.
+            ConfigurationError: A layout that cannot be used.
+        """
+        self._given = parse_rover_layout(options)
+        observation, info = super().reset(seed=seed, options=options)
+        return observation, info
+
+    def reset_model(self) -> Array:
+        """Sample what the options left open, place everything, return the observation."""
+        self._apply(sample_rover_layout(self.np_random, self._given))
+        return self.observe()
+
+    def set_state(self, qpos: Array, qvel: Array) -> None:
+        """Set positions and velocities (shapes (13,), (12,)), with the controls at 0, and judge the state.
+
+        Loads and tyre forces depend on each other through the load transfer: both are those of an equilibrium.
+        """
+        model, data = self.model, self.data
+        for left_over in (data.ctrl, data.xfrc_applied, data.qacc_warmstart, data.userdata):
+            left_over[:] = 0.0
+        super().set_state(qpos, qvel)  # type: ignore[no-untyped-call]
+        for _ in range(_SETTLING):
+            data.userdata[:] = data.sensordata[:4]
+            self._apply_tyre_forces()
+            mujoco.mj_forwardSkip(model, data, mujoco.mjtStage.mjSTAGE_VEL, 0)
+        data.userdata[:] = data.sensordata[:4]
+        self._begin_judging()
+        self._judge()
+
+    # MujocoEnv's signature promises NumPy scalars where Env's promises Python's: ours are Python's.
+    def step(  # type: ignore[override]
+        self, action: NDArray[np.floating[Any]]
+    ) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """Hold an action for one control step.
+
+        Raises:
+            ActionError: Wrong shape, or a number that is not finite; the env was not stepped.
+            SafeWrappersError: The physics left finite numbers.
+        """
+        control = np.asarray(action, dtype=np.float64)
+        if control.shape != (self.model.nu,) or not np.isfinite(control).all():
+            raise ActionError(f"action must be {self.model.nu} finite numbers; got {control.tolist()}")
+        before = self._goal_distance()
+        self._step_mujoco_simulation(control, self.frame_skip)
+        distance = self._goal_distance()
+        reward = before - distance
+        self._goal_met = distance <= ROVER_GOAL_RADIUS
+        if self._goal_met:
+            reward += 1.0
+            self._goals_reached += 1
+            self.place_goal(sample_rover_goal(self.np_random, self.agent_position, self._targets[1:]))
+        observation = self.observe()
+        if not np.isfinite(observation).all():
+            raise SafeWrappersError(_NOT_FINITE)
+        if self.render_mode == "human":
+            self.render()  # type: ignore[no-untyped-call]
+        return observation, reward, self._rolled_over(), False, self._get_reset_info()
+
+    def observe(self) -> Array:
+        """Observation of the state as it is now: also right after `set_state`."""
+        data = self.data
+        vx, vy, _, _, _, yaw_rate, ax, ay, _ = data.sensordata[4:13].tolist()
+        heading = self.agent_heading
+        cos, sin = math.cos(heading), math.sin(heading)
+        relative = (self._targets - data.qpos[:2]) @ np.array([[cos, -sin], [sin, cos]])
+        rims = (self.wheel_radius * data.qvel[self._rates]).tolist()
+        sensors = [vx, vy, yaw_rate, ax, ay, *rims, self._steering_angle()]
+        return np.concatenate([sensors, pseudo_lidar(relative, self._groups, 2, max_dist=_LIDAR_RANGE)])
+
+    def _get_reset_info(self) -> dict[str, Any]:
+        cost = float(self._violated)
+        return {
+            COST: cost,
+            COST_SUBSTEP: cost,
+            SLIP: np.array(self._slips),
+            SLIP_MAX: self._slip_max,
+            SPIN_OUT: float(self._slip_max > SPIN_OUT_SLIP),
+            YAW_RATE_ERROR: self._yaw_rate_error,
+            GOAL_MET: self._goal_met,
+            GOALS_REACHED: self._goals_reached,
+        }
+
+    # Physics and judging -----------------------------------------------------------------------------------
+
+    def _step_mujoco_simulation(self, ctrl: Array, n_frames: int) -> None:
+        """Step substep by substep: the state's kinematics, the tyres' forces on it, then dynamics and integration."""
+        model, data = self.model, self.data
+        loads = data.sensordata[:4]
+        data.ctrl[:] = ctrl
+        self._begin_judging()
+        for k in range(n_frames):
+            mujoco.mj_step1(model, data)
+            self._apply_tyre_forces()
+            if k:  # the first substep's start was judged as the end of the control step before
+                self._judge()
+            mujoco.mj_step2(model, data)
+            data.userdata[:] = loads
+        # Sensors and loads of the state reached.
+        mujoco.mj_step1(model, data)
+        self._apply_tyre_forces()
+        self._judge()
+        mujoco.mj_forwardSkip(model, data, mujoco.mjtStage.mjSTAGE_VEL, 0)
+        data.userdata[:] = loads
+
+    def _apply_tyre_forces(self) -> None:
+        """Put every tyre's force on its wheel at the contact point, and keep the slips.
+
+        Needs the kinematics of the present state (`mj_step1`). With z upwards, the contact point lies `r z` under the
+        wheel's centre; its speed against the ground is the centre's plus that of the whole rotation of the wheel, the
+        chassis's share included.
+        """
+        data, r = self.data, self.wheel_radius
+        com_x, com_y, com_z = data.subtree_com[1].tolist()
+        axes, centres = data.xaxis.tolist(), data.xanchor.tolist()
+        velocities = data.cvel[: self._n_bodies].tolist()
+        loads = data.userdata.tolist()
+        curve_at, forces, slips = self._grounds.curve_at, self._forces, self._slips
+        for i, (body, joint) in enumerate(zip(self._bodies, self._joints, strict=True)):
+            left_x, left_y, _ = axes[joint]
+            level = math.hypot(left_x, left_y)
+            if level == 0.0:  # it lies on its side
+                slips[i], forces[body] = 0.0, [0.0] * 6
+                continue
+            left_x, left_y = left_x / level, left_y / level
+            x, y, z = centres[joint]
+            wx, wy, wz, vx, vy, _ = velocities[body]  # as if it moved along at the whole's centre of mass
+            vx += wy * (z - com_z) - wz * (y - com_y)
+            vy += wz * (x - com_x) - wx * (z - com_z)
+            rim = r * (wx * left_x + wy * left_y)
+            forward = vx * left_y - vy * left_x
+            sideways = vx * left_x + vy * left_y + r * (wx * left_y - wy * left_x)
+            along, across, slips[i] = tyre_force(rim, forward, sideways, loads[i], curve_at(x, y))
+            fx = along * left_y + across * left_x
+            fy = across * left_y - along * left_x
+            forces[body] = [fx, fy, 0.0, r * fy, -r * fx, 0.0]
+        data.xfrc_applied[: self._n_bodies] = forces
+
+    def _begin_judging(self) -> None:
+        self._violated = False
+        self._slip_max = self._yaw_rate_error = 0.0
+
+    def _judge(self) -> None:
+        """Judge the present state, whose slips were kept, on top of what was judged before."""
+        x, y, _, w, qx, qy, z = self.data.qpos[:7].tolist()
+        for hx, hy in self._hazards:
+            if (x - hx) ** 2 + (y - hy) ** 2 <= ROVER_HAZARD_RADIUS**2:
+                self._violated = True
+        for slip, load in zip(self._slips, self.data.userdata.tolist(), strict=True):
+            if load > 0.0:
+                self._slip_max = max(self._slip_max, abs(slip))
+        vx, vy, _, _, _, yaw_rate = self.data.qvel[:6].tolist()
+        heading = math.atan2(2.0 * (w * z + qx * qy), 1.0 - 2.0 * (qy * qy + z * z))
+        speed = vx * math.cos(heading) + vy * math.sin(heading)
+        asked = speed * math.tan(self._steering_angle()) / WHEELBASE
+        self._yaw_rate_error = max(self._yaw_rate_error, abs(yaw_rate - asked))
+
+    def _steering_angle(self) -> float:
+        left, right = self._steer
+        qpos = self.data.qpos
+        return 0.5 * float(qpos[left] + qpos[right])
+
+    def _rolled_over(self) -> bool:
+        _, x, y, _ = self.data.qpos[3:7].tolist()
+        return bool(1.0 - 2.0 * (x * x + y * y) < _UPRIGHT)
+
+    # Scenario ----------------------------------------------------------------------------------------------
+
+    def _apply(self, layout: RoverLayout) -> None:
+        """Start an episode from a layout."""
+        self._goals_reached = 0
+        self._goal_met = False
+        self._targets = np.concatenate([layout.goal[None], layout.hazards])
+        self._groups = np.repeat([0, 1], [1, len(layout.hazards)])
+        self._hazards = layout.hazards.tolist()
+        self._grounds = Ground(layout.ground, layout.patches)
+        self._show(layout)
+        x, y, heading = layout.agent.tolist()
+        qpos, qvel = self.init_qpos.copy(), np.zeros(self.model.nv)
+        qpos[:2] = x, y
+        qpos[3:7] = math.cos(0.5 * heading), 0.0, 0.0, math.sin(0.5 * heading)
+        qvel[:2] = layout.speed * math.cos(heading), layout.speed * math.sin(heading)
+        qvel[self._rates] = layout.speed / self.wheel_radius
+        self.set_state(qpos, qvel)
+
+    def _show(self, layout: RoverLayout) -> None:
+        """Move what marks the scenario; none of it touches anything."""
+        model, mocap = self.model, self.data.mocap_pos
+        self.place_goal(layout.goal)
+        mocap[1:, :2] = _PARKED
+        n = len(layout.hazards)
+        mocap[1 : 1 + n, :2] = layout.hazards
+        first = len(mocap) - len(self._patch_geoms)
+        for i, (patch, geom) in enumerate(zip(layout.patches, self._patch_geoms, strict=False)):
+            mocap[first + i, :2] = patch.center
+            model.geom_size[geom, 0] = model.geom_rbound[geom] = patch.radius
+            model.geom_rgba[geom] = _COLOURS[patch.ground]
+        bare = layout.ground == "dry"
+        model.geom_rgba[self._floor] = self._floor_colour if bare else (*_COLOURS[layout.ground][:3], 1.0)
+
+    def place_goal(self, goal: Array) -> None:
+        """Move the goal to a centre, shape (2,), m; the next step's reward counts from there."""
+        self._targets[0] = goal
+        self.data.mocap_pos[0, :2] = goal
+
+    def _goal_distance(self) -> float:
+        goal, qpos = self._targets[0], self.data.qpos
+        return math.hypot(goal[0] - qpos[0], goal[1] - qpos[1])
