@@ -25,6 +25,9 @@ VELOCITY_IDS: Final = tuple(
 FLEX_JOINT_REACH_ID: Final = "FlexJointReach-v0"
 """Id of the reaching task with elastic joints."""
 
+SAFE_ROVER_ID: Final = "SafeRover-v0"
+"""Id of the rover on dry, wet and icy ground."""
+
 
 def register_envs() -> None:
     """Register every task of this package with Gymnasium; ids already there are left alone."""
@@ -35,6 +38,7 @@ def register_envs() -> None:
         _register(env_id, "safe_wrappers.envs.velocity:make_velocity_env", {"robot": robot})
     reach = "safe_wrappers.envs.flex_joint_reach:FlexJointReachEnv"
     _register(FLEX_JOINT_REACH_ID, reach, {}, steps=REACH_EPISODE_STEPS)
+    _register(SAFE_ROVER_ID, "safe_wrappers.envs.safe_rover:SafeRoverEnv", {})
 
 
 def _register(env_id: str, entry_point: str, kwargs: dict[str, object], steps: int = EPISODE_STEPS) -> None:
@@ -47,6 +51,7 @@ __all__ = [
     "FLEX_JOINT_REACH_ID",
     "POINT_GOAL_IDS",
     "REACH_EPISODE_STEPS",
+    "SAFE_ROVER_ID",
     "VELOCITY_IDS",
     "register_envs",
 ]
