@@ -69,12 +69,12 @@ def normalized_slip(piecewise: ArrayLike) -> Array:
     return np.asarray(s / (1.0 + np.abs(s)))
 
 
-def slip_window(ground_speed: ArrayLike, max_slip: float, regularization: float) -> tuple[Array, Array]:
+def slip_window(ground_speed: ArrayLike, max_slip: ArrayLike, regularization: float) -> tuple[Array, Array]:
     """The circumferential speeds whose slip is at most `max_slip` in size.
 
     Args:
         ground_speed: v_x, m/s, any shape.
-        max_slip: In (0, 1).
+        max_slip: In (0, 1), broadcast against it.
         regularization: As in `slip_ratio`, m/s.
 
     Returns:
@@ -83,25 +83,19 @@ def slip_window(ground_speed: ArrayLike, max_slip: float, regularization: float)
     Raises:
         ConfigurationError: A number out of its range.
     """
-    (ground,) = finite_arrays(ground_speed=ground_speed)
+    ground, slip = finite_arrays(ground_speed=ground_speed, max_slip=max_slip)
     _positive("regularization", regularization, "m/s")
-    check_max_slip(max_slip)
-    return -_fastest(-ground, max_slip, regularization), _fastest(ground, max_slip, regularization)
-
-
-def _fastest(ground: Array, slip: float, floor: float) -> Array:
-    braking_or_slow = ground + slip * np.maximum(np.abs(ground), floor)
-    return np.asarray(np.where(ground > floor * (1.0 - slip), ground / (1.0 - slip), braking_or_slow))
-
-
-def check_max_slip(max_slip: float) -> float:
-    """A slip in (0, 1), or an error."""
-    if not (isinstance(max_slip, int | float | np.number) and 0.0 < max_slip < 1.0):
+    if not ((slip > 0.0) & (slip < 1.0)).all():
         raise ConfigurationError(
             "max_slip is a normalised slip ratio in (0, 1), where 1 is a wheel that spins on the spot; got "
             f"{max_slip!r}"
         )
-    return float(max_slip)
+    return -_fastest(-ground, slip, regularization), _fastest(ground, slip, regularization)
+
+
+def _fastest(ground: Array, slip: Array, floor: float) -> Array:
+    braking_or_slow = ground + slip * np.maximum(np.abs(ground), floor)
+    return np.asarray(np.where(ground > floor * (1.0 - slip), ground / (1.0 - slip), braking_or_slow))
 
 
 def wheel_acceleration(

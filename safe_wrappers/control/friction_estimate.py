@@ -1,0 +1,104 @@
+"""The peak of a traction curve, estimated while driving: how high, at which slip, and how sure that is.
+
+Every measured pair of slip and friction coefficient lies on the ground's curve, of which only a stretch is seen: at
+small slip only the slope, which fits a high peak far off as well as a low one nearby. So there is a hypothesis per
+slip of the peak, each with a Gaussian estimate of the peak's height (a Kalman filter: the coefficient is linear in
+it), weighted by how well it has predicted. Height and weights fade with the distance travelled, because the ground
+changes; a measurement that no hypothesis can explain starts them afresh.
+
+Source: appendix "Wheel slip ratio and friction boundaries" (peak and falling slope); the curve's shape is the Magic
+Formula's. The bank of hypotheses is textbook multiple-model estimation. The standard deviations hold for noise
+that is white and curves of this shape; neither is guaranteed, so they are no error bound.
+"""
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+PEAK_SLIPS: Final = (0.05, 0.07, 0.09, 0.11, 0.13, 0.15, 0.18, 0.22)
+"""The hypotheses."""
+_SHAPE: Final = 1.65
+_PRIOR_MEAN, _PRIOR_STD = 0.5, 0.5
+_DRIFT: Final = 0.1
+"""Standard deviation that a metre of travel adds to the height."""
+_MEMORY_M: Final = 5.0
+"""Metres after which the hypotheses' weights have faded to a third."""
+_SURPRISE: Final = 4.0
+"""Standard deviations beyond which a measurement says that the ground is another one."""
+
+
+class FrictionEstimate:
+    """Peak friction under each of n wheels.
+
+    Args:
+        wheels: n.
+    """
+
+    def __init__(self, wheels: int) -> None:
+        peaks = np.array(PEAK_SLIPS)
+        self._stretch = math.tan(math.pi / (2.0 * _SHAPE)) / peaks
+        self._peaks = peaks
+        self._height = np.full((wheels, peaks.size), _PRIOR_MEAN)
+        self._variance = np.full((wheels, peaks.size), _PRIOR_STD**2)
+        self._log_weight = np.zeros((wheels, peaks.size))
+
+    @property
+    def weights(self) -> Array:
+        """Probability of each hypothesis in `PEAK_SLIPS`, shape (n, k)."""
+        weight = np.exp(self._log_weight - self._log_weight.max(axis=1, keepdims=True))
+        return np.asarray(weight / weight.sum(axis=1, keepdims=True))
+
+    @property
+    def mean(self) -> Array:
+        """Peak friction coefficient, shape (n,)."""
+        return np.asarray((self.weights * self._height).sum(axis=1))
+
+    @property
+    def std(self) -> Array:
+        """Its standard deviation, shape (n,): within the hypotheses and between them."""
+        weights = self.weights
+        mean = (weights * self._height).sum(axis=1, keepdims=True)
+        return np.asarray(np.sqrt((weights * (self._variance + (self._height - mean) ** 2)).sum(axis=1)))
+
+    @property
+    def peak_slip(self) -> tuple[Array, Array]:
+        """Mean and standard deviation of the slip at the peak, shapes (n,)."""
+        weights = self.weights
+        mean = (weights * self._peaks).sum(axis=1)
+        return mean, np.sqrt((weights * (self._peaks - mean[:, None]) ** 2).sum(axis=1))
+
+    def _shape(self, slip: Array) -> Array:
+        return np.asarray(np.sin(_SHAPE * np.arctan(np.abs(slip)[:, None] * self._stretch)))
+
+    def travel(self, distance: Array) -> None:
+        """Fade what is known over distances travelled, shape (n,), m, >= 0."""
+        self._variance = np.minimum(self._variance + (_DRIFT**2 * distance)[:, None], _PRIOR_STD**2)
+        self._log_weight *= np.exp(-distance / _MEMORY_M)[:, None]
+
+    def update(self, slip: Array, friction: Array, noise_std: Array) -> None:
+        """Take one measurement per wheel.
+
+        Args:
+            slip: Size of the normalised slip, shape (n,).
+            friction: Size of force over load, shape (n,).
+            noise_std: Of the friction, shape (n,), > 0; infinite where a wheel has no measurement.
+        """
+        shape, noise = self._shape(slip), (noise_std**2)[:, None]
+        known = np.isfinite(noise)
+        residual = np.where(known, friction[:, None] - shape * self._height, 0.0)
+        noise = np.where(known, noise, 1.0)
+        expected = shape**2 * self._variance + noise
+        strange = known[:, 0] & (residual**2 > _SURPRISE**2 * expected).all(axis=1)
+        if strange.any():
+            self._variance[strange] = _PRIOR_STD**2
+            self._log_weight[strange] = 0.0
+            expected = shape**2 * self._variance + noise
+        gain = np.where(known, self._variance * shape / expected, 0.0)
+        self._height = self._height + gain * residual
+        self._variance = self._variance * (1.0 - gain * shape)
+        self._log_weight -= np.where(known, 0.5 * (residual**2 / expected + np.log(expected)), 0.0)
+        self._log_weight -= self._log_weight.max(axis=1, keepdims=True)

@@ -1,0 +1,65 @@
+"""A driven wheel over one control interval: what its drive torque and the ground's force make of its rate.
+
+`I w' = tau - b w - r F`, with torque and force constant over the interval, stepped as a physics engine steps it
+(damping implicit): `w+ = decay w + gain (tau - r F)`, exactly. Read backwards it measures F, the traction-force
+observer of traction control: no force sensor, and no friction model.
+
+Source: appendix "Wheel slip ratio and friction boundaries" (the wheel's equation).
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.errors import ConfigurationError
+
+Array = NDArray[np.float64]
+
+
+class Response(NamedTuple):
+    """`w+ = decay w + gain (tau - r F)`.
+
+    Attributes:
+        decay: Share of the rate that damping leaves, in (0, 1].
+        gain: Rate per torque, rad/(s N m).
+    """
+
+    decay: Array
+    gain: Array
+
+
+@dataclass(frozen=True)
+class Wheel:
+    """Constants of one or more wheels, arrays of one shape.
+
+    Attributes:
+        radius: r, m, > 0.
+        inertia: I about the axle, rotor included, kg m^2, > 0.
+        damping: b of the axle, N m s/rad, >= 0.
+    """
+
+    radius: Array
+    inertia: Array
+    damping: Array
+
+    def __post_init__(self) -> None:
+        for name, least in (("radius", "> 0 m"), ("inertia", "> 0 kg m^2"), ("damping", ">= 0 N m s/rad")):
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            fits = value >= 0.0 if least.startswith(">=") else value > 0.0
+            if not (np.isfinite(value).all() and fits.all()):
+                raise ConfigurationError(f"a wheel's {name} must be finite and {least}, got {value}")
+            object.__setattr__(self, name, value)
+
+    def response(self, timestep: float, substeps: int) -> Response:
+        """To torque and force held for `substeps` physics steps of `timestep` s."""
+        share = 1.0 / (1.0 + timestep * self.damping / self.inertia)
+        decay = share**substeps
+        # (1 - decay) / b, without the quotient: b may be 0.
+        gain = timestep / self.inertia * sum(share ** (k + 1) for k in range(substeps))
+        return Response(decay, np.asarray(gain))
+
+    def traction(self, response: Response, before: Array, after: Array, torque: Array) -> Array:
+        """The ground's mean force F over an interval, N, from the rates (rad/s) around it and the torque (N m)."""
+        return np.asarray((torque - (after - response.decay * before) / response.gain) / self.radius)
