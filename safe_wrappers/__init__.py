@@ -21,6 +21,7 @@ from safe_wrappers.constraints import (
     Plane,
     SpeedLimit,
     Sphere,
+    Traction,
     Upright,
     WallClearance,
     Workspace,
@@ -37,6 +38,7 @@ from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.chunk_handover import ChunkHandover
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
+from safe_wrappers.wrappers.slip_limiter import SlipLimiter
 
 __all__ = [
     "AdaptionPenalty",
@@ -60,8 +62,10 @@ __all__ = [
     "Projection",
     "RecordInterventions",
     "SafeWrappersError",
+    "SlipLimiter",
     "SpeedLimit",
     "Sphere",
+    "Traction",
     "UnsafeStateWarning",
     "Upright",
     "WallClearance",

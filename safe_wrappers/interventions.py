@@ -37,6 +37,17 @@ PROPOSED_ACTION: Final = "proposed_action"
 CBF_BOOLS: Final = (CBF_INTERVENED, CBF_INFEASIBLE, CBF_FALLBACK, CBF_NONFINITE, CBF_UNSAFE)
 CBF_FLOATS: Final = (CBF_CORRECTION, CBF_CLIPPED, CBF_MARGIN)
 
+# Traction in a filter, SlipLimiter: every step --------------------------------------------------------------------
+SLIP_RATIO: Final = "slip/ratio"
+"""float64 array, one per wheel in the order of `wheels`: normalised slip before the step; 0 where the state is not
+finite."""
+SLIP_LIMITED: Final = "slip/limited"
+"""bool array, one per wheel: the filter changed a control that drives it."""
+SLIP_MU_ESTIMATE: Final = "slip/mu_estimate"
+"""float64 array, one per wheel: estimated peak friction coefficient of its ground, before the step."""
+SLIP_MU_STD: Final = "slip/mu_std"
+"""float64 array, one per wheel: the estimate's standard deviation (of its model; no error bound)."""
+
 # Tasks, every step: the env's own truth, never the filter's plant ------------------------------------------
 COST: Final = "cost"
 """float64: cost of this control step, judged at its end, as Safety-Gymnasium publishes it."""

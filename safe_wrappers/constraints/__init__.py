@@ -8,6 +8,7 @@ from safe_wrappers.constraints.joint_position_limit import JointPositionLimit
 from safe_wrappers.constraints.joint_speed_limit import JointSpeedLimit
 from safe_wrappers.constraints.obstacles import Box, Disc, Discs, Plane, Sphere
 from safe_wrappers.constraints.speed_limit import SpeedLimit
+from safe_wrappers.constraints.traction import Traction
 from safe_wrappers.constraints.upright import Upright
 from safe_wrappers.constraints.wall_clearance import WallClearance
 from safe_wrappers.constraints.workspace import Workspace
@@ -27,6 +28,7 @@ __all__ = [
     "Plane",
     "SpeedLimit",
     "Sphere",
+    "Traction",
     "Upright",
     "WallClearance",
     "Workspace",

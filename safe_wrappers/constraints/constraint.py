@@ -38,8 +38,9 @@ class Constraint(Protocol):
     A class with `rows` alone is enough. `value(plant)` (the barrier h, shape (k,), positive inside) lets the
     filter report a margin. `bind(plant)` resolves names once, and refuses unknown ones; `check(plant)` refuses
     at a reset what only a state can show; `reset()` forgets an episode. `promise` says what holds: "proved" or
-    "best effort". `admits` belongs to `CertifyingConstraint`. The plant is any `Plant`; a constraint that needs
-    a particular one refuses others in `bind`.
+    "best effort". `report(proposed, executed)` returns info keys of its own, always the same ones, after every
+    reset (with two equal actions) and step. `admits` belongs to `CertifyingConstraint`. The plant is any `Plant`;
+    a constraint that needs a particular one refuses others in `bind`.
     """
 
     def rows(self, plant: Any) -> HalfSpaces:

@@ -13,6 +13,7 @@ from safe_wrappers.constraints.joint_position_limit import JointPositionLimit
 from safe_wrappers.constraints.joint_speed_limit import JointSpeedLimit
 from safe_wrappers.constraints.obstacles import obstacle_data
 from safe_wrappers.constraints.speed_limit import SpeedLimit
+from safe_wrappers.constraints.traction import Traction
 from safe_wrappers.constraints.upright import Upright
 from safe_wrappers.constraints.wall_clearance import WallClearance
 from safe_wrappers.constraints.workspace import Workspace
@@ -25,6 +26,7 @@ KINDS: dict[str, Callable[..., Constraint]] = {
     "JointPositionLimit": JointPositionLimit,
     "JointSpeedLimit": JointSpeedLimit,
     "SpeedLimit": SpeedLimit,
+    "Traction": Traction,
     "Upright": Upright,
     "WallClearance": WallClearance,
     "Workspace": Workspace,

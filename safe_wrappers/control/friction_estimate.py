@@ -45,12 +45,15 @@ class FrictionEstimate:
         self._height = np.full((wheels, peaks.size), _PRIOR_MEAN)
         self._variance = np.full((wheels, peaks.size), _PRIOR_STD**2)
         self._log_weight = np.zeros((wheels, peaks.size))
+        self._weights: Array | None = None
 
     @property
     def weights(self) -> Array:
         """Probability of each hypothesis in `PEAK_SLIPS`, shape (n, k)."""
-        weight = np.exp(self._log_weight - self._log_weight.max(axis=1, keepdims=True))
-        return np.asarray(weight / weight.sum(axis=1, keepdims=True))
+        if self._weights is None:
+            weight = np.exp(self._log_weight - self._log_weight.max(axis=1, keepdims=True))
+            self._weights = weight / weight.sum(axis=1, keepdims=True)
+        return self._weights
 
     @property
     def mean(self) -> Array:
@@ -78,6 +81,7 @@ class FrictionEstimate:
         """Fade what is known over distances travelled, shape (n,), m, >= 0."""
         self._variance = np.minimum(self._variance + (_DRIFT**2 * distance)[:, None], _PRIOR_STD**2)
         self._log_weight *= np.exp(-distance / _MEMORY_M)[:, None]
+        self._weights = None
 
     def update(self, slip: Array, friction: Array, noise_std: Array) -> None:
         """Take one measurement per wheel.
@@ -102,3 +106,4 @@ class FrictionEstimate:
         self._variance = self._variance * (1.0 - gain * shape)
         self._log_weight -= np.where(known, 0.5 * (residual**2 / expected + np.log(expected)), 0.0)
         self._log_weight -= self._log_weight.max(axis=1, keepdims=True)
+        self._weights = None

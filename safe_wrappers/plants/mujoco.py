@@ -88,7 +88,7 @@ class MujocoPlant:
             )
         self.data = mujoco.MjData(self.model)
         self._nq, self._nv = int(self.model.nq), int(self.model.nv)
-        self._actuators = AffineActuators(self.model)
+        self.actuators = AffineActuators(self.model)
         self._clamped = bool(self.model.actuator_forcelimited.any())
         limited = self.model.actuator_ctrllimited.astype(bool)
         self._lower = np.where(limited, self.model.actuator_ctrlrange[:, 0], -np.inf)
@@ -191,9 +191,9 @@ class MujocoPlant:
 
     def _derive(self) -> None:
         d = self.data
-        gain, _ = self._actuators.gain_and_bias(d.actuator_length, d.actuator_velocity)
-        least, most = self._actuators.acting_range(d.actuator_length, d.actuator_velocity)
-        moment = self._actuators.moment(d)
+        gain, _ = self.actuators.gain_and_bias(d.actuator_length, d.actuator_velocity)
+        least, most = self.actuators.acting_range(d.actuator_length, d.actuator_velocity)
+        moment = self.actuators.moment(d)
         force_per_control = moment * gain[:, None]
         saturated = most <= least
         effect = self._solve_inertia(force_per_control).T
@@ -298,11 +298,11 @@ class MujocoPlant:
         """
         if not self._clamped:
             return self._lower, self._upper
-        motion = self._actuators.motion_without_kinematics(self.qpos, self.qvel)
+        motion = self.actuators.motion_without_kinematics(self.qpos, self.qvel)
         if motion is None:
             data = self.forward()
             motion = data.actuator_length, data.actuator_velocity
-        return self._actuators.acting_range(*motion, self.hold_s)
+        return self.actuators.acting_range(*motion, self.hold_s)
 
     def inertia_diagonal(self) -> Array:
         """Diagonal of the joint-space inertia, shape (nv,), kg or kg m^2."""

@@ -110,6 +110,8 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         for constraint in self.constraints:
             getattr(constraint, "bind", _nothing)(self.plant)
         self._barriers: list[Any] = [c for c in self.constraints if hasattr(c, "value")]
+        self._reporting: list[Any] = [c for c in self.constraints if hasattr(c, "report")]
+        _refuse_same_reports(self._reporting)
         self._low = np.asarray(space.low, dtype=np.float64)
         self._high = np.asarray(space.high, dtype=np.float64)
         chosen = Fallback(fallback, [c for c in self.constraints if hasattr(c, "backup")])
@@ -145,6 +147,8 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         # these keys only if a reset reports them, and a loop reads them at every step.
         info[keys.PROPOSED_ACTION] = np.zeros(self._shape)
         info[keys.EXECUTED_ACTION] = np.zeros(self._shape)
+        for constraint in self._reporting:
+            info |= constraint.report(info[keys.PROPOSED_ACTION], info[keys.EXECUTED_ACTION])
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -208,6 +212,8 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         info[keys.CBF_MARGIN] = margin
         info[keys.PROPOSED_ACTION] = proposed
         info[keys.EXECUTED_ACTION] = executed.copy()
+        for constraint in self._reporting:
+            info |= constraint.report(proposed, executed)
         return observation, reward, terminated, truncated, info
 
     def _checked(self, action: Any) -> Array:
@@ -266,6 +272,17 @@ def _no_state() -> None:
 
 def _nothing(plant: Plant) -> None:
     """A constraint without `bind` resolves no names, one without `check` needs no state to be refused."""
+
+
+def _refuse_same_reports(reporting: list[Any]) -> None:
+    """Two constraints of a kind would write the same info keys."""
+    kinds = [type(c).__name__ for c in reporting]
+    for kind in kinds:
+        if kinds.count(kind) > 1:
+            raise ConfigurationError(
+                f"{kind} is in the list {kinds.count(kind)} times, and both would write the same info keys; use one "
+                "for everything it watches"
+            )
 
 
 def is_filtered(env: gym.Env[Any, Any]) -> bool:

@@ -1,0 +1,217 @@
+"""Traction: keep driven wheels on the stable side of a traction curve that nobody knows."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers import interventions as keys
+from safe_wrappers.constraints.constraint import HalfSpaces, Promise, non_negative, positive
+from safe_wrappers.control.friction_estimate import FrictionEstimate
+from safe_wrappers.control.slip import slip_ratio, slip_window
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.plants.driven_wheels import DrivenWheels
+from safe_wrappers.plants.mujoco import MujocoPlant
+from safe_wrappers.plants.plant import Plant
+
+Array = NDArray[np.float64]
+
+_CAUTION = 0.5
+"""Standard deviations of the estimated peak's slip by which the limit stays on the rising side of it."""
+_NOISE = 0.02
+"""Standard deviation of a measured friction coefficient while the slip stands still."""
+_NOISE_PER_SLIP = 1.5
+"""And what a slip that changed within the interval adds to it: at which slip the force acted is not known."""
+_LEAST_LIMIT = 0.1
+"""Share of `max_slip` that is always allowed: without any slip there is no force."""
+_UNBOUNDED = 1e9
+"""Stands for the control of an actuator without limits."""
+_LEAST_LOAD = 0.05
+"""Share of the largest load seen below which a wheel counts as in the air: it measures nothing."""
+
+
+@dataclass
+class Traction:
+    """Keep the slip ratio of every driven wheel within `max_slip`, and below the peak of its ground's curve.
+
+    The wheel's own equation says which torque takes the slip to its limit by the end of the held control step. The
+    force of the ground in it is not modelled but measured, from how the wheel answered the last torque; so no
+    friction has to be known. From slip and force over load the peak of the traction curve is estimated for each
+    wheel, with its uncertainty (`control/friction_estimate.py`); where it is believed to lie below `max_slip`, the
+    limit is half a standard deviation below it. Accelerating and braking, forward and in reverse are the same rows.
+
+    What it promises: a wheel whose ground stays the same for a control step ends it within the limit, up to what
+    the force changes while the slip does. At the edge of another ground, and where a wheel is unloaded or hits
+    something, the measured force is one control step old: the slip overshoots for one or two steps, and comes back as
+    fast as the drives can bring it. Sideways slip is not limited: a turn that is too fast for the ground still
+    slides. Hence best effort.
+
+    A wheel in the air has no force: its circumferential speed is held within the limit of its ground speed, so
+    that it touches down rolling, and its estimate stays as it is. At a standstill slip is counted against
+    `regularization`.
+
+    Args:
+        wheels: Names of the wheels' hinges; each must be driven directly by an actuator of its own or a shared one.
+        max_slip: Largest slip ratio, normalised, in (0, 1).
+        friction: Declared lower bound on the peak friction coefficient under every wheel, > 0: the ground is then
+            counted on for that much force at once, instead of only for what it gave in the last control step. A bound
+            that is too high lets wheels spin. None counts on nothing.
+        regularization: Speed below which slip is counted against it, m/s.
+        margin: Slip kept free below the limit.
+
+    Source: appendix "Wheel slip ratio and friction boundaries".
+    """
+
+    wheels: Sequence[str]
+    max_slip: float = 0.15
+    friction: float | None = None
+    regularization: float = 0.5
+    margin: float = 0.0
+
+    promise: Promise = field(default="best effort", init=False)
+
+    def __post_init__(self) -> None:
+        if isinstance(self.wheels, str) or not isinstance(self.wheels, Sequence):
+            raise ConfigurationError(f"wheels is a list of joint names, got {self.wheels!r}")
+        self.wheels = list(self.wheels)
+        slip_window(0.0, self.max_slip, 1.0)  # refuses a slip outside (0, 1)
+        self.max_slip = float(self.max_slip)
+        if self.friction is not None:
+            self.friction = positive("friction", self.friction, "force per load")
+        self.regularization = positive("regularization", self.regularization, "m/s")
+        self.margin = non_negative("margin", self.margin, "slip")
+        if self.margin >= self.max_slip:
+            raise ConfigurationError(f"margin must be below max_slip = {self.max_slip}, got {self.margin}")
+
+    def bind(self, plant: Plant) -> None:
+        """Find the wheels."""
+        if not isinstance(plant, MujocoPlant):
+            raise UnsupportedEnvError("Traction needs a MujocoPlant: it reads the wheels from the model")
+        if plant.delay_s > 0.0:
+            raise ConfigurationError(
+                f"Traction measures the ground's force from how the wheels answer, which a plant with a delay "
+                f"({plant.delay_s} s) predicts instead; use delay_s=0"
+            )
+        self._wheels = DrivenWheels(plant, self.wheels)
+        self._read_constants(plant)
+        self.reset()
+
+    def _read_constants(self, plant: MujocoPlant) -> None:
+        self._revision = plant.revision
+        self._constants = self._wheels.constants(plant)
+        self._response = self._constants.response(float(plant.model.opt.timestep), plant.substeps)
+
+    def reset(self) -> None:
+        """Forget the ground and the motion."""
+        n = len(self.wheels)
+        self._estimate = FrictionEstimate(n)
+        self._stamp: int | None = None
+        self._rows: HalfSpaces | None = None
+        self._rate: Array | None = None
+        self._slip, self._traction = np.zeros(n), np.zeros(n)
+        self._most_load = np.zeros(n)
+
+    def _look(self, plant: MujocoPlant) -> None:
+        """Take the state and measure what the last control step showed, once per observation."""
+        if self._stamp == plant.stamp:
+            return
+        self._stamp, self._rows = plant.stamp, None
+        if plant.revision != self._revision:
+            self._read_constants(plant)
+        rate, ground = self._wheels.motion(plant)
+        published = plant.published()
+        assert published is not None  # there is no delay
+        load = self._wheels.loads(plant.model, published)
+        self._readable = bool(np.isfinite(rate + ground + load).all())
+        if not self._readable:
+            self._rate, self._slip = None, np.full_like(rate, np.nan)
+            return
+        slip = slip_ratio(self._constants.radius * rate, ground, self.regularization)
+        if self._rate is None:
+            self._ahead = np.zeros_like(rate)
+        else:
+            self._ahead = ground - self._ground
+            torque = self._wheels.torque(published)
+            self._traction = self._constants.traction(self._response, self._rate, rate, torque)
+            self._learn(plant, np.abs(self._constants.radius * rate), ground, slip, load)
+        self._rate, self._ground, self._slip, self._load = rate, ground, slip, load
+        at, spread = self._estimate.peak_slip
+        limit = np.minimum(self.max_slip, at - _CAUTION * spread) - self.margin
+        self._limit = np.maximum(limit, _LEAST_LIMIT * self.max_slip)
+        window = slip_window(ground + self._ahead, self._limit, self.regularization)
+        self._window = window[0] / self._constants.radius, window[1] / self._constants.radius
+
+    def _learn(self, plant: MujocoPlant, wheel: Array, ground: Array, slip: Array, load: Array) -> None:
+        """Give the estimate the slip and the friction of the last control step, where it showed any."""
+        mean_load, mean_slip = 0.5 * (load + self._load), 0.5 * (slip + self._slip)
+        self._most_load = np.maximum(self._most_load, mean_load)
+        self._estimate.travel(np.abs(ground) * plant.hold_s)
+        loaded = np.minimum(load, self._load) > _LEAST_LOAD * self._most_load
+        # Below the regularisation the number is no slip ratio, and says nothing about the curve.
+        rolls = np.maximum(np.abs(ground), wheel) >= self.regularization
+        usable = loaded & rolls & (self._traction * mean_slip > 0.0)
+        friction = np.abs(self._traction) / np.where(loaded, mean_load, 1.0)
+        noise = _NOISE + _NOISE_PER_SLIP * np.abs(slip - self._slip)
+        self._estimate.update(np.abs(mean_slip), friction, np.where(usable, noise, np.inf))
+
+    def value(self, plant: MujocoPlant) -> Array:
+        """What is left of `max_slip`, shape (n,); the estimated peak and the margin are not taken off."""
+        self._look(plant)
+        return np.asarray(self.max_slip - np.abs(self._slip))
+
+    def _torques(self, plant: MujocoPlant, rates: Array, counted_on: Array) -> Array:
+        """The torques that take the wheels to given rates by the end of the hold, if the ground gives a force."""
+        assert self._rate is not None  # rows and backup are asked for at readable states only
+        coasting = self._response.decay * self._rate
+        return np.asarray((rates - coasting) / self._response.gain + self._constants.radius * counted_on)
+
+    def rows(self, plant: MujocoPlant) -> HalfSpaces:
+        """Two per wheel, for driving and braking torque, where the drive could exceed them."""
+        self._look(plant)
+        if self._rows is None:
+            self._rows = self._bounds(plant)
+        return self._rows
+
+    def _bounds(self, plant: MujocoPlant) -> HalfSpaces:
+        bias, effect = self._wheels.drive(plant)
+        carried = 0.0 if self.friction is None else self.friction * self._load
+        most = self._torques(plant, self._window[1], np.maximum(self._traction, carried)) - bias
+        least = self._torques(plant, self._window[0], np.minimum(self._traction, -carried)) - bias
+        low, high = plant.acting_range
+        low, high = np.maximum(low, -_UNBOUNDED), np.minimum(high, _UNBOUNDED)
+        ends = (
+            np.minimum(effect * low, effect * high).sum(axis=1),
+            np.maximum(effect * low, effect * high).sum(axis=1),
+        )
+        # From outside the window, as fast back as the drive can: no more can be asked for.
+        outside = np.abs(self._slip) > self._limit
+        most = np.where(outside, np.maximum(most, ends[0]), most)
+        least = np.where(outside, np.minimum(least, ends[1]), least)
+        # Negated, so that a row that is not a number is kept, and fails, instead of being left out.
+        up, down = ~(ends[1] <= most), ~(ends[0] >= least)
+        return HalfSpaces(
+            np.concatenate([effect[up], -effect[down]]), np.concatenate([most[up], -least[down]])
+        )
+
+    def backup(self, plant: MujocoPlant) -> Array:
+        """The control that brakes the vehicle as the slip limit allows it; other actuators at zero."""
+        self._look(plant)
+        bias, effect = self._wheels.drive(plant)
+        speed = self._ground + self._ahead
+        wanted = np.where(speed > 0.0, self._window[0], self._window[1])
+        # No farther than to a standstill: past it the wheel would drive the other way.
+        wanted = np.where(speed > 0.0, np.maximum(wanted, 0.0), np.minimum(wanted, 0.0))
+        torque = self._torques(plant, wanted, self._traction) - bias
+        return np.asarray(np.linalg.lstsq(effect, torque, rcond=None)[0])
+
+    def report(self, proposed: Array, executed: Array) -> dict[str, Any]:
+        """The info keys `slip/...`: of the state before the step, and what its control did to the wheels."""
+        mean, std = self._estimate.mean, self._estimate.std
+        return {
+            keys.SLIP_RATIO: self._slip.copy() if self._readable else np.zeros_like(mean),
+            keys.SLIP_LIMITED: self._wheels.driven_by(executed != proposed),
+            keys.SLIP_MU_ESTIMATE: mean,
+            keys.SLIP_MU_STD: std,
+        }
