@@ -9,13 +9,16 @@ from typing import Final
 import gymnasium as gym
 
 EPISODE_STEPS: Final = 1000
-"""Control steps per episode, after which `TimeLimit` truncates (20 s at PointGoal's 50 Hz)."""
+"""Control steps per episode, after which `TimeLimit` truncates (20 s with the point, 40 s with the car)."""
 
 REACH_EPISODE_STEPS: Final = 200
 """The same for the arm with elastic joints: 2 s at 100 Hz."""
 
 POINT_GOAL_IDS: Final = tuple(f"SafePointGoal{level}-v0" for level in range(3))
 """Ids of the goal task with the point robot, by level."""
+
+CAR_GOAL_IDS: Final = tuple(f"SafeCarGoal{level}-v0" for level in range(3))
+"""Ids of the goal task with the car, by level."""
 
 VELOCITY_IDS: Final = tuple(
     f"Safe{robot}Velocity-v0" for robot in ("HalfCheetah", "Hopper", "Walker2d", "Swimmer", "Ant", "Humanoid")
@@ -33,6 +36,8 @@ def register_envs() -> None:
     """Register every task of this package with Gymnasium; ids already there are left alone."""
     for level, env_id in enumerate(POINT_GOAL_IDS):
         _register(env_id, "safe_wrappers.envs.point_goal:SafePointGoalEnv", {"level": level})
+    for level, env_id in enumerate(CAR_GOAL_IDS):
+        _register(env_id, "safe_wrappers.envs.car_goal:SafeCarGoalEnv", {"level": level})
     for env_id in VELOCITY_IDS:
         robot = env_id.removeprefix("Safe").removesuffix("Velocity-v0")
         _register(env_id, "safe_wrappers.envs.velocity:make_velocity_env", {"robot": robot})
@@ -47,6 +52,7 @@ def _register(env_id: str, entry_point: str, kwargs: dict[str, object], steps: i
 
 
 __all__ = [
+    "CAR_GOAL_IDS",
     "EPISODE_STEPS",
     "FLEX_JOINT_REACH_ID",
     "POINT_GOAL_IDS",

@@ -1,4 +1,4 @@
-"""The goal task for any planar robot: reach goals, keep out of hazards, leave vases alone."""
+"""The goal task for any robot on the floor: reach goals, keep out of hazards, leave vases alone."""
 
 import math
 from pathlib import Path
@@ -24,7 +24,7 @@ from .levels import (
 )
 from .lidar import LIDAR_BINS, pseudo_lidar
 from .placement import sample_goal, sample_layout
-from .robot import PlanarRobot
+from .robot import Robot
 
 COST_HAZARDS: Final = "cost_hazards"
 """float: 1 if the robot's centre is inside a hazard's disc at the end of the step, else 0."""
@@ -68,9 +68,9 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
     ...], "vases": [[x, y], ...]}})``; any subset of the keys, the rest is sampled. With fewer hazards or
     vases than the level has, the others are parked far away: no lidar, cost or property knows of them.
 
-    **State**: ``qpos = [x, y, heading, then x, y, z, quaternion per vase]`` in world coordinates;
-    `set_state` works as in every Gymnasium MuJoCo env. Vases at rest sleep where MuJoCo knows how to (from
-    3.4 on): without it level 2 is several times slower, and the same to 1e-6 m/s.
+    **State**: ``qpos`` holds the robot's coordinates, then x, y, z and a quaternion per vase, in world
+    coordinates; `set_state` works as in every Gymnasium MuJoCo env. Vases at rest sleep where MuJoCo knows how
+    to (from 3.4 on): without it level 2 is several times slower, and the same to 1e-6 m/s.
 
     Args:
         robot: The machine.
@@ -90,7 +90,7 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
     goal_radius: Final = GOAL_RADIUS
     vase_half_size: Final = VASE_HALF_SIZE
 
-    def __init__(self, robot: PlanarRobot, level: int, **kwargs: Any) -> None:
+    def __init__(self, robot: Robot, level: int, **kwargs: Any) -> None:
         if level not in range(len(LEVELS)):
             raise ConfigurationError(f"level must be one of 0, 1, 2; got {level!r}")
         self.robot = robot
@@ -125,13 +125,13 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
 
     @property
     def agent_position(self) -> NDArray[np.float64]:
-        """Robot's turning axis, shape (2,), m."""
+        """Robot's centre, shape (2,), m."""
         return np.array(self.data.qpos[:2])
 
     @property
     def agent_heading(self) -> float:
-        """Robot's heading in [-pi, pi], rad."""
-        return math.remainder(self.data.qpos[2], math.tau)
+        """Where positive controls drive the robot, in [-pi, pi], rad."""
+        return self.robot.heading(self.data.qpos)
 
     @property
     def goal_position(self) -> NDArray[np.float64]:
@@ -177,7 +177,7 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
     def step(  # type: ignore[override]
         self, action: NDArray[np.floating[Any]]
     ) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
-        """Hold an action for one control step (0.02 s, ten physics substeps).
+        """Hold an action for one control step (`dt` seconds, ten physics substeps).
 
         Raises:
             ActionError: Wrong shape, or a number that is not finite; the env was not stepped.
@@ -290,7 +290,7 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
         mocap[1:, 2] = _HAZARD_Z
         self.place_goal(layout.goal)
         qpos = self.init_qpos.copy()
-        qpos[:3] = layout.agent
+        self.robot.place(qpos, layout.agent)
         vases = qpos[self._vases_qpos].reshape(-1, 7)
         vases[:, 0] = _PARKED
         vases[:, 1] = np.arange(self.level.vases)  # a metre apart, so that parked vases do not touch
@@ -309,10 +309,8 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
 
     def observe(self) -> NDArray[np.float64]:
         """Observation of the state as it is now: also right after `set_state`."""
-        x, y, heading = self.data.qpos[:3].tolist()
         targets = self._targets
         targets[len(targets) - self._n_vases :] = self.vase_positions
-        cos, sin = math.cos(heading), math.sin(heading)
-        relative = (targets - (x, y)) @ np.array([[cos, -sin], [sin, cos]])
+        relative = self.robot.relative(targets, self.data.qpos)
         lidar = pseudo_lidar(relative, self._groups, self._kinds)
-        return np.concatenate([self.data.sensordata[: self.robot.n_sensors], lidar])
+        return np.concatenate([self.robot.sensors(self.data), lidar])

@@ -2,7 +2,43 @@
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Robot(Protocol):
+    """A machine whose first two coordinates are the world x and y of its centre, m."""
+
+    @property
+    def name(self) -> str:
+        """Prefix of its assets: ``<name>_goal<level>.xml``."""
+
+    @property
+    def body(self) -> str:
+        """Name of its root body; every geom in its subtree counts as the robot."""
+
+    @property
+    def n_sensors(self) -> int:
+        """How many numbers its sensors put at the front of the observation."""
+
+    @property
+    def reach(self) -> float:
+        """Largest horizontal distance of any point of the robot from its centre, m."""
+
+    def place(self, qpos: NDArray[np.float64], pose: NDArray[np.float64]) -> None:
+        """Write its pose, shape (3,): x, y (m) and heading (rad), into the configuration, shape (nq,)."""
+
+    def heading(self, qpos: NDArray[np.float64]) -> float:
+        """Heading in a configuration, shape (nq,): where positive controls drive it, in [-pi, pi], rad."""
+
+    def sensors(self, data: mujoco.MjData) -> NDArray[np.float64]:
+        """Sensor readings, shape (n_sensors,)."""
+
+    def relative(self, points: NDArray[np.float64], qpos: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points on the floor in its lidar's frame; shape (n, 2) both, m."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +63,25 @@ class PlanarRobot:
     def reach(self) -> float:
         """Largest distance of any point of the robot from its turning axis, m."""
         return max(self.hull_radius, *(math.hypot(x, y) for x, y in self.hull_corners))
+
+    def place(self, qpos: NDArray[np.float64], pose: NDArray[np.float64]) -> None:
+        """The pose is the first three coordinates."""
+        qpos[:3] = pose
+
+    def heading(self, qpos: NDArray[np.float64]) -> float:
+        """The third coordinate, in [-pi, pi], rad."""
+        return math.remainder(qpos[2], math.tau)
+
+    def sensors(self, data: mujoco.MjData) -> NDArray[np.float64]:
+        """The first readings of the model."""
+        return data.sensordata[: self.n_sensors]
+
+    def relative(self, points: NDArray[np.float64], qpos: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points with x along the heading and y to its left, shape (n, 2), m."""
+        x, y, heading = qpos[:3].tolist()
+        cos, sin = math.cos(heading), math.sin(heading)
+        turned: NDArray[np.float64] = (points - (x, y)) @ np.array([[cos, -sin], [sin, cos]])
+        return turned
 
 
 POINT: Final = PlanarRobot(

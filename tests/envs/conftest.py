@@ -1,15 +1,15 @@
 import gymnasium as gym
 import pytest
 
-from safe_wrappers.envs import POINT_GOAL_IDS, register_envs
+from safe_wrappers.envs import CAR_GOAL_IDS, POINT_GOAL_IDS, register_envs
 
-if not all(env_id in gym.registry for env_id in POINT_GOAL_IDS):
+if not all(env_id in gym.registry for env_id in POINT_GOAL_IDS + CAR_GOAL_IDS):
     register_envs()
 
 
-@pytest.fixture(params=POINT_GOAL_IDS)
+@pytest.fixture(params=POINT_GOAL_IDS + CAR_GOAL_IDS)
 def env(request):
-    """Each level in turn, with Gymnasium's usual wrappers."""
+    """Each robot and level in turn, with Gymnasium's usual wrappers."""
     env = gym.make(request.param)
     yield env
     env.close()
@@ -17,11 +17,21 @@ def env(request):
 
 @pytest.fixture
 def make_env():
-    """A function (level) -> the bare env; closes what it made."""
+    """A function (level) -> the bare env with the point; closes what it made."""
+    yield from _maker(POINT_GOAL_IDS)
+
+
+@pytest.fixture
+def make_car():
+    """A function (level) -> the bare env with the car; closes what it made."""
+    yield from _maker(CAR_GOAL_IDS)
+
+
+def _maker(ids):
     made = []
 
     def make(level):
-        made.append(gym.make(POINT_GOAL_IDS[level]).unwrapped)
+        made.append(gym.make(ids[level]).unwrapped)
         return made[-1]
 
     yield make

@@ -2,8 +2,8 @@
 
 Each file holds one episode of 300 control steps from Safety-Gymnasium 1.2 on MuJoCo 2.3.3: the states before
 each step and after the last one, the solver's warm start, actions, observations, rewards, costs and goals.
-Their robot's joints are relative to where it started (`origin`: x, y, heading), ours are in world
-coordinates: `Recording` rotates and shifts the first three joints, and nothing else.
+The original point's joints are relative to where it started (`origin`: x, y, heading), ours are in world
+coordinates: `Recording` rotates and shifts the first three joints, and nothing else. The car's are the same.
 """
 
 from dataclasses import dataclass
@@ -34,15 +34,16 @@ class Recording:
     hazards: np.ndarray
 
     @classmethod
-    def load(cls, level, episode):
-        with np.load(DATA / f"point_goal{level}_ep{episode}.npz") as file:
+    def load(cls, level, episode, robot="point"):
+        with np.load(DATA / f"{robot}_goal{level}_ep{episode}.npz") as file:
             arrays = {name: file[name] for name in file.files}
-        x, y, heading = arrays.pop("origin")
-        rotation = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
         arrays["warmstart"] = arrays["warmstart"].astype(np.float64)
-        for name in ("qpos", "qvel", "warmstart"):
-            arrays[name][:, :2] = arrays[name][:, :2] @ rotation.T
-        arrays["qpos"][:, :3] += x, y, heading
+        if "origin" in arrays:
+            x, y, heading = arrays.pop("origin")
+            rotation = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
+            for name in ("qpos", "qvel", "warmstart"):
+                arrays[name][:, :2] = arrays[name][:, :2] @ rotation.T
+            arrays["qpos"][:, :3] += x, y, heading
         return cls(level=level, **arrays)
 
     def __len__(self):
@@ -50,7 +51,8 @@ class Recording:
 
     def vases(self, t):
         """Vase centres before step t, shape (n, 2)."""
-        return self.qpos[t, 3:].reshape(-1, 7)[:, :2]
+        n_vases = 1 if self.level == 1 else 10
+        return self.qpos[t, -7 * n_vases :].reshape(-1, 7)[:, :2]
 
 
 @dataclass
@@ -65,30 +67,25 @@ class StepErrors:
     cost: float
     goal_met: bool
     over: bool
-    nose_on_vase: bool
+    touched: bool
 
 
-def replay(env, recording, monkeypatch, mj_step=mujoco.mj_step):
-    """Replay every recorded step from its recorded state, by `mj_step`; one `StepErrors` per step."""
+def replay(env, recording, monkeypatch, touching, mj_step=mujoco.mj_step):
+    """Replay every recorded step from its recorded state, by `mj_step`; one `StepErrors` per step.
+
+    A step counts as touched if `touching(env)` was true after one of its substeps.
+    """
     layout = {
-        "agent": recording.qpos[0, :3],
         "goal": recording.goal[0],
         "hazards": recording.hazards,
         "vases": recording.vases(0),
     }
     env.reset(seed=0, options={"layout": layout})
-    nose = env.model.geom("pointarrow").id
-    vase = env.model.geom_bodyid >= env.model.body("vase0").id
-
-    def nose_on_vase():
-        pairs = env.data.contact.geom
-        return bool(((pairs == nose).any(axis=1) & vase[pairs].any(axis=1)).any())
-
     touched = []
 
     def watched_step(model, data):
         mj_step(model, data)
-        touched.append(nose_on_vase())
+        touched.append(touching(env))
 
     monkeypatch.setattr(mujoco, "mj_step", watched_step)
     errors = []
@@ -105,13 +102,13 @@ def replay(env, recording, monkeypatch, mj_step=mujoco.mj_step):
             StepErrors(
                 position=np.abs(env.data.qpos - recording.qpos[t + 1]).max(),
                 velocity=np.abs(env.data.qvel - recording.qvel[t + 1]).max(),
-                sensors=error[:12].max(),
-                lidar=error[12:].max(),
+                sensors=error[: env.robot.n_sensors].max(),
+                lidar=error[env.robot.n_sensors :].max(),
                 reward=abs(reward - recording.reward[t]),
                 cost=abs(info["cost"] - recording.cost[t]),
                 goal_met=info["goal_met"] == recording.goal_met[t],
                 over=terminated or truncated,
-                nose_on_vase=any(touched) or nose_on_vase(),
+                touched=any(touched) or touching(env),
             )
         )
     return errors

@@ -11,13 +11,15 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import safe_wrappers.envs
-from safe_wrappers.envs import POINT_GOAL_IDS, register_envs
+from safe_wrappers.envs import CAR_GOAL_IDS, POINT_GOAL_IDS, register_envs
 
+GOAL_IDS = POINT_GOAL_IDS + CAR_GOAL_IDS
+OBSERVED = dict(zip(GOAL_IDS, (28, 60, 60, 40, 72, 72), strict=True))
 # Said of every env with unbounded sensors, Gymnasium's own MuJoCo envs included.
 UNBOUNDED = "A Box observation space (minimum|maximum) value is -?infinity"
 
 
-@pytest.mark.parametrize("env_id", POINT_GOAL_IDS)
+@pytest.mark.parametrize("env_id", GOAL_IDS)
 def test_check_env_passes_without_warnings(env_id):
     env = gym.make(env_id).unwrapped
     with warnings.catch_warnings():
@@ -30,11 +32,11 @@ def test_check_env_passes_without_warnings(env_id):
 def test_spaces_and_timing(env):
     bare = env.unwrapped
     assert env.observation_space.dtype == np.float64
-    assert env.observation_space.shape == ((28,) if env.spec.id == POINT_GOAL_IDS[0] else (60,))
+    assert env.observation_space.shape == (OBSERVED[env.spec.id],)
     assert env.action_space == gym.spaces.Box(-1, 1, (2,), np.float32)
-    assert bare.dt == pytest.approx(0.02)
+    assert bare.dt == pytest.approx(0.02 if env.spec.id in POINT_GOAL_IDS else 0.04)
     assert bare.frame_skip == 10
-    assert env.metadata["render_fps"] == 50
+    assert env.metadata["render_fps"] == round(1 / bare.dt)
 
 
 def test_pickled_env_is_the_same_task(env):
@@ -45,11 +47,12 @@ def test_pickled_env_is_the_same_task(env):
 
 
 @pytest.mark.parametrize("mode", ["sync", "async"])
-def test_vector_env_steps_and_reports(mode):
-    envs = gym.make_vec(POINT_GOAL_IDS[1], num_envs=2, vectorization_mode=mode)
+@pytest.mark.parametrize("env_id", [POINT_GOAL_IDS[1], CAR_GOAL_IDS[2]])
+def test_vector_env_steps_and_reports(mode, env_id):
+    envs = gym.make_vec(env_id, num_envs=2, vectorization_mode=mode)
     observations, _ = envs.reset(seed=0)
     assert not np.array_equal(observations[0], observations[1])
-    single = gym.make(POINT_GOAL_IDS[1])
+    single = gym.make(env_id)
     single.reset(seed=0)
     expected = single.step(np.array([1.0, 0.5]))
     observations, rewards, _, _, infos = envs.step(np.tile([1.0, 0.5], (2, 1)))
@@ -66,7 +69,7 @@ def test_spec_rebuilds_the_env(env):
 
 
 def test_registering_twice_changes_nothing():
-    before = {env_id: gym.registry[env_id] for env_id in POINT_GOAL_IDS}
+    before = {env_id: gym.registry[env_id] for env_id in GOAL_IDS}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         register_envs()
@@ -84,10 +87,11 @@ def test_registering_imports_no_physics():
     assert subprocess.run(command, check=False).returncode == 0
 
 
-def test_stepping_needs_no_gl():
+@pytest.mark.parametrize("env_id", [POINT_GOAL_IDS[2], CAR_GOAL_IDS[2]])
+def test_stepping_needs_no_gl(env_id):
     code = (
         "import gymnasium as gym; from safe_wrappers.envs import register_envs; register_envs();"
-        "env = gym.make('SafePointGoal2-v0', render_mode='rgb_array'); env.reset(seed=0);"
+        f"env = gym.make('{env_id}', render_mode='rgb_array'); env.reset(seed=0);"
         "env.step(env.action_space.sample())"
     )
     environ = {"MUJOCO_GL": "disabled", "PATH": ""}
@@ -102,10 +106,11 @@ def gl_works():
     return subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
 
 
-def test_frames_show_the_scenario():
+@pytest.mark.parametrize("env_id", [POINT_GOAL_IDS[1], CAR_GOAL_IDS[1]])
+def test_frames_show_the_scenario(env_id):
     if not gl_works():
         pytest.skip("no working GL here (libosmesa6 and MUJOCO_GL=osmesa, or MUJOCO_GL=egl, are enough)")
-    env = gym.make(POINT_GOAL_IDS[1], render_mode="rgb_array", width=160, height=120, camera_name="top")
+    env = gym.make(env_id, render_mode="rgb_array", width=160, height=120, camera_name="top")
     layout = {"agent": [-1.0, -1.0, 0.0], "goal": [1.0, 1.0], "hazards": [[0.0, 0.0]], "vases": []}
     env.reset(seed=0, options={"layout": layout})
     frame = env.render().astype(int)
