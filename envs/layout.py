@@ -1,7 +1,7 @@
 """Where everything stands when an episode starts, and how a user asks for it."""
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -61,39 +61,65 @@ def parse_layout(options: Mapping[str, Any] | None, level: Level) -> PartialLayo
         UnknownNameError: An unknown key in the layout, or an option that looks like a misspelt ``"layout"``.
         ConfigurationError: A wrong shape, too many objects, or a number that is not finite.
     """
+    given = layout_option(options, LAYOUT_KEYS)
+    return PartialLayout(
+        agent=numbers(given, "agent", "[x, y, heading]", (3,)),
+        goal=numbers(given, "goal", "[x, y]", (2,)),
+        hazards=points(given, "hazards", level.hazards),
+        vases=points(given, "vases", level.vases),
+    )
+
+
+def layout_option(options: Mapping[str, Any] | None, keys: Sequence[str]) -> Mapping[str, Any]:
+    """The layout among `reset`'s options, its keys checked; empty when there is none.
+
+    Args:
+        options: `reset`'s options; never changed. Those other than ``"layout"`` belong to wrappers.
+        keys: What a layout may have.
+
+    Raises:
+        UnknownNameError: An unknown key in the layout, or an option that looks like a misspelt ``"layout"``.
+        ConfigurationError: The layout is no mapping.
+    """
     options = options or {}
     for key in options:
         if key != "layout" and difflib.get_close_matches(str(key), ["layout"], cutoff=0.7):
             raise UnknownNameError(f"unknown reset option {key!r}: did you mean 'layout'?")
     given = options.get("layout")
     if given is None:
-        return PartialLayout()
+        return {}
     if not isinstance(given, Mapping):
         raise ConfigurationError(
-            f"options['layout'] must be a mapping with keys among {', '.join(LAYOUT_KEYS)};"
-            f" got {type(given).__name__}"
+            f"options['layout'] must be a mapping with keys among {', '.join(keys)}; got {type(given).__name__}"
         )
     for key in given:
-        if key not in LAYOUT_KEYS:
-            raise UnknownNameError(f"unknown layout key {key!r}: valid keys are {', '.join(LAYOUT_KEYS)}")
-    return PartialLayout(
-        agent=_numbers(given, "agent", "[x, y, heading]", 3),
-        goal=_numbers(given, "goal", "[x, y]", 2),
-        hazards=_points(given, "hazards", level.hazards),
-        vases=_points(given, "vases", level.vases),
-    )
+        if key not in keys:
+            raise UnknownNameError(f"unknown layout key {key!r}: valid keys are {', '.join(keys)}")
+    return given
 
 
-def _numbers(given: Mapping[str, Any], key: str, form: str, length: int) -> NDArray[np.float64] | None:
+def numbers(
+    given: Mapping[str, Any], key: str, form: str, shape: tuple[int, ...]
+) -> NDArray[np.float64] | None:
+    """Finite numbers of a shape, or None where the key is missing.
+
+    Raises:
+        ConfigurationError: Anything else; `form` tells people what was expected.
+    """
     if given.get(key) is None:
         return None
     value = _finite_array(given[key], key, form)
-    if value.shape != (length,):
+    if value.shape != shape:
         raise ConfigurationError(f"layout {key!r} must be {form}; got shape {value.shape}")
     return value
 
 
-def _points(given: Mapping[str, Any], key: str, at_most: int) -> NDArray[np.float64] | None:
+def points(given: Mapping[str, Any], key: str, at_most: int) -> NDArray[np.float64] | None:
+    """Points in the plane, shape (n, 2), m, or None where the key is missing.
+
+    Raises:
+        ConfigurationError: Another shape, a number that is not finite, or more points than `at_most`.
+    """
     if given.get(key) is None:
         return None
     value = _finite_array(given[key], key, "[[x, y], ...]")
@@ -102,7 +128,7 @@ def _points(given: Mapping[str, Any], key: str, at_most: int) -> NDArray[np.floa
     if value.ndim != 2 or value.shape[1] != 2:
         raise ConfigurationError(f"layout {key!r} must be [[x, y], ...]; got shape {value.shape}")
     if len(value) > at_most:
-        raise ConfigurationError(f"layout gives {len(value)} {key}, but this level has at most {at_most}")
+        raise ConfigurationError(f"layout gives {len(value)} {key}, but there is room for at most {at_most}")
     return value
 
 

@@ -1,6 +1,7 @@
 """Random placement with keepouts: no two objects nearer than the sum of their keepout radii."""
 
-from typing import Final
+from collections.abc import Mapping
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +18,7 @@ _TRIES_PER_LAYOUT: Final = 1000
 def sample_layout(rng: np.random.Generator, level: Level, given: PartialLayout) -> Layout:
     """Sample what is missing of a layout.
 
-    An object with keepout k is drawn uniformly from the field shrunk by k, until it is at least k + k' away
-    from every object placed before. Given parts come first and are kept as they are.
+    As `place_objects` does; given parts come first and are kept as they are.
 
     Args:
         rng: Source of randomness.
@@ -31,13 +31,24 @@ def sample_layout(rng: np.random.Generator, level: Level, given: PartialLayout) 
     Raises:
         ConfigurationError: The given parts leave no room for the rest.
     """
-    for _ in range(_TRIES_PER_LAYOUT):
-        layout = _try_layout(rng, level, given)
-        if layout is not None:
-            return layout
-    raise ConfigurationError(
-        f"no room for the objects left to sample in the field [-{level.half_extent}, {level.half_extent}]^2:"
-        " give fewer hazards and vases, or all positions"
+    agent = None if given.agent is None else given.agent[None, :2]
+    goal = None if given.goal is None else given.goal[None]
+    placed = place_objects(
+        rng,
+        level.half_extent,
+        {
+            "agent": Kind(1, AGENT_KEEPOUT, agent),
+            "goal": Kind(1, GOAL_KEEPOUT, goal),
+            "hazards": Kind(level.hazards, HAZARD_KEEPOUT, given.hazards),
+            "vases": Kind(level.vases, VASE_KEEPOUT, given.vases),
+        },
+    )
+    heading = rng.uniform(-np.pi, np.pi) if given.agent is None else given.agent[2]
+    return Layout(
+        agent=np.append(placed["agent"][0], heading),
+        goal=placed["goal"][0],
+        hazards=placed["hazards"],
+        vases=placed["vases"],
     )
 
 
@@ -64,10 +75,29 @@ def sample_goal(
     """
     placed = np.concatenate([agent[None], hazards, vases])
     keepouts = np.repeat([AGENT_KEEPOUT, HAZARD_KEEPOUT, VASE_KEEPOUT], [1, len(hazards), len(vases)])
+    return place_one(rng, level.half_extent, GOAL_KEEPOUT, placed, keepouts)
+
+
+def place_one(
+    rng: np.random.Generator,
+    half_extent: float,
+    keepout: float,
+    placed: NDArray[np.float64],
+    keepouts: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Place one more object, shape (2,), m; where no try is clear, the clearest is taken.
+
+    Args:
+        rng: Source of randomness.
+        half_extent: The field is [-half_extent, half_extent]^2, m.
+        keepout: The object's, m.
+        placed: Centres of the others, shape (n, 2), m.
+        keepouts: Theirs, shape (n,), m.
+    """
     best, best_slack = np.zeros(2), -np.inf
     for _ in range(_TRIES_PER_OBJECT):
-        point = _draw(rng, level, GOAL_KEEPOUT)
-        slack = _slack(point, GOAL_KEEPOUT, placed, keepouts)
+        point = _draw(rng, half_extent, keepout)
+        slack = _slack(point, keepout, placed, keepouts)
         if slack > best_slack:
             best, best_slack = point, slack
         if slack >= 0.0:
@@ -75,48 +105,74 @@ def sample_goal(
     return best
 
 
-def _try_layout(rng: np.random.Generator, level: Level, given: PartialLayout) -> Layout | None:
-    agent = None if given.agent is None else given.agent[None, :2]
-    goal = None if given.goal is None else given.goal[None]
-    parts = {
-        "agent": (agent, 1, AGENT_KEEPOUT),
-        "goal": (goal, 1, GOAL_KEEPOUT),
-        "hazards": (given.hazards, level.hazards, HAZARD_KEEPOUT),
-        "vases": (given.vases, level.vases, VASE_KEEPOUT),
-    }
-    placed = np.zeros((0, 2))
-    keepouts = np.zeros(0)
-    chosen: dict[str, NDArray[np.float64]] = {}
-    for name, (known, _, keepout) in parts.items():
-        if known is not None:
-            chosen[name] = known
-            placed = np.concatenate([placed, known])
-            keepouts = np.concatenate([keepouts, np.full(len(known), keepout)])
-    for name, (known, count, keepout) in parts.items():
-        if known is not None:
+class Kind(NamedTuple):
+    """Objects of one kind.
+
+    Attributes:
+        count: How many to place.
+        keepout: m.
+        known: Their centres if they stand already, shape (n, 2), m.
+    """
+
+    count: int
+    keepout: float
+    known: NDArray[np.float64] | None
+
+
+def place_objects(
+    rng: np.random.Generator, half_extent: float, kinds: Mapping[str, Kind]
+) -> dict[str, NDArray[np.float64]]:
+    """Place the objects that do not stand yet, kind by kind.
+
+    An object with keepout k is drawn uniformly from the field shrunk by k, until it is at least k + k' away
+    from every object placed before.
+
+    Args:
+        rng: Source of randomness.
+        half_extent: The field is [-half_extent, half_extent]^2, m.
+        kinds: By name; those that stand count as placed first.
+
+    Returns:
+        Centres by name, shapes (n, 2), m.
+
+    Raises:
+        ConfigurationError: What stands leaves no room for the rest.
+    """
+    for _ in range(_TRIES_PER_LAYOUT):
+        centres = _try_objects(rng, half_extent, kinds)
+        if centres is not None:
+            return centres
+    raise ConfigurationError(
+        f"no room for the objects left to sample in the field [-{half_extent}, {half_extent}]^2:"
+        " give fewer objects, or all positions"
+    )
+
+
+def _try_objects(
+    rng: np.random.Generator, half_extent: float, kinds: Mapping[str, Kind]
+) -> dict[str, NDArray[np.float64]] | None:
+    centres = {name: kind.known.copy() for name, kind in kinds.items() if kind.known is not None}
+    placed = np.concatenate([np.zeros((0, 2)), *centres.values()])
+    keepouts = np.concatenate([np.zeros(0), *(np.full(len(c), kinds[n].keepout) for n, c in centres.items())])
+    for name, kind in kinds.items():
+        if name in centres:
             continue
         first = len(placed)
-        for _ in range(count):
+        for _ in range(kind.count):
             for _ in range(_TRIES_PER_OBJECT):
-                point = _draw(rng, level, keepout)
-                if _slack(point, keepout, placed, keepouts) >= 0.0:
+                point = _draw(rng, half_extent, kind.keepout)
+                if _slack(point, kind.keepout, placed, keepouts) >= 0.0:
                     break
             else:
                 return None
             placed = np.concatenate([placed, point[None]])
-            keepouts = np.append(keepouts, keepout)
-        chosen[name] = placed[first:]
-    heading = rng.uniform(-np.pi, np.pi) if given.agent is None else given.agent[2]
-    return Layout(
-        agent=np.append(chosen["agent"][0], heading),
-        goal=chosen["goal"][0].copy(),
-        hazards=chosen["hazards"].copy(),
-        vases=chosen["vases"].copy(),
-    )
+            keepouts = np.append(keepouts, kind.keepout)
+        centres[name] = placed[first:].copy()
+    return centres
 
 
-def _draw(rng: np.random.Generator, level: Level, keepout: float) -> NDArray[np.float64]:
-    reach = level.half_extent - keepout
+def _draw(rng: np.random.Generator, half_extent: float, keepout: float) -> NDArray[np.float64]:
+    reach = half_extent - keepout
     return rng.uniform(-reach, reach, size=2)
 
 
