@@ -39,8 +39,7 @@ CBF_FLOATS: Final = (CBF_CORRECTION, CBF_CLIPPED, CBF_MARGIN)
 
 # Traction in a filter, SlipLimiter: every step --------------------------------------------------------------------
 SLIP_RATIO: Final = "slip/ratio"
-"""float64 array, one per wheel in the order of `wheels`: normalised slip before the step; 0 where the state is not
-finite."""
+"""float64 array, one per wheel in the order of `wheels`: normalised slip before the step."""
 SLIP_LIMITED: Final = "slip/limited"
 """bool array, one per wheel: the filter changed a control that drives it."""
 SLIP_MU_ESTIMATE: Final = "slip/mu_estimate"
@@ -53,6 +52,8 @@ COST: Final = "cost"
 """float64: cost of this control step, judged at its end, as Safety-Gymnasium publishes it."""
 COST_SUBSTEP: Final = "cost_substep"
 """float64: 1 if the constraint was violated at any physics substep of this control step, else 0."""
+SPIN_OUT: Final = "spin_out"
+"""float64: 1 if a loaded wheel spun or locked (slip above 0.5 in size) at any physics substep of this control step."""
 
 # RecordInterventions ---------------------------------------------------------------------------------------
 EPISODE_SUMMARY: Final = "interventions"
@@ -105,6 +106,18 @@ LEASE_REFUSED: Final = "lease/refused"
 force or from the future, or a chunk's end was out of reach."""
 LEASE_BRAKING: Final = "lease/braking"
 """bool: the fallback acted at this control step."""
+
+# ContactMonitor, every step: of the watched contacts over the physics substeps of the control step -----------------
+CONTACT_PEAK_FORCE: Final = "contact/peak_force"
+"""float64: N, the largest normal force between two bodies, summed over their contacts."""
+CONTACT_IMPULSE: Final = "contact/impulse"
+"""float64: N s, the normal forces of all contacts, summed and integrated over the control step."""
+CONTACT_PENETRATION: Final = "contact/penetration"
+"""float64: m, the deepest."""
+CONTACT_RESIDUAL: Final = "contact/residual"
+"""float64: N m, the largest ``|gap * force|`` of a contact: what misses complementarity."""
+CONTACT_PARTIAL: Final = "contact/partial"
+"""bool: not every substep was seen; the others are of the contacts that the step left behind, for one substep."""
 
 # The faults of safe_wrappers.wrappers.faults, every step --------------------------------------------------------
 FAULT_ACTIVE: Final = "fault/active"

@@ -15,6 +15,7 @@ from safe_wrappers.constraints import (
     JointSpeedLimit,
     Plane,
     SpeedLimit,
+    Traction,
     WallClearance,
     Workspace,
 )
@@ -64,6 +65,12 @@ def _reacher(env: gym.Env[Any, Any]) -> list[Constraint]:
 def _flex_joint_reach(env: gym.Env[Any, Any]) -> list[Constraint]:
     # What a torque does to a joint that rings shows within one and a half periods of the lowest resonance.
     return [JointSpeedLimit(limit=8.0, margin=0.3, holds=15)]
+
+
+def _safe_rover(
+    env: gym.Env[Any, Any], max_slip: float = 0.15, friction: float | None = None
+) -> list[Constraint]:
+    return [Traction(env.unwrapped.wheels, max_slip, friction)]  # type: ignore[attr-defined]
 
 
 def _pusher(env: gym.Env[Any, Any]) -> list[Constraint]:
@@ -120,6 +127,7 @@ RECIPES: dict[str, Callable[..., list[Constraint]]] = {
     "InvertedDoublePendulum": _inverted_double_pendulum,
     "FlexJointReach": _flex_joint_reach,
     "Reacher": _reacher,
+    "SafeRover": _safe_rover,
     "Pusher": _pusher,
     "HumanoidStandup": _humanoid_standup,
     "PointMaze": _point_maze,

@@ -21,7 +21,7 @@ CONDITIONS: Final = {
     "filter_off": "Evaluation, filter off",
     "filter_on": "Evaluation, filter on",
 }
-TOTALS: Final = ("violations", "infeasible", "fallback", "unsafe", "lease_braking", "lease_expired")
+TOTALS: Final = ("violations", "infeasible", "fallback", "unsafe", "lease_braking", "lease_expired", "spin_outs")
 METRICS: Final = {
     "return": "Return / episode",
     "length": "Steps / episode",
@@ -39,13 +39,19 @@ METRICS: Final = {
     "lease_braking": "Steps braked by the lease, total",
     "lease_expired": "Leases run out, total",
     "goals_reached": "Goals / episode",
+    "spin_outs": "Steps in spin-out, total",
+    "spin_outs_per_million": "Steps in spin-out / million",
 }
-"""What is reported. Totals and rates per 1000 steps are over a condition's episodes; all else is the mean over its
+"""What is reported. Totals and rates are over a condition's episodes; all else is the mean over its
 episodes of the episode's value (so `correction_p95` is the mean of the episodes' percentiles)."""
 
 
-PER_1000: Final = {"violations_per_1000": "violations", "infeasible_per_1000": "infeasible"}
-"""Episodes that end early have less time for violations: rates are over all steps, whatever the episodes."""
+RATES: Final = {
+    "violations_per_1000": ("violations", 1000.0),
+    "infeasible_per_1000": ("infeasible", 1000.0),
+    "spin_outs_per_million": ("spin_outs", 1e6),
+}
+"""Of a count, per so many steps. Episodes that end early have less time for violations: rates are over all steps, whatever the episodes."""
 
 OF_THE_FILTER: Final = (
     "intervention_rate",
@@ -195,11 +201,11 @@ def _seed_row(episodes: Sequence[Mapping[str, float]]) -> dict[str, Any]:
     steps = sum(episode["length"] for episode in episodes)
     row: dict[str, Any] = {"episodes": len(episodes), "steps": int(steps)}
     for metric in METRICS:
-        source = PER_1000.get(metric, metric)
+        source, per = RATES.get(metric, (metric, 1.0))
         if all(source in episode for episode in episodes):
             values = [episode[source] for episode in episodes]
-            if metric in PER_1000:
-                row[metric] = 1000.0 * float(np.sum(values)) / steps
+            if metric in RATES:
+                row[metric] = per * float(np.sum(values)) / steps
             else:
                 row[metric] = float(np.sum(values) if metric in TOTALS else np.mean(values))
     return row

@@ -26,6 +26,8 @@ _NOISE_PER_SLIP = 1.5
 """And what a slip that changed within the interval adds to it: at which slip the force acted is not known."""
 _LEAST_LIMIT = 0.1
 """Share of `max_slip` that is always allowed: without any slip there is no force."""
+_LEAST_SHARE = 0.3
+"""Of the slip that must be along the heading: the force across is not measured."""
 _UNBOUNDED = 1e9
 """Stands for the control of an actuator without limits."""
 _LEAST_LOAD = 0.05
@@ -45,8 +47,10 @@ class Traction:
     What it promises: a wheel whose ground stays the same for a control step ends it within the limit, up to what
     the force changes while the slip does. At the edge of another ground, and where a wheel is unloaded or hits
     something, the measured force is one control step old: the slip overshoots for one or two steps, and comes back as
-    fast as the drives can bring it. Sideways slip is not limited: a turn that is too fast for the ground still
-    slides. Hence best effort.
+    fast as the drives can bring it. A wheel that slides sideways has less left to slip along its heading (a friction
+    circle), so that driving and braking leave the grip to the turn; but a turn that is too fast for the ground still
+    slides, and a vehicle that spins about its own axis turns its wheels faster than any drive follows. Hence best
+    effort. Overshoots are the ground's and no unsafe state, so there is no `value`.
 
     A wheel in the air has no force: its circumferential speed is held within the limit of its ground speed, so
     that it touches down rolling, and its estimate stays as it is. At a standstill slip is counted against
@@ -110,7 +114,7 @@ class Traction:
         self._stamp: int | None = None
         self._rows: HalfSpaces | None = None
         self._rate: Array | None = None
-        self._slip, self._traction = np.zeros(n), np.zeros(n)
+        self._slip, self._traction, self._present = np.zeros(n), np.zeros(n), np.zeros(n)
         self._most_load = np.zeros(n)
 
     def _look(self, plant: MujocoPlant) -> None:
@@ -120,56 +124,75 @@ class Traction:
         self._stamp, self._rows = plant.stamp, None
         if plant.revision != self._revision:
             self._read_constants(plant)
-        rate, ground = self._wheels.motion(plant)
+        rate, ground, sideways = self._wheels.motion(plant)
         published = plant.published()
         assert published is not None  # there is no delay
         load = self._wheels.loads(plant.model, published)
-        self._readable = bool(np.isfinite(rate + ground + load).all())
-        if not self._readable:
-            self._rate, self._slip = None, np.full_like(rate, np.nan)
+        if not np.isfinite(rate + ground + sideways + load).all():
+            self._rate = None
             return
-        slip = slip_ratio(self._constants.radius * rate, ground, self.regularization)
+        wheel = self._constants.radius * rate
+        slip = slip_ratio(wheel, ground, self.regularization)
+        faster = np.maximum(np.maximum(np.abs(ground), np.abs(wheel)), self.regularization)
+        across = np.abs(sideways) / faster
         if self._rate is None:
             self._ahead = np.zeros_like(rate)
         else:
             self._ahead = ground - self._ground
             torque = self._wheels.torque(published)
             self._traction = self._constants.traction(self._response, self._rate, rate, torque)
-            self._learn(plant, np.abs(self._constants.radius * rate), ground, slip, load)
-        self._rate, self._ground, self._slip, self._load = rate, ground, slip, load
+            # Below the regularisation the number is no slip ratio, and says nothing about the curve.
+            self._learn(plant, ground, slip, across, load, rolls=faster > self.regularization)
+        self._rate, self._ground, self._slip, self._across, self._load = rate, ground, slip, across, load
         at, spread = self._estimate.peak_slip
         limit = np.minimum(self.max_slip, at - _CAUTION * spread) - self.margin
+        # Along and across share one curve: what slides sideways already is not left for driving and braking.
+        limit = np.sqrt(np.maximum(limit**2 - across**2, 0.0))
         self._limit = np.maximum(limit, _LEAST_LIMIT * self.max_slip)
         window = slip_window(ground + self._ahead, self._limit, self.regularization)
         self._window = window[0] / self._constants.radius, window[1] / self._constants.radius
 
-    def _learn(self, plant: MujocoPlant, wheel: Array, ground: Array, slip: Array, load: Array) -> None:
+    def _learn(
+        self,
+        plant: MujocoPlant,
+        ground: Array,
+        slip: Array,
+        across: Array,
+        load: Array,
+        rolls: NDArray[np.bool_],
+    ) -> None:
         """Give the estimate the slip and the friction of the last control step, where it showed any."""
-        mean_load, mean_slip = 0.5 * (load + self._load), 0.5 * (slip + self._slip)
+        mean_load, along = 0.5 * (load + self._load), 0.5 * (slip + self._slip)
+        total = np.hypot(along, 0.5 * (across + self._across))
         self._most_load = np.maximum(self._most_load, mean_load)
         self._estimate.travel(np.abs(ground) * plant.hold_s)
         loaded = np.minimum(load, self._load) > _LEAST_LOAD * self._most_load
-        # Below the regularisation the number is no slip ratio, and says nothing about the curve.
-        rolls = np.maximum(np.abs(ground), wheel) >= self.regularization
-        usable = loaded & rolls & (self._traction * mean_slip > 0.0)
-        friction = np.abs(self._traction) / np.where(loaded, mean_load, 1.0)
-        noise = _NOISE + _NOISE_PER_SLIP * np.abs(slip - self._slip)
-        self._estimate.update(np.abs(mean_slip), friction, np.where(usable, noise, np.inf))
+        usable = loaded & rolls & (self._traction * along > 0.0) & (np.abs(along) > _LEAST_SHARE * total)
+        # The force points against the sliding: its part along the heading is the part of the slip there.
+        part = np.where(usable, np.abs(along) / np.where(usable, total, 1.0), 1.0)
+        friction = np.abs(self._traction) / (part * np.where(loaded, mean_load, 1.0))
+        noise = (_NOISE + _NOISE_PER_SLIP * np.abs(slip - self._slip)) / part
+        self._estimate.update(total, friction, np.where(usable, noise, np.inf))
+        # What was measured is the interval's mean; where the slip went on growing, so did the force.
+        now = np.where(slip * along > 0.0, np.abs(slip), 0.0)
+        risen = self._traction * self._estimate.rise(np.abs(along), now)
+        self._present = np.where(self._traction * along > 0.0, risen, self._traction)
 
-    def value(self, plant: MujocoPlant) -> Array:
-        """What is left of `max_slip`, shape (n,); the estimated peak and the margin are not taken off."""
-        self._look(plant)
-        return np.asarray(self.max_slip - np.abs(self._slip))
-
-    def _torques(self, plant: MujocoPlant, rates: Array, counted_on: Array) -> Array:
+    def _torques(self, rates: Array, counted_on: Array) -> Array:
         """The torques that take the wheels to given rates by the end of the hold, if the ground gives a force."""
-        assert self._rate is not None  # rows and backup are asked for at readable states only
+        assert self._rate is not None
         coasting = self._response.decay * self._rate
         return np.asarray((rates - coasting) / self._response.gain + self._constants.radius * counted_on)
+
+    def check(self, plant: MujocoPlant) -> None:
+        """Look at the state in which an episode starts: the report of a reset is of it."""
+        self._look(plant)
 
     def rows(self, plant: MujocoPlant) -> HalfSpaces:
         """Two per wheel, for driving and braking torque, where the drive could exceed them."""
         self._look(plant)
+        if self._rate is None:  # says nothing, and a row that is not a number fails
+            return HalfSpaces(np.full((1, plant.lower.size), np.nan), np.full(1, np.nan))
         if self._rows is None:
             self._rows = self._bounds(plant)
         return self._rows
@@ -177,8 +200,8 @@ class Traction:
     def _bounds(self, plant: MujocoPlant) -> HalfSpaces:
         bias, effect = self._wheels.drive(plant)
         carried = 0.0 if self.friction is None else self.friction * self._load
-        most = self._torques(plant, self._window[1], np.maximum(self._traction, carried)) - bias
-        least = self._torques(plant, self._window[0], np.minimum(self._traction, -carried)) - bias
+        most = self._torques(self._window[1], np.maximum(self._present, carried)) - bias
+        least = self._torques(self._window[0], np.minimum(self._present, -carried)) - bias
         low, high = plant.acting_range
         low, high = np.maximum(low, -_UNBOUNDED), np.minimum(high, _UNBOUNDED)
         ends = (
@@ -198,19 +221,21 @@ class Traction:
     def backup(self, plant: MujocoPlant) -> Array:
         """The control that brakes the vehicle as the slip limit allows it; other actuators at zero."""
         self._look(plant)
+        if self._rate is None:
+            return np.zeros_like(plant.lower)
         bias, effect = self._wheels.drive(plant)
         speed = self._ground + self._ahead
         wanted = np.where(speed > 0.0, self._window[0], self._window[1])
         # No farther than to a standstill: past it the wheel would drive the other way.
         wanted = np.where(speed > 0.0, np.maximum(wanted, 0.0), np.minimum(wanted, 0.0))
-        torque = self._torques(plant, wanted, self._traction) - bias
+        torque = self._torques(wanted, self._present) - bias
         return np.asarray(np.linalg.lstsq(effect, torque, rcond=None)[0])
 
     def report(self, proposed: Array, executed: Array) -> dict[str, Any]:
         """The info keys `slip/...`: of the state before the step, and what its control did to the wheels."""
         mean, std = self._estimate.mean, self._estimate.std
         return {
-            keys.SLIP_RATIO: self._slip.copy() if self._readable else np.zeros_like(mean),
+            keys.SLIP_RATIO: self._slip.copy(),
             keys.SLIP_LIMITED: self._wheels.driven_by(executed != proposed),
             keys.SLIP_MU_ESTIMATE: mean,
             keys.SLIP_MU_STD: std,

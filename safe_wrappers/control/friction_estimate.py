@@ -74,6 +74,12 @@ class FrictionEstimate:
         mean = (weights * self._peaks).sum(axis=1)
         return mean, np.sqrt((weights * (self._peaks - mean[:, None]) ** 2).sum(axis=1))
 
+    def rise(self, start: Array, end: Array) -> Array:
+        """Friction at one slip over friction at another, both >= 0 and shape (n,); 1 between two slips of zero."""
+        weights = self.weights
+        first, last = ((weights * self._shape(slip)).sum(axis=1) for slip in (start, end))
+        return np.asarray(np.where(first > 0.0, last / np.where(first > 0.0, first, 1.0), 1.0))
+
     def _shape(self, slip: Array) -> Array:
         return np.asarray(np.sin(_SHAPE * np.arctan(np.abs(slip)[:, None] * self._stretch)))
 

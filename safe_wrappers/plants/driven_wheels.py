@@ -29,10 +29,12 @@ class WheelMotion(NamedTuple):
     Attributes:
         rate: Of the wheel about its axle in the world, rad/s; positive rolls ahead.
         ground: Speed of its centre, m/s.
+        sideways: The same to the left of the heading, m/s.
     """
 
     rate: Array
     ground: Array
+    sideways: Array
 
 
 class DrivenWheels:
@@ -98,7 +100,7 @@ class DrivenWheels:
         return Wheel(m.geom_size[self._geoms, 0], np.array(inertia), m.dof_damping[self.dofs])
 
     def motion(self, plant: MujocoPlant) -> WheelMotion:
-        """Rates and ground speeds at the plant's present state."""
+        """Rates and speeds over ground at the plant's present state."""
         m, d = plant.model, plant.pose()
         mujoco.mj_comPos(m, d)
         mujoco.mj_comVel(m, d)
@@ -111,7 +113,8 @@ class DrivenWheels:
         arm = d.geom_xpos[self._geoms] - d.subtree_com[self._roots]
         vx = move[:, 0] + turn[:, 1] * arm[:, 2] - turn[:, 2] * arm[:, 1]
         vy = move[:, 1] + turn[:, 2] * arm[:, 0] - turn[:, 0] * arm[:, 2]
-        return WheelMotion((turn * axle).sum(axis=1), ahead_x * vx + ahead_y * vy)
+        rate = (turn * axle).sum(axis=1)
+        return WheelMotion(rate, ahead_x * vx + ahead_y * vy, ahead_x * vy - ahead_y * vx)
 
     def loads(self, model: mujoco.MjModel, data: mujoco.MjData) -> Array:
         """Force of the ground on each wheel against gravity, shape (n,), N, from the contacts in an env's data."""

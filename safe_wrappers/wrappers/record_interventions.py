@@ -35,9 +35,10 @@ COLUMNS: Final = (
     "cost",
     "cost_substep",
     "goals_reached",
+    "spin_outs",
     "success",
 )
-"""The CSV file's columns. `goals_reached` and `success` stay empty for tasks that do not report them."""
+"""The CSV file's columns. `goals_reached`, `spin_outs` and `success` stay empty for tasks that do not report them."""
 
 
 _COUNTED: Final = {
@@ -73,6 +74,7 @@ class RecordInterventions(
     - `margin_min`: the smallest finite `cbf/margin` (0 when there was none);
     - `violations`: steps with `cost` or `cost_substep` above 0;
     - `cost`, `cost_substep`: sums;
+    - `spin_outs`: steps with `spin_out` above 0, when the task reports it;
     - `goals_reached` and `success` when the task reports `goals_reached`, and `success` or `is_success`.
 
     Args:
@@ -169,6 +171,8 @@ class RecordInterventions(
         self._cost_substep += cost_substep
         if "goals_reached" in info:
             self._task["goals_reached"] = int(info["goals_reached"])
+        if keys.SPIN_OUT in info:
+            self._task["spin_outs"] = self._task.get("spin_outs", 0) + bool(info[keys.SPIN_OUT] > 0.0)
         success = info.get("success", info.get("is_success"))
         if success is not None:
             self._task["success"] = self._task.get("success", False) or bool(success)

@@ -33,7 +33,7 @@ class SlipLimiter(CBFActionFilter):
         solver: "daqp" or any installed qpsolvers backend.
         margin: Slip kept free below the limit.
 
-    Info, at every step: the keys of `CBFActionFilter` (``cbf/margin`` in units of slip), and arrays with one entry
+    Info, at every step: the keys of `CBFActionFilter` (``cbf/margin`` stays 0), and arrays with one entry
     per wheel: ``slip/ratio``, ``slip/limited``, ``slip/mu_estimate``, ``slip/mu_std``.
 
     Raises:

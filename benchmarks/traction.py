@@ -1,0 +1,249 @@
+"""SafeRover under hard drivers, with the slip limiter on and off, and how far it takes to stop.
+
+    python -m benchmarks.traction                    # 200,000 steps per driver, on and off; stopping distances
+    python -m benchmarks.traction --steps 2000       # a look
+    python -m benchmarks.traction --policy runs/saferover_ppo/unfiltered/seed_0   # of the learned driver
+
+Drivers: full throttle, panic brake, pulse, and a policy that PPO has learned without a limiter
+(`safe-wrappers compare configs/saferover_ppo.yaml` trains it; without it that row is left out). Grounds: a base of
+dry, wet or ice, by turns, with patches of water and ice. The judge is the env's own: a step counts as slipping if any
+loaded wheel's slip was above 0.2 in size at the end of any physics substep, as a spin-out above 0.5, as a yaw
+excursion if the yaw rate was more than 0.5 rad/s off what speed and steering ask for.
+"""
+
+import argparse
+import itertools
+import json
+import math
+import multiprocessing
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+import safe_wrappers as sw
+
+RESULTS = Path(__file__).parent / "results"
+POLICY = Path(__file__).parents[1] / "runs" / "saferover_ppo" / "unfiltered" / "seed_0"
+SLIPPING, YAW_EXCURSION = 0.2, 0.5
+EPISODE_STEPS = 300
+"""Three seconds: under full throttle the rover is out of the field soon after."""
+GROUNDS = ("dry", "wet", "ice")
+STOPPING_GROUNDS = ("dry", "wet", "snow", "ice")
+START_SPEED = 3.0
+STANDSTILL = 0.05
+"""m/s."""
+
+Driver = Callable[[Any, Any], Any]
+
+
+@dataclass(frozen=True)
+class Job:
+    """One driver for so many steps."""
+
+    driver: str
+    limited: bool
+    steps: int
+    seed: int
+    policy: str
+
+
+def drivers(raw: Any, rng: np.random.Generator, policy: str) -> dict[str, Callable[[], Driver]]:
+    """By name: what makes a driver of one episode, a function of observation and time step."""
+
+    def steering() -> Callable[[int], float]:
+        period, size = rng.uniform(0.4, 2.0), rng.uniform(0.0, 1.0)
+        return lambda step: size * math.sin(math.tau * 0.01 * step / period)
+
+    def full_throttle() -> Driver:
+        steer = steering()
+        return lambda _, step: np.array([1.0, 1.0, 1.0, 1.0, steer(step)])
+
+    def panic_brake() -> Driver:
+        steer, state = steering(), {"braking": False, "top": rng.uniform(1.0, 5.0)}
+
+        def drive(_: Any, step: int) -> Any:
+            speed = raw.forward_speed
+            if speed > state["top"]:
+                state["braking"] = True
+            elif state["braking"] and speed < STANDSTILL:
+                state["braking"], state["top"] = False, rng.uniform(1.0, 5.0)
+            return np.array([*[-1.0 if state["braking"] else 1.0] * 4, steer(step)])
+
+        return drive
+
+    def pulse() -> Driver:
+        steer, state = steering(), {"until": 0, "torque": np.ones(4)}
+
+        def drive(_: Any, step: int) -> Any:
+            if step >= state["until"]:
+                state["until"] = step + int(rng.integers(3, 50))
+                state["torque"] = rng.choice([-1.0, 0.0, 1.0], size=4 if rng.random() < 0.3 else 1)
+            return np.array([*np.broadcast_to(state["torque"], 4), steer(step)])
+
+        return drive
+
+    made = {"full throttle": full_throttle, "panic brake": panic_brake, "pulse": pulse}
+    if Path(policy).exists():
+        made["learned"] = _learned(policy)
+    return made
+
+
+def _learned(folder: str) -> Callable[[], Driver]:
+    from safe_wrappers.train import load_policy
+
+    predict = load_policy(Path(folder))
+    return lambda: lambda observation, _: predict(observation)
+
+
+def run(job: Job) -> dict[str, Any]:
+    """Drive, count."""
+    env: Any = gym.make("SafeRover-v0", max_episode_steps=EPISODE_STEPS)
+    raw = env.unwrapped
+    if job.limited:
+        env = sw.SlipLimiter(env, wheels=raw.wheels)
+    rng = np.random.default_rng(job.seed)
+    make = drivers(raw, rng, job.policy)[job.driver]
+    count = dict.fromkeys(("slipping", "spin_out", "spin_outs_begun", "yaw", "intervened", "infeasible"), 0)
+    distance, worst, done, episode, spun = 0.0, 0.0, True, 0, False
+    for _ in range(job.steps):
+        if done:
+            ground = GROUNDS[episode % len(GROUNDS)]
+            # A learned policy drives on what it has learned on.
+            layout = (
+                {} if job.driver == "learned" else {"ground": ground, "agent": [0.0, 0.0, rng.uniform(-3, 3)]}
+            )
+            observation, _ = env.reset(seed=1000 * job.seed + episode, options={"layout": layout})
+            drive, step, episode, spun = make(), 0, episode + 1, False
+        observation, _, terminated, truncated, info = env.step(drive(observation, step).astype(np.float32))
+        step, done = step + 1, terminated or truncated
+        spins = bool(info["spin_out"])
+        count["slipping"] += info["slip_max"] > SLIPPING
+        count["spin_out"] += spins
+        count["spin_outs_begun"] += spins and not spun
+        count["yaw"] += info["yaw_rate_error"] > YAW_EXCURSION
+        if job.limited:
+            count["intervened"] += info["cbf/intervened"]
+            count["infeasible"] += info["cbf/infeasible"]
+        spun, worst = spins, max(worst, info["slip_max"])
+        distance += abs(raw.forward_speed) * raw.dt
+    row = asdict(job) | {k: int(v) for k, v in count.items()} | {"worst_slip": float(worst)}
+    row["mean_speed"] = distance / (job.steps * raw.dt)
+    row["filter_us"] = 1e6 * env.filter_seconds / env.filter_calls if job.limited else None
+    del row["policy"]
+    return row
+
+
+def stopping_distance(ground: str, limited: bool) -> float:
+    """Way to a standstill under a panic brake on one ground, m."""
+    env: Any = gym.make("SafeRover-v0", max_episode_steps=10_000)
+    raw = env.unwrapped
+    if limited:
+        env = sw.SlipLimiter(env, wheels=raw.wheels)
+    _start(env, ground)
+    brake = np.array([-1.0, -1.0, -1.0, -1.0, 0.0], dtype=np.float32)
+    while raw.forward_speed > STANDSTILL:
+        env.step(brake)
+    return float(raw.agent_position[0])
+
+
+def constant_slip_distance(ground: str, slip: float) -> float:
+    """The same with all wheels held at one slip from the first moment on: no drive can, it is the yardstick."""
+    env: Any = gym.make("SafeRover-v0", max_episode_steps=100_000)
+    raw = env.unwrapped
+    raw.frame_skip = 1
+    rates = [int(raw.model.joint(wheel).dofadr[0]) for wheel in raw.wheels]
+    _start(env, ground)
+    while raw.forward_speed > STANDSTILL:
+        speed = raw.forward_speed
+        # Below 0.5 m/s slip counts against that speed.
+        raw.data.qvel[rates] = (speed - slip * max(speed, 0.5)) / raw.wheel_radius
+        env.step(np.zeros(5, dtype=np.float32))
+    return float(raw.agent_position[0])
+
+
+def _start(env: Any, ground: str) -> None:
+    layout = {"agent": [0.0, 0.0, 0.0], "goal": [4.0, 4.0], "hazards": [], "patches": []}
+    env.reset(seed=0, options={"layout": layout | {"ground": ground, "speed": START_SPEED}})
+
+
+def stopping_row(ground: str) -> dict[str, Any]:
+    """All distances on one ground."""
+    found = minimize_scalar(
+        lambda s: constant_slip_distance(ground, s),
+        bounds=(0.02, 0.5),
+        method="bounded",
+        options={"xatol": 2e-3},
+    )
+    return {
+        "ground": ground,
+        "unlimited_m": stopping_distance(ground, limited=False),
+        "limited_m": stopping_distance(ground, limited=True),
+        "best_constant_slip_m": float(found.fun),
+        "best_slip": float(found.x),
+    }
+
+
+def tables(rows: list[dict[str, Any]], stops: list[dict[str, Any]]) -> str:
+    """Markdown."""
+    lines = [
+        "| driver | limiter | steps | slip > 0.2 | spin-out | spin-outs / min | yaw excursion | worst slip "
+        "| mean speed (m/s) | changed | infeasible |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+
+    def key(row: dict[str, Any]) -> tuple[str, bool]:
+        return row["driver"], row["limited"]
+
+    for (driver, limited), group in itertools.groupby(sorted(rows, key=key), key):
+        part = list(group)
+        total = {k: sum(r[k] for r in part) for k in part[0] if isinstance(part[0][k], int)}
+        steps = total["steps"]
+        minutes = steps * 0.01 / 60.0
+        speed = sum(r["mean_speed"] * r["steps"] for r in part) / steps
+        lines.append(
+            f"| {driver} | {'on' if limited else 'off'} | {steps:,} | {total['slipping'] / steps:.2%} "
+            f"| {total['spin_out'] / steps:.3%} | {total['spin_outs_begun'] / minutes:.1f} "
+            f"| {total['yaw'] / steps:.2%} | {max(r['worst_slip'] for r in part):.2f} | {speed:.2f} "
+            + (f"| {total['intervened'] / steps:.1%} | {total['infeasible']} |" if limited else "| - | - |")
+        )
+    lines += [
+        "",
+        "| ground | limiter off (m) | limiter on (m) | best constant slip (m) | at slip | on / best |",
+        "|---|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| {s['ground']} | {s['unlimited_m']:.3f} | {s['limited_m']:.3f} | {s['best_constant_slip_m']:.3f} "
+        f"| {s['best_slip']:.3f} | {s['limited_m'] / s['best_constant_slip_m']:.3f} |"
+        for s in stops
+    ]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Run the jobs in parallel, print the tables, keep the rows."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--steps", type=int, default=200_000, help="per driver, on and off each")
+    parser.add_argument("--parts", type=int, default=4, help="independent runs per driver")
+    parser.add_argument("--policy", default=str(POLICY), help="run folder of the learned driver")
+    parser.add_argument("--workers", type=int, default=2)
+    arguments = parser.parse_args()
+    names = ["full throttle", "panic brake", "pulse"] + ["learned"] * Path(arguments.policy).exists()
+    jobs = [
+        Job(driver, limited, arguments.steps // arguments.parts, part, arguments.policy)
+        for driver, limited, part in itertools.product(names, (False, True), range(arguments.parts))
+    ]
+    with multiprocessing.get_context("spawn").Pool(arguments.workers) as pool:
+        rows = pool.map(run, jobs, chunksize=1)
+        stops = pool.map(stopping_row, STOPPING_GROUNDS, chunksize=1)
+    print(tables(rows, stops))
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / "traction.json").write_text(json.dumps({"drivers": rows, "stopping": stops}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
