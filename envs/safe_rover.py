@@ -45,7 +45,9 @@ WHEELBASE: Final = 0.5
 _FRAME_SKIP: Final = 5
 _LIDAR_RANGE: Final = 12.0  # m: across the field
 _PARKED: Final = 1000.0  # m: farther than the rover gets in an episode
-_UPRIGHT: Final = 0.5  # of the chassis's upward axis: below it has rolled over
+_UPRIGHT: Final = (
+    0.5  # cosine of the tilt from which on the chassis has rolled over, and a wheel does not roll
+)
 _SETTLING: Final = 12  # rounds until loads and tyre forces agree: each leaves a quarter of the difference
 _COLOURS: Final = {
     "dry": (0.55, 0.5, 0.45, 0.6),
@@ -328,7 +330,7 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
         for i, (body, joint) in enumerate(zip(self._bodies, self._joints, strict=True)):
             left_x, left_y, _ = axes[joint]
             level = math.hypot(left_x, left_y)
-            if level == 0.0:  # it lies on its side
+            if level < _UPRIGHT:  # it lies on its side: no heading, and no tread on the ground
                 slips[i], forces[body] = 0.0, [0.0] * 6
                 continue
             left_x, left_y = left_x / level, left_y / level

@@ -1,0 +1,695 @@
+"""The rover: tyre forces against their formula and MuJoCo's Jacobians, drives against ODEs and closed forms."""
+
+import copy
+import math
+import pickle
+import warnings
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from safe_wrappers.control.slip import slip_ratio
+from safe_wrappers.control.traction_curves import MAGIC_FORMULA, peak
+from safe_wrappers.envs import EPISODE_STEPS, SAFE_ROVER_ID
+from safe_wrappers.envs.ground import GROUNDS, Ground, Patch
+from safe_wrappers.envs.safe_rover import WHEELS
+from safe_wrappers.envs.tyre import SLOWEST, tyre_force
+from safe_wrappers.errors import ActionError, ConfigurationError, SafeWrappersError, UnknownNameError
+
+G = 9.81
+MASS, WHEELBASE, RADIUS = 18.0, 0.5, 0.1
+AXLE_INERTIA, OWN_INERTIA = 0.05, 0.005  # kg m^2 of a wheel: with its rotor, without
+TORQUE, DAMPING = 15.0, 0.02
+INFO_TYPES = {
+    "cost": float,
+    "cost_substep": float,
+    "slip": np.ndarray,
+    "slip_max": float,
+    "spin_out": float,
+    "yaw_rate_error": float,
+    "goal_met": bool,
+    "goals_reached": int,
+}
+EMPTY = {"agent": [0.0, 0.0, 0.0], "goal": [3.5, 3.5], "hazards": [], "patches": []}
+
+
+@pytest.fixture
+def env():
+    made = gym.make(SAFE_ROVER_ID).unwrapped
+    yield made
+    made.close()
+
+
+def start(env, **layout):
+    return env.reset(seed=0, options={"layout": {**EMPTY, **layout}})
+
+
+def throttle(*torques, steer=0.0):
+    return np.array([*(torques if len(torques) == 4 else torques * 4), steer])
+
+
+def contact_motion(model, qpos, qvel):
+    """Per wheel: rim speed, speed ahead, speed to the left of the contact point, and the two directions.
+
+    From MuJoCo's Jacobians at the contact point; a wheel that turns with its carrier's pitch slips by that, too.
+    """
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = qpos, qvel
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    found = []
+    for wheel in WHEELS:
+        body = model.body(wheel).id
+        centre, point, turn = np.zeros((3, model.nv)), np.zeros((3, model.nv)), np.zeros((3, model.nv))
+        below = data.xpos[body] - [0.0, 0.0, RADIUS]
+        mujoco.mj_jac(model, data, centre, turn, data.xpos[body], body)
+        mujoco.mj_jac(model, data, point, None, below, body)
+        left = data.xmat[body].reshape(3, 3)[:, 1] * [1, 1, 0]
+        left /= np.linalg.norm(left)
+        ahead = np.cross(left, [0, 0, 1])
+        rim = RADIUS * left @ turn @ qvel
+        found.append((rim, ahead @ centre @ qvel, left @ point @ qvel, ahead, left, below, body))
+    return found
+
+
+def random_state(env, rng):
+    qpos, qvel = env.init_qpos.copy(), rng.normal(0.0, 1.0, env.model.nv)
+    qpos[:2] = rng.uniform(-4, 4, 2)
+    turn = np.array([*rng.normal(0.0, 0.02, 2), rng.uniform(-3, 3)])
+    mujoco.mju_euler2Quat(qpos[3:7], turn, "xyz")
+    qpos[2] += rng.uniform(-0.001, 0.0)
+    qpos[7:] = rng.uniform(-0.6, 0.6, len(qpos) - 7)
+    qvel[[2, 3, 4]] *= 0.1
+    qvel[[7, 9, 10, 11]] = rng.normal(0.0, 20.0, 4)
+    return qpos, qvel
+
+
+# One tyre ------------------------------------------------------------------------------------------------
+
+speeds = st.floats(-20.0, 20.0)
+
+
+@given(rim=speeds, forward=speeds, load=st.floats(0.0, 200.0), ground=st.sampled_from(GROUNDS))
+def test_along_its_heading_a_tyre_follows_the_traction_curve(rim, forward, load, ground):
+    along, across, slip = tyre_force(rim, forward, 0.0, load, MAGIC_FORMULA[ground])
+    assert slip == pytest.approx(float(slip_ratio(rim, forward, SLOWEST)), abs=1e-12)
+    assert along == pytest.approx(float(MAGIC_FORMULA[ground].friction(slip)) * load, abs=1e-9)
+    assert across == 0.0
+
+
+@given(
+    rim=speeds, forward=speeds, sideways=speeds, load=st.floats(0.1, 200.0), ground=st.sampled_from(GROUNDS)
+)
+def test_a_tyre_opposes_its_sliding_with_no_more_than_the_curve_gives(rim, forward, sideways, load, ground):
+    curve = MAGIC_FORMULA[ground]
+    along, across, _ = tyre_force(rim, forward, sideways, load, curve)
+    sliding = np.array([forward - rim, sideways])
+    speed = max(abs(forward), abs(rim), SLOWEST)
+    assert math.hypot(along, across) == pytest.approx(
+        float(curve.friction(np.linalg.norm(sliding) / speed)) * load, abs=1e-9
+    )
+    assert along * sliding[0] + across * sliding[1] <= 1e-9
+    assert along * sliding[1] == pytest.approx(across * sliding[0], abs=1e-6)  # along the sliding
+
+
+@given(rim=speeds, forward=speeds, sideways=speeds, load=st.floats(-50.0, 0.0))
+def test_no_load_no_force(rim, forward, sideways, load):
+    assert tyre_force(rim, forward, sideways, load, MAGIC_FORMULA["dry"])[:2] == (0.0, 0.0)
+
+
+# The forces on the machine ---------------------------------------------------------------------------------
+
+
+def test_every_wheel_gets_the_formulas_force_at_its_contact_point(env):
+    """Joint by joint, against Jacobians; and no state in which the tyres put power into the rover."""
+    rng = np.random.default_rng(0)
+    start(env, patches=[{"ground": "ice", "center": [1, 1], "radius": 3}], ground="wet")
+    grounds, loaded = set(), 0
+    for _ in range(60):
+        qpos, qvel = random_state(env, rng)
+        env.set_state(qpos, qvel)
+        expected = np.zeros(env.model.nv)
+        loads = env.wheel_loads
+        power = 0.0
+        for i, (rim, forward, sideways, ahead, left, below, body) in enumerate(
+            contact_motion(env.model, qpos, qvel)
+        ):
+            over = max(abs(rim), abs(forward), SLOWEST)
+            slip = np.array([rim - forward, -sideways]) / over
+            size = np.linalg.norm(slip)
+            ground = "ice" if np.hypot(*(below[:2] - 1)) <= 3 else "wet"
+            assert env.ground_under(WHEELS[i]) == ground
+            assert env.curve_under(WHEELS[i]) is MAGIC_FORMULA[ground]
+            grounds.add(ground)
+            loaded += loads[i] > 0
+            share = float(MAGIC_FORMULA[ground].friction(size)) * loads[i] / size
+            force = share * (slip[0] * ahead + slip[1] * left)
+            power += share * slip @ [forward - rim, sideways]
+            mujoco.mj_applyFT(env.model, env.data, force, np.zeros(3), below, body, expected)
+        got = np.zeros(env.model.nv)
+        for body in range(env.model.nbody):
+            wrench = env.data.xfrc_applied[body]
+            mujoco.mj_applyFT(env.model, env.data, wrench[:3], wrench[3:], env.data.xipos[body], body, got)
+        np.testing.assert_allclose(
+            got, expected, rtol=1e-5, atol=1e-3
+        )  # loads agree to 1e-6 of the load transfer
+        assert got @ qvel == pytest.approx(power, rel=1e-4, abs=1e-3)
+        assert got @ qvel <= 0.0
+    assert grounds == {"ice", "wet"}
+    assert loaded > 60
+
+
+def test_sliding_without_drive_only_loses_energy(env):
+    """Kinetic and potential energy after every substep, motors off, thrown with spin on every ground."""
+    env.model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
+    rng = np.random.default_rng(1)
+    env.frame_skip = 1
+    for ground in GROUNDS:
+        start(env, ground=ground)
+        qvel = np.zeros(env.model.nv)
+        qvel[:2], qvel[5], qvel[[7, 9, 10, 11]] = rng.normal(0, 3, 2), 4.0, rng.normal(0, 30, 4)
+        env.set_state(env.data.qpos.copy(), qvel)
+        energy = [env.data.energy.sum()]
+        for _ in range(300):
+            env.step(throttle(0.0))
+            energy.append(env.data.energy.sum())
+        assert energy[-1] < energy[0] - 1.0
+        # 50 mJ: an unloaded corner's landing, which the contact's spring gives back.
+        assert np.diff(energy).max() < 0.05
+
+
+def test_a_wheel_in_the_air_gets_no_force(env):
+    start(env)
+    qpos, qvel = env.data.qpos.copy(), np.zeros(env.model.nv)
+    qpos[2] += 0.3
+    qvel[0], qvel[[7, 9, 10, 11]] = 2.0, 50.0
+    env.set_state(qpos, qvel)
+    for _ in range(10):
+        info = env.step(throttle(0.0))[4]
+        np.testing.assert_array_equal(env.wheel_loads, 0.0)
+        np.testing.assert_array_equal(env.data.xfrc_applied, 0.0)
+        assert info["slip"].min() > 0.5  # as the ratio is
+        assert info["slip_max"] == info["spin_out"] == 0.0  # but nothing spins out without a load
+    assert env.data.qvel[0] == pytest.approx(2.0, abs=0.01)
+    landing = [env.step(throttle(0.0))[4]["spin_out"] for _ in range(40)]
+    assert max(landing) == 1.0
+    assert env.data.qvel[0] > 2.5
+
+
+# Drives with known results ---------------------------------------------------------------------------------
+
+
+def ride(torque, ground, speed, until, mass=MASS):
+    """The rover straight ahead as an ODE: v, front and rear wheel rate; load transfer without pitching."""
+    curve, lever = MAGIC_FORMULA[ground], 0.5 * WHEELBASE
+    height = 0.12 - 8.5e-5
+
+    def rates(_, state):
+        v, *wheel = state
+        slips = [float(slip_ratio(RADIUS * w, v, SLOWEST)) for w in wheel]
+        loads = [mass * G / 4.0] * 2
+        for _ in range(30):  # loads and forces agree
+            forces = [float(curve.friction(s)) * load for s, load in zip(slips, loads, strict=True)]
+            alpha = [
+                (torque - RADIUS * f - DAMPING * w) / AXLE_INERTIA for f, w in zip(forces, wheel, strict=True)
+            ]
+            moved = (height * 2 * sum(forces) + OWN_INERTIA * 2 * sum(alpha)) / (4.0 * lever)
+            loads = [mass * G / 4.0 - moved, mass * G / 4.0 + moved]
+        return [2 * sum(forces) / mass, *alpha]
+
+    found = solve_ivp(
+        rates, (0, until), [speed, speed / RADIUS, speed / RADIUS], rtol=1e-8, atol=1e-8, max_step=0.01
+    )
+    return found.y[:, -1]
+
+
+@pytest.mark.parametrize(
+    ("control", "ground", "speed"),
+    [(0.2, "dry", 0.0), (1.0, "wet", 0.0), (-0.35, "dry", 3.0), (-0.1, "ice", 2.0)],
+)
+def test_driving_straight_is_the_wheels_own_equation(env, control, ground, speed):
+    start(env, ground=ground, speed=speed)
+    for _ in range(40):
+        env.step(throttle(control))
+    v, front, rear = ride(TORQUE * control, ground, speed, 0.4)
+    assert env.forward_speed == pytest.approx(v, rel=0.01, abs=0.01)
+    np.testing.assert_allclose(env.data.qvel[[7, 9]], front, rtol=0.01, atol=0.1)
+    np.testing.assert_allclose(env.data.qvel[[10, 11]], rear, rtol=0.01, atol=0.1)
+
+
+def lock(env):
+    """Hold the wheels at the rate that they have: rotors too heavy to turn."""
+    env.model.dof_armature[[7, 9, 10, 11]] = 1e9
+
+
+@pytest.mark.parametrize("ground", GROUNDS)
+def test_locked_wheels_stop_in_the_sliding_frictions_distance(env, ground):
+    speed, mu = 4.0, float(MAGIC_FORMULA[ground].friction(1.0))
+    start(env, ground=ground, speed=speed, agent=[0, 0, 0.7])
+    lock(env)
+    qvel = env.data.qvel.copy()
+    qvel[[7, 9, 10, 11]] = 0.0
+    env.set_state(env.data.qpos.copy(), qvel)
+    for _ in range(1500):
+        env.step(throttle(0.0))
+        if env.forward_speed < 0.02:
+            break
+    assert np.hypot(*env.agent_position) == pytest.approx(speed**2 / (2 * mu * G), rel=0.02)
+    assert env.agent_heading == pytest.approx(0.7, abs=0.01)
+
+
+@pytest.mark.parametrize("ground", GROUNDS)
+def test_the_best_slip_brakes_with_the_peak_friction_and_moves_the_load_forward(env, ground):
+    best = peak(MAGIC_FORMULA[ground])
+    start(env, ground=ground, speed=6.0)
+    lock(env)
+    env.frame_skip = 1
+    speeds, loads = [], []
+    for _ in range(150):
+        env.data.qvel[[7, 9, 10, 11]] = (1.0 - best.slip) * env.forward_speed / RADIUS
+        env.step(throttle(0.0))
+        speeds.append(env.forward_speed)
+        loads.append(env.wheel_loads)
+    # The pitching that the brake's onset causes has settled by then.
+    deceleration = (speeds[49] - speeds[149]) / (100 * 0.002)
+    assert deceleration == pytest.approx(best.friction * G, rel=0.01)
+    moved = MASS * deceleration * (0.12 - 8.5e-5) / WHEELBASE
+    load = np.mean(loads[50:], axis=0)
+    assert load[:2].sum() == pytest.approx(MASS * G / 2 + moved, rel=0.01)
+    assert load[2:].sum() == pytest.approx(MASS * G / 2 - moved, rel=0.01)
+
+
+def test_symmetric_driving_stays_straight_and_mirrored_steering_mirrors_the_path(env):
+    start(env)
+    for k in range(200):
+        env.step(throttle(1.0 if k < 100 else -1.0))
+    assert abs(env.agent_position[1]) < 1e-3
+    assert abs(env.agent_heading) < 1e-3
+    paths = []
+    for side in (1.0, -1.0):
+        start(env, speed=1.5)
+        for _ in range(80):
+            env.step(throttle(0.05, steer=0.4 * side))
+        paths.append([*env.agent_position, env.agent_heading])
+    np.testing.assert_allclose(paths[0], np.array(paths[1]) * [1, -1, -1], atol=1e-4)
+    assert paths[0][2] > 0.3  # to the left
+
+
+def test_a_slow_turn_has_the_radius_that_the_steering_asks_for(env):
+    start(env, speed=0.5)
+    for _ in range(100):
+        env.step(throttle(0.003 * 1.0, steer=0.5))
+    turn, speed = env.data.qvel[5], env.forward_speed
+    assert turn == pytest.approx(speed * math.tan(0.25) / WHEELBASE, rel=0.03)
+    assert env.observe()[9] == pytest.approx(0.25, abs=0.005)
+
+
+def test_the_track_rod_keeps_the_front_wheels_parallel(env):
+    start(env)
+    qpos = env.data.qpos.copy()
+    qpos[[7, 9]] = 0.1, -0.1
+    env.set_state(qpos, np.zeros(env.model.nv))
+    for _ in range(10):
+        env.step(throttle(0.0, steer=-0.6))
+    for _ in range(20):
+        env.step(throttle(0.0, steer=-0.6))
+        assert abs(env.data.qpos[7] - env.data.qpos[9]) < 2e-3
+    assert env.data.qpos[7] == pytest.approx(-0.3, abs=0.005)
+
+
+def test_ice_under_the_right_wheels_turns_a_braking_rover_to_the_left(env):
+    ice = [{"ground": "ice", "center": [1.0, -30.0], "radius": 29.95}]
+    start(env, speed=3.0, patches=ice, agent=[1.0, 0.0, 0.0])
+    assert [env.ground_under(wheel) for wheel in WHEELS] == ["dry", "ice", "dry", "ice"]
+    worst = max(env.step(throttle(-0.5))[4]["yaw_rate_error"] for _ in range(15))
+    assert env.data.qvel[5] > 0.5
+    assert worst > 0.5
+
+
+def test_full_throttle_spins_all_four_wheels_even_on_dry_ground(env):
+    start(env)
+    spins = [env.step(throttle(1.0))[4] for _ in range(60)]
+    assert spins[-1]["slip"].min() > 0.5
+    assert spins[-1]["spin_out"] == 1.0
+    start(env)
+    for _ in range(60):
+        info = env.step(throttle(0.2))[4]
+        assert info["spin_out"] == 0.0
+        assert info["slip_max"] < 0.14
+
+
+def test_it_comes_to_rest_and_stays_there(env):
+    """Where slip counts against SLOWEST the tyre is stiffest: an explicit step must neither creep nor chatter."""
+    for ground in GROUNDS:
+        start(env, ground=ground)
+        qvel = np.zeros(env.model.nv)
+        qvel[1], qvel[5] = 0.3, 0.5
+        env.set_state(env.data.qpos.copy(), qvel)
+        for _ in range(300):
+            env.step(throttle(0.0))
+        place, rates = env.agent_position, []
+        for _ in range(100):
+            env.step(throttle(0.0))
+            rates.append(env.data.qvel[[0, 1, 5]])
+        assert np.abs(rates).max() < 0.02  # it rolls freely; across and around it stands
+        assert np.abs(np.diff(rates, axis=0)).max() < 1e-4
+        assert np.hypot(*(env.agent_position - place)) < 0.02
+
+
+def test_a_finer_step_changes_a_manoeuvre_little(env):
+    """Throttle, swerve and brake for 2 s, with spinning wheels, at 2 ms and at 0.4 ms."""
+    ends = []
+    for finer in (1, 5):
+        env.model.opt.timestep = 0.002 / finer
+        env.frame_skip = 5 * finer
+        start(env, speed=1.0)
+        for k in range(200):
+            env.step(throttle(0.5 if k < 60 else -0.15, steer=0.5 * math.sin(k / 20)))
+        ends.append([*env.agent_position, env.agent_heading, env.forward_speed])
+    np.testing.assert_allclose(ends[0], ends[1], atol=0.03)
+    assert np.hypot(*ends[0][:2]) > 2.0
+
+
+# The task ------------------------------------------------------------------------------------------------
+
+
+def test_check_env_passes_without_warnings(env):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings(
+            "ignore", message=".*A Box observation space (minimum|maximum) value is -?infinity"
+        )
+        check_env(env, skip_render_check=True)
+
+
+def test_spaces_spec_and_pickling():
+    env = gym.make(SAFE_ROVER_ID)
+    assert env.action_space == gym.spaces.Box(-1, 1, (5,), np.float32)
+    assert env.observation_space.shape == (42,)
+    assert env.observation_space.dtype == np.float64
+    assert env.unwrapped.dt == pytest.approx(0.01)
+    assert env.spec.max_episode_steps == EPISODE_STEPS
+    again = pickle.loads(pickle.dumps(env.unwrapped))
+    np.testing.assert_array_equal(again.reset(seed=7)[0], env.reset(seed=7)[0])
+    np.testing.assert_array_equal(gym.make(env.spec).reset(seed=7)[0], again.observe())
+
+
+def test_info_keeps_its_types(env):
+    rng = np.random.default_rng(2)
+    infos = [env.reset(seed=2)[1]] + [env.step(rng.uniform(-1, 1, 5))[4] for _ in range(200)]
+    for info in infos:
+        assert {key: type(value) for key, value in info.items()} == INFO_TYPES
+        assert info["slip"].shape == (4,)
+        assert info["slip"].dtype == np.float64
+        assert info["cost"] == info["cost_substep"]
+    assert infos[5]["slip"] is not infos[6]["slip"]
+
+
+def test_a_vector_env_reports_slip():
+    envs = gym.make_vec(SAFE_ROVER_ID, num_envs=2)
+    envs.reset(seed=0)
+    infos = envs.step(np.ones((2, 5)))[4]
+    assert infos["slip"].shape == (2, 4)
+    assert infos["slip"].dtype == np.float64
+    envs.close()
+
+
+def test_observation_is_what_it_says(env):
+    start(env, speed=2.0, agent=[1.0, -1.0, 2.0], goal=[1.0, 2.0], hazards=[[2.0, -1.0]])
+    for _ in range(20):
+        env.step(throttle(0.3, 0.2, 0.1, 0.0, steer=0.5))
+    before = env.data.qvel.copy()
+    observation = env.step(throttle(0.3, 0.2, 0.1, 0.0, steer=0.5))[0]
+    qpos, qvel = env.data.qpos, env.data.qvel
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, qpos[3:7])
+    axes = rotation.reshape(3, 3)
+    np.testing.assert_allclose(observation[:2], (axes.T @ qvel[:3])[:2], atol=2e-3)  # 2 cm lower
+    assert observation[2] == pytest.approx(qvel[5])
+    gained = axes.T @ (qvel[:3] - before[:3]) / env.dt
+    np.testing.assert_allclose(observation[3:5], gained[:2], atol=0.3)
+    np.testing.assert_allclose(observation[5:9], RADIUS * qvel[[7, 9, 10, 11]])
+    assert observation[9] == pytest.approx(env.data.ten_length[0], abs=2e-3)
+    for target, lidar in (
+        (env.goal_position, observation[10:26]),
+        (env.hazard_positions[0], observation[26:]),
+    ):
+        ahead, left = (axes[:2, :2].T @ (target - env.agent_position)).tolist()
+        sector = int(math.atan2(left, ahead) % math.tau / (math.tau / 16))
+        assert lidar.argmax() == sector
+        assert lidar.max() == pytest.approx(1 - math.hypot(ahead, left) / 12.0)
+
+
+def test_costs_and_slips_count_every_substep(env, monkeypatch):
+    """Independent oracle: the states after each physics substep, judged one by one."""
+    states = []
+
+    def recording(model, data, step=mujoco.mj_step2):
+        step(model, data)
+        states.append((data.qpos.copy(), data.qvel.copy()))
+
+    monkeypatch.setattr(mujoco, "mj_step2", recording)
+    rng = np.random.default_rng(3)
+    cut_only_between = costs = spins = 0
+    for episode in range(6):
+        env.reset(
+            seed=episode, options={"layout": {"speed": 3.0, "agent": [-2, 0, 0], "hazards": [[-1, 0.28]]}}
+        )
+        for k in range(60):
+            if k % 15 == 0:
+                action = throttle(rng.uniform(-1, 1), steer=rng.uniform(-0.3, 0.3))
+            states.clear()
+            info = env.step(action)[4]
+            hazards = env.hazard_positions
+            inside = [bool((np.hypot(*(q[:2] - hazards).T) <= 0.3).any()) for q, _ in states]
+            assert info["cost"] == float(any(inside))
+            costs += any(inside)
+            cut_only_between += any(inside) and not inside[-1]
+            slips, yaw = [], []
+            for qpos, qvel in states:
+                moved = contact_motion(env.model, qpos, qvel)
+                slips.append([float(slip_ratio(m[0], m[1], SLOWEST)) for m in moved])
+                ahead = np.cross(moved[2][4], [0, 0, 1])
+                yaw.append(abs(qvel[5] - qvel[:3] @ ahead * math.tan(0.5 * (qpos[7] + qpos[9])) / WHEELBASE))
+            np.testing.assert_allclose(info["slip"], slips[-1], atol=1e-9)
+            assert info["slip_max"] <= np.abs(slips).max() + 1e-9
+            if env.wheel_loads.min() > 1.0:
+                assert info["slip_max"] == pytest.approx(np.abs(slips).max(), abs=1e-9)
+            assert info["spin_out"] == float(info["slip_max"] > 0.5)
+            assert info["yaw_rate_error"] == pytest.approx(max(yaw), abs=1e-3)
+            spins += info["spin_out"]
+    assert len(states) == 5
+    assert costs > 10
+    assert cut_only_between > 0
+    assert 10 < spins < 350
+
+
+def pursue(env, speed=1.5):
+    """A driver of modest throttle: steers at the goal, backs up where it lies inside the turning circle."""
+    to_goal, heading = env.goal_position - env.agent_position, env.agent_heading
+    ahead = math.cos(heading) * to_goal[0] + math.sin(heading) * to_goal[1]
+    left = math.cos(heading) * to_goal[1] - math.sin(heading) * to_goal[0]
+    bearing = math.atan2(left, ahead)
+    if math.hypot(ahead, abs(left) - 0.95) < 0.65:
+        wanted, steer = -speed, 0.0
+    else:
+        wanted, steer = speed * (0.4 + 0.6 * max(0.0, math.cos(bearing))), 1.5 * bearing
+    push = 0.3 * (wanted - env.forward_speed)
+    return np.clip(throttle(push, steer=steer), -1.0, 1.0)
+
+
+def test_a_modest_driver_reaches_goals_and_is_paid_for_the_distance(env):
+    goals = 0
+    for seed in range(3):
+        env.reset(seed=seed)
+        goal, gained = env.goal_position, 0.0
+        distance = np.hypot(*(goal - env.agent_position))
+        for _ in range(700):
+            reward, terminated, truncated, info = env.step(pursue(env))[1:]
+            assert not (terminated or truncated)
+            now = np.hypot(*(goal - env.agent_position))
+            assert reward == pytest.approx(distance - now + info["goal_met"], abs=1e-12)
+            gained += reward
+            if info["goal_met"]:
+                assert now <= 0.4
+                goal = env.goal_position
+                now = np.hypot(*(goal - env.agent_position))
+                assert now > 0.8
+            distance = now
+        goals += info["goals_reached"]
+    assert goals >= 3
+
+
+def test_the_same_seed_is_the_same_episode_and_mujocos_state_is_the_whole_state(env):
+    rng = np.random.default_rng(4)
+    actions = rng.uniform(-1, 1, (120, 5))
+    env.reset(seed=5)
+    first = [env.step(a) for a in actions]
+    other = gym.make(SAFE_ROVER_ID).unwrapped
+    other.reset(seed=5)
+    kept = None
+    for k, (action, (observation, reward, *_)) in enumerate(zip(actions, first, strict=True)):
+        got = other.step(action)
+        np.testing.assert_array_equal(got[0], observation)
+        assert got[1] == reward
+        if k == 60:
+            whole = mujoco.mjtState.mjSTATE_INTEGRATION
+            kept = np.zeros(mujoco.mj_stateSize(other.model, whole))
+            mujoco.mj_getState(other.model, other.data, kept, whole)
+    # Another env, another past: MuJoCo's state alone carries it over.
+    layout = {"agent": [0, 0, 0], "goal": other.goal_position, "hazards": other.hazard_positions}
+    layout["patches"] = [
+        {"ground": p.ground, "center": p.center, "radius": p.radius} for p in other.ground.patches
+    ]
+    env.reset(seed=99, options={"layout": layout})
+    for _ in range(30):
+        env.step(actions[0])
+    mujoco.mj_setState(env.model, env.data, kept, mujoco.mjtState.mjSTATE_INTEGRATION)
+    for action, (observation, *_) in zip(actions[61:], first[61:], strict=True):
+        np.testing.assert_array_equal(env.step(action)[0][:10], observation[:10])
+
+
+def test_set_state_forgets_the_past(env):
+    env.reset(seed=6)
+    for _ in range(50):
+        env.step(throttle(1.0, steer=0.5))
+    qpos, qvel = env.data.qpos.copy(), env.data.qvel.copy()
+    for _ in range(20):
+        env.step(throttle(-1.0))
+    env.set_state(qpos, qvel)
+    here, info = env.observe(), env._get_reset_info()
+    env.reset(seed=6)
+    env.set_state(qpos, qvel)
+    np.testing.assert_array_equal(env.observe(), here)
+    np.testing.assert_array_equal(env._get_reset_info()["slip"], info["slip"])
+
+
+def test_layouts_are_sampled_apart_and_given_ones_are_kept(env):
+    kinds = set()
+    for seed in range(30):
+        env.reset(seed=seed)
+        hazards, agent, goal = env.hazard_positions, env.agent_position, env.goal_position
+        assert hazards.shape == (6, 2)
+        assert np.abs(hazards).max() <= 4.0
+        assert np.hypot(*(hazards - agent).T).min() > 1.0
+        assert np.hypot(*(hazards - goal).T).min() > 0.8
+        assert [p.ground for p in env.ground.patches] == ["wet"] * 4 + ["ice"] * 4
+        assert all(
+            0.6 <= p.radius <= 1.0 and max(map(abs, p.center)) + p.radius <= 4 for p in env.ground.patches
+        )
+        kinds.add(env.ground_under("rear_left"))
+    assert kinds == {"dry", "wet", "ice"}
+    layout = {
+        "agent": [1.0, 2.0, -3.0],
+        "goal": [0.0, 1.0],
+        "hazards": [[3.0, 3.0]],
+        "patches": [
+            {"ground": "snow", "center": [1.0, 2.0], "radius": 5.0},
+            {"ground": "ice", "center": [1.0, 2.0], "radius": 0.4},
+        ],
+        "ground": "wet",
+        "speed": -1.5,
+    }
+    kept = copy.deepcopy(layout)
+    _, info = env.reset(options={"layout": layout})
+    assert layout == kept
+    np.testing.assert_allclose(env.agent_position, [1.0, 2.0])
+    assert env.agent_heading == pytest.approx(-3.0)
+    assert env.forward_speed == pytest.approx(-1.5)
+    np.testing.assert_allclose(info["slip"], 0.0, atol=1e-12)
+    np.testing.assert_array_equal(env.goal_position, [0.0, 1.0])
+    np.testing.assert_array_equal(env.hazard_positions, [[3.0, 3.0]])
+    assert {env.ground_under(wheel) for wheel in WHEELS} == {"ice"}  # on top of the snow
+    assert env.ground.at(3.0, 2.0) == "snow"
+    assert env.ground.at(-3.9, -3.9) == "wet"
+
+
+@given(points=st.lists(st.tuples(st.floats(-4, 4), st.floats(-4, 4)), min_size=1, max_size=5))
+def test_the_later_patch_lies_on_top(points):
+    patches = [Patch("ice", (0.0, 0.0), 2.0), Patch("wet", (1.0, 0.0), 1.5), Patch("snow", (-2.0, 1.0), 1.0)]
+    ground = Ground("dry", patches)
+    for x, y in points:
+        covering = [p.ground for p in patches if math.dist((x, y), p.center) ** 2 <= p.radius**2]
+        assert ground.at(x, y) == (covering[-1] if covering else "dry")
+        assert ground.curve_at(x, y) is MAGIC_FORMULA[ground.at(x, y)]
+
+
+@pytest.mark.parametrize(
+    ("layout", "error", "message"),
+    [
+        ({"vases": []}, UnknownNameError, "'vases'.*agent, goal, hazards, patches, ground, speed"),
+        ({"ground": "mud"}, UnknownNameError, "'mud'.*dry, wet, snow, ice"),
+        ({"ground": ["ice"]}, UnknownNameError, "valid grounds"),
+        ({"patches": {"ground": "ice"}}, ConfigurationError, "must be a list"),
+        (
+            {"patches": [{"ground": "ice", "center": [0, 0]}]},
+            UnknownNameError,
+            r"patches\[0\].*ground, center, radius",
+        ),
+        ({"patches": [{"ground": "ice", "center": [0, 0], "radius": 0}]}, ConfigurationError, "radius > 0"),
+        ({"patches": [{"ground": "mud", "center": [0, 0], "radius": 1}]}, UnknownNameError, "'mud'"),
+        ({"patches": [{"ground": "ice", "center": [0], "radius": 1}]}, ConfigurationError, r"\[x, y\]"),
+        (
+            {"patches": [{"ground": "ice", "center": [0, 0], "radius": 1}] * 9},
+            ConfigurationError,
+            "9 patches.* 8",
+        ),
+        ({"hazards": [[0, 0]] * 7}, ConfigurationError, "7 hazards.*at most 6"),
+        ({"agent": [0, 0]}, ConfigurationError, "heading"),
+        ({"speed": [1.0]}, ConfigurationError, "a number of m/s"),
+        ({"speed": math.inf}, ConfigurationError, "finite"),
+        ([1], ConfigurationError, "must be a mapping"),
+    ],
+)
+def test_layouts_that_cannot_be_used_are_refused(env, layout, error, message):
+    with pytest.raises(error, match=message):
+        env.reset(options={"layout": layout})
+
+
+@pytest.mark.parametrize("action", [[0, 0, 0, 0], [0, 0, math.nan, 0, 0], [math.inf, 0, 0, 0, 0]])
+def test_actions_that_are_no_five_finite_numbers_are_refused(env, action):
+    env.reset(seed=0)
+    qpos = env.data.qpos.copy()
+    with pytest.raises(ActionError, match="5 finite numbers"):
+        env.step(np.array(action, dtype=float))
+    np.testing.assert_array_equal(env.data.qpos, qpos)
+
+
+def test_unknown_wheels_are_named(env):
+    for ask in (env.ground_under, env.curve_under):
+        with pytest.raises(UnknownNameError, match=r"'left'.*front_left, front_right, rear_left, rear_right"):
+            ask("left")
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_numbers_that_are_not_finite_are_not_hidden(env, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warning into a log here
+    env.reset(seed=0)
+    qvel = np.zeros(env.model.nv)
+    qvel[0] = math.nan
+    env.set_state(env.data.qpos.copy(), qvel)
+    with pytest.raises(SafeWrappersError, match="not finite"):
+        env.step(throttle(0.0))
+    assert np.isfinite(env.reset(seed=0)[0]).all()
+
+
+def test_rolled_over_is_the_end(env):
+    start(env)
+    qpos = env.data.qpos.copy()
+    qpos[2], qpos[3:7] = 0.12, [0.0, 1.0, 0.0, 0.0]
+    env.set_state(qpos, np.zeros(env.model.nv))
+    assert env.step(throttle(1.0))[2]
+    np.testing.assert_array_equal(env.wheel_loads, 0.0)
+    start(env)
+    qpos[2], qpos[3:7] = 0.295, [math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0]  # on its right side: axles upright
+    env.set_state(qpos, np.zeros(env.model.nv))
+    assert env.wheel_loads[[1, 3]].min() > 0.0
+    assert not env.data.xfrc_applied.any()
+    assert env.step(throttle(1.0))[2]
+    assert not env.data.xfrc_applied.any()
