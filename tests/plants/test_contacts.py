@@ -1,0 +1,109 @@
+"""Contacts: against mj_contactForce, and which ones are read."""
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from dropped_ball import DroppedBall
+
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.plants.contacts import Contacts
+
+
+def by_mujoco(model, data):
+    """Every contact by MuJoCo's own function."""
+    wrench, found = np.zeros(6), []
+    for i in range(data.ncon):
+        mujoco.mj_contactForce(model, data, i, wrench)
+        bodies = sorted(model.geom_bodyid[data.contact[i].geom].tolist())
+        found.append((tuple(bodies), data.contact[i].dist, wrench[0]))
+    return found
+
+
+def assert_same(model, data):
+    read, expected = Contacts(model).read(data), by_mujoco(model, data)
+    assert [c.bodies for c in read] == [e[0] for e in expected]
+    np.testing.assert_array_equal([c.gap for c in read], [e[1] for e in expected])
+    np.testing.assert_allclose([c.force for c in read], [e[2] for e in expected], rtol=1e-12, atol=1e-12)
+    return len(read)
+
+
+@pytest.mark.parametrize("env_id", ["Humanoid-v5", "Pusher-v5", "HalfCheetah-v5"])
+@pytest.mark.parametrize("cone", ["PYRAMIDAL", "ELLIPTIC"])
+def test_forces_are_mujocos(env_id, cone):
+    env = gym.make(env_id).unwrapped
+    env.model.opt.cone = getattr(mujoco.mjtCone, f"mjCONE_{cone}")
+    env.reset(seed=0)
+    rng, seen = np.random.default_rng(0), 0
+    for _ in range(80):
+        env.step(rng.uniform(env.action_space.low, env.action_space.high))
+        seen += assert_same(env.model, env.data)
+    assert seen > 30
+
+
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+@pytest.mark.parametrize("condim", [1, 3, 4, 6])
+def test_forces_are_mujocos_for_every_kind_of_contact(cone, condim):
+    env = DroppedBall(cone=cone, height=0.101)
+    env.model.geom_condim[:] = condim
+    env.model.geom_friction[:, 1:] = 0.01
+    env.reset()
+    env.data.qvel[3:6] = 1.0, 2.0, 3.0
+    assert sum(env.step(np.zeros(3)) is not None and assert_same(env.model, env.data) for _ in range(20)) > 20
+
+
+def test_a_gap_inside_the_margin_without_force_is_a_contact_with_none():
+    env = DroppedBall(height=0.11)
+    env.model.geom_gap[:] = 0.05
+    env.reset()
+    if not env.data.ncon:  # before MuJoCo 3.5 the gap was counted from the margin down
+        env.model.geom_margin[:] = 0.05
+        env.reset()
+    (found,) = Contacts(env.model, ["ball"]).read(env.data)
+    assert found.force == 0.0 and found.gap == pytest.approx(0.01)
+
+
+def test_only_what_is_named_is_read():
+    env = DroppedBall(height=0.0995)
+    env.reset()
+    model, data = env.model, env.data
+    pairs = lambda *names: {c.bodies for c in Contacts(model, *names).read(data)}  # noqa: E731
+    world, ball, box, hand, puck = (model.body(n).id for n in ("world", "ball", "box", "hand", "puck"))
+    data.qpos[model.jnt_qposadr[-1]] = -0.25
+    mujoco.mj_forward(model, data)
+    assert pairs() == {(world, ball), (world, box), (hand, puck)}
+    assert pairs(["ball"]) == pairs(None, ["ball"]) == pairs(["world"], ["ball"]) == {(world, ball)}
+    assert pairs(["puck", "box"]) == {(world, box), (hand, puck)}
+    assert pairs(["puck", "box"], ["world"]) == {(world, box)}
+    assert pairs(["ball"], ["box"]) == pairs(["ball"], ["ball"]) == set()
+
+
+def test_what_is_flexible_counts_as_everything_and_has_no_name():
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><geom type="plane" size="2 2 .1"/>
+        <flexcomp name="cloth" type="grid" dim="2" count="3 3 1" spacing=".2 .2 .2" pos="0 0 .02" radius=".03"
+        mass="1"/></worldbody></mujoco>"""
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert data.ncon > 0 and (data.contact.geom == -1).any()
+    found = Contacts(model).read(data)
+    assert {c.bodies for c in found} == {(0, model.nbody)}
+    assert len(Contacts(model, None, ["world"]).read(data)) == len(found)
+    assert not Contacts(model, [model.body(1).name], [model.body(2).name]).read(data)
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "said"),
+    [
+        ({"bodies": ["ball", "bal"]}, UnknownNameError, "bodies: .* no body 'bal'; it has: world, ball, box"),
+        ({"against": ["wall"]}, UnknownNameError, "against: .* no body 'wall'"),
+        ({"bodies": [3]}, UnknownNameError, "no body 3"),
+        ({"bodies": "ball"}, ConfigurationError, "bodies is a list of names"),
+        ({"bodies": 3}, ConfigurationError, "bodies is a list of names"),
+        ({"against": []}, ConfigurationError, "against is a list of names"),
+    ],
+)
+def test_names_that_cannot_be_meant_are_refused(given, error, said):
+    with pytest.raises(error, match=said):
+        Contacts(DroppedBall().model, **given)

@@ -1,0 +1,146 @@
+"""Replays: the env's own end, bit for bit, what is seen on the way, and when they say that they have failed."""
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from dropped_ball import DroppedBall
+
+from safe_wrappers.control.impact import peak_force
+from safe_wrappers.plants.contacts import Contacts
+from safe_wrappers.plants.replay import Replay
+
+INTEGRATORS = ("Euler", "implicit", "implicitfast", "RK4")
+RAW = ("HalfCheetah-v5", "Pusher-v5", "Hopper-v5", "Ant-v5", "Humanoid-v5", "SafePointGoal2-v0")
+
+
+def nothing(data, time_s):
+    """Looks away."""
+
+
+def stepped(env, replay, action):
+    """One step, and whether its replay is the same."""
+    replay.before()
+    env.step(action)
+    return replay.after(nothing)
+
+
+def states(env, data):
+    size = mujoco.mj_stateSize(env.model, int(mujoco.mjtState.mjSTATE_INTEGRATION))
+    state = np.zeros(size)
+    mujoco.mj_getState(env.model, data, state, int(mujoco.mjtState.mjSTATE_INTEGRATION))
+    return state
+
+
+@pytest.mark.parametrize("env_id", RAW)
+def test_a_replay_ends_where_the_env_does_and_leaves_it_alone(env_id):
+    env = gym.make(env_id).unwrapped
+    replay = Replay(env)
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        replay.before()
+        env.step(rng.uniform(env.action_space.low, env.action_space.high))
+        before = states(env, env.data).tobytes()
+        assert replay.after(nothing)
+        assert states(env, env.data).tobytes() == before
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("meddle", ["nothing", "pushes", "moves the hand"])
+def test_every_integrator_with_activations_applied_forces_and_mocap_bodies(integrator, meddle):
+    env = DroppedBall(meddle, integrator)
+    replay = Replay(env)
+    env.reset()
+    rng = np.random.default_rng(1)
+    for _ in range(60):
+        assert stepped(env, replay, rng.uniform(-1.0, 1.0, 3))
+    # The limited activation has been at its limit, and the puck has been lifted where the hand moves.
+    assert np.abs(env.data.act[0]) <= 0.3 and env.data.act.any()
+
+
+def test_a_limited_activation_stays_in_its_range_in_runge_kutta_steps():
+    env = DroppedBall(integrator="RK4")
+    replay = Replay(env)
+    env.reset()
+    assert all(stepped(env, replay, [0.0, 1.0, 1.0]) for _ in range(50))
+    assert env.data.act[0] == 0.3
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
+def test_what_changes_between_substeps_is_noticed(integrator):
+    env = DroppedBall("pushes in substeps", integrator)
+    replay = Replay(env)
+    env.reset()
+    assert not stepped(env, replay, np.zeros(3))
+
+
+@pytest.mark.parametrize(
+    ("integrator", "nudge", "same"),
+    [("Euler", 0.0, True), ("Euler", 1e-13, False), ("RK4", 1e-13, True), ("RK4", 1e-8, False)],
+)
+def test_same_is_bit_for_bit_and_up_to_rounding_for_runge_kutta(integrator, nudge, same):
+    env = DroppedBall("nudges", integrator)
+    env.nudge = nudge
+    replay = Replay(env)
+    env.reset()
+    assert stepped(env, replay, np.zeros(3)) is same
+
+
+def test_an_env_that_makes_itself_another_model_is_followed():
+    env = DroppedBall()
+    replay = Replay(env)
+    env.reset()
+    assert stepped(env, replay, np.zeros(3))
+    env.meddle = "another model"
+    assert not stepped(env, replay, np.zeros(3))
+    env.meddle = "nothing"
+    assert stepped(env, replay, np.zeros(3))
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_forces_times_their_times_are_the_momentum_gained(integrator):
+    # Ball and box fall, land and bounce; along z the floor's normal force and the weight are all there is.
+    env = DroppedBall(integrator=integrator, height=0.13)
+    replay, floor = Replay(env), Contacts(env.model, ["ball", "box"], ["world"])
+    env.reset()
+    held = 0.0
+    for _ in range(100):
+        seen = []
+        mass = {name: float(env.model.body(name).mass[0]) for name in ("ball", "box")}
+        before = mass["ball"] * env.data.qvel[2] + mass["box"] * env.data.qvel[8]
+        replay.before()
+        env.step(np.zeros(3))
+        assert replay.after(
+            lambda data, time_s, seen=seen: seen.append((time_s, sum(c.force for c in floor.read(data))))
+        )
+        gained = mass["ball"] * env.data.qvel[2] + mass["box"] * env.data.qvel[8] - before
+        assert sum(t for t, _ in seen) == pytest.approx(0.01)
+        impulse = sum(t * f for t, f in seen)
+        assert impulse == pytest.approx(gained + (mass["ball"] + mass["box"]) * 9.81 * 0.01, abs=1e-9)
+        held += impulse
+    assert held > 10.0
+
+
+@pytest.mark.parametrize("integrator", ["implicitfast", "RK4"])
+def test_the_peak_of_an_elastic_landing_is_the_formula_s(integrator):
+    mass, stiffness, height = 2.0, 2e4, 0.5
+    # A given stiffness is per mass, and the impedance's share of it: near 1 it is the spring's.
+    env = DroppedBall(
+        integrator=integrator,
+        timestep=1e-4,
+        mass=mass,
+        stiffness=stiffness / mass,
+        height=0.1 + height,
+        impedance=".9999 .9999 .001",
+    )
+    replay, floor = Replay(env), Contacts(env.model, ["ball"], ["world"])
+    env.reset()
+    forces = []
+    for _ in range(800):
+        replay.before()
+        env.step(np.zeros(3))
+        assert replay.after(lambda data, _: forces.extend(c.force for c in floor.read(data)))
+    # Undamped: it falls for 0.32 s and peaks 16 ms later; the weight adds less than twice itself.
+    expected = float(peak_force(np.sqrt(2.0 * 9.81 * height), mass, stiffness))
+    assert expected < max(forces) < 1.01 * (expected + 2.0 * mass * 9.81)

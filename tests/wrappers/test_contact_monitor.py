@@ -1,0 +1,241 @@
+"""ContactMonitor: against stepping by hand, that it changes nothing, and that it says when it cannot see."""
+
+import warnings
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+
+import safe_wrappers as sw
+from safe_wrappers import interventions as keys
+from safe_wrappers.control.contact import complementarity_residuals
+from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+
+FLOATS = (
+    keys.CONTACT_PEAK_FORCE,
+    keys.CONTACT_IMPULSE,
+    keys.CONTACT_PENETRATION,
+    keys.CONTACT_RESIDUAL,
+)
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+
+
+class Meddling(gym.Wrapper):
+    """Writes to the env's data after a step, where it is told to."""
+
+    at = ()
+    steps = 0
+    contact = None
+
+    def step(self, action):
+        out = super().step(action)
+        self.steps += 1
+        if self.steps in self.at:
+            self.unwrapped.data.qvel[0] += 1e-3
+            if self.contact is not None:
+                self.unwrapped.data.contact.dist[:] = self.contact
+        return out
+
+
+def actions(env, count, seed=0):
+    rng = np.random.default_rng(seed)
+    space = env.action_space
+    return rng.uniform(space.low, space.high, (count, *space.shape)).astype(space.dtype)
+
+
+def by_hand(env, start, substeps, bodies=None):
+    """The figures of one Euler step, substep by substep, by MuJoCo's own functions."""
+    model, data = env.model, mujoco.MjData(env.model)
+    mujoco.mj_setState(model, data, start, int(STATE))
+    data.ctrl[:] = env.data.ctrl
+    peak = impulse = depth = residual = 0.0
+    wrench = np.zeros(6)
+    for _ in range(substeps):
+        mujoco.mj_step(model, data)
+        pairs = {}
+        for i in range(data.ncon):
+            contact = data.contact[i]
+            pair = frozenset(model.body(model.geom_bodyid[g]).name for g in contact.geom)
+            if bodies is not None and not pair & bodies:
+                continue
+            mujoco.mj_contactForce(model, data, i, wrench)
+            pairs[pair] = pairs.get(pair, 0.0) + wrench[0]
+            impulse += wrench[0] * model.opt.timestep
+            missed = complementarity_residuals(contact.dist, wrench[0])
+            depth, residual = max(depth, missed.penetration), max(residual, missed.product)
+        peak = max([peak, *pairs.values()])
+    return peak, impulse, depth, residual
+
+
+@pytest.mark.parametrize("bodies", [None, ["ffoot", "bfoot"]])
+def test_figures_are_those_of_stepping_by_hand(bodies):
+    env = sw.ContactMonitor(gym.make("HalfCheetah-v5"), bodies)
+    raw = env.unwrapped
+    env.reset(seed=0)
+    start = np.zeros(mujoco.mj_stateSize(raw.model, int(STATE)))
+    landed = 0
+    for action in actions(env, 100):
+        mujoco.mj_getState(raw.model, raw.data, start, int(STATE))
+        info = env.step(action)[4]
+        expected = by_hand(raw, start, raw.frame_skip, None if bodies is None else set(bodies))
+        np.testing.assert_allclose([info[k] for k in FLOATS], expected, rtol=1e-12)
+        assert info[keys.CONTACT_PARTIAL] is False
+        landed += expected[0] > 0.0
+    assert landed > 20
+
+
+@pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Ant-v5", "Pusher-v5"])
+def test_the_physics_stays_the_same_bit_for_bit(env_id):
+    env, bare = sw.ContactMonitor(gym.make(env_id)), gym.make(env_id)
+    assert env.reset(seed=0)[0].tobytes() == bare.reset(seed=0)[0].tobytes()
+    for action in actions(env, 60):
+        one, other = env.step(action), bare.step(action)
+        assert one[0].tobytes() == other[0].tobytes() and one[1:4] == other[1:4]
+        assert {k: one[4][k] for k in other[4]} == other[4]
+        assert env.unwrapped.data.qacc_warmstart.tobytes() == bare.unwrapped.data.qacc_warmstart.tobytes()
+
+
+def test_a_runner_with_runge_kutta_balances_its_weight():
+    # Upwards, the floor's normal force and the weight are all there is, but for what a soft foot's turning adds.
+    env = sw.ContactMonitor(gym.make("Ant-v5", terminate_when_unhealthy=False), against=["world"])
+    raw = env.unwrapped
+    env.reset(seed=0)
+    weight, impulse, time = float(raw.model.body_mass.sum()) * 9.81, 0.0, 0.0
+
+    def upwards():
+        mujoco.mj_forward(raw.model, raw.data)
+        mujoco.mj_subtreeVel(raw.model, raw.data)
+        return raw.data.subtree_linvel[0, 2] * raw.model.body_mass.sum()
+
+    before = upwards()
+    for action in actions(env, 200):
+        info = env.step(action)[4]
+        assert not info[keys.CONTACT_PARTIAL]
+        impulse, time = impulse + info[keys.CONTACT_IMPULSE], time + raw.dt
+    assert impulse == pytest.approx(upwards() - before + weight * time, rel=1e-3)
+
+
+def test_a_touch_that_is_over_before_the_step_ends_is_seen():
+    env = sw.ContactMonitor(gym.make("HalfCheetah-v5"))
+    env.reset(seed=0)
+    unseen = 0
+    for action in actions(env, 200):
+        info = env.step(action)[4]
+        mujoco.mj_forward(env.unwrapped.model, env.unwrapped.data)
+        unseen += info[keys.CONTACT_PEAK_FORCE] > 1.0 and env.unwrapped.data.ncon == 0
+    assert unseen > 0
+
+
+def test_no_contact_is_zero_and_so_is_a_reset():
+    env = sw.ContactMonitor(gym.make("HalfCheetah-v5"))
+    _, info = env.reset(seed=0)
+    assert [info[k] for k in FLOATS] == [0.0] * 4 and info[keys.CONTACT_PARTIAL] is False
+    for _ in range(30):
+        info = env.step(env.action_space.low)[4]
+    assert info[keys.CONTACT_PEAK_FORCE] > 0.0 and env.peak_bodies is not None
+    _, info = env.reset(seed=1)
+    assert [info[k] for k in FLOATS] == [0.0] * 4 and env.peak_bodies is None
+    info = sw.ContactMonitor(gym.make("Reacher-v5")).reset()[1]
+    assert all(isinstance(info[k], float) for k in FLOATS)
+
+
+def test_the_bodies_of_the_peak_are_named():
+    env = sw.ContactMonitor(gym.make("HalfCheetah-v5"), bodies=["ffoot"])
+    env.reset(seed=0)
+    named = set()
+    for action in actions(env, 60):
+        info = env.step(action)[4]
+        assert (env.peak_bodies is None) == (info[keys.CONTACT_PEAK_FORCE] == 0.0)
+        named.add(env.peak_bodies)
+    assert named == {None, ("world", "ffoot")}
+
+
+def test_a_step_that_cannot_be_replayed_is_said_to_be_and_the_next_is_whole_again():
+    meddling = Meddling(gym.make("HalfCheetah-v5"))
+    meddling.at = (25, 30)
+    env = sw.ContactMonitor(meddling)
+    raw = env.unwrapped
+    env.reset(seed=0)
+    partial = []
+    with pytest.warns(UserWarning, match="contact/partial") as caught:
+        for step, _ in enumerate(range(40), start=1):
+            info = env.step(env.action_space.low)[4]
+            if info[keys.CONTACT_PARTIAL]:
+                partial.append(step)
+                wrench, forces = np.zeros(6), []
+                for i in range(raw.data.ncon):
+                    mujoco.mj_contactForce(raw.model, raw.data, i, wrench)
+                    forces.append(wrench[0])
+                assert forces and info[keys.CONTACT_IMPULSE] == pytest.approx(
+                    sum(forces) * raw.model.opt.timestep
+                )
+            assert env.peak_bodies is not None or not info[keys.CONTACT_PEAK_FORCE]
+    assert partial == [25, 30]
+    assert sum("contact/partial" in str(w.message) for w in caught) == 1  # once
+
+
+def test_numbers_that_are_none_are_reported_as_none():
+    meddling = Meddling(gym.make("HalfCheetah-v5"))
+    meddling.at, meddling.contact = (25,), np.nan
+    env = sw.ContactMonitor(meddling)
+    env.reset(seed=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        info = [env.step(env.action_space.low)[4] for _ in range(25)][-1]
+    assert np.isnan([info[k] for k in FLOATS]).all()
+
+
+def test_what_a_broken_simulation_was_reset_to_is_no_contact():
+    env = sw.ContactMonitor(gym.make("HalfCheetah-v5"))
+    env.reset(seed=0)
+    env.step(env.action_space.low)
+    env.unwrapped.data.qvel[3] = np.nan
+    with pytest.warns(UserWarning, match="MuJoCo has reset it"):
+        info = env.step(env.action_space.low)[4]
+    assert info[keys.CONTACT_PARTIAL] and np.isfinite([info[k] for k in FLOATS]).all()
+
+
+def test_inside_a_chunk_impulses_add_up_and_peaks_are_the_largest():
+    single, chunked = (gym.make("HalfCheetah-v5") for _ in range(2))
+    single = sw.ContactMonitor(single)
+    chunked = sw.ChunkHandover(sw.ContactMonitor(chunked), 5, 5, jerk_limit=1e6)
+    single.reset(seed=0), chunked.reset(seed=0)
+    for chunk in actions(single, 100).reshape(20, 5, -1):
+        macro = chunked.step(chunk)[4]
+        infos = [single.step(a)[4] for a in chunk]
+        assert macro[keys.CONTACT_IMPULSE] == pytest.approx(sum(i[keys.CONTACT_IMPULSE] for i in infos))
+        for key in (keys.CONTACT_PEAK_FORCE, keys.CONTACT_PENETRATION, keys.CONTACT_RESIDUAL):
+            assert macro[key] == max(i[key] for i in infos)
+        assert macro[keys.CONTACT_PARTIAL] is False
+
+
+@pytest.mark.parametrize(
+    ("env_id", "whole"),
+    [
+        ("SafePointGoal2-v0", True),
+        ("SafeCarGoal2-v0", True),
+        ("FlexJointReach-v0", True),
+        ("SafeAntVelocity-v0", True),
+        ("SafeRover-v0", False),  # its tyres push anew in every substep
+    ],
+)
+def test_which_of_our_tasks_are_seen_whole(env_id, whole):
+    env = sw.ContactMonitor(gym.make(env_id))
+    env.reset(seed=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        partial = [env.step(a)[4][keys.CONTACT_PARTIAL] for a in actions(env, 20)]
+    assert all(partial) if not whole else not any(partial)
+
+
+def test_bad_input_is_refused_in_words():
+    with pytest.raises(UnsupportedEnvError, match=r"MuJoCo's \.model and \.data"):
+        sw.ContactMonitor(gym.make("Pendulum-v1"))
+    with pytest.raises(UnknownNameError, match="no body 'hoof'; it has: world, torso"):
+        sw.ContactMonitor(gym.make("HalfCheetah-v5"), bodies=["hoof"])
+    with pytest.raises(ConfigurationError, match="against is a list"):
+        sw.ContactMonitor(gym.make("HalfCheetah-v5"), against="world")
+    chunked = sw.ChunkHandover(gym.make("Reacher-v5"), 4, 2)
+    with pytest.raises(ConfigurationError, match=r"ChunkHandover\(ContactMonitor"):
+        sw.ContactMonitor(chunked)
