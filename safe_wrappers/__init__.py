@@ -36,6 +36,7 @@ from safe_wrappers.protect import protect
 from safe_wrappers.wrappers.adaption_penalty import AdaptionPenalty
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.chunk_handover import ChunkHandover
+from safe_wrappers.wrappers.contact_monitor import ContactMonitor
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
 from safe_wrappers.wrappers.slip_limiter import SlipLimiter
@@ -49,6 +50,7 @@ __all__ = [
     "ChunkHandover",
     "Clearance",
     "Constraint",
+    "ContactMonitor",
     "Disc",
     "Discs",
     "HalfSpaces",
