@@ -109,12 +109,12 @@ class Kind(NamedTuple):
     """Objects of one kind.
 
     Attributes:
-        count: How many to place.
+        number: How many to place.
         keepout: m.
         known: Their centres if they stand already, shape (n, 2), m.
     """
 
-    count: int
+    number: int
     keepout: float
     known: NDArray[np.float64] | None
 
@@ -158,7 +158,7 @@ def _try_objects(
         if name in centres:
             continue
         first = len(placed)
-        for _ in range(kind.count):
+        for _ in range(kind.number):
             for _ in range(_TRIES_PER_OBJECT):
                 point = _draw(rng, half_extent, kind.keepout)
                 if _slack(point, kind.keepout, placed, keepouts) >= 0.0:
