@@ -2,7 +2,7 @@
 
     python -m benchmarks.traction                    # 200,000 steps per driver, on and off; stopping distances
     python -m benchmarks.traction --steps 2000       # a look
-    python -m benchmarks.traction --policy runs/saferover_ppo/unfiltered/seed_0   # of the learned driver
+    python -m benchmarks.traction --config my.yaml   # whose unfiltered arm, seed 0, is the learned driver
 
 Drivers: full throttle, panic brake, pulse, and a policy that PPO has learned without a limiter
 (`safe-wrappers compare configs/saferover_ppo.yaml` trains it; without it that row is left out). Grounds: a base of
@@ -28,7 +28,7 @@ from scipy.optimize import minimize_scalar
 import safe_wrappers as sw
 
 RESULTS = Path(__file__).parent / "results"
-POLICY = Path(__file__).parents[1] / "runs" / "saferover_ppo" / "unfiltered" / "seed_0"
+CONFIG = Path(__file__).parents[1] / "configs" / "saferover_ppo.yaml"
 SLIPPING, YAW_EXCURSION = 0.2, 0.5
 EPISODE_STEPS = 300
 """Three seconds: under full throttle the rover is out of the field soon after."""
@@ -49,10 +49,10 @@ class Job:
     limited: bool
     steps: int
     seed: int
-    policy: str
+    config: str
 
 
-def drivers(raw: Any, rng: np.random.Generator, policy: str) -> dict[str, Callable[[], Driver]]:
+def drivers(raw: Any, rng: np.random.Generator, config: str) -> dict[str, Callable[[], Driver]]:
     """By name: what makes a driver of one episode, a function of observation and time step."""
 
     def steering() -> Callable[[int], float]:
@@ -88,16 +88,32 @@ def drivers(raw: Any, rng: np.random.Generator, policy: str) -> dict[str, Callab
         return drive
 
     made = {"full throttle": full_throttle, "panic brake": panic_brake, "pulse": pulse}
-    if Path(policy).exists():
-        made["learned"] = _learned(policy)
+    if is_learned(config):
+        made["learned"] = _learned(config)
     return made
 
 
-def _learned(folder: str) -> Callable[[], Driver]:
-    from safe_wrappers.train import load_policy
+def is_learned(config: str) -> bool:
+    """Whether the config's unfiltered arm has been trained with its first seed."""
+    return (_run_folder(config)[1] / "finished.json").exists()
 
-    predict = load_policy(Path(folder))
-    return lambda: lambda observation, _: predict(observation)
+
+def _run_folder(config: str) -> tuple[Any, Path]:
+    from safe_wrappers.train.config import parse_experiment
+    from safe_wrappers.train.config_file import read_config
+
+    experiment = parse_experiment(read_config(Path(config)))
+    arm = next(a for a in experiment.arms if a.filter.kind == "none")
+    return arm, experiment.run_folder(arm, experiment.seeds[0])
+
+
+def _learned(config: str) -> Callable[[], Driver]:
+    from safe_wrappers.train.policy import TrainedPolicy
+    from safe_wrappers.train.run import finished_checkpoint
+
+    arm, folder = _run_folder(config)
+    policy = TrainedPolicy(arm, finished_checkpoint(arm, 0, folder))
+    return lambda: lambda observation, _: policy(observation)
 
 
 def run(job: Job) -> dict[str, Any]:
@@ -107,7 +123,7 @@ def run(job: Job) -> dict[str, Any]:
     if job.limited:
         env = sw.SlipLimiter(env, wheels=raw.wheels)
     rng = np.random.default_rng(job.seed)
-    make = drivers(raw, rng, job.policy)[job.driver]
+    make = drivers(raw, rng, job.config)[job.driver]
     count = dict.fromkeys(("slipping", "spin_out", "spin_outs_begun", "yaw", "intervened", "infeasible"), 0)
     distance, worst, done, episode, spun = 0.0, 0.0, True, 0, False
     for _ in range(job.steps):
@@ -134,7 +150,7 @@ def run(job: Job) -> dict[str, Any]:
     row = asdict(job) | {k: int(v) for k, v in count.items()} | {"worst_slip": float(worst)}
     row["mean_speed"] = distance / (job.steps * raw.dt)
     row["filter_us"] = 1e6 * env.filter_seconds / env.filter_calls if job.limited else None
-    del row["policy"]
+    del row["config"]
     return row
 
 
@@ -152,7 +168,7 @@ def stopping_distance(ground: str, limited: bool) -> float:
 
 
 def constant_slip_distance(ground: str, slip: float) -> float:
-    """The same with all wheels held at one slip from the first moment on: no drive can, it is the yardstick."""
+    """The same with all wheels held at one slip from the first moment on: the yardstick."""
     env: Any = gym.make("SafeRover-v0", max_episode_steps=100_000)
     raw = env.unwrapped
     raw.frame_skip = 1
@@ -229,12 +245,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--steps", type=int, default=200_000, help="per driver, on and off each")
     parser.add_argument("--parts", type=int, default=4, help="independent runs per driver")
-    parser.add_argument("--policy", default=str(POLICY), help="run folder of the learned driver")
+    parser.add_argument("--config", default=str(CONFIG), help="of the learned driver's training")
     parser.add_argument("--workers", type=int, default=2)
     arguments = parser.parse_args()
-    names = ["full throttle", "panic brake", "pulse"] + ["learned"] * Path(arguments.policy).exists()
+    names = ["full throttle", "panic brake", "pulse"] + ["learned"] * is_learned(arguments.config)
     jobs = [
-        Job(driver, limited, arguments.steps // arguments.parts, part, arguments.policy)
+        Job(driver, limited, arguments.steps // arguments.parts, part, arguments.config)
         for driver, limited, part in itertools.product(names, (False, True), range(arguments.parts))
     ]
     with multiprocessing.get_context("spawn").Pool(arguments.workers) as pool:
@@ -243,6 +259,7 @@ def main() -> None:
     print(tables(rows, stops))
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / "traction.json").write_text(json.dumps({"drivers": rows, "stopping": stops}, indent=1) + "\n")
+    (RESULTS / "traction.md").write_text(tables(rows, stops) + "\n")
 
 
 if __name__ == "__main__":
