@@ -24,7 +24,7 @@ from safe_wrappers.errors import ActionError, ConfigurationError, SafeWrappersEr
 
 G = 9.81
 MASS, WHEELBASE, RADIUS = 18.0, 0.5, 0.1
-AXLE_INERTIA, OWN_INERTIA = 0.05, 0.005  # kg m^2 of a wheel: with its rotor, without
+AXLE_INERTIA, OWN_INERTIA = 0.05, 0.0025  # kg m^2 of a wheel: with its rotor, without
 TORQUE, DAMPING = 15.0, 0.02
 INFO_TYPES = {
     "cost": float,
