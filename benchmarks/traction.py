@@ -1,6 +1,6 @@
 """SafeRover under hard drivers, with the slip limiter on and off, and how far it takes to stop.
 
-    python -m benchmarks.traction                    # 200,000 steps per driver, on and off; stopping distances
+    python -m benchmarks.traction                    # 200,000 steps per driver; stopping distances; a car
     python -m benchmarks.traction --steps 2000       # a look
     python -m benchmarks.traction --config my.yaml   # whose unfiltered arm, seed 0, is the learned driver
 
@@ -8,7 +8,8 @@ Drivers: full throttle, panic brake, pulse, and a policy that PPO has learned wi
 (`safe-wrappers compare configs/saferover_ppo.yaml` trains it; without it that row is left out). Grounds: a base of
 dry, wet or ice, by turns, with patches of water and ice. The judge is the env's own: a step counts as slipping if any
 loaded wheel's slip was above 0.2 in size at the end of any physics substep, as a spin-out above 0.5, as a yaw
-excursion if the yaw rate was more than 0.5 rad/s off what speed and steering ask for.
+excursion if the yaw rate was more than 0.5 rad/s off what speed and steering ask for. SafeCarGoal's car stands on
+MuJoCo's own friction; its wheels are judged at the ends of the control steps.
 """
 
 import argparse
@@ -22,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 from scipy.optimize import minimize_scalar
 
@@ -204,7 +206,57 @@ def stopping_row(ground: str) -> dict[str, Any]:
     }
 
 
-def tables(rows: list[dict[str, Any]], stops: list[dict[str, Any]]) -> str:
+@dataclass(frozen=True)
+class CarJob:
+    """Pulses of full torque, both wheels alike or not, for so many steps."""
+
+    limited: bool
+    steps: int
+    seed: int
+
+
+def run_car(job: CarJob) -> dict[str, Any]:
+    """Drive SafeCarGoal's car, count."""
+    env: Any = gym.make("SafeCarGoal0-v0", max_episode_steps=EPISODE_STEPS)
+    raw = env.unwrapped
+    if job.limited:
+        env = sw.SlipLimiter(env, wheels=["left", "right"])
+    rng = np.random.default_rng(job.seed)
+    slipping = spin_out = 0
+    distance, done, episode, until, control = 0.0, True, 0, 0, np.zeros(2)
+    for step in range(job.steps):
+        if done:
+            env.reset(seed=1000 * job.seed + episode)
+            episode += 1
+        if step >= until:
+            until = step + int(rng.integers(3, 50))
+            control = np.broadcast_to(rng.choice([-1.0, 1.0], size=2 if rng.random() < 0.3 else 1), 2)
+        _, _, terminated, truncated, _ = env.step(control.astype(np.float32))
+        done = terminated or truncated
+        slip = max(_car_slip(raw, wheel) for wheel in ("left", "right"))
+        slipping += slip > SLIPPING
+        spin_out += slip > 0.5
+        distance += math.hypot(*raw.data.qvel[:2]) * raw.dt
+    return asdict(job) | {
+        "slipping": int(slipping),
+        "spin_out": int(spin_out),
+        "mean_speed": distance / (job.steps * raw.dt),
+    }
+
+
+def _car_slip(raw: Any, wheel: str) -> float:
+    """Size of a wheel's slip, from MuJoCo's own velocities of the wheel's geom."""
+    velocity = np.zeros(6)
+    geom = raw.model.geom(wheel)
+    mujoco.mj_objectVelocity(raw.model, raw.data, mujoco.mjtObj.mjOBJ_GEOM, geom.id, velocity, 0)
+    axle = raw.data.joint(wheel).xaxis
+    ahead = np.cross(axle, [0.0, 0.0, 1.0])
+    rim = float(geom.size[0]) * float(velocity[:3] @ axle)
+    ground = float(velocity[3:] @ ahead) / float(np.linalg.norm(ahead))
+    return abs(rim - ground) / max(abs(rim), abs(ground), 0.5)
+
+
+def tables(rows: list[dict[str, Any]], stops: list[dict[str, Any]], cars: list[dict[str, Any]]) -> str:
     """Markdown."""
     lines = [
         "| driver | limiter | steps | slip > 0.2 | spin-out | spin-outs / min | yaw excursion | worst slip "
@@ -237,6 +289,19 @@ def tables(rows: list[dict[str, Any]], stops: list[dict[str, Any]]) -> str:
         f"| {s['best_slip']:.3f} | {s['limited_m'] / s['best_constant_slip_m']:.3f} |"
         for s in stops
     ]
+    lines += [
+        "",
+        "| SafeCarGoal0, pulses | steps | slip > 0.2 | slip > 0.5 | mean speed (m/s) |",
+        "|---|---|---|---|---|",
+    ]
+    for limited in (False, True):
+        part = [c for c in cars if c["limited"] == limited]
+        steps = sum(c["steps"] for c in part)
+        slipping, spin_out = (sum(c[k] for c in part) / steps for k in ("slipping", "spin_out"))
+        speed = float(np.mean([c["mean_speed"] for c in part]))
+        lines.append(
+            f"| limiter {'on' if limited else 'off'} | {steps:,} | {slipping:.2%} | {spin_out:.2%} | {speed:.2f} |"
+        )
     return "\n".join(lines)
 
 
@@ -256,10 +321,18 @@ def main() -> None:
     with multiprocessing.get_context("spawn").Pool(arguments.workers) as pool:
         rows = pool.map(run, jobs, chunksize=1)
         stops = pool.map(stopping_row, STOPPING_GROUNDS, chunksize=1)
-    print(tables(rows, stops))
+        part = arguments.steps // arguments.parts
+        cars = pool.map(
+            run_car,
+            [CarJob(on, part, p) for on in (False, True) for p in range(arguments.parts)],
+            chunksize=1,
+        )
+    print(tables(rows, stops, cars))
     RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "traction.json").write_text(json.dumps({"drivers": rows, "stopping": stops}, indent=1) + "\n")
-    (RESULTS / "traction.md").write_text(tables(rows, stops) + "\n")
+    (RESULTS / "traction.json").write_text(
+        json.dumps({"drivers": rows, "stopping": stops, "car": cars}, indent=1) + "\n"
+    )
+    (RESULTS / "traction.md").write_text(tables(rows, stops, cars) + "\n")
 
 
 if __name__ == "__main__":
