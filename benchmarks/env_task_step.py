@@ -12,10 +12,10 @@ import time
 import gymnasium as gym
 import numpy as np
 
-from safe_wrappers.envs import CAR_GOAL_IDS, POINT_GOAL_IDS, register_envs
+from safe_wrappers.envs import CAR_GOAL_IDS, POINT_GOAL_IDS, SAFE_ROVER_ID, register_envs
 
-LIMITS_US = dict.fromkeys(POINT_GOAL_IDS, 150.0) | dict.fromkeys(CAR_GOAL_IDS, 400.0)
-"""A tenth of what Safety-Gymnasium's steps take, or less."""
+LIMITS_US = dict.fromkeys(POINT_GOAL_IDS, 150.0) | dict.fromkeys(CAR_GOAL_IDS, 400.0) | {SAFE_ROVER_ID: 300.0}
+"""A tenth of what Safety-Gymnasium's steps take, or less; the rover has no counterpart there."""
 
 
 def step_times(env_id: str, steps: int, seed: int, bare: bool) -> np.ndarray:
@@ -42,8 +42,11 @@ def step_times(env_id: str, steps: int, seed: int, bare: bool) -> np.ndarray:
         bearing = np.arctan2(to_goal[1], to_goal[0]) - inner.agent_heading
         turn = np.clip(np.arctan2(np.sin(bearing), np.cos(bearing)), -1, 1)
         ahead = np.cos(bearing)
-        steered = [ahead + turn, ahead - turn] if env_id in CAR_GOAL_IDS else [ahead, turn]
-        action = np.clip(np.array(steered) + rng.normal(0, 0.3, 2), -1, 1)
+        if env_id == SAFE_ROVER_ID:  # torque on every wheel: speed is the driver's to keep
+            steered = [0.3 * (2.0 - inner.forward_speed)] * 4 + [2.0 * turn]
+        else:
+            steered = [ahead + turn, ahead - turn] if env_id in CAR_GOAL_IDS else [ahead, turn]
+        action = np.clip(np.array(steered) + rng.normal(0, 0.3, len(steered)), -1, 1)
         start = time.perf_counter()
         env.step(action)
         times[i] = time.perf_counter() - start

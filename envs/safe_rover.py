@@ -35,6 +35,7 @@ YAW_RATE_ERROR: Final = "yaw_rate_error"
 """float64, rad/s: how far the yaw rate was at most from the one that steering angle and speed ask for."""
 
 SPIN_OUT_SLIP: Final = 0.5
+"""Longitudinal slip from which on a wheel has spun out, or locked."""
 ROVER_GOAL_RADIUS: Final = 0.4
 """Distance from the goal's centre at which it counts as reached, m."""
 ROVER_HAZARD_RADIUS: Final = 0.3
