@@ -13,6 +13,7 @@ MuJoCo's own friction; its wheels are judged at the ends of the control steps.
 """
 
 import argparse
+import importlib.util
 import itertools
 import json
 import math
@@ -54,7 +55,7 @@ class Job:
     config: str
 
 
-def drivers(raw: Any, rng: np.random.Generator, config: str) -> dict[str, Callable[[], Driver]]:
+def drivers(raw: Any, rng: np.random.Generator) -> dict[str, Callable[[], Driver]]:
     """By name: what makes a driver of one episode, a function of observation and time step."""
 
     def steering() -> Callable[[int], float]:
@@ -89,14 +90,13 @@ def drivers(raw: Any, rng: np.random.Generator, config: str) -> dict[str, Callab
 
         return drive
 
-    made = {"full throttle": full_throttle, "panic brake": panic_brake, "pulse": pulse}
-    if is_learned(config):
-        made["learned"] = _learned(config)
-    return made
+    return {"full throttle": full_throttle, "panic brake": panic_brake, "pulse": pulse}
 
 
 def is_learned(config: str) -> bool:
-    """Whether the config's unfiltered arm has been trained with its first seed."""
+    """Whether the config's unfiltered arm has been trained with its first seed (which takes SB3)."""
+    if importlib.util.find_spec("stable_baselines3") is None:
+        return False
     return (_run_folder(config)[1] / "finished.json").exists()
 
 
@@ -125,7 +125,7 @@ def run(job: Job) -> dict[str, Any]:
     if job.limited:
         env = sw.SlipLimiter(env, wheels=raw.wheels)
     rng = np.random.default_rng(job.seed)
-    make = drivers(raw, rng, job.config)[job.driver]
+    make = _learned(job.config) if job.driver == "learned" else drivers(raw, rng)[job.driver]
     count = dict.fromkeys(("slipping", "spin_out", "spin_outs_begun", "yaw", "intervened", "infeasible"), 0)
     distance, worst, done, episode, spun = 0.0, 0.0, True, 0, False
     for _ in range(job.steps):
