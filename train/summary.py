@@ -51,7 +51,8 @@ RATES: Final = {
     "infeasible_per_1000": ("infeasible", 1000.0),
     "spin_outs_per_million": ("spin_outs", 1e6),
 }
-"""Of a count, per so many steps. Episodes that end early have less time for violations: rates are over all steps, whatever the episodes."""
+"""Of a count, per so many steps. Episodes that end early have less time for violations: rates are over all steps,
+whatever the episodes."""
 
 OF_THE_FILTER: Final = (
     "intervention_rate",

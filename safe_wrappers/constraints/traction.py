@@ -114,8 +114,9 @@ class Traction:
         self._stamp: int | None = None
         self._rows: HalfSpaces | None = None
         self._rate: Array | None = None
-        self._slip, self._traction, self._present = np.zeros(n), np.zeros(n), np.zeros(n)
-        self._most_load = np.zeros(n)
+        self._ground, self._slip, self._across = np.zeros(n), np.zeros(n), np.zeros(n)
+        self._load, self._most_load = np.zeros(n), np.zeros(n)
+        self._traction, self._present = np.zeros(n), np.zeros(n)
 
     def _look(self, plant: MujocoPlant) -> None:
         """Take the state and measure what the last control step showed, once per observation."""
