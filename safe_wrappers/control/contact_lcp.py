@@ -113,7 +113,7 @@ def contact_step(
 
 def _delassus(lower: Array, j: Array) -> tuple[Array, Array]:
     """L^-1 J' and its square, which is exactly symmetric."""
-    half = np.linalg.solve(lower, j.T)
+    half: Array = np.asarray(np.linalg.solve(lower, j.T), dtype=np.float64)
     matrix = half.T @ half
     return half, np.asarray(0.5 * (matrix + matrix.T))
 

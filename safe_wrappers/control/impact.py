@@ -235,14 +235,14 @@ def attenuation_after_delay(
 def _checked(
     speed: ArrayLike, mass: ArrayLike, stiffness: ArrayLike, moving: str = "speed", least: float = -np.inf
 ) -> tuple[Array, Array, Array]:
-    """What approaches, cut at 0, and mass and stiffness."""
+    """What moves, and mass and stiffness."""
     (v,) = finite_arrays(**{moving: speed})
     if not (v >= least).all():
         raise ConfigurationError(f"{moving} must be at least {least}, got {v}")
     m, k = _positive("mass", mass), _positive("stiffness", stiffness)
     if (np.isinf(m) & np.isinf(k)).any():
         raise ConfigurationError("mass and stiffness are both infinite: such an impact has no finite answer")
-    return np.maximum(v, 0.0), m, k
+    return v, m, k
 
 
 def _positive(name: str, value: ArrayLike) -> Array:
@@ -269,6 +269,6 @@ def _in_series(*parts: Array) -> Array:
 
 
 def _times(speed: Array, factor: Array) -> Array:
-    """Their product, and 0 for what does not move, whatever the factor: 0 times inf is not a number."""
+    """Their product, and 0 for what does not approach, whatever the factor: 0 times inf is not a number."""
     some = speed > 0.0
     return np.asarray(np.where(some, np.where(some, speed, 1.0) * factor, 0.0))

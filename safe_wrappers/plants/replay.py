@@ -9,7 +9,6 @@ import numpy as np
 Visit = Callable[[mujoco.MjData, float], None]
 """Given data whose contacts and forces are those of one evaluation, and the share of time that it acts for, s."""
 
-_STATE: Final = mujoco.mjtState.mjSTATE_INTEGRATION
 _INPUTS: Final = mujoco.mjtState.mjSTATE_USER
 _PHYSICS: Final = mujoco.mjtState.mjSTATE_PHYSICS
 _RK4: Final = int(mujoco.mjtIntegrator.mjINT_RK4)
@@ -36,21 +35,21 @@ class Replay:
 
     def __init__(self, raw: Any) -> None:
         self._raw = raw
-        self._model: mujoco.MjModel | None = None
+        self._model: Any = None
 
     def before(self) -> None:
-        """Keep the state that the env's step starts from."""
+        """Keep all data that the env's step starts from: which bodies sleep is not in MuJoCo's state."""
         if self._model is not self._raw.model:  # the first time, or the env has made itself another one
             self._model = self._raw.model
             self._data = mujoco.MjData(self._model)
-            self._start, self._inputs, self._end, self._there = (
+            self._inputs, self._end, self._there = (
                 np.zeros(mujoco.mj_stateSize(self._model, int(kind)))
-                for kind in (_STATE, _INPUTS, _PHYSICS, _PHYSICS)
+                for kind in (_INPUTS, _PHYSICS, _PHYSICS)
             )
-        mujoco.mj_getState(self._model, self._raw.data, self._start, int(_STATE))
+        mujoco.mj_copyData(self._data, self._model, self._raw.data)
 
     def after(self, visit: Visit) -> bool:
-        """Replay the step that the env has made since.
+        """Replay the step that the env has made since; once per step.
 
         Args:
             visit: Called at each evaluation in turn.
@@ -59,10 +58,10 @@ class Replay:
             Whether it ends in the env's own state, bit for bit (Runge-Kutta: up to rounding). If not, what was
             visited is not what happened.
         """
-        model, data, there = self._raw.model, self._data, self._raw.data
+        model: mujoco.MjModel = self._raw.model
+        data, there = self._data, self._raw.data
         if model is not self._model:
             return False
-        mujoco.mj_setState(model, data, self._start, int(_STATE))
         mujoco.mj_getState(model, there, self._inputs, int(_INPUTS))
         mujoco.mj_setState(model, data, self._inputs, int(_INPUTS))
         step_s = float(model.opt.timestep)
@@ -81,7 +80,7 @@ class Replay:
 
 
 def _runge_kutta(model: mujoco.MjModel, data: mujoco.MjData, visit: Visit) -> None:
-    """`mj_step` by the classical four stages, in the order of MuJoCo's own sums."""
+    """`mj_step` by the classical four stages, in the order of MuJoCo's own sums; the last one is at its end."""
     step_s, time = float(model.opt.timestep), data.time
     # Positions change by their rates as quaternions do; the others are added to. Views of the data, and copies.
     qpos, qvel, act, qacc, act_dot = data.qpos, data.qvel, data.act, data.qacc, data.act_dot
@@ -105,7 +104,6 @@ def _runge_kutta(model: mujoco.MjModel, data: mujoco.MjData, visit: Visit) -> No
     qvel[:] = qvel0 + step_s * acceleration
     if model.na:
         act[:] = _within_ranges(model, act0 + step_s * activation)
-    data.time = time + step_s
     data.qacc_warmstart[:] = qacc
 
 

@@ -52,7 +52,8 @@ class ContactMonitor(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructo
     - ``contact/partial`` (bool): the step could not be replayed; the others are of the contacts that it has left
       behind, for one substep.
 
-    Where the simulation's contacts are not finite numbers, neither is what is reported of them.
+    Where the simulation's contacts are not finite numbers, neither is what is reported of them. Bodies that MuJoCo
+    has put to sleep have no contacts.
 
     Raises:
         UnsupportedEnvError: No MuJoCo model.

@@ -65,7 +65,10 @@ class DroppedBall(gym.Env):
         elif self.meddle == "moves the hand":
             data.mocap_pos[0, 2] = 1.0 + 0.1 * np.sin(0.2 * self.steps)
         elif self.meddle == "another model":
-            self.model = model = mujoco.MjModel.from_xml_string(XML.format(**WORLD))
+            one_more = '<body pos="4 0 1"><freejoint/><geom size=".1"/></body></worldbody>'
+            self.model = model = mujoco.MjModel.from_xml_string(
+                XML.replace("</worldbody>", one_more).format(**WORLD)
+            )
             self.data = data = mujoco.MjData(model)
         for k in range(self.frame_skip):
             if self.meddle == "pushes in substeps":

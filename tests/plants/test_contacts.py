@@ -61,6 +61,13 @@ def test_a_gap_inside_the_margin_without_force_is_a_contact_with_none():
         env.reset()
     (found,) = Contacts(env.model, ["ball"]).read(env.data)
     assert found.force == 0.0 and found.gap == pytest.approx(0.01)
+    # Nor does it borrow the force of another one.
+    env.model.geom_condim[: env.model.geom("ball").id + 1] = 1
+    env.data.qpos[2], env.data.qpos[9] = 0.0995, 0.21
+    mujoco.mj_forward(env.model, env.data)
+    box, ball = (Contacts(env.model, [name]).read(env.data) for name in ("box", "ball"))
+    assert env.data.nefc == 1 and ball[0].force > 0.0
+    assert len(box) > 0 and all(contact.force == 0.0 for contact in box)
 
 
 def test_only_what_is_named_is_read():

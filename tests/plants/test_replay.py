@@ -46,6 +46,23 @@ def test_a_replay_ends_where_the_env_does_and_leaves_it_alone(env_id):
         assert states(env, env.data).tobytes() == before
 
 
+def test_bodies_that_sleep_sleep_in_the_replay_and_wake_with_the_env():
+    env = gym.make("SafePointGoal2-v0").unwrapped
+    replay, vases = Replay(env), Contacts(env.model, [f"vase{i}" for i in range(10)])
+    for seed in range(3):
+        env.reset(seed=seed)
+        counts = []
+        for _ in range(30):
+            seen = []
+            replay.before()
+            env.step(np.zeros(2))
+            assert replay.after(lambda data, _, seen=seen: seen.append(len(vases.read(data))))
+            counts.append(set(seen))
+        # Four corners each, and no contacts any more where MuJoCo has put them to sleep.
+        assert counts[:5] == [{40}] * 5
+        assert counts[-5:] == ([{0}] * 5 if hasattr(mujoco.mjtEnableBit, "mjENBL_SLEEP") else [{40}] * 5)
+
+
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("meddle", ["nothing", "pushes", "moves the hand"])
 def test_every_integrator_with_activations_applied_forces_and_mocap_bodies(integrator, meddle):
@@ -96,6 +113,19 @@ def test_an_env_that_makes_itself_another_model_is_followed():
     assert not stepped(env, replay, np.zeros(3))
     env.meddle = "nothing"
     assert stepped(env, replay, np.zeros(3))
+
+
+def test_the_stages_of_a_runge_kutta_step_have_their_times():
+    env = DroppedBall(integrator="RK4")
+    replay, times = Replay(env), []
+    env.reset()
+    for _ in range(2):
+        replay.before()
+        env.step(np.zeros(3))
+        replay.after(lambda data, _: times.append(data.time))
+    starts = 0.002 * np.arange(10)
+    expected = starts[:, None] + 0.002 * np.array([0.0, 0.5, 0.5, 1.0])
+    np.testing.assert_allclose(times, expected.ravel(), atol=1e-12)
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)

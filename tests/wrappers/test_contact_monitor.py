@@ -1,5 +1,6 @@
 """ContactMonitor: against stepping by hand, that it changes nothing, and that it says when it cannot see."""
 
+import copy
 import warnings
 
 import gymnasium as gym
@@ -18,7 +19,6 @@ FLOATS = (
     keys.CONTACT_PENETRATION,
     keys.CONTACT_RESIDUAL,
 )
-STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
 class Meddling(gym.Wrapper):
@@ -44,10 +44,9 @@ def actions(env, count, seed=0):
     return rng.uniform(space.low, space.high, (count, *space.shape)).astype(space.dtype)
 
 
-def by_hand(env, start, substeps, bodies=None):
-    """The figures of one Euler step, substep by substep, by MuJoCo's own functions."""
-    model, data = env.model, mujoco.MjData(env.model)
-    mujoco.mj_setState(model, data, start, int(STATE))
+def by_hand(env, data, substeps, bodies=None):
+    """The figures of one Euler step from some data on, substep by substep, by MuJoCo's own functions."""
+    model = env.model
     data.ctrl[:] = env.data.ctrl
     peak = impulse = depth = residual = 0.0
     wrench = np.zeros(6)
@@ -68,15 +67,21 @@ def by_hand(env, start, substeps, bodies=None):
     return peak, impulse, depth, residual
 
 
-@pytest.mark.parametrize("bodies", [None, ["ffoot", "bfoot"]])
-def test_figures_are_those_of_stepping_by_hand(bodies):
-    env = sw.ContactMonitor(gym.make("HalfCheetah-v5"), bodies)
+@pytest.mark.parametrize(
+    ("env_id", "bodies"),
+    [("HalfCheetah-v5", None), ("HalfCheetah-v5", ["ffoot", "bfoot"]), ("SafeCarGoal2-v0", None)],
+)
+def test_figures_are_those_of_stepping_by_hand(env_id, bodies):
+    env = sw.ContactMonitor(gym.make(env_id), bodies)
     raw = env.unwrapped
+    raw.model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER  # one evaluation per substep
     env.reset(seed=0)
-    start = np.zeros(mujoco.mj_stateSize(raw.model, int(STATE)))
     landed = 0
-    for action in actions(env, 100):
-        mujoco.mj_getState(raw.model, raw.data, start, int(STATE))
+    for step, action in enumerate(actions(env, 100)):
+        if step == 50:  # whose contacts have other rows
+            raw.model = copy.copy(raw.model)
+            raw.model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        start = copy.copy(raw.data)
         info = env.step(action)[4]
         expected = by_hand(raw, start, raw.frame_skip, None if bodies is None else set(bodies))
         np.testing.assert_allclose([info[k] for k in FLOATS], expected, rtol=1e-12)
@@ -208,6 +213,16 @@ def test_inside_a_chunk_impulses_add_up_and_peaks_are_the_largest():
         for key in (keys.CONTACT_PEAK_FORCE, keys.CONTACT_PENETRATION, keys.CONTACT_RESIDUAL):
             assert macro[key] == max(i[key] for i in infos)
         assert macro[keys.CONTACT_PARTIAL] is False
+
+
+def test_a_chunk_is_partial_if_any_of_its_steps_was():
+    meddling = Meddling(gym.make("HalfCheetah-v5"))
+    meddling.at = (7,)
+    env = sw.ChunkHandover(sw.ContactMonitor(meddling), 5, 5, jerk_limit=1e6)
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="contact/partial"):
+        partial = [env.step(chunk)[4][keys.CONTACT_PARTIAL] for chunk in actions(env, 3)]
+    assert partial == [False, True, False]
 
 
 @pytest.mark.parametrize(
