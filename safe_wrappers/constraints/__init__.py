@@ -4,6 +4,7 @@ from safe_wrappers.constraints.barrier import Barrier
 from safe_wrappers.constraints.clearance import Clearance
 from safe_wrappers.constraints.constraint import CertifyingConstraint, Constraint, HalfSpaces
 from safe_wrappers.constraints.heading_drive_clearance import HeadingDriveClearance
+from safe_wrappers.constraints.impact_speed_limit import ImpactSpeedLimit
 from safe_wrappers.constraints.joint_position_limit import JointPositionLimit
 from safe_wrappers.constraints.joint_speed_limit import JointSpeedLimit
 from safe_wrappers.constraints.obstacles import Box, Disc, Discs, Plane, Sphere
@@ -23,6 +24,7 @@ __all__ = [
     "Discs",
     "HalfSpaces",
     "HeadingDriveClearance",
+    "ImpactSpeedLimit",
     "JointPositionLimit",
     "JointSpeedLimit",
     "Plane",

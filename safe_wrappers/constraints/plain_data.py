@@ -9,6 +9,7 @@ from safe_wrappers.constraints.barrier import Barrier
 from safe_wrappers.constraints.clearance import Clearance
 from safe_wrappers.constraints.constraint import Constraint
 from safe_wrappers.constraints.heading_drive_clearance import HeadingDriveClearance
+from safe_wrappers.constraints.impact_speed_limit import ImpactSpeedLimit
 from safe_wrappers.constraints.joint_position_limit import JointPositionLimit
 from safe_wrappers.constraints.joint_speed_limit import JointSpeedLimit
 from safe_wrappers.constraints.obstacles import obstacle_data
@@ -23,6 +24,7 @@ KINDS: dict[str, Callable[..., Constraint]] = {
     "Barrier": Barrier,
     "Clearance": Clearance,
     "HeadingDriveClearance": HeadingDriveClearance,
+    "ImpactSpeedLimit": ImpactSpeedLimit,
     "JointPositionLimit": JointPositionLimit,
     "JointSpeedLimit": JointSpeedLimit,
     "SpeedLimit": SpeedLimit,
