@@ -1,9 +1,10 @@
-"""Violations of SafePointGoal under adversarial drivers, with the filter on and off.
+"""Violations of SafePointGoal and SafeCarGoal under adversarial drivers, with the filter on and off.
 
     python -m benchmarks.adversarial                     # 1,000,000 filtered steps per level, 5 drivers
     python -m benchmarks.adversarial --mismatch          # the plant wrong by 20 % in mass and damping
     python -m benchmarks.adversarial --off --steps 20000 # the drivers unfiltered
     python -m benchmarks.adversarial --price             # what each inset costs the goal-seeking driver
+    python -m benchmarks.adversarial --robot car --steps 500000   # the same for SafeCarGoal, 7 drivers
 
 A violation is a control step in which the env's own truth was broken at any physics substep
 (`cost_substep`): the centre in a hazard disc, or, at level 2, a vase touched or moving.
@@ -22,16 +23,21 @@ import gymnasium as gym
 import numpy as np
 
 import safe_wrappers as sw
-from benchmarks.drivers import DRIVERS
+from benchmarks import car_drivers, drivers
 from safe_wrappers.errors import UnsafeStateWarning
 
 RESULTS = Path(__file__).parent / "results"
-VARIANTS: dict[str, dict[str, Any]] = {
-    "brake and coast, detour": {},
-    "brake and coast": {"detour": False},
-    "coast only, detour": {"brake": False},
-    "coast only": {"brake": False, "detour": False},
+DRIVERS = {"point": drivers.DRIVERS, "car": car_drivers.DRIVERS}
+VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
+    "point": {
+        "brake and coast, detour": {},
+        "brake and coast": {"detour": False},
+        "coast only, detour": {"brake": False},
+        "coast only": {"brake": False, "detour": False},
+    },
+    "car": {"detour": {}, "no detour": {"detour": False}},
 }
+"""The first is the recipe."""
 
 
 @dataclass(frozen=True)
@@ -47,19 +53,22 @@ class Job:
     damping: float = 1.0
     uncertainty: float = 0.0
     variant: str = "brake and coast, detour"
+    robot: str = "point"
 
 
 def run(job: Job) -> dict[str, Any]:
     """Drive, count, and say what it cost."""
     warnings.simplefilter("ignore", UnsafeStateWarning)  # counted below
-    env: Any = gym.make(f"SafePointGoal{job.level}-v0")
+    env: Any = gym.make(f"Safe{job.robot.capitalize()}Goal{job.level}-v0")
     if job.filtered:
         plant = sw.MujocoPlant()
         plant.perturb(mass=job.mass, damping=job.damping)
-        options = {"uncertainty": job.uncertainty, **VARIANTS[job.variant]}
+        options = dict(VARIANTS[job.robot][job.variant])
+        if job.uncertainty:
+            options["uncertainty"] = job.uncertainty
         env = sw.protect(env, plant=plant, **options)
     raw = env.unwrapped
-    driver = DRIVERS[job.driver](raw, np.random.default_rng(job.seed))
+    driver = DRIVERS[job.robot][job.driver](raw, np.random.default_rng(job.seed))
     count = dict.fromkeys(("violations", "cost", "intervened", "infeasible", "fallback", "unsafe"), 0)
     returns: list[float] = []
     total, lowest, episode = 0.0, np.inf, job.seed * 100_000
@@ -86,20 +95,25 @@ def run(job: Job) -> dict[str, Any]:
 
 def jobs(arguments: argparse.Namespace) -> list[Job]:
     """What to run."""
-    steps = arguments.steps // len(DRIVERS)
-    levels, drivers = arguments.level, list(DRIVERS)
+    robot = arguments.robot
+    levels, names = arguments.level, list(DRIVERS[robot])
+    variants = list(VARIANTS[robot])
+    steps = arguments.steps // len(names)
+    kind = {"variant": variants[0], "robot": robot}
     if arguments.price:
-        pairs = itertools.product(levels, VARIANTS)
-        filtered = [Job(lv, "goal-seeking", arguments.steps, 1, variant=v) for lv, v in pairs]
-        return filtered + [Job(lv, "goal-seeking", arguments.steps, 1, filtered=False) for lv in levels]
+        pairs = itertools.product(levels, variants)
+        filtered = [Job(lv, "goal-seeking", arguments.steps, 1, variant=v, robot=robot) for lv, v in pairs]
+        return filtered + [
+            Job(lv, "goal-seeking", arguments.steps, 1, filtered=False, **kind) for lv in levels
+        ]
     if arguments.mismatch:
         wrong = list(itertools.product((0.8, 1.2), repeat=2))
-        grid = itertools.product(levels, drivers, wrong)
+        grid = itertools.product(levels, names, wrong)
         # True is the plant's times 1 / factor: 0.8 needs 25 % of uncertainty, 1.2 needs 17 %.
         return [Job(lv, d, steps // 4, 2, True, m, c, 0.25) for lv, d, (m, c) in grid]
     return [
-        Job(lv, d, steps // arguments.parts, part, filtered=not arguments.off)
-        for lv, d, part in itertools.product(levels, drivers, range(arguments.parts))
+        Job(lv, d, steps // arguments.parts, part, filtered=not arguments.off, **kind)
+        for lv, d, part in itertools.product(levels, names, range(arguments.parts))
     ]
 
 
@@ -139,14 +153,18 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1_000_000, help="per level (with --price: per variant)")
     parser.add_argument("--parts", type=int, default=4, help="independent runs per driver")
     parser.add_argument("--workers", type=int, default=multiprocessing.cpu_count())
+    parser.add_argument("--robot", choices=list(DRIVERS), default="point")
     mode = parser.add_mutually_exclusive_group()
     mode.add_argument("--mismatch", action="store_true")
     mode.add_argument("--off", action="store_true")
     mode.add_argument("--price", action="store_true")
     arguments = parser.parse_args()
+    if arguments.mismatch and arguments.robot != "point":
+        parser.error("--mismatch is for the point: the car's filter declares no uncertainty")
     with multiprocessing.get_context("spawn").Pool(arguments.workers) as pool:
         rows = pool.map(run, jobs(arguments), chunksize=1)
     name = next((m for m in ("mismatch", "off", "price") if getattr(arguments, m)), "filtered")
+    name = name if arguments.robot == "point" else f"{arguments.robot}_{name}"
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / f"adversarial_{name}.json").write_text(json.dumps(rows, indent=1) + "\n")
     text = table(rows)

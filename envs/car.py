@@ -74,6 +74,6 @@ CAR: Final = WheeledCar(
     body="agent",
     n_sensors=24,  # accelerometer, velocimeter, gyro, magnetometer, caster's turning, its 3 x 3 orientation
     # The chassis, the back bumper, the front bumper, the wheels' outer rims.
-    corners=((0.1, 0.1), (0.1, 0.16), (0.05, -0.175), (0.155, 0.15), (0.155, 0.05)),
+    corners=((0.1, -0.1), (0.1, 0.16), (0.05, -0.175), (0.155, 0.15), (0.155, 0.05)),
 )
 """Safety-Gymnasium's car."""

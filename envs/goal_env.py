@@ -148,6 +148,11 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
         """Centres of the vases in the scenario now, shape (n, 2), m."""
         return np.array(self.data.qpos[self._vases_qpos].reshape(-1, 7)[: self._n_vases, :2])
 
+    @property
+    def robot_model(self) -> mujoco.MjModel:
+        """The robot alone on the floor, with nothing to hit: for a plant that has only its motion to forecast."""
+        return mujoco.MjModel.from_xml_path(str(_ASSETS / f"{self.robot.name}_goal0.xml"))
+
     # Gymnasium ---------------------------------------------------------------------------------------------
 
     def reset(

@@ -2,6 +2,7 @@
 
 from safe_wrappers.constraints.barrier import Barrier
 from safe_wrappers.constraints.clearance import Clearance
+from safe_wrappers.constraints.coasting_clearance import CoastingClearance
 from safe_wrappers.constraints.constraint import CertifyingConstraint, Constraint, HalfSpaces
 from safe_wrappers.constraints.heading_drive_clearance import HeadingDriveClearance
 from safe_wrappers.constraints.impact_speed_limit import ImpactSpeedLimit
@@ -19,6 +20,7 @@ __all__ = [
     "Box",
     "CertifyingConstraint",
     "Clearance",
+    "CoastingClearance",
     "Constraint",
     "Disc",
     "Discs",

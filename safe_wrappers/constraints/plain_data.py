@@ -7,6 +7,7 @@ from typing import Any
 
 from safe_wrappers.constraints.barrier import Barrier
 from safe_wrappers.constraints.clearance import Clearance
+from safe_wrappers.constraints.coasting_clearance import CoastingClearance
 from safe_wrappers.constraints.constraint import Constraint
 from safe_wrappers.constraints.heading_drive_clearance import HeadingDriveClearance
 from safe_wrappers.constraints.impact_speed_limit import ImpactSpeedLimit
@@ -23,6 +24,7 @@ from safe_wrappers.errors import ConfigurationError, UnknownNameError
 KINDS: dict[str, Callable[..., Constraint]] = {
     "Barrier": Barrier,
     "Clearance": Clearance,
+    "CoastingClearance": CoastingClearance,
     "HeadingDriveClearance": HeadingDriveClearance,
     "ImpactSpeedLimit": ImpactSpeedLimit,
     "JointPositionLimit": JointPositionLimit,

@@ -1,0 +1,60 @@
+"""Convex outlines in the plane: how far points are from them."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def convex_outline(points: Array) -> Array:
+    """Corners of the smallest convex outline around points, counter-clockwise (Andrew's monotone chain).
+
+    Args:
+        points: Shape (n, 2), m.
+
+    Returns:
+        Shape (c, 2), m; points on an edge are left out.
+
+    Raises:
+        ValueError: All points lie on one line: there is no area to go around.
+    """
+    ordered = sorted({(float(x), float(y)) for x, y in points})
+    corners = _chain(ordered)[:-1] + _chain(ordered[::-1])[:-1]
+    if len(corners) < 3:
+        raise ValueError(f"an outline needs three points that are not on one line, got {points.tolist()}")
+    return np.array(corners)
+
+
+def _chain(ordered: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    chain: list[tuple[float, float]] = []
+    for point in ordered:
+        while len(chain) >= 2 and _turn(chain[-2], chain[-1], point) <= 0.0:
+            chain.pop()
+        chain.append(point)
+    return chain
+
+
+def _turn(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> float:
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+
+def distances_to_outline(outline: Array, points: Array) -> Array:
+    """Signed distances of points to a convex outline; negative inside.
+
+    Args:
+        outline: Corners counter-clockwise, shape (c, 2), m.
+        points: Shape (..., 2), m.
+
+    Returns:
+        Shape (...), m.
+    """
+    edges = np.roll(outline, -1, axis=0) - outline
+    lengths = np.sqrt((edges**2).sum(axis=1))
+    along = edges / lengths[:, None]
+    offsets = points[..., None, :] - outline
+    ahead = (offsets * along).sum(axis=-1)
+    beyond = offsets[..., 0] * along[:, 1] - offsets[..., 1] * along[:, 0]
+    past = ahead - np.minimum(np.maximum(ahead, 0.0), lengths)
+    outside = np.sqrt((past**2 + beyond**2).min(axis=-1))
+    deepest = beyond.max(axis=-1)
+    return np.asarray(np.where(deepest <= 0.0, deepest, outside))
