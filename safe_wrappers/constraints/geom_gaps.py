@@ -18,6 +18,8 @@ _BESIDE = 1e-7 * np.array(
     [[0.0, 0.0, 0.0], [1.0, 0.3, 0.2], [-0.3, 1.0, -0.5], [0.4, -0.6, 1.0], [-1.0, -0.7, -0.4]]
 )
 """m: where a geom is asked about again."""
+_ROUND = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
+"""Up to it: planes, height fields, spheres, capsules."""
 _NUDGE = 1e-6
 """m: by which a geom is moved to find a normal."""
 _NORMAL = 1e-9
@@ -137,10 +139,11 @@ def _distance(model: mujoco.MjModel, data: mujoco.MjData, a: int, b: int, segmen
 
     Of about one in thirty pairs of boxes that are apart MuJoCo says that they touch: exactly 0, or the distance with
     the wrong sign (seen with 3.11). Another rounding is mostly enough to make it right. So whoever seems to touch is
-    asked about again a hair's breadth beside, and of what is not exactly 0 the answer in the middle counts.
+    asked about again a hair's breadth beside, and of what is not exactly 0 the answer in the middle counts. Where a
+    plane, a sphere or a capsule is one of the two this has not been seen.
     """
     gap = mujoco.mj_geomDistance(model, data, a, b, _FAR, segment)
-    if gap > 0.0:
+    if gap > 0.0 or model.geom_type[a] <= _ROUND or model.geom_type[b] <= _ROUND:
         return float(gap)
     place, answers = data.geom_xpos[a].copy(), []
     for beside in _BESIDE:

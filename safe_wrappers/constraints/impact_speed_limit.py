@@ -41,9 +41,10 @@ class ImpactSpeedLimit(Predicted):
 
     What it promises: along the held step of an executed control that is not flagged every first touch keeps the
     limit, for a plant that is right, a contact that is a linear spring of the declared stiffness, and one pair of
-    geoms at a time; forces through other contacts and joint stops are not counted. That braking always can keep it
-    afterwards holds as long as it takes no more than `holds` control steps, or `braking` is true. Obstacles are
-    taken where they are; who walks into the robot is not slowed down. Hence best effort.
+    geoms at a time; friction, and forces through other contacts and joint stops, are not counted. That braking
+    always can keep it afterwards holds as long as it takes no more than `holds` control steps, or `braking` is true.
+    Obstacles are taken where they are; who walks into the robot is not slowed down. The physics step should be short
+    against the contact (a tenth of `control.impact.time_to_peak`, say). Hence best effort.
 
     `value`, N: the limit less the peak that a contact at the present speed would have. Before contact, without
     `braking`, it is not below zero, since the machine may still slow down; with it, the speed counts that this
@@ -209,6 +210,7 @@ class ImpactSpeedLimit(Predicted):
 
     def _now(self, plant: MujocoPlant) -> Array:
         m, d = plant.model, self._probe
+        self._known: dict[tuple[int, bytes], Array] = {}
         data, what = plant.pose(), int(mujoco.mjtState.mjSTATE_INTEGRATION)
         mujoco.mj_getState(m, data, self._integration, what)
         mujoco.mj_setState(m, d, self._integration, what)
@@ -246,17 +248,22 @@ class ImpactSpeedLimit(Predicted):
 
     def slacks(self, plant: MujocoPlant, control: Array) -> Array:
         """What is left along the forecast of a control, and, from outside, closer after one step; see `Predicted`."""
-        self._control = control
-        asked = super().slacks(plant, control)
-        if not self._lost.any():
-            return asked
-        closer = self._lost * np.exp(-plant.hold_s / RECOVERY_S)
-        return np.concatenate([asked, self._next - self.margin - closer])
+        self._look(plant)
+        key = plant.revision, control.tobytes()
+        if key not in self._known:
+            self._control = control
+            asked = super().slacks(plant, control)
+            if self._lost.any():
+                closer = self._lost * np.exp(-plant.hold_s / RECOVERY_S)
+                asked = np.concatenate([asked, self._next - self.margin - closer])
+            self._known[key] = asked
+        return self._known[key]
 
     def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
         k, pairs = len(forecast.qpos), len(self._gaps.pairs)
         if not np.isfinite(forecast.qpos[-1]).all():
-            return np.full((k, pairs), np.nan)  # MuJoCo gave up: nobody knows
+            self._next = np.full(pairs, np.nan)  # MuJoCo gave up: nobody knows
+            return np.full((k, pairs), np.nan)
         touched: dict[int, list[int]] = {}
         for pair in range(pairs):
             for instant in self._gaps.touched(plant, forecast, self._probe, pair):
@@ -267,7 +274,8 @@ class ImpactSpeedLimit(Predicted):
         # Without contact as much is left as in the gentlest one.
         room = np.full((k, pairs), 0.5 * (self._force - self.margin))
         for instant, those in touched.items():
-            control = self._control if instant < soon else None
+            # At the end of the held step another control takes over.
+            control = self._control if instant < soon or instant == 0 else None
             self._at(plant, forecast.qpos[instant], forecast.qvel[instant], control)
             for pair in those:
                 contact = self._contact(plant, pair)

@@ -396,6 +396,25 @@ def test_pushing_counts():
         assert any(i["cbf/intervened"] for i in infos) != passes
 
 
+def test_pushing_counts_in_an_env_of_single_physics_steps():
+    env = slide(force=LIMIT, frame_skip=1)
+    env.data.qpos[0] = 0.3 + 1e-6
+    constraint = limit(holds=30)
+    plant = ready(env, constraint)
+    assert constraint.admits(plant, np.full(1, 0.48)) and not constraint.admits(plant, np.full(1, 0.52))
+
+
+def test_a_forecast_that_mujoco_gives_up_is_refused():
+    for start in (0.1, 0.3 + 0.01):
+        env = slide(force=1e15)
+        env.data.qpos[0] = start
+        constraint = limit()
+        plant = ready(env, constraint)
+        constraint.value(plant)
+        assert not constraint.admits(plant, np.ones(1)) and constraint.shortfall(plant, np.ones(1)) == np.inf
+        assert constraint.admits(plant, np.zeros(1))
+
+
 def test_falling_counts():
     env = slide(force=400.0, mass=MASS, gap=0.2, option='integrator="RK4"')
     env.model.opt.gravity[:] = 9.81, 0.0, 0.0  # "down" is along x: 49 N of 140
