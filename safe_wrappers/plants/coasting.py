@@ -101,6 +101,10 @@ class Coasting:
         """Where the machine is now, as a course of one instant."""
         return _course(self._plant.qpos[self._pose][None], False)
 
+    def state(self) -> Array:
+        """The machine's positions and velocities now: m, rad, quaternions, m/s, rad/s."""
+        return np.concatenate([self._plant.qpos[self._qpos], self._plant.qvel[self._qvel]])
+
     def speed(self, turning_radius: float) -> float:
         """The largest speed of its origin and of a point at that distance, as it moves now, m/s."""
         vx, vy, _, wx, wy, wz = self._plant.qvel[self._motion].tolist()
