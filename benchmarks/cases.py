@@ -154,6 +154,15 @@ def _ant_maze(maze: str) -> Case:
     )
 
 
+def _rover() -> Case:
+    # At the edge of another ground a step or two overshoot the limit of 0.15; beyond 0.2 all grounds have fallen.
+    return Case(
+        "SafeRover-v0",
+        judge=lambda env: Reported(judges.slips_more_than(0.2)),
+        drivers=_BLIND | {"full throttle and reverse": drivers.end_seeking},
+    )
+
+
 def _fallen(env_id: str) -> Case:
     """A pendulum whose episodes go on after the fall: the cart goes far before the pole does only by chance."""
     return Case(env_id, _rail, _RAIL, note="on after the fall", past_termination=True, max_episode_steps=500)
@@ -177,6 +186,7 @@ PROTECTED: dict[str, Case] = _by_name(
     _velocity("Ant", 2.6222, plane=True),
     _velocity("Humanoid", 1.4149, plane=True),
     Case("HumanoidStandup-v5", _joint_speeds(20.0), _SPEED),
+    _rover(),
     _point_maze("UMaze"),
     _ant_maze("UMaze"),
 )

@@ -45,6 +45,8 @@ def _phrase(constraint: Any) -> str:
             return f"stopping path clear of {_obstacles(constraint.obstacles)}"
         case sw.WallClearance():
             return "braking path clear of the walls"
+        case sw.Traction():
+            return f"slip of {len(constraint.wheels)} wheels within {constraint.max_slip:g}"
     return type(constraint).__name__
 
 
@@ -55,6 +57,8 @@ def _margin(constraint: Any) -> str:
             return f"{margin:g} rad/s"
         case sw.SpeedLimit():
             return f"{margin:g} m/s"
+        case sw.Traction():
+            return f"{margin:g}"
     return f"{1e3 * margin:g} mm"
 
 

@@ -27,6 +27,7 @@ KNOWN = {
     "FlexJointReach-v0": [sw.JointSpeedLimit],
     "Pusher-v5": [sw.JointSpeedLimit, sw.Workspace],
     "HumanoidStandup-v5": [sw.JointSpeedLimit],
+    "SafeRover-v0": [sw.Traction],
     "PointMaze_UMaze-v3": [sw.WallClearance],
     "AntMaze_UMaze-v5": [sw.Workspace],
     **{f"{robot}-{version}": [sw.SpeedLimit] for robot in RUNNERS for version in ("v4", "v5")},

@@ -80,6 +80,13 @@ def test_the_judge_means_the_limit_that_the_filter_keeps(name):
                         assert h == pytest.approx(-missed, abs=1e-9)
                     seen.add(h < 0.0)
                 assert seen == {True, False}
+            case sw.Traction():
+                assert isinstance(judge, Reported)
+                slips = {
+                    missed: judge.after(np.zeros(1), {"slip_max": missed}) for missed in (0.15, 0.2, 0.5)
+                }
+                # Looser than the limit: an edge is overshot, and a slip of a third more is no spin-out yet.
+                assert slips[constraint.max_slip] < slips[0.2] == 0.0 < slips[0.5]
             case sw.WallClearance():
                 pass  # both read the walls from the model; tests/benchmarks/test_judges.py places the ball
             case _:
@@ -123,6 +130,7 @@ DISCS = "hazard_positions (0.2 m) and vase_positions (0.3 m)"
     ("Pusher-v5", f"joint speeds below 6 rad/s; tips_arm {TABLE}", "best effort", "0.05 rad/s, 5 mm"),
     ("SafeHumanoidVelocity-v0", "speed of the centre of mass (xy) below 1.4149 m/s", "best effort", "0.02 m/s"),
     ("PointMaze_UMaze-v3", "braking path clear of the walls", "proved", "1 mm"),
+    ("SafeRover-v0", "slip of 4 wheels within 0.15", "best effort", "0"),
     ("Reacher-v5, with a disc",
      "joint speeds below 5 rad/s; fingertip clear of a disc of 0.05 m at (-0.1, 0.1) m", "best effort",
      "0.01 rad/s, 1 mm"),

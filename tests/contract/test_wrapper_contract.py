@@ -17,6 +17,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 import safe_wrappers as sw
+from safe_wrappers.envs.safe_rover import WHEELS
 
 TASK, STEPS = "SafePointGoal1-v0", 60
 
@@ -104,6 +105,21 @@ EXAMPLES = {
         ),
     },
     "RecordInterventions": {"no arguments": (TASK, dict)},
+    "SlipLimiter": {
+        "all wheels": ("SafeRover-v0", lambda: {"wheels": list(WHEELS)}),
+        "the rear ones, with options": (
+            "SafeRover-v0",
+            lambda: {
+                "wheels": ["rear_left", "rear_right"],
+                "max_slip": 0.1,
+                "friction": 0.05,
+                "regularization": 0.3,
+                "fallback": "hold",
+                "solver": "clarabel",
+                "margin": 0.01,
+            },
+        ),
+    },
 }
 """Wrapper name -> what it shows -> (env id, function of its arguments): plain data or what becomes it."""
 
@@ -112,6 +128,9 @@ INSIDE = {"AdaptionPenalty": lambda env: sw.CBFActionFilter(env, [_clearance()])
 
 CHUNKED = ("ChunkHandover",)
 """Wrappers whose action is a chunk, shape (chunk_size, controls), executed over several control steps."""
+
+FILTERS = ("CBFActionFilter", "SlipLimiter")
+"""Wrappers that let no action through that is not finite or outside the action space."""
 
 ONLY_LOOKING = ("ContactMonitor", "RecordInterventions")
 """Wrappers that look on and pass every action as it is."""
@@ -323,7 +342,7 @@ def test_info_has_the_same_keys_and_types_at_every_step(name, case):
         for seed in range(2):
             env.reset(seed=seed)
             seen += [types(env.step(a)[4]) for a in actions(env)]
-        if name == "CBFActionFilter":
+        if name in FILTERS:
             seen.append(types(env.step(np.full(env.action_space.shape, np.nan))[4]))
             seen.append(types(env.step(np.full(env.action_space.shape, 9.0))[4]))
         if name in CHUNKED:
@@ -441,6 +460,8 @@ def harmless(name, case):
     if name == "LeaseExpiry":
         far = sw.JointSpeedLimit(1e9)
         return sw.LeaseExpiry(Witness(gym.make("Reacher-v5")), far, closing_speed=1.0)
+    if name == "SlipLimiter":  # a ground that is said to carry any torque
+        return sw.SlipLimiter(Witness(gym.make("SafeRover-v0")), list(WHEELS), friction=1e9)
     env_id, arguments = example(name, case)
     return getattr(sw, name)(Witness(inside(name, gym.make(env_id))), **arguments())
 

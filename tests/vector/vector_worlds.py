@@ -142,7 +142,21 @@ def pendulum(index=0):
     return CountUnsafeWarnings(sw.RecordInterventions(pendulum_filter(env)))
 
 
-TASKS = {"cart": cart, "point_goal": point_goal, "reacher": reacher, "pendulum": pendulum}
+class AtSpeed(gym.Wrapper):
+    """Starts every episode of the rover at speed; all else stays random."""
+
+    def reset(self, *, seed=None, options=None):
+        return self.env.reset(seed=seed, options={"layout": {"speed": 2.0}})
+
+
+def rover(index=0):
+    """What the limiter has learnt of the ground is its state; the friction declared admits some random torques."""
+    env = AtSpeed(gym.make("SafeRover-v0", max_episode_steps=7 + 2 * index))
+    limiter = sw.SlipLimiter(env, wheels=["rear_left", "rear_right"], friction=2.0, fallback="hold")
+    return CountUnsafeWarnings(sw.RecordInterventions(limiter))
+
+
+TASKS = {"cart": cart, "point_goal": point_goal, "reacher": reacher, "pendulum": pendulum, "rover": rover}
 
 
 def sub_envs(make, n=3):

@@ -139,6 +139,7 @@ def test_without_a_filter_everything_counts_as_zero():
         "length",
         "return",
         "goals_reached",
+        "spin_outs",
         "success",
     }
     assert env.filter_time_us is None
@@ -193,10 +194,34 @@ def test_file_gains_one_row_per_episode(tmp_path: Path):
     first, second = read_episodes(path)
     assert first["correction_mean"] == second["correction_mean"] == 0.5
     assert first["success"] == 1.0
-    # A task without goals: empty cells, which do not come back.
+    # A task without goals and wheels: empty cells, which do not come back.
     bare = tmp_path / "bare.csv"
     play(RecordInterventions(gym.make("Pendulum-v1", max_episode_steps=2), bare))
-    assert set(read_episodes(bare)[0]) == set(COLUMNS) - {"goals_reached", "success"}
+    assert set(read_episodes(bare)[0]) == set(COLUMNS) - {"goals_reached", "spin_outs", "success"}
+
+
+def test_spin_outs_are_counted_where_the_task_reports_them(tmp_path: Path):
+    path = tmp_path / "rover.csv"
+    script = [cbf(spin_out=value) for value in (1.0, 0.0, 1.0, 1.0)]
+    env = scripted_env(path, script)
+    for _ in range(2):  # an episode's own
+        infos, _ = play(env)
+        assert infos[-1][keys.EPISODE_SUMMARY]["spin_outs"] == 3
+    assert [row["spin_outs"] for row in read_episodes(path)] == [3.0, 3.0]
+    calm = [cbf(spin_out=0.0)] * 4
+    assert play(scripted_env(infos=calm))[0][-1][keys.EPISODE_SUMMARY]["spin_outs"] == 0
+    assert "spin_outs" not in play(scripted_env())[0][-1][keys.EPISODE_SUMMARY]
+
+
+def test_a_rovers_spin_outs_are_those_of_its_own_judge():
+    env = RecordInterventions(gym.make("SafeRover-v0", max_episode_steps=40))
+    env.reset(seed=0)
+    reported = 0
+    for step in range(40):
+        info = env.step(np.array([1, 1, 1, 1, 0] if step < 20 else np.zeros(5), np.float32))[4]
+        reported += info[keys.SPIN_OUT] > 0.0
+    assert 10 < reported < 40
+    assert info[keys.EPISODE_SUMMARY]["spin_outs"] == reported
 
 
 @pytest.mark.parametrize("cut", [1, 3, 30])
