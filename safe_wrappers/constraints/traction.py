@@ -1,5 +1,6 @@
 """Traction: keep driven wheels on the stable side of a traction curve that nobody knows."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -32,6 +33,11 @@ _UNBOUNDED = 1e9
 """Stands for the control of an actuator without limits."""
 _LEAST_LOAD = 0.05
 """Share of the largest load seen below which a wheel counts as in the air: it measures nothing."""
+_MOST_FRICTION = 3.0
+"""Force over load beyond which something else than the ground held the wheel: it says nothing about the curve."""
+_ROUNDING = 1e-6
+"""Share of a control below which its change is the action space's own rounding (float32)."""
+_SOLVERS_NOISE = 1e-9
 
 
 @dataclass
@@ -57,7 +63,7 @@ class Traction:
     `regularization`.
 
     Args:
-        wheels: Names of the wheels' hinges; each must be driven directly by an actuator of its own or a shared one.
+        wheels: Names of the wheels' hinges; each must be driven by actuators on that joint and nothing else.
         max_slip: Largest slip ratio, normalised, in (0, 1).
         friction: Declared lower bound on the peak friction coefficient under every wheel, > 0: the ground is then
             counted on for that much force at once, instead of only for what it gave in the last control step. A bound
@@ -77,11 +83,12 @@ class Traction:
     promise: Promise = field(default="best effort", init=False)
 
     def __post_init__(self) -> None:
-        if isinstance(self.wheels, str) or not isinstance(self.wheels, Sequence):
+        named = isinstance(self.wheels, Sequence) and not isinstance(self.wheels, str)
+        if not (named and all(isinstance(name, str) for name in self.wheels)):
             raise ConfigurationError(f"wheels is a list of joint names, got {self.wheels!r}")
         self.wheels = list(self.wheels)
+        self.max_slip = positive("max_slip", self.max_slip, "slip, in (0, 1)")
         slip_window(0.0, self.max_slip, 1.0)  # refuses a slip outside (0, 1)
-        self.max_slip = float(self.max_slip)
         if self.friction is not None:
             self.friction = positive("friction", self.friction, "force per load")
         self.regularization = positive("regularization", self.regularization, "m/s")
@@ -114,6 +121,7 @@ class Traction:
         self._stamp: int | None = None
         self._rows: HalfSpaces | None = None
         self._rate: Array | None = None
+        self._time = math.nan
         self._ground, self._slip, self._across = np.zeros(n), np.zeros(n), np.zeros(n)
         self._load, self._most_load = np.zeros(n), np.zeros(n)
         self._traction, self._present = np.zeros(n), np.zeros(n)
@@ -136,9 +144,13 @@ class Traction:
         slip = slip_ratio(wheel, ground, self.regularization)
         faster = np.maximum(np.maximum(np.abs(ground), np.abs(wheel)), self.regularization)
         across = np.abs(sideways) / faster
-        if self._rate is None:
-            self._ahead = np.zeros_like(rate)
-        else:
+        elapsed, self._time = plant.time - self._time, plant.time
+        held = math.isclose(elapsed, plant.hold_s, rel_tol=1e-6)
+        again = elapsed == 0.0 and bool((rate == self._rate).all())  # keeps what was measured
+        if self._rate is None or not (held or again):
+            # Nothing before it, or a clock that was set: no held control led from that state to this one.
+            self._ahead, self._traction, self._present = (np.zeros_like(rate) for _ in range(3))
+        elif held:
             self._ahead = ground - self._ground
             torque = self._wheels.torque(published)
             self._traction = self._constants.traction(self._response, self._rate, rate, torque)
@@ -172,10 +184,12 @@ class Traction:
         # The force points against the sliding: its part along the heading is the part of the slip there.
         part = np.where(usable, np.abs(along) / np.where(usable, total, 1.0), 1.0)
         friction = np.abs(self._traction) / (part * np.where(loaded, mean_load, 1.0))
+        usable &= friction <= _MOST_FRICTION
         noise = (_NOISE + _NOISE_PER_SLIP * np.abs(slip - self._slip)) / part
         self._estimate.update(total, friction, np.where(usable, noise, np.inf))
-        # What was measured is the interval's mean; where the slip went on growing, so did the force.
-        now = np.where(slip * along > 0.0, np.abs(slip), 0.0)
+        # What was measured is the interval's mean; where the slip went on growing, so did the force. From nothing to
+        # its end a slip is at most twice its mean; a slip that has changed its sign in between shows no more.
+        now = np.where(slip * along > 0.0, np.minimum(np.abs(slip), 2.0 * np.abs(along)), 0.0)
         risen = self._traction * self._estimate.rise(np.abs(along), now)
         self._present = np.where(self._traction * along > 0.0, risen, self._traction)
 
@@ -235,9 +249,10 @@ class Traction:
     def report(self, proposed: Array, executed: Array) -> dict[str, Any]:
         """The info keys `slip/...`: of the state before the step, and what its control did to the wheels."""
         mean, std = self._estimate.mean, self._estimate.std
+        changed = np.abs(executed - proposed) > _ROUNDING * np.abs(proposed) + _SOLVERS_NOISE
         return {
             keys.SLIP_RATIO: self._slip.copy(),
-            keys.SLIP_LIMITED: self._wheels.driven_by(executed != proposed),
+            keys.SLIP_LIMITED: self._wheels.driven_by(changed),
             keys.SLIP_MU_ESTIMATE: mean,
             keys.SLIP_MU_STD: std,
         }

@@ -40,17 +40,17 @@ class WheelMotion(NamedTuple):
 class DrivenWheels:
     """The wheels of a vehicle on level ground.
 
-    A wheel is a hinge that at least one actuator drives directly. Its radius is read from a sphere, cylinder or
-    capsule of its body: the one named like the joint, else the first that can touch something. Ahead is where a
-    positive joint rate rolls it: the axle's axis times up.
+    A wheel is a hinge that one or more actuators drive, all of them directly. Its radius is read from a sphere,
+    cylinder or capsule of its body: the one named like the joint, else the first that can touch something. Ahead is
+    where a positive joint rate rolls it: the axle's axis times up.
 
     Args:
         plant: Bound.
         names: Of the hinges.
 
     Raises:
-        ConfigurationError: An empty list, a name twice, a joint that is no hinge or that nothing drives, or a wheel
-            without a round geom of a radius above zero.
+        ConfigurationError: An empty list, a name twice, a joint that is no hinge or that nothing drives, a wheel
+            that a tendon or site drives, too, or one without a round geom of a radius above zero.
         UnknownNameError: No joint of that name.
     """
 
@@ -74,9 +74,13 @@ class DrivenWheels:
             if not drives.any():
                 raise ConfigurationError(
                     f"no actuator drives joint {name!r} directly, so its slip cannot be limited; driven are "
-                    + ", ".join(sorted({m.joint(int(j)).name for j in m.actuator_trnid[direct, 0]}))
+                    + (
+                        ", ".join(sorted({m.joint(int(j)).name for j in m.actuator_trnid[direct, 0]}))
+                        or "none"
+                    )
                 )
         self.dofs = m.jnt_dofadr[self._joints]
+        self._refuse_other_drives(plant)
         self._bodies = m.jnt_bodyid[self._joints]
         self._roots = m.body_rootid[self._bodies]
         self._geoms = np.array([_round_geom(plant, int(j)) for j in self._joints])
@@ -86,9 +90,22 @@ class DrivenWheels:
         self._force = np.zeros(6)
         self._fixed_drive: tuple[Array, Array] | None = None
 
+    def _refuse_other_drives(self, plant: MujocoPlant) -> None:
+        """A drive through a tendon or a site that turns a wheel would be missing in `drive`."""
+        data = mujoco.MjData(plant.model)
+        mujoco.mj_forward(plant.model, data)
+        turns = plant.actuators.moment(data)[:, self.dofs].T != 0.0
+        for others, name in zip(turns & ~self._drives, self.names, strict=True):
+            if others.any():
+                raise ConfigurationError(
+                    f"joint {name!r} is also driven by {', '.join(_actuators(plant, others))} through a tendon or a "
+                    "site, which its slip limit would not hold back; drive wheels by actuators on their own joints"
+                )
+
     def constants(self, plant: MujocoPlant) -> Wheel:
         """Radius, inertia about the axle and damping, as the plant's model has them now."""
         m = plant.model
+        self._fixed_drive = None
         data, column = mujoco.MjData(m), np.empty(m.nv)
         mujoco.mj_forward(m, data)
         inertia = []
@@ -166,6 +183,10 @@ def _round_geom(plant: MujocoPlant, joint: int) -> int:
             f"has {has}"
         )
     return found
+
+
+def _actuators(plant: MujocoPlant, chosen: NDArray[np.bool_]) -> list[str]:
+    return [plant.model.actuator(int(i)).name or f"actuator #{i}" for i in np.flatnonzero(chosen)]
 
 
 def _hinges(plant: MujocoPlant) -> str:

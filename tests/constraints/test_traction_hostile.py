@@ -1,0 +1,230 @@
+"""Traction against strange vehicles, drivers and episodes: judged by MuJoCo's own velocities, never by the filter."""
+
+import copy
+import pickle
+import warnings
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from vehicles import MOTORS, Trolley
+
+import safe_wrappers as sw
+from safe_wrappers.control.slip import slip_ratio
+from safe_wrappers.errors import ConfigurationError
+
+FULL = np.array([1.0, 1.0, 1.0, 1.0, 0.0], dtype=np.float32)
+OPEN = {"agent": [0.0, 0.0, 0.0], "goal": [4.0, 4.0], "hazards": [], "patches": []}
+
+
+def rover(**options):
+    env = gym.make("SafeRover-v0", max_episode_steps=100_000)
+    return sw.SlipLimiter(env, wheels=env.unwrapped.wheels, **options)
+
+
+def start(env, **layout):
+    env.reset(seed=0, options={"layout": OPEN | layout})
+    return env
+
+
+def true_slips(raw, names=("left", "right"), radius=0.1):
+    """From `mj_objectVelocity` in a copy of the data: not the filter's kinematics."""
+    model, data = raw.model, mujoco.MjData(raw.model)
+    data.qpos[:], data.qvel[:] = raw.data.qpos, raw.data.qvel
+    mujoco.mj_forward(model, data)
+    slips = []
+    for name in names:
+        joint, velocity = model.joint(name), np.zeros(6)
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, joint.bodyid[0], velocity, 0)
+        axle = data.xaxis[joint.id]
+        ahead = np.cross(axle, [0.0, 0.0, 1.0])
+        ahead /= np.linalg.norm(ahead)
+        slips.append(float(slip_ratio(radius * velocity[:3] @ axle, velocity[3:] @ ahead, 0.5)))
+    return np.array(slips)
+
+
+# Drivers -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("ground", "period"), [("dry", 1), ("dry", 2), ("wet", 2), ("ice", 3)])
+def test_throttle_and_brake_by_turns(ground, period):
+    """The slip changes its sign within a control step: its mean is near zero, and so is the force measured."""
+    env = start(rover(), ground=ground, speed=2.0)
+    slips = [env.step(FULL * (1 if k // period % 2 else -1))[4]["slip_max"] for k in range(200)]
+    assert max(slips) < 0.16
+
+
+def test_a_driver_that_draws_lots():
+    env = start(rover(), speed=2.0)
+    rng = np.random.default_rng(0)
+    slips = []
+    for _ in range(500):
+        action = np.append(np.sign(rng.uniform(-1, 1, 4)), rng.uniform(-0.2, 0.2)).astype(np.float32)
+        slips.append(env.step(action)[4]["slip_max"])
+    assert max(slips) < 0.3
+    assert np.mean(np.array(slips) > 0.2) < 0.05
+
+
+# Vehicles ------------------------------------------------------------------------------------------------------
+
+
+def test_a_tendon_that_drives_a_limited_wheel_is_refused():
+    """Its torque would be in no row: the wheels would spin at any limit."""
+
+    joints = "".join(f'<joint joint="{side}" coef="1"/>' for side in ("left", "right"))
+    tendon = f'<tendon><fixed name="axle">{joints}</fixed></tendon>'
+    both = (
+        MOTORS
+        + '<motor name="booster" tendon="axle" gear="6" ctrlrange="-1 1"/></actuator>'
+        + tendon
+        + "<actuator>"
+    )
+    with pytest.raises(ConfigurationError, match="'left' is also driven by booster"):
+        sw.SlipLimiter(Trolley(actuators=both), wheels=["left", "right"])
+    alone = '<motor tendon="axle" ctrlrange="-1 1"/></actuator>' + tendon + "<actuator>"
+    with pytest.raises(
+        ConfigurationError, match=r"no actuator drives joint 'left' directly.*driven are none"
+    ):
+        sw.SlipLimiter(Trolley(actuators=alone), wheels=["left", "right"])
+
+
+def test_a_drive_of_the_plants_model_that_changes_is_read_anew():
+    env = sw.SlipLimiter(Trolley(0.15), wheels=["left", "right"])
+    env.reset(seed=0)
+    traction, plant = env.constraints[0], env.plant
+    before = traction.rows(plant).normals
+    plant.model.actuator_gear[:, 0] *= 2.0
+    plant.revision += 1
+    plant.observe()
+    np.testing.assert_allclose(traction.rows(plant).normals, 2.0 * before)
+
+
+# What a step before was ----------------------------------------------------------------------------------------
+
+
+def test_a_second_look_changes_nothing():
+    """A logger that asks for rows between two steps must not be taken for a control step in which nothing moved."""
+    watched, left_alone = (start(rover(), ground="ice", speed=2.0) for _ in range(2))
+    for _ in range(30):
+        watched.plant.observe()
+        watched.constraints[0].rows(watched.plant)
+        got, expected = watched.step(FULL)[4], left_alone.step(FULL)[4]
+        np.testing.assert_array_equal(got["executed_action"], expected["executed_action"])
+        np.testing.assert_array_equal(got["slip/mu_estimate"], expected["slip/mu_estimate"])
+
+
+def test_a_clock_that_is_set_back_measures_nothing():
+    """An env that starts its own next episode within a step: the motion before it says nothing about the ground."""
+    env = start(rover(), ground="wet")
+    for _ in range(30):
+        env.step(FULL)
+    raw = env.unwrapped
+    mujoco.mj_resetData(raw.model, raw.data)
+    raw.set_state(raw.init_qpos.copy(), np.zeros(raw.model.nv))
+    known = env.constraints[0]._estimate.mean
+    info = env.step(FULL)[4]
+    np.testing.assert_array_equal(env.constraints[0]._traction, 0.0)
+    np.testing.assert_array_equal(info["slip/mu_estimate"], known)
+    fresh = start(rover(), ground="wet").step(FULL)[4]
+    # As from a fresh start but for the limit, which the estimate has moved.
+    np.testing.assert_allclose(info["executed_action"], fresh["executed_action"], rtol=0.5)
+
+
+def test_a_state_that_is_set_costs_one_wrong_step_and_no_estimate():
+    """Braking at 4 m/s, then at once at 6 m/s with the same slip: no ground has that force."""
+    env = start(rover(), ground="wet", speed=4.0)
+    for _ in range(25):
+        info = env.step(-FULL)[4]
+    known, raw = info["slip/mu_estimate"], env.unwrapped
+    qvel = np.zeros(raw.model.nv)
+    qvel[0], qvel[raw._rates] = 6.0, 0.92 * 60.0
+    raw.set_state(raw.data.qpos.copy(), qvel)
+    after = [env.step(-FULL)[4] for _ in range(30)]
+    np.testing.assert_allclose(after[0]["slip/mu_estimate"], known, rtol=0.05)
+    assert max(i["slip_max"] for i in after) < 0.2
+
+
+def test_a_state_that_is_no_number_is_forgotten():
+    """The filter falls back; when numbers come again, nothing from before them is counted on."""
+    env = sw.SlipLimiter(Trolley(0.15), wheels=["left", "right"])
+    env.reset(seed=0)
+    for _ in range(30):
+        env.step(np.ones(2, dtype=np.float32))
+    raw = env.unwrapped
+    good = raw.data.qvel.copy()
+    traction = env.constraints[0]
+    assert (traction._present > 0.0).all()
+    raw.data.qvel[6] = np.nan
+    env.plant.observe()
+    assert np.isnan(traction.rows(env.plant).offsets).all()
+    assert np.isfinite(traction.backup(env.plant)).all()
+    raw.data.qvel[:] = good
+    env.plant.observe()
+    assert np.isfinite(traction.rows(env.plant).offsets).all()
+    np.testing.assert_array_equal(traction._present, 0.0)
+
+
+# Reports -------------------------------------------------------------------------------------------------------
+
+
+def test_actions_in_double_precision_are_limited_only_where_they_are():
+    env = start(rover())
+    action = np.array([1.0, 0.1, 0.01, 0.02, 0.3])  # none but the first is a float32
+    info = env.step(action)[4]
+    assert info["cbf/intervened"]
+    assert info["slip/limited"].tolist() == [True, False, False, False]
+
+
+def test_infos_keep_their_shape_and_share_nothing():
+    env = start(rover())
+    rng = np.random.default_rng(0)
+    infos = [env.reset(seed=0)[1]]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for k in range(100):
+            action = rng.uniform(-2, 2, 5).astype(np.float32)
+            if k % 17 == 0:
+                action[0] = np.nan
+            infos.append(env.reset()[1] if k % 23 == 22 else env.step(action)[4])
+            infos.append(copy.deepcopy(infos[-1]))
+
+    def shapes(info):
+        return {k: (type(v), getattr(v, "dtype", None), getattr(v, "shape", None)) for k, v in info.items()}
+
+    assert all(shapes(info) == shapes(infos[0]) for info in infos)
+    for info, kept in zip(infos[1::2], infos[2::2], strict=True):
+        for key, value in kept.items():
+            np.testing.assert_array_equal(info[key], value)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_filters_its_own_env(copied):
+    """Gymnasium's MuJoCo envs start anew when copied; the copy's filter must read that env, not the first."""
+    env = start(rover(), ground="wet")
+    for _ in range(20):
+        env.step(FULL)
+    twin = start(copied(env), ground="wet")
+    expected = [twin.step(FULL)[4]["executed_action"] for _ in range(10)]
+    start(env, ground="wet")
+    for action in expected:
+        np.testing.assert_array_equal(env.step(FULL)[4]["executed_action"], action)
+
+
+# Bad input -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"wheels": [0, 1]}, "list of joint names"),
+        ({"wheels": None}, "list of joint names"),
+        ({"max_slip": [0.1, 0.1]}, "max_slip must be a number"),
+        ({"max_slip": None}, "max_slip must be a number"),
+        ({"max_slip": float("inf")}, "max_slip must be a finite number"),
+        ({"friction": [0.1] * 4}, "friction must be a number"),
+    ],
+)
+def test_arguments_of_other_types_are_refused_by_name(arguments, says):
+    with pytest.raises(ConfigurationError, match=says):
+        sw.Traction(**{"wheels": ["left"]} | arguments)
