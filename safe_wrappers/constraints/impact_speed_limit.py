@@ -237,10 +237,9 @@ class ImpactSpeedLimit(Predicted):
     def _left(self, contact: "_Contact") -> float:
         """What is left of the limit less the margin, N, to first order; in squares, nearly linear in the control."""
         limit = self._force - self.margin
-        if contact.pressed > limit:
-            square = -((contact.pressed - limit) ** 2)
-        else:
-            square = (limit - contact.pressed) * (limit + contact.pressed - 2.0 * contact.push)
+        # Beyond the limit the push would change its sign with that of the first factor.
+        push = contact.push if contact.pressed <= limit else -contact.push
+        square = (limit - contact.pressed) * (limit + contact.pressed - 2.0 * push)
         return (square - contact.inertia * contact.speed**2) / (2.0 * limit)
 
     def _violation(self, value: Array) -> Array:

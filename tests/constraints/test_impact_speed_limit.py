@@ -124,6 +124,8 @@ def test_what_is_left_is_negative_exactly_where_the_peak_is_too_high(speed, iner
     if abs(over) > 1e-6 * LIMIT:
         assert (left < 0.0) == (over > 0.0)
     assert left <= 0.5 * LIMIT + 1e-9
+    harder = limit(margin=margin)._left(replace(contact, push=push + 10.0))
+    assert harder < left or pressed == LIMIT - margin  # also where all is lost
 
 
 def test_to_first_order_what_is_left_is_the_force_that_is_missing():
@@ -312,14 +314,17 @@ def test_a_wall_that_the_env_moves_by_hand_is_taken_where_it_is():
 
 @pytest.mark.parametrize(("mass", "stiffness"), [(0.5, 6e4), (MASS, 8e3), (40.0, 6e4)])
 def test_at_full_throttle_it_arrives_with_what_is_allowed_and_then_holds_it(mass, stiffness):
-    held = limit(stiffness=stiffness, margin=2.0, holds=40 if mass == 40.0 else 6)
-    fine = {"timestep": 2.5e-4, "frame_skip": 40} if mass < 1.0 else {}  # a contact lasts 20 ms or less
+    held = limit(stiffness=stiffness, margin=2.0, holds={0.5: 8, MASS: 12, 40.0: 40}[mass])
+    fine = (
+        {"timestep": 2.5e-4, "frame_skip": 40, "gap": 0.05} if mass < 1.0 else {}
+    )  # a contact lasts 20 ms or less
     env = sw.CBFActionFilter(slide(mass=mass, stiffness=stiffness, **fine), [held])
-    force, infos = peaks(env, full, 80)
+    steps = 30 if mass < 1.0 else 70
+    force, infos = peaks(env, full, steps)
     assert force.max() <= LIMIT  # by MuJoCo's own contact
     assert force.max() >= 0.9 * LIMIT  # and it is let near the limit
     assert not any(i["cbf/infeasible"] or i["cbf/fallback"] for i in infos)
-    unfiltered, _ = peaks(slide(mass=mass, stiffness=stiffness, **fine), full, 80)
+    unfiltered, _ = peaks(slide(mass=mass, stiffness=stiffness, **fine), full, steps)
     assert unfiltered.max() > 3.0 * LIMIT
 
 
@@ -444,11 +449,11 @@ def test_pressed_too_hard_already_it_says_so_and_lets_go():
     env.start = [0.3 + 0.01], [0.0]  # 200 N
     filtered = sw.CBFActionFilter(env, [limit()])
     with pytest.warns(sw.UnsafeStateWarning, match="margin"):
-        force, infos = peaks(filtered, full, 60)
+        force, infos = peaks(filtered, full, 30)
     assert infos[0]["cbf/unsafe"] and infos[0]["cbf/margin"] == pytest.approx(-60.0, abs=1.0)
     left = force[force > LIMIT]
-    assert (np.diff(left) < 0.0).all() and 3 < left.size < 50  # less and less, then none
-    assert (force[50:] <= LIMIT).all()
+    assert (np.diff(left) < 0.0).all() and 1 < left.size < 10  # less and less, then none
+    assert (force[10:] <= LIMIT).all()
 
 
 def test_away_from_everything_actions_pass_bit_for_bit():
