@@ -335,7 +335,7 @@ class _Group:
 
     def keep(self, here: Course, room: float) -> float:
         """Forget what is farther than `room`, m; the least clearance there was, m."""
-        now = self._left(here)[0]
+        now = self._left(here)[0] if len(self._centers) else np.zeros(0)
         close = now < room
         self._centers, self._radii, self.now = self._centers[close], self._radii[close], now[close]
         self.near = bool(close.any())

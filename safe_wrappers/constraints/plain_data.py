@@ -65,6 +65,6 @@ def constraint_data(constraint: Constraint) -> Any:
     for field in fields(constraint):
         if field.init and field.name != "promise":
             value = getattr(constraint, field.name)
-            obstacles = field.name in ("obstacles", "keep_out")
+            obstacles = field.name in ("obstacles", "keep_out", "untouched")
             data[field.name] = [obstacle_data(o) for o in value] if obstacles else value
     return data

@@ -1,0 +1,213 @@
+"""CoastingClearance: what it admits, suggests, refuses and says."""
+
+import json
+import warnings
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+
+import safe_wrappers as sw
+from safe_wrappers.constraints.plain_data import constraint_data, constraint_from
+from safe_wrappers.errors import ConfigurationError, UnsafeStateWarning, UnsupportedEnvError
+
+FULL = np.array([1.0, 1.0])
+BACK = -FULL
+NONE = np.zeros(2)
+SQUARE = [[0.16, 0.18], [0.16, -0.18], [-0.16, 0.18], [-0.16, -0.18]]
+
+
+def bound(hazards, level=1, vases=(), heading=0.0, speed_up=0, **options):
+    """A filtered car at the origin after `speed_up` steps of full drive without the filter, and its constraint."""
+    options = {"keep_out": [sw.Discs("hazard_positions", 0.2)], "alone": "robot_model"} | options
+    env = sw.CBFActionFilter(gym.make(f"SafeCarGoal{level}-v0"), [sw.CoastingClearance(**options)])
+    layout = {"agent": [0.0, 0.0, heading], "goal": [9.0, 9.0], "hazards": hazards, "vases": list(vases)}
+    env.reset(seed=0, options={"layout": layout})
+    for _ in range(speed_up):
+        env.unwrapped.step(FULL)
+    env.plant.observe()
+    return env, env.constraints[0], env.plant
+
+
+def least_way(env, control, point=(0.0, 0.0), steps=25):
+    """Smallest distance of the origin to a point while a control is held for a step and then none: on a copy."""
+    raw = env.unwrapped
+    data = mujoco.MjData(raw.model)
+    mujoco.mj_copyData(data, raw.model, raw.data)
+    data.ctrl[:] = control
+    least = np.inf
+    for k in range(steps * raw.frame_skip):
+        if k == raw.frame_skip:
+            data.ctrl[:] = 0.0
+        mujoco.mj_step(raw.model, data)
+        least = min(least, np.hypot(*(data.qpos[:2] - point)))
+    return least
+
+
+def ahead_of(env, distance):
+    """The place at a distance along x from the car."""
+    x, y = env.unwrapped.agent_position
+    return np.array([x + distance, y])
+
+
+@pytest.mark.parametrize("gap", np.linspace(0.02, 0.16, 8))
+@pytest.mark.parametrize("speed_up", [0, 6, 30])
+def test_a_control_is_admitted_iff_its_way_to_rest_keeps_the_margin(gap, speed_up):
+    """Independent: the env's own data, stepped on without any control."""
+    env, _, _ = bound([[5.0, 0.0]], speed_up=speed_up)
+    hazard = ahead_of(env, 0.2 + gap)
+    env.unwrapped._hazards[:] = hazard
+    constraint, plant = env.constraints[0], env.plant
+    plant.observe()
+    at_rest = least_way(env, NONE, hazard) - 0.2
+    for control in (FULL, BACK, NONE, np.array([1.0, -1.0]), np.array([0.006, 0.0])):
+        way = least_way(env, control, hazard) - 0.2
+        if abs(way - 0.005) < 1e-3 or at_rest < 0.006:
+            continue  # too close to call, or already inside the margin
+        assert constraint.admits(plant, control) == (way > 0.005)
+
+
+def test_no_control_is_admitted_as_long_as_its_way_is_clear():
+    env, constraint, plant = bound([[5.0, 0.0]], speed_up=30)
+    stop = 5.0 - env.unwrapped.agent_position[0]
+    way = stop - least_way(env, NONE, [5.0, 0.0])
+    for slack, admitted in ((0.002, True), (-0.002, False)):  # less than the margin, but clear; not clear
+        env.unwrapped._hazards[:] = ahead_of(env, 0.2 + way + slack)
+        plant.observe()
+        assert constraint.admits(plant, NONE) == admitted
+        assert constraint.admits(plant, -NONE) == admitted  # minus zero is no control, too
+        assert not constraint.admits(plant, FULL)
+        assert (constraint.shortfall(plant, NONE) < 0.0) == admitted
+
+
+def test_far_from_everything_nothing_is_forecast():
+    _, constraint, plant = bound([[3.0, 0.0]], reach=0.05, reach_s=0.13)
+    constraint._coasting.run = None  # any forecast would fail
+    assert constraint.admits(plant, FULL)
+    assert constraint.value(plant) == pytest.approx(2.8)
+
+
+def test_the_outline_counts_where_it_should():
+    """Beside a vase that its front corner would touch, the car may not turn to it; its origin is far enough."""
+    vases = [[0.18, 0.16 + 0.1415 + 0.008]]
+    outlined = {"untouched": [sw.Discs("vase_positions", 0.1415)], "outline": SQUARE}
+    _, constraint, plant = bound([], 2, vases, **outlined)
+    assert constraint.value(plant) == pytest.approx(0.008, abs=1e-6)
+    assert constraint.admits(plant, NONE)
+    assert [constraint.admits(plant, np.array([s, -s])) for s in (1.0, -1.0)] == [False, True]
+    _, bare, plant = bound([], 2, vases, keep_out=[sw.Discs("vase_positions", 0.1415)])
+    assert all(bare.admits(plant, np.array([s, -s])) for s in (1.0, -1.0))
+
+
+def test_without_a_model_of_the_machine_alone_it_takes_the_plants():
+    for alone in (None, "robot_model"):
+        _, constraint, plant = bound([[0.215, 0.0]], vases=[[3.0, 3.0]], alone=alone)
+        assert constraint._coasting._model is plant.model or alone is not None
+        assert not constraint.admits(plant, FULL)
+        assert constraint.admits(plant, BACK)
+
+
+def test_a_reach_that_is_broken_is_dropped_with_a_warning():
+    _, constraint, plant = bound([[0.2055, 0.0]], reach=0.001)
+    with pytest.warns(UserWarning, match=r"farther than the declared reach of 0\.001 m"):
+        assert not constraint.admits(plant, FULL)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not constraint.admits(plant, FULL)
+    assert constraint._reach is None and not constraint._free
+
+
+def test_what_stands_still_is_forecast_once():
+    env, constraint, plant = bound([[0.212, 0.0]])
+    for _ in range(40):
+        env.unwrapped.step(NONE)
+    plant.observe()
+    constraint.admits(plant, FULL)
+    run, calls = constraint._coasting.run, []
+    constraint._coasting.run = lambda *arguments: calls.append(arguments) or run(*arguments)
+    env.unwrapped.step(NONE)
+    plant.observe()
+    answer = constraint.admits(plant, FULL)
+    assert not calls
+    env.unwrapped._hazards[:] += 0.5  # it still stands, but the hazard has gone
+    plant.observe()
+    assert constraint.admits(plant, FULL) and not answer
+    assert calls
+
+
+def test_from_inside_it_drives_out():
+    options = {"keep_out": [sw.Discs("hazard_positions", 0.2)], "alone": "robot_model"}
+    env = sw.CBFActionFilter(gym.make("SafeCarGoal1-v0"), [sw.CoastingClearance(**options)])
+    layout = {"agent": [0.0, 0.0, 0.0], "goal": [9.0, 9.0], "hazards": [[0.12, 0.05]], "vases": []}
+    with pytest.warns(UnsafeStateWarning):
+        info = env.reset(seed=0, options={"layout": layout})[1]
+    assert info["cbf/unsafe"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        infos = [env.step(FULL.astype(np.float32))[4] for _ in range(60)]
+    assert infos[0]["cbf/unsafe"] and infos[0]["cbf/intervened"]
+    first = next(k for k, info in enumerate(infos) if not info["cost_substep"])
+    assert first < 40 and not any(info["cost_substep"] for info in infos[first:])
+
+
+def test_a_start_that_cannot_stop_is_reported_as_infeasible():
+    env, _, _ = bound([[5.0, 0.0]], speed_up=30)
+    env.unwrapped._hazards[:] = ahead_of(env, 0.21)
+    info = env.step(FULL.astype(np.float32))[4]
+    assert info["cbf/infeasible"] and info["cbf/fallback"]
+
+
+def test_a_detour_leads_around():
+    """Blind drive at a hazard a little off the middle: without a detour it stands in front of it."""
+    reached = {}
+    for detour in (True, False):
+        env, _, _ = bound([[0.8, 0.02]], detour=detour)
+        for _ in range(200):
+            raw = env.unwrapped
+            bearing = -raw.agent_heading  # keep to the heading 0
+            env.step(np.clip(0.02 * np.array([1 + 2 * bearing, 1 - 2 * bearing]), 0, 1).astype(np.float32))
+        reached[detour] = env.unwrapped.agent_position[0]
+    assert reached[False] < 0.62 and reached[True] > 1.2
+
+
+def test_plain_data_rebuilds_it():
+    constraint = sw.CoastingClearance(
+        keep_out=[sw.Disc([1.0, 2.0], 0.2)],
+        untouched=[sw.Discs("vase_positions", 0.1)],
+        outline=SQUARE,
+        reach=0.1,
+    )
+    assert constraint_from(json.loads(json.dumps(constraint_data(constraint)))) == constraint
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "keep_out .* or untouched"),
+        ({"keep_out": sw.Disc([0, 0], 1)}, "keep_out is a list"),
+        ({"keep_out": [sw.Plane([0.0], [1.0])]}, "keep_out holds Disc and Discs, got Plane"),
+        ({"keep_out": [sw.Discs("a", 0.1, "v")]}, "discs that stand still"),
+        ({"untouched": [sw.Disc([0, 0], 1)]}, "needs the machine's outline"),
+        ({"untouched": [sw.Disc([0, 0], 1)], "outline": [[0, 0], [1, 1]]}, "outline: .*not on one line"),
+        ({"keep_out": [sw.Disc([0, 0], 1)], "outline": [[0, "x"]]}, "list of points"),
+        ({"keep_out": [sw.Disc([0, 0], 1)], "holds": 1}, "holds is a whole number"),
+        ({"keep_out": [sw.Disc([0, 0], 1)], "reach": -1.0}, "reach must be"),
+        ({"keep_out": [sw.Disc([0, 0], 1)], "reach_s": -1.0}, "reach_s must be"),
+        ({"keep_out": [sw.Disc([0, 0], 1)], "margin": -0.1}, "margin must be"),
+    ],
+)
+def test_bad_arguments_are_refused_when_it_is_made(options, message):
+    with pytest.raises(ConfigurationError, match=message):
+        sw.CoastingClearance(**options)
+
+
+def test_an_attribute_that_holds_no_model_is_refused():
+    with pytest.raises(ConfigurationError, match="an attribute that holds an MjModel; 'goal_position' is"):
+        bound([], alone="goal_position")
+
+
+def test_a_plant_without_a_model_is_refused():
+    plant = sw.AnalyticPlant(f=lambda x: -x, g=lambda x: np.eye(1), state=lambda env: np.zeros(1))
+    with pytest.raises(UnsupportedEnvError, match="needs a MujocoPlant"):
+        sw.CoastingClearance(keep_out=[sw.Disc([0, 0], 1)]).bind(plant)
