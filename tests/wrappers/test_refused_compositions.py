@@ -99,3 +99,46 @@ def test_a_geom_is_kept_clear():
     _, info = filtered.reset(seed=0)
     fingertip = filtered.unwrapped.data.geom("fingertip").xpos
     assert info["cbf/margin"] == pytest.approx(5.0 + fingertip[0], abs=1e-6)
+
+
+def on_wheels(env):
+    return sw.SlipLimiter(env, wheels=["front_left", "rear_right"])
+
+
+def lease(env):
+    return sw.LeaseExpiry(env, lambda env: (9.0, 0.0), braking=1.0, acceleration=1.0)
+
+
+@pytest.mark.parametrize(
+    ("wrap", "message"),
+    [
+        (lambda env: on_wheels(on_wheels(env)), "filtered already"),
+        (lambda env: on_wheels(sw.protect(env)), "filtered already"),
+        (lambda env: sw.CBFActionFilter(on_wheels(env), [speed()]), "filtered already"),
+        (lambda env: on_wheels(sw.ChunkHandover(env, 4, 2)), "inside the filter"),
+        (lambda env: on_wheels(lease(env)), "inside the filter"),
+        (lambda env: on_wheels(gym.wrappers.StickyAction(env, 0.5)), "inside the filter"),
+    ],
+)
+def test_a_slip_limiter_has_the_last_word(wrap, message):
+    with pytest.raises(ConfigurationError, match=message):
+        wrap(gym.make("SafeRover-v0"))
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        lambda env: sw.ChunkHandover(sw.RecordInterventions(lease(on_wheels(env))), 4, 2),
+        lambda env: on_wheels(sw.RecordInterventions(env)),
+        lambda env: sw.RecordInterventions(on_wheels(sw.ContactMonitor(env))),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_where_a_slip_limiter_fits(wrap):
+    env = wrap(gym.make("SafeRover-v0"))
+    env.reset(seed=0, options={"layout": {"ground": "ice", "patches": []}})
+    for _ in range(20):
+        info = env.step(
+            np.broadcast_to([1.0, 1.0, 1.0, 1.0, 0.0], env.action_space.shape).astype(np.float32)
+        )[4]
+    assert info["slip/limited"].all() and (np.abs(info["slip/ratio"]) < 0.15).all()
