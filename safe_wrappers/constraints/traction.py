@@ -136,7 +136,7 @@ class Traction:
         rate, ground, sideways = self._wheels.motion(plant)
         published = plant.published()
         assert published is not None  # there is no delay
-        load = self._wheels.loads(plant.model, published)
+        load = self._wheels.loads(plant.attribute("model"), published)
         if not np.isfinite(rate + ground + sideways + load).all():
             self._rate = None
             return

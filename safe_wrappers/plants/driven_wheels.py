@@ -84,9 +84,11 @@ class DrivenWheels:
         self._bodies = m.jnt_bodyid[self._joints]
         self._roots = m.body_rootid[self._bodies]
         self._geoms = np.array([_round_geom(plant, int(j)) for j in self._joints])
-        self._wheel_of_geom = np.full(m.ngeom, -1)
-        for i, body in enumerate(self._bodies):
-            self._wheel_of_geom[m.geom_bodyid == body] = i
+        # Contacts are the env's, whose geoms need not be those of the plant's model; what is no geom is the last one.
+        truth: mujoco.MjModel = plant.attribute("model")
+        self._wheel_of_geom = np.full(truth.ngeom + 1, -1)
+        for i, body in enumerate(truth.jnt_bodyid[self._joints]):
+            self._wheel_of_geom[:-1][truth.geom_bodyid == body] = i
         self._force = np.zeros(6)
         self._fixed_drive: tuple[Array, Array] | None = None
 
@@ -134,7 +136,7 @@ class DrivenWheels:
         return WheelMotion(rate, ahead_x * vx + ahead_y * vy, ahead_x * vy - ahead_y * vx)
 
     def loads(self, model: mujoco.MjModel, data: mujoco.MjData) -> Array:
-        """Force of the ground on each wheel against gravity, shape (n,), N, from the contacts in an env's data."""
+        """Force of the ground on each wheel against gravity, shape (n,), N, from an env's model and contacts."""
         loads = np.zeros(len(self.names))
         pairs = data.contact.geom
         for contact, wheel in enumerate(self._wheel_of_geom[pairs].max(axis=1, initial=-1).tolist()):

@@ -8,7 +8,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from vehicles import MOTORS, Trolley
+from vehicles import MOTORS, WHEEL, Trolley
 
 import safe_wrappers as sw
 from safe_wrappers.control.slip import slip_ratio
@@ -98,6 +98,34 @@ def test_a_drive_of_the_plants_model_that_changes_is_read_anew():
     plant.revision += 1
     plant.observe()
     np.testing.assert_allclose(traction.rows(plant).normals, 2.0 * before)
+
+
+@pytest.mark.parametrize("change", ["geoms more", "geoms less", "cone"])
+def test_loads_are_the_envs_whatever_the_plants_model_looks_like(change):
+    """Contacts name the env's geoms and are told by its cone; the plant's model may have others."""
+    plain, deco = (
+        Trolley(),
+        Trolley(wheel='<geom type="sphere" size="0.01" contype="0" conaffinity="0"/>' + WHEEL),
+    )
+    env, model = (plain, deco.model) if change == "geoms more" else (deco, plain.model)
+    if change == "cone":
+        env, model = plain, copy.copy(plain.model)
+        model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    filtered = sw.SlipLimiter(env, wheels=["left", "right"], plant=sw.MujocoPlant(model=model))
+    filtered.reset(seed=0)
+    for _ in range(60):
+        filtered.step(np.zeros(2, dtype=np.float32))
+    wheels = [env.model.joint(side).bodyid[0] for side in ("left", "right")]
+    expected, force = np.zeros(2), np.zeros(6)
+    for i, contact in enumerate(env.data.contact):
+        for k, body in enumerate(wheels):
+            if body in env.model.geom_bodyid[[contact.geom1, contact.geom2]]:
+                mujoco.mj_contactForce(env.model, env.data, i, force)
+                expected[k] += force[0]
+    filtered.plant.observe()
+    filtered.constraints[0].rows(filtered.plant)
+    assert (expected > 5.0).all()
+    np.testing.assert_allclose(filtered.constraints[0]._load, expected, rtol=1e-6)
 
 
 # What a step before was ----------------------------------------------------------------------------------------
