@@ -21,6 +21,8 @@ RUNNERS = ["HalfCheetah", "Hopper", "Walker2d", "Swimmer", "Ant", "Humanoid"]
 KNOWN = {
     "SafePointGoal1-v0": [sw.HeadingDriveClearance],
     "SafePointGoal2-v0": [sw.HeadingDriveClearance],
+    "SafeCarGoal1-v0": [sw.CoastingClearance],
+    "SafeCarGoal2-v0": [sw.CoastingClearance],
     "InvertedPendulum-v5": [sw.Clearance],
     "InvertedDoublePendulum-v5": [sw.Clearance, sw.JointPositionLimit],
     "Reacher-v5": [sw.JointSpeedLimit],
@@ -130,6 +132,34 @@ def test_vases_are_obstacles_where_they_cost_and_only_there():
         for level in (1, 2)
     }
     assert at == {1: {"hazard_positions"}, 2: {"hazard_positions", "vase_positions"}}
+
+
+def test_a_car_keeps_clear_of_vases_with_its_outline_where_they_cost():
+    for level, attributes in ((1, []), (2, ["vase_positions"])):
+        [clearance] = sw.protect(gym.make(f"SafeCarGoal{level}-v0")).constraints
+        assert [o.attribute for o in clearance.keep_out] == ["hazard_positions"]
+        assert [o.attribute for o in clearance.untouched] == attributes
+        assert clearance.detour
+    assert not sw.protect(gym.make("SafeCarGoal1-v0"), detour=False).constraints[0].detour
+
+
+def test_the_cars_outline_encloses_every_geom():
+    from safe_wrappers.control.outlines import distances_to_outline
+
+    env = gym.make("SafeCarGoal1-v0").unwrapped
+    env.reset(
+        seed=0, options={"layout": {"agent": [0.0, 0.0, -np.pi / 2]}}
+    )  # the body's axes are the world's
+    model, data = env.model, env.data
+    outline = sw.protect(gym.make("SafeCarGoal2-v0")).constraints[0]._corners
+    closest = np.inf
+    for g in np.flatnonzero(model.body_rootid[model.geom_bodyid] == model.body("agent").id):
+        corners = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T * model.geom_aabb[g, 3:]
+        turned = (corners + model.geom_aabb[g, :3]) @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g]
+        beyond = distances_to_outline(outline, turned[:, :2])
+        assert beyond.max() < 1e-9
+        closest = min(closest, np.abs(beyond).min())
+    assert closest < 1e-9
 
 
 def test_hulls_are_as_large_as_the_geoms():

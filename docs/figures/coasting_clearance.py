@@ -1,0 +1,83 @@
+"""A car before a hazard: the ways to rest of three controls, and a blind drive around."""
+
+import math
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from numpy.typing import NDArray
+
+import safe_wrappers as sw
+from _style import FORBIDDEN, INK, OFF, ON, SAFE, bare, panels
+
+Array = NDArray[np.float64]
+
+HAZARD = [0.92, 0.03]
+LAYOUT = {"agent": [0.0, 0.0, 0.0], "goal": [1.9, 0.15], "hazards": [HAZARD], "vases": []}
+
+
+def drive(env: Any, steps: int = 120) -> Array:
+    """Towards the goal, blind: positions, shape (k, 2)."""
+    task = env.unwrapped
+    env.reset(seed=0, options={"layout": LAYOUT})
+    where = [task.agent_position]
+    for _ in range(steps):
+        x, y = task.goal_position - task.agent_position
+        bearing = math.remainder(math.atan2(y, x) - task.agent_heading, math.tau)
+        action = 0.02 * np.clip([1.0 + 2.0 * bearing, 1.0 - 2.0 * bearing], 0.0, 1.0)
+        info = env.step(action.astype(np.float32))[4]
+        if info["goal_met"]:
+            break
+        where.append(task.agent_position)
+    return np.array(where)
+
+
+def ways() -> tuple[Array, list[Array], Array]:
+    """Where the car is in the last step before its full torque is refused: there, and its ways to rest."""
+    env = sw.protect(gym.make("SafeCarGoal1-v0"), detour=False)
+    env.reset(seed=0, options={"layout": LAYOUT})
+    constraint, plant = env.constraints[0], env.plant
+    while True:
+        plant.observe()
+        if not constraint.admits(plant, np.ones(2)):
+            break
+        env.step(np.ones(2, dtype=np.float32))
+    run = constraint._coasting.run
+    controls = ([1.0, 1.0], [0.0, 0.0])
+    courses = [run(np.array(u), constraint.holds, 0.2).places for u in controls]
+    return env.unwrapped.agent_position, courses, np.array(HAZARD)
+
+
+def draw() -> Figure:
+    """Left: what is asked. Right: what comes of it."""
+    figure, (close, chart) = panels(2, height=2.6, width_ratios=[1, 2])
+    here, (pushing, resting), _ = ways()
+    _hazard(close)
+    for way, color, offset, name in (
+        (pushing, OFF, 0.012, "full torque"),
+        (resting, ON, -0.012, "no torque"),
+    ):
+        close.plot(way[:, 0], way[:, 1] + offset, color=color, lw=2)
+        close.plot(way[9, 0], way[9, 1] + offset, "|", color=color, ms=9)
+        close.plot(way[-1, 0], way[-1, 1] + offset, "o", color=color, ms=5)
+        close.text(here[0] - 0.005, here[1] + 2.6 * offset, name, color=color, ha="right", va="center")
+    close.plot(here[0], here[1], "s", color=INK, ms=5)
+    bare(close)
+    close.set_xlim(here[0] - 0.11, here[0] + 0.16)
+    close.set_ylim(-0.08, 0.08)
+    _hazard(chart)
+    chart.plot(*drive(gym.make("SafeCarGoal1-v0")).T, color=OFF)
+    chart.plot(*drive(sw.protect(gym.make("SafeCarGoal1-v0"))).T, color=ON)
+    chart.add_patch(Circle(LAYOUT["goal"], 0.3, fill=False, color=SAFE, lw=1.5))
+    chart.text(*LAYOUT["goal"], "goal", color=SAFE, ha="center", va="center")
+    chart.plot(0.0, 0.0, "s", color=INK, ms=5)
+    bare(chart)
+    chart.set_xlim(-0.15, 2.25)
+    return figure
+
+
+def _hazard(ax: Axes) -> None:
+    ax.add_patch(Circle(HAZARD, 0.2, color=FORBIDDEN, alpha=0.35, lw=0))
