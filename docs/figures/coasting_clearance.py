@@ -19,7 +19,7 @@ HAZARD = [0.92, 0.03]
 LAYOUT = {"agent": [0.0, 0.0, 0.0], "goal": [1.9, 0.15], "hazards": [HAZARD], "vases": []}
 
 
-def drive(env: Any, steps: int = 120) -> Array:
+def drive(env: Any, steps: int = 400) -> Array:
     """Towards the goal, blind: positions, shape (k, 2)."""
     task = env.unwrapped
     env.reset(seed=0, options={"layout": LAYOUT})
