@@ -14,9 +14,16 @@ _SUMS: Final = (
     keys.CONTACT_IMPULSE,
 )
 _LEASE_BOOLS: Final = (keys.LEASE_EXPIRED, keys.LEASE_REFUSED, keys.LEASE_BRAKING)
-_ANY: Final = (*keys.CBF_BOOLS, keys.CBF_REFUSED, *_LEASE_BOOLS, keys.FAULT_ACTIVE, keys.CONTACT_PARTIAL)
+_ANY: Final = (
+    *keys.CBF_BOOLS,
+    keys.CBF_REFUSED,
+    keys.SLIP_LIMITED,
+    *_LEASE_BOOLS,
+    keys.FAULT_ACTIVE,
+    keys.CONTACT_PARTIAL,
+)
 _CONTACT_PEAKS: Final = (keys.CONTACT_PEAK_FORCE, keys.CONTACT_PENETRATION, keys.CONTACT_RESIDUAL)
-_LARGEST: Final = (keys.CBF_CORRECTION, keys.CBF_CLIPPED, *_CONTACT_PEAKS)
+_LARGEST: Final = (keys.CBF_CORRECTION, keys.CBF_CLIPPED, keys.SPIN_OUT, *_CONTACT_PEAKS)
 _SMALLEST: Final = (keys.CBF_MARGIN,)
 
 
@@ -24,9 +31,9 @@ def macro_info(infos: list[dict[str, Any]]) -> dict[str, Any]:
     """The last control step's info, in which costs are summed up and no intervention of the others is lost.
 
     Costs, impulses, and what `AdaptionPenalty` says of the reward, are sums; what is a flag is True if it was at any
-    control step; corrections and contact forces are the largest, the margin is the smallest. Everything else is the
-    last control step's, the running counts of `RecordInterventions` too. A key that only some control steps have
-    counts where it is there.
+    control step; corrections, contact forces and a spin-out are the largest, the margin is the smallest. Everything
+    else is the last control step's, the running counts of `RecordInterventions` too. A key that only some control
+    steps have counts where it is there.
     """
     last = infos[-1]
     if len(infos) == 1:

@@ -20,6 +20,9 @@ INFOS = [
             (keys.LEASE_EXPIRED, keys.LEASE_REFUSED, keys.LEASE_BRAKING, keys.FAULT_ACTIVE), flag
         ),
         keys.CBF_REFUSED: np.array(refused),
+        keys.SLIP_LIMITED: np.array(refused),
+        keys.SLIP_RATIO: np.array([0.1 * i, 0.0]),
+        keys.SPIN_OUT: float(flag),
         keys.CBF_CORRECTION: correction,
         keys.CBF_CLIPPED: correction / 2,
         keys.CBF_MARGIN: margin,
@@ -49,6 +52,9 @@ def test_sums_flags_extremes_and_the_last():
     ):
         assert found[name] is True, name
     assert found[keys.CBF_REFUSED].tolist() == [True, False] and found[keys.CBF_REFUSED].dtype == bool
+    assert found[keys.SLIP_LIMITED].tolist() == [True, False] and found[keys.SLIP_LIMITED].dtype == bool
+    assert found[keys.SLIP_RATIO].tolist() == [0.2, 0.0]
+    assert found[keys.SPIN_OUT] == 1.0 and type(found[keys.SPIN_OUT]) is float
     assert found[keys.CBF_CORRECTION] == 0.7 and found[keys.CBF_CLIPPED] == 0.35
     assert found[keys.CBF_MARGIN] == -0.1
     assert found[keys.ADAPTION_PENALTY] == 1.5 and found[keys.ADAPTION_TASK_REWARD] == 3.0
