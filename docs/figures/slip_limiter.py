@@ -1,0 +1,56 @@
+"""Full throttle from dry ground onto ice and back: speed, slip and the estimate, with the limiter and without."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from _rover import FULL_THROTTLE, STEP_S, rover
+from _style import FORBIDDEN, GRID, INK, OFF, ON, SAFE
+from safe_wrappers.control.traction_curves import MAGIC_FORMULA
+
+ICE = {"ground": "ice", "center": [2.0, 0.0], "radius": 1.0}
+END = 5.0
+"""m, of the way."""
+
+
+def run(limited: bool) -> tuple[Any, list[dict[str, Any]]]:
+    """Place and speed of the front left wheel, and whether it is on ice, at every step; the infos."""
+    env = rover(limited, patches=[ICE])
+    raw, seen, infos = env.unwrapped, [], []
+    name = raw.wheels[0]
+    wheel = raw.data.body(name)
+    while wheel.xpos[0] < END:
+        infos.append(env.step(FULL_THROTTLE)[4])
+        seen.append((wheel.xpos[0], raw.forward_speed, raw.ground_under(name) == "ice"))
+    return np.array(seen).T, infos
+
+
+def draw() -> Figure:
+    """Three panels over the way of a front wheel; the shading is the ice."""
+    figure = Figure(figsize=(7.2, 5.0))
+    speed, slip, estimate = figure.subplots(3, 1, sharex=True)
+    for limited, color, label in ((False, OFF, "limiter off"), (True, ON, "limiter on")):
+        (metres, fast, on_ice), infos = run(limited)
+        speed.plot(metres, fast, color=color, label=f"{label}: {STEP_S * len(infos):.2f} s")
+        slip.plot(metres, [info["slip"][0] for info in infos], color=color)
+    mean, std = (np.array([info[f"slip/mu_{part}"][0] for info in infos]) for part in ("estimate", "std"))
+    estimate.fill_between(metres, mean - 2 * std, mean + 2 * std, color=SAFE, alpha=0.25, lw=0)
+    estimate.plot(metres, mean, color=SAFE, label="estimate, two standard deviations")
+    truth = np.where(on_ice > 0.0, MAGIC_FORMULA["ice"].peak_friction, MAGIC_FORMULA["dry"].peak_friction)
+    estimate.step(metres, truth, where="post", color=INK, lw=1.0, label="truth")
+    slip.axhline(0.15, color=FORBIDDEN, lw=1.0)
+    slip.text(0.1, 0.18, "max_slip", color=FORBIDDEN)
+    icy = metres[on_ice > 0.0]
+    for ax in (speed, slip, estimate):
+        ax.axvspan(icy[0], icy[-1], color=GRID, alpha=0.25, lw=0, zorder=0)
+    speed.text(icy.mean(), 0.3, "ice", ha="center")
+    speed.set_ylabel("speed (m/s)")
+    slip.set_ylabel("slip")
+    estimate.set_ylabel("peak friction")
+    estimate.set_xlabel("way of the front left wheel (m)")
+    slip.set_ylim(0.0, 1.05)
+    estimate.set_ylim(0.0, 1.5)
+    speed.legend(loc="upper left")
+    estimate.legend(loc="upper right", ncols=2)
+    return figure
