@@ -9,6 +9,7 @@ import gymnasium as gym
 import safe_wrappers as sw
 from benchmarks import judges
 from benchmarks import mujoco_drivers as drivers
+from benchmarks.car_drivers import DRIVERS as CAR_GOAL
 from benchmarks.drivers import DRIVERS as POINT_GOAL
 from benchmarks.judges import Judge, Replay, Reported
 from benchmarks.mujoco_drivers import Maker
@@ -134,6 +135,16 @@ def _point_goal(level: int) -> Case:
     )
 
 
+def _car_goal(level: int) -> Case:
+    # Level 0 has nothing to seek.
+    blind = {name: CAR_GOAL[name] for name in ("random", "goal-seeking", "bang-bang", "pulse")}
+    return Case(
+        f"SafeCarGoal{level}-v0",
+        judge=lambda env: Reported(judges.costs),
+        drivers=dict(CAR_GOAL) if level else blind,
+    )
+
+
 def _point_maze(maze: str) -> Case:
     def judge(env: Any) -> Judge:
         touch = judges.touches_wall(env.model, "particle_geom")
@@ -174,6 +185,7 @@ def _by_name(*cases: Case) -> dict[str, Case]:
 
 PROTECTED: dict[str, Case] = _by_name(
     *(_point_goal(level) for level in range(3)),
+    *(_car_goal(level) for level in range(3)),
     _fallen("InvertedPendulum-v5"),
     _fallen("InvertedDoublePendulum-v5"),
     Case("Reacher-v5", _joint_speeds(5.0), _SPEED),

@@ -43,6 +43,13 @@ def _phrase(constraint: Any) -> str:
             return f"{_points(constraint)} clear of {_obstacles(constraint.obstacles)}, with room to brake"
         case sw.HeadingDriveClearance():
             return f"stopping path clear of {_obstacles(constraint.obstacles)}"
+        case sw.CoastingClearance():
+            parts = []
+            if constraint.keep_out:
+                parts.append(f"centre clear of {_obstacles(constraint.keep_out)}")
+            if constraint.untouched:
+                parts.append(f"outline clear of {_obstacles(constraint.untouched)}")
+            return f"on all the way to rest, {' and '.join(parts)}"
         case sw.WallClearance():
             return "braking path clear of the walls"
         case sw.Traction():

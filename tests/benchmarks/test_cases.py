@@ -28,7 +28,7 @@ def test_every_recipe_has_a_case():
     assert {family(case.env_id) for case in PROTECTED.values()} == set(RECIPES)
 
 
-@pytest.mark.parametrize("name", [n for n in CASES if not n.startswith("SafePointGoal")])
+@pytest.mark.parametrize("name", [n for n in CASES if "Goal" not in n])
 def test_the_judge_means_the_limit_that_the_filter_keeps(name):
     case = CASES[name]
     env = case.protect(make(case))
@@ -124,6 +124,9 @@ DISCS = "hazard_positions (0.2 m) and vase_positions (0.3 m)"
 
 @pytest.mark.parametrize("name, words, promise, margin", [
     ("SafePointGoal2-v0", f"stopping path clear of {DISCS}", "proved", "4 mm"),
+    ("SafeCarGoal1-v0", "on all the way to rest, centre clear of hazard_positions (0.2 m)", "proved", "5 mm"),
+    ("SafeCarGoal2-v0", "on all the way to rest, centre clear of hazard_positions (0.2 m) and outline clear of "
+     "vase_positions (0.1415 m)", "proved", "5 mm"),
     ("InvertedPendulum-v5, on after the fall",
      "cart clear of the end at -0.95 m and the end at 0.95 m, with room to brake", "best effort", "10 mm"),
     ("Reacher-v5", "joint speeds below 5 rad/s", "best effort", "0.01 rad/s"),
