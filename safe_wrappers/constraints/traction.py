@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,6 +39,10 @@ _MOST_FRICTION = 3.0
 _ROUNDING = 1e-6
 """Share of a control below which its change is the action space's own rounding (float32)."""
 _SOLVERS_NOISE = 1e-9
+
+
+_IMPLICIT = (int(mujoco.mjtIntegrator.mjINT_IMPLICIT), int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST))
+"""Integrators that step a servo's feedback as they step damping."""
 
 
 @dataclass
@@ -112,7 +117,13 @@ class Traction:
     def _read_constants(self, plant: MujocoPlant) -> None:
         self._revision = plant.revision
         self._constants = self._wheels.constants(plant)
-        self._response = self._constants.response(float(plant.model.opt.timestep), plant.substeps)
+        options = plant.model.opt
+        self._response = self._constants.response(
+            float(options.timestep),
+            plant.substeps,
+            self._wheels.feedback,
+            int(options.integrator) in _IMPLICIT,
+        )
 
     def reset(self) -> None:
         """Forget the ground and the motion."""

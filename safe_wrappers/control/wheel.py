@@ -1,8 +1,11 @@
 """A driven wheel over one control interval: what its drive torque and the ground's force make of its rate.
 
-`I w' = tau - b w - r F`, with torque and force constant over the interval, stepped as a physics engine steps it
-(damping implicit): `w+ = decay w + gain (tau - r F)`, exactly. Read backwards it measures F, the traction-force
-observer of traction control: no force sensor, and no friction model.
+`I w' = tau - k w - b w - r F`, with torque and force constant over the interval and k the feedback of a speed servo,
+stepped as a physics engine steps it (damping implicit, as MuJoCo's Euler, implicit and implicitfast do):
+`w+ = decay w + gain (tau - r F)`, exactly. Engines that do otherwise (Runge-Kutta) differ by a share of the rate of
+half the time step over the wheel's time constant I / b, per time constant: little, unless the axle is very stiff.
+Read backwards it measures F, the traction-force observer of traction control: no force sensor, and no friction model.
+What else brakes the axle (dry friction, a spring) is measured as the ground's.
 
 Source: appendix "Wheel slip ratio and friction boundaries" (the wheel's equation).
 """
@@ -22,7 +25,7 @@ class Response(NamedTuple):
     """`w+ = decay w + gain (tau - r F)`.
 
     Attributes:
-        decay: Share of the rate that damping leaves, in (0, 1].
+        decay: Share of the rate that damping and feedback leave, at most 1.
         gain: Rate per torque, rad/(s N m).
     """
 
@@ -52,12 +55,23 @@ class Wheel:
                 raise ConfigurationError(f"a wheel's {name} must be finite and {least}, got {value}")
             object.__setattr__(self, name, value)
 
-    def response(self, timestep: float, substeps: int) -> Response:
-        """To torque and force held for `substeps` physics steps of `timestep` s."""
-        share = 1.0 / (1.0 + timestep * self.damping / self.inertia)
+    def response(
+        self, timestep: float, substeps: int, feedback: Array | float = 0.0, implicit: bool = False
+    ) -> Response:
+        """To torque and force held for `substeps` physics steps of `timestep` s.
+
+        Args:
+            timestep: s.
+            substeps: Of one control interval.
+            feedback: k of speed servos, N m s/rad; their torque here is the one at a standstill.
+            implicit: Whether the engine steps the feedback like damping, instead of by the rate before the step.
+        """
+        k = np.asarray(feedback, dtype=np.float64)
+        effective = self.inertia + timestep * (self.damping + (k if implicit else 0.0))
+        share = (self.inertia - (0.0 if implicit else timestep * k)) / effective
         decay = share**substeps
-        # (1 - decay) / b, without the quotient: b may be 0.
-        gain = timestep / self.inertia * sum(share ** (k + 1) for k in range(substeps))
+        # (1 - decay) / (b + k), without the quotient: both may be 0.
+        gain = timestep / effective * sum(share**step for step in range(substeps))
         return Response(decay, np.asarray(gain))
 
     def traction(self, response: Response, before: Array, after: Array, torque: Array) -> Array:

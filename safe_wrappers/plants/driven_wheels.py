@@ -20,6 +20,7 @@ _ROUND = {
     int(mujoco.mjtGeom.mjGEOM_CAPSULE),
 }
 _FIXED_GAIN, _NO_BIAS = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_NONE)
+_AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_AFFINE)
 _DRIVES = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
@@ -47,6 +48,9 @@ class DrivenWheels:
     Args:
         plant: Bound.
         names: Of the hinges.
+
+    Attributes:
+        feedback: Of the speed servos on each wheel, shape (n,), N m s/rad.
 
     Raises:
         ConfigurationError: An empty list, a name twice, a joint that is no hinge or that nothing drives, a wheel
@@ -91,6 +95,7 @@ class DrivenWheels:
             self._wheel_of_geom[:-1][truth.geom_bodyid == body] = i
         self._force = np.zeros(6)
         self._fixed_drive: tuple[Array, Array] | None = None
+        self.constants(plant)
 
     def _refuse_other_drives(self, plant: MujocoPlant) -> None:
         """A drive through a tendon or a site that turns a wheel would be missing in `drive`."""
@@ -105,7 +110,7 @@ class DrivenWheels:
                 )
 
     def constants(self, plant: MujocoPlant) -> Wheel:
-        """Radius, inertia about the axle and damping, as the plant's model has them now."""
+        """Radius, inertia about the axle and damping, as the plant's model has them now; sets `feedback`, too."""
         m = plant.model
         self._fixed_drive = None
         data, column = mujoco.MjData(m), np.empty(m.nv)
@@ -116,6 +121,12 @@ class DrivenWheels:
             unit[dof] = 1.0
             mujoco.mj_mulM(m, data, column, unit)
             inertia.append(column[dof])
+        # A servo that a forcerange can clamp is no feedback while it is: its torque counts as held.
+        servos = (m.actuator_biastype == _AFFINE_BIAS) & ~m.actuator_forcelimited.astype(bool)
+        self._opposing = self._drives * np.where(
+            servos, -m.actuator_gear[:, 0] * m.actuator_biasprm[:, 2], 0.0
+        )
+        self.feedback = np.asarray((self._opposing * m.actuator_gear[:, 0]).sum(axis=1))
         return Wheel(m.geom_size[self._geoms, 0], np.array(inertia), m.dof_damping[self.dofs])
 
     def motion(self, plant: MujocoPlant) -> WheelMotion:
@@ -146,15 +157,15 @@ class DrivenWheels:
         return loads
 
     def torque(self, data: mujoco.MjData) -> Array:
-        """Of the drives on each wheel, shape (n,), N m, as an env's data has it of its last physics substep."""
-        return np.asarray(data.qfrc_actuator[self.dofs])
+        """Of the drives on each wheel, shape (n,), N m, without `feedback`: from an env's last physics substep."""
+        return np.asarray(data.qfrc_actuator[self.dofs] + self._opposing @ data.actuator_velocity)
 
     def driven_by(self, controls: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Whether any of some controls, shape (nu,), drives each wheel, shape (n,)."""
         return np.asarray((self._drives & controls).any(axis=1))
 
     def drive(self, plant: MujocoPlant) -> tuple[Array, Array]:
-        """`torque = bias + effect @ u`: shapes (n,) in N m and (n, nu), inside the actuators' clamps."""
+        """`torque = bias + effect @ u - feedback * rate` inside the actuators' clamps: (n,) in N m and (n, nu)."""
         if self._fixed_drive is not None:
             return self._fixed_drive
         m, driven = plant.model, self._drives
@@ -163,7 +174,8 @@ class DrivenWheels:
         length = gear * plant.qpos[m.jnt_qposadr[joint]]
         velocity = gear * plant.qvel[m.jnt_dofadr[joint]]
         gain, bias = plant.actuators.gain_and_bias(length, velocity)
-        drive = np.asarray((driven * (gear * bias)).sum(axis=1)), np.asarray(driven * (gear * gain))
+        at_rest = (driven * (gear * bias)).sum(axis=1) + self._opposing @ velocity
+        drive = np.asarray(at_rest), np.asarray(driven * (gear * gain))
         motors = (m.actuator_gaintype == _FIXED_GAIN) & (m.actuator_biastype == _NO_BIAS)
         if motors[driven.any(axis=0)].all():
             self._fixed_drive = drive

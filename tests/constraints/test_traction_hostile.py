@@ -128,6 +128,45 @@ def test_loads_are_the_envs_whatever_the_plants_model_looks_like(change):
     np.testing.assert_allclose(filtered.constraints[0]._load, expected, rtol=1e-6)
 
 
+SERVOS = "".join(f'<velocity joint="{side}" kv="{{kv}}" ctrlrange="-40 40"/>' for side in ("left", "right"))
+
+
+@pytest.mark.parametrize("integrator", ["EULER", "IMPLICIT", "IMPLICITFAST"])
+@pytest.mark.parametrize("actuators", [MOTORS, SERVOS.format(kv=0.5), SERVOS.format(kv=4.0)])
+@pytest.mark.parametrize("substeps", [1, 5, 25])
+def test_wheels_that_touch_nothing_feel_no_force(actuators, integrator, substeps):
+    """In the air, from torque to rate and back: exact, also where a servo has settled within the hold."""
+    raw = Trolley(height=50.0, actuators=actuators, damping=0.05, substeps=substeps)
+    raw.model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}")
+    env = sw.SlipLimiter(raw, wheels=["left", "right"])
+    # The hull is held: on a free one the drives' reaction turns the axles, which the wheel's equation leaves out.
+    raw.model.body_inertia[raw.model.body("trolley").id] = env.plant.model.body_inertia[1] = 1e6
+    env.reset(seed=0)
+    raw.data.qvel[[6, 7]] = 3.0, -5.0
+    mujoco.mj_forward(raw.model, raw.data)
+    for _ in range(6):
+        raw.step(np.array([0.5, -0.3]) * env.action_space.high)
+        env.plant.observe()
+        env.constraints[0].rows(env.plant)
+    assert np.abs(raw.data.qvel[6:]).min() > 0.3
+    np.testing.assert_allclose(env.constraints[0]._traction, 0.0, atol=1e-4)
+
+
+@pytest.mark.parametrize(("kv", "substeps"), [(0.5, 25), (5.0, 5), (5.0, 25)])
+def test_a_servo_faster_than_the_hold_still_drives(kv, substeps):
+    env = sw.SlipLimiter(
+        Trolley(0.15, actuators=SERVOS.format(kv=kv), substeps=substeps), wheels=["left", "right"]
+    )
+    env.reset(seed=0)
+    slips = []
+    for _ in range(500 // substeps):
+        env.step(np.full(2, 40.0, dtype=np.float32))
+        slips.append(true_slips(env.unwrapped))
+    assert np.abs(slips).max() < 0.17
+    assert np.abs(slips).max() > 0.09
+    assert env.unwrapped.data.qvel[0] > 0.3
+
+
 # What a step before was ----------------------------------------------------------------------------------------
 
 
