@@ -224,3 +224,67 @@ def test_a_measurement_that_is_no_number_is_reported_and_forgotten():
     assert not info["cbf/fallback"]
     assert np.isfinite(np.concatenate([info["slip/mu_estimate"], info["slip/mu_std"]])).all()
     assert info["slip_max"] < 0.16
+
+
+def test_a_servos_brake_ends_at_a_standstill_within_the_limit():
+    actuators = "".join(SERVOS["speed"].format(side) for side in ("left", "right"))
+    env = sw.SlipLimiter(Trolley(0.15, actuators=actuators), wheels=["left", "right"])
+    env.reset(seed=0)
+    data, slips = env.unwrapped.data, []
+    for _ in range(100):
+        env.step(np.full(2, 40.0, dtype=np.float32))
+    assert data.qvel[0] > 0.8
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for _ in range(150):
+            env.step(np.full(2, np.nan, dtype=np.float32))
+            slips.append(abs(float(slip_ratio(0.1 * data.qvel[6], data.qvel[0], 0.5))))
+    assert max(slips) < 0.2
+    assert abs(data.qvel[0]) < 0.02
+
+
+def test_a_limit_that_shrinks_is_followed_as_fast_as_the_drives_can():
+    """Slip of 0.14 ahead, within max_slip, and a slide of as much across, which leaves nothing of it."""
+    env = rover()
+    start(env, ground="ice", speed=6.0, lateral=0.9, wheel_speed=6.0 / (1.0 - 0.14))
+    info = env.step(FULL)[4]
+    assert not info["cbf/infeasible"]
+    np.testing.assert_array_equal(info["executed_action"][:4], -1.0)
+
+
+def test_a_row_that_is_no_number_is_kept_and_fails():
+    env = rover(friction=1e6)
+    start(env, speed=1.0)
+    env.plant.observe()
+    traction = env.constraints[0]
+    traction.rows(env.plant)
+    traction._window = tuple(np.nan * end for end in traction._window)
+    assert np.isnan(traction._bounds(env.plant).offsets).all()
+    assert traction._bounds(env.plant).offsets.shape == (8,)
+
+
+# The report --------------------------------------------------------------------------------------------------------
+
+
+def test_a_reader_that_writes_into_a_report_changes_nothing():
+    untouched, written = rover(), rover()
+    for env in (untouched, written):
+        start(env, ground="wet", speed=2.0)
+    for _ in range(10):
+        one, other = untouched.step(FULL)[4], written.step(FULL)[4]
+        np.testing.assert_array_equal(one["executed_action"], other["executed_action"])
+        np.testing.assert_array_equal(one["slip/mu_estimate"], other["slip/mu_estimate"])
+        for key in ("slip/ratio", "slip/limited", "slip/mu_estimate", "slip/mu_std"):
+            other[key][:] = 9.0
+
+
+def test_a_resets_report_is_of_the_state_that_it_begins_in():
+    class Spinning(Trolley):
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed, options=options)
+            self.data.qvel[6:8] = 2.0, -3.0
+            return self.observe(), {}
+
+    info = sw.SlipLimiter(Spinning(), wheels=["left", "right"]).reset(seed=0)[1]
+    np.testing.assert_allclose(info["slip/ratio"], [0.2 / 0.5, -0.3 / 0.5], atol=1e-9)
+    assert not info["slip/limited"].any()
