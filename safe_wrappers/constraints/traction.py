@@ -47,7 +47,7 @@ _IMPLICIT = (int(mujoco.mjtIntegrator.mjINT_IMPLICIT), int(mujoco.mjtIntegrator.
 
 @dataclass
 class Traction:
-    """Keep the slip ratio of every driven wheel within `max_slip`, and below the peak of its ground's curve.
+    """Keep the slip ratio of every driven wheel within `max_slip`, and below where its ground's curve seems to peak.
 
     The wheel's own equation says which torque takes the slip to its limit by the end of the held control step. The
     force of the ground in it is not modelled but measured, from how the wheel answered the last torque; so no
@@ -62,6 +62,11 @@ class Traction:
     circle), so that driving and braking leave the grip to the turn; but a turn that is too fast for the ground still
     slides, and a vehicle that spins about its own axis turns its wheels faster than any drive follows. Hence best
     effort. Overshoots are the ground's and no unsafe state, so there is no `value`.
+
+    The estimate believes in curves of one shape, the Magic Formula's. On others it may take the peak for a later one:
+    on Burckhardt's snow (peak at 0.06, nearly flat behind it) a wheel is held at 0.11, for 2 % less force.
+    What else holds an axle (dry friction, a spring) is measured as force of the ground: the limit keeps, the friction
+    estimate is too high. A state that is set from outside within an episode looks like a force, too, for one step.
 
     A wheel in the air has no force: its circumferential speed is held within the limit of its ground speed, so
     that it touches down rolling, and its estimate stays as it is. At a standstill slip is counted against

@@ -13,7 +13,7 @@ from safe_wrappers.wrappers.own_plant import PlantOfSpec, own_plant
 
 
 class SlipLimiter(CBFActionFilter):
-    """Keeps every driven wheel on the stable side of its traction curve, with friction unknown.
+    """Keeps every driven wheel on what seems the stable side of its traction curve, with friction unknown.
 
     It is `CBFActionFilter` with one `Traction`; put `Traction` into a filter's list to hold it together with other
     constraints, in one projection.

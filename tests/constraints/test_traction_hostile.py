@@ -1,6 +1,7 @@
 """Traction against strange vehicles, drivers and episodes: judged by MuJoCo's own velocities, never by the filter."""
 
 import copy
+import math
 import pickle
 import warnings
 
@@ -8,6 +9,8 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from gymnasium.vector import AutoresetMode
+from scipy.integrate import solve_ivp
 from vehicles import MOTORS, WHEEL, Trolley
 
 import safe_wrappers as sw
@@ -64,6 +67,102 @@ def test_a_driver_that_draws_lots():
         slips.append(env.step(action)[4]["slip_max"])
     assert max(slips) < 0.3
     assert np.mean(np.array(slips) > 0.2) < 0.05
+
+
+# A quarter of a car, written down as its equations ------------------------------------------------------------
+
+RADIUS, MASS, INERTIA, DRAG, MOST = 0.3, 400.0, 1.2, 0.05, 1500.0
+QUARTER = f"""
+<mujoco>
+  <option timestep="0.0002"/>
+  <worldbody>
+    <geom type="plane" size="900 900 1" condim="1"/>
+    <body pos="0 0 {RADIUS}">
+      <joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>
+      <geom type="box" size="0.2 0.2 0.1" mass="{MASS - 20.0}" contype="0" conaffinity="0"/>
+      <body>
+        <joint name="wheel" axis="0 1 0" damping="{DRAG}"/>
+        <inertial pos="0 0 0" mass="20" diaginertia="0.8 {INERTIA} 0.8"/>
+        <geom type="sphere" size="{RADIUS}" condim="1" density="0"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="wheel" gear="{MOST}" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+BURCKHARDT = {"dry": (1.2801, 23.99, 0.52), "wet": (0.857, 33.822, 0.347), "snow": (0.1946, 94.129, 0.0646)}
+
+
+def burckhardt(ground, slip):
+    c1, c2, c3 = BURCKHARDT[ground]
+    return math.copysign(c1 * (1.0 - math.exp(-c2 * abs(slip))) - c3 * abs(slip), slip)
+
+
+def slip_of(v, w):
+    return (RADIUS * w - v) / max(abs(v), abs(RADIUS * w), 0.5)
+
+
+class QuarterCar(gym.Env):
+    """Its tyre follows Burckhardt's published curve, which is not the shape that the estimate believes in."""
+
+    metadata = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(self, ground, speed, substeps=50):
+        self.model = mujoco.MjModel.from_xml_string(QUARTER)
+        self.data = mujoco.MjData(self.model)
+        self.frame_skip, self.dt = substeps, 0.0002 * substeps
+        self.ground, self.speed = ground, speed
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[1], self.data.qvel[:] = -1e-4, (self.speed, 0.0, self.speed / RADIUS)
+        mujoco.mj_forward(self.model, self.data)
+        return self.data.qvel[[0, 2]], {}
+
+    def step(self, action):
+        self.data.ctrl[:] = action
+        for _ in range(self.frame_skip):
+            force = burckhardt(self.ground, slip_of(*self.data.qvel[[0, 2]])) * MASS * 9.81
+            self.data.qfrc_applied[:] = force, 0.0, -RADIUS * force
+            mujoco.mj_step(self.model, self.data)
+        return self.data.qvel[[0, 2]], 0.0, False, False, {}
+
+
+def equations(ground, torque, state, hold):
+    """Speed, rate and the force's impulse after one hold, by scipy."""
+
+    def change(_, y):
+        force = burckhardt(ground, slip_of(y[0], y[1])) * MASS * 9.81
+        return [force / MASS, (torque - DRAG * y[1] - RADIUS * force) / INERTIA, force]
+
+    return solve_ivp(change, (0.0, hold), [*state, 0.0], method="LSODA", rtol=1e-8, atol=1e-9).y[:, -1]
+
+
+@pytest.mark.parametrize("ground", BURCKHARDT)
+@pytest.mark.parametrize(("speed", "action"), [(3.0, 1.0), (15.0, -1.0)])
+def test_a_quarter_car_by_its_equations(ground, speed, action):
+    """Each hold by scipy from the env's state: its end, the force observed, the slip, and the grip that is used."""
+    raw = QuarterCar(ground, speed)
+    env = sw.SlipLimiter(raw, wheels=["wheel"])
+    env.reset(seed=0)
+    traction, slips, errors = env.constraints[0], [], []
+    for _ in range(60):
+        before = raw.data.qvel[[0, 2]].copy()
+        info = env.step(np.array([action], dtype=np.float32))[4]
+        v, w, impulse = equations(ground, MOST * info["executed_action"][0], before, raw.dt)
+        np.testing.assert_allclose(raw.data.qvel[[0, 2]], (v, w), rtol=5e-3, atol=5e-3)
+        env.plant.observe()
+        env.constraints[0].rows(env.plant)
+        errors.append(abs(traction._traction[0] - impulse / raw.dt) / (MASS * 9.81))
+        slips.append(abs(slip_of(v, w)))
+    assert max(errors) < 0.02  # of the load
+    assert max(slips) < 0.16
+    top = max(burckhardt(ground, s) for s in np.linspace(0.0, 1.0, 2001))
+    # A start on dry ground is the slowest: 0.70 of what the peak would give, as the force is learned step by step.
+    assert abs(raw.data.qvel[0] - speed) / (60 * raw.dt) > 0.65 * top * 9.81
 
 
 # Vehicles ------------------------------------------------------------------------------------------------------
@@ -167,6 +266,21 @@ def test_a_servo_faster_than_the_hold_still_drives(kv, substeps):
     assert env.unwrapped.data.qvel[0] > 0.3
 
 
+def test_dry_friction_of_an_axle_leaves_the_limit_where_it_is():
+    """It is measured as the ground's, which is right for the wheel and wrong for the estimate alone."""
+    raw = Trolley(0.15)
+    raw.model.dof_frictionloss[6:] = 0.3
+    env = sw.SlipLimiter(raw, wheels=["left", "right"])
+    env.reset(seed=0)
+    slips = []
+    for _ in range(120):
+        info = env.step(np.ones(2, dtype=np.float32))[4]
+        slips.append(true_slips(raw))
+    assert np.abs(slips).max() < 0.17
+    assert (info["slip/mu_estimate"] > 0.17).all()
+    assert raw.data.qvel[0] > 0.7
+
+
 # What a step before was ----------------------------------------------------------------------------------------
 
 
@@ -230,6 +344,35 @@ def test_a_state_that_is_no_number_is_forgotten():
     env.plant.observe()
     assert np.isfinite(traction.rows(env.plant).offsets).all()
     np.testing.assert_array_equal(traction._present, 0.0)
+
+
+class AlwaysHere(gym.Wrapper):
+    """Every episode starts at the same place, on wet ground."""
+
+    def reset(self, *, seed=None, options=None):
+        return self.env.reset(seed=seed, options={"layout": OPEN | {"ground": "wet"}})
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_a_vector_envs_next_episode_starts_afresh(mode):
+    """Same layout in every episode: so are the filter's actions and estimates, and no key comes or goes."""
+
+    def make():
+        env = gym.make("SafeRover-v0", max_episode_steps=12)
+        return sw.SlipLimiter(AlwaysHere(env), wheels=env.unwrapped.wheels)
+
+    envs = gym.vector.SyncVectorEnv([make, make], autoreset_mode=mode)
+    _, infos = envs.reset(seed=0)
+    keys, seen = {k for k in infos if k.startswith(("slip/", "cbf/"))}, []
+    assert len(keys) >= 4 + 8
+    for _ in range(40):
+        infos = envs.step(np.stack([FULL, FULL]))[4]
+        assert keys <= set(infos)
+        seen.append(np.concatenate([infos["executed_action"][0], infos["slip/mu_estimate"][0]]))
+    period = 13 if mode is AutoresetMode.NEXT_STEP else 12
+    np.testing.assert_array_equal(seen[:11], seen[period : period + 11])
+    assert np.ptp(np.array(seen)[:11, 0]) > 0.1
+    envs.close()
 
 
 # Reports -------------------------------------------------------------------------------------------------------
