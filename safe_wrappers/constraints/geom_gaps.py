@@ -99,8 +99,8 @@ class GeomGaps:
     ) -> Iterator[int]:
         """The instants of a forecast at which a contact has to be judged, in time.
 
-        In contact: the very first instant, the last of every control step, the first of every contact, and the
-        first of every approach that follows a rebound without letting go. In between the control is held, and what
+        In contact: the first of every contact, the last of every control step, and the first of every approach that
+        follows a rebound without letting go. In between the control is held, and what
         the approach can come to was known when it began. Nothing is skipped that could touch: the next instant
         looked at is the first by which the geoms could have covered the distance.
 
@@ -125,7 +125,7 @@ class GeomGaps:
             gap = _distance(m, data, a, b, None)
             if gap <= touch:
                 ends = (instant + 1) % plant.substeps == 0
-                if before == np.inf or ends or instant == 0 or (back and gap < before):
+                if before == np.inf or ends or (back and gap < before):
                     yield instant
                 before, back = gap, before < gap
                 instant += 1

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers.constraints.constraint import Promise, non_negative, positive
 from safe_wrappers.constraints.geom_gaps import GeomGaps
-from safe_wrappers.constraints.predicted import RECOVERY_S, Predicted
+from safe_wrappers.constraints.predicted import Predicted
 from safe_wrappers.control.body_regions import body_region
 from safe_wrappers.control.impact import series_stiffness
 from safe_wrappers.errors import ConfigurationError
@@ -246,23 +246,18 @@ class ImpactSpeedLimit(Predicted):
         return self._lost
 
     def slacks(self, plant: MujocoPlant, control: Array) -> Array:
-        """What is left along the forecast of a control, and, from outside, closer after one step; see `Predicted`."""
+        """What is left along the forecast of a control; see `Predicted`."""
         self._look(plant)
         key = plant.revision, control.tobytes()
         if key not in self._known:
             self._control = control
-            asked = super().slacks(plant, control)
-            if self._lost.any():
-                closer = self._lost * np.exp(-plant.hold_s / RECOVERY_S)
-                asked = np.concatenate([asked, self._next - self.margin - closer])
-            self._known[key] = asked
+            self._known[key] = super().slacks(plant, control)
         return self._known[key]
 
     def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
         k, pairs = len(forecast.qpos), len(self._gaps.pairs)
         if not np.isfinite(forecast.qpos[-1]).all():
-            self._next = np.full(pairs, np.nan)  # MuJoCo gave up: nobody knows
-            return np.full((k, pairs), np.nan)
+            return np.full((k, pairs), np.nan)  # MuJoCo gave up: nobody knows
         touched: dict[int, list[int]] = {}
         for pair in range(pairs):
             for instant in self._gaps.touched(plant, forecast, self._probe, pair):
@@ -280,9 +275,7 @@ class ImpactSpeedLimit(Predicted):
                 contact = self._contact(plant, pair)
                 there = contact.gap <= self._gaps.touch[pair]
                 room[instant, pair] = self._left(contact if there else self._braked(contact))
-        room += self.margin
-        self._next = room[soon]
-        return room
+        return room + self.margin
 
 
 @dataclass(frozen=True, slots=True)

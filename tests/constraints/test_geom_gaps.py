@@ -1,5 +1,7 @@
 """GeomGaps: every touch of a forecast is found, whatever is skipped on the way."""
 
+from types import SimpleNamespace
+
 import mujoco
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from scipy.optimize import lsq_linear
 import safe_wrappers as sw
 from safe_wrappers.constraints.geom_gaps import GeomGaps
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.plants.forecast import Poses
 
 ARM = """<mujoco><option timestep="0.005" gravity="0 0 0"/><worldbody>
 <geom name="floor" type="plane" pos="0 0 -.4" size="3 3 .1"/>
@@ -74,6 +77,20 @@ def test_nothing_that_touches_is_skipped(plant):
             looked += len(calls) / k
     assert touches > 100
     assert looked < 0.5 * 120 * len(gaps.pairs)  # and most of what cannot touch is
+
+
+def test_an_approach_that_follows_a_rebound_begins_anew(plant):
+    gaps = GeomGaps(plant, ["ball"], ["floor"])
+    distances = [9, 3, -1, -4, -5, -3, -2, -2.5, -4, -4.5, -4, -1, 2, -1, -3, -2, -3, -2, -1, -4]  # mm
+    ball, k = plant.named("body", "ball"), len(distances)
+    poses = Poses(*(np.zeros((k, plant.model.nbody, *shape)) for shape in ((3,), (3, 3), (3,))))
+    poses.axes[:] = np.eye(3)
+    poses.frames[:, ball, 2] = -0.4 + 0.05 + 1e-3 * np.array(distances)
+    poses.frames[:, 0] = 0.0
+    forecast = SimpleNamespace(poses=lambda: poses)
+    assert plant.substeps == 5
+    found = list(gaps.touched(plant, forecast, mujoco.MjData(plant.model), 0))
+    assert found == [2, 4, 7, 9, 13, 14, 16, 19]  # 2, 13: touch; 4, 9, 14, 19: ends; 7, 16, 19: approaches
 
 
 def test_boxes_are_as_far_apart_as_a_least_squares_solver_finds_them():
