@@ -74,7 +74,8 @@ class PlanarRobot:
 
     def sensors(self, data: mujoco.MjData) -> NDArray[np.float64]:
         """The first readings of the model."""
-        return data.sensordata[: self.n_sensors]
+        readings: NDArray[np.float64] = data.sensordata[: self.n_sensors]
+        return readings
 
     def relative(self, points: NDArray[np.float64], qpos: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points with x along the heading and y to its left, shape (n, 2), m."""
