@@ -83,9 +83,18 @@ def test_a_wall_carries_nothing(monkeypatch):
 
 
 def test_the_geom_that_touches_is_the_wheel():
-    """Not a hub cap that is listed first and touches nothing, nor, where both touch, one of another name."""
+    """Not a hub cap that is listed first and touches nothing."""
     hub = '<geom type="cylinder" size="0.05 0.03" euler="90 0 0" mass="0.1" contype="0" conaffinity="0"/>'
     wheels, plant = wheels_of(Trolley(wheel=hub + vehicles.WHEEL))
+    np.testing.assert_allclose(wheels.constants(plant).radius, 0.1)
+
+
+def test_of_geoms_that_touch_the_one_of_the_joints_name_is_the_wheel(monkeypatch):
+    hub = '<geom type="cylinder" size="0.05 0.03" euler="90 0 0" mass="0.1"/>'
+    named = vehicles.WHEEL.replace("<geom ", '<geom name="left" ')
+    both = vehicles.TROLLEY.replace("{wheel}", (hub + named).format(friction=0.7), 1)
+    monkeypatch.setattr(vehicles, "TROLLEY", both)
+    wheels, plant = wheels_of(Trolley())
     np.testing.assert_allclose(wheels.constants(plant).radius, 0.1)
 
 

@@ -226,8 +226,9 @@ def test_a_measurement_that_is_no_number_is_reported_and_forgotten():
     assert info["slip_max"] < 0.16
 
 
-def test_a_servos_brake_ends_at_a_standstill_within_the_limit():
-    actuators = "".join(SERVOS["speed"].format(side) for side in ("left", "right"))
+@pytest.mark.parametrize("servo", SERVOS)
+def test_a_servos_brake_ends_at_a_standstill_within_the_limit(servo):
+    actuators = "".join(SERVOS[servo].format(side) for side in ("left", "right"))
     env = sw.SlipLimiter(Trolley(0.15, actuators=actuators), wheels=["left", "right"])
     env.reset(seed=0)
     data, slips = env.unwrapped.data, []
