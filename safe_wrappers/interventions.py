@@ -53,7 +53,7 @@ COST: Final = "cost"
 COST_SUBSTEP: Final = "cost_substep"
 """float64: 1 if the constraint was violated at any physics substep of this control step, else 0."""
 SPIN_OUT: Final = "spin_out"
-"""float64: 1 if a loaded wheel spun or locked (slip above 0.5 in size) at any physics substep of this step, else 0."""
+"""float64: 1 if a loaded wheel spun or locked (slip above 0.5 in size) at any physics substep, else 0."""
 
 # RecordInterventions ---------------------------------------------------------------------------------------
 EPISODE_SUMMARY: Final = "interventions"

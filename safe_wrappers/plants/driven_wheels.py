@@ -21,6 +21,8 @@ _ROUND = {
 }
 _FIXED_GAIN, _NO_BIAS = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_NONE)
 _AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_AFFINE)
+_FLAT = 1e-6
+"""Level part of an axle's direction below which it has none."""
 _DRIVES = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
@@ -136,7 +138,7 @@ class DrivenWheels:
         mujoco.mj_comVel(m, d)
         axle = d.xaxis[self._joints]
         level = np.sqrt(axle[:, 0] ** 2 + axle[:, 1] ** 2)
-        level = np.where(level > 0.0, level, 1.0)  # a wheel that lies flat goes nowhere
+        level = np.where(level > _FLAT, level, np.inf)  # a wheel that lies flat goes nowhere
         ahead_x, ahead_y = axle[:, 1] / level, -axle[:, 0] / level
         velocity = d.cvel[self._bodies]
         turn, move = velocity[:, :3], velocity[:, 3:]

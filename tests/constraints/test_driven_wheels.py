@@ -43,6 +43,21 @@ def test_motion_is_that_of_the_wheels_centres_in_any_attitude():
     assert tilted > 20
 
 
+def test_a_wheel_that_lies_flat_goes_nowhere():
+    """Its axle stands upright but for rounding, and what is left of a direction is none."""
+    env = Trolley()
+    env.reset(seed=0)
+    wheels, plant = wheels_of(env)
+    env.data.qpos[3:7] = [np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]
+    env.data.qvel[:3] = 1.0, 2.0, 0.5
+    mujoco.mj_forward(env.model, env.data)
+    assert abs(env.data.joint("left").xaxis[2]) == pytest.approx(1.0)
+    plant.observe()
+    _, ground, sideways = wheels.motion(plant)
+    assert (ground == 0.0).all()
+    assert (sideways == 0.0).all()
+
+
 @pytest.mark.parametrize("floor", ["plane", "box"])
 def test_loads_on_any_floor(floor, monkeypatch):
     """A contact names its geoms by their types' order: a wheel comes second on a plane, first on a box."""
