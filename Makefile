@@ -48,19 +48,23 @@ bench: .venv/bench
 	$(BIN)/python -m benchmarks.wrapper_cost
 	$(BIN)/python -m benchmarks.training_time
 
-# Every long figure of the README and docs/results.md: about four hours on two cores.
+# Every long figure of the README and docs/results.md: about six hours on two cores.
 figures: .venv/installed
 	$(BIN)/python -m benchmarks.adversarial
 	$(BIN)/python -m benchmarks.adversarial --mismatch
 	$(BIN)/python -m benchmarks.adversarial --price --steps 50000
 	$(BIN)/python -m benchmarks.adversarial --off --steps 100000
+	$(BIN)/python -m benchmarks.adversarial --robot car --steps 500000
+	$(BIN)/python -m benchmarks.adversarial --robot car --off --steps 49000 --parts 1
 	$(BIN)/python -m benchmarks.protected --steps 3000
 	$(BIN)/python -m benchmarks.protected --hard --steps 100000
 	$(BIN)/python -m benchmarks.admission
 	$(BIN)/python -m benchmarks.leases
 	$(BIN)/python -m benchmarks.seams
 	for config in pointgoal1_300k velocity_experts halfcheetah_velocity_ppo swimmer_velocity_ppo ant_velocity_ppo \
-		halfcheetah_velocity_sac outages; do $(BIN)/safe-wrappers compare configs/$$config.yaml --report || exit 1; done
+		halfcheetah_velocity_sac outages saferover_ppo; do $(BIN)/safe-wrappers compare configs/$$config.yaml --report || exit 1; done
+	$(BIN)/python -m benchmarks.traction
+	$(BIN)/python -m benchmarks.impact
 
 .venv/docs: .venv/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
