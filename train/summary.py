@@ -21,7 +21,15 @@ CONDITIONS: Final = {
     "filter_off": "Evaluation, filter off",
     "filter_on": "Evaluation, filter on",
 }
-TOTALS: Final = ("violations", "infeasible", "fallback", "unsafe", "lease_braking", "lease_expired", "spin_outs")
+TOTALS: Final = (
+    "violations",
+    "infeasible",
+    "fallback",
+    "unsafe",
+    "lease_braking",
+    "lease_expired",
+    "spin_outs",
+)
 METRICS: Final = {
     "return": "Return / episode",
     "length": "Steps / episode",
