@@ -204,7 +204,7 @@ def test_an_unknown_env_is_refused_with_lines_that_work(lab):
     families = {
         f.removeprefix("Safe").removesuffix("Velocity") if f.endswith("Velocity") else f for f in families
     }
-    assert set(listed) == families | {"SafePointGoal0"}
+    assert set(listed) == families | {"SafePointGoal0", "SafeCarGoal0"}
     lines = textwrap.dedent("\n".join(message.splitlines()[1:]))
     assert len(lines.splitlines()) == 3
     scope = {"env": env}

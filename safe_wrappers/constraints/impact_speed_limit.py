@@ -206,6 +206,10 @@ class ImpactSpeedLimit(Predicted):
                 self._resting = self._moving
         return float(given @ self._resting)
 
+    def backup(self, plant: MujocoPlant) -> Array:
+        """The braking with which every forecast goes on: what was admitted for its sake stays admissible."""
+        return plant.braking()
+
     # Now, and along a forecast --------------------------------------------------------------------------------
 
     def _now(self, plant: MujocoPlant) -> Array:

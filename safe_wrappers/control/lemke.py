@@ -5,8 +5,8 @@ Stone (1992), The Linear Complementarity Problem, section 4.4. Find z with
 
     w = M z + q,    z >= 0,    w >= 0,    z . w = 0.
 
-Complementary pivots from the basis w, with one artificial variable whose column is all ones. Ties are broken
-lexicographically, so no basis comes twice.
+Complementary pivots from the basis w, with one artificial variable whose column is positive (the cover). Ties are
+broken lexicographically, so no basis comes twice.
 
 For dense problems of up to some tens of unknowns, as a control step's contacts are.
 """
@@ -77,23 +77,25 @@ def solve_lcp(matrix: ArrayLike, vector: ArrayLike) -> LcpSolution:
         return LcpSolution(np.zeros(n), q.copy(), LcpStatus.SOLVED, 0)
     # In units of the largest entries, which changes neither the pivots nor their order.
     size, length = float(np.abs(m).max()) or 1.0, float(np.abs(q).max())
-    status, basis, pivots = _pivots(m / size, q / length)
-    z, w = np.zeros(n), q.copy()
-    if status is LcpStatus.SOLVED:
-        z = _basic_solution(m / size, q / length, basis) * (length / size)
-        w = m @ z + q
-        if not _holds(m, q, z, w):
-            z, w, status = np.zeros(n), q.copy(), LcpStatus.FAILED
-    return LcpSolution(z, w, status, pivots)
+    # On degenerate problems rounding can lead one way onto a ray that is none: another cover is another way.
+    for cover in (np.ones(n), 1.0 + np.arange(n) / n):
+        status, basis, pivots = _pivots(m / size, q / length, cover)
+        if status is LcpStatus.SOLVED:
+            z = _basic_solution(m / size, q / length, basis) * (length / size)
+            w = m @ z + q
+            if _holds(m, q, z, w):
+                return LcpSolution(z, w, status, pivots)
+            status = LcpStatus.FAILED
+    return LcpSolution(np.zeros(n), q.copy(), status, pivots)
 
 
-def _pivots(m: Array, q: Array) -> tuple[LcpStatus, NDArray[np.int64], int]:
+def _pivots(m: Array, q: Array, cover: Array) -> tuple[LcpStatus, NDArray[np.int64], int]:
     """The way to a complementary basis. Variables: w are 0 to n - 1, z are n to 2n - 1, the artificial one is 2n."""
     n = len(q)
     artificial = 2 * n
-    table = np.hstack([np.eye(n), -m, -np.ones((n, 1)), q[:, None]])
+    table = np.hstack([np.eye(n), -m, -cover[:, None], q[:, None]])
     basis = np.arange(n)
-    leaving = _lexicographic_least(table[:, [-1, *range(n)]], np.arange(n))
+    leaving = _lexicographic_least(table[:, [-1, *range(n)]] / cover[:, None], np.arange(n))
     entering = artificial
     for pivots in range(1, _PIVOTS * n + 1):
         table[leaving] /= table[leaving, entering]
@@ -106,10 +108,16 @@ def _pivots(m: Array, q: Array) -> tuple[LcpStatus, NDArray[np.int64], int]:
         column = table[:, entering]
         rows = np.flatnonzero(column > _SMALL)
         if not len(rows):
-            return LcpStatus.RAY, basis, pivots
+            if table[basis == artificial, -1] > _SMALL:
+                return LcpStatus.RAY, basis, pivots
+            basis[basis == artificial] = left  # it is zero: rounding hid that it could leave with this one
+            return LcpStatus.SOLVED, basis, pivots
         ratios = table[rows][:, [-1, *range(n)]] / column[rows, None]
         # Where the artificial variable can leave, it does: that is the end.
-        first = np.flatnonzero((basis[rows] == artificial) & (ratios[:, 0] <= ratios[:, 0].min() + _SMALL))
+        least = float(ratios[:, 0].min())
+        first = np.flatnonzero(
+            (basis[rows] == artificial) & (ratios[:, 0] <= least + _SMALL * max(1.0, least))
+        )
         leaving = int(rows[first[0]]) if len(first) else _lexicographic_least(ratios, rows)
     return LcpStatus.FAILED, basis, _PIVOTS * n
 

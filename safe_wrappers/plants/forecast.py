@@ -110,7 +110,7 @@ class Recorder:
         data.ctrl[:] = control
         for hold in range(holds):
             if hold:
-                data.ctrl[:] = self._braking(data)
+                data.ctrl[:] = self.braking(data)
             for i in range(hold * n, hold * n + n):
                 mujoco.mj_step(m, data)
                 qpos[i], qvel[i] = data.qpos, data.qvel
@@ -121,8 +121,8 @@ class Recorder:
                 break
         return Forecast(self, qpos, qvel, frames, centres)
 
-    def _braking(self, data: mujoco.MjData) -> Array:
-        """Read once per control interval, as a controller would."""
+    def braking(self, data: mujoco.MjData) -> Array:
+        """Every actuator against its own motion, shape (nu,); read once per control interval, as a controller does."""
         at_rest = self._rest[:, 0] + self._rest[:, 1] * data.actuator_length
         control = at_rest - self._damping * data.actuator_velocity
         return np.asarray(np.minimum(np.maximum(control, self._low), self._high))

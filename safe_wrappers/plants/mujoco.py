@@ -344,10 +344,14 @@ class MujocoPlant:
             known = self._forecasts[key] = self._recorder.record(self.data, control, holds)
         return known.first(holds)
 
+    def braking(self) -> Array:
+        """The control with which a forecast goes on after its held control, shape (nu,), from the present state."""
+        return self._recorder.braking(self.forward())
+
     def pose(self) -> mujoco.MjData:
         """The plant's data with positions of bodies up to date at the present state; cheaper than `forward`."""
+        self._load()  # a forecast leaves the data at its end
         if not self._forwarded:
-            self._load()
             mujoco.mj_kinematics(self.model, self.data)
         return self.data
 

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import nnls
 
@@ -141,8 +141,12 @@ def machine(seed):
 
 @settings(max_examples=150, deadline=None)
 @given(st.integers(0, 2**32), st.floats(0.0, 1.0))
+@example(27255, 0.0)  # more contacts than joints: two variables may leave at once, but for rounding
 def test_impulses_push_and_gain_no_energy(seed, e):
     _, m, j, v = machine(seed)
+    sizes = np.linalg.eigvalsh(j @ np.linalg.solve(m, j.T))
+    # Directions that are neither independent nor dependent, but for rounding, have no answer to rely on.
+    assume(not ((sizes > 1e-13 * sizes[-1]) & (sizes < 1e-9 * sizes[-1])).any())
     step = contact_step(m, j, np.zeros(len(j)), v, np.zeros(len(v)), 0.001, e)
     assert step.status is LcpStatus.SOLVED and (step.impulse >= 0.0).all()
     np.testing.assert_allclose(m @ (step.velocity - v), j.T @ step.impulse, atol=1e-9)

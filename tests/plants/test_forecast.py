@@ -223,6 +223,30 @@ def test_the_present_state_is_as_before_a_forecast():
     np.testing.assert_array_equal(plant.pose().xpos, fresh(env.unwrapped).xpos)
 
 
+def test_a_pose_after_a_forecast_is_still_that_of_the_state():
+    env = make("Ant")
+    env.reset(seed=0)
+    plant = bound(env)
+    plant.forward()
+    plant.forecast(np.ones(8), 3)
+    np.testing.assert_array_equal(plant.pose().xpos, fresh(env.unwrapped).xpos)
+    plant.forward()
+    list(plant.rollout(np.ones(8)))
+    np.testing.assert_array_equal(plant.pose().xpos, fresh(env.unwrapped).xpos)
+
+
+def test_the_braking_of_a_forecast_is_told():
+    env = make("Pusher")
+    env.reset(seed=0)
+    plant = bound(env)
+    env.step(env.action_space.high)
+    plant.observe()
+    braking, before = plant.braking(), plant.qvel.copy()
+    slower = plant.forecast(braking).qvel[-1]
+    assert np.abs(slower[:7]).sum() < 0.7 * np.abs(before[:7]).sum()
+    assert (braking >= env.action_space.low).all() and (braking <= env.action_space.high).all()
+
+
 def fresh(raw):
     """Data at the env's state with everything up to date."""
     data = mujoco.MjData(raw.model)
