@@ -122,7 +122,7 @@ class Recorder:
         return Forecast(self, qpos, qvel, frames, centres)
 
     def braking(self, data: mujoco.MjData) -> Array:
-        """Every actuator against its own motion, shape (nu,); read once per control interval, as a controller does."""
+        """Every actuator against its own motion, shape (nu,); read once per control interval, as controllers do."""
         at_rest = self._rest[:, 0] + self._rest[:, 1] * data.actuator_length
         control = at_rest - self._damping * data.actuator_velocity
         return np.asarray(np.minimum(np.maximum(control, self._low), self._high))
