@@ -61,7 +61,8 @@ class Traction:
     fast as the drives can bring it. A wheel that slides sideways has less left to slip along its heading (a friction
     circle), so that driving and braking leave the grip to the turn; but a turn that is too fast for the ground still
     slides, and a vehicle that spins about its own axis turns its wheels faster than any drive follows. Hence best
-    effort. Overshoots are the ground's and no unsafe state, so there is no `value`.
+    effort. Overshoots are the ground's and no unsafe state, so there is no `value`; and from outside the limit the
+    rows ask for no more than the drives can give: the way back is not called infeasible.
 
     The estimate believes in curves of one shape, the Magic Formula's. On others it may take the peak for a later one:
     on Burckhardt's snow (peak at 0.06, nearly flat behind it) a wheel is held at 0.11, for 2 % less force.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
@@ -26,7 +27,10 @@ _STEP_KEYS = {
     keys.HANDOVER_STARVED: "step_starved",
     keys.HANDOVER_LIMITED: "step_limited",
     keys.FAULT_ACTIVE: "step_fault",
+    keys.SPIN_OUT: "step_spin_out",
+    keys.CONTACT_PEAK_FORCE: "step_contact_force",
 }
+_LARGEST_OF_WHEELS = {keys.SLIP_RATIO: "step_slip", keys.SLIP_LIMITED: "step_slip_limited"}
 
 
 class InterventionCallback(BaseCallback):
@@ -37,11 +41,13 @@ class InterventionCallback(BaseCallback):
     - `interventions/step_rate`, `step_infeasible`, `step_fallback`, `step_correction`, `step_cost`,
       `step_cost_substep`, `step_penalty` (AdaptionPenalty's), `step_lease_expired`, `step_lease_refused`,
       `step_lease_braking` (LeaseExpiry's), `step_peak_jerk`, `step_blend_time`, `step_starved`, `step_limited`
-      (ChunkHandover's, per chunk), `step_fault`: over all steps of all envs, from the keys that the wrappers and the
-      task write at every step;
+      (ChunkHandover's, per chunk), `step_fault`, `step_slip` (the largest size of any wheel), `step_slip_limited`
+      (any wheel), `step_spin_out`, `step_contact_force` (ContactMonitor's, N): over all steps of all envs, from the
+      keys that the wrappers and the task write at every step;
     - `interventions/rate`, `correction_mean`, `correction_p95`, `infeasible`, `fallback`, `nonfinite`,
       `unsafe`, `lease_expired`, `lease_refused`, `lease_braking`, `margin_min`, `violations`, `cost`,
-      `cost_substep`, `goals_reached`, `success`: over the episodes that ended, from `RecordInterventions`.
+      `cost_substep`, `goals_reached`, `spin_outs`, `success`: over the episodes that ended, from
+      `RecordInterventions`.
 
     It reads infos only, so it works the same with `DummyVecEnv` and `SubprocVecEnv`. For evaluation use
     `InterventionEvalCallback`.
@@ -69,6 +75,9 @@ def log_steps(logger: Logger, infos: Iterable[Mapping[str, Any]]) -> None:
         for key, name in _STEP_KEYS.items():
             if key in info:
                 logger.record_mean(f"interventions/{name}", float(info[key]))
+        for key, name in _LARGEST_OF_WHEELS.items():
+            if key in info:
+                logger.record_mean(f"interventions/{name}", float(np.abs(info[key]).max()))
 
 
 def log_episode(logger: Logger, info: Mapping[str, Any], prefix: str) -> None:

@@ -67,6 +67,38 @@ def lost_now_and_then():
     return Monitor(DroppedRefreshes(stack, share=1.0))
 
 
+class SlipsKept(gym.Wrapper):
+    """Keeps the infos of a run, to compare with what was logged."""
+
+    kept: list
+
+    def step(self, action):
+        *result, info = self.env.step(action)
+        self.kept.append(info)
+        return *result, info
+
+
+def test_slips_spin_outs_and_contact_forces_reach_tensorboard(tmp_path):
+    rover = sw.protect(gym.make("SafeRover-v0", max_episode_steps=16))
+    env = SlipsKept(sw.RecordInterventions(sw.ContactMonitor(rover)))
+    env.kept = []
+    model = PPO("MlpPolicy", Monitor(env), n_steps=32, n_epochs=1, batch_size=32, device="cpu", seed=0)
+    model.set_logger(configure(str(tmp_path), ["tensorboard"]))
+    with pytest.warns(UserWarning, match="made once more"):  # the rover's tyres push in every substep
+        model.learn(32, callback=InterventionCallback())
+    logged, infos = scalars(tmp_path), env.kept
+
+    def mean(of):
+        return [pytest.approx(np.mean([of(info) for info in infos]), rel=1e-5)]
+
+    assert logged["interventions/step_slip"] == mean(lambda i: np.abs(i["slip/ratio"]).max())
+    assert logged["interventions/step_slip_limited"] == mean(lambda i: i["slip/limited"].any())
+    assert logged["interventions/step_spin_out"] == mean(lambda i: i["spin_out"])
+    assert logged["interventions/step_contact_force"] == mean(lambda i: i["contact/peak_force"])
+    assert logged["interventions/step_slip"][0] > 0.0 and logged["interventions/step_contact_force"][0] > 20.0
+    assert logged["interventions/spin_outs"] == [0.0]
+
+
 def test_handover_lease_and_faults_reach_tensorboard(tmp_path):
     model = PPO("MlpPolicy", lost_now_and_then(), n_steps=32, n_epochs=1, batch_size=32, device="cpu", seed=0)
     model.set_logger(configure(str(tmp_path), ["tensorboard"]))
