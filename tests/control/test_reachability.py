@@ -140,10 +140,10 @@ states = st.tuples(st.floats(-3, 3), SHARE, SHARE)
 
 
 def inside(state, acceleration, speed, jerk):
-    """Scaled so that neither its past nor its future must leave the limits."""
+    """Scaled so that neither its past nor its future must leave the limits, by more than ruckig's rounding."""
     p, v, a = state
     a *= min(acceleration, np.sqrt(jerk * speed))
-    v *= speed - 0.5 * a * a / jerk
+    v *= (1.0 - 1e-6) * speed - 0.5 * a * a / jerk
     return p, v, a
 
 
