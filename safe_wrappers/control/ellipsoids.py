@@ -1,0 +1,122 @@
+"""Ellipsoids: how far points are from them, and which way leads out.
+
+A moving obstacle whose position is known with a covariance is an obstacle somewhere in an ellipsoid; one that may
+have been displaced along a line is an ellipsoid without width. Both are the same set here.
+"""
+
+import math
+from collections.abc import Iterable
+from operator import mul
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.errors import ConfigurationError
+
+Array = NDArray[np.float64]
+
+_ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
+"""Error of an eigenvalue over the largest one, where the shape is not diagonal."""
+_UNEVEN = 1e-9
+"""Asymmetry and negative eigenvalues up to here, relative, are a user's rounding."""
+_CONVERGED = 1e-11
+"""Of the secular equation; the distance errs with its square, and downwards."""
+_TINY = 1e-150
+"""Smaller is zero: squares underflow, quotients overflow."""
+_MOST_STEPS = 100
+
+
+def ellipsoid_gap(offset: Array, shape: Array) -> tuple[Array, Array]:
+    """Signed distances of points to ellipsoids, and the unit normals along which they grow.
+
+    The ellipsoid is {S^(1/2) u : |u| <= 1}, filled. S may be singular or zero: then it is flat, a segment or a point,
+    which has no inside. The signed distance is the largest of `n @ offset - sqrt(n @ S @ n)` over unit vectors n, so
+    any n bounds it from below, and what is returned is that expression at the normal returned: outside, the Euclidean
+    distance and the direction from the nearest point of the set to the point; inside, minus the distance to the
+    boundary and the shortest way out (one of them where several are equally short); on a flat set, zero and a normal
+    across it.
+
+    The distance is never overestimated, save by rounding (1e-15 of the lengths involved). It is underestimated by at
+    most 5e-8 of the longest half-axis, and that only for a shape that is (nearly) singular and not diagonal: its
+    width, the root of an eigenvalue, is lost in rounding and taken at its largest.
+
+    The normal comes from the secular equation in the eigenbasis, by Newton's method on its inverse root, which
+    approaches from one side without overshooting (Moré and Sorensen, Computing a trust region step, 1983). Plain
+    floats: for the few obstacles of a control step they are faster than arrays.
+
+    Args:
+        offset: Point minus centre, shape (n, d), m; d is 2 or 3.
+        shape: S, symmetric positive semidefinite, shape (n, d, d), m²: for k sigma of a covariance P it is k² P.
+
+    Returns:
+        Distances, shape (n,), m, and unit normals, shape (n, d).
+
+    Raises:
+        ConfigurationError: Other shapes, numbers that are not finite, or an S that is not symmetric or has a negative
+            eigenvalue.
+    """
+    d = _dimension(offset, shape)
+    squares, bases = np.linalg.eigh(shape)
+    coupled = np.any(shape * (1.0 - np.eye(d)), axis=(1, 2)).tolist()
+    along = (offset[:, None, :] @ bases)[:, 0]
+    found = [_gap(*point) for point in zip(along.tolist(), squares.tolist(), coupled, strict=True)]
+    distances = np.array([distance for distance, _ in found])
+    normals = np.array([normal for _, normal in found]).reshape(offset.shape)
+    return distances, (bases @ normals[:, :, None])[:, :, 0]
+
+
+def _dimension(offset: Array, shape: Array) -> int:
+    """Of the space, once everything about the arguments but the eigenvalues is known to be in order."""
+    d = offset.shape[-1] if offset.ndim == 2 else 0
+    if d not in (2, 3) or shape.shape != (*offset.shape, d):
+        raise ConfigurationError(
+            f"expected offsets (n, d) and shapes (n, d, d) with d = 2 or 3, got {offset.shape} and {shape.shape}"
+        )
+    if not (np.isfinite(offset).all() and np.isfinite(shape).all()):
+        raise ConfigurationError(
+            f"offsets and shapes must be finite, got {offset.tolist()} and {shape.tolist()}"
+        )
+    uneven = np.abs(shape - shape.swapaxes(1, 2))
+    if uneven.any() and (uneven > _UNEVEN * np.abs(shape).max(axis=(1, 2), keepdims=True)).any():
+        raise ConfigurationError(f"shapes must be symmetric, got {shape.tolist()}")
+    return d
+
+
+def _gap(y: list[float], squares: list[float], coupled: bool) -> tuple[float, list[float]]:
+    """Distance and normal in the eigenbasis: y the point, squares those of the half-axes, smallest first."""
+    if squares[0] < -_UNEVEN * max(squares[-1], -squares[0]):
+        raise ConfigurationError(f"shapes must be positive semidefinite, got an eigenvalue of {squares[0]:g}")
+    lost = _ROUNDING * squares[-1] if coupled else 0.0
+    squares = [square + lost if square > 0.0 else lost for square in squares]
+    axes = [math.sqrt(square) for square in squares]
+    beyond = [square - squares[0] for square in squares]
+    s, filled = _secular_root(map(abs, map(mul, axes, y)), beyond)
+    normal = [x * s / (s + b) if b > 0.0 else x for x, b in zip(y, beyond, strict=True)]
+    length = math.hypot(*normal)
+    if length < _TINY:
+        # In the plane that the shortest axis crosses: nearest are two points, above and below; one of them is taken.
+        normal = [axes[0] * x / b if b > 0.0 else 0.0 for x, b in zip(y, beyond, strict=True)]
+        normal[0] = math.sqrt(max(1.0 - filled, 0.0))
+        length = math.hypot(*normal)
+    normal = [x / length for x in normal] if length > 0.0 else [1.0, *normal[1:]]
+    return sum(map(mul, y, normal)) - math.hypot(*map(mul, axes, normal)), normal
+
+
+def _secular_root(reach: Iterable[float], beyond: list[float]) -> tuple[float, float]:
+    """The root s >= 0 of G(s) = sum of (reach / (s + beyond))² = 1, or 0 where there is none, and G there."""
+    terms = [(c, b) for c, b in zip(reach, beyond, strict=True) if c > _TINY]
+    # Each term alone bounds the root from below; from there on no denominator is smaller than its numerator.
+    s = max([0.0, *[c - b for c, b in terms]])
+    total = 0.0
+    for _ in range(_MOST_STEPS):
+        total = steepness = 0.0
+        for c, b in terms:
+            below = s + b
+            share = c / below
+            total += share * share
+            steepness += share * share / below
+        excess = math.sqrt(total) - 1.0
+        if excess <= _CONVERGED:
+            break
+        s += excess * total / steepness
+    return s, total
