@@ -31,6 +31,12 @@ FLEX_JOINT_REACH_ID: Final = "FlexJointReach-v0"
 SAFE_ROVER_ID: Final = "SafeRover-v0"
 """Id of the rover on dry, wet and icy ground."""
 
+CROSSING_EPISODE_STEPS: Final = 500
+"""`EPISODE_STEPS` of the crossing: 20 s at 25 Hz."""
+
+OCCLUDED_CROSSING_ID: Final = "OccludedCrossing-v0"
+"""Id of the road to cross between cars that hide behind pillars."""
+
 
 def register_envs() -> None:
     """Register every task of this package with Gymnasium; ids already there are left alone."""
@@ -44,6 +50,8 @@ def register_envs() -> None:
     reach = "safe_wrappers.envs.flex_joint_reach:FlexJointReachEnv"
     _register(FLEX_JOINT_REACH_ID, reach, {}, steps=REACH_EPISODE_STEPS)
     _register(SAFE_ROVER_ID, "safe_wrappers.envs.safe_rover:SafeRoverEnv", {})
+    crossing = "safe_wrappers.envs.occluded_crossing:OccludedCrossingEnv"
+    _register(OCCLUDED_CROSSING_ID, crossing, {}, steps=CROSSING_EPISODE_STEPS)
 
 
 def _register(env_id: str, entry_point: str, kwargs: dict[str, object], steps: int = EPISODE_STEPS) -> None:
@@ -53,8 +61,10 @@ def _register(env_id: str, entry_point: str, kwargs: dict[str, object], steps: i
 
 __all__ = [
     "CAR_GOAL_IDS",
+    "CROSSING_EPISODE_STEPS",
     "EPISODE_STEPS",
     "FLEX_JOINT_REACH_ID",
+    "OCCLUDED_CROSSING_ID",
     "POINT_GOAL_IDS",
     "REACH_EPISODE_STEPS",
     "SAFE_ROVER_ID",

@@ -1,0 +1,196 @@
+"""Where everything stands when a crossing starts, and how a user asks for it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.errors import ConfigurationError
+
+from .layout import layout_option, numbers
+from .traffic import CAR_MEAN_SPEED, CAR_SPEED_STD
+
+Array = NDArray[np.float64]
+
+CROSSING_LAYOUT_KEYS: Final = ("agent", "goal", "cars", "pillars")
+"""What the crossing's ``reset(options={"layout": {...}})`` understands."""
+FIELD: Final = (4.0, 3.5)
+"""The field is ``|x| <= 4``, ``|y| <= 3.5``, m: rails keep the robot in it."""
+ROAD_HALF_WIDTH: Final = 1.3
+"""The road is ``|y| <= 1.3``, m; pavements beyond."""
+LANE_CENTRES: Final = (-0.8, 0.8)
+"""Their y, m: the first lane leads towards +x, the second towards -x."""
+CARS_PER_LANE: Final = 3
+CARS: Final = 2 * CARS_PER_LANE
+PILLARS: Final = 4
+"""Two on the lower pavement, then two on the upper one."""
+ROBOT_RADIUS: Final = 0.2
+PILLAR_RADIUS: Final = 0.35
+CROSSING_GOAL_RADIUS: Final = 0.3
+"""Distance from the goal's centre at which it counts as reached, m."""
+
+_PAVEMENT: Final = 2.9  # m: |y| of starts and goals
+_AGENT_REACH: Final = 2.0  # m: |x|
+_GOAL_REACH: Final = 2.5
+_PILLAR_REACH: Final = 3.0
+_PILLAR_BAND: Final = (1.8, 2.0)  # m: |y|
+_PILLAR_SPACING: Final = 1.5  # m between the centres of two on one side: the robot fits through
+_CAR_START: Final = (-7.0, -2.0)  # m: the first of a lane, seen along it
+_CAR_GAPS: Final = (5.0, 8.0)  # m between the centres of one and the next
+_SPARE: Final = 0.05  # m between the robot and a pillar, at least
+_TRIES: Final = 1000
+
+
+@dataclass(frozen=True)
+class CrossingLayout:
+    """A whole layout.
+
+    Attributes:
+        agent: Position and heading, shape (3,), m and rad.
+        goal: Centre, shape (2,), m.
+        cars: Position and velocity along x, shape (6, 2), m and m/s; the first three in the first lane.
+        pillars: Centres, shape (4, 2), m.
+    """
+
+    agent: Array
+    goal: Array
+    cars: Array
+    pillars: Array
+
+
+@dataclass(frozen=True)
+class PartialCrossingLayout:
+    """The same parts; None means "sample it"."""
+
+    agent: Array | None
+    goal: Array | None
+    cars: Array | None
+    pillars: Array | None
+
+
+def parse_crossing_layout(options: Mapping[str, Any] | None) -> PartialCrossingLayout:
+    """Read the layout out of `reset`'s options.
+
+    Given positions are taken as they are, but for a robot that would stand outside the field or in a given pillar:
+    it would be thrown out. Options other than ``"layout"`` belong to wrappers and are left alone.
+
+    Args:
+        options: `reset`'s options; never changed.
+
+    Raises:
+        UnknownNameError: An unknown layout key, or what looks like a misspelt ``"layout"``.
+        ConfigurationError: A wrong shape, a number that is not finite, or a robot where it cannot stand.
+    """
+    given = layout_option(options, CROSSING_LAYOUT_KEYS)
+    parsed = PartialCrossingLayout(
+        agent=numbers(given, "agent", "[x, y, heading]", (3,)),
+        goal=numbers(given, "goal", "[x, y]", (2,)),
+        cars=numbers(given, "cars", f"[[x, v], ...] of {CARS} cars", (CARS, 2)),
+        pillars=numbers(given, "pillars", f"[[x, y], ...] of {PILLARS} pillars", (PILLARS, 2)),
+    )
+    if parsed.agent is not None:
+        _check_agent(parsed.agent, parsed.pillars)
+    return parsed
+
+
+def _check_agent(agent: Array, pillars: Array | None) -> None:
+    room = np.array(FIELD) - ROBOT_RADIUS
+    if (np.abs(agent[:2]) > room).any():
+        raise ConfigurationError(
+            f"layout 'agent' must stand inside the rails, |x| <= {room[0]:g} and |y| <= {room[1]:g};"
+            f" got {agent[:2].tolist()}"
+        )
+    if pillars is not None and _slack(agent[:2], pillars) < 0.0:
+        raise ConfigurationError(
+            f"layout 'agent' stands in a pillar: its centre must be {ROBOT_RADIUS + PILLAR_RADIUS:g} m or more"
+            f" from each pillar's; got {agent[:2].tolist()} and pillars {pillars.tolist()}"
+        )
+
+
+def sample_crossing_layout(rng: np.random.Generator, given: PartialCrossingLayout) -> CrossingLayout:
+    """Sample what is missing of a layout; given parts are kept as they are.
+
+    The robot starts on the lower pavement and faces the road; the goal lies on the other side. In each lane the first
+    car is 2 to 7 m before the field's middle and each next one 5 to 8 m behind; speeds are drawn from their
+    stationary distribution.
+
+    Args:
+        rng: Source of randomness.
+        given: The parts to keep.
+
+    Raises:
+        ConfigurationError: The given pillars leave the robot no place to start from.
+    """
+    agent = _sample_agent(rng, given.pillars) if given.agent is None else given.agent
+    pillars = _sample_pillars(rng, agent, given.goal) if given.pillars is None else given.pillars
+    goal = sample_crossing_goal(rng, agent[:2], pillars) if given.goal is None else given.goal
+    cars = _sample_cars(rng) if given.cars is None else given.cars
+    return CrossingLayout(agent=agent, goal=goal, cars=cars, pillars=pillars)
+
+
+def sample_crossing_goal(rng: np.random.Generator, agent: Array, pillars: Array) -> Array:
+    """Sample a goal, shape (2,), m, on the pavement across the road, beside the pillars.
+
+    Pillars all over a pavement must not end an episode with an error: where no try is clear, the clearest is taken.
+
+    Args:
+        rng: Source of randomness.
+        agent: Robot's position, shape (2,), m; from the road's middle line, the goal is on the upper side.
+        pillars: Centres, shape (4, 2), m.
+    """
+    side = _PAVEMENT if agent[1] <= 0.0 else -_PAVEMENT
+    return _sample_clear(rng, _GOAL_REACH, side, pillars)
+
+
+def _sample_clear(rng: np.random.Generator, reach: float, y: float, pillars: Array) -> Array:
+    """A place on a pavement where the robot can stand; the clearest of the tries if none is clear."""
+    best, best_slack = np.zeros(2), -np.inf
+    for _ in range(_TRIES):
+        point = np.array([rng.uniform(-reach, reach), y])
+        slack = _slack(point, pillars) - _SPARE
+        if slack > best_slack:
+            best, best_slack = point, slack
+        if slack >= 0.0:
+            break
+    return best
+
+
+def _sample_agent(rng: np.random.Generator, pillars: Array | None) -> Array:
+    if pillars is None:
+        place = np.array([rng.uniform(-_AGENT_REACH, _AGENT_REACH), -_PAVEMENT])
+    else:
+        place = _sample_clear(rng, _AGENT_REACH, -_PAVEMENT, pillars)
+        if _slack(place, pillars) < 0.0:
+            raise ConfigurationError(
+                f"no room for the robot to start from: layout 'pillars' {pillars.tolist()} cover the pavement"
+                f" at y = {-_PAVEMENT:g}; give 'agent' too, or other pillars"
+            )
+    return np.append(place, 0.5 * np.pi)
+
+
+def _sample_pillars(rng: np.random.Generator, agent: Array, goal: Array | None) -> Array:
+    """Pillars beside the robot, and beside the goal if that stands already."""
+    taken = agent[None, :2] if goal is None else np.stack([agent[:2], goal])
+    while True:  # robot and goal stand in the way of at most 2.4 m of the 12
+        x = rng.uniform(-_PILLAR_REACH, _PILLAR_REACH, PILLARS)
+        y = rng.uniform(*_PILLAR_BAND, PILLARS) * (-1.0, -1.0, 1.0, 1.0)
+        pillars = np.stack([x, y], axis=1)
+        apart = min(abs(x[0] - x[1]), abs(x[2] - x[3]))
+        if apart >= _PILLAR_SPACING and min(_slack(point, pillars) for point in taken) >= _SPARE:
+            return pillars
+
+
+def _sample_cars(rng: np.random.Generator) -> Array:
+    first = rng.uniform(*_CAR_START, (2, 1))
+    gaps = rng.uniform(*_CAR_GAPS, (2, CARS_PER_LANE - 1))
+    along = np.concatenate([first, first - np.cumsum(gaps, axis=1)], axis=1)
+    speeds = rng.normal(CAR_MEAN_SPEED, CAR_SPEED_STD, (2, CARS_PER_LANE))
+    directions = np.array([[1.0], [-1.0]])
+    return np.stack([(directions * along).ravel(), (directions * speeds).ravel()], axis=1)
+
+
+def _slack(point: Array, pillars: Array) -> float:
+    """Room between the robot at a point and the nearest pillar, m; negative inside."""
+    return float(np.hypot(*(pillars - point).T).min()) - ROBOT_RADIUS - PILLAR_RADIUS

@@ -1,0 +1,302 @@
+"""Crossing a road whose cars hide behind pillars: what is not seen has to be estimated."""
+
+import math
+from pathlib import Path
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+from gymnasium.envs.mujoco import MujocoEnv
+from gymnasium.spaces import Box
+from gymnasium.utils import EzPickle
+from numpy.typing import NDArray
+
+from safe_wrappers.errors import ActionError, SafeWrappersError
+from safe_wrappers.interventions import COST, COST_SUBSTEP
+
+from .crossing_layout import (
+    CARS,
+    CARS_PER_LANE,
+    CROSSING_GOAL_RADIUS,
+    LANE_CENTRES,
+    PILLAR_RADIUS,
+    PILLARS,
+    ROBOT_RADIUS,
+    CrossingLayout,
+    parse_crossing_layout,
+    sample_crossing_goal,
+    sample_crossing_layout,
+)
+from .goal_env import GOAL_MET, GOALS_REACHED
+from .traffic import CAR_ACCELERATION_NOISE, CAR_MEAN_SPEED, CAR_SPEED_STD, CAR_TIME_CONSTANT_S, Traffic
+
+__all__ = [
+    "CAR_ACCELERATION_NOISE",
+    "CAR_BODIES",
+    "CAR_MEAN_SPEED",
+    "CAR_RADIUS",
+    "CAR_SPEED_STD",
+    "CAR_TIME_CONSTANT_S",
+    "COLLISIONS",
+    "OccludedCrossingEnv",
+]
+
+Array = NDArray[np.float64]
+
+CAR_BODIES: Final = tuple(f"car{i}" for i in range(CARS))
+"""The cars' bodies and joints, in the order of every array of six: the first three drive towards +x."""
+CAR_RADIUS: Final = 0.4
+"""m."""
+COLLISIONS: Final = "collisions"
+"""int: collisions that began in this step, one per car: contact now, none at the physics substep before."""
+
+_FRAME_SKIP: Final = 4
+_CARS: Final = slice(3, 3 + CARS)  # coordinates: robot x, y, heading, then the cars' x
+_CONTACT_SQUARED: Final = (CAR_RADIUS + ROBOT_RADIUS) ** 2
+_GOAL_BODY: Final = 0  # of the mocap bodies; the pillars follow
+_ASSET: Final = Path(__file__).parent / "assets" / "occluded_crossing.xml"
+_CAMERA: Final = {"distance": 10.0, "elevation": -60.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.4, 0.0])}
+_NOT_FINITE: Final = "the crossing's state is not finite: a state that was set, or a changed model, broke it"
+
+
+class OccludedCrossingEnv(MujocoEnv, EzPickle):
+    """Cross a road of two lanes, again and again, between cars that pillars hide and the observation leaves out.
+
+    A disc of 0.2 m and 1 kg with a camera and a site, both called ``eye``, 0.15 m ahead of the axis that it turns
+    about and 0.3 m high, looking ahead (the camera along its -z, the site's z axis points there; 100 degrees). Two
+    pillars on each pavement stop the robot and hide what is behind them. Cars are discs of 0.4 m in lanes at
+    y = -0.8 m (towards +x) and y = +0.8 m (towards -x); they drive as `traffic.Traffic` says, react to nothing, and
+    pass through the robot and each other: whether they would have hit it is judged.
+
+    **Action**: ``Box(-1, 1, (3,), float32)``, held for 0.04 s (four physics substeps): the force along the world's x
+    and y, 4 N at 1, and the torque that turns the robot. Damped by 2 N s/m, it reaches 2 m/s along each axis (2.8 m/s
+    along both), and brakes with 4 m/s^2 or more at any speed. It turns with 4 rad/s at most; 0.15 s take
+    it to 96 % of that.
+
+    **Observation**, float64, shape (17,): position (2, m), velocity (2, m/s), cosine and sine of the heading, yaw
+    rate (rad/s), goal and pillars relative to the robot (2 and 4 times 2, m), all along the world's axes. No cars:
+    what can be seen of them is for a sensor to add.
+
+    **Reward**: distance to the goal gained in this step (m), plus 1 on coming within 0.3 m of it; then a new goal is
+    sampled on the other side of the road and the episode goes on.
+
+    **Info**, at every step and at reset: ``cost`` and its equal ``cost_substep`` (1.0 if robot and car overlapped at
+    the end of any physics substep), ``collisions``, ``goal_met``, ``goals_reached``. At reset they judge the start
+    state, where every overlap counts as begun.
+
+    **Layout**: ``reset(options={"layout": {"agent": [x, y, heading], "goal": [x, y], "cars": [[x, v], ...],
+    "pillars": [[x, y], ...]}})``, six cars (v along x) and four pillars; any subset of the keys, the rest is sampled.
+
+    **Randomness**: the seed alone decides the cars' way through a whole episode, whatever the robot does.
+
+    **State**: `set_state` takes the robot's x, y and heading and the cars' x (9 coordinates, m and rad), and their
+    rates.
+
+    **End**: an episode never terminates; `gymnasium.make` truncates after 500 steps (20 s).
+
+    Args:
+        kwargs: Passed to `gymnasium.envs.mujoco.MujocoEnv` (``render_mode``, ``width``, ``camera_name``, ...).
+
+    Example:
+        >>> import gymnasium as gym, numpy as np, safe_wrappers
+        >>> env = gym.make("OccludedCrossing-v0")
+        >>> _ = env.reset(seed=0)
+        >>> for _ in range(100):
+        ...     observation, reward, _, _, info = env.step(np.array([0, 1, 0]))
+        >>> bool(observation[1] > 1.3)  # straight ahead, over the road
+        True
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium declares it on the instance)
+        "render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"],
+        "render_fps": 25,
+    }
+
+    robot_radius: Final = ROBOT_RADIUS
+    car_radius: Final = CAR_RADIUS
+    pillar_radius: Final = PILLAR_RADIUS
+    goal_radius: Final = CROSSING_GOAL_RADIUS
+    car_bodies: Final = CAR_BODIES
+    lane_centres: Final = LANE_CENTRES
+
+    def __init__(self, **kwargs: Any) -> None:
+        EzPickle.__init__(self, **kwargs)
+        kwargs.setdefault("default_camera_config", _CAMERA)
+        space = Box(-np.inf, np.inf, (9 + 2 * PILLARS,), dtype=np.float64)
+        MujocoEnv.__init__(self, str(_ASSET), _FRAME_SKIP, space, **kwargs)
+        self._lanes = np.repeat(LANE_CENTRES, CARS_PER_LANE)
+        self._mean_velocities = CAR_MEAN_SPEED * np.repeat([1.0, -1.0], CARS_PER_LANE)
+        self._traffic = Traffic(self._mean_velocities, self.model.opt.timestep, _FRAME_SKIP)
+        self._goal_met = False
+        self._goals_reached = 0
+        cars = np.stack([np.zeros(CARS), self._mean_velocities], axis=1)
+        self._apply(CrossingLayout(np.array([0.0, -2.9, 0.0]), np.zeros(2), cars, np.zeros((PILLARS, 2))))
+
+    # What a constraint or a judge may read: from qpos, never a substep behind ------------------------------
+
+    @property
+    def agent_position(self) -> Array:
+        """The robot's axis, shape (2,), m."""
+        return np.array(self.data.qpos[:2])
+
+    @property
+    def agent_velocity(self) -> Array:
+        """Shape (2,), m/s."""
+        return np.array(self.data.qvel[:2])
+
+    @property
+    def agent_heading(self) -> float:
+        """Heading in [-pi, pi], rad."""
+        return math.remainder(self.data.qpos[2], math.tau)
+
+    @property
+    def goal_position(self) -> Array:
+        """Goal's centre, shape (2,), m."""
+        return np.array(self._goal)
+
+    @property
+    def pillar_positions(self) -> Array:
+        """Centres of the pillars, shape (4, 2), m."""
+        return self._pillars.copy()
+
+    @property
+    def car_positions(self) -> Array:
+        """Centres of the cars, shape (6, 2), m: the truth that no driver may see."""
+        return np.stack([self.data.qpos[_CARS], self._lanes], axis=1)
+
+    @property
+    def car_velocities(self) -> Array:
+        """Velocities of the cars, shape (6, 2), m/s: as true."""
+        return np.stack([self.data.qvel[_CARS], np.zeros(CARS)], axis=1)
+
+    # Gymnasium ---------------------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Start an episode; ``options["layout"]`` fixes parts of the scenario.
+
+        Raises:
+            UnknownNameError: An unknown layout key.
+            ConfigurationError: A layout that cannot be used.
+        """
+        self._given = parse_crossing_layout(options)
+        observation, info = super().reset(seed=seed, options=options)
+        return observation, info
+
+    def reset_model(self) -> Array:
+        """Sample what the options left open, place everything, return the observation."""
+        layout = sample_crossing_layout(self.np_random, self._given)
+        # A stream of the cars' own: a goal reached, and so the next one drawn, must not change their way.
+        self._cars_random = np.random.default_rng(self.np_random.integers(2**63))
+        self._apply(layout)
+        return self.observe()
+
+    def set_state(self, qpos: Array, qvel: Array) -> None:
+        """Set positions and velocities, shape (9,) each, with the controls at 0, and judge the state."""
+        for left_over in (self.data.ctrl, self.data.qacc_warmstart):
+            left_over[:] = 0.0
+        super().set_state(qpos, qvel)  # type: ignore[no-untyped-call]
+        self._touching = np.zeros(CARS, dtype=bool)
+        self._judge(self.data.qpos[None, :2], self.data.qpos[None, _CARS])
+
+    # MujocoEnv's signature promises NumPy scalars where Env's promises Python's: ours are Python's.
+    def step(  # type: ignore[override]
+        self, action: NDArray[np.floating[Any]]
+    ) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """Hold an action for one control step.
+
+        Raises:
+            ActionError: Wrong shape, or a number that is not finite; the env was not stepped.
+            SafeWrappersError: The physics left finite numbers.
+        """
+        control = np.asarray(action, dtype=np.float64)
+        if control.shape != (self.model.nu,) or not np.isfinite(control).all():
+            raise ActionError(f"action must be {self.model.nu} finite numbers; got {control.tolist()}")
+        before = self._goal_distance()
+        self._step_mujoco_simulation(control, self.frame_skip)
+        distance = self._goal_distance()
+        reward = before - distance
+        self._goal_met = distance <= CROSSING_GOAL_RADIUS
+        if self._goal_met:
+            reward += 1.0
+            self._goals_reached += 1
+            self.place_goal(sample_crossing_goal(self.np_random, self.agent_position, self._pillars))
+        if not math.isfinite(float(self.data.qpos.sum() + self.data.qvel.sum())):
+            raise SafeWrappersError(_NOT_FINITE)
+        if self.render_mode == "human":
+            self.render()  # type: ignore[no-untyped-call]
+        return self.observe(), reward, False, False, self._get_reset_info()
+
+    def observe(self) -> Array:
+        """Observation of the state as it is now: also right after `set_state`."""
+        x, y, heading = self.data.qpos[:3].tolist()
+        vx, vy, yaw_rate = self.data.qvel[:3].tolist()
+        goal_x, goal_y = self._goal
+        observation = np.empty(9 + 2 * PILLARS)
+        observation[:9] = x, y, vx, vy, math.cos(heading), math.sin(heading), yaw_rate, goal_x - x, goal_y - y
+        observation[9:] = (self._pillars - self.data.qpos[:2]).ravel()
+        return observation
+
+    def _get_reset_info(self) -> dict[str, Any]:
+        return {
+            COST: self._cost,
+            COST_SUBSTEP: self._cost,
+            COLLISIONS: self._collisions,
+            GOAL_MET: self._goal_met,
+            GOALS_REACHED: self._goals_reached,
+        }
+
+    # Physics and judging -----------------------------------------------------------------------------------
+
+    def _step_mujoco_simulation(self, ctrl: Array, n_frames: int) -> None:
+        """Step substep by substep: MuJoCo moves the robot, the traffic's law the cars. Judge them all at the end."""
+        model, data = self.model, self.data
+        qpos, qvel = data.qpos, data.qvel
+        step_s = model.opt.timestep
+        if (self._traffic.step_s, self._traffic.steps) != (step_s, n_frames):
+            self._traffic = Traffic(self._mean_velocities, step_s, n_frames)
+        cars = self._traffic.drive(self._cars_random, qpos[_CARS], qvel[_CARS])
+        robot = np.empty((n_frames, 2))
+        data.ctrl[:] = ctrl
+        for k in range(n_frames):
+            mujoco.mj_step(model, data)
+            qpos[_CARS], qvel[_CARS] = cars[k]
+            robot[k] = qpos[:2]
+        mujoco.mj_forward(model, data)  # poses, sensors and contacts of the state reached
+        self._judge(robot, cars[:, 0])
+
+    def _judge(self, robot: Array, cars: Array) -> None:
+        """Judge consecutive substeps: the robot's positions, shape (n, 2), and the cars' x, shape (n, 6)."""
+        ahead = cars - robot[:, :1]
+        aside = self._lanes - robot[:, 1:]
+        touching = ahead * ahead + aside * aside <= _CONTACT_SQUARED
+        self._cost, self._collisions = 0.0, 0
+        if touching.any():
+            before = np.concatenate([self._touching[None], touching[:-1]])
+            self._cost, self._collisions = 1.0, int((touching & ~before).sum())
+        self._touching = touching[-1]
+
+    # Scenario ----------------------------------------------------------------------------------------------
+
+    def _apply(self, layout: CrossingLayout) -> None:
+        """Start an episode from a layout, the robot at rest."""
+        self._goals_reached = 0
+        self._goal_met = False
+        self._pillars = layout.pillars
+        self.data.mocap_pos[_GOAL_BODY + 1 :, :2] = layout.pillars
+        self.place_goal(layout.goal)
+        qpos, qvel = np.zeros(self.model.nq), np.zeros(self.model.nv)
+        qpos[:3] = layout.agent
+        qpos[_CARS], qvel[_CARS] = layout.cars.T
+        self.set_state(qpos, qvel)
+
+    def place_goal(self, goal: Array) -> None:
+        """Move the goal to a centre, shape (2,), m; the next step's reward counts from there."""
+        self._goal: tuple[float, float] = float(goal[0]), float(goal[1])
+        self.data.mocap_pos[_GOAL_BODY, :2] = self._goal
+
+    def _goal_distance(self) -> float:
+        x, y = self.data.qpos[:2].tolist()
+        goal_x, goal_y = self._goal
+        return math.hypot(goal_x - x, goal_y - y)
