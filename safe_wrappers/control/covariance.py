@@ -17,13 +17,14 @@ Anderson and Moore, "Optimal Filtering" (1979), for doubling the Riccati equatio
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import expm, matrix_balance, solve_continuous_are
+from scipy.linalg import expm, solve_continuous_are
 
+from safe_wrappers.control.block_exponentials import Discrete, norm_or_one, riccati_flow, van_loan
 from safe_wrappers.control.finite import finite_arrays
+from safe_wrappers.control.first_crossing import first_crossing
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -35,20 +36,8 @@ _MODE = 1e-8
 of a double pole are not known any better than that."""
 _GOAL = 1e-12
 """A tolerance is met with this much to spare, relative, so that rounding never makes a time late."""
-_ORDER = 12
-"""Terms of the Taylor series that bounds a window of time in `blind_time`."""
-
-
-class Discrete(NamedTuple):
-    """x -> F x plus noise of covariance Q_d: the system over one step of time.
-
-    Attributes:
-        transition: F = exp(A t), shape (..., n, n).
-        noise: Q_d, symmetric, shape (..., n, n).
-    """
-
-    transition: Array
-    noise: Array
+_LARGEST = 1e100
+"""A tolerance above it counts as it: the covariance must not overflow before it gets there."""
 
 
 def checked_covariance(name: str, matrix: ArrayLike, n: int | None = None) -> Array:
@@ -150,7 +139,7 @@ def discretise(A: ArrayLike, Q: ArrayLike, time_s: ArrayLike) -> Discrete:
     """
     a, q = _system(A, Q)
     times = _times(time_s)
-    step = _van_loan(a, q, times)
+    step = van_loan(a, q, times)
     _in_range(*step, times)
     return step
 
@@ -239,7 +228,7 @@ def seen_covariance(
     seen = np.empty((*times.shape, *start.shape))
     for index in np.ndindex(times.shape):
         with np.errstate(over="ignore", invalid="ignore"):
-            seen[index] = _riccati(start, a, q, information, float(times[index]))
+            seen[index] = riccati_flow(start, a, q, information, float(times[index]))
         _in_range(seen[index], seen[index], times[index])
     return seen
 
@@ -294,7 +283,7 @@ def steady_state(A: ArrayLike, Q: ArrayLike, C: ArrayLike, R: ArrayLike) -> Arra
     """
     a, q = _system(A, Q)
     c, r, information = _sensor(a, C, R)
-    scale = _size(a)
+    scale = norm_or_one(a)
     _refuse_unreached(a, c, scale, "detectable", "C does not see it, so its covariance grows without end")
     _refuse_unreached(
         a.T,
@@ -359,138 +348,8 @@ def blind_time(
         if not (math.isfinite(value) and value > 0.0):
             raise ConfigurationError(f"{name} must be finite and above 0, got {value!r}")
     horizon = float(_times(horizon_s, "horizon_s"))
-    goal = (tolerance / sigmas) ** 2 * (1.0 - _GOAL)
-    if _largest(rows, start) >= goal:
-        return 0.0
-    return _first_crossing(start, a, q, rows, goal, horizon)
-
-
-def _first_crossing(start: Array, a: Array, q: Array, rows: Array, goal: float, horizon: float) -> float:
-    """First time at which the largest eigenvalue of D P D' reaches the goal, never late; inf after the horizon."""
-    # dP/dt is exp(A t) X exp(A t)' with X that at the start: once of one sign, always of it.
-    rates = np.linalg.eigvalsh(lyapunov_rate(start, a, q))
-    if rates[-1] <= 0.0:
-        return math.inf
-    if rates[0] >= 0.0:
-        return _crossing_of_rising(start, a, q, rows, goal, horizon)
-    # The remainder of the series is measured in norms: balanced, they are the least wasteful.
-    a, scales = matrix_balance(a, permute=False)
-    inverse = np.linalg.inv(scales)
-    start, q, rows = inverse @ start @ inverse.T, inverse @ q @ inverse.T, rows @ scales
-    rate, length = float(np.linalg.norm(a, 2)), float(np.linalg.norm(rows, 2))
-    time = 0.0
-    while True:
-        step = _van_loan(a, q, np.asarray(time))
-        now = step.transition @ start @ step.transition.T + step.noise
-        value = rows @ now @ rows.T
-        derivative = lyapunov_rate(now, a, q)
-        slope = rows @ derivative @ rows.T
-        curve = [0.0] * (_ORDER + 2)
-        for order in range(2, _ORDER + 1):
-            derivative = lyapunov_rate(derivative, a, np.zeros_like(q))
-            curve[order] = max(0.0, _largest(rows, derivative)) / math.factorial(order)
-        # Derivatives of P obey the homogeneous equation: exp(A t) X exp(A t)', at most e^2 times X while |A| t <= 1.
-        last = float(np.linalg.norm(lyapunov_rate(derivative, a, np.zeros_like(q)), 2))
-        curve[-1] = math.exp(2.0) * length**2 * last / math.factorial(_ORDER + 1)
-        room = horizon - time
-        longest = room if last == 0.0 else min(room, 1.0 / rate)
-        free = _longest_free(value, slope, curve, goal, longest)
-        if free == room:
-            return math.inf
-        if free <= 1e-9 * (time + free) or time + free == time:
-            return time
-        time += free
-
-
-def _longest_free(value: Array, slope: Array, curve: list[float], goal: float, longest: float) -> float:
-    """The longest window in which the bound `value + slope t + sum of curve[k] t^k` stays below the goal."""
-    first = float(np.linalg.eigvalsh(value)[-1])
-
-    def peak(time: float) -> float:
-        # The largest eigenvalue of value + slope t is convex in t: over a window it is largest at an end.
-        line = max(first, float(np.linalg.eigvalsh(value + time * slope)[-1]))
-        return line + sum(factor * time**order for order, factor in enumerate(curve))
-
-    if peak(longest) < goal:
-        return longest
-    free, crossed = 0.0, longest
-    for _ in range(50):
-        middle = 0.5 * (free + crossed)
-        free, crossed = (middle, crossed) if peak(middle) < goal else (free, middle)
-    return free
-
-
-def _crossing_of_rising(start: Array, a: Array, q: Array, rows: Array, goal: float, horizon: float) -> float:
-    """As `_first_crossing` where dP/dt is positive semidefinite at the start, so always: then P only rises."""
-    steps_s = horizon * 2.0 ** -np.arange(46)
-    steps = _van_loan(a, q, steps_s)
-    time, now = 0.0, start
-    for step_s, transition, noise in zip(steps_s, *steps, strict=True):
-        later = transition @ now @ transition.T + noise
-        if np.isfinite(later).all() and _largest(rows, later) < goal:
-            time, now = time + float(step_s), later
-            if time >= horizon:
-                return math.inf
-    return time
-
-
-def _largest(rows: Array, covariance: Array) -> float:
-    return float(np.linalg.eigvalsh(rows @ covariance @ rows.T)[-1])
-
-
-def _van_loan(a: Array, q: Array, times: Array) -> Discrete:
-    """`discretise` without its checks; what overflows is not finite."""
-    n = len(a)
-    size = _size(q)
-    doublings = _doublings(_size(a), times)
-    base = (times / 2.0**doublings)[..., None, None]
-    block = np.zeros((*times.shape, 2 * n, 2 * n))
-    block[..., :n, :n], block[..., n:, n:] = -a * base, a.T * base
-    block[..., :n, n:] = q / size
-    exponential = expm(block)
-    transition = np.swapaxes(exponential[..., n:, n:], -1, -2)
-    noise = transition @ exponential[..., :n, n:] * (size * base)
-    with np.errstate(over="ignore", invalid="ignore"):
-        for level in range(int(doublings.max(initial=0))):
-            on = (doublings > level)[..., None, None]
-            noise = np.where(on, transition @ noise @ np.swapaxes(transition, -1, -2) + noise, noise)
-            transition = np.where(on, transition @ transition, transition)
-    return Discrete(transition, 0.5 * (noise + np.swapaxes(noise, -1, -2)))
-
-
-def _riccati(start: Array, a: Array, q: Array, information: Array, time: float) -> Array:
-    """P(t) of the Riccati equation: P -> Q_t + E P (I + G P)^-1 E', with E, Q_t, G by doubling.
-
-    Over a short time they are the blocks of the Hamiltonian's exponential. Two equal steps in a row are one of the
-    same form, in which only sums and products of positive semidefinite matrices occur.
-    """
-    unit = math.sqrt(_size(q) / _size(information))
-    hamiltonian = np.block([[a, q / unit], [information * unit, -a.T]])
-    doublings = int(_doublings(_size(hamiltonian), np.asarray(time)))
-    exponential = expm(hamiltonian * (time / 2.0**doublings))
-    n = len(a)
-    transition = np.linalg.inv(exponential[n:, n:]).T
-    noise, seen = exponential[:n, n:] @ transition.T, transition.T @ exponential[n:, :n]
-    while doublings > 0 and np.abs(transition).max() < 1e4:  # beyond, an unstable mode would drown the others
-        doublings -= 1
-        between = np.linalg.inv(np.eye(n) + noise @ seen)
-        noise, seen, transition = (
-            noise + transition @ between @ noise @ transition.T,
-            seen + transition.T @ seen @ between @ transition,
-            transition @ between @ transition,
-        )
-        noise, seen = 0.5 * (noise + noise.T), 0.5 * (seen + seen.T)
-    now = start / unit
-    for _ in range(2**doublings):
-        values, vectors = np.linalg.eigh(now)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
-        turned = np.swapaxes(root, -1, -2)
-        moved = transition @ root @ np.linalg.solve(np.eye(n) + turned @ seen @ root, turned) @ transition.T
-        later = noise + 0.5 * (moved + np.swapaxes(moved, -1, -2))
-        if np.array_equal(later, now) or not np.isfinite(later).all():
-            return np.asarray(later * unit)  # at rest, bit for bit, for good; or out of range
-        now = later
-    return np.asarray(now * unit)
+    goal = min(tolerance / sigmas, _LARGEST) ** 2 * (1.0 - _GOAL)
+    return first_crossing(start, a, q, rows, goal, horizon)
 
 
 def _refuse_unreached(a: Array, c: Array, scale: float, word: str, why: str) -> None:
@@ -498,7 +357,7 @@ def _refuse_unreached(a: Array, c: Array, scale: float, word: str, why: str) -> 
     for mode in np.linalg.eigvals(a):
         if mode.real < -_MODE * scale:
             continue
-        pencil = np.vstack(((a - mode * np.eye(len(a))) / scale, c / _size(c)))
+        pencil = np.vstack(((a - mode * np.eye(len(a))) / scale, c / norm_or_one(c)))
         _, singular, directions = np.linalg.svd(pencil)
         if singular[-1] < _MODE:
             direction = np.round(directions[-1].conj() / np.abs(directions[-1]).max(), 6)
@@ -554,16 +413,6 @@ def _times(time_s: ArrayLike, name: str = "time_s") -> Array:
     if (times < 0.0).any():
         raise ConfigurationError(f"{name} must be at least 0 s, got {time_s!r}: time does not run backwards")
     return times
-
-
-def _size(matrix: Array) -> float:
-    """Its largest column sum; 1 for a zero matrix, to divide by."""
-    return float(np.linalg.norm(matrix, 1)) or 1.0
-
-
-def _doublings(rate: float, times: Array) -> NDArray[np.int64]:
-    """How often each time is halved until `rate time <= 1`, in which the exponential is well conditioned."""
-    return np.maximum(np.ceil(np.log2(np.maximum(rate * times, 1.0))), 0.0).astype(np.int64)
 
 
 def _in_range(first: Array, second: Array, times: Array) -> None:

@@ -121,6 +121,6 @@ def _checked(sigmas: ArrayLike, dimensions: int) -> tuple[Array, int]:
 
 
 def _dimensions(dimensions: int) -> int:
-    if int(dimensions) != dimensions or dimensions < 1:
+    if not isinstance(dimensions, int | np.integer) or dimensions < 1:
         raise ConfigurationError(f"dimensions must be a whole number of at least 1, got {dimensions!r}")
     return int(dimensions)
