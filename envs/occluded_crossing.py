@@ -127,6 +127,7 @@ class OccludedCrossingEnv(MujocoEnv, EzPickle):
         self._lanes = np.repeat(LANE_CENTRES, CARS_PER_LANE)
         self._mean_velocities = CAR_MEAN_SPEED * np.repeat([1.0, -1.0], CARS_PER_LANE)
         self._traffic = Traffic(self._mean_velocities, self.model.opt.timestep, _FRAME_SKIP)
+        self._cars_random = np.random.default_rng(0)  # until the first reset
         self._goal_met = False
         self._goals_reached = 0
         cars = np.stack([np.zeros(CARS), self._mean_velocities], axis=1)

@@ -1,0 +1,594 @@
+"""The crossing: judged against replays, its eye against trigonometry, its robot against closed forms."""
+
+import copy
+import math
+import pickle
+import warnings
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from hypothesis import given
+from hypothesis import strategies as st
+
+from safe_wrappers.envs import CROSSING_EPISODE_STEPS, OCCLUDED_CROSSING_ID
+from safe_wrappers.envs.occluded_crossing import CAR_BODIES, CAR_MEAN_SPEED, CAR_SPEED_STD
+from safe_wrappers.errors import ActionError, ConfigurationError, SafeWrappersError, UnknownNameError
+
+INFO_TYPES = {
+    "cost": float,
+    "cost_substep": float,
+    "collisions": int,
+    "goal_met": bool,
+    "goals_reached": int,
+}
+FAR = 60.0
+NO_CARS = [[FAR, 0.0]] * 6
+PILLARS = [[-2.5, -1.9], [2.5, -1.9], [-2.5, 1.9], [2.5, 1.9]]
+OPEN = {"agent": [0.0, -2.9, math.pi / 2], "goal": [0.0, 2.9], "cars": NO_CARS, "pillars": PILLARS}
+
+
+@pytest.fixture
+def env():
+    made = gym.make(OCCLUDED_CROSSING_ID).unwrapped
+    yield made
+    made.close()
+
+
+def start(env, seed=0, **layout):
+    return env.reset(seed=seed, options={"layout": {**OPEN, **layout}})
+
+
+def cars_at(*cars):
+    """The given [x, v], and the rest far away."""
+    return [*cars, *NO_CARS[len(cars) :]]
+
+
+def push(x=0.0, y=0.0, turn=0.0):
+    return np.array([x, y, turn])
+
+
+def towards_goal(env, rng, noise=0.3):
+    """A driver that knows nothing of cars or pillars."""
+    to_goal = env.goal_position - env.agent_position
+    return np.clip(np.append(2.0 * to_goal, 0.0) + rng.normal(0.0, noise, 3), -1.0, 1.0)
+
+
+# The robot ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("heading", [0.0, 2.0])
+def test_force_acts_along_the_worlds_axes_and_takes_it_to_two_metres_a_second(env, axis, heading):
+    start(env, agent=[0.0, -2.9, heading], pillars=[[FAR, FAR]] * 4)
+    control = push(*np.eye(2)[axis])
+    env.set_state(np.array([-3.5, -3.0, heading, *[FAR] * 6]), np.zeros(9))
+    for k in range(1, 60):
+        env.step(control)
+        # m v' = 4 N - 2 N s/m v, in steps of 10 ms: v_k = 2 (1 - 0.98^k).
+        assert env.agent_velocity[axis] == pytest.approx(2.0 * (1.0 - 0.98 ** (4 * k)), abs=1e-12)
+        assert env.agent_velocity[1 - axis] == 0.0
+    assert env.agent_velocity[axis] > 1.98
+
+
+@given(speed=st.floats(0.05, 2.0), heading=st.floats(-3.0, 3.0))
+def test_it_brakes_with_four_metres_per_second_squared_at_any_speed(speed, heading):
+    env = _open_field()
+    qvel = np.zeros(9)
+    qvel[0] = speed
+    env.set_state(np.array([0.0, 0.0, heading, *[FAR] * 6]), qvel)
+    env.frame_skip = 1
+    before = speed
+    while before > 0.0:
+        env.step(push(-1.0))
+        now = env.agent_velocity[0]
+        assert (before - now) / 0.01 >= 4.0 - 1e-9
+        before = now
+    assert env.agent_position[0] <= speed**2 / 8.0
+
+
+_KEPT = {}
+
+
+def _open_field():
+    """One env for all of hypothesis's examples, far from everything."""
+    if not _KEPT:
+        _KEPT["env"] = gym.make(OCCLUDED_CROSSING_ID).unwrapped
+    env = _KEPT["env"]
+    start(env, pillars=[[FAR, FAR]] * 4)
+    return env
+
+
+def test_it_turns_with_four_radians_a_second_and_stays_where_it_is(env):
+    start(env)
+    rates = []
+    for _ in range(50):
+        env.step(push(turn=1.0))
+        rates.append(env.data.qvel[2])
+    assert rates[3] > 0.96 * 4.0  # 0.16 s
+    assert rates[-1] == pytest.approx(4.0, abs=1e-9)
+    np.testing.assert_allclose(env.agent_position, [0.0, -2.9], atol=1e-12)
+    assert -math.pi <= env.agent_heading <= math.pi
+    assert math.cos(env.agent_heading) == pytest.approx(env.observe()[4], abs=1e-12)
+
+
+# What stops it -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("angle", np.linspace(0.0, 2.0 * np.pi, 9)[:-1] + 0.2)
+def test_pillars_are_solid_and_frictionless(env, angle):
+    """Run into one at the largest speed and on with full force, from all sides; then past it, off its centre."""
+    along = np.array([math.cos(angle), math.sin(angle)])
+    control = push(*(along / np.abs(along).max()))
+    pillar = np.array([0.0, 0.0])
+    for aside in (0.0, 0.2):
+        offset = aside * np.array([-along[1], along[0]])
+        start(env, pillars=[[0.0, 0.0], *PILLARS[1:]])
+        qvel = np.zeros(9)
+        qvel[:2] = 2.0 * along / np.abs(along).max()
+        env.set_state(np.array([*(-0.8 * along + offset), 0.0, *[FAR] * 6]), qvel)
+        env.frame_skip = 1
+        nearest = math.inf
+        for _ in range(160):
+            env.step(control)
+            nearest = min(nearest, math.dist(env.agent_position, pillar))
+        assert 0.55 - 0.02 < nearest < 0.551
+        # Stuck only where it runs at the centre (and there only by rounding); never through it.
+        if aside:
+            assert (env.agent_position - pillar) @ along > 0.3
+        assert env.data.qvel[2] == pytest.approx(0.0, abs=2e-3)  # rad/s, of the contact point's rounding
+        env.frame_skip = 4
+
+
+def test_rails_keep_it_in_the_field(env):
+    rng = np.random.default_rng(0)
+    start(env, pillars=[[FAR, FAR]] * 4)
+    reach = []
+    for k in range(1500):
+        if k % 75 == 0:
+            control = push(*rng.choice([-1.0, 1.0], 2))
+        env.step(control)
+        reach.append(np.abs(env.agent_position))
+    np.testing.assert_allclose(np.max(reach, axis=0), [3.8, 3.3], atol=0.02)
+
+
+def test_cars_pass_through_the_robot(env):
+    start(env, agent=[0.0, -0.8, 0.0], cars=cars_at([-1.0, 1.0]))
+    cost = sum(env.step(push())[4]["cost"] for _ in range(60))
+    np.testing.assert_array_equal(env.agent_position, [0.0, -0.8])
+    assert cost > 10
+
+
+# The eye -----------------------------------------------------------------------------------------------------
+
+
+def test_camera_and_site_look_ahead_from_their_place_on_the_turning_robot(env):
+    rng = np.random.default_rng(1)
+    env.reset(seed=1)
+    for _ in range(60):
+        env.step(rng.uniform(-1.0, 1.0, 3))
+        x, y, heading = env.data.qpos[:3]
+        ahead = np.array([math.cos(heading), math.sin(heading), 0.0])
+        eye = [x + 0.15 * ahead[0], y + 0.15 * ahead[1], 0.3]
+        camera, site = env.data.cam("eye"), env.data.site("eye")
+        np.testing.assert_allclose(camera.xpos, eye, atol=1e-12)
+        np.testing.assert_allclose(site.xpos, eye, atol=1e-12)
+        np.testing.assert_allclose(camera.xmat.reshape(3, 3)[:, 2], -ahead, atol=1e-12)
+        np.testing.assert_allclose(camera.xmat.reshape(3, 3)[:, 1], [0, 0, 1], atol=1e-12)
+        np.testing.assert_allclose(site.xmat.reshape(3, 3)[:, 2], ahead, atol=1e-12)
+        assert env.agent_heading == pytest.approx(math.remainder(heading, math.tau))
+        for i, body in enumerate(env.car_bodies):  # bodies stand where the truth says, this substep
+            np.testing.assert_allclose(env.data.body(body).xpos[:2], env.car_positions[i], atol=1e-12)
+            assert env.data.body(body).xpos[2] == 0.3
+    assert env.model.cam("eye").fovy[0] == 100.0
+
+
+def ray(env, target):
+    """Name of the first geom on the way from the eye to a point of the plane, and its distance."""
+    origin = env.data.cam("eye").xpos
+    way = np.append(np.asarray(target) - origin[:2], 0.0)
+    geom = np.zeros(1, dtype=np.int32)
+    robot = env.model.body("robot").id
+    found = mujoco.mj_ray(env.model, env.data, origin, way / np.linalg.norm(way), None, 1, robot, geom)
+    return (env.model.geom(int(geom[0])).name if geom[0] >= 0 else None), found
+
+
+def test_level_rays_meet_cars_and_pillars_and_nothing_else(env):
+    seen = hidden = 0
+    for seed in range(20):
+        env.reset(seed=seed)
+        rng = np.random.default_rng(seed)
+        for _ in range(12 * (seed % 6)):
+            env.step(towards_goal(env, rng))
+        eye = env.data.cam("eye").xpos[:2].copy()
+        bodies = np.concatenate([env.car_positions, env.pillar_positions])
+        radii = np.repeat([env.car_radius, env.pillar_radius], [6, 4])
+        names = [*env.car_bodies, *(f"pillar{i}" for i in range(4))]
+        for target in env.car_positions:
+            # Oracle: the smallest root of |eye + t way - centre| = radius over all discs.
+            way = (target - eye) / math.dist(target, eye)
+            along = (bodies - eye) @ way
+            clear = radii**2 - np.sum((bodies - eye) ** 2, axis=1) + along**2
+            entry = np.where(clear > 0, along - np.sqrt(np.maximum(clear, 0.0)), np.inf)
+            if (np.linalg.norm(bodies - eye, axis=1) < radii).any():
+                continue  # the eye is inside a car
+            entry[entry < 0.0] = np.inf
+            name, distance = ray(env, target)
+            assert name == names[int(entry.argmin())]
+            assert distance == pytest.approx(entry.min(), abs=1e-9)
+            seen += name.startswith("car")
+            hidden += name.startswith("pillar")
+    assert seen > 20
+    assert hidden > 3
+    start(env, cars=[[FAR, 0.0]] * 6, pillars=[[FAR, FAR]] * 4)
+    for angle in np.linspace(-3.0, 3.0, 50):
+        if abs(math.sin(angle)) > 0.1:  # rails, road, floor and what stops the robot are no sight
+            x, y, _ = env.data.cam("eye").xpos
+            assert ray(env, [x + math.cos(angle), y + math.sin(angle)])[0] is None
+
+
+# Collisions --------------------------------------------------------------------------------------------------
+
+
+def replayed(env, seed, actions, layout):
+    """Positions after every physics substep, from the same episode at a quarter of the control step."""
+    env.frame_skip = 1
+    env.reset(seed=seed, options={"layout": layout})
+    robots, cars = [], []
+    for action in actions:
+        for _ in range(4):
+            env.step(action)
+            robots.append(env.agent_position)
+            cars.append(env.car_positions)
+    return np.array(robots), np.array(cars)
+
+
+def test_cost_and_collisions_count_every_substep(env):
+    """Independent oracle: a replay substep by substep, distances judged one by one."""
+    other = gym.make(OCCLUDED_CROSSING_ID).unwrapped
+    rng = np.random.default_rng(2)
+    costs = between = begun = 0
+    for seed in range(16):
+        fast = cars_at([-4.0, 25.0], [-9.0, 15.0], [-2.5, 2.0], [6.0, -30.0], [8.0, -10.0])
+        layout = {**OPEN, "agent": [0.0, -1.5, 0.0], "cars": fast}
+        actions = np.repeat(rng.uniform([-0.4, -0.2, -1.0], [0.4, 0.8, 1.0], (10, 3)), 12, axis=0)
+        robots, cars = replayed(other, seed, actions, layout)
+        touching = np.linalg.norm(cars - robots[:, None], axis=2) <= 0.6
+        _, info = env.reset(seed=seed, options={"layout": layout})
+        assert info["cost"] == info["collisions"] == 0
+        was = np.zeros(6, dtype=bool)
+        for k, action in enumerate(actions):
+            info = env.step(action)[4]
+            np.testing.assert_allclose(env.agent_position, robots[4 * k + 3], atol=1e-9)
+            np.testing.assert_allclose(env.car_positions, cars[4 * k + 3], atol=1e-9)
+            now = touching[4 * k : 4 * k + 4]
+            count = 0
+            for contact in now:
+                count += sum(bool(c and not w) for c, w in zip(contact, was, strict=True))
+                was = contact
+            assert info["cost"] == info["cost_substep"] == float(now.any())
+            assert info["collisions"] == count
+            costs += now.any()
+            between += now.any() and not now[-1].any()
+            begun += count
+    assert between > 3
+    assert 10 < begun < costs
+
+
+def test_a_contact_that_lasts_is_one_collision_and_a_start_in_one_counts(env):
+    _, info = start(env, agent=[0.0, -0.8, 0.0], cars=cars_at([-0.3, 1.0], [0.3, 1.0]))
+    assert info["cost"] == 1.0
+    assert info["collisions"] == 2
+    later = [env.step(push())[4] for _ in range(10)]
+    assert {info["cost"] for info in later} == {1.0}
+    assert sum(info["collisions"] for info in later) == 0
+    for _ in range(60):
+        info = env.step(push())[4]
+    assert info["cost"] == 0.0
+
+
+@pytest.mark.parametrize(("gap", "cost"), [(0.6 - 1e-9, 1.0), (0.6 + 1e-9, 0.0)])
+def test_contact_is_where_the_discs_meet(env, gap, cost):
+    _, info = start(env, agent=[0.0, -0.8 + gap, 0.0], cars=cars_at([0.0, 1.0]))
+    assert info["cost"] == cost
+    _, info = start(env, agent=[0.0, 0.8 - gap, 0.0], cars=[*NO_CARS[:3], [0.0, -1.0], *NO_CARS[:2]])
+    assert info["cost"] == cost
+
+
+# The traffic -------------------------------------------------------------------------------------------------
+
+
+def test_the_seed_alone_decides_the_cars_way(env):
+    paths, goals = [], []
+    for driver in range(3):
+        rng = np.random.default_rng(driver)
+        env.reset(seed=3)
+        path = []
+        for _ in range(400):
+            info = env.step(towards_goal(env, rng, noise=0.2 * driver) if driver else push())[4]
+            path.append(np.append(env.car_positions, env.car_velocities))
+        paths.append(path)
+        goals.append(info["goals_reached"])
+    np.testing.assert_array_equal(paths[1], paths[0])
+    np.testing.assert_array_equal(paths[2], paths[0])
+    assert goals[0] == 0 < goals[1]
+
+
+def test_cars_start_upstream_and_drive_along_their_lanes(env):
+    speeds, arrivals = [], []
+    for seed in range(40):
+        env.reset(seed=seed)
+        positions, velocities = env.car_positions, env.car_velocities
+        np.testing.assert_array_equal(positions[:, 1], [-0.8] * 3 + [0.8] * 3)
+        np.testing.assert_array_equal(velocities[:, 1], 0.0)
+        back = positions[:, 0].reshape(2, 3) * [[-1.0], [1.0]]  # metres to go to the field's middle
+        assert back[:, 0].min() >= 2.0
+        assert back[:, 0].max() <= 7.0
+        assert np.diff(back, axis=1).min() >= 5.0
+        assert np.diff(back, axis=1).max() <= 8.0
+        speeds.append(velocities[:, 0] * [1, 1, 1, -1, -1, -1])
+        arrivals.append(back.ravel())
+    z = (np.ravel(speeds) - CAR_MEAN_SPEED) / CAR_SPEED_STD
+    assert abs(z.mean()) < 4.5 / math.sqrt(240)
+    assert abs(z.var() - 1.0) < 4.5 * math.sqrt(2.0 / 240)
+    spread = np.histogram(arrivals, bins=[2, 7, 14, 21])[0]
+    assert spread.min() > 40  # over the whole episode
+
+
+def test_positions_and_velocities_of_the_cars_are_mujocos_state(env):
+    env.reset(seed=4)
+    env.step(push())
+    for i, name in enumerate(CAR_BODIES):
+        joint = env.data.joint(name)
+        assert joint.qpos[0] == env.car_positions[i, 0]
+        assert joint.qvel[0] == env.car_velocities[i, 0]
+    assert env.car_bodies == CAR_BODIES
+    assert env.lane_centres == (-0.8, 0.8)
+
+
+def test_a_changed_time_step_keeps_the_traffics_law(env):
+    """At twice the time step a fast car still comes back to its mean with the same time constant."""
+    ends = []
+    for step in (0.01, 0.02):
+        env.model.opt.timestep = step
+        start(env, cars=cars_at([0.0, 101.0]))
+        for _ in range(round(2.0 / env.dt)):
+            env.step(push())
+        ends.append([env.car_positions[0, 0], env.car_velocities[0, 0]])
+    expected = [2.0 + 200.0 * (1 - math.exp(-1.0)), 1.0 + 100.0 * math.exp(-1.0)]
+    np.testing.assert_allclose(ends, [expected] * 2, atol=1.0)
+
+
+# The task ----------------------------------------------------------------------------------------------------
+
+
+def test_check_env_passes_without_warnings(env):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings(
+            "ignore", message=".*A Box observation space (minimum|maximum) value is -?infinity"
+        )
+        check_env(env, skip_render_check=True)
+
+
+def test_spaces_spec_and_pickling():
+    env = gym.make(OCCLUDED_CROSSING_ID)
+    assert env.action_space == gym.spaces.Box(-1, 1, (3,), np.float32)
+    assert env.observation_space == gym.spaces.Box(-np.inf, np.inf, (17,), np.float64)
+    assert env.unwrapped.dt == pytest.approx(0.04)
+    assert env.metadata["render_fps"] == 25
+    assert env.spec.max_episode_steps == CROSSING_EPISODE_STEPS == 500
+    again = pickle.loads(pickle.dumps(env.unwrapped))
+    np.testing.assert_array_equal(again.reset(seed=7)[0], env.reset(seed=7)[0])
+    np.testing.assert_array_equal(gym.make(env.spec).reset(seed=7)[0], again.observe())
+
+
+def test_info_keeps_its_types_and_a_vector_env_reports_it(env):
+    rng = np.random.default_rng(5)
+    infos = [env.reset(seed=5)[1]]
+    infos += [env.step(towards_goal(env, rng))[4] for _ in range(200)]
+    for info in infos:
+        assert {key: type(value) for key, value in info.items()} == INFO_TYPES
+    envs = gym.make_vec(OCCLUDED_CROSSING_ID, num_envs=2)
+    envs.reset(seed=0)
+    infos = envs.step(np.ones((2, 3)))[4]
+    assert infos["collisions"].dtype.kind == "i"
+    assert infos["cost"].dtype == np.float64
+    envs.close()
+
+
+def test_observation_is_what_it_says_and_knows_no_cars(env):
+    start(env, agent=[1.0, -2.0, 2.0], goal=[-1.0, 2.9])
+    for _ in range(10):
+        observation = env.step(push(0.5, -0.3, 0.8))[0]
+    (x, y, heading), (vx, vy, rate) = env.data.qpos[:3], env.data.qvel[:3]
+    here = np.array([x, y])
+    np.testing.assert_allclose(observation[:7], [x, y, vx, vy, math.cos(heading), math.sin(heading), rate])
+    np.testing.assert_allclose(here + observation[7:9], [-1.0, 2.9])
+    np.testing.assert_allclose(here + observation[9:].reshape(4, 2), PILLARS)
+    np.testing.assert_array_equal(env.pillar_positions, PILLARS)
+    np.testing.assert_array_equal([*env.agent_position, *env.agent_velocity], observation[:4])
+    others = env.data.qpos.copy()
+    others[3:] = 0.0
+    env.set_state(others, env.data.qvel.copy())
+    np.testing.assert_array_equal(env.observe(), observation)
+
+
+def test_goals_change_sides_and_pay_for_the_distance(env):
+    goals = 0
+    for seed in range(3):
+        env.reset(seed=seed)
+        rng = np.random.default_rng(seed)
+        goal = env.goal_position
+        distance = math.dist(goal, env.agent_position)
+        assert goal[1] == 2.9
+        for _ in range(500):
+            _, reward, terminated, truncated, info = env.step(towards_goal(env, rng))
+            assert not (terminated or truncated)
+            now = math.dist(goal, env.agent_position)
+            assert reward == pytest.approx(distance - now + info["goal_met"], abs=1e-12)
+            assert info["goal_met"] == (now <= 0.3)
+            if info["goal_met"]:
+                side, goal = goal[1], env.goal_position
+                assert goal[1] == -side
+                assert abs(goal[0]) <= 2.5
+                assert np.linalg.norm(env.pillar_positions - goal, axis=1).min() >= 0.6
+                now = math.dist(goal, env.agent_position)
+            distance = now
+        goals += info["goals_reached"]
+    assert goals >= 6
+
+
+def test_the_same_seed_is_the_same_episode(env):
+    other = gym.make(OCCLUDED_CROSSING_ID).unwrapped
+    env.reset(seed=6)
+    other.reset(seed=99)
+    other.step(push(1.0, 1.0, 1.0))
+    other.reset(seed=6)
+    rng = np.random.default_rng(6)
+    for _ in range(300):
+        action = towards_goal(env, rng)
+        (observation, reward, _, _, info), got = env.step(action), other.step(action)
+        np.testing.assert_array_equal(got[0], observation)
+        assert got[1] == reward
+        assert got[4] == info
+    np.testing.assert_array_equal(other.data.qpos, env.data.qpos)
+    assert not np.array_equal(env.reset(seed=7)[0], other.reset(seed=8)[0])
+    assert not np.array_equal(env.reset()[0], other.reset()[0])
+
+
+def test_set_state_forgets_the_past_and_judges(env):
+    env.reset(seed=7)
+    for _ in range(30):
+        env.step(push(1.0, 1.0, 1.0))
+    qpos, qvel = env.data.qpos.copy(), env.data.qvel.copy()
+    qpos[3] = 0.0
+    qpos[:2] = 0.1, -0.7
+    ways = []
+    for past in (push(-1.0), push(0.0, 1.0)):
+        for _ in range(5):
+            env.step(past)
+        env.set_state(qpos, qvel)
+        assert env._get_reset_info()["cost"] == 1.0
+        assert env._get_reset_info()["collisions"] == 1
+        eye = env.data.cam("eye").xpos[:2] - qpos[:2]
+        np.testing.assert_allclose(eye, [0.15 * math.cos(qpos[2]), 0.15 * math.sin(qpos[2])], atol=1e-12)
+        assert env.data.ctrl.any() == 0
+        ways.append(env.data.qacc[:3].copy())
+    np.testing.assert_array_equal(ways[0], ways[1])
+
+
+def test_layouts_are_sampled_apart(env):
+    for seed in range(100):
+        env.reset(seed=seed)
+        agent, goal, pillars = env.agent_position, env.goal_position, env.pillar_positions
+        assert agent[1] == -2.9
+        assert goal[1] == 2.9
+        assert abs(agent[0]) <= 2.0
+        assert abs(goal[0]) <= 2.5
+        assert env.agent_heading == pytest.approx(math.pi / 2)
+        np.testing.assert_array_equal(np.sign(pillars[:, 1]), [-1, -1, 1, 1])
+        assert np.abs(pillars[:, 1]).min() >= 1.8
+        assert np.abs(pillars[:, 1]).max() <= 2.0
+        assert np.abs(pillars[:, 0]).max() <= 3.0
+        assert abs(pillars[0, 0] - pillars[1, 0]) >= 1.5
+        assert abs(pillars[2, 0] - pillars[3, 0]) >= 1.5
+        assert env.data.ncon == 0
+
+
+def test_a_given_layout_is_kept_and_the_rest_is_sampled_beside_it(env):
+    layout = {
+        "agent": [-2.0, 1.9, -1.0],
+        "goal": [1.0, -1.9],
+        "cars": [[float(i), 0.1 * i] for i in range(6)],
+    }
+    kept = copy.deepcopy(layout)
+    for seed in range(30):
+        env.reset(seed=seed, options={"layout": layout, "other": 1})
+        np.testing.assert_array_equal(env.data.qpos[:3], layout["agent"])
+        np.testing.assert_array_equal(env.goal_position, layout["goal"])
+        np.testing.assert_array_equal(env.car_positions[:, 0], np.array(layout["cars"])[:, 0])
+        np.testing.assert_array_equal(env.car_velocities[:, 0], np.array(layout["cars"])[:, 1])
+        for place in (layout["agent"][:2], layout["goal"]):
+            assert np.linalg.norm(env.pillar_positions - place, axis=1).min() >= 0.6
+        env.reset(seed=seed, options={"layout": {"agent": [0.0, 2.9, 0.0]}})
+        assert env.goal_position[1] == -2.9
+    assert layout == kept
+    covered = [[-1.5, -2.9], [0.0, -2.9], [1.5, -2.9], [0.0, 2.9]]
+    env.reset(seed=0, options={"layout": {"pillars": covered}})
+    assert np.linalg.norm(env.pillar_positions - env.agent_position, axis=1).min() >= 0.6
+
+
+@pytest.mark.parametrize(
+    ("layout", "error", "match"),
+    [
+        ({"hazards": []}, UnknownNameError, "agent, goal, cars, pillars"),
+        ({"agent": [0, 0]}, ConfigurationError, "x, y, heading"),
+        ({"agent": [0, 3.4, 0]}, ConfigurationError, r"\|y\| <= 3.3"),
+        ({"agent": [-3.9, 0, 0]}, ConfigurationError, r"\|x\| <= 3.8"),
+        ({"agent": [-2.2, -1.9, 0], "pillars": PILLARS}, ConfigurationError, "in a pillar"),
+        ({"agent": [math.nan, 0, 0]}, ConfigurationError, "finite"),
+        ({"goal": "there"}, ConfigurationError, "goal"),
+        ({"cars": [[0, 1]] * 5}, ConfigurationError, "6 cars"),
+        ({"cars": [[0, math.inf]] * 6}, ConfigurationError, "finite"),
+        ({"pillars": PILLARS[:3]}, ConfigurationError, "4 pillars"),
+        ({"pillars": [[x, -2.9] for x in (-1.5, -0.5, 0.5, 1.5)]}, ConfigurationError, "no room"),
+        ([0, 1], ConfigurationError, "mapping"),
+    ],
+)
+def test_bad_layouts_are_refused_with_the_reason(env, layout, error, match):
+    with pytest.raises(error, match=match):
+        env.reset(seed=0, options={"layout": layout})
+
+
+def test_a_misspelt_layout_is_refused(env):
+    with pytest.raises(UnknownNameError, match="did you mean 'layout'"):
+        env.reset(options={"layuot": {}})
+
+
+def test_goals_on_a_covered_pavement_lie_where_there_is_most_room(env):
+    """Pillars over all of the other pavement end no episode: the goal lies in the widest gap."""
+    wall = [[-2.4, 2.9], [-0.8, 2.9], [0.2, 2.9], [1.8, 2.9]]
+    goals = []
+    for seed in range(20):
+        start(env, seed=seed, pillars=wall, goal=None)
+        goals.append(env.goal_position[0])
+    assert max(min(abs(abs(goal + 1.6)), abs(goal - 1.0), abs(goal - 2.5)) for goal in goals) < 0.25
+    assert len(set(goals)) > 1
+
+
+@pytest.mark.parametrize("action", [np.zeros(2), np.zeros((1, 3)), np.array([0, np.nan, 0]), [np.inf, 0, 0]])
+def test_bad_actions_are_refused_before_the_step(env, action):
+    env.reset(seed=8)
+    before = env.data.qpos.copy()
+    with pytest.raises(ActionError, match="3 finite numbers"):
+        env.step(action)
+    np.testing.assert_array_equal(env.data.qpos, before)
+
+
+def test_forces_beyond_the_action_space_are_clipped_by_the_motors(env):
+    ends = []
+    for size in (1.0, 50.0):
+        start(env)
+        env.step(push(size, size, size))
+        ends.append(env.data.qpos[:3].copy())
+    np.testing.assert_array_equal(*ends)
+
+
+@pytest.mark.parametrize("entry", [0, 2, 5])
+def test_a_state_that_is_not_finite_is_said(env, entry):
+    env.reset(seed=9)
+    qpos = env.data.qpos.copy()
+    qpos[entry] = np.nan
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        env.set_state(qpos, env.data.qvel.copy())
+        with pytest.raises(SafeWrappersError, match="not finite"):
+            env.step(push())
+
+
+def test_it_steps_before_the_first_reset(env):
+    observation = env.step(push())[0]
+    assert np.isfinite(observation).all()
