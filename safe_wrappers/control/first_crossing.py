@@ -65,7 +65,8 @@ def _by_bisection(P0: Array, a: Array, q: Array, rows: Array, goal: float, horiz
     steps = van_loan(a, q, steps_s)
     time, now = 0.0, P0
     for step_s, transition, noise in zip(steps_s, *steps, strict=True):
-        later = transition @ now @ transition.T + noise
+        with np.errstate(over="ignore", invalid="ignore"):
+            later = transition @ now @ transition.T + noise
         if np.isfinite(later).all() and largest_variance(rows, later) < goal:
             time, now = time + float(step_s), later
             if time >= horizon:

@@ -1,0 +1,218 @@
+"""The sampled filter: against Bayes' rule written out, python-control, and its own claims in Monte-Carlo runs."""
+
+import control as ct
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import chi2
+
+from safe_wrappers.control.covariance import discretise, discretise_drift, seen_covariance
+from safe_wrappers.control.kalman import chi_square_band, normalised_error_squared, predict, update
+from safe_wrappers.errors import ConfigurationError
+
+INTEGRATOR = np.array([[0.0, 1.0], [0.0, 0.0]])
+seeds = st.integers(0, 10**6)
+
+
+def covariance(rng, *shape):
+    root = rng.normal(size=(*shape, shape[-1]))
+    return root @ np.swapaxes(root, -1, -2)
+
+
+# One update -------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=60, deadline=None)
+@given(seeds, st.integers(1, 4), st.integers(1, 3))
+def test_an_update_is_bayes_rule_on_the_joint_normal(seed, n, m):
+    rng = np.random.default_rng(seed)
+    cov, r, c = covariance(rng, n), covariance(rng, m) + 0.1 * np.eye(m), rng.normal(size=(m, n))
+    mean, measured = rng.normal(size=n), rng.normal(size=m)
+    # Condition (x, y) on y.
+    cross, marginal = cov @ c.T, c @ cov @ c.T + r
+    updated = update(mean, cov, measured, c, r)
+    np.testing.assert_allclose(
+        updated.mean, mean + cross @ np.linalg.solve(marginal, measured - c @ mean), rtol=1e-8, atol=1e-8
+    )
+    expected = cov - cross @ np.linalg.solve(marginal, cross.T)
+    np.testing.assert_allclose(updated.cov, expected, rtol=1e-7, atol=1e-9 * np.abs(cov).max())
+    np.testing.assert_allclose(updated.innovation, measured - c @ mean, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(updated.innovation_cov, marginal, rtol=1e-10, atol=1e-12)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seeds, st.integers(1, 4), st.floats(-8, 8))
+def test_the_covariance_stays_symmetric_and_semidefinite(seed, n, decades):
+    rng = np.random.default_rng(seed)
+    cov, c = covariance(rng, n), rng.normal(size=(1, n))
+    for _ in range(20):
+        cov = update(np.zeros(n), cov, np.zeros(1), c, np.array([[10.0**decades]])).cov
+        assert np.array_equal(cov, cov.T)
+        assert np.linalg.eigvalsh(cov).min() >= -1e-13 * np.abs(cov).max()
+        _, cov = predict(np.zeros(n), cov, np.eye(n) + 0.1 * rng.normal(size=(n, n)), 1e-9 * np.eye(n))
+        assert np.array_equal(cov, cov.T)
+
+
+def test_the_covariance_survives_a_measurement_a_billion_times_better_than_the_prior():
+    cov, c, r = 1e9 * np.eye(2), np.array([[1.0, 1e-3]]), np.array([[1e-9]])
+    for _ in range(5):
+        cov = update(np.zeros(2), cov, np.zeros(1), c, r).cov
+        assert np.linalg.eigvalsh(cov).min() >= 0.0
+
+
+def test_a_measurement_of_no_worth_changes_nothing():
+    rng = np.random.default_rng(0)
+    mean, cov, c = rng.normal(size=3), covariance(rng, 3), rng.normal(size=(2, 3))
+    updated = update(mean, cov, np.array([5.0, -5.0]), c, 1e18 * np.eye(2))
+    np.testing.assert_allclose(updated.mean, mean, atol=1e-15)
+    np.testing.assert_allclose(updated.cov, cov, rtol=1e-14)
+
+
+# Batches ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_tracks_are_independent(own):
+    rng = np.random.default_rng(1)
+    n, m, tracks = 4, 2, 6
+    mean, cov, measured = (
+        rng.normal(size=(tracks, n)),
+        covariance(rng, tracks, n),
+        rng.normal(size=(tracks, m)),
+    )
+    each = (tracks,) if own else ()
+    c, f = rng.normal(size=(*each, m, n)), rng.normal(size=(*each, n, n))
+    r, q, drift = covariance(rng, *each, m), covariance(rng, *each, n), rng.normal(size=(*each, n))
+    before = [part.copy() for part in (mean, cov, measured, c, f, r, q, drift)]
+    together = update(mean, cov, measured, c, r)
+    moved = predict(mean, cov, f, q, drift)
+    for i in range(tracks):
+        pick = i if own else ...
+        alone = update(mean[i], cov[i], measured[i], c[pick], r[pick])
+        for batch, single in zip(together, alone, strict=True):
+            np.testing.assert_allclose(batch[i], single, rtol=1e-11, atol=1e-12)
+        for batch, single in zip(moved, predict(mean[i], cov[i], f[pick], q[pick], drift[pick]), strict=True):
+            np.testing.assert_allclose(batch[i], single, rtol=1e-11, atol=1e-12)
+    for part, copy in zip((mean, cov, measured, c, f, r, q, drift), before, strict=True):
+        np.testing.assert_array_equal(part, copy)
+
+
+def test_no_track_is_no_trouble():
+    mean, cov = np.zeros((0, 4)), np.zeros((0, 4, 4))
+    assert update(mean, cov, np.zeros((0, 2)), np.eye(2, 4), np.eye(2)).cov.shape == (0, 4, 4)
+    assert predict(mean, cov, np.eye(4), np.eye(4))[0].shape == (0, 4)
+
+
+def test_a_prediction_moves_mean_and_covariance():
+    mean, cov = np.array([1.0, 2.0]), np.diag([0.1, 0.2])
+    f, q = np.array([[1.0, 0.5], [0.0, 1.0]]), np.diag([0.0, 0.3])
+    moved, grown = predict(mean, cov, f, q, np.array([10.0, 0.0]))
+    np.testing.assert_allclose(moved, [12.0, 2.0])
+    np.testing.assert_allclose(grown, [[0.15, 0.1], [0.1, 0.5]])
+    np.testing.assert_allclose(predict(mean, cov, f, q)[0], [2.0, 2.0])
+
+
+# Against others ---------------------------------------------------------------------------------------------------
+
+
+def test_the_steady_filter_is_python_control_s():
+    step = discretise(INTEGRATOR, np.diag([0.0, 0.4]), 0.1)
+    c, r = np.array([[1.0, 0.0]]), np.array([[0.05]])
+    _, predicted, _ = ct.dlqe(step.transition, np.eye(2), c, step.noise, r)
+    mean, cov = np.zeros(2), np.eye(2)
+    for _ in range(500):
+        mean, cov = predict(mean, update(mean, cov, np.zeros(1), c, r).cov, *step)
+    np.testing.assert_allclose(cov, predicted, rtol=1e-9)
+
+
+def test_ever_faster_sampling_becomes_the_filter_in_continuous_time():
+    start, q, c, r = np.diag([0.5, 0.2]), np.diag([0.0, 0.4]), np.array([[1.0, 0.0]]), np.array([[0.05]])
+    exact = seen_covariance(start, INTEGRATOR, q, c, r, 1.0)
+    errors = []
+    for steps in (1000, 2000):
+        step, cov, mean = discretise(INTEGRATOR, q, 1.0 / steps), start, np.zeros(2)
+        for _ in range(steps):
+            mean, cov = predict(mean, cov, *step)
+            cov = update(mean, cov, np.zeros(1), c, r * steps).cov
+        errors.append(np.abs(cov - exact).max() / np.abs(exact).max())
+    assert errors[0] < 5e-3 and errors[1] == pytest.approx(errors[0] / 2, rel=0.05)
+
+
+# Consistency ------------------------------------------------------------------------------------------------------
+
+RUNS, SIGHT, STEP_S, SUBSTEPS, INTENSITY, NOISE = 1000, 40, 0.05, 25, 0.3, 0.02
+SEEN, C, R = np.eye(2), np.array([[1.0, 0.0]]), np.array([[NOISE]])
+
+
+def errors_over_time(believed_intensity, seed):
+    """NEES of RUNS runs of a double integrator with a constant pull, SIGHT steps seen and as many blind.
+
+    The truth is integrated in small steps of its own, so it shares no formula with the filter.
+    """
+    rng = np.random.default_rng(seed)
+    pull = np.array([0.0, -0.5])
+    step = discretise(INTEGRATOR, np.diag([0.0, believed_intensity]), STEP_S)
+    drift = discretise_drift(INTEGRATOR, pull, STEP_S)
+    prior = np.array([[0.2, 0.05], [0.05, 0.1]])
+    truth = rng.multivariate_normal([1.0, -1.0], prior, size=RUNS)
+    mean, cov = np.tile([1.0, -1.0], (RUNS, 1)), np.tile(prior, (RUNS, 1, 1))
+    h = STEP_S / SUBSTEPS
+    for k in range(2 * SIGHT):
+        for _ in range(SUBSTEPS):
+            speed = truth[:, 1] + h * pull[1] + rng.normal(0.0, np.sqrt(INTENSITY * h), RUNS)
+            truth = np.stack([truth[:, 0] + 0.5 * h * (truth[:, 1] + speed), speed], axis=-1)
+        mean, cov = predict(mean, cov, *step, drift)
+        if k < SIGHT:
+            measured = truth[:, :1] + rng.normal(0.0, np.sqrt(NOISE), (RUNS, 1))
+            mean, cov, *_ = update(mean, cov, measured, C, R)
+        yield normalised_error_squared(truth - mean, cov)
+
+
+@pytest.mark.parametrize("phase", ["seen", "blind"])
+def test_the_errors_are_as_large_as_the_filter_says(phase):
+    low, high = chi_square_band(2, RUNS)
+    means = np.array([nees.mean() for nees in errors_over_time(INTENSITY, seed=6)])
+    ends = {"seen": means[SIGHT - 1], "blind": means[-1]}
+    assert low <= ends[phase] <= high
+    # Along the phase the means are correlated: more than 5 % may leave the band, but not far.
+    part = means[:SIGHT] if phase == "seen" else means[SIGHT:]
+    wide = chi_square_band(2, RUNS, 0.99999)
+    assert wide[0] <= part.min() and part.max() <= wide[1]
+
+
+def test_a_filter_that_believes_in_less_noise_is_found_out():
+    _, high = chi_square_band(2, RUNS)
+    means = np.array([nees.mean() for nees in errors_over_time(0.5 * INTENSITY, seed=6)])
+    assert means[SIGHT - 1] > high and means[-1] > high
+
+
+def test_the_normalised_error_is_a_squared_distance():
+    rng = np.random.default_rng(2)
+    cov, error = covariance(rng, 5, 3), rng.normal(size=(5, 3))
+    expected = [e @ np.linalg.inv(p) @ e for e, p in zip(error, cov, strict=True)]
+    np.testing.assert_allclose(normalised_error_squared(error, cov), expected, rtol=1e-9)
+
+
+def test_the_band_is_scipy_s_chi_square():
+    for n, runs, confidence in ((2, 1000, 0.95), (4, 50, 0.95), (1, 1, 0.5)):
+        low, high = chi_square_band(n, runs, confidence)
+        assert chi2.cdf(low * runs, n * runs) == pytest.approx((1 - confidence) / 2)
+        assert chi2.sf(high * runs, n * runs) == pytest.approx((1 - confidence) / 2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((0, 10), ["n must be", "0"]),
+        ((2, 0), ["runs must be", "0"]),
+        ((2.5, 10), ["n must be", "2.5"]),
+        ((2, 10, 1.0), ["confidence", "1.0"]),
+        ((2, 10, 0.0), ["confidence", "0.0"]),
+        ((2, 10, float("nan")), ["confidence", "nan"]),
+    ],
+)
+def test_a_band_of_nothing_is_refused(arguments, words):
+    with pytest.raises(ConfigurationError) as refusal:
+        chi_square_band(*arguments)
+    assert all(word in str(refusal.value) for word in words)
