@@ -1,5 +1,7 @@
 """Distances to ellipsoids against the nearest point of the boundary, searched for, and against closed cases."""
 
+from decimal import Decimal, localcontext
+
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -177,6 +179,29 @@ def test_a_segment_at_any_angle():
         assert (found >= distance - 2.0 * LOST_WIDTH).all()
         if distance == 0.0:
             np.testing.assert_allclose(np.abs((normal * across).sum(axis=1)), 1.0, atol=1e-6)
+
+
+def smallest_eigenvalue(a, b, c):
+    """Of [[a, b], [b, c]], or zero, in 60 digits."""
+    with localcontext(prec=60):
+        return max((a + c - ((a - c) ** 2 + 4 * b * b).sqrt()) / 2, Decimal(0))
+
+
+def test_the_width_that_rounding_hides_is_not_left_out():
+    """Shapes of almost no width at any angle, against the width of the very same numbers in 60 digits."""
+    rng = np.random.default_rng(5)
+    hidden = 0.0
+    for angle, thin in zip(rng.uniform(0.0, np.pi, 300), 10.0 ** rng.uniform(-10, -7, 300), strict=True):
+        basis = turn(2, [angle])
+        shape = basis @ np.diag([4.0, thin**2]) @ basis.T
+        shape[1, 0] = shape[0, 1]
+        a, b, c = Decimal(shape[0, 0]), Decimal(shape[0, 1]), Decimal(shape[1, 1])
+        width = float(smallest_eigenvalue(a, b, c).sqrt())
+        distance, _ = one(np.zeros(2), shape)
+        assert distance <= -width
+        assert distance >= -width - 2.0 * LOST_WIDTH
+        hidden = max(hidden, width - np.sqrt(max(np.linalg.eigvalsh(shape)[0], 0.0)))
+    assert hidden > 1e-9, "no width was lost: the test would not see its overestimation"
 
 
 def test_a_disc_in_space():

@@ -1,0 +1,253 @@
+"""Lever arms and poses against MuJoCo's own sensors, finite differences and 4x4 matrices."""
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from safe_wrappers.control.spatial import (
+    centre_acceleration,
+    centre_acceleration_from_imu,
+    centre_velocity,
+    from_sensor,
+    imu_specific_force,
+    lever_arm_acceleration,
+    lever_arm_velocity,
+    rigid_transform,
+    sensor_pose,
+    to_sensor,
+)
+from safe_wrappers.errors import ConfigurationError
+
+SPINNING = """
+<mujoco>
+  <option gravity="0.3 -0.2 -9.5"/>
+  <worldbody>
+    <body name="body">
+      <freejoint/>
+      <inertial pos="0.05 -0.03 0.08" mass="1.7" diaginertia="0.02 0.05 0.03"/>
+      <site name="imu" pos="0.3 -0.2 0.5" euler="40 -25 110"/>
+    </body>
+  </worldbody>
+  <sensor>
+    <accelerometer site="imu"/> <gyro site="imu"/> <velocimeter site="imu"/>
+  </sensor>
+</mujoco>
+"""
+VECTORS = arrays(np.float64, 3, elements=st.floats(-10.0, 10.0))
+
+
+@pytest.fixture(scope="module")
+def spinning():
+    model = mujoco.MjModel.from_xml_string(SPINNING)
+    return model, mujoco.MjData(model)
+
+
+def thrown(spinning, seed):
+    """A random state and wrench: velocity, angular velocity, their derivatives (world axes), orientation, sensors."""
+    model, data = spinning
+    rng = np.random.default_rng(seed)
+    mujoco.mj_resetData(model, data)
+    turn = Rotation.random(rng=rng)
+    data.qpos[:] = [*rng.normal(size=3), *turn.as_quat(scalar_first=True)]
+    data.qvel[:] = rng.normal(size=6) * 3.0
+    data.xfrc_applied[1] = rng.normal(size=6) * 5.0
+    mujoco.mj_forward(model, data)
+    # A free joint has its linear part in world axes and its angular part in the body's.
+    return {
+        "velocity": data.qvel[:3].copy(),
+        "turning": turn.apply(data.qvel[3:]),
+        "acceleration": data.qacc[:3].copy(),
+        "speeding": turn.apply(data.qacc[3:]),
+        "orientation": turn,
+        "sensors": data.sensordata.reshape(3, 3).copy(),
+    }
+
+
+def extrinsics(model):
+    return RigidTransform.from_components(
+        model.site_pos[0], Rotation.from_quat(model.site_quat[0], scalar_first=True)
+    )
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_mujocos_velocimeter_reads_the_lever_arms_velocity(spinning, seed):
+    s, mount = thrown(spinning, seed), extrinsics(spinning[0])
+    arm = s["orientation"].apply(mount.translation)
+    at_site = lever_arm_velocity(s["velocity"], s["turning"], arm)
+    reading = (s["orientation"] * mount.rotation).apply(s["sensors"][2])
+    np.testing.assert_allclose(at_site, reading, atol=1e-12)
+    np.testing.assert_allclose(centre_velocity(reading, s["turning"], arm), s["velocity"], atol=1e-12)
+    assert np.linalg.norm(reading - s["velocity"]) > 0.1, "without compensation it would be wrong"
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_mujocos_accelerometer_reads_the_specific_force(spinning, seed):
+    model, _ = spinning
+    s, mount = thrown(spinning, seed), extrinsics(spinning[0])
+    found = imu_specific_force(
+        s["acceleration"], s["turning"], s["speeding"], s["orientation"], mount, model.opt.gravity
+    )
+    np.testing.assert_allclose(found, s["sensors"][0], atol=1e-10)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_mujocos_imu_gives_the_centres_acceleration_back(spinning, seed):
+    model, _ = spinning
+    s, mount = thrown(spinning, seed), extrinsics(spinning[0])
+    force, gyro, _ = s["sensors"]
+    gyro_rate = (s["orientation"] * mount.rotation).apply(s["speeding"], inverse=True)
+    found = centre_acceleration_from_imu(force, gyro, gyro_rate, s["orientation"], mount, model.opt.gravity)
+    np.testing.assert_allclose(found, s["acceleration"], atol=1e-10)
+    no_arm = RigidTransform.from_components(np.zeros(3), mount.rotation)
+    wrong = centre_acceleration_from_imu(force, gyro, gyro_rate, s["orientation"], no_arm, model.opt.gravity)
+    assert np.linalg.norm(wrong - s["acceleration"]) > 0.5, "without the lever arm it would be wrong"
+
+
+def test_the_derivative_of_the_gyro_is_the_angular_acceleration(spinning):
+    """By MuJoCo's own integration over a short step, torque and gyroscopic terms included."""
+    model, data = spinning
+    s, mount = thrown(spinning, 7), extrinsics(spinning[0])
+    step = model.opt.timestep = 1e-6
+    before = data.sensordata[3:6].copy()
+    mujoco.mj_step(model, data)
+    mujoco.mj_forward(model, data)
+    found = (data.sensordata[3:6] - before) / step
+    expected = (s["orientation"] * mount.rotation).apply(s["speeding"], inverse=True)
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+
+
+def test_at_rest_an_accelerometer_reads_gravity_upwards():
+    still, mount = np.zeros(3), RigidTransform.from_translation([0.1, 0.2, 0.3])
+    found = imu_specific_force(still, still, still, Rotation.identity(), mount)
+    np.testing.assert_allclose(found, [0.0, 0.0, 9.81])
+
+
+def test_the_terms_are_the_derivatives_of_the_points_position():
+    """A point on a body that turns faster and faster about a fixed axis while its centre flies on a parabola."""
+    axis, start, pull = np.array([0.36, 0.48, 0.8]), np.array([1.0, -2.0, 0.5]), np.array([0.3, 0.1, -9.81])
+    arm_in_body = np.array([0.4, -0.3, 0.2])
+
+    def turned(t):
+        return Rotation.from_rotvec((1.5 * t + 0.5 * 2.0 * t**2) * axis)
+
+    def position(t):
+        return start * t + 0.5 * pull * t**2 + turned(t).apply(arm_in_body)
+
+    t, step = 0.7, 1e-4
+    arm, turning, speeding = turned(t).apply(arm_in_body), (1.5 + 2.0 * t) * axis, 2.0 * axis
+    velocity = lever_arm_velocity(start + pull * t, turning, arm)
+    acceleration = lever_arm_acceleration(pull, turning, speeding, arm)
+    behind, here, ahead = position(t - step), position(t), position(t + step)
+    np.testing.assert_allclose(velocity, (ahead - behind) / (2 * step), atol=1e-6)
+    np.testing.assert_allclose(acceleration, (ahead - 2 * here + behind) / step**2, atol=1e-5)
+
+
+def test_the_acceleration_has_a_tangential_and_a_centripetal_part():
+    """Turning about z at 3 rad/s, faster by 2 rad/s each second, 0.5 m out along x: -w² r inwards, α r across."""
+    found = lever_arm_acceleration(
+        np.zeros(3), np.array([0.0, 0.0, 3.0]), np.array([0.0, 0.0, 2.0]), np.array([0.5, 0.0, 0.0])
+    )
+    np.testing.assert_allclose(found, [-4.5, 1.0, 0.0])
+
+
+@settings(max_examples=50, deadline=None)
+@given(VECTORS, VECTORS, VECTORS, VECTORS)
+def test_the_inverses_undo_the_lever_arm(value, turning, speeding, arm):
+    velocity = centre_velocity(lever_arm_velocity(value, turning, arm), turning, arm)
+    np.testing.assert_allclose(velocity, value, atol=1e-12)
+    there = lever_arm_acceleration(value, turning, speeding, arm)
+    back = centre_acceleration(there, turning, speeding, arm)
+    np.testing.assert_allclose(back, value, atol=1e-10)
+
+
+def test_leading_axes_broadcast():
+    rng = np.random.default_rng(1)
+    a, w, dw, arms = rng.normal(size=3), rng.normal(size=3), rng.normal(size=3), rng.normal(size=(4, 2, 3))
+    many = lever_arm_acceleration(a, w, dw, arms)
+    assert many.shape == (4, 2, 3)
+    np.testing.assert_allclose(many[3, 1], lever_arm_acceleration(a, w, dw, arms[3, 1]))
+    np.testing.assert_allclose(lever_arm_velocity(a, w, arms)[2, 0], lever_arm_velocity(a, w, arms[2, 0]))
+    turns, mount = Rotation.random(5, rng=rng), RigidTransform.from_translation([0.1, 0.0, 0.2])
+    forces = imu_specific_force(rng.normal(size=(5, 3)), w, dw, turns, mount)
+    rates = turns.apply(np.tile(w, (5, 1)), inverse=True), turns.apply(np.tile(dw, (5, 1)), inverse=True)
+    back = centre_acceleration_from_imu(forces, *rates, turns, mount)
+    one = centre_acceleration_from_imu(forces[4], rates[0][4], rates[1][4], turns[4], mount)
+    np.testing.assert_allclose(back[4], one, atol=1e-12)
+
+
+@settings(max_examples=50, deadline=None)
+@given(arrays(np.float64, (5, 3), elements=st.floats(-10.0, 10.0)), VECTORS, VECTORS, VECTORS)
+def test_points_go_to_the_sensor_and_back(points, rotvec, position, mounted):
+    body = rigid_transform(Rotation.from_rotvec(rotvec).as_matrix(), position)
+    mount = rigid_transform(Rotation.from_rotvec(mounted).as_matrix(), 0.1 * mounted)
+    pose = sensor_pose(body, mount)
+    np.testing.assert_allclose(pose.as_matrix(), body.as_matrix() @ mount.as_matrix(), atol=1e-12)
+    rotation, origin = pose.rotation.as_matrix(), pose.translation
+    seen = to_sensor(points, rotation, origin)
+    np.testing.assert_allclose(seen, pose.inv().apply(points), atol=1e-12)
+    np.testing.assert_allclose(from_sensor(seen, rotation, origin), points, atol=1e-12)
+    np.testing.assert_allclose(to_sensor(points[2], rotation, origin), seen[2], atol=1e-14)
+
+
+def test_a_sensors_own_position_is_its_origin():
+    quarter = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    pose = sensor_pose(rigid_transform(quarter, [1.0, 2.0, 0.0]), rigid_transform(np.eye(3), [0.5, 0.0, 0.0]))
+    np.testing.assert_allclose(pose.translation, [1.0, 2.5, 0.0], atol=1e-15)
+    # What is 1 m to the left of the sensor is at -x in the world.
+    np.testing.assert_allclose(
+        from_sensor(np.array([0.0, 1.0, 0.0]), pose.rotation.as_matrix(), pose.translation),
+        [0.0, 2.5, 0.0],
+        atol=1e-15,
+    )
+
+
+def test_many_poses_at_once():
+    turns = Rotation.random(3, rng=np.random.default_rng(0))
+    poses = rigid_transform(turns.as_matrix(), np.arange(9.0).reshape(3, 3))
+    np.testing.assert_allclose(poses.translation[1], [3.0, 4.0, 5.0])
+
+
+@pytest.mark.parametrize(
+    ("rotation", "position", "words"),
+    [
+        (np.diag([1.0, 1.0, -1.0]), np.zeros(3), r"determinant \+1 \(here -1"),
+        (2.0 * np.eye(3), np.zeros(3), "off by up to 3"),
+        (np.eye(3) + 1e-4, np.zeros(3), "expected a rotation"),
+        (np.zeros((3, 3)), np.zeros(3), "expected a rotation"),
+        (np.eye(2), np.zeros(3), r"got \(2, 2\) and \(3,\)"),
+        (np.eye(3), np.zeros(2), r"got \(3, 3\) and \(2,\)"),
+        (np.eye(3), np.zeros((2, 3)), "or n of each"),
+        (np.full((3, 3), np.nan), np.zeros(3), "rotation must be finite"),
+        (np.eye(3), [0.0, np.inf, 0.0], "position must be finite"),
+    ],
+)
+def test_what_is_no_pose_is_refused(rotation, position, words):
+    with pytest.raises(ConfigurationError, match=words):
+        rigid_transform(rotation, position)
+
+
+@pytest.mark.parametrize("bad", [np.zeros(2), np.zeros((3, 2)), np.zeros(()), np.array([0.0, np.nan, 0.0])])
+@pytest.mark.parametrize("at", range(4))
+def test_what_is_no_vector_is_refused_wherever_it_is_given(bad, at):
+    given = [np.ones(3)] * 4
+    given[at] = bad
+    words = "of three numbers|finite numbers"
+    for function in (lever_arm_acceleration, centre_acceleration):
+        with pytest.raises(ConfigurationError, match=words):
+            function(*given)
+    if at < 3:
+        for function in (lever_arm_velocity, centre_velocity):
+            with pytest.raises(ConfigurationError, match=words):
+                function(*given[:3])
+
+
+def test_imu_readings_that_are_not_finite_are_named():
+    still, mount = np.zeros(3), RigidTransform.identity()
+    with pytest.raises(ConfigurationError, match="rate must be finite"):
+        centre_acceleration_from_imu(still, [0, np.nan, 0], still, Rotation.identity(), mount)
+    with pytest.raises(ConfigurationError, match="gravity must be finite"):
+        imu_specific_force(still, still, still, Rotation.identity(), mount, gravity=[0, 0, -np.inf])
