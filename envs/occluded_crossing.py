@@ -11,6 +11,7 @@ from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
+from safe_wrappers.control.tracks import Motion, Tracks
 from safe_wrappers.errors import ActionError, SafeWrappersError
 from safe_wrappers.interventions import COST, COST_SUBSTEP
 
@@ -128,6 +129,9 @@ class OccludedCrossingEnv(MujocoEnv, EzPickle):
         self._mean_velocities = CAR_MEAN_SPEED * np.repeat([1.0, -1.0], CARS_PER_LANE)
         self._traffic = Traffic(self._mean_velocities, self.model.opt.timestep, _FRAME_SKIP)
         self._cars_random = np.random.default_rng(0)  # until the first reset
+        along = np.diag([CAR_ACCELERATION_NOISE, 0.0])
+        ways = [Motion(along, CAR_TIME_CONSTANT_S, np.array([v * CAR_MEAN_SPEED, 0.0])) for v in (1.0, -1.0)]
+        self._tracks = Tracks([motion for motion in ways for _ in range(CARS_PER_LANE)])
         self._goal_met = False
         self._goals_reached = 0
         cars = np.stack([np.zeros(CARS), self._mean_velocities], axis=1)
@@ -169,6 +173,14 @@ class OccludedCrossingEnv(MujocoEnv, EzPickle):
     def car_velocities(self) -> Array:
         """Velocities of the cars, shape (6, 2), m/s: as true."""
         return np.stack([self.data.qvel[_CARS], np.zeros(CARS)], axis=1)
+
+    @property
+    def car_tracks(self) -> Tracks:
+        """The cars' true states, without uncertainty now, and how they move: what a perfect tracker would know."""
+        states = np.zeros((CARS, 4))
+        states[:, :2], states[:, 2:] = self.car_positions, self.car_velocities
+        self._tracks.start(states, np.zeros((CARS, 4, 4)))
+        return self._tracks
 
     # Gymnasium ---------------------------------------------------------------------------------------------
 

@@ -15,6 +15,7 @@ from safe_wrappers.constraints import (
     Constraint,
     Disc,
     Discs,
+    EscapeClearance,
     HalfSpaces,
     HeadingDriveClearance,
     ImpactSpeedLimit,
@@ -23,6 +24,8 @@ from safe_wrappers.constraints import (
     Plane,
     SpeedLimit,
     Sphere,
+    TrackedDiscs,
+    TrackPermission,
     Traction,
     Upright,
     WallClearance,
@@ -40,8 +43,11 @@ from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.chunk_handover import ChunkHandover
 from safe_wrappers.wrappers.contact_monitor import ContactMonitor
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
+from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
+from safe_wrappers.wrappers.sensor import Sensor
 from safe_wrappers.wrappers.slip_limiter import SlipLimiter
+from safe_wrappers.wrappers.track import Track
 
 __all__ = [
     "AdaptionPenalty",
@@ -56,6 +62,7 @@ __all__ = [
     "ContactMonitor",
     "Disc",
     "Discs",
+    "EscapeClearance",
     "HalfSpaces",
     "HeadingDriveClearance",
     "ImpactSpeedLimit",
@@ -63,14 +70,19 @@ __all__ = [
     "JointSpeedLimit",
     "LeaseExpiry",
     "MujocoPlant",
+    "OcclusionPenalty",
     "Plane",
     "Plant",
     "Projection",
     "RecordInterventions",
     "SafeWrappersError",
+    "Sensor",
     "SlipLimiter",
     "SpeedLimit",
     "Sphere",
+    "Track",
+    "TrackPermission",
+    "TrackedDiscs",
     "Traction",
     "UnsafeStateWarning",
     "Upright",

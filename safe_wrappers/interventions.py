@@ -54,6 +54,8 @@ COST_SUBSTEP: Final = "cost_substep"
 """float64: 1 if the constraint was violated at any physics substep of this control step, else 0."""
 SPIN_OUT: Final = "spin_out"
 """float64: 1 if a loaded wheel spun or locked (slip above 0.5 in size) at any physics substep, else 0."""
+COLLISIONS: Final = "collisions"
+"""int64: collisions that began in this step."""
 
 # RecordInterventions ---------------------------------------------------------------------------------------
 EPISODE_SUMMARY: Final = "interventions"
@@ -118,6 +120,19 @@ CONTACT_RESIDUAL: Final = "contact/residual"
 """float64: N m, the largest ``|gap * force|`` of a contact: what misses complementarity."""
 CONTACT_PARTIAL: Final = "contact/partial"
 """bool: not every substep was seen; the others are of the contacts that the step left behind, for one substep."""
+
+# OcclusionPenalty, every step: one entry per track, after the step ------------------------------------------------
+OCCLUSION_VISIBLE: Final = "occlusion/visible"
+"""bool array, one per track: it was measured at the end of this step (in sight, in range, and not dropped out)."""
+OCCLUSION_SIGMA: Final = "occlusion/sigma"
+"""float64 array, one per track: m, standard deviation of the estimated position where it is largest."""
+OCCLUSION_EXPIRED: Final = "occlusion/expired"
+"""bool array, one per track: `sigmas` standard deviations would cross the tolerance before the next control step ends,
+if nothing is seen until then: no permission to rely on this track."""
+OCCLUSION_PENALTY: Final = "occlusion/penalty"
+"""float64: what was taken off this step's reward, in reward units."""
+OCCLUSION_TASK_REWARD: Final = "occlusion/task_reward"
+"""float64: the task's own reward of this step, before the penalty."""
 
 # The faults of safe_wrappers.wrappers.faults, every step --------------------------------------------------------
 FAULT_ACTIVE: Final = "fault/active"

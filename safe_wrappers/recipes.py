@@ -11,11 +11,13 @@ from safe_wrappers.constraints import (
     Clearance,
     CoastingClearance,
     Discs,
+    EscapeClearance,
     HeadingDriveClearance,
     JointPositionLimit,
     JointSpeedLimit,
     Plane,
     SpeedLimit,
+    TrackedDiscs,
     Traction,
     WallClearance,
     Workspace,
@@ -24,6 +26,7 @@ from safe_wrappers.constraints.constraint import Constraint
 from safe_wrappers.control.rectangles import merged
 from safe_wrappers.envs.car import CAR
 from safe_wrappers.envs.speed_limits import SPEED_LIMITS
+from safe_wrappers.errors import UnknownNameError
 
 POINT_HULL_RADIUS_M = 0.1585
 """Around the Point robot's turning axis: the far corners of its nose, sqrt(0.15^2 + 0.05^2), rounded up."""
@@ -92,6 +95,24 @@ def _safe_rover(
     return [Traction(env.unwrapped.wheels, max_slip, friction)]  # type: ignore[attr-defined]
 
 
+def _occluded_crossing(env: gym.Env[Any, Any], cars: str = "", sigmas: float = 3.0) -> list[Constraint]:
+    raw: Any = env.unwrapped
+    cars = cars or ("estimated" if env.has_wrapper_attr("tracking") else "true")
+    seen: dict[str, Any] = {
+        "true": TrackedDiscs(raw.car_radius, sigmas, attribute="car_tracks"),
+        "last_seen": Discs("last_seen_positions", raw.car_radius),
+        "estimated": TrackedDiscs(raw.car_radius, sigmas),
+    }
+    if cars not in seen:
+        raise UnknownNameError(
+            f"cars is one of {', '.join(seen)}: which positions to keep clear of; got {cars!r}"
+        )
+    # No way out leads through pillars, or over the rails at 4 m and 3.5 m.
+    rails = [Plane([x, y], [-x, -y]) for x, y in ((-4.0, 0.0), (4.0, 0.0), (0.0, -3.5), (0.0, 3.5))]
+    obstacles = [seen[cars], Discs("pillar_positions", raw.pillar_radius), *rails]
+    return [EscapeClearance("robot", obstacles, raw.robot_radius)]
+
+
 def _pusher(env: gym.Env[Any, Any]) -> list[Constraint]:
     # The tip stays over the table, clear of its top by 2.5 cm, and in front of the shoulder.
     table = Workspace([-0.2, -1.2, -0.3], [0.9, 0.15, 0.4], bodies=["tips_arm"], margin=0.005, holds=8)
@@ -150,6 +171,7 @@ RECIPES: dict[str, Callable[..., list[Constraint]]] = {
     "FlexJointReach": _flex_joint_reach,
     "Reacher": _reacher,
     "SafeRover": _safe_rover,
+    "OccludedCrossing": _occluded_crossing,
     "Pusher": _pusher,
     "HumanoidStandup": _humanoid_standup,
     "PointMaze": _point_maze,

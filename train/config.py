@@ -17,6 +17,7 @@ from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.protect import protect_options
 from safe_wrappers.wrappers.faults import FAULTS
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
+from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 
 from .names import check_name
 
@@ -33,6 +34,7 @@ _LEASE_OPTIONS: Final = [
     for name in inspect.signature(LeaseExpiry).parameters
     if name not in ("env", "plant", "measured")  # what a YAML file cannot hold
 ]
+_OCCLUSION_OPTIONS: Final = [name for name in inspect.signature(OcclusionPenalty).parameters if name != "env"]
 _ARM_KEYS: Final = (
     "filter",
     "learner",
@@ -53,7 +55,10 @@ _EXECUTED: Final = ("safe_action", "both")
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """Which env: `env: Id-v0`, or `env: {id: Id-v0, kwargs: {...}, faults: {Outages: {...}}}`.
+    """Which env: `env: Id-v0`, or `env: {id: Id-v0, kwargs: {...}, occlusion: {...}, faults: {Outages: {...}}}`.
+
+    `occlusion` holds the arguments of an `OcclusionPenalty` around the task and inside the filter, in training and
+    evaluation. Its penalty is the learner's: every return that is reported is the task's own.
 
     `faults` go wrong between the policy and the robot in all arms, filtered or not, in training and evaluation:
     names and arguments of `safe_wrappers.wrappers.faults`, the innermost first.
@@ -62,6 +67,7 @@ class EnvConfig:
     id: str
     kwargs: dict[str, Any] = field(default_factory=dict)
     faults: dict[str, dict[str, Any]] = field(default_factory=dict)
+    occlusion: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -152,6 +158,8 @@ class ArmConfig:
             del values["learner"]
         if not self.env.faults:
             del values["env"]["faults"]
+        if self.env.occlusion is None:
+            del values["env"]["occlusion"]
         if self.filter.lease is None:
             del values["filter"]["lease"]
         return values
@@ -355,14 +363,20 @@ def _env(value: Any) -> EnvConfig:
         value = {"id": value}
     value = _mapping(value, "env")
     for key in value:
-        check_name(key, ("id", "kwargs", "faults"), "env")
+        check_name(key, ("id", "kwargs", "faults", "occlusion"), "env")
     env_id = _text(value.get("id"), "env.id")
     if ":" not in env_id:  # `module:Id-v0` is registered by importing the module, when the env is made
         try:
             gym.spec(env_id)
         except gym.error.Error:
             check_name(env_id, gym.registry, "env.id")
-    return EnvConfig(env_id, dict(_mapping(value.get("kwargs"), "env.kwargs")), _faults(value.get("faults")))
+    occlusion = None
+    if value.get("occlusion") is not None:
+        occlusion = dict(_mapping(value["occlusion"], "env.occlusion"))
+        for key in occlusion:
+            check_name(key, _OCCLUSION_OPTIONS, "env.occlusion")
+    kwargs = dict(_mapping(value.get("kwargs"), "env.kwargs"))
+    return EnvConfig(env_id, kwargs, _faults(value.get("faults")), occlusion)
 
 
 def _faults(value: Any) -> dict[str, dict[str, Any]]:

@@ -16,6 +16,7 @@ from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.adaption_penalty import AdaptionPenalty
 from safe_wrappers.wrappers.faults import FAULTS
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
+from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
 
 from .config import NAIVE, EnvConfig, FilterConfig, LearnerConfig
@@ -25,9 +26,10 @@ from .names import check_name
 def make_stack(
     env: EnvConfig, action_filter: FilterConfig, learner: LearnerConfig = NAIVE
 ) -> gym.Env[Any, Any]:
-    """Makes the task, filter and lease if there are any, the recorder, faults and Monitor, and AdaptionPenalty.
+    """Makes the task; OcclusionPenalty, filter, lease if there are any; recorder, faults, Monitor, AdaptionPenalty.
 
-    The recorder and Monitor see the task's own reward, whatever the learner sees.
+    The recorder counts the task's own reward, whatever the learner sees. Monitor does too, but for OcclusionPenalty,
+    which is inside of it.
 
     Args:
         env: The task.
@@ -41,6 +43,11 @@ def make_stack(
         task: gym.Env[Any, Any] = gym.make(env.id, **env.kwargs)
     except (TypeError, gym.error.Error, ImportError) as error:
         raise ConfigurationError(f"env: {env.id} with kwargs {env.kwargs} cannot be made: {error}") from error
+    if env.occlusion is not None:
+        try:
+            task = OcclusionPenalty(task, **env.occlusion)
+        except TypeError as error:
+            raise ConfigurationError(f"env.occlusion: {error}") from None
     if action_filter.kind == "protect":
         task = safe_wrappers.protect(task, **action_filter.kwargs)
     elif action_filter.kind == "factory":

@@ -29,6 +29,8 @@ TOTALS: Final = (
     "lease_braking",
     "lease_expired",
     "spin_outs",
+    "collisions",
+    "expiries",
 )
 METRICS: Final = {
     "return": "Return / episode",
@@ -49,6 +51,11 @@ METRICS: Final = {
     "goals_reached": "Goals / episode",
     "spin_outs": "Steps in spin-out, total",
     "spin_outs_per_million": "Steps in spin-out / million",
+    "collisions": "Collisions, total",
+    "collisions_per_million": "Collisions / million steps",
+    "seen": "Share of time that a track is seen",
+    "expiries": "Permissions to rely on a track run out, total",
+    "expiries_per_1000": "Permissions run out / 1000 steps",
 }
 """What is reported. Totals and rates are over a condition's episodes; all else is the mean over its
 episodes of the episode's value (so `correction_p95` is the mean of the episodes' percentiles)."""
@@ -58,6 +65,8 @@ RATES: Final = {
     "violations_per_1000": ("violations", 1000.0),
     "infeasible_per_1000": ("infeasible", 1000.0),
     "spin_outs_per_million": ("spin_outs", 1e6),
+    "collisions_per_million": ("collisions", 1e6),
+    "expiries_per_1000": ("expiries", 1000.0),
 }
 """Of a count, per so many steps. Episodes that end early have less time for violations: rates are over all steps,
 whatever the episodes."""

@@ -4,12 +4,15 @@ from safe_wrappers.constraints.barrier import Barrier
 from safe_wrappers.constraints.clearance import Clearance
 from safe_wrappers.constraints.coasting_clearance import CoastingClearance
 from safe_wrappers.constraints.constraint import CertifyingConstraint, Constraint, HalfSpaces
+from safe_wrappers.constraints.escape_clearance import EscapeClearance
 from safe_wrappers.constraints.heading_drive_clearance import HeadingDriveClearance
 from safe_wrappers.constraints.impact_speed_limit import ImpactSpeedLimit
 from safe_wrappers.constraints.joint_position_limit import JointPositionLimit
 from safe_wrappers.constraints.joint_speed_limit import JointSpeedLimit
 from safe_wrappers.constraints.obstacles import Box, Disc, Discs, Plane, Sphere
 from safe_wrappers.constraints.speed_limit import SpeedLimit
+from safe_wrappers.constraints.track_permission import TrackPermission
+from safe_wrappers.constraints.tracked_discs import TrackedDiscs
 from safe_wrappers.constraints.traction import Traction
 from safe_wrappers.constraints.upright import Upright
 from safe_wrappers.constraints.wall_clearance import WallClearance
@@ -24,6 +27,7 @@ __all__ = [
     "Constraint",
     "Disc",
     "Discs",
+    "EscapeClearance",
     "HalfSpaces",
     "HeadingDriveClearance",
     "ImpactSpeedLimit",
@@ -32,6 +36,8 @@ __all__ = [
     "Plane",
     "SpeedLimit",
     "Sphere",
+    "TrackPermission",
+    "TrackedDiscs",
     "Traction",
     "Upright",
     "WallClearance",

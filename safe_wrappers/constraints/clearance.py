@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.constraints.constraint import HalfSpaces, Promise, non_negative, positive
-from safe_wrappers.constraints.obstacles import Nearest, obstacle_from
+from safe_wrappers.constraints.obstacle_kinds import obstacle_from
+from safe_wrappers.constraints.obstacles import Nearest
 from safe_wrappers.control.stopping import sampled_acceleration_limit, sampled_inset
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco import MujocoPlant

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.constraints.constraint import HalfSpaces, Promise, non_negative, positive
-from safe_wrappers.constraints.obstacles import Disc, Discs, obstacle_from
+from safe_wrappers.constraints.obstacle_kinds import obstacle_from
+from safe_wrappers.constraints.obstacles import Disc, Discs
 from safe_wrappers.control.outlines import convex_outline, distances_to_outline
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.coasting import Coasting, Course

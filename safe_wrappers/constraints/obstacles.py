@@ -5,8 +5,8 @@ that is given obstacles can be recorded and rebuilt.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any, NamedTuple, Protocol
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -236,28 +236,3 @@ class Discs:
     def distances(self, points: Array, plant: Plant) -> Array:
         """Shape (k, n), m."""
         return _to_centers(points, self.centers(plant), self.radius)
-
-
-KINDS: dict[str, type[Any]] = {kind.__name__: kind for kind in (Disc, Sphere, Plane, Box, Discs)}
-
-
-def obstacle_from(data: Any) -> Obstacle:
-    """An obstacle itself, or rebuilt from the plain dict that a recorded wrapper holds."""
-    if not isinstance(data, dict):
-        if hasattr(data, "nearest"):
-            return data  # type: ignore[no-any-return]
-        raise ConfigurationError(f"expected an obstacle ({', '.join(KINDS)}) or its dict, got {data!r}")
-    kind = KINDS.get(data.get("kind", ""))
-    if kind is None:
-        raise ConfigurationError(
-            f"unknown obstacle kind {data.get('kind')!r}; the kinds are {', '.join(KINDS)}"
-        )
-    return kind(**{k: v for k, v in data.items() if k != "kind"})  # type: ignore[no-any-return]
-
-
-def obstacle_data(obstacle: Any) -> Any:
-    """The plain dict of an obstacle of ours, or a foreign obstacle as it is."""
-    kind = KINDS.get(type(obstacle).__name__)
-    if kind is not type(obstacle):
-        return obstacle
-    return {"kind": kind.__name__, **{f.name: getattr(obstacle, f.name) for f in fields(kind)}}

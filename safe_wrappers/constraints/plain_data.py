@@ -9,12 +9,14 @@ from safe_wrappers.constraints.barrier import Barrier
 from safe_wrappers.constraints.clearance import Clearance
 from safe_wrappers.constraints.coasting_clearance import CoastingClearance
 from safe_wrappers.constraints.constraint import Constraint
+from safe_wrappers.constraints.escape_clearance import EscapeClearance
 from safe_wrappers.constraints.heading_drive_clearance import HeadingDriveClearance
 from safe_wrappers.constraints.impact_speed_limit import ImpactSpeedLimit
 from safe_wrappers.constraints.joint_position_limit import JointPositionLimit
 from safe_wrappers.constraints.joint_speed_limit import JointSpeedLimit
-from safe_wrappers.constraints.obstacles import obstacle_data
+from safe_wrappers.constraints.obstacle_kinds import obstacle_data
 from safe_wrappers.constraints.speed_limit import SpeedLimit
+from safe_wrappers.constraints.track_permission import TrackPermission
 from safe_wrappers.constraints.traction import Traction
 from safe_wrappers.constraints.upright import Upright
 from safe_wrappers.constraints.wall_clearance import WallClearance
@@ -25,11 +27,13 @@ KINDS: dict[str, Callable[..., Constraint]] = {
     "Barrier": Barrier,
     "Clearance": Clearance,
     "CoastingClearance": CoastingClearance,
+    "EscapeClearance": EscapeClearance,
     "HeadingDriveClearance": HeadingDriveClearance,
     "ImpactSpeedLimit": ImpactSpeedLimit,
     "JointPositionLimit": JointPositionLimit,
     "JointSpeedLimit": JointSpeedLimit,
     "SpeedLimit": SpeedLimit,
+    "TrackPermission": TrackPermission,
     "Traction": Traction,
     "Upright": Upright,
     "WallClearance": WallClearance,

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.constraints.constraint import Promise, non_negative
-from safe_wrappers.constraints.obstacles import distances, obstacle_from
+from safe_wrappers.constraints.obstacle_kinds import obstacle_from
+from safe_wrappers.constraints.obstacles import distances
 from safe_wrappers.constraints.predicted import Predicted
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.forecast import Forecast

@@ -37,8 +37,11 @@ COLUMNS: Final = (
     "goals_reached",
     "spin_outs",
     "success",
+    "collisions",
+    "seen",
+    "expiries",
 )
-"""The CSV file's columns. `goals_reached`, `spin_outs` and `success` stay empty for tasks that do not report them."""
+"""The CSV file's columns. Those from `goals_reached` on stay empty for tasks and stacks that do not report them."""
 
 
 _COUNTED: Final = {
@@ -66,7 +69,7 @@ class RecordInterventions(
     At every step `info` gains the keys of `safe_wrappers.interventions.RUNNING` (float64, the episode so
     far), and at an episode's last step `info["interventions"]`, a dict:
 
-    - `length`, `return`;
+    - `length`, `return` (of the task: what an `OcclusionPenalty` inside has taken off is added back);
     - `intervention_rate`: intervened steps / length;
     - `correction_mean`, `correction_p95`: over all steps of the episode, also those with no correction;
     - `infeasible`, `fallback`, `nonfinite`, `unsafe`: numbers of steps;
@@ -75,6 +78,9 @@ class RecordInterventions(
     - `violations`: steps with `cost` or `cost_substep` above 0;
     - `cost`, `cost_substep`: sums;
     - `spin_outs`: steps with `spin_out` above 0, when the task reports it;
+    - `collisions`: how many began, when the task reports it;
+    - `seen`: share of time that a tracked thing was seen, mean over the tracks, and `expiries`: how often the permission
+      to rely on one ran out, with an `OcclusionPenalty` inside;
     - `goals_reached` and `success` when the task reports `goals_reached`, and `success` or `is_success`.
 
     Args:
@@ -126,6 +132,7 @@ class RecordInterventions(
         """Starts a new episode's counts, all zero in info; seed and options pass through untouched."""
         self._clear()
         observation, info = self.env.reset(seed=seed, options=options)
+        self._expired = info.get(keys.OCCLUSION_EXPIRED)
         info.update(dict.fromkeys(keys.RUNNING, 0.0))
         return observation, info
 
@@ -151,10 +158,12 @@ class RecordInterventions(
         self._violations = 0
         self._cost = 0.0
         self._cost_substep = 0.0
-        self._task: dict[str, int | bool] = {}
+        self._task: dict[str, int | float | bool] = {}
+        self._seen = 0.0
+        self._expired: Any = None
 
     def _count(self, reward: float, info: dict[str, Any]) -> None:
-        self._return += reward
+        self._return += float(info.get(keys.OCCLUSION_TASK_REWARD, reward))
         correction = float(info.get(keys.CBF_CORRECTION, 0.0))
         self._corrections.append(correction)
         self._correction_sum += correction
@@ -173,9 +182,21 @@ class RecordInterventions(
             self._task["goals_reached"] = int(info["goals_reached"])
         if keys.SPIN_OUT in info:
             self._task["spin_outs"] = self._task.get("spin_outs", 0) + bool(info[keys.SPIN_OUT] > 0.0)
+        if keys.COLLISIONS in info:
+            self._task["collisions"] = self._task.get("collisions", 0) + int(info[keys.COLLISIONS])
+        if keys.OCCLUSION_VISIBLE in info:
+            self._count_sight(info)
         success = info.get("success", info.get("is_success"))
         if success is not None:
             self._task["success"] = self._task.get("success", False) or bool(success)
+
+    def _count_sight(self, info: dict[str, Any]) -> None:
+        self._seen += float(np.mean(info[keys.OCCLUSION_VISIBLE]))
+        self._task["seen"] = self._seen / len(self._corrections)
+        expired = np.asarray(info[keys.OCCLUSION_EXPIRED])
+        before = expired if self._expired is None else self._expired
+        self._task["expiries"] = self._task.get("expiries", 0) + int((expired & ~before).sum())
+        self._expired = expired
 
     def _running(self) -> dict[str, float]:
         steps = len(self._corrections)

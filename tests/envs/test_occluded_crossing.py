@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from safe_wrappers.envs import CROSSING_EPISODE_STEPS, OCCLUDED_CROSSING_ID
 from safe_wrappers.envs.occluded_crossing import CAR_BODIES, CAR_MEAN_SPEED, CAR_SPEED_STD
+from safe_wrappers.envs.traffic import noise_covariance, transition
 from safe_wrappers.errors import ActionError, ConfigurationError, SafeWrappersError, UnknownNameError
 
 INFO_TYPES = {
@@ -357,6 +358,26 @@ def test_positions_and_velocities_of_the_cars_are_mujocos_state(env):
         assert joint.qvel[0] == env.car_velocities[i, 0]
     assert env.car_bodies == CAR_BODIES
     assert env.lane_centres == (-0.8, 0.8)
+
+
+def test_the_cars_tracks_are_their_true_states_and_their_true_law(env):
+    """A tracker told the truth: certain now, and as spread later as the traffic that is drawn."""
+    env.reset(seed=12)
+    for _ in range(5):
+        env.step(push())
+    tracks = env.car_tracks
+    np.testing.assert_array_equal(tracks.positions, env.car_positions)
+    np.testing.assert_array_equal(tracks.velocities, env.car_velocities)
+    assert not tracks.covariance.any()
+    times = [0.04, 1.0, 5.0]
+    positions, covariances = tracks.ahead(times)
+    for i, time in enumerate(times):
+        flow, mean = transition(time), CAR_MEAN_SPEED * np.repeat([1.0, -1.0], 3)
+        expected = env.car_positions[:, 0] + mean * time + flow[0, 1] * (env.car_velocities[:, 0] - mean)
+        np.testing.assert_allclose(positions[i, :, 0], expected, rtol=1e-9)
+        np.testing.assert_array_equal(positions[i, :, 1], env.car_positions[:, 1])
+        np.testing.assert_allclose(covariances[i, :, 0, 0], noise_covariance(time)[0, 0], rtol=1e-6)
+        np.testing.assert_array_equal(covariances[i, :, 1], 0.0)
 
 
 def test_a_changed_time_step_keeps_the_traffics_law(env):

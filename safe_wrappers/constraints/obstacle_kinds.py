@@ -1,0 +1,34 @@
+"""Obstacles as plain data, so that a constraint that holds them can be recorded and rebuilt."""
+
+from dataclasses import fields
+from typing import Any
+
+from safe_wrappers.constraints.obstacles import Box, Disc, Discs, Obstacle, Plane, Sphere
+from safe_wrappers.constraints.tracked_discs import TrackedDiscs
+from safe_wrappers.errors import ConfigurationError
+
+KINDS: dict[str, type[Any]] = {
+    kind.__name__: kind for kind in (Disc, Sphere, Plane, Box, Discs, TrackedDiscs)
+}
+
+
+def obstacle_from(data: Any) -> Obstacle:
+    """An obstacle itself, or rebuilt from the plain dict that a recorded wrapper holds."""
+    if not isinstance(data, dict):
+        if hasattr(data, "nearest"):
+            return data  # type: ignore[no-any-return]
+        raise ConfigurationError(f"expected an obstacle ({', '.join(KINDS)}) or its dict, got {data!r}")
+    kind = KINDS.get(data.get("kind", ""))
+    if kind is None:
+        raise ConfigurationError(
+            f"unknown obstacle kind {data.get('kind')!r}; the kinds are {', '.join(KINDS)}"
+        )
+    return kind(**{k: v for k, v in data.items() if k != "kind"})  # type: ignore[no-any-return]
+
+
+def obstacle_data(obstacle: Any) -> Any:
+    """The plain dict of an obstacle of ours, or a foreign obstacle as it is."""
+    kind = KINDS.get(type(obstacle).__name__)
+    if kind is not type(obstacle):
+        return obstacle
+    return {"kind": kind.__name__, **{f.name: getattr(obstacle, f.name) for f in fields(kind)}}

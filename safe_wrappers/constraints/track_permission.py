@@ -1,0 +1,82 @@
+"""TrackPermission: stop while something that the machine relies on knowing may no longer be relied on."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.constraints.constraint import HalfSpaces, Promise, non_negative, positive
+from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.plants.mujoco import MujocoPlant
+from safe_wrappers.plants.plant import Plant
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class TrackPermission:
+    """While the permission of a track has expired, slow down to `creep` (rest), at least as hard as `braking`.
+
+    An `OcclusionPenalty` inside the filter says which tracks may be relied on. The rows bound the speed along each axis
+    at the end of the control step: it falls by `braking` times the control interval, shared as the velocity is, down
+    to `creep`. With all permissions in force it asks for nothing, and the policy's action passes.
+
+    What it promises: the executed controls brake as declared, or the step is flagged infeasible. It stops the machine,
+    not what comes to meet it: where standing still is no safe state, keep out of the way (`Clearance` with
+    `TrackedDiscs`), too. Best effort: the drift changes within a held step, and another constraint may ask for the
+    opposite.
+
+    Args:
+        body: Name of the body whose frame origin is stopped.
+        braking: Deceleration that the actuators can give in every direction, m/s^2.
+        creep: Speed that stays allowed, m/s.
+        tracks: Names of the tracks that count (`track_names` of the OcclusionPenalty); None: all.
+
+    Source: appendix "Continuous Lyapunov and Riccati covariance dynamics": expire tracking permission before the
+    declared error bound crosses the physical tolerance.
+    """
+
+    body: str
+    braking: float
+    creep: float = 0.0
+    tracks: Sequence[str] | None = None
+
+    promise: Promise = field(default="best effort", init=False)
+
+    def __post_init__(self) -> None:
+        self.braking = positive("braking", self.braking, "m/s^2")
+        self.creep = non_negative("creep", self.creep, "m/s")
+        if self.tracks is not None:
+            if isinstance(self.tracks, str) or not self.tracks:
+                raise ConfigurationError(
+                    f"tracks is a list of names with at least one, or None for all; got {self.tracks!r}"
+                )
+            self.tracks = list(self.tracks)
+
+    def bind(self, plant: Plant) -> None:
+        """Resolve names."""
+        if not isinstance(plant, MujocoPlant):
+            raise UnsupportedEnvError("TrackPermission needs a MujocoPlant: it brakes a body of its model")
+        plant.named("body", self.body)
+        names = list(plant.attribute("track_names"))
+        chosen = names if self.tracks is None else list(self.tracks)
+        for name in chosen:
+            if name not in names:
+                raise UnknownNameError(f"there is no track {name!r}; there are {', '.join(names)}")
+        self._which = [names.index(name) for name in chosen]
+
+    def rows(self, plant: Any) -> HalfSpaces:
+        """Two rows per axis that a control acts on, while a permission has expired; else none."""
+        if bool(np.asarray(plant.attribute("permitted"))[self._which].all()):
+            return HalfSpaces.none(plant.lower.size)
+        _, v, drift, effect = plant.point("body", self.body)
+        acted = np.abs(effect).max(axis=1) > 1e-12
+        v, drift, effect = v[acted], drift[acted], effect[acted]
+        speed = float(np.sqrt(v @ v))
+        left = max(0.0, 1.0 - self.braking * plant.hold_s / speed) if speed > 0.0 else 0.0
+        # The speed in each axis at the end of the hold; sideways creep is shared among the axes.
+        allowed = np.maximum(left * np.abs(v), self.creep / np.sqrt(max(v.size, 1)))
+        least, most = (-allowed - v) / plant.hold_s - drift, (allowed - v) / plant.hold_s - drift
+        return HalfSpaces(np.concatenate([effect, -effect]), np.concatenate([most, -least]))
