@@ -78,7 +78,8 @@ def riccati_flow(start: Array, a: Array, q: Array, information: Array, time: flo
         root = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
         turned = np.swapaxes(root, -1, -2)
         moved = transition @ root @ np.linalg.solve(np.eye(n) + turned @ seen @ root, turned) @ transition.T
-        later = noise + 0.5 * (moved + np.swapaxes(moved, -1, -2))
+        later = noise + moved
+        later = 0.5 * (later + np.swapaxes(later, -1, -2))
         if np.array_equal(later, now) or not np.isfinite(later).all():
             return np.asarray(later * unit)  # at rest, bit for bit, for good; or out of range
         now = later

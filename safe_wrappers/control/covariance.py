@@ -36,7 +36,7 @@ _MODE = 1e-8
 of a double pole are not known any better than that."""
 _GOAL = 1e-12
 """A tolerance is met with this much to spare, relative, so that rounding never makes a time late."""
-_LARGEST = 1e100
+_LARGEST = 1e60
 """A tolerance above it counts as it: the covariance must not overflow before it gets there."""
 
 

@@ -1,16 +1,16 @@
 """The first time at which a covariance that nothing measures reaches a bound in some direction, never late.
 
-The growth need not be monotonic: an oscillator's covariance swings, and a correlation may let it sink first. But its
-rate X obeys X' = A X + X A', so `X(t) = exp(A t) X(0) exp(A t)'` keeps the signs of its eigenvalues. If they are all
-of one sign, growth is monotonic and bisection is enough. If not, the search goes from window to window, each shown to
-be free before time moves on, by the better of two bounds:
+The growth need not be monotonic: an oscillator's covariance swings, and a correlation may let it sink first. So the
+search goes from window to window, each shown to be free before time moves on, by the better of two bounds:
 
 - the Taylor series of the variance with its remainder: tight near the crossing, but for windows up to 1 / |A| only;
 - the growth by the positive part of the rate alone: it only rises, and holds for windows of any length.
 
-Its cost grows with the number of swings within the horizon.
+Both rest on the rate X = dP/dt, which obeys X' = A X + X A': `X(t) = exp(A t) X(0) exp(A t)'` keeps the signs of its
+eigenvalues, so a covariance that sinks in every direction never rises again.
 
-Nothing is checked here: `safe_wrappers.control.covariance.blind_time` does that.
+The cost grows with the number of swings within the horizon. Nothing is checked here:
+`safe_wrappers.control.covariance.blind_time` does that.
 """
 
 import math
@@ -25,8 +25,6 @@ Array = NDArray[np.float64]
 
 _ORDER = 12
 """Terms of the Taylor series: at the longest window the remainder is 1e-5 of the rate's norm times the window."""
-_HALVINGS = 60
-"""Down to which share of the horizon, as a power of two, bisection goes."""
 _RESOLUTION = 1e-9
 """Relative to the time: a shorter free window is taken for the crossing itself."""
 
@@ -47,34 +45,8 @@ def first_crossing(P0: Array, a: Array, q: Array, rows: Array, goal: float, hori
     """
     if largest_variance(rows, P0) >= goal:
         return 0.0
-    signs = np.linalg.eigvalsh(_rate(P0, a) + q)
-    if signs[-1] <= 0.0:
-        return math.inf
-    if signs[0] >= 0.0:
-        return _by_bisection(P0, a, q, rows, goal, horizon)
-    return _by_windows(P0, a, q, rows, goal, horizon)
-
-
-def largest_variance(rows: Array, covariance: Array) -> float:
-    """Largest eigenvalue of `D P D'`: of D x, over all unit combinations of its entries."""
-    return float(np.linalg.eigvalsh(rows @ covariance @ rows.T)[-1])
-
-
-def _by_bisection(P0: Array, a: Array, q: Array, rows: Array, goal: float, horizon: float) -> float:
-    steps_s = np.ldexp(horizon, -np.arange(_HALVINGS))
-    steps = van_loan(a, q, steps_s)
-    time, now = 0.0, P0
-    for step_s, transition, noise in zip(steps_s, *steps, strict=True):
-        with np.errstate(over="ignore", invalid="ignore"):
-            later = transition @ now @ transition.T + noise
-        if np.isfinite(later).all() and largest_variance(rows, later) < goal:
-            time, now = time + float(step_s), later
-            if time >= horizon:
-                return math.inf
-    return time
-
-
-def _by_windows(P0: Array, a: Array, q: Array, rows: Array, goal: float, horizon: float) -> float:
+    if np.linalg.eigvalsh(_rate(P0, a) + q)[-1] <= 0.0:
+        return math.inf  # it sinks, and goes on sinking
     # The remainder is measured in norms: in balanced coordinates they are the least wasteful.
     a, scales = matrix_balance(a, permute=False)
     inverse = np.linalg.inv(scales)
@@ -94,7 +66,9 @@ def _by_windows(P0: Array, a: Array, q: Array, rows: Array, goal: float, horizon
         curve.append(rest / math.factorial(_ORDER + 1))
         room = horizon - time
         longest = room if rest == 0.0 else min(room, 1.0 / speed)
-        free = _free_by_series(rows @ now @ rows.T, rows @ rate @ rows.T, curve, goal, longest)
+        free = _free_by_series(
+            rows @ now @ rows.T, rows @ rate @ rows.T, curve, goal, _RESOLUTION * time, longest
+        )
         if free == longest < room:
             free = _free_by_rise(rows @ now @ rows.T, rate, a, rows, goal, longest, room)
         if free == room:
@@ -104,19 +78,27 @@ def _by_windows(P0: Array, a: Array, q: Array, rows: Array, goal: float, horizon
         time += free
 
 
-def _free_by_series(value: Array, slope: Array, curve: list[float], goal: float, longest: float) -> float:
-    """The longest window in which `value + slope t + sum of curve[k] t^k` stays below the goal."""
-    first = float(np.linalg.eigvalsh(value)[-1])
+def largest_variance(rows: Array, covariance: Array) -> float:
+    """Largest eigenvalue of `D P D'`: of D x, over all unit combinations of its entries."""
+    return float(np.linalg.eigvalsh(rows @ covariance @ rows.T)[-1])
+
+
+def _free_by_series(
+    value: Array, slope: Array, curve: list[float], goal: float, shortest: float, longest: float
+) -> float:
+    """The longest window in which `value + slope t + sum of curve[k] t^k` stays below the goal, as `value` does."""
 
     def peak(time: float) -> float:
         # The largest eigenvalue of value + slope t is convex in t: over a window it is largest at an end.
-        line = max(first, float(np.linalg.eigvalsh(value + time * slope)[-1]))
-        return line + sum(factor * time**order for order, factor in enumerate(curve))
+        bound = 0.0
+        for factor in reversed(curve):
+            bound = bound * time + factor
+        return bound + float(np.linalg.eigvalsh(value + time * slope)[-1])
 
     if peak(longest) < goal:
         return longest
     free, crossed = 0.0, longest
-    for _ in range(50):
+    while crossed > shortest and crossed - free > 1e-6 * crossed:
         middle = 0.5 * (free + crossed)
         free, crossed = (middle, crossed) if peak(middle) < goal else (free, middle)
     return free

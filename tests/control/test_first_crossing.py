@@ -77,10 +77,24 @@ def test_never_late_and_hardly_early(seed, n, directions, factor, noisy):
 def test_the_tolerance_reached_already_leaves_no_time():
     assert blind_time(np.eye(2), INTEGRATOR, np.eye(2), POSITION, 1.0, 1.0, 10.0) == 0.0
     assert blind_time(np.eye(2), INTEGRATOR, np.eye(2), POSITION, 0.5, 1.0, 10.0) == 0.0
+    assert blind_time(np.eye(2), -np.eye(2), 0.1 * np.eye(2), POSITION, 0.5, 1.0, 10.0) == 0.0
 
 
 def test_a_sinking_covariance_never_crosses():
+    began = time.process_time()
     assert blind_time(np.eye(2), -np.eye(2), 0.1 * np.eye(2), POSITION, 1.01, 1.0, 1e9) == math.inf
+    assert blind_time(np.eye(2), np.zeros((2, 2)), np.zeros((2, 2)), POSITION, 1.01, 1.0, 1e9) == math.inf
+    assert time.process_time() - began < 0.1
+
+
+@pytest.mark.parametrize("tolerance", [1.0, 1e9, 1e12])
+def test_growth_that_the_first_derivatives_do_not_show(tolerance):
+    # Eight integrators in a row: only the fourteenth derivative of the first one's variance, t^14 / 7!^2, is not 0.
+    start, a = np.diag([0.0] * 7 + [1.0]), np.eye(8, k=1)
+    start[6, 6] = 1e-30
+    found = blind_time(start, a, np.zeros((8, 8)), np.eye(8)[0], tolerance, 1.0, 1e4)
+    exact = (tolerance * math.factorial(7)) ** (1 / 7)
+    assert exact * (1 - 1e-8) <= found <= exact
 
 
 def test_a_crossing_after_the_horizon_is_none():
@@ -97,6 +111,8 @@ def test_a_far_horizon_costs_no_precision_and_no_overflow():
     found = blind_time([[1.0]], [[10.0]], [[0.0]], [1.0], 2.0, 1.0, 1e7)
     assert found == pytest.approx(math.log(2.0) / 10.0, rel=1e-9)
     assert blind_time([[1.0]], [[10.0]], [[0.0]], [1.0], 1e300, 1.0, 1e7) < math.inf
+    walk = blind_time(np.zeros((2, 2)), INTEGRATOR, np.diag([0.0, 3.0]), POSITION, 8.0, 1.0, 1e40)
+    assert walk == pytest.approx(4.0, rel=1e-9)
 
 
 def test_several_directions_take_the_worst():
@@ -115,7 +131,7 @@ def test_several_directions_take_the_worst():
 @pytest.mark.parametrize("lag_s", [1.0, 0.1, 1e-2, 1e-3])
 def test_a_stiff_system_is_quick(lag_s):
     # A velocity that forgets itself within lag_s: windows of 1 / |A| would be up to 60,000 here.
-    a, q = np.array([[0.0, 1.0], [0.0, -1.0 / lag_s]]), np.diag([0.0, 0.1 / lag_s**2])
+    a, q = np.array([[-0.001, 1.0], [0.0, -1.0 / lag_s]]), np.diag([0.0, 0.15 / lag_s**2])
     began = time.process_time()
     found = blind_time(0.01 * np.eye(2), a, q, POSITION, 4.0, 2.0, 60.0)
     assert time.process_time() - began < 0.5
