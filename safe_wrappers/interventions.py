@@ -127,7 +127,7 @@ OCCLUSION_VISIBLE: Final = "occlusion/visible"
 OCCLUSION_SIGMA: Final = "occlusion/sigma"
 """float64 array, one per track: m, standard deviation of the estimated position where it is largest."""
 OCCLUSION_EXPIRED: Final = "occlusion/expired"
-"""bool array, one per track: `sigmas` standard deviations would cross the tolerance before the next control step ends,
+"""bool array, one per track: `sigmas` standard deviations would cross the tolerance before the next step ends,
 if nothing is seen until then: no permission to rely on this track."""
 OCCLUSION_PENALTY: Final = "occlusion/penalty"
 """float64: what was taken off this step's reward, in reward units."""

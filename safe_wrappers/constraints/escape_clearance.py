@@ -29,6 +29,7 @@ _EVERY = 2
 """Holds between the instants at which ways are checked."""
 _GOING_S = (0.3, 0.8)
 """For how long the manoeuvres go before they brake, s."""
+_DIRECTIONS = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 _RECOVERY_S = 0.4
 """Time constant, s, with which the way out of a violation must come clear."""
 _BLENDS = (0.2, 0.4, 0.6, 0.8)
@@ -46,10 +47,10 @@ class EscapeClearance:
     (`Discs` at constant velocity), `TrackedDiscs` anywhere inside the bound of their estimate as it grows if nothing
     more is seen, boxed in along x and y. So the less is known, the earlier the machine keeps off.
 
-    What it promises: from a state with a way out, the executed control leaves a way out, or the step is flagged. While
+    What it promises: from a state with a way out, the executed control leaves one, or the step is flagged. While
     everything stays inside its declared bound, following the manoeuvre that was open keeps clear for the rest of the
-    horizon. Best effort: a way out is looked for among nine manoeuvres; what was clear may not be clear when more is
-    seen (an estimate moves); the ways are checked at every second control step (`margin` covers what lies between: for
+    horizon. Best effort: a way out is looked for among nine manoeuvres and the one that was open before; what was clear may not be clear when more is
+    seen (an estimate moves); ways are checked at every second control step (`margin` covers what lies between: for
     a relative speed v and steps of h it is `(v h)^2 / 2` over the distance); nobody is seen beyond the horizon.
 
     Args:
@@ -99,12 +100,22 @@ class EscapeClearance:
     def _read_constants(self, plant: MujocoPlant) -> None:
         self._stamp, self._revision = -1, plant.revision
         self._point = point = planar_point(plant, np.inf, self.body)
+        # What one hold makes of a state; x and y.
+        self._hold = np.array([(a.low, a.high, a.drift, a.shift, a.keep, a.add) for a in point.axes]).T
         holds = int(np.ceil(self.horizon_s / plant.hold_s))
-        ways = [Manoeuvre(0.0, 0.0, 0)]
-        for seconds in _GOING_S:
-            going = max(1, round(seconds / plant.hold_s))
-            ways += [Manoeuvre(x, y, going) for x, y in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))]
-        self._escapes = Escapes(point.axes, ways, np.arange(0, holds + 1, _EVERY))
+        longest = max(1, round(max(_GOING_S) / plant.hold_s))
+        bank = [Manoeuvre(0.0, 0.0, 0)]
+        bank += [Manoeuvre(x, y, going) for x, y in _DIRECTIONS for going in range(1, longest + 1)]
+        self._escapes = Escapes(point.axes, bank, np.arange(0, holds + 1, _EVERY))
+        starts = [max(1, round(seconds / plant.hold_s)) for seconds in _GOING_S]
+        self._usual = [0, *(bank.index(Manoeuvre(x, y, n)) for x, y in _DIRECTIONS for n in starts)]
+        self._firsts_of = [0, *(bank.index(Manoeuvre(x, y, 1)) for x, y in _DIRECTIONS)]
+        self._tried: list[tuple[Array, Array]] = []
+
+    def reset(self) -> None:
+        """Forget the way out of the episode before."""
+        self._stamp = -1
+        self._tried = []
 
     def _look(self, plant: MujocoPlant) -> None:
         """Take the state, and where everything may be later on, once per observation."""
@@ -113,6 +124,7 @@ class EscapeClearance:
         if plant.revision != self._revision:
             self._read_constants(plant)
         self._stamp = plant.stamp
+        self._open = self._with_going_on(plant.qvel[list(self._point.joints)])
         joints = list(self._point.joints)
         self._position = plant.qpos[joints] + np.asarray(self._point.origin)
         self._velocity = plant.qvel[joints]
@@ -136,6 +148,23 @@ class EscapeClearance:
         self._wanted = self.margin + outside * np.exp(-times[1:] / _RECOVERY_S)
         self._best: float | None = None
 
+    def _with_going_on(self, velocity: Array) -> Array:
+        """The manoeuvres to look at: the usual ones, and to go on with the one that was open after the last control.
+
+        Which control was executed shows in the velocity that it has led to.
+        """
+        which = list(self._usual)
+        if self._tried:
+            led_to = np.concatenate([v for v, _ in self._tried])
+            chosen = np.concatenate([best for _, best in self._tried])
+            nearest = int(((led_to - velocity) ** 2).sum(axis=1).argmin())
+            # The same way with one hold less to go: the manoeuvres of a direction are in the order of their lengths.
+            going_on = int(chosen[nearest])
+            shorter = going_on - 1 if self._escapes.manoeuvres[going_on].holds > 1 else 0
+            which += [i for i in (going_on, shorter) if i not in which]
+        self._tried = []
+        return np.array(which)
+
     def _expected(self, obstacle: Any, plant: MujocoPlant, times: Array) -> tuple[Array, Array]:
         """Centres and half-widths of the boxes that hold them, shapes (k, n, 2)."""
         late = times + plant.delay_s
@@ -147,15 +176,15 @@ class EscapeClearance:
         return moved, np.zeros_like(moved)
 
     def _slacks(self, plant: MujocoPlant, controls: Array) -> Array:
-        """What the best way out after each of some held controls (c, 2) leaves, wanted >= 0, shape (c, manoeuvres)."""
-        x_axis, y_axis = self._point.axes
-        held = np.minimum(np.maximum(controls, (x_axis.low, y_axis.low)), (x_axis.high, y_axis.high))
-        v = self._velocity
-        position = self._position + (x_axis.drift, y_axis.drift) * v + (x_axis.shift, y_axis.shift) * held
-        velocity = (x_axis.keep, y_axis.keep) * v + (x_axis.add, y_axis.add) * held
-        x, y = self._escapes.paths(position, velocity)
-        left = self._clearances(plant, x, y) - self._wanted
-        return np.asarray(left.min(axis=-1))
+        """What every way out after each of some held controls (c, 2) leaves, wanted >= 0, shape (c, manoeuvres)."""
+        low, high, drift, shift, keep, add = self._hold
+        held = np.minimum(np.maximum(controls, low), high)
+        position = self._position + drift * self._velocity + shift * held
+        velocity = keep * self._velocity + add * held
+        x, y = self._escapes.paths(position, velocity, self._open)
+        left = (self._clearances(plant, x, y) - self._wanted).min(axis=-1)
+        self._tried.append((velocity, self._open[left.argmax(axis=1)]))
+        return np.asarray(left)
 
     def _clearances(self, plant: MujocoPlant, x: Array, y: Array) -> Array:
         """Distance of ways from whatever is nearest, margin not taken off; shapes (c, m, k) as the ways'."""
@@ -220,9 +249,8 @@ class EscapeClearance:
         return control
 
     def _firsts(self) -> Array:
-        """First controls of all manoeuvres, shape (manoeuvres, 2), each once."""
-        every = [self._escapes.first(i, self._velocity) for i in range(len(self._escapes.manoeuvres))]
-        return np.unique(np.array(every), axis=0)
+        """First controls of the manoeuvres: braking, and each direction; shape (5, 2)."""
+        return np.array([self._escapes.first(i, self._velocity) for i in self._firsts_of])
 
     def suggestions(self, plant: MujocoPlant, control: Array) -> list[Array]:
         """Admissible controls near a refused one, the nearest first."""

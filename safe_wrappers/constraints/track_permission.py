@@ -19,11 +19,11 @@ Array = NDArray[np.float64]
 class TrackPermission:
     """While the permission of a track has expired, slow down to `creep` (rest), at least as hard as `braking`.
 
-    An `OcclusionPenalty` inside the filter says which tracks may be relied on. The rows bound the speed along each axis
+    An `OcclusionPenalty` inside the filter says which tracks may be relied on. The rows bound the speed along an axis
     at the end of the control step: it falls by `braking` times the control interval, shared as the velocity is, down
     to `creep`. With all permissions in force it asks for nothing, and the policy's action passes.
 
-    What it promises: the executed controls brake as declared, or the step is flagged infeasible. It stops the machine,
+    What it promises: executed controls brake as declared, or the step is flagged infeasible. It stops the machine,
     not what comes to meet it: where standing still is no safe state, keep out of the way (`Clearance` with
     `TrackedDiscs`), too. Best effort: the drift changes within a held step, and another constraint may ask for the
     opposite.

@@ -2,9 +2,9 @@
 
 A manoeuvre holds a full (or no) control along each axis for some control steps, then brakes each axis for itself,
 fully, and in its last hold just to rest (`held_axis.py`). Along one axis the way of the go-phase is linear in the
-present state. The way of the braking is piecewise linear in the speed at which it begins, with a knot at each speed that
-whole holds of full braking take away exactly; so it is tabulated once, and every manoeuvre from many states is a few
-array operations, exact to rounding.
+present state. The way of the braking is piecewise linear in the speed at which it begins, with a knot at each
+speed that whole holds of full braking take away exactly; so it is tabulated once, and every manoeuvre from many states
+is a few array operations, exact to rounding.
 """
 
 from typing import NamedTuple
@@ -50,7 +50,7 @@ class _Braking(NamedTuple):
 
 
 class _Prepared(NamedTuple):
-    """What all go-phases make of an axis's position and speed, and the braking after them; m manoeuvres, k instants."""
+    """What go-phases make of an axis's position and speed, and the braking after them; m manoeuvres, k instants."""
 
     drift: Array
     shift: Array
@@ -108,32 +108,35 @@ class Escapes:
             axis.high == -axis.low,
         )
 
-    def paths(self, position: Array, velocity: Array) -> tuple[Array, Array]:
-        """Positions at the instants, for every manoeuvre.
+    def paths(self, position: Array, velocity: Array, which: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Positions at the instants.
 
         Args:
             position: Shape (c, 2), m.
             velocity: Shape (c, 2), m/s.
+            which: Indices of the manoeuvres that are asked for, shape (m,).
 
         Returns:
-            Along x and along y, shapes (c, manoeuvres, instants), m.
+            Along x and along y, shapes (c, m, instants), m.
         """
         along = []
         for i, p in enumerate(self._parts):
             v = velocity[:, i, None]
-            end = p.keep * v + p.add  # (c, m): the speed at which braking begins
+            end = p.keep[which] * v + p.add[which]  # (c, m): the speed at which braking begins
+            after = p.after[which]
             if p.symmetric:
-                braked = np.sign(end)[..., None] * p.forwards.at(np.abs(end), p.after)
+                braked = np.sign(end)[..., None] * p.forwards.at(np.abs(end), after)
             else:
                 ahead, back = np.maximum(end, 0.0), np.maximum(-end, 0.0)
-                braked = p.forwards.at(ahead, p.after) - p.backwards.at(back, p.after)
-            along.append(position[:, i, None, None] + p.drift * v[..., None] + (p.shift + braked))
+                braked = p.forwards.at(ahead, after) - p.backwards.at(back, after)
+            gone = p.drift[which] * v[..., None] + p.shift[which]
+            along.append(position[:, i, None, None] + (gone + braked))
         return along[0], along[1]
 
     def first(self, which: int, velocity: Array) -> Array:
         """The control of a manoeuvre's first hold from a velocity (2,), shape (2,)."""
         if self._going[which]:
-            return self.controls[which].copy()
+            return np.array(self.controls[which])
         return np.array([axis.brake(float(v)) for axis, v in zip(self._axes, velocity, strict=True)])
 
 

@@ -6,8 +6,7 @@ search goes from window to window, each shown to be free before time moves on, b
 - the Taylor series of the variance with its remainder: tight near the crossing, but for windows up to 1 / |A| only;
 - the growth by the positive part of the rate alone: it only rises, and holds for windows of any length.
 
-Both rest on the rate X = dP/dt, which obeys X' = A X + X A': `X(t) = exp(A t) X(0) exp(A t)'` keeps the signs of its
-eigenvalues, so a covariance that sinks in every direction never rises again.
+Both rest on the rate X = dP/dt, which obeys X' = A X + X A'.
 
 The cost grows with the number of swings within the horizon. Nothing is checked here:
 `safe_wrappers.control.covariance.blind_time` does that.
@@ -45,8 +44,6 @@ def first_crossing(P0: Array, a: Array, q: Array, rows: Array, goal: float, hori
     """
     if largest_variance(rows, P0) >= goal:
         return 0.0
-    if np.linalg.eigvalsh(_rate(P0, a) + q)[-1] <= 0.0:
-        return math.inf  # it sinks, and goes on sinking
     # The remainder is measured in norms: in balanced coordinates they are the least wasteful.
     a, scales = matrix_balance(a, permute=False)
     inverse = np.linalg.inv(scales)
@@ -98,7 +95,7 @@ def _free_by_series(
     if peak(longest) < goal:
         return longest
     free, crossed = 0.0, longest
-    while crossed > shortest and crossed - free > 1e-6 * crossed:
+    while crossed - free > 1e-6 * crossed:
         middle = 0.5 * (free + crossed)
         free, crossed = (middle, crossed) if peak(middle) < goal else (free, middle)
     return free

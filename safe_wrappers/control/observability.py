@@ -14,7 +14,6 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import matrix_balance
 
 from safe_wrappers.control.finite import finite_arrays
 from safe_wrappers.control.taylor import Function, output_series
@@ -29,12 +28,12 @@ LONGEST_TIME_SCALE_S: Final = 1e6
 """s; what changes more slowly than this is judged on this scale, or rounding errors would pass for slow motion."""
 
 _NO_COUPLING = 1e-13
-"""Entries of A below this share of the largest are rounding."""
+"""Entries of A or C below this share of its largest are rounding."""
 _STATE_ROUNDING = 1e-12
 """Relative; what this much of an error in the state can make of a coefficient is not told from zero."""
 _NOISE_FACTOR = 10.0
 _PROBES = 4
-_LARGEST_COLUMN_SCALE = 1e6
+_LARGEST_COLUMN_SCALE = 1e3
 _NEGLIGIBLE = 1e-8
 _PIVOT = 0.1
 
@@ -138,7 +137,8 @@ def linear_observability(
 
     The unobservable subspace is found as the largest one in the kernel of C that A maps into itself, by orthogonal
     projections, so no power of A is formed that fast and slow modes would spoil. Before, units are taken out: the
-    states are balanced (LAPACK's gebal), A is divided by its norm and each row of C by its own.
+    states are scaled so that their couplings are about equally strong, A is divided by its norm and each row of C by
+    its own.
 
     Args:
         A: Shape (n, n), 1/s.
@@ -205,7 +205,7 @@ def nonlinear_observability(
     Taylor coefficients, in time, of the output's sensitivity to the initial state, and are found by running f and h
     on truncated Taylor series (`control.taylor`): no differences, no step size; rounding is all that they err by, and
     what a relative error of 1e-12 in x could make of zero counts as zero. Each output's rows are scaled by the time
-    on which that output changes, and each state's column by its size (by a factor of up to a million), so that units
+    on which that output changes, and each state's column by its size (by a factor of up to a thousand), so that units
     do not decide.
 
     Known inputs belong into f: close over them. An input that varies is an extra state that is measured.
@@ -321,7 +321,7 @@ def described_subspace(basis: Array, names: Sequence[str]) -> tuple[str, ...]:
 
 
 class _Scaled(NamedTuple):
-    """A system without units: its states balanced, its time in `time_s`, the rows of C of length one."""
+    """A system without units: its states scaled, its time in `time_s`, the rows of C of length one."""
 
     a: Array
     c: Array
@@ -330,14 +330,46 @@ class _Scaled(NamedTuple):
 
 
 def _scaled(a: Array, c: Array) -> _Scaled:
-    # Rounding errors are no couplings to balance.
-    couplings = np.where(np.abs(a) > _NO_COUPLING * np.abs(a).max(), a, 0.0)
-    _, (units, _) = matrix_balance(couplings, permute=False, separate=True)
+    units = _units(a, c)
     a = a * units / units[:, None]
     c = c * units
     rate = max(float(np.linalg.norm(a, 2)), 1.0 / LONGEST_TIME_SCALE_S)
     lengths = np.linalg.norm(c, axis=1, keepdims=True)
     return _Scaled(a / rate, c / np.where(lengths > 0.0, lengths, 1.0), units, 1.0 / rate)
+
+
+def _units(a: Array, c: Array) -> Array:
+    """Units of the states, shape (n,), powers of two, in which couplings between states are all about as large.
+
+    Least squares of the entries' logarithms (Curtis and Reid, On the automatic scaling of matrices for Gaussian
+    elimination, 1972), with a time scale and a gain for each output free. Unlike LAPACK's balancing, it also serves
+    chains, in which nothing feeds back.
+    """
+    n, m = len(a), len(c)
+    couplings = _weights(a - np.diag(np.diag(a)), np.abs(a).max())
+    gains = _weights(c, np.abs(c).max())
+    rows, right = [], []
+    for (i, j), size in couplings:
+        row = np.zeros(n + 1 + m)
+        row[j], row[i], row[n] = 1.0, -1.0, -1.0
+        rows.append(row)
+        right.append(-size)
+    for (k, j), size in gains:
+        row = np.zeros(n + 1 + m)
+        row[j], row[n + 1 + k] = 1.0, -1.0
+        rows.append(row)
+        right.append(-size)
+    if not rows:
+        return np.ones(n)
+    solution = np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0]
+    return np.asarray(np.exp2(np.round(solution[:n])))
+
+
+def _weights(matrix: Array, largest: float) -> list[tuple[tuple[int, int], float]]:
+    """Places and binary logarithms of the entries; rounding errors are no entries."""
+    sizes = np.abs(matrix)
+    places = np.argwhere(sizes > _NO_COUPLING * largest)
+    return [((int(i), int(j)), float(np.log2(sizes[i, j]))) for i, j in places]
 
 
 def _hidden(a: Array, c: Array, tolerance: float) -> tuple[Array, float]:
@@ -371,14 +403,17 @@ def _certain_series(f: Function, h: Function, x: Array, order: int) -> Array:
 
 
 def _in_own_time(rows: Array) -> Array:
-    """Rows of one output, order by order, in the time on which it changes fastest, the longest row of length one."""
+    """Rows of one output, order by order, in the time on which it changes, the longest row of length one.
+
+    That time is the usual ratio of one order to the next. A root of the last order over the first would make the time
+    longer, the weaker what the first order misses, and so hide how weak it is.
+    """
     lengths = np.linalg.norm(rows, axis=1)
-    if not lengths.any():
+    orders = np.flatnonzero(lengths)
+    if not orders.size:
         return rows
-    first = int(np.argmax(lengths > 0.0))
-    orders = np.arange(1, len(rows) - first)
-    growth = (lengths[first + 1 :] / lengths[first]) ** (1.0 / orders)
-    rate = max(growth.max(initial=0.0), 1.0 / LONGEST_TIME_SCALE_S)
+    growth = np.diff(np.log(lengths[orders])) / np.diff(orders)
+    rate = max(math.exp(np.median(growth)) if growth.size else 0.0, 1.0 / LONGEST_TIME_SCALE_S)
     scaled = rows / rate ** np.arange(len(rows))[:, None]
     return np.asarray(scaled / np.linalg.norm(scaled, axis=1).max())
 

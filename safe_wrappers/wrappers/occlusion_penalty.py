@@ -39,8 +39,8 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
 
     - **Reward**: `weight` times the mean, over the tracks within the sensor's range, of
       ``min(1, sigmas * sigma / tolerance) ** 2``, is taken off. `weight=0` leaves the reward alone.
-    - **Observation** (`observe`): for each track the estimated position relative to the sensor's body (m, world axes),
-      the estimated velocity (m/s) and the standard deviation along each axis (m), appended to a flat Box, or under
+    - **Observation** (`observe`): for each track the estimated position relative to the sensor's body (m, world
+      axes), the estimated velocity (m/s) and the standard deviation along each axis (m), appended to a flat Box, or under
       the key "tracks" of a Dict. The tracks' true states are not in it.
     - **Permission**: a track's permission to be relied on expires *before* ``sigmas * sigma`` crosses `tolerance`,
       one control step ahead, and comes back when it is seen. `TrackPermission` stops the machine then; `permissions`
@@ -75,8 +75,8 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         track_names: One per track: the body's name, or the attribute's with an index.
         last_seen_positions: Where each was measured to be last, shape (n, d), m; before that, the initial fix.
         permitted: Tracks that may be relied on, bool (n,).
-        unobservable: Track name -> directions of its state that this sensor cannot resolve even in sight, in the names
-            of the state ("x", "vy"); empty for a sensor that measures positions.
+        unobservable: Track name -> directions of its state that this sensor cannot resolve even in sight, in the
+            names of the state ("x", "vy"); empty for a sensor that measures positions.
 
     Raises:
         UnsupportedEnvError: No MuJoCo model, or with `observe` neither a flat Box nor a Dict observation.
@@ -304,7 +304,7 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         d, n = self._d, len(self.track_names)
         truth, velocities = self._truth()
         seen = self._sight.sees(truth, self._bodies)
-        # Drawn for every track whether it is seen or not, so that the noise of one does not depend on another's sight.
+        # Drawn for every track, seen or not, so that the noise of one does not depend on another's sight.
         noise = self._random.draw.standard_normal((n, self._noise.shape[0])) @ self._noise_root.T
         if self.sensor.dropout:
             seen &= self._random.draw.random(n) >= self.sensor.dropout
@@ -395,7 +395,7 @@ def _with_tracks(space: gym.Space[Any], size: int) -> gym.Space[Any]:
     if isinstance(space, gym.spaces.Box) and len(space.shape) == 1:
         bound = np.full(size, np.inf)
         low, high = np.concatenate([space.low, -bound]), np.concatenate([space.high, bound])
-        return gym.spaces.Box(low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype.type)  # type: ignore[union-attr]
+        return gym.spaces.Box(low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype.type)
     raise UnsupportedEnvError(
         f"with observe=True the observation must be a flat Box or a Dict, got {space}; flatten it inside, or pass "
         "observe=False"

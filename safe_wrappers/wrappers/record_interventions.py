@@ -79,8 +79,8 @@ class RecordInterventions(
     - `cost`, `cost_substep`: sums;
     - `spin_outs`: steps with `spin_out` above 0, when the task reports it;
     - `collisions`: how many began, when the task reports it;
-    - `seen`: share of time that a tracked thing was seen, mean over the tracks, and `expiries`: how often the permission
-      to rely on one ran out, with an `OcclusionPenalty` inside;
+    - `seen`: share of time that a tracked thing was seen, mean over the tracks, and `expiries`: how often the
+      permission to rely on one ran out, with an `OcclusionPenalty` inside;
     - `goals_reached` and `success` when the task reports `goals_reached`, and `success` or `is_success`.
 
     Args:
@@ -104,6 +104,9 @@ class RecordInterventions(
     Change log:
         * v0.1.0: added.
     """
+
+    _expired: Any
+    """Permissions that had run out at the step before; None: nothing is tracked."""
 
     def __init__(self, env: gym.Env[Any, Any], path: str | os.PathLike[str] | None = None) -> None:
         _refuse_chunks(env)
@@ -160,10 +163,10 @@ class RecordInterventions(
         self._cost_substep = 0.0
         self._task: dict[str, int | float | bool] = {}
         self._seen = 0.0
-        self._expired: Any = None
+        self._expired = None
 
     def _count(self, reward: float, info: dict[str, Any]) -> None:
-        self._return += float(info.get(keys.OCCLUSION_TASK_REWARD, reward))
+        self._return += reward + float(info.get(keys.OCCLUSION_PENALTY, 0.0))
         correction = float(info.get(keys.CBF_CORRECTION, 0.0))
         self._corrections.append(correction)
         self._correction_sum += correction
@@ -194,7 +197,7 @@ class RecordInterventions(
         self._seen += float(np.mean(info[keys.OCCLUSION_VISIBLE]))
         self._task["seen"] = self._seen / len(self._corrections)
         expired = np.asarray(info[keys.OCCLUSION_EXPIRED])
-        before = expired if self._expired is None else self._expired
+        before: Any = expired if self._expired is None else self._expired
         self._task["expiries"] = self._task.get("expiries", 0) + int((expired & ~before).sum())
         self._expired = expired
 

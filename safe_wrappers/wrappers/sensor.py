@@ -20,7 +20,7 @@ class Sensor:
     """A camera, or any other sensor that needs a line of sight, on a body of the model.
 
     What it measures is simulated: the tracked point's position relative to the sensor, and if asked for its velocity
-    relative to it, in the sensor's own axes, with Gaussian noise. The pose of the body that it sits on is known; where
+    relative to it, in the sensor's own axes, with Gaussian noise. The pose of the body it sits on is known; where
     on the body it sits is the model's, or left out (`lever_arm`).
 
     Args:

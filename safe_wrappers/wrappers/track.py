@@ -57,8 +57,8 @@ class Track:
             )
         if self.acceleration_noise is None:
             raise ConfigurationError(
-                "say how it moves: acceleration_noise, the intensity of its white acceleration noise in m^2/s^3 (0: it "
-                "keeps its velocity exactly)"
+                "say how it moves: acceleration_noise, the intensity of its white acceleration noise in m^2/s^3 (0: "
+                "it keeps its velocity exactly)"
             )
         if self.reversion_s is not None:
             self.reversion_s = positive("reversion_s", self.reversion_s, "s")
