@@ -49,9 +49,10 @@ class EscapeClearance:
 
     What it promises: from a state with a way out, the executed control leaves one, or the step is flagged. While
     everything stays inside its declared bound, following the manoeuvre that was open keeps clear for the rest of the
-    horizon. Best effort: a way out is looked for among nine manoeuvres and the one that was open before; what was clear may not be clear when more is
-    seen (an estimate moves); ways are checked at every second control step (`margin` covers what lies between: for
-    a relative speed v and steps of h it is `(v h)^2 / 2` over the distance); nobody is seen beyond the horizon.
+    horizon. Best effort: a way out is looked for among nine manoeuvres and the one that was open before; what was
+    clear may not be clear when more is seen (an estimate moves; up to `margin` of that is borne without a flag); ways
+    are checked at every second control step (for a relative speed v and steps of h, `(v h)^2 / 2` over the distance
+    lies between); nothing is seen beyond the horizon.
 
     Args:
         body: Name of the body on its two slides along x and y, each with a force actuator of its own. What else the

@@ -2,9 +2,9 @@
 
 A manoeuvre holds a full (or no) control along each axis for some control steps, then brakes each axis for itself,
 fully, and in its last hold just to rest (`held_axis.py`). Along one axis the way of the go-phase is linear in the
-present state. The way of the braking is piecewise linear in the speed at which it begins, with a knot at each
-speed that whole holds of full braking take away exactly; so it is tabulated once, and every manoeuvre from many states
-is a few array operations, exact to rounding.
+present state. The way of the braking is piecewise linear in the speed at which it begins, with a knot at each speed
+that whole holds of full braking take away exactly; so it is tabulated once, and every manoeuvre from many states is a
+few array operations, exact to rounding.
 """
 
 from typing import NamedTuple

@@ -3,7 +3,8 @@
 The growth need not be monotonic: an oscillator's covariance swings, and a correlation may let it sink first. So the
 search goes from window to window, each shown to be free before time moves on, by the better of two bounds:
 
-- the Taylor series of the variance with its remainder: tight near the crossing, but only for windows up to 1 over the norm of A;
+- the Taylor series of the variance with its remainder: tight near the crossing, but only for windows up to 1 over
+  the norm of A;
 - the growth by the positive part of the rate alone: it only rises, and holds for windows of any length.
 
 Both rest on the rate X = dP/dt, which obeys X' = A X + X A'.

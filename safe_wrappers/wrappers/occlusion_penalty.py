@@ -40,8 +40,8 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
     - **Reward**: `weight` times the mean, over the tracks within the sensor's range, of
       ``min(1, sigmas * sigma / tolerance) ** 2``, is taken off. `weight=0` leaves the reward alone.
     - **Observation** (`observe`): for each track the estimated position relative to the sensor's body (m, world
-      axes), the estimated velocity (m/s) and the standard deviation along each axis (m), appended to a flat Box, or under
-      the key "tracks" of a Dict. The tracks' true states are not in it.
+      axes), the estimated velocity (m/s) and the standard deviation along each axis (m), appended to a flat Box, or
+      under the key "tracks" of a Dict. The tracks' true states are not in it.
     - **Permission**: a track's permission to be relied on expires *before* ``sigmas * sigma`` crosses `tolerance`,
       one control step ahead, and comes back when it is seen. `TrackPermission` stops the machine then; `permissions`
       says for how long they would last.
@@ -118,6 +118,10 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
             raise ConfigurationError(f"tracks is a list with at least one Track, got {tracks!r}")
         self.tracks = [track_from(t) for t in tracks]
         self.sensor = sensor_from(sensor)
+        if self.sensor.velocity_std is not None and any(t.published is not None for t in self.tracks):
+            raise ConfigurationError(
+                "velocity_std: velocities are measured of bodies; of positions that the env publishes none are known"
+            )
         self.tolerance = positive("tolerance", tolerance, "m")
         self.weight = non_negative("weight", weight, "the task's reward per step")
         self.sigmas = positive("sigmas", sigmas, "standard deviations")
