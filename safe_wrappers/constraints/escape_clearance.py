@@ -111,7 +111,7 @@ class EscapeClearance:
         starts = [max(1, round(seconds / plant.hold_s)) for seconds in _GOING_S]
         self._usual = [0, *(bank.index(Manoeuvre(x, y, n)) for x, y in _DIRECTIONS for n in starts)]
         self._firsts_of = [0, *(bank.index(Manoeuvre(x, y, 1)) for x, y in _DIRECTIONS)]
-        self._tried: list[tuple[Array, Array]] = []
+        self._tried: list[tuple[Array, NDArray[np.intp]]] = []
 
     def reset(self) -> None:
         """Forget the way out of the episode before."""
@@ -149,7 +149,7 @@ class EscapeClearance:
         self._wanted = self.margin + outside * np.exp(-times[1:] / _RECOVERY_S)
         self._best: float | None = None
 
-    def _with_going_on(self, velocity: Array) -> Array:
+    def _with_going_on(self, velocity: Array) -> NDArray[np.intp]:
         """The manoeuvres to look at: the usual ones, and to go on with the one that was open after the last control.
 
         Which control was executed shows in the velocity that it has led to.
@@ -164,7 +164,7 @@ class EscapeClearance:
             shorter = going_on - 1 if self._escapes.manoeuvres[going_on].holds > 1 else 0
             which += [i for i in (going_on, shorter) if i not in which]
         self._tried = []
-        return np.array(which)
+        return np.array(which, dtype=np.intp)
 
     def _expected(self, obstacle: Any, plant: MujocoPlant, times: Array) -> tuple[Array, Array]:
         """Centres and half-widths of the boxes that hold them, shapes (k, n, 2)."""

@@ -167,7 +167,7 @@ def largest_deviation(covariances: Array) -> Array:
     """The standard deviation in the direction in which it is largest, shape (...,), of covariances (..., d, d)."""
     if covariances.shape[-1] == 2:
         a, b, c = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
-        largest: Array = 0.5 * (a + c) + np.hypot(0.5 * (a - c), b)
+        largest = np.asarray(0.5 * (a + c) + np.hypot(0.5 * (a - c), b))
     else:
-        largest = np.linalg.eigvalsh(covariances)[..., -1]
+        largest = np.asarray(np.linalg.eigvalsh(covariances)[..., -1])
     return np.asarray(np.sqrt(np.maximum(largest, 0.0)))
