@@ -29,8 +29,16 @@ _STEP_KEYS = {
     keys.FAULT_ACTIVE: "step_fault",
     keys.SPIN_OUT: "step_spin_out",
     keys.CONTACT_PEAK_FORCE: "step_contact_force",
+    keys.OCCLUSION_PENALTY: "step_occlusion_penalty",
 }
-_LARGEST_OF_WHEELS = {keys.SLIP_RATIO: "step_slip", keys.SLIP_LIMITED: "step_slip_limited"}
+_LARGEST = {
+    keys.SLIP_RATIO: "step_slip",
+    keys.SLIP_LIMITED: "step_slip_limited",
+    keys.OCCLUSION_SIGMA: "step_sigma",
+}
+"""Of several wheels or tracks."""
+_SHARES = {keys.OCCLUSION_VISIBLE: "step_seen", keys.OCCLUSION_EXPIRED: "step_expired"}
+"""Of the tracks."""
 
 
 class InterventionCallback(BaseCallback):
@@ -42,12 +50,13 @@ class InterventionCallback(BaseCallback):
       `step_cost_substep`, `step_penalty` (AdaptionPenalty's), `step_lease_expired`, `step_lease_refused`,
       `step_lease_braking` (LeaseExpiry's), `step_peak_jerk`, `step_blend_time`, `step_starved`, `step_limited`
       (ChunkHandover's, per chunk), `step_fault`, `step_slip` (the largest size of any wheel), `step_slip_limited`
-      (any wheel), `step_spin_out`, `step_contact_force` (ContactMonitor's, N): over all steps of all envs, from the
-      keys that the wrappers and the task write at every step;
+      (any wheel), `step_spin_out`, `step_contact_force` (ContactMonitor's, N), `step_seen` and `step_expired` (shares
+      of the tracks), `step_sigma` (the largest of any track, m) and `step_occlusion_penalty` (OcclusionPenalty's):
+      over all steps of all envs, from the keys that the wrappers and the task write at every step;
     - `interventions/rate`, `correction_mean`, `correction_p95`, `infeasible`, `fallback`, `nonfinite`,
       `unsafe`, `lease_expired`, `lease_refused`, `lease_braking`, `margin_min`, `violations`, `cost`,
-      `cost_substep`, `goals_reached`, `spin_outs`, `success`: over the episodes that ended, from
-      `RecordInterventions`.
+      `cost_substep`, `goals_reached`, `spin_outs`, `success`, `collisions`, `seen`, `expiries`: over the episodes
+      that ended, from `RecordInterventions`.
 
     It reads infos only, so it works the same with `DummyVecEnv` and `SubprocVecEnv`. For evaluation use
     `InterventionEvalCallback`.
@@ -75,9 +84,12 @@ def log_steps(logger: Logger, infos: Iterable[Mapping[str, Any]]) -> None:
         for key, name in _STEP_KEYS.items():
             if key in info:
                 logger.record_mean(f"interventions/{name}", float(info[key]))
-        for key, name in _LARGEST_OF_WHEELS.items():
+        for key, name in _LARGEST.items():
             if key in info:
                 logger.record_mean(f"interventions/{name}", float(np.abs(info[key]).max()))
+        for key, name in _SHARES.items():
+            if key in info:
+                logger.record_mean(f"interventions/{name}", float(np.mean(info[key])))
 
 
 def log_episode(logger: Logger, info: Mapping[str, Any], prefix: str) -> None:

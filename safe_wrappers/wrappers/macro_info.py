@@ -9,8 +9,11 @@ from safe_wrappers import interventions as keys
 _SUMS: Final = (
     keys.COST,
     keys.COST_SUBSTEP,
+    keys.COLLISIONS,
     keys.ADAPTION_PENALTY,
     keys.ADAPTION_TASK_REWARD,
+    keys.OCCLUSION_PENALTY,
+    keys.OCCLUSION_TASK_REWARD,
     keys.CONTACT_IMPULSE,
 )
 _LEASE_BOOLS: Final = (keys.LEASE_EXPIRED, keys.LEASE_REFUSED, keys.LEASE_BRAKING)
@@ -20,6 +23,7 @@ _ANY: Final = (
     keys.SLIP_LIMITED,
     *_LEASE_BOOLS,
     keys.FAULT_ACTIVE,
+    keys.OCCLUSION_EXPIRED,
     keys.CONTACT_PARTIAL,
 )
 _CONTACT_PEAKS: Final = (keys.CONTACT_PEAK_FORCE, keys.CONTACT_PENETRATION, keys.CONTACT_RESIDUAL)
@@ -30,10 +34,11 @@ _SMALLEST: Final = (keys.CBF_MARGIN,)
 def macro_info(infos: list[dict[str, Any]]) -> dict[str, Any]:
     """The last control step's info, in which costs are summed up and no intervention of the others is lost.
 
-    Costs, impulses, and what `AdaptionPenalty` says of the reward, are sums; what is a flag is True if it was at any
-    control step; corrections, contact forces and a spin-out are the largest, the margin is the smallest. Everything
-    else is the last control step's, the running counts of `RecordInterventions` too. A key that only some control
-    steps have counts where it is there.
+    Costs, collisions, impulses, and what `AdaptionPenalty` and `OcclusionPenalty` say of the reward, are sums; what is
+    a flag is True if it was at any control step; corrections, contact forces and a spin-out are the largest, the
+    margin is the smallest. Everything else is the last control step's: the running counts of `RecordInterventions`,
+    and which tracks were seen and how uncertain they are. A key that only some control steps have counts where it is
+    there.
     """
     last = infos[-1]
     if len(infos) == 1:

@@ -30,6 +30,12 @@ INFOS = [
         keys.EXECUTED_ACTION: np.array([i], np.float32),
         keys.ADAPTION_PENALTY: 0.5 * i,
         keys.ADAPTION_TASK_REWARD: 1.0 * i,
+        keys.COLLISIONS: i,
+        keys.OCCLUSION_PENALTY: 0.25 * i,
+        keys.OCCLUSION_TASK_REWARD: 2.0 * i,
+        keys.OCCLUSION_EXPIRED: np.array(refused),
+        keys.OCCLUSION_VISIBLE: np.array(refused),
+        keys.OCCLUSION_SIGMA: np.array([0.3 - 0.1 * i, 0.1]),
         "interventions/cost": 10.0 * i,
         "own": f"step {i}",
     }
@@ -58,6 +64,11 @@ def test_sums_flags_extremes_and_the_last():
     assert found[keys.CBF_CORRECTION] == 0.7 and found[keys.CBF_CLIPPED] == 0.35
     assert found[keys.CBF_MARGIN] == -0.1
     assert found[keys.ADAPTION_PENALTY] == 1.5 and found[keys.ADAPTION_TASK_REWARD] == 3.0
+    assert found[keys.COLLISIONS] == 3
+    assert found[keys.OCCLUSION_PENALTY] == 0.75 and found[keys.OCCLUSION_TASK_REWARD] == 6.0
+    assert found[keys.OCCLUSION_EXPIRED].tolist() == [True, False]
+    assert found[keys.OCCLUSION_VISIBLE].tolist() == [False, False], "what is seen now, not what was"
+    assert found[keys.OCCLUSION_SIGMA] == pytest.approx([0.1, 0.1])
     assert found[keys.LEASE_REMAINING_S] == 0.2 and found["own"] == "step 2"
     assert found["interventions/cost"] == 20.0 and found[keys.EXECUTED_ACTION].tolist() == [2.0]
 
@@ -162,3 +173,23 @@ def test_no_braking_of_the_lease_and_no_fault_inside_is_lost():
         assert info["lease/remaining_s"] == last[-1]["lease/remaining_s"]
     every = [i for _, i in recorder.seen]
     assert any(i["lease/braking"] for i in every) and any(i["fault/active"] for i in every)
+
+
+def test_penalties_for_not_seeing_explain_a_chunk_s_reward_and_no_expiry_inside_is_lost():
+    cars = [sw.Track("car*", acceleration_noise=[0.2, 0.0])]
+    seen = sw.OcclusionPenalty(gym.make("OccludedCrossing-v0"), cars, "eye", tolerance=0.5, weight=0.1)
+    recorder = Recorder(seen)
+    env = sw.ChunkHandover(recorder, 6, 5, jerk_limit=1e6, fallback="zero")
+    env.reset(seed=0)
+    lost = 0
+    for chunk in bang(env, 30):
+        _, reward, _, _, info = env.step(chunk)
+        last = [i for _, i in recorder.seen[-5:]]
+        assert reward == pytest.approx(info["occlusion/task_reward"] - info["occlusion/penalty"])
+        assert info["occlusion/penalty"] == pytest.approx(sum(i["occlusion/penalty"] for i in last))
+        assert info["collisions"] == sum(i["collisions"] for i in last)
+        expired = np.any([i["occlusion/expired"] for i in last], axis=0)
+        assert info["occlusion/expired"].tolist() == expired.tolist()
+        lost += int((expired & ~last[-1]["occlusion/expired"]).sum())
+        assert info["occlusion/visible"].tolist() == last[-1]["occlusion/visible"].tolist()
+    assert lost > 0, "a last step alone would have lost some"
