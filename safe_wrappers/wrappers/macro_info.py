@@ -34,10 +34,10 @@ _SMALLEST: Final = (keys.CBF_MARGIN,)
 def macro_info(infos: list[dict[str, Any]]) -> dict[str, Any]:
     """The last control step's info, in which costs are summed up and no intervention of the others is lost.
 
-    Costs, collisions, impulses, and what `AdaptionPenalty` and `OcclusionPenalty` say of the reward, are sums; what is
-    a flag is True if it was at any control step; corrections, contact forces and a spin-out are the largest, the
+    Costs, collisions, impulses, and what `AdaptionPenalty` and `OcclusionPenalty` say of the reward, are sums; what
+    is a flag is True if it was at any control step; corrections, contact forces and a spin-out are the largest, the
     margin is the smallest. Everything else is the last control step's: the running counts of `RecordInterventions`,
-    and which tracks were seen and how uncertain they are. A key that only some control steps have counts where it is
+    and which tracks are seen, how uncertain they are. A key that only some control steps have counts where it is
     there.
     """
     last = infos[-1]
