@@ -215,6 +215,17 @@ def test_a_rank_on_the_edge_says_so():
     assert strict.gap < 10.0
 
 
+def test_an_early_decision_on_the_edge_is_not_forgotten():
+    """Two outputs that are nearly the same one; what A adds afterwards is clear."""
+    found = linear_observability(np.diag([0.0, -1.0, -2.0]), [[1, 1, 1], [1, 1 + 8e-9, 1]])
+    assert found.observable
+    assert found.gap < 10.0
+
+
+def test_an_outputs_gain_does_not_matter():
+    assert linear_observability(np.zeros((2, 2)), [[1, 0], [0, 1e-25]]).observable
+
+
 def test_nothing_seen_has_no_condition():
     found = linear_observability(np.zeros((2, 2)), np.zeros((1, 2)))
     assert found.rank == 0
@@ -262,6 +273,16 @@ def test_a_rotated_basis_of_single_states_is_shown_as_these_states(states, seed)
     chosen = sorted(states)
     basis = np.eye(6)[:, chosen] @ transform(len(chosen), seed)
     assert described_subspace(basis, list("abcdef")) == tuple("abcdef"[i] for i in chosen)
+
+
+def test_each_direction_has_the_coefficient_one_for_the_first_state_that_will_do():
+    def shown(*columns):
+        return described_subspace(np.array(columns).T, ("x", "y", "z"))
+
+    assert shown([0.6, 0.8, 0.0]) == ("x + 1.33 y",)
+    assert shown([0.05, 1.0, 0.0]) == ("0.05 x + y",)
+    assert shown([0.01, 1.0, 0.0], [0.02, 1.0, 0.0]) == ("x", "y")
+    assert shown([1.0, 1.0, 0.5], [1.0, -1.0, 0.5]) == ("x + 0.5 z", "y")
 
 
 # Nonlinear
@@ -408,8 +429,20 @@ def test_rounding_is_not_taken_for_information():
     assert "x0" in heading.names[0]
 
 
+def test_a_state_in_large_units_is_not_overlooked():
+    """Of a share of 3e-11 in the output, a factor of 1,000 is put down to its units."""
+    found = nonlinear_observability(lambda x: [x[0], 2.0 * x[1]], lambda x: [x[0] + 3e-11 * x[1]], [1.0, 1.0])
+    assert found.observable
+
+
+def test_a_weak_first_order_does_not_spoil_the_time_scale():
+    """cos(x) has nearly no slope near pi; how fast it changes is told by the orders that follow."""
+    found = nonlinear_observability(lambda x: [x[1], 0.0], lambda x: [np.cos(x[0])], [np.pi - 1e-7, 1.0])
+    assert found.rank_by_order[1:3] == (1, 2)
+
+
 @settings(max_examples=50, deadline=None)
-@given(st.lists(st.integers(-2, 2), min_size=4, max_size=4), st.integers(-4, 4), st.integers(-3, 3))
+@given(st.lists(st.integers(-2, 2), min_size=4, max_size=4), st.integers(-5, 6), st.integers(-3, 3))
 def test_units_do_not_decide_either(powers, second, gain):
     units, rate, gain = 10.0 ** np.array(powers, float), 10.0**second, 10.0**gain
 
