@@ -87,6 +87,17 @@ class EscapeClearance:
         self.radius = non_negative("radius", self.radius, "m")
         self.margin = non_negative("margin", self.margin, "m")
         self.horizon_s = positive("horizon_s", self.horizon_s, "s")
+        if self.horizon_s <= max(_GOING_S):
+            raise ConfigurationError(
+                f"horizon_s must be longer than the manoeuvres, which go for {max(_GOING_S):g} s before they brake; "
+                f"got {self.horizon_s:g}"
+            )
+        for obstacle in self.obstacles:
+            place = getattr(obstacle, "center", getattr(obstacle, "point", ()))
+            if len(place) > 2:
+                raise ConfigurationError(
+                    f"obstacles are seen from above: in {obstacle!r} give two coordinates, x and y"
+                )
         self._moving: list[Any] = [o for o in self.obstacles if _moves(o)]
         self._fixed = [o for o in self.obstacles if not _moves(o)]
 
@@ -96,6 +107,9 @@ class EscapeClearance:
             raise UnsupportedEnvError(
                 "EscapeClearance needs a MujocoPlant: it reads the point from the model"
             )
+        for obstacle in self._moving:
+            if isinstance(obstacle, TrackedDiscs):
+                obstacle.tracks(plant)
         self._read_constants(plant)
 
     def _read_constants(self, plant: MujocoPlant) -> None:
@@ -105,6 +119,11 @@ class EscapeClearance:
         self._hold = np.array([(a.low, a.high, a.drift, a.shift, a.keep, a.add) for a in point.axes]).T
         holds = int(np.ceil(self.horizon_s / plant.hold_s))
         longest = max(1, round(max(_GOING_S) / plant.hold_s))
+        if holds <= longest:
+            raise ConfigurationError(
+                f"horizon_s = {self.horizon_s:g} s is too short for control steps of {plant.hold_s:g} s: a manoeuvre "
+                f"takes {longest} of them before it brakes"
+            )
         bank = [Manoeuvre(0.0, 0.0, 0)]
         bank += [Manoeuvre(x, y, going) for x, y in _DIRECTIONS for going in range(1, longest + 1)]
         self._escapes = Escapes(point.axes, bank, np.arange(0, holds + 1, _EVERY))
@@ -168,9 +187,11 @@ class EscapeClearance:
 
     def _expected(self, obstacle: Any, plant: MujocoPlant, times: Array) -> tuple[Array, Array]:
         """Centres and half-widths of the boxes that hold them, shapes (k, n, 2)."""
-        late = times + plant.delay_s
+        # Under a delay the state is predicted: so are the obstacles, to the same moment.
+        late = times + (plant.time - float(plant.attribute("data").time) if plant.delay_s else 0.0)
         if isinstance(obstacle, TrackedDiscs):
-            return obstacle.boxes(plant, late)
+            centers, halves = obstacle.boxes(plant, late)
+            return centers[..., :2], halves[..., :2]
         centers = obstacle.centers(plant)[:, :2]
         velocity = np.asarray(plant.attribute(obstacle.velocity_attribute), dtype=np.float64)[:, :2]
         moved = centers + late[:, None, None] * velocity

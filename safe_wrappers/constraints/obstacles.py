@@ -51,7 +51,12 @@ def distances(obstacle: Obstacle, points: Array, plant: Plant) -> Array:
 
 
 def _to_centers(points: Array, centers: Array, radius: float) -> Array:
-    offsets = points[:, None, : centers.shape[1]] - centers
+    d = centers.shape[1]
+    if d > points.shape[1]:
+        raise ConfigurationError(
+            f"{d}-dimensional obstacles cannot meet {points.shape[1]}-dimensional points"
+        )
+    offsets = points[:, None, :d] - centers
     return np.asarray(np.sqrt(np.einsum("kni,kni->kn", offsets, offsets)) - radius)
 
 

@@ -14,8 +14,8 @@ from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
 
-_SHARES = (0.1, 0.25, 0.5, 1.0)
-"""Of the horizon, at which the growth is looked at."""
+_SHARES = (1e-4, 0.1, 0.25, 0.5, 1.0)
+"""Of the horizon, at which the growth is looked at; the first of them for its rate now."""
 
 
 @dataclass
@@ -51,7 +51,8 @@ class TrackedDiscs:
         self.sigmas = non_negative("sigmas", self.sigmas, "standard deviations")
         self.horizon_s = positive("horizon_s", self.horizon_s, "s")
 
-    def _tracks(self, plant: Plant) -> Tracks:
+    def tracks(self, plant: Plant) -> Tracks:
+        """The tracks that the env holds, or an error that says what is missing."""
         tracks = plant.attribute(self.attribute)
         if not isinstance(tracks, Tracks):
             raise ConfigurationError(
@@ -62,7 +63,7 @@ class TrackedDiscs:
 
     def nearest(self, point: Array, plant: Plant) -> Nearest:
         """One surface per track."""
-        tracks = self._tracks(plant)
+        tracks = self.tracks(plant)
         d, n = tracks.coordinates, len(tracks.mean)
         if d > point.size:
             raise ConfigurationError(f"{d}-dimensional tracks cannot meet a {point.size}-dimensional point")
@@ -92,13 +93,13 @@ class TrackedDiscs:
         Returns:
             Centres and half-widths, shapes (k, n, d), m.
         """
-        positions, covariances = self._tracks(plant).ahead(times_s.tolist())
+        positions, covariances = self.tracks(plant).ahead(times_s.tolist())
         variances = np.diagonal(covariances, axis1=-2, axis2=-1)
         return positions, self.sigmas * np.sqrt(np.maximum(variances, 0.0))
 
     def distances(self, points: Array, plant: Plant) -> Array:
         """Shape (k, n), m, at the present bound."""
-        tracks = self._tracks(plant)
+        tracks = self.tracks(plant)
         d, n = tracks.coordinates, len(tracks.mean)
         offsets = points[:, None, :d] - tracks.positions
         shapes = np.broadcast_to(

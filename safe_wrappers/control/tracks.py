@@ -95,7 +95,8 @@ class Tracks:
 
     def start(self, mean: Array, covariance: Array) -> None:
         """Begin with a prior: shapes (n, 2d) and (n, 2d, 2d)."""
-        self.mean, self.covariance = np.array(mean), np.array(covariance)
+        self.mean = np.array(mean, dtype=np.float64)
+        self.covariance = np.array(covariance, dtype=np.float64)
 
     def advance(self, time_s: float) -> None:
         """Let time pass without a measurement."""

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.errors import UnknownNameError
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
 
 Array = NDArray[np.float64]
 
@@ -22,7 +22,8 @@ class LineOfSight:
     """Rays from a sensor to points, as the model's geoms stop them.
 
     MuJoCo's rays hit every visible geom (alpha above 0) of the groups asked for, but none of the body that the sensor
-    sits on. What moves with a tracked body does not hide it.
+    sits on (a sensor on the world sees the world's geoms, too). A ray that meets what moves with a tracked body,
+    before anything else, has found it.
 
     Args:
         model: Of the env; only read.
@@ -35,6 +36,7 @@ class LineOfSight:
 
     Raises:
         UnknownNameError: No camera or site of that name; the message lists those there are.
+        ConfigurationError: No `view_deg` for a camera that has no angle of view, being orthographic.
     """
 
     def __init__(
@@ -53,7 +55,8 @@ class LineOfSight:
         if camera is not None:
             self._id = named(model, "camera", camera)
             self.body = int(model.cam_bodyid[self._id])
-            view_deg = float(model.cam_fovy[self._id]) if view_deg is None else view_deg
+            if view_deg is None:
+                view_deg = _angle_of_view(model, self._id)
         else:
             self._id = named(model, "site", site or "")
             self.body = int(model.site_bodyid[self._id])
@@ -126,7 +129,7 @@ class LineOfSight:
             directions.reshape(-1),
             self._groups,
             1,
-            self.body,
+            self.body or -1,  # the world is no housing of the sensor: its walls hide things
             hit,
             at,
             *normals,
@@ -139,6 +142,17 @@ class LineOfSight:
         itself = (own >= 0) & self._root[blocker, np.maximum(own, 0)]
         seen[which] = ~hitting | itself | (at >= lengths[which] - _SKIN_M)
         return np.asarray(seen)
+
+
+def _angle_of_view(model: mujoco.MjModel, camera: int) -> float:
+    """A camera's own, degrees."""
+    flat = model.cam_projection if hasattr(model, "cam_projection") else model.cam_orthographic
+    if flat[camera]:
+        raise ConfigurationError(
+            f"the camera {model.camera(camera).name!r} is orthographic: its fovy is a length, not an angle; give "
+            "view_deg"
+        )
+    return float(model.cam_fovy[camera])
 
 
 def named(model: mujoco.MjModel, kind: str, name: str) -> int:

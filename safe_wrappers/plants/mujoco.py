@@ -96,7 +96,7 @@ class MujocoPlant:
         self._check_action_space(env)
         refuse_changed_actions(env)
         self.substeps = int(getattr(_stepped(raw), "frame_skip", 1))
-        self.hold_s = self.substeps * float(raw.model.opt.timestep)
+        self.hold_s = control_interval(raw)
         check_timing(env, self.hold_s, self.delay_s)
         self._delay_steps = int(np.ceil(self.delay_s / self.model.opt.timestep - 1e-9))
         self._pending = deque(maxlen=max(1, -(-self._delay_steps // self.substeps)))
@@ -434,6 +434,11 @@ class MujocoPlant:
         """Read a published fact of the env."""
         found = getattr(self._raw, name, None)
         return found if found is not None else read_attribute(self._env, name)
+
+
+def control_interval(raw: Any) -> float:
+    """How long an unwrapped MuJoCo env holds one action, s."""
+    return int(getattr(_stepped(raw), "frame_skip", 1)) * float(raw.model.opt.timestep)
 
 
 def _stepped(raw: Any) -> Any:

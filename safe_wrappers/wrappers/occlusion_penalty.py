@@ -18,6 +18,7 @@ from safe_wrappers.control.spatial import from_sensor, lever_arm_velocity, to_se
 from safe_wrappers.control.tracks import Tracks, largest_deviation
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.line_of_sight import LineOfSight
+from safe_wrappers.plants.mujoco import control_interval
 from safe_wrappers.plants.plant import read_attribute, wrappers_of
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.chunk_handover import ChunkHandover
@@ -141,7 +142,7 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         )
         gym.Wrapper.__init__(self, env)
         self._raw, self._d, self._random = raw, len(axes), OwnRandom("OcclusionPenalty")
-        self._hold_s = float(raw.dt)
+        self._hold_s = control_interval(raw)
         self._matrix, self._noise = self.sensor.matrices(self._d)
         self._noise_root = np.linalg.cholesky(self._noise)
         self._look_at(raw.model)
@@ -165,12 +166,11 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         self.track_names: list[str] = []
         for track in self.tracks:
             if track.bodies is not None:
-                found = [
-                    b for b in range(1, model.nbody) if fnmatchcase(model.body(b).name or "", track.bodies)
-                ]
+                there = {model.body(b).name: b for b in range(1, model.nbody) if model.body(b).name}
+                found = [b for name, b in there.items() if fnmatchcase(name, track.bodies)]
                 if not found:
-                    there = ", ".join(model.body(b).name for b in range(1, model.nbody) if model.body(b).name)
-                    raise UnknownNameError(f"the model has no body {track.bodies!r}; it has: {there}")
+                    listed = ", ".join(there) or "none"
+                    raise UnknownNameError(f"the model has no body {track.bodies!r}; it has: {listed}")
                 bodies += found
                 self.track_names += [model.body(b).name for b in found]
                 self._counted.append((track, len(found)))
@@ -184,6 +184,16 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
             raise ConfigurationError(f"each thing is tracked once; these are named twice: {', '.join(twice)}")
         self._bodies = np.array(bodies, dtype=np.intp)
         self._in_model = self._bodies >= 0
+
+    def _look_at_another(self, model: mujoco.MjModel) -> None:
+        """The env has another model now; the tracks must be the same."""
+        before = self.track_names
+        self._look_at(model)
+        if self.track_names != before:
+            raise ConfigurationError(
+                f"the env has another model than when the wrapper was made, with other things to track: "
+                f"{', '.join(self.track_names)} and not {', '.join(before)}"
+            )
 
     def _published(self, track: Track) -> Array:
         points = np.asarray(read_attribute(self.env, track.published or ""), dtype=np.float64)
@@ -237,7 +247,7 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         observation, info = self.env.reset(seed=seed, options=options)
         self._random.reset(self.env, seed)
         if self._sight.model is not self._raw.model:
-            self._look_at(self._raw.model)
+            self._look_at_another(self._raw.model)
         self._time = float(self._raw.data.time)
         self._sight.read(self._raw.data)
         self._start()
@@ -394,13 +404,22 @@ def _check_env(env: gym.Env[Any, Any]) -> None:
 def _with_tracks(space: gym.Space[Any], size: int) -> gym.Space[Any]:
     """The observation space with so many numbers more."""
     if isinstance(space, gym.spaces.Dict):
+        if "tracks" in space.spaces:
+            raise UnsupportedEnvError(
+                "the observation has an entry 'tracks' already, which the estimates would replace; rename it inside, "
+                "or pass observe=False"
+            )
         more = gym.spaces.Box(-np.inf, np.inf, (size,), dtype=np.float64)
         return gym.spaces.Dict({**space.spaces, "tracks": more})
-    if isinstance(space, gym.spaces.Box) and len(space.shape) == 1:
+    if (
+        isinstance(space, gym.spaces.Box)
+        and len(space.shape) == 1
+        and np.issubdtype(space.dtype, np.floating)
+    ):
         bound = np.full(size, np.inf)
         low, high = np.concatenate([space.low, -bound]), np.concatenate([space.high, bound])
         return gym.spaces.Box(low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype.type)
     raise UnsupportedEnvError(
-        f"with observe=True the observation must be a flat Box or a Dict, got {space}; flatten it inside, or pass "
-        "observe=False"
+        f"with observe=True the observation must be a flat Box of floats or a Dict, got {space}; flatten it inside, "
+        "or pass observe=False"
     )

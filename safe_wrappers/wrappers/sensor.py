@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from safe_wrappers.constraints.constraint import non_negative, positive
 from safe_wrappers.control.covariance import checked_noise
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.plain_numbers import plain_numbers
 
 Array = NDArray[np.float64]
 
@@ -57,6 +58,9 @@ class Sensor:
                 f"a sensor sits at a camera or at a site: name one of the two; got camera={self.camera!r}, "
                 f"site={self.site!r}"
             )
+        for name in ("camera", "site"):
+            if not isinstance(getattr(self, name), str | None):
+                raise ConfigurationError(f"{name} is a name, got {getattr(self, name)!r}")
         if self.view_deg is not None:
             self.view_deg = positive("view_deg", self.view_deg, "degrees")
         if self.range_m is not None:
@@ -67,22 +71,14 @@ class Sensor:
                 f"dropout is a probability below 1: nothing would ever be measured at {self.dropout}"
             )
         if self.occluder_groups is not None:
-            self.occluder_groups = list(self.occluder_groups)
-            if not self.occluder_groups or not all(
-                isinstance(g, int) and 0 <= g < mujoco.mjNGROUP for g in self.occluder_groups
-            ):
-                raise ConfigurationError(
-                    f"occluder_groups is a list of geom groups, 0 to {mujoco.mjNGROUP - 1}, or None for all; got "
-                    f"{self.occluder_groups!r}"
-                )
+            self.occluder_groups = _groups(self.occluder_groups)
         if self.position_std is None and self.velocity_std is None:
             raise ConfigurationError("the sensor measures nothing: give position_std, velocity_std or both")
         if not isinstance(self.lever_arm, bool | np.bool_):
             raise ConfigurationError(f"lever_arm is True or False, got {self.lever_arm!r}")
+        self.lever_arm = bool(self.lever_arm)
         for name in ("position_std", "velocity_std"):
-            value = getattr(self, name)
-            if isinstance(value, np.ndarray):
-                setattr(self, name, value.tolist())
+            setattr(self, name, plain_numbers(getattr(self, name)))
 
     def matrices(self, coordinates: int) -> tuple[Array, Array]:
         """C (m, 2d) and the noise covariance R (m, m) for states (position, velocity) of d coordinates.
@@ -110,8 +106,17 @@ class Sensor:
         return asdict(self)
 
 
+def _groups(given: Any) -> list[int]:
+    groups = list(given) if isinstance(given, Sequence | np.ndarray) else []
+    if not groups or not all(isinstance(g, int | np.integer) and 0 <= g < mujoco.mjNGROUP for g in groups):
+        raise ConfigurationError(
+            f"occluder_groups is a list of geom groups, 0 to {mujoco.mjNGROUP - 1}, or None for all; got {given!r}"
+        )
+    return [int(g) for g in groups]
+
+
 def _noise(name: str, given: Any, coordinates: int) -> Array:
-    if np.ndim(given) == 0:
+    if not isinstance(given, list):
         return positive(name, given, "m or m/s") ** 2 * np.eye(coordinates)
     return checked_noise(f"{name} as a covariance", given, coordinates)
 

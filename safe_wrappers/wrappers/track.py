@@ -11,6 +11,7 @@ from safe_wrappers.constraints.constraint import non_negative, positive
 from safe_wrappers.control.covariance import checked_covariance
 from safe_wrappers.control.tracks import Motion
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.plain_numbers import plain_numbers
 
 Array = NDArray[np.float64]
 
@@ -55,6 +56,9 @@ class Track:
                 "a track follows bodies of the model, by name or pattern, or positions that the env publishes; got "
                 f"bodies={self.bodies!r}, published={self.published!r}"
             )
+        name = self.published if self.bodies is None else self.bodies
+        if not isinstance(name, str):
+            raise ConfigurationError(f"bodies and published are names, got {name!r}")
         if self.acceleration_noise is None:
             raise ConfigurationError(
                 "say how it moves: acceleration_noise, the intensity of its white acceleration noise in m^2/s^3 (0: "
@@ -63,9 +67,7 @@ class Track:
         if self.reversion_s is not None:
             self.reversion_s = positive("reversion_s", self.reversion_s, "s")
         for name in ("acceleration_noise", "mean_velocity", "start_position_std", "start_velocity_std"):
-            value = getattr(self, name)
-            if isinstance(value, np.ndarray | tuple):
-                setattr(self, name, np.asarray(value).tolist())
+            setattr(self, name, plain_numbers(getattr(self, name)))
 
     def motion(self, coordinates: int) -> Motion:
         """The motion model for d coordinates.
@@ -110,7 +112,7 @@ def _each(name: str, given: Any, coordinates: int, unit: str) -> Array:
 
 
 def _intensity(given: Any, coordinates: int) -> Array:
-    if np.ndim(given) == 2:
+    if isinstance(given, list) and any(isinstance(row, list) for row in given):
         return checked_covariance("acceleration_noise", given, coordinates)
     values = _each("acceleration_noise", given, coordinates, "m^2/s^3")
     for value in values:
