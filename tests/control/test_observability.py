@@ -244,6 +244,7 @@ def test_a_weak_coupling_is_a_matter_of_units_but_rounding_is_none():
     a = np.diag([-1.0, -1.0])
     a[0, 1] = 1e-10
     assert linear_observability(a, [[1, 0]]).observable
+    assert linear_observability(np.diag([0.0, -1.0]), [[1, 1e-12]]).observable
     a[0, 1] = 1e-15
     assert linear_observability(a, [[1, 0]], names=("p", "q")).names == ("q",)
 
