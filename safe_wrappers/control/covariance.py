@@ -20,9 +20,9 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import expm, solve_continuous_are
+from scipy.linalg import solve_continuous_are
 
-from safe_wrappers.control.block_exponentials import Discrete, norm_or_one, riccati_flow, van_loan
+from safe_wrappers.control.block_exponentials import Discrete, integral, norm_or_one, riccati_flow, van_loan
 from safe_wrappers.control.finite import finite_arrays
 from safe_wrappers.control.first_crossing import first_crossing
 from safe_wrappers.errors import ConfigurationError
@@ -160,16 +160,13 @@ def discretise_drift(A: ArrayLike, b: ArrayLike, time_s: ArrayLike) -> Array:
     """
     a = _square("A", A)
     times = _times(time_s)
-    n = len(a)
     (drift,) = finite_arrays(b=b)
-    if drift.ndim == 0 or drift.shape[-1] != n:
-        raise ConfigurationError(f"b must have {n} entries, one for each state of A, got shape {drift.shape}")
-    block = np.zeros((*times.shape, 2 * n, 2 * n))
-    block[..., :n, :n] = a * times[..., None, None]
-    block[..., :n, n:] = np.eye(n)
+    if drift.ndim == 0 or drift.shape[-1] != len(a):
+        raise ConfigurationError(
+            f"b must have {len(a)} entries, one for each state of A, got shape {drift.shape}"
+        )
     with np.errstate(over="ignore", invalid="ignore"):
-        integral = expm(block)[..., :n, n:] * times[..., None, None]
-        carried = np.tensordot(integral, drift, axes=(-1, -1))
+        carried = np.tensordot(integral(a, times), drift, axes=(-1, -1))
     carried = np.moveaxis(carried, times.ndim, -1)
     _in_range(carried, carried, times)
     return np.asarray(carried)
