@@ -1,0 +1,322 @@
+"""What a sensor sees, against geometry of the test's own: circles and segments, cones, ranges."""
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+
+import safe_wrappers  # noqa: F401 (registers the crossing)
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.plants.line_of_sight import LineOfSight
+
+
+def world(inside, robot="", eye='pos="0 0 0.5"'):
+    text = f"""
+    <mujoco>
+      <worldbody>
+        {inside}
+        <body name="robot">
+          <joint name="turn" type="hinge" axis="0 0 1"/>
+          <geom size="0.2" mass="1"/>
+          <camera name="cam" {eye} xyaxes="0 -1 0 0 0 1" fovy="60"/>
+          <site name="spot" {eye} zaxis="1 0 0"/>
+          {robot}
+        </body>
+        <camera name="fixed" pos="0 0 0.5" xyaxes="0 -1 0 0 0 1" fovy="170"/>
+      </worldbody>
+    </mujoco>"""
+    model = mujoco.MjModel.from_xml_string(text)
+    return model, mujoco.MjData(model)
+
+
+def looking(model, data, camera="cam", site=None, view_deg=360.0, range_m=np.inf, groups=None):
+    sight = LineOfSight(model, None if site else camera, site, view_deg, range_m, groups)
+    sight.read(data)
+    return sight
+
+
+def sees(sight, *points, bodies=None):
+    which = np.full(len(points), -1) if bodies is None else np.array(bodies)
+    return sight.sees(np.array(points, dtype=float), which).tolist()
+
+
+WALL = '<geom name="wall" type="box" pos="2 0 0.5" size="0.1 1 1"/>'
+
+
+# The crossing -----------------------------------------------------------------------------------------------------
+
+
+def hidden_by_circles(eye, point, centres, radius):
+    """Whether the segment between two points in the plane passes through a circle; from how far inside, m."""
+    way = point - eye
+    share = np.clip(((centres - eye) @ way) / (way @ way), 0.0, 1.0)
+    return float((radius - np.linalg.norm(eye + share[:, None] * way - centres, axis=1)).max())
+
+
+def test_on_the_crossing_it_is_what_circles_and_cones_say():
+    env = gym.make("OccludedCrossing-v0").unwrapped
+    sight = LineOfSight(env.model, "eye", None, 120.0, 6.0, None)
+    bodies = np.array([env.model.body(name).id for name in env.car_bodies])
+    rng = np.random.default_rng(0)
+    env.reset(seed=0)
+    judged, seen, hidden, aside, far = 0, 0, 0, 0, 0
+    for k in range(1000):
+        if k % 20 == 0:
+            env.reset(seed=k)
+        qpos = np.concatenate([rng.uniform([-3.7, -3.2, -9.0], [3.7, 3.2, 9.0]), rng.uniform(-8, 8, 6)])
+        env.set_state(qpos, np.zeros(9))
+        sight.read(env.data)
+        heading = np.array([np.cos(qpos[2]), np.sin(qpos[2])])
+        eye = qpos[:2] + 0.15 * heading
+        np.testing.assert_allclose(sight.position, [*eye, 0.3], atol=1e-12)
+        cars = env.car_positions
+        got = sight.sees(np.column_stack([cars, np.full(6, 0.3)]), bodies)
+        for i, car in enumerate(cars):
+            away = car - eye
+            length = np.linalg.norm(away)
+            angle = np.degrees(np.arccos(np.clip(away @ heading / length, -1, 1)))
+            others = np.delete(cars, i, axis=0)
+            surface = car - 0.4 * away / length  # cars drive through each other
+            slack = [
+                60.0 - angle,
+                6.0 - length,
+                -hidden_by_circles(eye, surface, env.pillar_positions, 0.35),
+                -hidden_by_circles(eye, surface, others, 0.4),
+            ]
+            inside = (
+                min(np.linalg.norm(others - eye, axis=1)) < 0.41
+                or min(np.linalg.norm(env.pillar_positions - eye, axis=1)) < 0.36
+            )
+            if min(np.abs(slack)) < 1e-4 or inside or length < 0.4:
+                continue  # at an edge, or looking from inside of something
+            judged += 1
+            assert got[i] == (min(slack) > 0.0), (k, i, slack)
+            seen += got[i]
+            aside += slack[0] < 0
+            far += slack[1] < 0
+            hidden += min(slack[:2]) > 0 and min(slack[2:]) < 0
+    assert min(seen, hidden, aside, far) > 200 and judged > 4000
+
+
+def test_all_rays_in_one_call_are_each_ray_alone():
+    # MuJoCo's many-ray call prunes by angles; the single one does not. Everything around, many geoms, all directions.
+    rng = np.random.default_rng(1)
+    geoms = "".join(
+        f'<geom type="{kind}" size="0.3 0.2 0.4" pos="{x:.3f} {y:.3f} {z:.3f}" euler="{a:.0f} {b:.0f} 0"/>'
+        for kind, x, y, z, a, b in zip(
+            ["box", "cylinder", "capsule", "ellipsoid", "sphere"] * 8,
+            *rng.uniform(-4, 4, (3, 40)),
+            *rng.uniform(0, 180, (2, 40)),
+            strict=True,
+        )
+    )
+    model, data = world(geoms)
+    sight = looking(model, data)
+    points = rng.uniform(-6, 6, (1500, 3))
+    got = sight.sees(points, np.full(1500, -1))
+    eye = sight.position
+    hit = np.zeros(1, dtype=np.int32)
+    for point, visible in zip(points, got, strict=True):
+        way = point - eye
+        length = np.linalg.norm(way)
+        arguments = (model, sight.data, eye, way / length, None, 1, sight.body, hit)
+        distance = mujoco.mj_ray(*arguments)
+        assert visible == (distance < 0 or distance >= length - 1e-9)
+    assert 100 < got.sum() < 1400
+
+
+# View and range ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sensor", [{"camera": "cam"}, {"site": "spot"}])
+@pytest.mark.parametrize("view", [10.0, 90.0, 180.0, 300.0])
+def test_the_view_is_a_cone_of_the_full_opening_angle(sensor, view):
+    model, data = world("")
+    sight = looking(model, data, view_deg=view, **sensor)
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        roll = rng.uniform(0, 2 * np.pi)
+        side = np.array([0.0, np.cos(roll), np.sin(roll)])
+        for angle, expected in ((view / 2 - 0.01, True), (view / 2 + 0.01, False)):
+            a = np.radians(angle)
+            point = sight.position + 3.0 * (np.cos(a) * np.array([1.0, 0, 0]) + np.sin(a) * side)
+            assert sees(sight, point) == [expected]
+
+
+def test_without_a_view_a_camera_has_its_own_and_a_site_sees_all_around():
+    model, data = world("")
+    for degrees, camera, site in ((29.9, True, True), (30.1, False, True), (179.0, False, True)):
+        a = np.radians(degrees)
+        point = [3 * np.cos(a), 3 * np.sin(a), 0.5]
+        assert sees(looking(model, data, view_deg=None), point) == [camera]
+        assert sees(looking(model, data, site="spot", view_deg=None), point) == [site]
+    assert sees(looking(model, data, view_deg=400.0), [-3.0, 0, 0.5]) == [True]
+
+
+def test_the_range_ends_where_it_says():
+    model, data = world("")
+    sight = looking(model, data, range_m=2.0)
+    assert sees(sight, [1.999999, 0, 0.5], [2.000001, 0, 0.5], [0, 1.5, 1.9]) == [True, False, False]
+
+
+def test_it_turns_with_the_body():
+    model, data = world("", eye='pos="0.5 0 0.5"')
+    data.qpos[0] = np.pi / 2
+    sight = looking(model, data, view_deg=60.0)
+    np.testing.assert_allclose(sight.position, [0, 0.5, 0.5], atol=1e-12)
+    assert sees(sight, [0, 2, 0.5], [2, 0, 0.5]) == [True, False]
+
+
+def test_it_reads_the_state_and_not_what_lags_behind_it():
+    model, data = world("", eye='pos="0.5 0 0.5"')
+    mujoco.mj_forward(model, data)
+    data.qpos[0] = np.pi / 2  # data.xpos is old now
+    np.testing.assert_allclose(looking(model, data).position, [0, 0.5, 0.5], atol=1e-12)
+
+
+# What hides -------------------------------------------------------------------------------------------------------
+
+
+def test_a_point_at_the_sensor_and_points_that_are_none():
+    model, data = world(WALL)
+    sight = looking(model, data, view_deg=60.0, range_m=4.0)
+    assert sees(sight, sight.position, [np.nan, 0, 0], [np.inf, 0, 0], [1, 0, 0.5]) == [
+        True,
+        False,
+        False,
+        True,
+    ]
+    assert sees(looking(model, data), [np.nan, 0, 0]) == [False]
+
+
+def test_a_surface_does_not_hide_the_points_on_it():
+    model, data = world(WALL)
+    sight = looking(model, data)
+    assert sees(sight, [1.9, 0.0, 0.5], [1.9, 0.7, 0.9], [1.9 + 1e-6, 0, 0.5], [2.1, 0, 0.5]) == [
+        True,
+        True,
+        False,
+        False,
+    ]
+
+
+@pytest.mark.parametrize(
+    ("change", "hides"),
+    [
+        ("", True),
+        ('rgba="1 0 0 0.01"', True),
+        ('rgba="1 0 0 0"', False),
+        ('contype="0" conaffinity="0"', True),
+        ('group="4"', True),
+    ],
+)
+def test_what_can_be_seen_hides_whether_it_collides_or_not(change, hides):
+    model, data = world(WALL.replace("<geom", f"<geom {change}"))
+    assert sees(looking(model, data), [3, 0, 0.5]) == [not hides]
+
+
+def test_groups_say_what_hides():
+    model, data = world(WALL.replace("<geom", '<geom group="2"'))
+    assert sees(looking(model, data, groups=[2]), [3, 0, 0.5]) == [False]
+    assert sees(looking(model, data, groups=[0, 1, 3, 4, 5]), [3, 0, 0.5]) == [True]
+
+
+def test_walls_hide_things_from_a_sensor_on_the_world():
+    model, data = world(WALL)
+    sight = looking(model, data, camera="fixed")
+    assert sight.body == 0
+    assert sees(sight, [3, 0, 0.5], [1, 0.3, 0.5]) == [False, True]
+
+
+def test_the_sensor_s_own_body_does_not_hide_but_its_other_bodies_do():
+    point = [2, 0, 0.1]
+    model, data = world("", eye='pos="0 0 0.1"')  # inside the robot's own ball
+    assert sees(looking(model, data), point) == [True]
+    arm = '<body name="arm" pos="0.5 0 0.1"><geom size="0.1" mass="1"/></body>'
+    model, data = world("", robot=arm, eye='pos="0 0 0.1"')
+    assert sees(looking(model, data), point) == [False]
+
+
+TRACKED = """
+<body name="thing" pos="3 0 0.5">
+  <geom name="shell" type="box" size="0.3 0.3 0.3"/>
+  <body name="flap" pos="-0.6 0 0"><geom type="box" size="0.05 0.5 0.5"/></body>
+</body>
+<body name="other" pos="5 0 0.5"><geom size="0.2"/></body>
+"""
+
+
+def test_what_moves_with_a_tracked_body_does_not_hide_it_and_hides_others():
+    model, data = world(TRACKED)
+    sight = looking(model, data)
+    thing, flap, other = (model.body(name).id for name in ("thing", "flap", "other"))
+    places = data.xpos if data.xpos.any() else sight.data.xpos
+    assert sees(sight, places[thing], bodies=[thing]) == [True]
+    assert sees(sight, places[thing]) == [False]  # the same point, when it belongs to nothing
+    assert sees(sight, places[other], bodies=[other]) == [False]
+    # A child's point is hidden by its parent: seen from behind.
+    data.qpos[0] = 0.0
+    model.body_pos[model.body("robot").id] = [6, 0, 0]
+    behind = looking(model, data)
+    assert sees(behind, behind.data.xpos[flap], bodies=[flap]) == [False]
+    assert sees(behind, behind.data.xpos[other], bodies=[other]) == [True]
+
+
+def test_a_wall_between_hides_the_body_with_all_its_geoms():
+    model, data = world(TRACKED + WALL)
+    thing = model.body("thing").id
+    sight = looking(model, data)
+    assert sees(sight, sight.data.xpos[thing], bodies=[thing]) == [False]
+
+
+def test_mocap_bodies_hide_where_they_are_now():
+    screen = '<body name="screen" mocap="true" pos="2 0 0.5"><geom type="box" size="0.1 0.5 0.5"/></body>'
+    model, data = world(screen)
+    sight = looking(model, data)
+    assert sees(sight, [3, 0, 0.5]) == [False]
+    data.mocap_pos[0] = [2, 2, 0.5]
+    sight.read(data)
+    assert sees(sight, [3, 0, 0.5], [3, 3, 0.5]) == [True, False]
+
+
+def test_looking_leaves_the_env_s_data_alone():
+    env = gym.make("OccludedCrossing-v0").unwrapped
+    env.reset(seed=0)
+    spec = mujoco.mjtState.mjSTATE_INTEGRATION
+    before = np.zeros(mujoco.mj_stateSize(env.model, spec))
+    mujoco.mj_getState(env.model, env.data, before, spec)
+    sight = looking(env.model, env.data, camera="eye")
+    sees(sight, [0, 0, 0.3])
+    after = np.zeros_like(before)
+    mujoco.mj_getState(env.model, env.data, after, spec)
+    assert before.tobytes() == after.tobytes()
+
+
+def test_velocities_are_those_of_the_origin_in_world_axes():
+    arm = '<body name="arm" pos="0.5 0 0.1"><geom pos="0.2 0 0" size="0.1" mass="1"/></body>'
+    model, data = world("", robot=arm)
+    data.qpos[0], data.qvel[0] = np.pi / 2, 2.0
+    linear, angular = looking(model, data).velocity(model.body("arm").id)
+    np.testing.assert_allclose(linear, [-1.0, 0, 0], atol=1e-12)  # 2 rad/s at 0.5 m
+    np.testing.assert_allclose(angular, [0, 0, 2.0], atol=1e-12)
+
+
+# Names ------------------------------------------------------------------------------------------------------------
+
+
+def test_unknown_names_list_those_there_are():
+    model, _ = world("")
+    with pytest.raises(UnknownNameError, match="no camera 'eye'; it has: fixed, cam"):
+        LineOfSight(model, "eye", None, None, np.inf, None)
+    with pytest.raises(UnknownNameError, match="no site 'eye'; it has: spot"):
+        LineOfSight(model, None, "eye", None, np.inf, None)
+
+
+def test_an_orthographic_camera_has_no_angle_of_view():
+    try:
+        model, _ = world('<camera name="flat" orthographic="true" fovy="2"/>')
+    except ValueError:
+        model, _ = world('<camera name="flat" projection="orthographic" fovy="2"/>')
+    with pytest.raises(ConfigurationError, match=r"'flat' is orthographic.*view_deg"):
+        LineOfSight(model, "flat", None, None, np.inf, None)
+    assert LineOfSight(model, "flat", None, 90.0, np.inf, None)
