@@ -76,7 +76,9 @@ class TrackPermission:
         v, drift, effect = v[acted], drift[acted], effect[acted]
         speed = float(np.sqrt(v @ v))
         left = max(0.0, 1.0 - self.braking * plant.hold_s / speed) if speed > 0.0 else 0.0
-        # The speed in each axis at the end of the hold; sideways creep is shared among the axes.
-        allowed = np.maximum(left * np.abs(v), self.creep / np.sqrt(max(v.size, 1)))
+        # The speed in each axis at the end of the hold: what braking leaves, and the room up to `creep`, shared by the
+        # axes. Together they are no faster than the larger of the two.
+        room = max(0.0, self.creep**2 - (left * speed) ** 2) / max(v.size, 1)
+        allowed = np.sqrt((left * v) ** 2 + room)
         least, most = (-allowed - v) / plant.hold_s - drift, (allowed - v) / plant.hold_s - drift
         return HalfSpaces(np.concatenate([effect, -effect]), np.concatenate([most, -least]))
