@@ -76,8 +76,8 @@ class TrackPermission:
         v, drift, effect = v[acted], drift[acted], effect[acted]
         speed = float(np.sqrt(v @ v))
         left = max(0.0, 1.0 - self.braking * plant.hold_s / speed) if speed > 0.0 else 0.0
-        # The speed in each axis at the end of the hold: what braking leaves, and the room up to `creep`, shared by the
-        # axes. Together they are no faster than the larger of the two.
+        # The speed in each axis at the end of the hold: what braking leaves, and a share of the room up to `creep`.
+        # All axes together are then no faster than the larger of the two.
         room = max(0.0, self.creep**2 - (left * speed) ** 2) / max(v.size, 1)
         allowed = np.sqrt((left * v) ** 2 + room)
         least, most = (-allowed - v) / plant.hold_s - drift, (allowed - v) / plant.hold_s - drift
