@@ -59,7 +59,7 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
 
     Args:
         env: Its unwrapped env has MuJoCo's `.model` and `.data`.
-        tracks: `Track`s, or the dicts of recorded ones.
+        tracks: Each a `Track`, or the dict of a recorded one.
         sensor: A `Sensor`, or the name of a camera in the model.
         tolerance: Position error that the task can bear, m.
         weight: Of the penalty, in units of the task's reward per step.
@@ -147,6 +147,10 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         self._noise_root = np.linalg.cholesky(self._noise)
         self._look_at(raw.model)
         self.tracking = Tracks([m for t, count in self._counted for m in [t.motion(self._d)] * count])
+        self._start_std = [
+            np.concatenate([np.tile(t.start(self._d)[k], (count, 1)) for t, count in self._counted])
+            for k in (0, 1)
+        ]
         self.unobservable = self._unobservable(axes)
         self.last_seen_positions = np.zeros((len(self.track_names), self._d))
         self.permitted = np.zeros(len(self.track_names), dtype=bool)
@@ -300,9 +304,7 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
     def _start(self) -> None:
         """The initial fix: truth plus noise of the declared size, and the declared mean velocity."""
         d, n = self._d, len(self.track_names)
-        position_std, velocity_std = (
-            np.concatenate([np.tile(t.start(d)[k], (count, 1)) for t, count in self._counted]) for k in (0, 1)
-        )
+        position_std, velocity_std = self._start_std
         truth, _ = self._truth()
         mean = np.zeros((n, 2 * d))
         mean[:, :d] = truth[:, :d] + position_std * self._random.draw.standard_normal((n, d))

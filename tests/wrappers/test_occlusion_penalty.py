@@ -1,0 +1,661 @@
+"""OcclusionPenalty against sums by hand and statistics: estimates, permissions, penalty, observation, randomness."""
+
+import copy
+import json
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from occlusion_world import STILL, WALL, Turning, straight
+
+import safe_wrappers as sw
+from safe_wrappers.control.covariance import blind_covariance, double_integrator_covariance
+from safe_wrappers.errors import (
+    ConfigurationError,
+    SafeWrappersError,
+    UnknownNameError,
+    UnsupportedEnvError,
+)
+
+EYE = sw.Sensor(site="eye", position_std=0.05)
+
+
+def crossing(weight=0.0, tolerance=1.0, sensor=None, **options):
+    cars = [
+        sw.Track(
+            f"car[{names}]",
+            acceleration_noise=[0.0225, 0.0],
+            reversion_s=2.0,
+            mean_velocity=[speed, 0.0],
+            start_position_std=[0.3, 0.0],
+            start_velocity_std=[0.15, 0.0],
+        )
+        for names, speed in (("012", 1.0), ("345", -1.0))
+    ]
+    sensor = sensor or sw.Sensor("eye", view_deg=120, range_m=6.0)
+    return sw.OcclusionPenalty(gym.make("OccludedCrossing-v0"), cars, sensor, tolerance, weight, **options)
+
+
+def steps(env, count, seed=0):
+    rng = np.random.default_rng(seed)
+    low, high = env.action_space.low, env.action_space.high
+    for _ in range(count):
+        yield env.step(rng.uniform(low, high).astype(env.action_space.dtype))
+
+
+# What is estimated ------------------------------------------------------------------------------------------------
+
+
+def test_errors_have_the_covariances_that_are_given_seen_and_unseen():
+    env = crossing()
+    raw = env.unwrapped
+    squared = {True: [], False: []}
+    for seed in range(60):
+        env.reset(seed=seed)
+        info = None
+        for k, (_, _, _, _, info) in enumerate(steps(env, 50, seed)):
+            if k in (9, 29, 49):
+                error = raw.data.qpos[3:] - env.tracking.positions[:, 0]
+                ratio = error**2 / env.tracking.position_covariances[:, 0, 0]
+                for seen, value in zip(info["occlusion/visible"], ratio, strict=True):
+                    squared[bool(seen)].append(value)
+        np.testing.assert_allclose(env.tracking.positions[:, 1], raw.car_positions[:, 1], atol=1e-9)
+        assert (info["occlusion/sigma"] >= 0).all()
+    # Chi-square with one degree of freedom: mean 1, variance 2; samples of a car share some of their noise.
+    for values in squared.values():
+        assert len(values) > 100
+        assert abs(np.mean(values) - 1.0) < 5.0 * np.sqrt(2.0 * 3 / len(values)), np.mean(values)
+        assert 0.6 < np.mean(np.array(values) < 1.0) < 0.77  # 68 %
+
+
+def test_unseen_sigma_is_the_closed_form():
+    blind = sw.Sensor(site="eye", range_m=0.01)
+    env = sw.OcclusionPenalty(Turning(), [straight(acceleration_noise=0.2)], blind, tolerance=100.0)
+    env.reset(seed=0)
+    start = np.diag([0.09, 0.09])
+    for k in range(1, 80):
+        info = env.step(STILL)[4]
+        sigma = np.sqrt(double_integrator_covariance(start, 0.2, 0.04 * k)[0, 0])
+        assert info["occlusion/sigma"][0] == pytest.approx(sigma, rel=1e-10)
+        assert not info["occlusion/visible"].any()
+
+
+def test_what_is_measured_has_the_declared_noise():
+    covariance = np.array([[0.04, 0.03], [0.03, 0.09]])
+    env = sw.OcclusionPenalty(
+        Turning(), [straight()], sw.Sensor(site="eye", position_std=covariance), tolerance=1.0
+    )
+    env.reset(seed=0)
+    noise = []
+    for _ in range(2000):
+        env.step(STILL)
+        noise.append(env.last_seen_positions[0] - [1.0, 0.0])
+    np.testing.assert_allclose(np.mean(noise, axis=0), 0.0, atol=5 * 0.3 / np.sqrt(2000))
+    np.testing.assert_allclose(np.cov(np.transpose(noise)), covariance, atol=0.015)
+    noise = np.array(noise)
+    assert abs((noise[1:] * noise[:-1]).mean(axis=0)).max() < 5 * 0.09 / np.sqrt(2000)  # white
+
+
+SPIN = ((0.3, 2.0, -1.0, -1, 0), (3.0, 0.5, 0.2, 0, 0))
+
+
+@pytest.mark.parametrize("arm", ["0.4 0 0", "0.1 -0.3 0.2"])
+def test_without_the_lever_arm_the_estimate_is_off_by_it(arm):
+    sharp = {"position_std": 1e-6, "velocity_std": 1e-6}
+    sure = straight(start_position_std=10.0, start_velocity_std=10.0, acceleration_noise=1e6)
+    offset = np.array([float(x) for x in arm.split()])
+    for knows in (True, False):
+        env = sw.OcclusionPenalty(
+            Turning(SPIN, arm=arm), [sure], sw.Sensor(site="eye", lever_arm=knows, **sharp), tolerance=1.0
+        )
+        env.reset(seed=0)
+        for _ in range(30):
+            env.step(np.array([0.5]))
+            angle, rate = env.unwrapped.data.qpos[0], env.unwrapped.data.qvel[0]
+            turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            r = turn @ offset[:2]
+            wrong = np.concatenate([-r, rate * np.array([r[1], -r[0]])]) * (not knows)
+            truth = np.concatenate([env.unwrapped.data.qpos[1:3], env.unwrapped.data.qvel[1:3]])
+            np.testing.assert_allclose(env.tracking.mean[0] - truth, wrong, atol=2e-5)
+
+
+def test_with_it_the_mean_error_is_zero_on_a_robot_that_spins():
+    env = sw.OcclusionPenalty(
+        Turning(SPIN),
+        [straight(acceleration_noise=0.5)],
+        sw.Sensor(site="eye", velocity_std=0.1),
+        tolerance=1.0,
+    )
+    errors = []
+    for seed in range(25):
+        env.reset(seed=seed)
+        for _ in range(40):
+            env.step(STILL)
+        errors.append(env.tracking.positions[0] - env.unwrapped.data.qpos[1:3])
+        spread = np.sqrt(np.diag(env.tracking.position_covariances[0]))
+    assert (np.abs(np.mean(errors, axis=0)) < 4.0 * spread / 5.0).all()
+
+
+def test_velocities_alone_leave_positions_unresolved_and_it_says_so():
+    only = sw.Sensor(site="eye", position_std=None, velocity_std=0.1)
+    env = sw.OcclusionPenalty(Turning(), [straight("thing*")], only, tolerance=1.0)
+    assert env.unobservable == {"thing": ["x", "y"], "thing2": ["x", "y"]}
+    assert crossing().unobservable == {f"car{i}": [] for i in range(6)}
+    env.reset(seed=0)
+    fix = env.last_seen_positions.copy()
+    for _ in range(100):
+        info = env.step(STILL)[4]
+    assert info["occlusion/visible"].all() and (info["occlusion/sigma"] >= 0.3).all()
+    assert (env.last_seen_positions == fix).all()
+    assert np.sqrt(env.tracking.covariance[:, 2, 2]).max() < 0.02
+
+
+def test_a_share_of_measurements_is_lost_for_each_track_by_itself():
+    dropping = sw.Sensor(site="eye", dropout=0.3)
+    env = sw.OcclusionPenalty(Turning(), [straight("thing*")], dropping, tolerance=1.0)
+    env.reset(seed=0)
+    seen = np.array([env.step(STILL)[4]["occlusion/visible"] for _ in range(3000)])
+    np.testing.assert_allclose(seen.mean(axis=0), 0.7, atol=5 * np.sqrt(0.21 / 3000))
+    assert abs(np.corrcoef(seen.T)[0, 1]) < 0.1
+    assert abs(np.corrcoef(seen[1:, 0], seen[:-1, 0])[0, 1]) < 0.1
+
+
+def test_a_wall_hides_and_last_seen_stays():
+    env = sw.OcclusionPenalty(
+        Turning(((0, 1.5, 0, -1, 0), (0, 1.0, 0, 0, 0)), world=WALL), [straight("thing*")], EYE, tolerance=1.0
+    )
+    env.reset(seed=0)
+    visible = []
+    for _ in range(40):
+        before = env.last_seen_positions.copy()
+        info = env.step(STILL)[4]
+        visible.append(info["occlusion/visible"].copy())
+        assert (env.last_seen_positions == before).all(axis=1).tolist() == (~visible[-1]).tolist()
+    x = 1.5 + 0.04 * np.arange(1, 41)
+    assert np.array(visible)[:, 0].tolist() == (x < 2.0).tolist()  # its ball sticks out until then
+    assert np.array(visible)[:, 1].all()
+
+
+def test_published_points_are_looked_at_level():
+    world = WALL.replace("0 0.5", "0 0").replace("3 1", "3 0.4")  # lower than the sensor
+    for text, expected in ((WALL, [False, True]), (world, [True, True])):
+        points = sw.Track(published="spots", acceleration_noise=0.1)
+        aside = (0, 1, -2, -1, 0), (0, 0, 0, 0, 0)
+        env = sw.OcclusionPenalty(Turning(aside, world=text), [points], EYE, tolerance=1.0)
+        assert env.track_names == ["spots[0]", "spots[1]"]
+        assert env.reset(seed=0)[1]["occlusion/visible"].tolist() == expected
+
+
+def test_points_and_bodies_together_keep_their_order():
+    tracks = [
+        sw.Track(published="spots", acceleration_noise=0.1, start_position_std=1e-9),
+        straight("thing2"),
+    ]
+    env = sw.OcclusionPenalty(Turning(), tracks, EYE, tolerance=1.0)
+    env.reset(seed=0)
+    assert env.track_names == ["spots[0]", "spots[1]", "thing2"]
+    np.testing.assert_allclose(env.tracking.positions, [[4, 0], [0, 1], [-1, 0]], atol=0.5)
+
+
+def test_points_that_come_and_go_cannot_be_tracked():
+    class Shrinking(Turning):
+        spots = np.zeros((2, 2))
+
+    env = sw.OcclusionPenalty(
+        Shrinking(), [sw.Track(published="spots", acceleration_noise=0.1)], EYE, tolerance=1.0
+    )
+    env.reset(seed=0)
+    env.unwrapped.spots = np.zeros((1, 2))
+    with pytest.raises(ConfigurationError, match=r"had 2 points.*has 1 now"):
+        env.step(STILL)
+
+
+def test_a_truth_that_is_no_number_is_not_seen():
+    class Broken(Turning):
+        spots = np.array([[1.0, 0.0]])
+
+    env = sw.OcclusionPenalty(
+        Broken(), [sw.Track(published="spots", acceleration_noise=0.1)], EYE, tolerance=1.0
+    )
+    env.reset(seed=0)
+    env.unwrapped.spots = np.array([[np.nan, 0.0]])
+    observation, _, _, _, info = env.step(STILL)
+    assert not info["occlusion/visible"].any() and np.isfinite(observation).all()
+
+
+def test_in_space_the_height_is_estimated_too():
+    env = sw.OcclusionPenalty(Turning(), [straight()], EYE, tolerance=1.0, axes="xyz")
+    env.reset(seed=0)
+    for _ in range(200):
+        observation = env.step(STILL)[0]
+    np.testing.assert_allclose(env.tracking.positions[0], [1.0, 0.0, 0.5], atol=0.05)
+    assert observation.shape == (1 + 9,)
+
+
+# Permissions ------------------------------------------------------------------------------------------------------
+
+
+@given(
+    q=st.floats(1e-3, 5.0),
+    tolerance=st.floats(0.5, 3.0),
+    sigmas=st.floats(0.5, 4.0),
+    reversion=st.sampled_from([None, 0.3, 3.0]),
+)
+@settings(deadline=None, max_examples=12)
+def test_a_permission_expires_before_the_bound_crosses_and_no_more_than_a_step_before(
+    q, tolerance, sigmas, reversion
+):
+    blind = sw.Sensor(site="eye", range_m=0.01)
+    track = straight(acceleration_noise=q, reversion_s=reversion)
+    env = sw.OcclusionPenalty(Turning(), [track], blind, tolerance, sigmas=sigmas)
+    info = env.reset(seed=0)[1]
+    start = np.diag([0.09] * 4)
+    a, _, noise = track.motion(2).matrices()
+
+    def bound(time_s):
+        return sigmas * np.sqrt(blind_covariance(start, a, noise, time_s)[0, 0])
+
+    for k in range(50):
+        expired = bool(info["occlusion/expired"][0])
+        soon = 0.04 * (k + 1)
+        if not expired:
+            assert bound(0.04 * k) <= tolerance and bound(soon) <= tolerance * (1 + 1e-12)
+            assert env.permissions()[0] >= 0.04 * (1 - 1e-9)
+        else:
+            assert bound(soon) > tolerance * (1 - 1e-12)
+            assert env.permissions()[0] <= 0.04 * (1 + 1e-9)
+            break
+        info = env.step(STILL)[4]
+
+
+def test_permissions_say_for_how_long_they_last():
+    env = crossing(tolerance=1.5, sensor=sw.Sensor("eye", range_m=0.01))
+    env.reset(seed=0)
+    foretold = env.permissions()
+    assert np.isfinite(foretold).all() and (foretold > 0.2).all()
+    expired_at = np.full(6, np.nan)
+    for k, (_, _, _, _, info) in enumerate(steps(env, 300)):
+        new = info["occlusion/expired"] & np.isnan(expired_at)
+        expired_at[new] = 0.04 * (k + 1)
+    assert (expired_at <= foretold + 1e-9).all() and (expired_at > foretold - 0.081).all()
+
+
+def test_a_permission_comes_back_when_the_thing_is_seen():
+    # It comes out from behind the wall.
+    env = sw.OcclusionPenalty(
+        Turning(((0, 2.5, 2.0, -1, 0), (0, 0.0, 1.0, 0, 0)), world=WALL),
+        [straight(acceleration_noise=0.2, start_position_std=1.0)],
+        EYE,
+        tolerance=0.5,
+    )
+    info = env.reset(seed=0)[1]
+    assert info["occlusion/expired"].all()
+    for _ in range(60):
+        info = env.step(STILL)[4]
+    assert info["occlusion/visible"].all() and not info["occlusion/expired"].any()
+
+
+# Reward and observation -------------------------------------------------------------------------------------------
+
+
+def test_the_penalty_is_what_it_says_and_is_taken_off():
+    env, bare = crossing(weight=0.3, tolerance=0.8), gym.make("OccludedCrossing-v0")
+    env.reset(seed=3)
+    bare.reset(seed=3)
+    near_none = False
+    for (_, reward, _, _, info), (_, task, _, _, _) in zip(
+        steps(env, 150, 1), steps(bare, 150, 1), strict=True
+    ):
+        eye = env.unwrapped.data.qpos[:2] + 0.15 * np.array(
+            [np.cos(env.unwrapped.agent_heading), np.sin(env.unwrapped.agent_heading)]
+        )
+        near = np.linalg.norm(env.tracking.positions - eye, axis=1) <= 6.0
+        share = np.minimum(1.0, 3.0 * info["occlusion/sigma"] / 0.8) ** 2
+        expected = 0.3 * share[near].mean() if near.any() else 0.0
+        near_none |= not near.all()
+        assert info["occlusion/penalty"] == pytest.approx(expected, abs=1e-12)
+        assert info["occlusion/task_reward"] == task
+        assert reward == pytest.approx(task - expected, abs=1e-12)
+    assert near_none
+
+
+def test_without_a_weight_the_reward_is_the_task_s_own():
+    env, bare = crossing(), gym.make("OccludedCrossing-v0")
+    env.reset(seed=3)
+    bare.reset(seed=3)
+    for with_it, without in zip(steps(env, 30), steps(bare, 30), strict=True):
+        assert with_it[1] == without[1] and type(with_it[1]) is type(without[1])
+        assert with_it[4]["occlusion/penalty"] == 0.0
+
+
+def test_no_track_in_range_costs_nothing():
+    blind = sw.Sensor(site="eye", range_m=0.3)
+    env = sw.OcclusionPenalty(
+        Turning(((0, 9, 0, -9, 0), (0,) * 5)), [straight("thing*")], blind, tolerance=0.1, weight=1.0
+    )
+    env.reset(seed=0)
+    assert env.step(STILL)[4]["occlusion/penalty"] == 0.0
+
+
+def there_and_away(env):
+    """Up to the road, looking at it; then it turns round and waits."""
+    for k in range(200):
+        yield env.step(np.array([0.0, 0.5 if k < 40 else 0.0, 1.0 if 60 <= k < 80 else 0.0]))
+
+
+def test_the_recorder_counts_the_task_s_own_return_sight_and_expiries():
+    env = sw.RecordInterventions(gym.wrappers.TimeLimit(crossing(weight=0.3, tolerance=0.6), 200))
+    bare = gym.make("OccludedCrossing-v0")
+    info = env.reset(seed=3)[1]
+    bare.reset(seed=3)
+    expired, expiries, seen, total = info["occlusion/expired"], 0, [], 0.0
+    for (_, _, _, _, info), (_, task, _, _, _) in zip(there_and_away(env), there_and_away(bare), strict=True):
+        total += task
+        seen.append(info["occlusion/visible"].mean())
+        expiries += int((info["occlusion/expired"] & ~expired).sum())
+        expired = info["occlusion/expired"]
+    summary = info["interventions"]
+    assert summary["return"] == pytest.approx(total, abs=1e-9)
+    assert summary["seen"] == pytest.approx(np.mean(seen)) and 0.0 < summary["seen"] < 1.0
+    assert summary["expiries"] == expiries > 0
+
+
+@pytest.mark.parametrize("axes", ["xy", "xyz"])
+def test_the_observation_gains_the_estimates_relative_to_the_robot(axes):
+    d = len(axes)
+    cars = [sw.Track("car*", acceleration_noise=0.1)]
+    env = sw.OcclusionPenalty(gym.make("OccludedCrossing-v0"), cars, "eye", 1.0, axes=axes)
+    bare = gym.make("OccludedCrossing-v0")
+    seen = [env.reset(seed=2)[0], *(s[0] for s in steps(env, 20))]
+    plain = [bare.reset(seed=2)[0], *(s[0] for s in steps(bare, 20))]
+    assert env.observation_space.shape == (17 + 6 * 3 * d,)
+    for mine, theirs in zip(seen, plain, strict=True):
+        assert mine[:17].tobytes() == theirs.tobytes() and env.observation_space.contains(mine)
+    table = seen[-1][17:].reshape(6, 3, d)
+    robot = np.array([*env.unwrapped.agent_position, 0.0])[:d]
+    np.testing.assert_allclose(table[:, 0], env.tracking.positions - robot, atol=1e-12)
+    np.testing.assert_array_equal(table[:, 1], env.tracking.velocities)
+    deviations = np.sqrt(np.einsum("nii->ni", env.tracking.position_covariances))
+    np.testing.assert_allclose(table[:, 2], deviations, atol=1e-12)
+
+
+def test_with_observe_off_the_observation_and_its_space_are_the_env_s():
+    env = crossing(observe=False)
+    assert env.observation_space == gym.make("OccludedCrossing-v0").observation_space
+    assert env.reset(seed=0)[0].shape == (17,)
+
+
+def test_a_dict_gains_a_key_and_float32_stays_float32():
+    spaces = {"a": gym.spaces.Box(-1, 1, (2,), np.float32)}
+    env = sw.OcclusionPenalty(
+        Turning(space=gym.spaces.Dict(spaces)), [straight("thing*")], EYE, tolerance=1.0
+    )
+    observation = env.reset(seed=0)[0]
+    assert set(observation) == {"a", "tracks"} and observation["tracks"].shape == (12,)
+    assert env.observation_space.contains(observation)
+    env = sw.OcclusionPenalty(
+        Turning(space=gym.spaces.Box(-1, 1, (3,), np.float32)), [straight()], EYE, tolerance=1.0
+    )
+    assert env.observation_space.contains(env.reset(seed=0)[0])
+    assert env.observation_space.dtype == np.float32
+
+
+# Randomness and episodes ------------------------------------------------------------------------------------------
+
+
+def trace(env, seed=0, count=40):
+    told = [env.reset(seed=seed)]
+    told += list(steps(env, count))
+    return [
+        (
+            observation["tracks"].tobytes() if isinstance(observation, dict) else observation.tobytes(),
+            *[{k: np.asarray(v).tobytes() for k, v in x.items()} if isinstance(x, dict) else x for x in rest],
+        )
+        for observation, *rest in told
+    ]
+
+
+def test_seeds_repeat_and_differ_and_the_env_s_own_generator_is_untouched():
+    env, bare = crossing(sensor=sw.Sensor("eye", dropout=0.2)), gym.make("OccludedCrossing-v0")
+    first = trace(env, 5)
+    assert trace(env, 6) != first and trace(env, 5) == first
+    bare.reset(seed=5)
+    for _ in steps(bare, 40):
+        pass
+    for _ in range(2):  # and on, without seeds
+        env.reset()
+        bare.reset()
+        for _ in zip(steps(env, 10), steps(bare, 10), strict=True):
+            pass
+        assert env.unwrapped.data.qpos.tobytes() == bare.unwrapped.data.qpos.tobytes()
+    a, b = (e.unwrapped.np_random.bit_generator.state for e in (env, bare))
+    assert a == b
+
+
+def test_episodes_without_a_seed_go_on_and_do_not_repeat():
+    env = sw.OcclusionPenalty(Turning(), [straight()], EYE, tolerance=1.0)
+    env.reset(seed=1)
+    one, two = env.reset()[0], env.reset()[0]
+    assert one.tobytes() != two.tobytes()
+
+
+def test_the_noise_of_a_track_does_not_depend_on_what_else_is_seen():
+    def last(world):
+        env = sw.OcclusionPenalty(
+            Turning(((0, 3, 0, -1, 0), (0,) * 5), world=world), [straight("thing*")], EYE, tolerance=1.0
+        )
+        env.reset(seed=4)
+        for _ in range(5):
+            env.step(STILL)
+        return env.last_seen_positions
+
+    assert (
+        last(WALL)[1].tobytes() == last("")[1].tobytes() and last(WALL)[0].tobytes() != last("")[0].tobytes()
+    )
+
+
+def test_a_reset_starts_every_track_anew():
+    env = sw.OcclusionPenalty(
+        Turning(), [straight(acceleration_noise=1.0)], sw.Sensor(site="eye", range_m=0.01), tolerance=1.0
+    )
+    info = env.reset(seed=0)[1]
+    for _ in range(100):
+        env.step(STILL)
+    again = env.reset(seed=0)[1]
+    assert again["occlusion/sigma"] == info["occlusion/sigma"] == 0.3
+
+
+def test_the_first_fix_has_the_declared_accuracy():
+    blind = sw.Sensor(site="eye", range_m=0.01)
+    env = sw.OcclusionPenalty(
+        Turning(), [straight(start_position_std=[0.5, 0.1], mean_velocity=[2.0, 0.0])], blind, tolerance=1.0
+    )
+    env.reset(seed=0)
+    fixes = []
+    for _ in range(1500):
+        env.reset()
+        fixes.append(env.tracking.positions[0] - [1.0, 0.0])
+    np.testing.assert_allclose(np.std(fixes, axis=0), [0.5, 0.1], rtol=0.1)
+    np.testing.assert_allclose(np.mean(fixes, axis=0), 0.0, atol=0.06)
+    assert env.tracking.velocities.tolist() == [[2.0, 0.0]]
+
+
+def test_time_that_runs_backwards_is_refused():
+    env = crossing()
+    env.reset(seed=0)
+    for _ in steps(env, 5):
+        pass
+    env.unwrapped.data.time = 0.0
+    with pytest.raises(SafeWrappersError, match=r"backwards by 0\.16 s.*Reset the env"):
+        env.step(env.action_space.sample())
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+
+
+def test_a_state_that_is_set_is_seen_where_it_is():
+    env = sw.OcclusionPenalty(Turning(), [straight(acceleration_noise=100.0)], EYE, tolerance=1.0)
+    env.reset(seed=0)
+    env.unwrapped.data.qpos[1:3] = [0.0, -2.0]
+    env.step(STILL)
+    np.testing.assert_allclose(env.last_seen_positions[0], [0.0, -2.0], atol=0.25)
+
+
+def test_steps_of_any_length_grow_as_long_as_they_last():
+    class Uneven(Turning):
+        def step(self, action):
+            self.frame_skip = int(action[0])
+            return super().step(STILL)
+
+    env = sw.OcclusionPenalty(
+        Uneven(), [straight(acceleration_noise=0.3)], sw.Sensor(site="eye", range_m=0.01), tolerance=9.0
+    )
+    env.reset(seed=0)
+    for skip in (4, 1, 7, 30, 4):
+        info = env.step(np.array([skip]))[4]
+    sigma = np.sqrt(double_integrator_covariance(np.diag([0.09, 0.09]), 0.3, 0.46)[0, 0])
+    assert info["occlusion/sigma"][0] == pytest.approx(sigma, rel=1e-10)
+
+
+def test_another_model_at_a_reset_is_looked_at_and_other_things_are_refused():
+    env = sw.OcclusionPenalty(Turning(), [straight("thing*")], EYE, tolerance=1.0)
+    assert env.reset(seed=0)[1]["occlusion/visible"].tolist() == [True, True]
+    raw = env.unwrapped
+    raw.build(WALL.replace("2 0", "0.7 0"), "0.4 0 0")
+    assert env.reset(seed=0)[1]["occlusion/visible"].tolist() == [False, True]
+    raw.build('<body name="thing3"><geom size="0.1"/></body>', "0.4 0 0")
+    with pytest.raises(
+        ConfigurationError, match=r"another model.*thing3, thing, thing2 and not thing, thing2"
+    ):
+        env.reset(seed=0)
+
+
+def test_an_env_that_names_no_time_step_is_taken_at_its_physics():
+    class Timeless(Turning):
+        dt = property()
+
+    env = sw.OcclusionPenalty(Timeless(), [straight()], EYE, tolerance=1.0)
+    env.reset(seed=0)
+    env.step(STILL)
+    maze = pytest.importorskip("gymnasium_robotics")
+    gym.register_envs(maze)
+    particle = sw.Track("particle", acceleration_noise=0.1)
+    env = sw.OcclusionPenalty(
+        gym.make("PointMaze_UMaze-v3"), [particle], sw.Sensor(site="target"), tolerance=1.0
+    )
+    env.reset(seed=0)
+    assert env.step(env.action_space.sample())[0]["tracks"].shape == (6,)
+
+
+# What Gymnasium asks ----------------------------------------------------------------------------------------------
+
+
+def test_gymnasium_s_checks_specs_json_and_pickles():
+    env = crossing(weight=0.1, sensor=sw.Sensor("eye", position_std=0.01 * np.eye(2), occluder_groups=(0, 1)))
+    first = trace(env)
+    assert trace(gym.make(env.spec)) == first
+    assert trace(gym.make(EnvSpec.from_json(env.spec.to_json()))) == first
+    json.loads(env.spec.to_json())
+    assert trace(pickle.loads(pickle.dumps(env))) == first
+    with pytest.warns(UserWarning):
+        check_env(env, skip_render_check=True)
+
+
+def test_a_copy_in_the_middle_goes_on_alike():
+    env = sw.OcclusionPenalty(Turning(SPIN), [straight("thing*")], EYE, tolerance=1.0)
+    env.reset(seed=0)
+    env.step(STILL)
+    again = copy.deepcopy(env)
+    for _ in range(5):
+        assert env.step(STILL)[0].tobytes() == again.step(STILL)[0].tobytes()
+
+
+# What is refused --------------------------------------------------------------------------------------------------
+
+
+def made(env=None, tracks=None, sensor=EYE, tolerance=1.0, **options):
+    return sw.OcclusionPenalty(
+        Turning() if env is None else env,
+        [straight()] if tracks is None else tracks,
+        sensor,
+        tolerance,
+        **options,
+    )
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "words"),
+    [
+        ({"tolerance": 0.0}, ConfigurationError, "tolerance.*> 0 in m, got 0"),
+        ({"tolerance": -1}, ConfigurationError, "tolerance"),
+        ({"tolerance": np.nan}, ConfigurationError, "tolerance"),
+        ({"tolerance": None}, ConfigurationError, "tolerance must be a number"),
+        ({"weight": -0.1}, ConfigurationError, "weight"),
+        ({"weight": np.inf}, ConfigurationError, "weight"),
+        ({"sigmas": 0.0}, ConfigurationError, "sigmas"),
+        ({"axes": "xz"}, ConfigurationError, "'xy' or 'xyz', got 'xz'"),
+        ({"axes": 2}, ConfigurationError, "axes"),
+        ({"observe": "yes"}, ConfigurationError, "observe is True or False"),
+        ({"tracks": []}, ConfigurationError, "at least one Track"),
+        ({"tracks": "thing"}, ConfigurationError, "at least one Track"),
+        ({"tracks": straight()}, ConfigurationError, "at least one Track"),
+        ({"tracks": ["thing"]}, ConfigurationError, "acceleration_noise"),
+        ({"tracks": [straight("think")]}, UnknownNameError, "'think'; it has: robot, thing, thing2"),
+        ({"tracks": [straight("")]}, UnknownNameError, "no body ''"),
+        ({"tracks": [straight("thing"), straight("thing*")]}, ConfigurationError, "twice: thing$"),
+        ({"tracks": [sw.Track(published="spot", acceleration_noise=1)]}, UnknownNameError, "'spot'.*spots"),
+        ({"tracks": [sw.Track(published="dt", acceleration_noise=1)]}, ConfigurationError, r"shape \(k, 2\)"),
+        ({"tracks": [straight(acceleration_noise=[[1, 2], [2, 1]])]}, ConfigurationError, "semidefinite"),
+        ({"tracks": [straight(start_position_std=-1)]}, ConfigurationError, "start_position_std"),
+        ({"sensor": "eye"}, UnknownNameError, "no camera 'eye'; it has: front"),
+        ({"sensor": sw.Sensor(site="front")}, UnknownNameError, "no site 'front'; it has: eye"),
+        ({"sensor": sw.Sensor("front", position_std=[[1, 1], [1, 1]])}, ConfigurationError, "definite"),
+        (
+            {
+                "sensor": sw.Sensor("front", velocity_std=0.1),
+                "tracks": [sw.Track(published="spots", acceleration_noise=1)],
+            },
+            ConfigurationError,
+            "velocities are measured of bodies",
+        ),
+        ({"env": gym.make("Pendulum-v1")}, UnsupportedEnvError, "model and .data"),
+        (
+            {"env": Turning(space=gym.spaces.Box(0, 255, (4,), np.uint8))},
+            UnsupportedEnvError,
+            "flat Box of floats",
+        ),
+        (
+            {"env": Turning(space=gym.spaces.Box(0, 1, (2, 2), np.float64))},
+            UnsupportedEnvError,
+            "observe=False",
+        ),
+        (
+            {"env": Turning(space=gym.spaces.Dict({"tracks": gym.spaces.Box(0, 1, (2,))}))},
+            UnsupportedEnvError,
+            "'tracks' already",
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused_at_construction_with_the_reason(given, error, words):
+    with pytest.raises(error, match=words):
+        made(**given)
+
+
+def test_unnamed_bodies_do_not_fit_any_pattern():
+    assert made(tracks=[straight("*")]).track_names == ["robot", "thing", "thing2"]
+
+
+def test_wrong_orders_are_refused():
+    with pytest.raises(ConfigurationError, match="already; give that one all the tracks"):
+        made(env=made())
+    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(4.0)])
+    arm = sw.Track("body1", acceleration_noise=1)
+    with pytest.raises(ConfigurationError, match="outside of the filter tells it nothing"):
+        made(env=filtered, tracks=[arm])
+    chunks = sw.ChunkHandover(gym.make("Reacher-v5"), 4, 2)
+    with pytest.raises(ConfigurationError, match="once per chunk"):
+        made(env=chunks, tracks=[arm])
