@@ -1,0 +1,79 @@
+"""Four ways to grow unseen, and what a distance alone tells of a place: at rest one direction never."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+from numpy.typing import NDArray
+
+from _style import FORBIDDEN, INK, OFF, ON, OTHER, SAFE, panels
+from safe_wrappers.control.covariance import blind_covariance
+from safe_wrappers.control.kalman import update
+
+Array = NDArray[np.float64]
+
+RATE = 0.5
+"""1/s."""
+STEPS = 40
+NOISE = np.array([[0.05**2]])
+"""m^2, of a measured distance."""
+
+
+def draw() -> Figure:
+    """Left: sigma over time. Right: three-sigma ellipses before and after many distances."""
+    figure, (left, right) = panels(2, height=3.2)
+    times = np.linspace(0.0, 6.0, 121)
+    systems: tuple[tuple[str, list[list[float]], list[float], str], ...] = (
+        ("exponential: unstable", [[RATE]], [0.02], FORBIDDEN),
+        ("polynomial: noisy speed", [[0.0, 1.0], [0.0, 0.0]], [0.0, 0.02], OFF),
+        ("linear variance: random walk", [[0.0]], [0.1], ON),
+        ("bounded: returns to its mean", [[-RATE]], [0.1], SAFE),
+    )
+    for label, a, q, color in systems:
+        start = 0.05**2 * np.eye(len(a))
+        grown = blind_covariance(start, a, np.diag(q), times)[:, 0, 0]
+        left.plot(times, np.sqrt(grown), color=color, label=label)
+    left.set_ylim(0.0, 2.6)
+    left.set_xlabel("time unseen (s)")
+    left.set_ylabel(r"$\sigma$")
+    left.legend(loc="upper left")
+    start = np.array([2.0, 1.5])
+    for moves, color, label in ((0.0, OFF, "standing"), (1.0, ON, "moving")):
+        cov = 0.3**2 * np.eye(2)
+        for step in range(STEPS):
+            place = start + moves * np.array([2.0 * step / STEPS, 0.0])  # known motion past the beacon
+            gradient = (place / np.linalg.norm(place))[None]
+            cov = update(np.zeros(2), cov, np.zeros(1), gradient, NOISE).cov
+        _ellipse(right, start, cov, color, label)
+    _ellipse(right, start, 0.3**2 * np.eye(2), OTHER, "before")
+    right.plot(0.0, 0.0, "^", color=INK)
+    right.text(0.15, -0.05, "beacon", va="center")
+    right.plot([0.0, start[0]], [0.0, start[1]], color=INK, lw=0.8, ls=":")
+    right.set_aspect("equal")
+    right.set_xlim(-0.3, 3.6)
+    right.set_ylim(-0.4, 3.0)
+    right.set_xlabel("x (m)")
+    right.set_ylabel("y (m)")
+    right.legend(loc="upper left")
+    return figure
+
+
+def _ellipse(ax: Axes, center: Array, cov: Array, color: str, label: str) -> None:
+    """Three standard deviations about the place at the start."""
+    squares, axes = np.linalg.eigh(cov)
+    width, height = 6.0 * np.sqrt(squares)
+    angle = float(np.degrees(np.arctan2(axes[1, 0], axes[0, 0])))
+    dashed = "--" if label == "before" else "-"
+    ax.add_patch(
+        Ellipse(
+            (float(center[0]), float(center[1])),
+            width,
+            height,
+            angle=angle,
+            fill=False,
+            edgecolor=color,
+            ls=dashed,
+            lw=1.6,
+            label=label,
+        )
+    )
