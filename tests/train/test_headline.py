@@ -54,6 +54,11 @@ def told(experiment, **more):
             "It changed less than 0.01 % of the evaluation steps; no step was infeasible and none ran the"
             " fallback.",
         ),
+        (
+            {"violations": 5, "collisions": 2, "return": 10},
+            {"return": 10},
+            "without it 120 of 2,400 steps (5 %) were. Collisions begun: 0 with it, 48 without. The return",
+        ),
         ({"violations": 1}, {}, "It changed none of the evaluation steps; no step was infeasible"),
     ],
 )

@@ -124,6 +124,22 @@ def test_spin_outs_are_a_total_and_a_rate_over_all_steps(fake_experiment):
     assert not {"spin_outs", "spin_outs_per_million"} & table["filtered"]["training"].keys()
 
 
+def test_collisions_sight_and_expiries_of_a_task_whose_things_are_tracked(fake_experiment):
+    experiment = fake_experiment()
+    seen = [
+        episode(collisions=2, seen=0.25, expiries=3, length=40),
+        episode(seen=0.75, expiries=1, length=10),
+    ]
+    write_training(experiment, 0, 0, seen)
+    write_training(experiment, 1, 0, [episode(collisions="", seen="", expiries="")])
+    table = summarize(experiment).table
+    tracked = {key: value.iqm for key, value in table["unfiltered"]["training"].items()}
+    assert (tracked["collisions"], tracked["seen"], tracked["expiries"]) == (2.0, 0.5, 4.0)
+    assert tracked["collisions_per_million"] == 1e6 * 2 / 50 and tracked["expiries_per_1000"] == 80.0
+    names = {"collisions", "collisions_per_million", "seen", "expiries", "expiries_per_1000"}
+    assert not names & table["filtered"]["training"].keys()
+
+
 def test_learning_curve(fake_experiment):
     experiment = fake_experiment()
     for seed in (0, 1):

@@ -26,6 +26,8 @@ class Side:
     infeasible: int
     fallback: int
     unsafe: int
+    collisions: int
+    """0 where the task reports none, too."""
     returns: tuple[Estimate, ...]
     """Of evaluation, one per compared arm; empty if one is missing."""
     changed: float | None
@@ -75,7 +77,7 @@ def side(summary: Summary, arms: Sequence[ArmConfig], condition: str, training: 
     rows = [row for row in summary.per_seed if row["arm"] in names and row["condition"] in wanted]
     totals = {
         key: int(sum(row.get(key, 0) for row in rows))
-        for key in ("steps", "violations", "infeasible", "fallback", "unsafe")
+        for key in ("steps", "violations", "infeasible", "fallback", "unsafe", "collisions")
     }
     cells = [summary.table[name][condition] for name in names]
     rates = [cell["intervention_rate"].iqm for cell in cells if "intervention_rate" in cell]

@@ -13,7 +13,7 @@ def verdict(experiment: ExperimentConfig, summary: Summary) -> str:
     if found is None:
         return _without_comparison(experiment, summary)
     safety = _safety(found.off, found.on) if found.judged else _own_measure(found.on)
-    return " ".join(filter(None, (safety, _price(found), _work(found.on))))
+    return " ".join(filter(None, (safety, _collisions(found.off, found.on), _price(found), _work(found.on))))
 
 
 def percent(share: float) -> str:
@@ -36,6 +36,12 @@ def _safety(off: Side, on: Side) -> str:
             f"The filter lowered violations without removing them: {with_filter} with it, {without} without."
         )
     return f"The filter did not lower violations: {with_filter} with it, {without} without."
+
+
+def _collisions(off: Side, on: Side) -> str:
+    if not off.collisions and not on.collisions:
+        return ""
+    return f"Collisions begun: {on.collisions:,} with it, {off.collisions:,} without."
 
 
 def _own_measure(on: Side) -> str:
