@@ -37,6 +37,9 @@ CROSSING_EPISODE_STEPS: Final = 500
 OCCLUDED_CROSSING_ID: Final = "OccludedCrossing-v0"
 """Id of the road to cross between cars that hide behind pillars."""
 
+PATROLLED_MAZE_ID: Final = "PatrolledPointMaze-v0"
+"""Id of gymnasium-robotics' PointMaze with patrols that its walls hide."""
+
 
 def register_envs() -> None:
     """Register every task of this package with Gymnasium; ids already there are left alone."""
@@ -52,6 +55,7 @@ def register_envs() -> None:
     _register(SAFE_ROVER_ID, "safe_wrappers.envs.safe_rover:SafeRoverEnv", {})
     crossing = "safe_wrappers.envs.occluded_crossing:OccludedCrossingEnv"
     _register(OCCLUDED_CROSSING_ID, crossing, {}, steps=CROSSING_EPISODE_STEPS)
+    _register(PATROLLED_MAZE_ID, "safe_wrappers.envs.patrolled_maze:PatrolledPointMazeEnv", {})
 
 
 def _register(env_id: str, entry_point: str, kwargs: dict[str, object], steps: int = EPISODE_STEPS) -> None:
@@ -65,6 +69,7 @@ __all__ = [
     "EPISODE_STEPS",
     "FLEX_JOINT_REACH_ID",
     "OCCLUDED_CROSSING_ID",
+    "PATROLLED_MAZE_ID",
     "POINT_GOAL_IDS",
     "REACH_EPISODE_STEPS",
     "SAFE_ROVER_ID",

@@ -1,0 +1,232 @@
+"""PointMaze with patrols: discs that go up and down its corridors, hidden by its walls."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.control.tracks import Motion, Tracks
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.interventions import COST, COST_SUBSTEP
+
+from .traffic import CAR_SPEED_STD, CAR_TIME_CONSTANT_S, Traffic
+
+try:
+    from gymnasium_robotics.envs.maze.maps import U_MAZE
+    from gymnasium_robotics.envs.maze.point_maze import PointMazeEnv
+except ImportError as error:
+    raise UnsupportedEnvError(
+        "PatrolledPointMaze is built on gymnasium-robotics' PointMaze: pip install gymnasium-robotics"
+    ) from error
+
+Array = NDArray[np.float64]
+
+COLLISIONS: Final = "collisions"
+"""int: collisions that began in this step, one per patrol: contact now, none at the end of the step before."""
+BALL_RADIUS: Final = 0.1
+PATROL_RADIUS: Final = 0.15
+"""m."""
+PATROL_MEAN_SPEED: Final = 0.5
+"""m/s, up and down the corridor."""
+PATROL_REVERSION_S: Final = CAR_TIME_CONSTANT_S
+PATROL_ACCELERATION_NOISE: Final = 2.0 * (PATROL_MEAN_SPEED**2 + CAR_SPEED_STD**2) / PATROL_REVERSION_S
+"""Intensity of acceleration noise along the corridor, m^2/s^3, for a tracker whose velocity goes back to 0 with
+`PATROL_REVERSION_S`: in the long run as much velocity as a patrol has, turns at its ends included."""
+START_GAP: Final = 0.3
+"""m: no patrol starts closer to the ball than that."""
+
+_CONTACT: Final = BALL_RADIUS + PATROL_RADIUS
+_SHORTEST: Final = 2.0  # m: on a shorter way the ball may leave no place to start at
+_TRIES: Final = 1000
+U_MAZE_PATROLS: Final = (((1, 1), (1, 3)), ((3, 1), (3, 3)))
+"""The two long corridors of the U maze, each from its first cell to its last (row, column)."""
+
+
+class PatrolledPointMazeEnv(PointMazeEnv):  # type: ignore[misc]
+    """gymnasium-robotics' PointMaze with discs that patrol; the ball's physics, observations and rewards stay.
+
+    Each patrol (radius 0.15 m) goes up and down between the centres of two cells of one row or column, always on the
+    straight line between them. Its speed wanders about 0.5 m/s by the law of the crossing's cars (standard deviation
+    0.15 m/s, time constant 2 s; `safe_wrappers.envs.traffic`), drawn without a discretisation error; at an end it
+    turns about, as a ball off a wall. Patrols are no bodies of the model: they pass through the ball, nothing shows
+    them in a rendering, and walls hide them from whoever looks along the floor. The observation has nothing of them.
+
+    **Attributes**: `patrol_positions` and `patrol_velocities`, shape (k, 2), m and m/s; `patrol_tracks` (a
+    `control.tracks.Tracks`): the same as tracks that are known exactly now. `agent_position`, `agent_velocity`.
+
+    **Info**, at every step and at reset: ``cost`` and its equal ``cost_substep`` (1.0 if ball and patrol overlapped
+    anywhere in the step: closest approach of the straight ways from one physics step to the next), ``collisions``.
+
+    **Randomness**: the seed alone decides the patrols' way, whatever the ball does, but for where it starts: a patrol
+    starts at least 0.3 m off the ball.
+
+    Args:
+        maze_map: As PointMaze's.
+        patrols: A way each: its first and its last cell, (row, column) both, at least 2 m apart, in one row or
+            column, with no wall between. None: the two long corridors of the U maze.
+        kwargs: Passed to PointMaze (``reward_type``, ``continuing_task``, ``reset_target``, ``render_mode``, ...).
+
+    Raises:
+        ConfigurationError: A way that is none; a map of one's own without ways.
+
+    Example:
+        >>> import gymnasium as gym, safe_wrappers
+        >>> env = gym.make("PatrolledPointMaze-v0")  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        maze_map: Sequence[Sequence[int | str]] = U_MAZE,
+        patrols: Sequence[Sequence[Sequence[int]]] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        if patrols is None:
+            if [list(row) for row in maze_map] != U_MAZE:
+                raise ConfigurationError(
+                    "name the patrols' ways on a map of your own: patrols=[[[row, column], [row, column]], ...]"
+                )
+            patrols = U_MAZE_PATROLS
+        super().__init__(maze_map=[list(row) for row in maze_map], **kwargs)
+        self._ezpickle_args = ()
+        self._ezpickle_kwargs = {"maze_map": maze_map, "patrols": patrols, **kwargs}
+        ways = [self._way(way) for way in patrols]
+        if not ways:
+            raise ConfigurationError("patrols is a list with at least one way, got none")
+        self._starts = np.array([start for start, _ in ways])
+        offsets = np.array([end for _, end in ways]) - self._starts
+        self._lengths = np.hypot(*offsets.T)
+        self._directions = offsets / self._lengths[:, None]
+        self._traffic = Traffic(np.full(len(ways), PATROL_MEAN_SPEED), self.dt, 1)
+        # Where each would be on a way without turns, and its speed along it.
+        self._gone, self._speeds = np.zeros(len(ways)), np.full(len(ways), PATROL_MEAN_SPEED)
+        self._patrols_random = np.random.default_rng(0)  # until the first reset
+        motions = [
+            Motion(PATROL_ACCELERATION_NOISE * np.outer(along, along), PATROL_REVERSION_S, np.zeros(2))
+            for along in self._directions
+        ]
+        self._tracks = Tracks(motions)
+        self._touching = np.zeros(len(ways), dtype=bool)
+
+    def _way(self, given: Sequence[Sequence[int]]) -> tuple[Array, Array]:
+        """The ends of a way, m."""
+        cells = np.asarray(given)
+        grid = self.maze.maze_map
+        rows, columns = len(grid), len(grid[0])
+        if (
+            cells.shape != (2, 2)
+            or not np.issubdtype(cells.dtype, np.integer)
+            or (cells < 0).any()
+            or (cells >= (rows, columns)).any()
+            or (cells[0] != cells[1]).sum() != 1
+        ):
+            raise ConfigurationError(
+                f"a patrol's way is two cells (row, column) of one row or column of a map of {rows} x {columns}, "
+                f"got {given!r}"
+            )
+        count = int(np.abs(cells[1] - cells[0]).max())
+        step = np.sign(cells[1] - cells[0])
+        for k in range(count + 1):
+            row, column = (int(i) for i in cells[0] + k * step)
+            if grid[row][column] == 1:
+                raise ConfigurationError(f"there is a wall in cell {[row, column]}, on the way {given!r}")
+        start, end = (np.array(self.maze.cell_rowcol_to_xy(cell), dtype=np.float64) for cell in cells)
+        if math.dist(start, end) < _SHORTEST:
+            raise ConfigurationError(
+                f"a patrol's way is at least {_SHORTEST:g} m long, {given!r} is {math.dist(start, end):g} m"
+            )
+        return start, end
+
+    # What a constraint, a sensor or a judge may read ---------------------------------------------------------
+
+    @property
+    def dt(self) -> float:
+        """Of a control step, which is one physics step, s."""
+        return float(self.model.opt.timestep)
+
+    @property
+    def agent_position(self) -> Array:
+        """The ball's centre, shape (2,), m."""
+        return np.array(self.data.qpos[:2])
+
+    @property
+    def agent_velocity(self) -> Array:
+        """Shape (2,), m/s."""
+        return np.array(self.data.qvel[:2])
+
+    @property
+    def patrol_positions(self) -> Array:
+        """Centres, shape (k, 2), m: the truth that no driver may see."""
+        return np.asarray(self._starts + self._along()[0][:, None] * self._directions)
+
+    @property
+    def patrol_velocities(self) -> Array:
+        """Shape (k, 2), m/s: as true."""
+        return np.asarray(self._along()[1][:, None] * self._directions)
+
+    @property
+    def patrol_tracks(self) -> Tracks:
+        """True states, without uncertainty now, and a model of how they move: what a perfect tracker would know."""
+        states = np.concatenate([self.patrol_positions, self.patrol_velocities], axis=1)
+        self._tracks.start(states, np.zeros((len(states), 4, 4)))
+        return self._tracks
+
+    def _along(self) -> tuple[Array, Array]:
+        """Way from the start, m, and speed along it, m/s, folded back at both ends."""
+        around = np.mod(self._gone, 2.0 * self._lengths)
+        back = around > self._lengths
+        return np.where(back, 2.0 * self._lengths - around, around), np.where(back, -1.0, 1.0) * self._speeds
+
+    # Gymnasium -----------------------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Array], dict[str, Any]]:
+        """Reset PointMaze and draw where each patrol is, and how fast."""
+        observation, info = super().reset(seed=seed, options=options)
+        # A stream of the patrols' own: a goal that is reached and drawn anew must not change their way.
+        self._patrols_random = np.random.default_rng(self.np_random.integers(2**63))
+        self._draw_starts()
+        self._touching = np.zeros(len(self._gone), dtype=bool)
+        offset = self.patrol_positions - self.agent_position
+        self._judge(info, offset, offset)
+        return observation, info
+
+    def _draw_starts(self) -> None:
+        rng = self._patrols_random
+        self._speeds = rng.normal(PATROL_MEAN_SPEED, CAR_SPEED_STD, len(self._gone))
+        for i in range(len(self._gone)):
+            for _ in range(_TRIES):
+                self._gone[i] = rng.uniform(0.0, 2.0 * self._lengths[i])
+                if math.dist(self.patrol_positions[i], self.agent_position) >= _CONTACT + START_GAP:
+                    break
+
+    # PointMaze's step has no annotations; its numbers are Python's.
+    def step(
+        self, action: NDArray[np.floating[Any]]
+    ) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
+        """Step PointMaze, move the patrols, and judge the whole way."""
+        before = self.patrol_positions - self.agent_position
+        observation, reward, terminated, truncated, info = super().step(action)
+        if self._traffic.step_s != self.dt:
+            self._traffic = Traffic(np.full(len(self._gone), PATROL_MEAN_SPEED), self.dt, 1)
+        self._gone, self._speeds = self._traffic.drive(self._patrols_random, self._gone, self._speeds)[0]
+        self._judge(info, before, self.patrol_positions - self.agent_position)
+        return observation, float(reward), bool(terminated), bool(truncated), info
+
+    def _judge(self, info: dict[str, Any], before: Array, after: Array) -> None:
+        """Judge straight ways between two offsets of the patrols from the ball, shape (k, 2), m."""
+        touched = closest_approach(before, after) <= _CONTACT
+        info[COST] = info[COST_SUBSTEP] = float(touched.any())
+        info[COLLISIONS] = int((touched & ~self._touching).sum())
+        self._touching = np.hypot(*after.T) <= _CONTACT
+
+
+def closest_approach(before: Array, after: Array) -> Array:
+    """Least distance from the origin of straight ways from `before` to `after`, shapes (k, 2); shape (k,), m."""
+    way = after - before
+    squared = (way * way).sum(axis=1)
+    share = -(before * way).sum(axis=1) / np.where(squared > 0.0, squared, 1.0)
+    nearest = before + np.clip(share, 0.0, 1.0)[:, None] * way
+    return np.asarray(np.hypot(*nearest.T))
