@@ -1,0 +1,342 @@
+"""EscapeClearance against MuJoCo: every way out played on the env's model, the cars on their foretold paths."""
+
+import copy
+import json
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+
+import safe_wrappers as sw
+from safe_wrappers.constraints.plain_data import constraint_data, constraint_from
+from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+
+HOLD, RADIUS, CAR, PILLAR, MARGIN = 0.04, 0.2, 0.4, 0.35, 0.05
+TRUE_CARS = sw.TrackedDiscs(CAR, 0.0, attribute="car_tracks")
+PILLARS = sw.Discs("pillar_positions", PILLAR)
+WAYS = [(0, 0, 0), *((x, y, n) for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)) for n in (8, 20))]
+
+
+def bound(obstacles, delay_s=0.0, horizon_s=2.5, margin=MARGIN, env=None):
+    env = gym.make("OccludedCrossing-v0") if env is None else env
+    env.reset(seed=0)
+    plant = sw.MujocoPlant(delay_s=delay_s)
+    plant.bind(env)
+    clearance = sw.EscapeClearance("robot", obstacles, RADIUS, margin, horizon_s)
+    clearance.bind(plant)
+    return env.unwrapped, plant, clearance
+
+
+def anew(raw, plant, clearance, qpos, qvel):
+    raw.set_state(np.asarray(qpos, dtype=float), np.asarray(qvel, dtype=float))
+    clearance.reset()
+    plant.observe()
+
+
+class Played:
+    """The env's own model, without contacts, driven hold by hold."""
+
+    def __init__(self, model, mass=1.0):
+        self.model = copy.copy(model)
+        self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        self.model.body_mass *= mass
+        self.data = mujoco.MjData(self.model)
+
+    def hold(self, control):
+        self.data.ctrl[:2] = control
+        for _ in range(4):
+            mujoco.mj_step(self.model, self.data)
+
+    def brake(self):
+        """The control that ends the hold at rest, as far as there is one: both ends tried, and between them."""
+        spec = mujoco.mjtState.mjSTATE_INTEGRATION
+        kept = np.zeros(mujoco.mj_stateSize(self.model, spec))
+        mujoco.mj_getState(self.model, self.data, kept, spec)
+        ends = []
+        for control in (-1.0, 1.0):
+            self.hold([control, control])
+            ends.append(self.data.qvel[:2].copy())
+            mujoco.mj_setState(self.model, self.data, kept, spec)
+        share = ends[0] / (ends[0] - ends[1])
+        return np.clip(-1.0 + 2.0 * share, -1.0, 1.0)
+
+    def positions(self, qpos, qvel, control, way, holds):
+        """At the end of the control's hold, and of each one of the way's."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:], self.data.qvel[:] = qpos, qvel
+        self.hold(np.clip(control, -1, 1))
+        places = [self.data.qpos[:2].copy()]
+        for k in range(holds):
+            self.hold(way[:2] if k < way[2] else self.brake())
+            places.append(self.data.qpos[:2].copy())
+        return np.array(places)
+
+
+def foretold(qpos, qvel, times):
+    """The cars' centres some times ahead: back to their mean speed with 2 s."""
+    mean = np.repeat([1.0, -1.0], 3)
+    kept = np.exp(-times / 2.0)[:, None]
+    x = qpos[3:] + mean * times[:, None] + 2.0 * (1.0 - kept) * (qvel[3:] - mean)
+    return np.stack([x, np.broadcast_to(np.repeat([-0.8, 0.8], 3), x.shape)], axis=-1)
+
+
+def left(played, raw, qpos, qvel, control, wanted):
+    """What the best of the nine ways out leaves."""
+    times = HOLD * (1 + np.arange(64))
+    cars = foretold(qpos, qvel, times)
+    best = []
+    for way in WAYS:
+        places = played.positions(qpos, qvel, control, way, 62)[::2]
+        to_cars = np.linalg.norm(places[:, None] - cars[:63:2], axis=-1).min(axis=1) - CAR - RADIUS
+        to_pillars = np.linalg.norm(places[:, None] - raw.pillar_positions, axis=-1).min(axis=1)
+        best.append((np.minimum(to_cars, to_pillars - PILLAR - RADIUS) - wanted).min())
+    return max(best)
+
+
+def random_states(count, seed=0):
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        qpos = np.concatenate([rng.uniform([-2, -1.8, -3], [2, 1.8, 3]), rng.uniform(-5, 5, 6)])
+        qvel = np.concatenate([rng.uniform([-2, -2, -4], [2, 2, 4]), np.repeat([1, -1], 3)])
+        qvel[3:] += rng.normal(size=6) * 0.15
+        qpos[3::3] = qpos[0] + rng.uniform(-2, 2, 2)  # one of each lane not far away
+        yield qpos, qvel, rng.uniform(-1.3, 1.3, 3)
+
+
+def test_what_is_left_is_what_mujoco_leaves():
+    raw, plant, clearance = bound([TRUE_CARS, PILLARS])
+    played, agreed, refused = Played(raw.model), 0, 0
+    for qpos, qvel, control in random_states(30):
+        anew(raw, plant, clearance, qpos, qvel)
+        now = clearance.value(plant)
+        cars = np.linalg.norm(raw.car_positions - qpos[:2], axis=1) - CAR - RADIUS
+        pillars = np.linalg.norm(raw.pillar_positions - qpos[:2], axis=1) - PILLAR - RADIUS
+        np.testing.assert_allclose(now, [*cars, *pillars], atol=1e-12)
+        if now.min() < MARGIN:
+            continue
+        expected = left(played, raw, qpos, qvel, control[:2], MARGIN)
+        shortfall = clearance.shortfall(plant, control)
+        if expected >= 0.0:  # where nothing is near it only says that there is room
+            assert shortfall <= -expected + 1e-7
+            agreed += 1
+        else:
+            # What the margin is there for: the best first control may use it up, and another one no more than that.
+            mujoco.mj_resetData(played.model, played.data)
+            played.data.qpos[:], played.data.qvel[:] = qpos, qvel
+            firsts = [played.brake(), [1, 0], [-1, 0], [0, 1], [0, -1]]
+            best = max(left(played, raw, qpos, qvel, np.array(first), MARGIN) for first in firsts)
+            needed = best if -MARGIN < best < 0.0 else 0.0
+            assert shortfall == pytest.approx(needed - expected, abs=1e-7)
+            refused += 1
+        assert clearance.admits(plant, control) == (shortfall <= 1e-9)
+    assert agreed > 8 and refused > 2, (agreed, refused)
+
+
+def test_suggestions_and_the_backup_are_admitted_and_the_nearest_comes_first():
+    raw, plant, clearance = bound([TRUE_CARS, PILLARS])
+    tried = 0
+    for qpos, qvel, control in random_states(300, seed=1):
+        anew(raw, plant, clearance, qpos, qvel)
+        if clearance.value(plant).min() < MARGIN or clearance.admits(plant, control):
+            continue
+        found = clearance.suggestions(plant, control)
+        for suggestion in found:
+            assert clearance.admits(plant, suggestion) and suggestion[2] == control[2]
+            assert (np.abs(suggestion[:2]) <= np.maximum(1.0, np.abs(control[:2])) + 1e-12).all()
+        away = [np.linalg.norm(s - control) for s in found]
+        assert away == sorted(away)
+        if found:
+            tried += 1
+            assert clearance.admits(plant, clearance.backup(plant))
+    assert tried > 8
+
+
+def test_under_a_delay_all_are_where_they_will_be():
+    for delay, actual in ((0.04, 0.04), (0.1, 0.1), (0.015, 0.02)):  # in whole physics steps
+        raw, plant, clearance = bound([TRUE_CARS], delay_s=delay)
+        qpos = np.array([0.0, -2.0, 0, -3, -1, 2, 3, 1, -2])
+        qvel = np.array([1.0, 0.5, 0, 1.2, 1.0, 0.8, -1, -1.3, -1])
+        anew(raw, plant, clearance, qpos, qvel)
+        played = Played(raw.model)
+        played.data.qpos[:], played.data.qvel[:] = qpos, qvel
+        for _ in range(round(actual / 0.01)):
+            mujoco.mj_step(played.model, played.data)
+        cars = foretold(qpos, qvel, np.array([actual]))[0]
+        expected = np.linalg.norm(cars - played.data.qpos[:2], axis=1) - CAR - RADIUS
+        np.testing.assert_allclose(clearance.value(plant), expected, atol=1e-9)
+
+
+def test_discs_that_move_go_straight_on_and_standing_ones_stay():
+    class Published(gym.Wrapper):
+        balls = np.array([[0.0, 0.0, 7.0]])
+        rolling = np.array([[0.0, -1.0, 7.0]])
+        __slots__ = ()
+
+    def met(obstacle):
+        raw, plant, clearance = bound([obstacle], env=Published(gym.make("OccludedCrossing-v0")))
+        anew(raw, plant, clearance, np.array([0, -2.0, 0, 9, 9, 9, 9, 9, 9]), np.zeros(9))
+        return clearance.value(plant)[0], clearance.admits(plant, np.zeros(3))
+
+    distance, admitted = met(sw.Discs("balls", 0.3, velocity_attribute="rolling"))
+    assert distance == pytest.approx(2.0 - 0.3 - RADIUS) and admitted
+    raw, plant, clearance = bound(
+        [sw.Discs("balls", 0.3, velocity_attribute="rolling")],
+        env=Published(gym.make("OccludedCrossing-v0")),
+    )
+    anew(raw, plant, clearance, np.array([0, -0.7, 0, 9, 9, 9, 9, 9, 9]), np.zeros(9))
+    forward, aside = clearance.shortfall(plant, [0, 1, 0]), clearance.shortfall(plant, [1, 0, 0])
+    assert forward > aside  # it does not stand still: away to the side is the way
+    with pytest.raises(ConfigurationError, match="3-dimensional obstacles cannot meet 2-dimensional points"):
+        met(sw.Discs("balls", 0.3))  # a ball that stands somewhere in the air
+
+
+def test_walls_alone_and_cars_alone():
+    wall = sw.Plane([0.0, 0.0], [0.0, -1.0])
+    raw, plant, clearance = bound([wall])
+    for y, vy, control, admitted in (
+        (-1.0, 0.0, 1.0, True),
+        (-0.252, 0.0, 1.0, False),
+        (-0.252, 0.0, -1.0, True),
+        (-0.55, 1.9, 1.0, False),
+        (-1.2, 1.9, -1.0, True),
+    ):
+        qvel = np.zeros(9)
+        qvel[1] = vy
+        anew(raw, plant, clearance, np.array([0, y, 0, 9, 9, 9, 9, 9, 9]), qvel)
+        assert clearance.admits(plant, np.array([0.0, control, 0.0])) == admitted, (y, vy, control)
+
+
+def test_more_margin_refuses_more():
+    def refused(margin):
+        raw, plant, clearance = bound([TRUE_CARS], margin=margin)
+        count = 0
+        for qpos, qvel, control in random_states(150, seed=2):
+            anew(raw, plant, clearance, qpos, qvel)
+            count += clearance.value(plant).min() >= 0.3 and not clearance.admits(plant, control)
+        return count
+
+    assert refused(0.3) > refused(0.0) > 0
+    env = sw.CBFActionFilter(
+        gym.make("OccludedCrossing-v0"), [sw.EscapeClearance("robot", [TRUE_CARS], margin=0.1)], margin=0.2
+    )
+    assert env.constraints[0].margin == pytest.approx(0.3)
+
+
+def test_what_is_less_known_keeps_it_farther_away():
+    refused = []
+    for sigmas in (0.0, 3.0, 9.0):
+        cars = sw.TrackedDiscs(CAR, sigmas, attribute="car_tracks")  # sure now, less so later
+        raw, plant, clearance = bound([cars])
+        count = 0
+        for qpos, qvel, control in random_states(150, seed=3):
+            anew(raw, plant, clearance, qpos, qvel)
+            count += clearance.value(plant).min() >= MARGIN and not clearance.admits(plant, control)
+        refused.append(count)
+    assert refused[0] < refused[1] < refused[2]
+
+
+def test_tracks_in_space_are_seen_from_above():
+    flat, space = (
+        sw.CBFActionFilter(
+            sw.OcclusionPenalty(
+                gym.make("OccludedCrossing-v0"),
+                [sw.Track("car*", acceleration_noise=0.1, start_position_std=1e-9, start_velocity_std=0.1)],
+                sw.Sensor("eye", range_m=0.01),
+                1.0,
+                axes=axes,
+            ),
+            [sw.EscapeClearance("robot", [sw.TrackedDiscs(CAR)], RADIUS)],
+        )
+        for axes in ("xy", "xyz")
+    )
+    flat.reset(seed=0)
+    space.reset(seed=0)
+    for _ in range(20):
+        margins = [env.step(np.array([0.0, 1.0, 0.0]))[4]["cbf/margin"] for env in (flat, space)]
+        assert margins[0] == pytest.approx(margins[1], abs=1e-6)
+
+
+def test_a_plant_with_another_mass_is_read_anew():
+    raw, plant, clearance = bound([TRUE_CARS, PILLARS])
+    plant.perturb(mass=1.5)
+    played, compared = Played(raw.model, mass=1.5), 0
+    for qpos, qvel, control in random_states(25, seed=4):
+        anew(raw, plant, clearance, qpos, qvel)
+        if clearance.value(plant).min() >= MARGIN:
+            expected = left(played, raw, qpos, qvel, control[:2], MARGIN)
+            assert expected < 0.0 or clearance.admits(plant, control)
+            compared += 1
+    assert compared > 10
+
+
+def test_from_outside_the_way_back_is_asked_for_and_taken():
+    env = sw.protect(gym.make("OccludedCrossing-v0"), cars="true")
+    # Closer to a pillar than the margin; the cars are far away.
+    layout = {
+        "agent": [0.0, -2.6, 0.0],
+        "pillars": [[0.0, -2.02], [2.5, -1.9], [-2, 1.9], [2, 1.9]],
+        "cars": [[-9.0, 1.0], [-14.0, 1.0], [-19.0, 1.0], [9.0, -1.0], [14.0, -1.0], [19.0, -1.0]],
+    }
+    env.reset(seed=0, options={"layout": layout})
+    gaps = []
+    for _ in range(40):
+        env.step(np.array([0.0, 1.0, 0.0]))
+        gaps.append(np.linalg.norm(env.unwrapped.agent_position - [0.0, -2.02]) - PILLAR - RADIUS)
+    assert gaps[-1] >= MARGIN - 2e-3 and min(gaps) >= 0.02
+
+
+def test_it_is_plain_data():
+    given = sw.EscapeClearance("robot", [TRUE_CARS, PILLARS, sw.Plane([0, 0], [0, 1])], RADIUS, 0.1, 2.0)
+    again = constraint_from(json.loads(json.dumps(constraint_data(given))))
+    assert again == given and again.promise == "best effort"
+    env = sw.protect(gym.make("OccludedCrossing-v0"), cars="true")
+    rebuilt = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    for e in (env, rebuilt):
+        e.reset(seed=1)
+    for _ in range(30):
+        a, b = (e.step(np.array([0.1, 1.0, 0.0])) for e in (env, rebuilt))
+        assert a[0].tobytes() == b[0].tobytes()
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"obstacles": []}, "at least one obstacle"),
+        ({"obstacles": {"kind": "Disc"}}, "list with at least one"),
+        ({"obstacles": ["car"]}, "expected an obstacle"),
+        ({"obstacles": [sw.Sphere([0, 0, 0], 1.0)]}, "from above.*x and y"),
+        ({"obstacles": [sw.Box([0, 0, 0], [1, 1, 1])]}, "from above"),
+        ({"obstacles": [sw.Plane([0, 0, 0], [0, 0, 1])]}, "from above"),
+        ({"radius": -0.1}, "radius"),
+        ({"margin": np.nan}, "margin"),
+        ({"horizon_s": 0.0}, "horizon_s"),
+        ({"horizon_s": 0.5}, r"horizon_s.*longer than the manoeuvres.*0.8 s.*got 0.5"),
+    ],
+)
+def test_what_is_wrong_is_refused_at_once(given, words):
+    with pytest.raises(ConfigurationError, match=words):
+        sw.EscapeClearance(**{"body": "robot", "obstacles": [TRUE_CARS]} | given)
+
+
+def test_what_does_not_fit_the_env_is_refused_at_binding():
+    def filtered(constraint, env="OccludedCrossing-v0", **options):
+        return sw.CBFActionFilter(gym.make(env), [constraint], **options)
+
+    with pytest.raises(UnknownNameError, match=r"robo.*robot, car0"):
+        filtered(sw.EscapeClearance("robo", [TRUE_CARS]))
+    with pytest.raises(UnsupportedEnvError, match="two slides"):
+        filtered(sw.EscapeClearance("car0", [TRUE_CARS]))
+    with pytest.raises(UnknownNameError, match="no attribute 'tracking'"):
+        filtered(sw.EscapeClearance("robot", [sw.TrackedDiscs(CAR)]))
+    with pytest.raises(ConfigurationError, match="OcclusionPenalty inside"):
+        filtered(sw.EscapeClearance("robot", [sw.TrackedDiscs(CAR, attribute="car_radius")]))
+    plant = sw.AnalyticPlant(
+        f=lambda x: x, g=lambda x: np.ones((3, 1)), state=lambda env: env.state, hold_s=0.05
+    )
+    with pytest.raises(UnsupportedEnvError, match="MujocoPlant"):
+        filtered(sw.EscapeClearance("robot", [TRUE_CARS]), "Pendulum-v1", plant=plant)
+    slow = gym.make("OccludedCrossing-v0")
+    slow.unwrapped.frame_skip = 100
+    with pytest.raises(ConfigurationError, match="too short for control steps of 1 s"):
+        sw.CBFActionFilter(slow, [sw.EscapeClearance("robot", [TRUE_CARS], horizon_s=0.9)])

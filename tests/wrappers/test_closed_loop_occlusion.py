@@ -1,0 +1,132 @@
+"""The crossing under drivers that try to be hit: with the true cars and with estimates nothing unflagged hits it."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from crossing_drivers import CARS, DRIVERS, CarSeeking, GoalSeeking, OnTheRoad, crossing, drive
+
+import safe_wrappers as sw
+
+pytestmark = pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning")
+
+
+def kept_or_flagged(env, action, info):
+    """The control that was executed is admitted by what was known when it was chosen, or the step says so."""
+    inner = env
+    while not isinstance(inner, sw.CBFActionFilter):
+        inner = inner.env
+    executed = info["executed_action"]
+    if not (info["cbf/infeasible"] or info["cbf/fallback"]):
+        assert inner.constraints[0].admits(inner.plant, executed)
+    if not info["cbf/intervened"]:
+        assert executed.tobytes() == action.astype(np.float64).tobytes()
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+@pytest.mark.parametrize("cars", ["true", "estimated"])
+def test_nothing_hits_it(cars, driver):
+    told = drive(crossing(cars), driver, episodes=1, steps=250, watch=kept_or_flagged)
+    assert told["collisions"] == 0 and told["flagged"] <= 5, told
+
+
+def test_without_a_filter_they_are_hit():
+    hits = [drive(crossing(None), d, episodes=1)["collisions"] for d in (GoalSeeking, CarSeeking, OnTheRoad)]
+    assert min(hits) >= 1 and sum(hits) >= 8, hits
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("driver", DRIVERS)
+@pytest.mark.parametrize("cars", ["true", "estimated"])
+def test_nothing_unflagged_hits_it_in_twenty_episodes(cars, driver):
+    told = drive(crossing(cars), driver, episodes=20, seed=7, watch=kept_or_flagged)
+    assert told["unflagged"] == 0 and told["collisions"] <= 2, told
+    assert told["flagged"] <= 0.01 * told["steps"], told
+
+
+@pytest.mark.slow
+def test_where_they_were_seen_last_is_not_where_they_are():
+    told = drive(crossing("last_seen"), CarSeeking, episodes=4)
+    assert told["collisions"] >= 5, told
+
+
+@pytest.mark.slow
+def test_under_a_delay_it_holds_as_well():
+    raw = gym.make("OccludedCrossing-v0")
+    env = sw.OcclusionPenalty(raw, CARS, sw.Sensor("eye", view_deg=120, range_m=6.0), 0.5)
+    ways = sw.EscapeClearance("robot", [sw.TrackedDiscs(0.4)], 0.2)
+
+    class Late(gym.Wrapper):
+        """Executes what was sent two steps before."""
+
+        def reset(self, **options):
+            self.queue = [np.zeros(3, np.float32)] * 2
+            return self.env.reset(**options)
+
+        def step(self, action):
+            self.queue.append(action)
+            return self.env.step(self.queue.pop(0))
+
+    for delay, expected in ((0.08, True), (0.0, False)):
+        late = sw.CBFActionFilter(Late(env), [ways], plant=sw.MujocoPlant(delay_s=delay))
+        told = drive(late, GoalSeeking, episodes=8, seed=1)
+        assert (told["collisions"] + told["flagged"] < 30) == expected, (delay, told)
+
+
+def test_a_permission_and_ways_out_together_stop_where_it_is_safe_to():
+    env = sw.OcclusionPenalty(
+        gym.make("OccludedCrossing-v0"), CARS, sw.Sensor("eye", view_deg=120, range_m=6.0), tolerance=0.8
+    )
+    both = [
+        sw.EscapeClearance("robot", [sw.TrackedDiscs(0.4)], 0.2),
+        sw.TrackPermission("robot", 3.0, creep=0.4),
+    ]
+    filtered = sw.CBFActionFilter(env, both)
+    filtered.reset(seed=2)
+    told = drive(filtered, GoalSeeking, episodes=1, steps=250)
+    assert told["collisions"] == 0 and told["changed"] > 20, told
+
+
+def test_a_clearance_from_tracks_and_one_from_walls_in_one_projection():
+    robotics = pytest.importorskip("gymnasium_robotics")
+    gym.register_envs(robotics)
+
+    class Patrolled(gym.Wrapper):
+        """A ball that rolls to and fro in the maze's upper corridor; nothing stops it."""
+
+        x, v = 0.0, 0.8
+
+        @property
+        def patrol(self):
+            return np.array([[self.x, 1.0]])
+
+        def reset(self, **options):
+            self.x, self.v = 0.0, 0.8
+            return self.env.reset(**options)
+
+        def step(self, action):
+            self.x += self.v * 0.01
+            if abs(self.x) > 1.2:
+                self.v = -self.v
+            return self.env.step(action)
+
+    env = sw.OcclusionPenalty(
+        Patrolled(gym.make("PointMaze_UMaze-v3")),
+        [sw.Track(published="patrol", acceleration_noise=[2.0, 0.0], start_velocity_std=1.0)],
+        sw.Sensor(site="particle_site", position_std=0.02),
+        tolerance=1.0,
+    )
+    filtered = sw.CBFActionFilter(
+        env,
+        [
+            sw.WallClearance(velocity_clip=5.0),
+            sw.Clearance([sw.TrackedDiscs(0.15, 2.0)], bodies=["particle"], braking=4.0, radius=0.1),
+        ],
+    )
+    filtered.reset(seed=0)
+    raw, nearest, changed = filtered.unwrapped, np.inf, 0
+    for _ in range(400):
+        way = env.get_wrapper_attr("patrol")[0] - raw.data.qpos
+        info = filtered.step(np.clip(5.0 * way, -1, 1).astype(np.float32))[4]
+        changed += info["cbf/intervened"]
+        nearest = min(nearest, np.linalg.norm(env.get_wrapper_attr("patrol")[0] - raw.data.qpos))
+    assert nearest > 0.25 and changed > 20, (nearest, changed)
