@@ -46,6 +46,7 @@ bench: .venv/bench
 	$(BIN)/python -m benchmarks.env_step
 	$(BIN)/python -m benchmarks.env_task_step
 	$(BIN)/python -m benchmarks.wrapper_cost
+	$(BIN)/python -m benchmarks.occlusion_cost
 	$(BIN)/python -m benchmarks.training_time
 
 # Every long figure of the README and docs/results.md: about six hours on two cores.
@@ -65,6 +66,7 @@ figures: .venv/installed
 		halfcheetah_velocity_sac outages saferover_ppo; do $(BIN)/safe-wrappers compare configs/$$config.yaml --report || exit 1; done
 	$(BIN)/python -m benchmarks.traction
 	$(BIN)/python -m benchmarks.impact
+	$(BIN)/python -m benchmarks.occlusion
 
 .venv/docs: .venv/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'

@@ -7,11 +7,12 @@ from typing import Any
 import gymnasium as gym
 
 import safe_wrappers as sw
-from benchmarks import judges
+from benchmarks import judges, patrol_drivers, tracked
 from benchmarks import mujoco_drivers as drivers
 from benchmarks.car_drivers import DRIVERS as CAR_GOAL
+from benchmarks.crossing_drivers import DRIVERS as CROSSING
 from benchmarks.drivers import DRIVERS as POINT_GOAL
-from benchmarks.judges import Judge, Replay, Reported
+from benchmarks.judges import Judge, Replay, Reported, Worst
 from benchmarks.mujoco_drivers import Maker
 
 
@@ -153,6 +154,26 @@ def _point_maze(maze: str) -> Case:
     return Case(f"PointMaze_{maze}-v3", judge=judge, drivers=_BLIND | {"wall-seeking": drivers.wall_seeking})
 
 
+def _crossing() -> Case:
+    return Case(
+        "OccludedCrossing-v0",
+        judge=lambda env: Reported(judges.costs),
+        drivers=_BLIND | CROSSING,
+        protect=lambda env: sw.protect(tracked.crossing(env)),
+    )
+
+
+def _patrolled_maze() -> Case:
+    walls = _point_maze("UMaze").judge
+    return Case(
+        "PatrolledPointMaze-v0",
+        judge=lambda env: Worst(walls(env), Reported(judges.costs)),
+        drivers=_BLIND
+        | {"patrol-seeking": patrol_drivers.patrol_seeking, "corridor": patrol_drivers.corridor},
+        protect=lambda env: sw.protect(tracked.patrolled(env)),
+    )
+
+
 def _ant_maze(maze: str) -> Case:
     return Case(
         f"AntMaze_{maze}-v5",
@@ -199,7 +220,9 @@ PROTECTED: dict[str, Case] = _by_name(
     _velocity("Humanoid", 1.4149, plane=True),
     Case("HumanoidStandup-v5", _joint_speeds(20.0), _SPEED),
     _rover(),
+    _crossing(),
     _point_maze("UMaze"),
+    _patrolled_maze(),
     _ant_maze("UMaze"),
 )
 """Every env that `protect` knows, by the name of its row."""

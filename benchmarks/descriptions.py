@@ -50,6 +50,9 @@ def _phrase(constraint: Any) -> str:
             if constraint.untouched:
                 parts.append(f"outline clear of {_obstacles(constraint.untouched)}")
             return f"on all the way to rest, {' and '.join(parts)}"
+        case sw.EscapeClearance():
+            moving = [o for o in constraint.obstacles if isinstance(o, sw.TrackedDiscs | sw.Discs)]
+            return f"a way out clear of {_obstacles(moving)}"
         case sw.WallClearance():
             return "braking path clear of the walls"
         case sw.Traction():
@@ -92,6 +95,8 @@ def _obstacle(obstacle: Any) -> str:
     match obstacle:
         case sw.Discs():
             return f"{obstacle.attribute} ({obstacle.radius:g} m)"
+        case sw.TrackedDiscs():
+            return f"{obstacle.attribute} ({obstacle.radius:g} m and {obstacle.sigmas:g} sigma)"
         case sw.Disc():
             return f"a disc of {obstacle.radius:g} m at {_numbers(obstacle.center)} m"
         case sw.Plane():

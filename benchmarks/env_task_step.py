@@ -1,4 +1,4 @@
-"""Time of one env step of each goal task, with the judging of every physics substep included.
+"""Time of one env step of each task with a goal, with the judging of every physics substep included.
 
     python benchmarks/env_task_step.py
 
@@ -12,10 +12,21 @@ import time
 import gymnasium as gym
 import numpy as np
 
-from safe_wrappers.envs import CAR_GOAL_IDS, POINT_GOAL_IDS, SAFE_ROVER_ID, register_envs
+from safe_wrappers.envs import (
+    CAR_GOAL_IDS,
+    OCCLUDED_CROSSING_ID,
+    POINT_GOAL_IDS,
+    SAFE_ROVER_ID,
+    register_envs,
+)
 
-LIMITS_US = dict.fromkeys(POINT_GOAL_IDS, 150.0) | dict.fromkeys(CAR_GOAL_IDS, 400.0) | {SAFE_ROVER_ID: 300.0}
-"""A tenth of what Safety-Gymnasium's steps take, or less; the rover has no counterpart there."""
+LIMITS_US = (
+    dict.fromkeys(POINT_GOAL_IDS, 150.0)
+    | dict.fromkeys(CAR_GOAL_IDS, 400.0)
+    | {SAFE_ROVER_ID: 300.0}
+    | {OCCLUDED_CROSSING_ID: 250.0}
+)
+"""A tenth of what Safety-Gymnasium's steps take, or less; the rover and the crossing have no counterpart there."""
 
 
 def step_times(env_id: str, steps: int, seed: int, bare: bool) -> np.ndarray:
@@ -44,6 +55,8 @@ def step_times(env_id: str, steps: int, seed: int, bare: bool) -> np.ndarray:
         ahead = np.cos(bearing)
         if env_id == SAFE_ROVER_ID:  # torque on every wheel: speed is the driver's to keep
             steered = [0.3 * (2.0 - inner.forward_speed)] * 4 + [2.0 * turn]
+        elif env_id == OCCLUDED_CROSSING_ID:  # forces along the world's axes
+            steered = [2.0 * to_goal[0], 2.0 * to_goal[1], turn]
         else:
             steered = [ahead + turn, ahead - turn] if env_id in CAR_GOAL_IDS else [ahead, turn]
         action = np.clip(np.array(steered) + rng.normal(0, 0.3, len(steered)), -1, 1)

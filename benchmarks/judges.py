@@ -174,6 +174,30 @@ def wall_geoms(model: mujoco.MjModel) -> np.ndarray:
     return np.flatnonzero((model.geom_bodyid == 0) & (model.geom_type == int(mujoco.mjtGeom.mjGEOM_BOX)))
 
 
+class Worst:
+    """Several judges at once: the one that is most displeased.
+
+    Args:
+        judges: At least one, in the same unit or at least with the same sign.
+    """
+
+    def __init__(self, *judges: Judge) -> None:
+        self._judges = judges
+
+    def start(self) -> float:
+        """The largest."""
+        return float(np.max([judge.start() for judge in self._judges]))
+
+    def before(self) -> None:
+        """Tell them all."""
+        for judge in self._judges:
+            judge.before()
+
+    def after(self, executed: np.ndarray, info: dict[str, Any]) -> float:
+        """The largest; not a number if one of them is not."""
+        return float(np.max([judge.after(executed, info) for judge in self._judges]))
+
+
 def faster_than(limit: float, plane: bool) -> Callable[[dict[str, Any]], float]:
     """The published speed of a step, displacement over time along x or in the plane, above `limit`, m/s."""
 

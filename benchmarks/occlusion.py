@@ -6,10 +6,10 @@
     python -m benchmarks.occlusion collisions --steps 100000   # per driver and filter
     python -m benchmarks.occlusion collisions --steps 2000     # a look
 
-OccludedCrossing, with the sensor and tracks of configs/occluded_crossing_ppo.yaml. The truth is the env's: its cars'
-positions and velocities, and its own judge of collisions at every physics substep. Estimates are the wrapper's.
-Every part puts its rows into benchmarks/results/occlusion.jsonl in place of its old ones, and the tables of all parts
-that are there make benchmarks/results/occlusion.md.
+OccludedCrossing, with the sensor and tracks of its trainings (benchmarks/tracked.py). The truth is the env's: the
+states of its cars, and its own judge of collisions at every physics substep. Estimates are the wrapper's. Every part puts its rows
+into benchmarks/results/occlusion.jsonl in place of its old ones, and the tables of all parts that are there make
+benchmarks/results/occlusion.md.
 """
 
 import argparse
@@ -25,11 +25,11 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from benchmarks.crossing_drivers import DRIVERS
+from benchmarks.tracked import CROSSING, crossing
 from safe_wrappers.control.covariance import double_integrator_covariance
 from safe_wrappers.control.kalman import chi_square_band, normalised_error_squared
 from safe_wrappers.control.tails import chebyshev_tail, gaussian_tail
@@ -38,7 +38,6 @@ from safe_wrappers.errors import UnsafeStateWarning
 Array = NDArray[np.float64]
 
 RESULTS = Path(__file__).parent / "results"
-CONFIG = Path(__file__).parents[1] / "configs" / "occluded_crossing_ppo.yaml"
 ENV_ID = "OccludedCrossing-v0"
 STATE = [0, 2]
 """Of a track: position and velocity along the lane; across it a car does not move, and that is known."""
@@ -58,12 +57,6 @@ WARNED_STEPS = 25
 """A collision is announced if a step of the last second was flagged."""
 EPISODES = 25
 """Of one job."""
-
-
-def occlusion(env: gym.Env[Any, Any], **changes: Any) -> sw.OcclusionPenalty:
-    """The wrapper of the trainings."""
-    settings = yaml.safe_load(CONFIG.read_text(encoding="utf-8"))["env"]["occlusion"]
-    return sw.OcclusionPenalty(env, **(settings | changes))
 
 
 # 1. Consistency ----------------------------------------------------------------------------------------------------
@@ -96,7 +89,7 @@ def episode(seed: int, scheduled: bool, steps: int | None = None, **changes: Any
         steps: How many; None: the whole episode.
         changes: Of the wrapper's settings.
     """
-    env = occlusion(gym.make(ENV_ID), **changes)
+    env = crossing(gym.make(ENV_ID), **changes)
     raw: Any = env.unwrapped
     start = {"agent": [0.0, -2.9, 0.5 * math.pi]}
     env.reset(seed=seed, options={"layout": start} if scheduled else None)
@@ -186,13 +179,13 @@ def consistency_job(first: int, count: int) -> list[dict[str, Any]]:
     """Episodes with the seeds from `first` on, in both modes."""
     rows = []
     for seed in range(first, first + count):
-        crossing = episode(seed, scheduled=False)
+        driven = episode(seed, scheduled=False)
         turned = episode(seed, scheduled=True, steps=round((TURNED_AT_S + TURNED_S + 4.0) / 0.04))
-        samples = nees_samples(crossing, np.random.default_rng(seed)) | scheduled_samples(turned, seed)
+        samples = nees_samples(driven, np.random.default_rng(seed)) | scheduled_samples(turned, seed)
         after = round((TURNED_AT_S + TURNED_S) / turned.step_s)
         away = Episode(turned.error[after:], turned.covariance[after:], turned.visible[after:], turned.step_s)
         scheduled = violations(away)["unseen"]
-        outside = violations(crossing) | {"turned away, by schedule": scheduled}
+        outside = violations(driven) | {"turned away, by schedule": scheduled}
         seen_after = int(away.visible.sum())
         rows.append({"part": "consistency", "seed": seed, "nees": samples, "violations": outside})
         rows[-1]["seen_when_turned_away"] = seen_after
@@ -242,13 +235,9 @@ def consistency_table(rows: list[dict[str, Any]]) -> str:
 
 
 def _phase_order(name: str) -> tuple[int, float]:
-    kind = ("seen", "unseen", "turned away").index(next(iter(_kinds(name)), "")) if _kinds(name) else 3
-    number = next(float(word) for word in name.split() if word.replace(".", "").isdigit())
-    return kind, number
-
-
-def _kinds(name: str) -> list[str]:
-    return [kind for kind in ("seen", "unseen", "turned away") if name.startswith(kind)]
+    kinds = ("seen", "unseen", "turned away", "")
+    kind = next(i for i, start in enumerate(kinds) if name.startswith(start))
+    return kind, next(float(word) for word in name.split() if word.replace(".", "").isdigit())
 
 
 # 2. Growth ---------------------------------------------------------------------------------------------------------
@@ -272,8 +261,7 @@ def growth_job(seed: int) -> list[dict[str, Any]]:
     """Largest relative error of sigma over all unseen stretches of an episode, for both motions of a track."""
     found_rows = []
     for reversion_s in (2.0, None):
-        tracks = yaml.safe_load(CONFIG.read_text(encoding="utf-8"))["env"]["occlusion"]["tracks"]
-        tracks = [track | {"reversion_s": reversion_s} for track in tracks]
+        tracks = [track | {"reversion_s": reversion_s} for track in CROSSING["tracks"]]
         found = episode(seed, scheduled=False, tracks=tracks)
         intensity = float(tracks[0]["acceleration_noise"][0])
         worst, longest, steps = 0.0, 0.0, 0
@@ -329,7 +317,7 @@ class Job:
 def collisions_job(job: Job) -> list[dict[str, Any]]:
     """Drive, count."""
     warnings.simplefilter("ignore", UnsafeStateWarning)  # counted below
-    env: Any = occlusion(gym.make(ENV_ID))
+    env: Any = crossing(gym.make(ENV_ID))
     raw = env.unwrapped
     options = ARMS[job.arm]
     if options is not None:

@@ -73,8 +73,14 @@ class PatrolledPointMazeEnv(PointMazeEnv):  # type: ignore[misc]
 
     Example:
         >>> import gymnasium as gym, safe_wrappers
-        >>> env = gym.make("PatrolledPointMaze-v0")  # doctest: +SKIP
+        >>> env = gym.make("PatrolledPointMaze-v0")
+        >>> _ = env.reset(seed=0)
+        >>> env.unwrapped.patrol_positions.shape
+        (2, 2)
     """
+
+    ball_radius: Final = BALL_RADIUS
+    patrol_radius: Final = PATROL_RADIUS
 
     def __init__(
         self,
@@ -185,8 +191,9 @@ class PatrolledPointMazeEnv(PointMazeEnv):  # type: ignore[misc]
     ) -> tuple[dict[str, Array], dict[str, Any]]:
         """Reset PointMaze and draw where each patrol is, and how fast."""
         observation, info = super().reset(seed=seed, options=options)
-        # A stream of the patrols' own: a goal that is reached and drawn anew must not change their way.
-        self._patrols_random = np.random.default_rng(self.np_random.integers(2**63))
+        # A stream of the patrols' own, of which PointMaze's draws (of goals) know nothing, nor the patrols of theirs.
+        (own,) = self.np_random.bit_generator.seed_seq.spawn(1)
+        self._patrols_random = np.random.default_rng(own)
         self._draw_starts()
         self._touching = np.zeros(len(self._gone), dtype=bool)
         offset = self.patrol_positions - self.agent_position

@@ -128,6 +128,24 @@ def _point_maze(env: gym.Env[Any, Any]) -> list[Constraint]:
     return [WallClearance(velocity_clip=5.0)]
 
 
+def _patrolled_maze(env: gym.Env[Any, Any], patrols: str = "", sigmas: float = 3.0) -> list[Constraint]:
+    raw: Any = env.unwrapped
+    patrols = patrols or ("estimated" if env.has_wrapper_attr("tracking") else "true")
+    seen: dict[str, Any] = {
+        "true": TrackedDiscs(raw.patrol_radius, sigmas, attribute="patrol_tracks"),
+        "last_seen": Discs("last_seen_positions", raw.patrol_radius),
+        "estimated": TrackedDiscs(raw.patrol_radius, sigmas),
+    }
+    if patrols not in seen:
+        raise UnknownNameError(
+            f"patrols is one of {', '.join(seen)}: which positions to keep clear of; got {patrols!r}"
+        )
+    # The ways out do not know the walls: with them as obstacles a corridor has none but to stand still, and stepping
+    # aside at the last moment, which the walls' own constraint leaves, avoids more. The ball rests within 0.5 s.
+    aside = EscapeClearance("particle", [seen[patrols]], raw.ball_radius, margin=0.03, horizon_s=1.0)
+    return [WallClearance(velocity_clip=5.0), aside]
+
+
 def _ant_maze(env: gym.Env[Any, Any]) -> list[Constraint]:
     # The torso's ball has 0.25 m; the legs reach farther and may touch.
     model: mujoco.MjModel = env.unwrapped.model  # type: ignore[attr-defined]
@@ -175,6 +193,7 @@ RECIPES: dict[str, Callable[..., list[Constraint]]] = {
     "Pusher": _pusher,
     "HumanoidStandup": _humanoid_standup,
     "PointMaze": _point_maze,
+    "PatrolledPointMaze": _patrolled_maze,
     "AntMaze": _ant_maze,
     # A policy trained through three steps ahead found states with no way out (1 violation in 1000 steps).
     "HalfCheetah": _velocity("HalfCheetah", margin=0.02, holds=5),

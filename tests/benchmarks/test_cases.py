@@ -6,7 +6,7 @@ import pytest
 import safe_wrappers as sw
 from benchmarks.cases import HARD, PROTECTED
 from benchmarks.descriptions import constrained, promised, reserve
-from benchmarks.judges import Reported
+from benchmarks.judges import Reported, Worst
 from safe_wrappers.recipes import RECIPES
 
 CASES = PROTECTED | HARD
@@ -87,6 +87,13 @@ def test_the_judge_means_the_limit_that_the_filter_keeps(name):
                 }
                 # Looser than the limit: an edge is overshot, and a slip of a third more is no spin-out yet.
                 assert slips[constraint.max_slip] < slips[0.2] == 0.0 < slips[0.5]
+            case sw.EscapeClearance():
+                touched, clear = ({"cost_substep": cost} for cost in (1.0, 0.0))
+                if isinstance(judge, Worst):  # of a step in which no wall was touched
+                    judge.before()
+                    env.unwrapped.step(np.zeros(2))
+                assert judge.after(np.zeros(raw.model.nu), touched) > 0.0
+                assert judge.after(np.zeros(raw.model.nu), clear) < 0.0
             case sw.WallClearance():
                 pass  # both read the walls from the model; tests/benchmarks/test_judges.py places the ball
             case _:
@@ -133,6 +140,10 @@ DISCS = "hazard_positions (0.2 m) and vase_positions (0.3 m)"
     ("Pusher-v5", f"joint speeds below 6 rad/s; tips_arm {TABLE}", "best effort", "0.05 rad/s, 5 mm"),
     ("SafeHumanoidVelocity-v0", "speed of the centre of mass (xy) below 1.4149 m/s", "best effort", "0.02 m/s"),
     ("PointMaze_UMaze-v3", "braking path clear of the walls", "proved", "1 mm"),
+    ("OccludedCrossing-v0", "a way out clear of tracking (0.4 m and 3 sigma) and pillar_positions (0.35 m)",
+     "best effort", "50 mm"),
+    ("PatrolledPointMaze-v0", "braking path clear of the walls; a way out clear of tracking (0.15 m and 3 sigma)",
+     "best effort", "1 mm, 30 mm"),
     ("SafeRover-v0", "slip of 4 wheels within 0.15", "best effort", "0"),
     ("Reacher-v5, with a disc",
      "joint speeds below 5 rad/s; fingertip clear of a disc of 0.05 m at (-0.1, 0.1) m", "best effort",

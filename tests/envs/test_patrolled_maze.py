@@ -1,0 +1,333 @@
+"""The patrolled maze: its physics is PointMaze's, its patrols keep to their law, its judge misses nothing."""
+
+import functools
+import pickle
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+import safe_wrappers as sw
+from benchmarks.patrol_drivers import corridor, patrol_seeking
+from benchmarks.tracked import patrolled
+from safe_wrappers.envs import PATROLLED_MAZE_ID
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
+
+gym.register_envs(pytest.importorskip("gymnasium_robotics"))
+from safe_wrappers.envs import patrolled_maze  # noqa: E402 (needs gymnasium_robotics)
+
+CONTACT = 0.25
+CLOSED = [[1] * 6, [1, 0, 0, 0, 1, 1], [1, 0, 1, 0, 0, 1], [1, 0, 1, 1, 0, 1], [1] * 6]
+
+
+@functools.cache
+def shared():
+    return gym.make(PATROLLED_MAZE_ID).unwrapped
+
+
+def place(env, ball, velocity, along, speeds):
+    """Ball (2,), its velocity (2,), and each patrol's way from its start and speed."""
+    env.point_env.set_state(np.array(ball, dtype=float), np.array(velocity, dtype=float))
+    env._gone, env._speeds = np.array(along, dtype=float), np.array(speeds, dtype=float)
+    env._touching = np.zeros(len(along), dtype=bool)
+
+
+# What stays ----------------------------------------------------------------------------------------------------
+
+
+def test_physics_observations_rewards_and_goals_are_point_mazes():
+    ours = gym.make(PATROLLED_MAZE_ID, reset_target=True)
+    theirs = gym.make("PointMaze_UMaze-v3", reset_target=True, max_episode_steps=1000)
+    rng = np.random.default_rng(0)
+    goals = set()
+    for seed in (3, None):
+        (one, _), (other, _) = ours.reset(seed=seed), theirs.reset(seed=seed)
+        for _ in range(600):
+            for key in one:
+                assert np.array_equal(one[key], other[key]), key
+            goals.add(tuple(one["desired_goal"]))
+            # To the goal and about: goals are reached, and drawn anew.
+            action = np.clip(2 * (one["desired_goal"] - one["achieved_goal"]) + rng.normal(0, 0.6, 2), -1, 1)
+            one, reward, *ends, _ = ours.step(action.astype(np.float32))
+            other, expected, *others, _ = theirs.step(action.astype(np.float32))
+            assert (reward, ends) == (expected, others)
+    assert len(goals) > 2
+
+
+def test_the_contract():
+    env = shared()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*(infinity|Box observation|Overriding).*")
+        check_env(env, skip_render_check=True)
+    copy = pickle.loads(pickle.dumps(gym.make(PATROLLED_MAZE_ID, patrols=[[[1, 1], [1, 3]]]).unwrapped))
+    assert copy.patrol_positions.shape == (1, 2)
+    info = env.reset(seed=0)[1]
+    for found in (info, env.step(np.zeros(2))[4]):
+        assert {k: type(found[k]) for k in ("cost", "cost_substep", "collisions")} == {
+            "cost": float,
+            "cost_substep": float,
+            "collisions": int,
+        }
+
+
+# How patrols move ----------------------------------------------------------------------------------------------
+
+
+def patrol_path(seed, steps=400, action=(0.0, 0.0)):
+    env = shared()
+    env.reset(seed=seed, options={"reset_cell": np.array([2, 3]), "goal_cell": np.array([1, 1])})
+    found = []
+    for _ in range(steps):
+        env.step(np.array(action))
+        found.append((env.patrol_positions, env.patrol_velocities))
+    return (np.array(part) for part in zip(*found, strict=True))
+
+
+def test_a_patrol_keeps_to_its_way_turns_at_its_ends_and_its_velocity_is_that_of_its_position():
+    turned = 0
+    for seed in range(4):
+        where, velocity = patrol_path(seed)
+        assert (where[:, 0, 1] == 1.0).all() and (where[:, 1, 1] == -1.0).all()
+        assert (np.abs(where[:, :, 0]) <= 1.0).all() and (velocity[:, :, 1] == 0.0).all()
+        between = np.diff(where[:, :, 0], axis=0) / 0.01
+        turns = np.sign(velocity[1:, :, 0]) != np.sign(velocity[:-1, :, 0])
+        straight = ~turns
+        # Within 10 ms the speed changes by about 0.015 m/s.
+        np.testing.assert_allclose(between[straight], velocity[1:, :, 0][straight], atol=0.08)
+        near_an_end = np.abs(where[1:, :, 0][turns]) > 0.99
+        assert near_an_end.all() and np.abs(between).max() < 1.5
+        turned += int(turns.sum())
+    assert turned > 5
+
+
+@given(gone=st.floats(-9.0, 9.0), speed=st.floats(-1.0, 1.0))
+def test_it_is_a_way_without_turns_folded_at_the_ends(gone, speed):
+    env = shared()
+    place(env, (1.0, 0.0), (0.0, 0.0), [gone, gone], [speed, speed])
+    expected = 2.0 / np.pi * np.arccos(np.cos(np.pi * gone / 2.0))
+    np.testing.assert_allclose(env.patrol_positions[:, 0] + 1.0, expected, atol=1e-7)
+    moved = 2.0 / np.pi * np.arccos(np.cos(np.pi * (gone + 1e-6 * speed) / 2.0))
+    if min(expected, 2.0 - expected) > 1e-3:
+        np.testing.assert_allclose(
+            env.patrol_velocities[:, 0],
+            speed * (moved - expected) / (1e-6 * speed) if speed else 0.0,
+            atol=1e-3,
+        )
+
+
+def test_speeds_have_the_laws_mean_spread_and_memory():
+    """Speeds of 600 patrols, at the start and a second later: every z-score within 4.5."""
+    env, first, later = shared(), [], []
+    for seed in range(300):
+        env.reset(seed=seed)
+        first.append(env._speeds.copy())
+        for _ in range(100):
+            env.step(np.zeros(2))
+        later.append(env._speeds.copy())
+    first, later = np.ravel(first), np.ravel(later)
+    n = len(first)
+    for speeds in (first, later):
+        assert abs(speeds.mean() - 0.5) / (0.15 / np.sqrt(n)) < 4.5
+        assert abs(speeds.var() / 0.15**2 - 1.0) / np.sqrt(2.0 / n) < 4.5
+    assert np.corrcoef(first, later)[0, 1] == pytest.approx(np.exp(-0.5), abs=4.5 / np.sqrt(n))
+    pairs = first.reshape(-1, 2)
+    assert abs(np.corrcoef(pairs.T)[0, 1]) < 4.5 / np.sqrt(len(pairs))
+
+
+def test_the_seed_alone_decides_the_way_whatever_the_ball_does():
+    first, pushed, other = (next(patrol_path(*a)) for a in ((5,), (5, 400, (1.0, -1.0)), (6,)))
+    assert np.array_equal(first, pushed) and not np.array_equal(first, other)
+
+
+def test_the_trackers_model_covers_the_turns():
+    """Unseen from an exact fix on: how often the truth is beyond k sigma, over 200 starts anywhere on the way."""
+    env, beyond = shared(), np.zeros((3, 3))
+    for seed in range(100):
+        env.reset(seed=seed)
+        tracks = env.patrol_tracks
+        for i, after in enumerate((0.3, 1.0, 3.0)):
+            while env.data.time < after - 1e-9:
+                env.step(np.zeros(2))
+            (centres,), (covariances,) = tracks.ahead([after])
+            error = np.abs(env.patrol_positions[:, 0] - centres[:, 0]) / np.sqrt(covariances[:, 0, 0])
+            beyond[i] += [(error > k).mean() for k in (1, 2, 3)]
+    shares = beyond / 100
+    # Not normal, but within what any distribution of this covariance could do.
+    assert (shares[:, 1] < 1 / 4).all() and (shares[:, 2] < 1 / 9).all(), shares
+
+
+# Judging -------------------------------------------------------------------------------------------------------
+
+
+@given(arrays(float, (5, 2), elements=st.floats(-2, 2)), arrays(float, (5, 2), elements=st.floats(-2, 2)))
+def test_closest_approach_is_that_of_many_points_between(before, after):
+    shares = np.linspace(0.0, 1.0, 2001)[:, None, None]
+    sampled = np.linalg.norm(before + shares * (after - before), axis=2).min(axis=0)
+    found = patrolled_maze.closest_approach(before, after)
+    assert (found <= sampled + 1e-12).all()
+    assert (sampled - found <= np.linalg.norm(after - before, axis=1) / 2000 + 1e-12).all()
+
+
+def test_a_pass_within_one_step_costs_and_counts_once():
+    env = shared()
+    env.reset(seed=0)
+    # Diagonally past the patrol at (0, 1): clear at both ends of the step, a hair too near in between.
+    aside = (CONTACT - 5e-5) * np.array([1.0, -1.0]) / np.sqrt(2.0)
+    way = 0.035 * np.array([1.0, 1.0]) / np.sqrt(2.0)
+    for offset, cost in ((aside, 1.0), (aside * 1.001, 0.0)):
+        place(env, np.array([0.0, 1.0]) + offset - way, way / 0.01 * 2.0, [1.0, 1.0], [0.0, 0.0])
+        before = np.hypot(*(env.patrol_positions[0] - env.agent_position))
+        info = env.step(np.zeros(2))[4]
+        after = np.hypot(*(env.patrol_positions[0] - env.agent_position))
+        assert min(before, after) > CONTACT + 1e-3
+        assert (info["cost"], info["cost_substep"], info["collisions"]) == (cost, cost, int(cost))
+
+
+def test_contact_that_lasts_costs_every_step_and_is_one_collision():
+    env = shared()
+    env.reset(seed=0)
+    place(env, (0.0, 0.85), (0.0, 0.0), [0.6, 0.6], [0.5, 0.5])
+    infos, inside = [], []
+    for _ in range(150):
+        infos.append(env.step(np.zeros(2))[4])
+        inside.append(np.hypot(*(env.patrol_positions[0] - env.agent_position)) <= CONTACT)
+    assert sum(inside) > 20
+    assert sum(info["collisions"] for info in infos) == 1
+    costs = np.array([info["cost"] for info in infos])
+    assert (costs[inside] == 1.0).all() and abs(int(costs.sum()) - sum(inside)) <= 1
+
+
+def test_no_patrol_starts_at_the_ball():
+    env, gaps = shared(), []
+    for seed in range(200):
+        _, info = env.reset(seed=seed)
+        assert info["cost"] == 0.0 and info["collisions"] == 0
+        gaps.append(np.linalg.norm(env.patrol_positions - env.agent_position, axis=1).min())
+    assert CONTACT + 0.3 <= min(gaps) < CONTACT + 0.4
+
+
+# Ways ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_map_and_ways_of_ones_own():
+    ways = [[[1, 1], [3, 1]], [[1, 3], [1, 1]]]
+    env = gym.make(PATROLLED_MAZE_ID, maze_map=CLOSED, patrols=ways).unwrapped
+    env.reset(seed=0)
+    assert env.patrol_velocities.shape == (2, 2)
+    # The first goes along y, the second from right to left.
+    assert (env.patrol_velocities[0, 0], env.patrol_velocities[1, 1]) == (0.0, 0.0)
+    place(env, (0.0, 0.0), (0.0, 0.0), [0.0, 0.5], [0.5, 0.5])
+    corner = env.maze.cell_rowcol_to_xy(np.array([1, 1])).astype(float)
+    np.testing.assert_allclose(env.patrol_positions, [corner, (corner[0] + 1.5, corner[1])], atol=1e-12)
+    np.testing.assert_allclose(env.patrol_velocities, [[0.0, -0.5], [-0.5, 0.0]], atol=1e-12)
+
+
+@pytest.mark.parametrize("patrols, message", [
+    ([[[1, 1], [2, 3]]], "one row or column"),
+    ([[[1, 1], [1, 1]]], "one row or column"),
+    ([[[1, 1], [1, 9]]], "one row or column"),
+    ([[[-1, 3], [3, 3]]], "one row or column"),
+    ([[[1.5, 1], [1.5, 3]]], "one row or column"),
+    ([[1, 1, 1, 3]], "one row or column"),
+    ([[[1, 1], [3, 1]]], r"a wall in cell \[2, 1\]"),
+    ([[[1, 1], [1, 2]]], "at least 2 m long"),
+    ([], "at least one way"),
+])  # fmt: skip
+def test_a_way_that_is_none_is_refused(patrols, message):
+    with pytest.raises(ConfigurationError, match=message):
+        gym.make(PATROLLED_MAZE_ID, patrols=patrols)
+
+
+def test_a_map_of_ones_own_needs_ways():
+    with pytest.raises(ConfigurationError, match="name the patrols' ways"):
+        gym.make(PATROLLED_MAZE_ID, maze_map=CLOSED)
+
+
+# Hidden, and kept clear of ---------------------------------------------------------------------------------------
+
+
+def blocked(a, b):
+    """Whether one of the U maze's walls lies on the straight way, by many points on it."""
+    points = a + np.linspace(0.0, 1.0, 4001)[:, None] * (b - a)
+    inside = (np.abs(points[:, 1]) < 0.5) & (points[:, 0] < 0.5)
+    return bool(inside.any()), bool((np.abs(np.abs(points[:, 1]) - 0.5) < 0.01).any())
+
+
+def test_walls_hide_patrols():
+    env = patrolled(gym.make(PATROLLED_MAZE_ID))
+    raw, rng, seen = env.unwrapped, np.random.default_rng(0), []
+    env.reset(seed=0)
+    for _ in range(150):
+        ball = (rng.uniform(-1.3, 1.3), rng.choice([-1.0, 1.0]) * rng.uniform(0.6, 1.3))
+        ball = (1.0 + rng.uniform(-0.3, 0.3), rng.uniform(-1.0, 1.0)) if rng.random() < 0.4 else ball
+        place(raw, ball, (0.0, 0.0), rng.uniform(0.0, 4.0, 2), [0.5, 0.5])
+        visible = env.step(np.zeros(2, dtype=np.float32))[4]["occlusion/visible"]
+        for patrol, sees in zip(raw.patrol_positions, visible, strict=True):
+            hidden, grazing = blocked(raw.agent_position, patrol)
+            assert grazing or sees == (not hidden), (ball, patrol)
+            seen.append(bool(sees))
+    assert 50 < sum(seen) < len(seen) - 50
+
+
+def test_protect_knows_it():
+    bare = sw.protect(gym.make(PATROLLED_MAZE_ID))
+    assert [type(c) for c in bare.constraints] == [sw.WallClearance, sw.EscapeClearance]
+    assert bare.constraints[1].obstacles[0].attribute == "patrol_tracks"
+    for patrols, attribute in (("estimated", "tracking"), ("true", "patrol_tracks"), ("", "tracking")):
+        env = sw.protect(patrolled(gym.make(PATROLLED_MAZE_ID)), patrols=patrols, sigmas=2.0)
+        (tracked,) = env.constraints[1].obstacles
+        assert (tracked.attribute, tracked.sigmas, tracked.radius) == (attribute, 2.0, 0.15)
+    last = sw.protect(patrolled(gym.make(PATROLLED_MAZE_ID)), patrols="last_seen")
+    assert last.constraints[1].obstacles[0].attribute == "last_seen_positions"
+    with pytest.raises(UnknownNameError, match="true, last_seen, estimated"):
+        sw.protect(gym.make(PATROLLED_MAZE_ID), patrols="all")
+
+
+def drive(driver, steps, patrols=None, sigmas=3.0, seed=0):
+    """Collisions with patrols, those in a step not flagged, and steps flagged and changed."""
+    env = patrolled(gym.make(PATROLLED_MAZE_ID))
+    if patrols is not None:
+        env = sw.protect(env, patrols=patrols, sigmas=sigmas)
+    raw = env.unwrapped
+    act, total, done, episode = driver(raw, np.random.default_rng(seed)), dict.fromkeys(COUNTED, 0), True, 0
+    for _ in range(steps):
+        if done:
+            env.reset(seed=1000 * seed + episode)
+            episode += 1
+        *_, terminated, truncated, info = env.step(act().astype(np.float32))
+        done = terminated or truncated
+        flagged = patrols is not None and any(info[f"cbf/{k}"] for k in ("infeasible", "fallback", "unsafe"))
+        total["collisions"] += info["collisions"]
+        total["unflagged"] += info["collisions"] * (not flagged)
+        total["flagged"] += flagged
+        total["changed"] += patrols is not None and bool(info["cbf/intervened"])
+    return {name: int(count) for name, count in total.items()}
+
+
+COUNTED = ("collisions", "unflagged", "flagged", "changed")
+
+
+def test_the_estimate_keeps_a_driver_clear_that_collides_without():
+    off, on = drive(patrol_seeking, 1200), drive(patrol_seeking, 1200, "estimated")
+    assert off["collisions"] > 5 and on["unflagged"] == 0 and 5 * on["collisions"] <= off["collisions"], (
+        off,
+        on,
+    )
+    assert on["changed"] > 100
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("driver", [patrol_seeking, corridor])
+@pytest.mark.filterwarnings("ignore::safe_wrappers.errors.UnsafeStateWarning")
+def test_twenty_thousand_steps(driver):
+    found = {name: drive(driver, 20_000, name) for name in (None, "last_seen", "true", "estimated")}
+    assert found[None]["collisions"] > 50, found
+    assert found["estimated"]["collisions"] <= 0.02 * found[None]["collisions"], found
+    assert found["estimated"]["unflagged"] <= 1, found
+    assert found["last_seen"]["collisions"] > 5 * max(found["estimated"]["collisions"], 1), found
