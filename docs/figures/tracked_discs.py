@@ -35,7 +35,7 @@ def draw() -> Figure:
     plant.bind(env)
     plant.observe()
     raw = env.unwrapped
-    x, y = np.meshgrid(np.linspace(-4.4, 4.4, 89), np.linspace(-2.4, 2.4, 49))
+    x, y = np.meshgrid(np.linspace(-4.5, 4.5, 73), np.linspace(-2.0, 2.0, 33))
     points = np.stack([x.ravel(), y.ravel()], axis=1)
     for sigmas in (3.0, 2.0, 1.0):
         gaps = sw.TrackedDiscs(raw.car_radius, sigmas).distances(points, plant)
