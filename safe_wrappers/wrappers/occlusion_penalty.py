@@ -204,7 +204,7 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         if points.ndim != 2 or points.shape[1] not in (self._d, 3) or not len(points):
             raise ConfigurationError(
                 f"the env's {track.published} must be positions of shape (k, {self._d}) or (k, 3), k >= 1, got shape "
-                f"{points.shape}"
+                f"{points.shape}; how many there are is read when the wrapper is made"
             )
         return points
 

@@ -5,7 +5,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from safe_wrappers.errors import UnsupportedEnvError
+import safe_wrappers  # noqa: F401 (registers the crossing)
+from safe_wrappers.errors import UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco import MujocoPlant
 from safe_wrappers.plants.planar_point import planar_point
 from safe_wrappers.plants.walls import walls
@@ -169,3 +170,73 @@ def test_the_reach_covers_every_geom_of_the_point():
 def test_a_point_without_a_colliding_geom_is_refused():
     with pytest.raises(UnsupportedEnvError, match="'point' has no geom that collides"):
         found(WALL, ball='<geom size="0.1" contype="0" conaffinity="0"/>')
+
+
+# A point among other things that move ------------------------------------------------------------------------------
+
+YAW = '<joint name="yaw" type="hinge" axis="0 0 1"/>'
+CAR = '<body name="car" pos="0 3 0"><joint name="drive" type="slide" axis="1 0 0"/><geom size="0.3"/></body>'
+TOP = '<body name="top" pos="0 5 0"><joint name="spin" type="hinge" axis="0 0 1"/><geom size="0.3"/></body>'
+
+
+def test_a_point_named_by_its_body_is_found_among_others():
+    motors = '<motor joint="drive" ctrlrange="-1 1"/>' + MOTORS + '<motor joint="yaw" ctrlrange="-1 1"/>'
+    plant = bound(xml(slides=SLIDES + YAW, world=WALL + CAR + TOP, motors=motors))
+    point = planar_point(plant, np.inf, "point")
+    names = [plant.model.joint(j).name for j in range(plant.model.njnt)]
+    assert [names[j] for j in point.joints] == ["x", "y"] and point.actuators == (1, 2)
+    assert point.origin == (0.5, -0.25) and plant.model.body(point.body).name == "point"
+    alone = planar_point(bound(xml()), np.inf)
+    for axis, expected in zip(point.axes, alone.axes, strict=True):
+        assert (axis.keep, axis.add) == pytest.approx((expected.keep, expected.add), rel=1e-12)
+
+
+def test_it_is_the_crossing_s_robot():
+    env = gym.make("OccludedCrossing-v0")
+    plant = MujocoPlant()
+    plant.bind(env)
+    point = planar_point(plant, np.inf, "robot")
+    env.reset(seed=0)
+    raw = env.unwrapped
+    x, v = raw.agent_position, raw.agent_velocity
+    for control in ([1.0, 0.5, 1.0], [-0.3, 1.0, -1.0], [0.0, 0.0, 0.0]):
+        env.step(np.array(control))
+        now = [
+            axis.step(*state)
+            for axis, state in zip(point.axes, zip(x, v, control, strict=False), strict=True)
+        ]
+        x, v = np.transpose(now)
+        np.testing.assert_allclose([raw.agent_position, raw.agent_velocity], [x, v], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"slides": SLIDES.split("/>")[0] + "/>", "motors": MOTORS.split("/>")[0] + "/>"}, "it has 1"),
+        ({"world": '<body><freejoint/><geom size="0.1"/></body>'}, "before any free or ball joint"),
+        ({"slides": YAW + SLIDES}, "is .* off that"),
+        ({"slides": SLIDES + YAW, "ball": BALL.replace("size", 'pos="0.2 0 0" size')}, "is .* off that"),
+        ({"ball": BALL + f'<body>{YAW}<geom pos="0.2 0 0" size="0.1"/></body>'}, "is .* off that"),
+        ({"motors": MOTORS + '<motor joint="x" ctrlrange="-1 1"/>'}, "only one"),
+        ({"slides": SLIDES.replace('"0 1 0"', '"0 1 0" range="-1 1" limited="true"')}, "no limits"),
+        ({"slides": SLIDES.replace('type="slide"', 'type="slide" stiffness="4"')}, "springs"),
+    ],
+    ids=[
+        "one slide",
+        "free joint before",
+        "turns its slides",
+        "off its centre",
+        "swings something",
+        "two motors",
+        "limits",
+        "springs",
+    ],
+)
+def test_what_acts_on_the_named_point_is_found_out(changed, says):
+    with pytest.raises(UnsupportedEnvError, match=f"(?s){says}.*Use Clearance"):
+        planar_point(bound(xml(**changed)), np.inf, "point")
+
+
+def test_a_body_that_is_not_there_is_named_with_those_that_are():
+    with pytest.raises(UnknownNameError, match=r"pint.*point"):
+        planar_point(bound(xml()), np.inf, "pint")
