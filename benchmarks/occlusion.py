@@ -7,9 +7,9 @@
     python -m benchmarks.occlusion collisions --steps 2000     # a look
 
 OccludedCrossing, with the sensor and tracks of its trainings (benchmarks/tracked.py). The truth is the env's: the
-states of its cars, and its own judge of collisions at every physics substep. Estimates are the wrapper's. Every part puts its rows
-into benchmarks/results/occlusion.jsonl in place of its old ones, and the tables of all parts that are there make
-benchmarks/results/occlusion.md.
+states of its cars, and its own judge of collisions at every physics substep. Estimates are the wrapper's. Every part
+puts its rows into benchmarks/results/occlusion.jsonl in place of its old ones, and the tables of all parts that are
+there make benchmarks/results/occlusion.md.
 """
 
 import argparse
