@@ -3,8 +3,8 @@
 A direction in which two states give the same outputs for ever is one that no filter resolves: what was not known
 there at the start develops as if nothing were ever measured. What is said here is structural: about ideal outputs,
 without noise. Full rank says that the state can be told, near this state if the system is nonlinear; it says nothing
-about how accurately or how soon, and `condition` only hints at it. A direction that is missing needs another sensor, a
-motion that has a permission of its own, or a restricted task.
+about how accurately or how soon, and `condition` only hints at it. A direction that is missing needs another sensor,
+a motion that has a permission of its own, or a restricted task.
 """
 
 import math
