@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.control.tracks import Motion, Tracks
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.interventions import COST, COST_SUBSTEP
 
 from .traffic import CAR_SPEED_STD, CAR_TIME_CONSTANT_S, Traffic
@@ -17,7 +17,7 @@ try:
     from gymnasium_robotics.envs.maze.maps import U_MAZE
     from gymnasium_robotics.envs.maze.point_maze import PointMazeEnv
 except ImportError as error:
-    raise UnsupportedEnvError(
+    raise ImportError(
         "PatrolledPointMaze is built on gymnasium-robotics' PointMaze: pip install gymnasium-robotics"
     ) from error
 
