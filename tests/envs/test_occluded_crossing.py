@@ -139,7 +139,9 @@ def test_pillars_are_solid_and_frictionless(env, angle):
         # Stuck only where it runs at the centre (and there only by rounding); never through it.
         if aside:
             assert (env.agent_position - pillar) @ along > 0.3
-        assert env.data.qvel[2] == pytest.approx(0.0, abs=4e-3)  # rad/s: contact points round, 3.3.7 to 2.2e-3
+        assert env.data.qvel[2] == pytest.approx(
+            0.0, abs=4e-3
+        )  # rad/s: contact points round, 3.3.7 to 2.2e-3
         env.frame_skip = 4
 
 
