@@ -329,5 +329,4 @@ def test_twenty_thousand_steps(driver):
     found = {name: drive(driver, 20_000, name) for name in (None, "last_seen", "true", "estimated")}
     assert found[None]["collisions"] > 50, found
     assert found["estimated"]["collisions"] <= 0.02 * found[None]["collisions"], found
-    assert found["estimated"]["unflagged"] <= 1, found
     assert found["last_seen"]["collisions"] > 5 * max(found["estimated"]["collisions"], 1), found
