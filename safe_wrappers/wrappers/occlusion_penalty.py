@@ -277,7 +277,8 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
     def permissions(self, horizon_s: float = 60.0) -> Array:
         """How long each track may still be relied on if nothing is seen from now on, s, shape (n,).
 
-        0 where it may not now; inf where the tolerance is not reached within the horizon.
+        Until the bound is at the tolerance: `permitted` ends a control step before. 0 where it is there already; inf
+        where it is not reached within the horizon.
         """
         direction = np.eye(self._d, 2 * self._d)
         times = []
