@@ -95,21 +95,29 @@ def _safe_rover(
     return [Traction(env.unwrapped.wheels, max_slip, friction)]  # type: ignore[attr-defined]
 
 
+def _of_what_is_known(
+    env: gym.Env[Any, Any], option: str, chosen: str, radius: float, true: str, sigmas: float
+) -> Any:
+    """Discs where things truly are, were seen last, or may be after all that an OcclusionPenalty inside has seen."""
+    known: dict[str, Any] = {
+        "true": TrackedDiscs(radius, sigmas, attribute=true),
+        "last_seen": Discs("last_seen_positions", radius),
+        "estimated": TrackedDiscs(radius, sigmas),
+    }
+    chosen = chosen or ("estimated" if env.has_wrapper_attr("tracking") else "true")
+    if chosen not in known:
+        raise UnknownNameError(
+            f"{option} is one of {', '.join(known)}: which positions to keep clear of; got {chosen!r}"
+        )
+    return known[chosen]
+
+
 def _occluded_crossing(env: gym.Env[Any, Any], cars: str = "", sigmas: float = 3.0) -> list[Constraint]:
     raw: Any = env.unwrapped
-    cars = cars or ("estimated" if env.has_wrapper_attr("tracking") else "true")
-    seen: dict[str, Any] = {
-        "true": TrackedDiscs(raw.car_radius, sigmas, attribute="car_tracks"),
-        "last_seen": Discs("last_seen_positions", raw.car_radius),
-        "estimated": TrackedDiscs(raw.car_radius, sigmas),
-    }
-    if cars not in seen:
-        raise UnknownNameError(
-            f"cars is one of {', '.join(seen)}: which positions to keep clear of; got {cars!r}"
-        )
+    discs = _of_what_is_known(env, "cars", cars, raw.car_radius, "car_tracks", sigmas)
     # No way out leads through pillars, or over the rails at 4 m and 3.5 m.
     rails = [Plane([x, y], [-x, -y]) for x, y in ((-4.0, 0.0), (4.0, 0.0), (0.0, -3.5), (0.0, 3.5))]
-    obstacles = [seen[cars], Discs("pillar_positions", raw.pillar_radius), *rails]
+    obstacles = [discs, Discs("pillar_positions", raw.pillar_radius), *rails]
     return [EscapeClearance("robot", obstacles, raw.robot_radius)]
 
 
@@ -130,19 +138,10 @@ def _point_maze(env: gym.Env[Any, Any]) -> list[Constraint]:
 
 def _patrolled_maze(env: gym.Env[Any, Any], patrols: str = "", sigmas: float = 3.0) -> list[Constraint]:
     raw: Any = env.unwrapped
-    patrols = patrols or ("estimated" if env.has_wrapper_attr("tracking") else "true")
-    seen: dict[str, Any] = {
-        "true": TrackedDiscs(raw.patrol_radius, sigmas, attribute="patrol_tracks"),
-        "last_seen": Discs("last_seen_positions", raw.patrol_radius),
-        "estimated": TrackedDiscs(raw.patrol_radius, sigmas),
-    }
-    if patrols not in seen:
-        raise UnknownNameError(
-            f"patrols is one of {', '.join(seen)}: which positions to keep clear of; got {patrols!r}"
-        )
+    discs = _of_what_is_known(env, "patrols", patrols, raw.patrol_radius, "patrol_tracks", sigmas)
     # The ways out do not know the walls: with them as obstacles a corridor has none but to stand still, and stepping
     # aside at the last moment, which the walls' own constraint leaves, avoids more. The ball rests within 0.5 s.
-    aside = EscapeClearance("particle", [seen[patrols]], raw.ball_radius, margin=0.03, horizon_s=1.0)
+    aside = EscapeClearance("particle", [discs], raw.ball_radius, margin=0.03, horizon_s=1.0)
     return [WallClearance(velocity_clip=5.0), aside]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.constraints.constraint import HalfSpaces, Promise, non_negative, positive
-from safe_wrappers.constraints.obstacle_kinds import obstacle_from
+from safe_wrappers.constraints.obstacle_kinds import obstacles_from
 from safe_wrappers.constraints.obstacles import Nearest
 from safe_wrappers.control.stopping import sampled_acceleration_limit, sampled_inset
 from safe_wrappers.errors import ConfigurationError
@@ -73,11 +73,7 @@ class Clearance:
     promise: Promise = field(default="best effort", init=False)
 
     def __post_init__(self) -> None:
-        if isinstance(self.obstacles, dict) or not isinstance(self.obstacles, Sequence) or not self.obstacles:
-            raise ConfigurationError(
-                f"obstacles is a list with at least one obstacle, got {self.obstacles!r}"
-            )
-        self.obstacles = [obstacle_from(o) for o in self.obstacles]
+        self.obstacles = obstacles_from(self.obstacles)
         self.braking = positive("braking", self.braking, "m/s^2")
         for name in ("radius", "margin", "state_error"):
             setattr(self, name, non_negative(name, getattr(self, name), "m"))

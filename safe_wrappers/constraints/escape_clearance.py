@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.constraints.constraint import HalfSpaces, Promise, non_negative, positive
-from safe_wrappers.constraints.obstacle_kinds import obstacle_from
+from safe_wrappers.constraints.obstacle_kinds import obstacles_from
 from safe_wrappers.constraints.obstacles import Discs, distances
 from safe_wrappers.constraints.tracked_discs import TrackedDiscs
 from safe_wrappers.control.escapes import Escapes, Manoeuvre
@@ -79,11 +79,7 @@ class EscapeClearance:
     promise: Promise = field(default="best effort", init=False)
 
     def __post_init__(self) -> None:
-        if isinstance(self.obstacles, dict) or not isinstance(self.obstacles, Sequence) or not self.obstacles:
-            raise ConfigurationError(
-                f"obstacles is a list with at least one obstacle, got {self.obstacles!r}"
-            )
-        self.obstacles = [obstacle_from(o) for o in self.obstacles]
+        self.obstacles = obstacles_from(self.obstacles)
         self.radius = non_negative("radius", self.radius, "m")
         self.margin = non_negative("margin", self.margin, "m")
         self.horizon_s = positive("horizon_s", self.horizon_s, "s")

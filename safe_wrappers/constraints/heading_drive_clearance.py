@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.constraints.constraint import HalfSpaces, Promise, non_negative
-from safe_wrappers.constraints.obstacle_kinds import obstacle_from
+from safe_wrappers.constraints.obstacle_kinds import obstacles_from
 from safe_wrappers.constraints.obstacles import Disc, Discs
 from safe_wrappers.control.heading_drive import StoppingPath
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
@@ -76,11 +76,7 @@ class HeadingDriveClearance:
     promise: Promise = field(default="proved", init=False)
 
     def __post_init__(self) -> None:
-        if isinstance(self.obstacles, dict) or not isinstance(self.obstacles, Sequence) or not self.obstacles:
-            raise ConfigurationError(
-                f"obstacles is a list with at least one obstacle, got {self.obstacles!r}"
-            )
-        self.obstacles = [obstacle_from(o) for o in self.obstacles]
+        self.obstacles = obstacles_from(self.obstacles)
         for obstacle in self.obstacles:
             if not isinstance(obstacle, Disc | Discs):
                 raise ConfigurationError(

@@ -1,5 +1,6 @@
 """Obstacles as plain data, so that a constraint that holds them can be recorded and rebuilt."""
 
+from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -24,6 +25,13 @@ def obstacle_from(data: Any) -> Obstacle:
             f"unknown obstacle kind {data.get('kind')!r}; the kinds are {', '.join(KINDS)}"
         )
     return kind(**{k: v for k, v in data.items() if k != "kind"})  # type: ignore[no-any-return]
+
+
+def obstacles_from(given: Any) -> list[Obstacle]:
+    """At least one obstacle, each itself or as its dict."""
+    if isinstance(given, dict) or not isinstance(given, Sequence) or not given:
+        raise ConfigurationError(f"obstacles is a list with at least one obstacle, got {given!r}")
+    return [obstacle_from(o) for o in given]
 
 
 def obstacle_data(obstacle: Any) -> Any:
