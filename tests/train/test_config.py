@@ -33,6 +33,14 @@ def test_every_config_of_the_repo_is_valid(path):
         assert kinds == {"unfiltered": "none", "filter_alone": "protect", "filtered": "protect"}
         assert [arm.name for arm in experiment.arms if arm.filter.lease is not None] == ["filtered"]
         assert all(list(arm.env.faults) == ["Outages"] for arm in experiment.arms)
+    elif path.stem == "occluded_crossing_ppo":
+        known = {"true_state": "true", "last_seen": "last_seen", "estimated": "estimated"}
+        kept = {arm.name: arm.filter.kwargs.get("cars") for arm in experiment.arms}
+        without = {name: cars for name, cars in kept.items() if not name.endswith("_penalty")}
+        assert without == known | {"unfiltered": None}
+        assert kept == without | {f"{name}_penalty": cars for name, cars in without.items()}
+        weights = {arm.name: (arm.env.occlusion or {}).get("weight", 0.0) for arm in experiment.arms}
+        assert all((weight > 0.0) == name.endswith("_penalty") for name, weight in weights.items())
     else:
         assert kinds == {"unfiltered": "none", "filtered": "protect"}
 

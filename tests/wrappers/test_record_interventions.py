@@ -141,6 +141,9 @@ def test_without_a_filter_everything_counts_as_zero():
         "goals_reached",
         "spin_outs",
         "success",
+        "collisions",
+        "seen",
+        "expiries",
     }
     assert env.filter_time_us is None
 
@@ -194,10 +197,11 @@ def test_file_gains_one_row_per_episode(tmp_path: Path):
     first, second = read_episodes(path)
     assert first["correction_mean"] == second["correction_mean"] == 0.5
     assert first["success"] == 1.0
-    # A task without goals and wheels: empty cells, which do not come back.
+    # A task without goals, wheels, cars and tracks: empty cells, which do not come back.
     bare = tmp_path / "bare.csv"
     play(RecordInterventions(gym.make("Pendulum-v1", max_episode_steps=2), bare))
-    assert set(read_episodes(bare)[0]) == set(COLUMNS) - {"goals_reached", "spin_outs", "success"}
+    absent = {"goals_reached", "spin_outs", "success", "collisions", "seen", "expiries"}
+    assert set(read_episodes(bare)[0]) == set(COLUMNS) - absent
 
 
 def test_spin_outs_are_counted_where_the_task_reports_them(tmp_path: Path):
