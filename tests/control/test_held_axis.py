@@ -71,7 +71,7 @@ def test_braking_ends_where_it_says_and_never_turns_back(axis, x, v):
     ends = axis.braking(x, v)
     assert ends[0] == x and ends[-1] == pytest.approx(xs[-1], abs=1e-9)
     # At a whole number of holds rounding decides whether one more, of next to nothing, ends at rest.
-    path = xs[:: axis.substeps] + [xs[-1]]
+    path = [*xs[:: axis.substeps], xs[-1]]
     assert ends == pytest.approx(path[: len(ends)], abs=1e-9)
 
 
