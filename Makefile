@@ -66,7 +66,7 @@ figures: .venv/installed
 		halfcheetah_velocity_sac outages saferover_ppo occluded_crossing_ppo; do $(BIN)/safe-wrappers compare configs/$$config.yaml --report || exit 1; done
 	$(BIN)/python -m benchmarks.traction
 	$(BIN)/python -m benchmarks.impact
-	$(BIN)/python -m benchmarks.occlusion
+	$(BIN)/python -m benchmarks.occlusion --steps 40000
 
 .venv/docs: .venv/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
