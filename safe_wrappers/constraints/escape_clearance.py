@@ -259,11 +259,12 @@ class EscapeClearance:
         return self.shortfall(plant, control) <= _ROUNDING
 
     def backup(self, plant: MujocoPlant) -> Array:
-        """The first control of the way out that keeps farthest away."""
+        """Braking where it leaves a way out, else the first control of the one that keeps farthest away."""
         self._look(plant)
         control = np.zeros(plant.model.nu)
         firsts = self._firsts()
-        control[list(self._point.actuators)] = firsts[int(self._slacks(plant, firsts).max(axis=1).argmax())]
+        left = self._slacks(plant, firsts).max(axis=1)
+        control[list(self._point.actuators)] = firsts[0 if left[0] >= 0.0 else int(left.argmax())]
         return control
 
     def _firsts(self) -> Array:

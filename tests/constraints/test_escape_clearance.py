@@ -340,3 +340,34 @@ def test_what_does_not_fit_the_env_is_refused_at_binding():
     slow.unwrapped.frame_skip = 100
     with pytest.raises(ConfigurationError, match="too short for control steps of 1 s"):
         sw.CBFActionFilter(slow, [sw.EscapeClearance("robot", [TRUE_CARS], horizon_s=0.9)])
+
+
+def test_the_backup_stands_still_where_that_is_safe_and_goes_where_it_is_not():
+    raw, plant, clearance = bound([TRUE_CARS])
+    away = [-10.0, -15.0, -20.0, 10.0, 15.0, 20.0]
+    speeds = [0.0] * 3 + [1.0] * 3 + [-1.0] * 3
+    anew(raw, plant, clearance, [0.0, -2.9, 0.0, *away], speeds)
+    assert (clearance.backup(plant) == 0.0).all()
+    moving = [0.5, 0.3, *speeds[2:]]  # braking: against the motion, just to rest
+    anew(raw, plant, clearance, [0.0, -2.9, 0.0, *away], moving)
+    backup = clearance.backup(plant)
+    assert (backup[:2] < 0.0).all() and backup[2] == 0.0
+    kinds = set()
+    for x in np.arange(-1.5, -0.7, 0.05):  # in the lane, a car that comes nearer and nearer
+        anew(raw, plant, clearance, [0.0, -0.8, 0.0, x, *away[1:]], speeds)
+        stays = clearance.shortfall(plant, np.zeros(3)) <= 0.0
+        backup = clearance.backup(plant)
+        assert np.abs(backup[:2]).max() == (0.0 if stays else 1.0)
+        assert clearance.shortfall(plant, backup) <= clearance.shortfall(plant, np.zeros(3))
+        kinds.add(stays)
+    assert kinds == {True, False}
+
+
+def test_a_policy_that_says_no_number_stops_on_the_pavement():
+    env = sw.protect(gym.make("OccludedCrossing-v0"))
+    env.reset(seed=0)
+    start = env.unwrapped.agent_position
+    with pytest.warns(UserWarning, match="not finite"):
+        infos = [env.step(np.full(3, np.nan))[4] for _ in range(50)]
+    assert all(info["cbf/nonfinite"] and info["cbf/fallback"] for info in infos)
+    assert np.abs(env.unwrapped.agent_position - start).max() < 1e-9
