@@ -12,6 +12,9 @@ machine may speed up by as much until then, which is what a policy that dies wit
 
 `braking` is a *verified lower bound* on the deceleration. Nothing here can check it.
 
+A human who steers from afar is late by the video, the reaction and the network's round trip instead. The same room
+bounds what the network may take (`round_trip_ceiling`; appendix "Teleoperation network round-trip time bounds").
+
 A lease of zero or less means: revoke now. Rounding only ever shortens a lease, and what is not finite revokes.
 """
 
@@ -174,6 +177,53 @@ def _lease(
     tau = min(tau, _LONGEST)
     lease = tau - delays - _ROUNDING * (abs(tau) + delays) - _TINY
     return -math.inf if math.isnan(lease) else lease
+
+
+def round_trip_ceiling(
+    clearance: ArrayLike,
+    speed: ArrayLike,
+    braking: ArrayLike,
+    video_s: ArrayLike,
+    human_s: ArrayLike,
+    act_s: ArrayLike,
+    localisation: ArrayLike = 0.0,
+    margin: ArrayLike = 0.0,
+    acceleration: ArrayLike = 0.0,
+    top_speed: ArrayLike = np.inf,
+) -> Array:
+    """The longest network round trip at which a remote operator can still stop the machine inside the clearance.
+
+    The largest T_RTT, downlink and uplink together, with
+
+        T_RTT <= (D_clear - d_brake) / v - (T_video + T_human + T_act),    d_brake = v^2 / (2 a_brake)
+
+    A round trip above it means that the operator cannot see the obstacle and brake in time: the machine has to brake
+    by itself. It holds for the clearance and the speed at which it was worked out, so it has to be worked out anew
+    all the time, at the machine's own rate. It bounds displacement and says nothing of energy or contact force.
+
+    Args:
+        clearance: D_clear as measured by the machine, m, shape (...).
+        speed: Approach speed v, m/s, positive towards the obstacle, shape (...).
+        braking: Verified lower bound on the deceleration a_brake, m/s^2, shape (...).
+        video_s: T_video, from the exposure to the operator's display, s, shape (...). Where the downlink is part of
+            it, it must not be counted in the round trip again.
+        human_s: T_human, the operator's reaction, s, shape (...); 0.15 to 0.25 s in the appendix.
+        act_s: T_act, until the full deceleration is there, s, shape (...).
+        localisation: Bound on the error of the clearance, m, shape (...).
+        margin: Clearance to be kept at rest, m, shape (...).
+        acceleration: Largest approach acceleration until the brakes hold, m/s^2; 0 is the appendix's constant speed.
+        top_speed: Bound on the speed that this may lead to, m/s; inf: none.
+
+    Returns:
+        Ceiling in s, shape (...). Zero or less: no round trip is short enough, revoke. inf where nothing approaches;
+        -inf as in `longest_lease`. Rounded down, never NaN.
+
+    Raises:
+        ConfigurationError: For a negative delay, localisation bound, margin, acceleration or top speed.
+    """
+    _not_negative(video_s=video_s, human_s=human_s, act_s=act_s)
+    late_s = np.asarray(video_s, dtype=np.float64) + human_s + act_s
+    return longest_lease(clearance, speed, braking, late_s, localisation, margin, acceleration, top_speed)
 
 
 def longest_lease_of_room(room: ArrayLike, closing_speed: ArrayLike, delays_s: ArrayLike) -> Array:

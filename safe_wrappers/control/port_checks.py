@@ -1,0 +1,81 @@
+"""Arguments of energy ports: one step's effort and flow, positive numbers, energies; or an error that names them."""
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from safe_wrappers.control.finite import finite_arrays
+from safe_wrappers.errors import ConfigurationError
+
+Array = NDArray[np.float64]
+
+
+def same_shape(**values: ArrayLike) -> tuple[Array, Array]:
+    """Two finite arrays of one shape, without broadcasting: a port that does not match is a mistake.
+
+    Raises:
+        ConfigurationError: What is no number, not finite, or of two shapes.
+    """
+    first, second = (finite_arrays(**{name: value})[0] for name, value in values.items())
+    if first.shape != second.shape:
+        a, b = values
+        raise ConfigurationError(f"expected {a} and {b} of one shape, got {first.shape} and {second.shape}")
+    return first, second
+
+
+def port_vectors(**values: ArrayLike) -> tuple[Array, Array]:
+    """Effort and flow of one port as (m,); numbers are (1,). Whether they are finite shows in `port_energy`.
+
+    Raises:
+        ConfigurationError: What is no number, of two shapes, of more than one axis, or empty.
+    """
+    a, b = values
+    try:
+        first, second = (np.asarray(value, dtype=np.float64) for value in values.values())
+    except (TypeError, ValueError):
+        raise ConfigurationError(
+            f"{a} and {b} are numbers or arrays of numbers, got {values[a]!r}, {values[b]!r}"
+        ) from None
+    if first.shape != second.shape or first.ndim > 1 or first.size == 0:
+        raise ConfigurationError(
+            f"expected {a} and {b} as numbers or of one shape (m,), got {first.shape} and {second.shape}"
+        )
+    return first.reshape(-1), second.reshape(-1)
+
+
+def port_energy(effort: Array, flow: Array, time_s: float) -> float:
+    """`F.v dt`, J.
+
+    Raises:
+        ConfigurationError: For a product that is not finite: it has a factor that is not, or it overflows.
+    """
+    # One look at the product instead of two at the factors: this runs at every tick.
+    energy = float(effort @ flow) * time_s
+    if not math.isfinite(energy):
+        raise ConfigurationError(
+            f"effort and flow must be finite, and so their product; got {effort} and {flow}"
+        )
+    return energy
+
+
+def positive(name: str, value: float) -> float:
+    """A finite number above 0.
+
+    Raises:
+        ConfigurationError: For any other.
+    """
+    if not (isinstance(value, (int, float, np.number)) and math.isfinite(value) and value > 0.0):
+        raise ConfigurationError(f"{name} must be a finite number above 0, got {value!r}")
+    return float(value)
+
+
+def energy_j(name: str, value: float) -> float:
+    """A finite energy, at least 0.
+
+    Raises:
+        ConfigurationError: For any other.
+    """
+    if not (isinstance(value, (int, float, np.number)) and math.isfinite(value) and value >= 0.0):
+        raise ConfigurationError(f"{name} must be a finite energy of at least 0 J, got {value!r}")
+    return float(value)
