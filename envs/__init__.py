@@ -41,6 +41,13 @@ PATROLLED_MAZE_ID: Final = "PatrolledPointMaze-v0"
 """Id of gymnasium-robotics' PointMaze with patrols that its walls hide."""
 
 
+TELEOP_EPISODE_STEPS: Final = 6000
+"""`EPISODE_STEPS` of the teleoperation: 6 s at 1 kHz."""
+
+TELEOP_CONTACT_ID: Final = "TeleopContact-v0"
+"""Id of the remote end of a teleoperation: a tool before a stiff wall."""
+
+
 def register_envs() -> None:
     """Register every task of this package with Gymnasium; ids already there are left alone."""
     for level, env_id in enumerate(POINT_GOAL_IDS):
@@ -56,6 +63,8 @@ def register_envs() -> None:
     crossing = "safe_wrappers.envs.occluded_crossing:OccludedCrossingEnv"
     _register(OCCLUDED_CROSSING_ID, crossing, {}, steps=CROSSING_EPISODE_STEPS)
     _register(PATROLLED_MAZE_ID, "safe_wrappers.envs.patrolled_maze:PatrolledPointMazeEnv", {})
+    teleop = "safe_wrappers.envs.teleop_contact:TeleopContactEnv"
+    _register(TELEOP_CONTACT_ID, teleop, {}, steps=TELEOP_EPISODE_STEPS)
 
 
 def _register(env_id: str, entry_point: str, kwargs: dict[str, object], steps: int = EPISODE_STEPS) -> None:
@@ -73,6 +82,8 @@ __all__ = [
     "POINT_GOAL_IDS",
     "REACH_EPISODE_STEPS",
     "SAFE_ROVER_ID",
+    "TELEOP_CONTACT_ID",
+    "TELEOP_EPISODE_STEPS",
     "VELOCITY_IDS",
     "register_envs",
 ]

@@ -1,0 +1,344 @@
+"""A tool that is pressed against a stiff wall and swept along it towards a clamp: the remote end of a teleoperation."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+from gymnasium.envs.mujoco import MujocoEnv
+from gymnasium.spaces import Box
+from gymnasium.utils import EzPickle
+from numpy.typing import NDArray
+
+from safe_wrappers.errors import ActionError, ConfigurationError, SafeWrappersError, UnknownNameError
+from safe_wrappers.interventions import COST, COST_SUBSTEP
+
+Array = NDArray[np.float64]
+
+COST_FORCE: Final = "cost_force"
+"""float64: 1 if the wall or the clamp pushed with more than `FORCE_LIMIT` in this step, else 0."""
+CONTACT_FORCE: Final = "contact_force"
+"""float64, N: normal force of the wall on the tool in this step."""
+CLEARANCE: Final = "clearance"
+"""float64, m: between tool and clamp at the end of this step; negative inside it."""
+SWEPT: Final = "swept"
+"""float64, m: how far the tool was swept towards the clamp while it pressed, this episode."""
+
+WALL_X: Final = 0.2
+"""Face of the wall, m: the tool's centre stays at smaller x."""
+CLAMP_Y: Final = 0.25
+"""Near face of the clamp, m: it must not be touched."""
+TOOL_RADIUS: Final = 0.015
+"""m."""
+FORCE_LIMIT: Final = 40.0
+"""N, of a contact."""
+CLOSE_TO_CLAMP: Final = 0.03
+"""Clearance at which the sweep is complete, m."""
+TELEOP_BRAKING: Final = 24.0
+"""m/s^2: what full reverse command takes off an approach speed at least, whatever the spring holds.
+
+The damper gives 40 N against any approach at full reverse (its forcerange), the spring pulls on with 15 N at most,
+and the tool has 1 kg: 25 m/s^2, less for what a last, partial step may lack."""
+TELEOP_ACCELERATION: Final = 55.0
+"""m/s^2: the most that any command may cause along an axis: 40 N of the damper, 15 N of the spring."""
+TELEOP_TOP_SPEED: Final = 1.4
+"""m/s: where damper and spring at their strongest balance, 40 (v - 1) = 15, rounded up."""
+
+_SPRING_LIMIT: Final = 15.0  # N: beyond it the commanded position slips along
+_PRESSING: Final = 0.5  # share of the wanted force within which a sweep counts
+_SWEEP_REWARD: Final = 10.0  # per m
+_START_X: Final = (0.0, 0.1)  # m
+_START_Y: Final = (-0.05, 0.0)
+_WANTED: Final = (6.0, 12.0)  # N
+_ASSET: Final = Path(__file__).parent / "assets" / "teleop_contact.xml"
+_CAMERA: Final = {"distance": 0.9, "elevation": -90.0, "azimuth": 90.0, "lookat": np.array([0.1, 0.08, 0.0])}
+
+
+class TeleopContactEnv(MujocoEnv, EzPickle):
+    """Press a tool against a wall with a wanted force, sweep it along the wall, stop before the clamp.
+
+    The remote machine of a bilateral teleoperation, in the horizontal plane: a tool of 1 kg, a wall of 20 kN/m at
+    x = 0.2 m, a clamp whose face is at y = 0.25 m. Physics, control and the cost run at 1 kHz: an action is held for
+    one physics substep.
+
+    **Action**: commanded velocity of the tool, m/s, ``Box(-1, 1, (2,), float32)``. A coupling drives the tool:
+    a spring of 400 N/m from the commanded position (its integral) and a damper of 40 N s/m from the commanded
+    velocity. The damper gives at most 40 N along an axis; at 15 N the spring slips: the commanded position is
+    dragged along. Both make a saturated coupling that stores and dissipates energy, and generates none.
+
+    **Observation**, float64, shape (9,): position (2, m) and velocity (2, m/s) of the tool, coupling force on the
+    tool (2, N) at this state and the last command, normal force of the wall (N), clearance to the clamp (m), wanted
+    force (N).
+
+    **Port**: what a channel with wave coding has to know is published: the action is the port's flow, the
+    observation's entries 4 and 5 its effort (`port_flow`, `port_effort_observed`); `port_effort` is the effort at the
+    present state and last command, `port_feedthrough` by how much it changes per change of the flow (N s/m), and
+    `port_effort_acted` what acted during the last step: this times the executed command times `dt` is the energy that
+    the machine has absorbed at its port, exactly.
+
+    **Reward**: per second, 1 less the relative error of the pressing force (0 at least); and 10 per metre of new
+    sweep towards the clamp, made at half to one and a half times the wanted force, up to 3 cm before the clamp.
+
+    **Info**, at every step and at reset: ``cost`` and its equal ``cost_substep`` (1.0 if the tool touched the clamp
+    at the end of the step, which is one physics substep), ``cost_force`` (1.0 if a contact pushed with more than
+    40 N), ``contact_force``, ``clearance``, ``swept``.
+
+    **Layout**: ``reset(options={"layout": {"tool": [x, y], "velocity": [vx, vy], "wanted_force": F}})``, any subset;
+    place (0 to 0.1, -0.05 to 0 m) and wanted force (6 to 12 N) are sampled where they are not given, at rest.
+
+    An episode never terminates; `gymnasium.make` truncates it after 6 s.
+
+    Args:
+        kwargs: Passed to `gymnasium.envs.mujoco.MujocoEnv` (``render_mode``, ``width``, ``camera_name``, ...).
+
+    Example:
+        >>> import gymnasium as gym, numpy as np, safe_wrappers
+        >>> env = gym.make("TeleopContact-v0")
+        >>> _ = env.reset(seed=0)
+        >>> for _ in range(2500):
+        ...     info = env.step(np.array([0.1, 0.0]))[4]
+        >>> round(info["contact_force"], 1)  # the spring's limit and the damper
+        19.0
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium declares it on the instance)
+        "render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"],
+        "render_fps": 1000,
+    }
+
+    port_flow: Final = (0, 1)
+    """Entries of the action that are the port's flow."""
+    port_effort_observed: Final = (4, 5)
+    """Entries of the observation that are its effort."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        EzPickle.__init__(self, **kwargs)
+        kwargs.setdefault("default_camera_config", _CAMERA)
+        MujocoEnv.__init__(self, str(_ASSET), 1, Box(-np.inf, np.inf, (9,), dtype=np.float64), **kwargs)
+        model = self.model
+        self._stiffness = float(model.tendon_stiffness.flat[0])
+        self.port_feedthrough = float(model.actuator_gainprm[0, 0])
+        self._damper_limit = float(model.actuator_forcerange[0, 1])
+        self._wall, self._clamp = (int(model.geom(name).id) for name in ("wall", "clamp"))
+        self._given: dict[str, Any] = {}
+        self._wanted = float(np.mean(_WANTED))
+        self._begin()
+
+    # What a channel, a constraint or a judge may read: from qpos, never a substep behind ---------------------
+
+    @property
+    def tool_position(self) -> Array:
+        """The tool's centre, shape (2,), m."""
+        return np.array(self.data.qpos)
+
+    @property
+    def tool_velocity(self) -> Array:
+        """Shape (2,), m/s."""
+        return np.array(self.data.qvel)
+
+    @property
+    def commanded_position(self) -> Array:
+        """The commanded velocities' integral, dragged along where the spring slips; shape (2,), m."""
+        return np.array(self.data.mocap_pos[0, :2])
+
+    @property
+    def clearance(self) -> float:
+        """Between tool and clamp, m."""
+        return CLAMP_Y - TOOL_RADIUS - float(self.data.qpos[1])
+
+    @property
+    def wanted_force(self) -> float:
+        """N."""
+        return self._wanted
+
+    @property
+    def port_effort(self) -> Array:
+        """Coupling force on the tool at the present state and the last command, shape (2,), N."""
+        return np.array(self._coupling(self.data.ctrl))
+
+    @property
+    def port_effort_acted(self) -> Array:
+        """Coupling force on the tool during the last step, shape (2,), N."""
+        return np.array(self._acted)
+
+    @property
+    def stored_energy(self) -> float:
+        """In the tool's motion, the coupling's spring and the compressed wall and clamp, J."""
+        data = self.data
+        (x, y), (vx, vy) = data.qpos.tolist(), data.qvel.tolist()
+        cx, cy, _ = data.mocap_pos[0].tolist()
+        stretched = (cx - x) ** 2 + (cy - y) ** 2
+        wall = float(-self.model.geom_solref[self._wall, 0] / self.model.body("tool").invweight0[0])
+        pressed = max(x + TOOL_RADIUS - WALL_X, 0.0) ** 2 + max(y + TOOL_RADIUS - CLAMP_Y, 0.0) ** 2
+        moving = float(self.model.body("tool").mass[0]) * (vx * vx + vy * vy)
+        return 0.5 * (moving + self._stiffness * stretched + wall * pressed)
+
+    # Gymnasium ---------------------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Start an episode; ``options["layout"]`` fixes parts of it.
+
+        Raises:
+            UnknownNameError: An unknown layout key.
+            ConfigurationError: A layout that cannot be used.
+        """
+        self._given = _layout(options)
+        observation, info = super().reset(seed=seed, options=options)
+        return observation, info
+
+    def reset_model(self) -> Array:
+        """Draw what the options left open."""
+        drawn = self.np_random.uniform(*np.transpose([_START_X, _START_Y, _WANTED]))
+        self._wanted = float(self._given.get("wanted_force", drawn[2]))
+        self.set_state(
+            np.array(self._given.get("tool", drawn[:2])), np.array(self._given.get("velocity", (0.0, 0.0)))
+        )
+        return self.observe()
+
+    def set_state(self, qpos: Array, qvel: Array) -> None:
+        """Set position and velocity of the tool (shapes (2,)), the coupling relaxed, and judge the state."""
+        self.data.ctrl[:] = 0.0
+        self.data.mocap_pos[0, :2] = qpos
+        super().set_state(qpos, qvel)  # type: ignore[no-untyped-call]
+        self._begin()
+
+    # MujocoEnv's signature promises NumPy scalars where Env's promises Python's: ours are Python's.
+    def step(  # type: ignore[override]
+        self, action: NDArray[np.floating[Any]]
+    ) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """Command a velocity for one step of 1 ms; beyond the action space it is clipped.
+
+        Raises:
+            ActionError: Wrong shape, or a number that is not finite; the env was not stepped.
+            SafeWrappersError: The physics left finite numbers.
+        """
+        command = np.asarray(action, dtype=np.float64)
+        if command.shape != (2,) or not np.isfinite(command).all():
+            raise ActionError(f"action must be 2 finite numbers; got {command.tolist()}")
+        self._step_mujoco_simulation(np.clip(command, -1.0, 1.0), self.frame_skip)
+        reward = self._pressing_reward() + self._sweep_reward()
+        observation = self.observe()
+        if not np.isfinite(observation).all():
+            raise SafeWrappersError("the tool's state is not finite: a state that was set broke it")
+        if self.render_mode == "human":
+            self.render()  # type: ignore[no-untyped-call]
+        return observation, reward, False, False, self._get_reset_info()
+
+    def observe(self) -> Array:
+        """Observation of the state as it is now."""
+        data = self.data
+        return np.array(
+            [
+                *data.qpos.tolist(),
+                *data.qvel.tolist(),
+                *self._coupling(data.ctrl),
+                self._force,
+                self.clearance,
+                self._wanted,
+            ]
+        )
+
+    def _get_reset_info(self) -> dict[str, Any]:
+        cost = float(self.clearance <= 0.0)
+        return {
+            COST: cost,
+            COST_SUBSTEP: cost,
+            COST_FORCE: float(self._largest_force > FORCE_LIMIT),
+            CONTACT_FORCE: self._force,
+            CLEARANCE: self.clearance,
+            SWEPT: self._swept,
+        }
+
+    # Physics -----------------------------------------------------------------------------------------------
+
+    def _step_mujoco_simulation(self, ctrl: Array, n_frames: int) -> None:
+        model, data = self.model, self.data
+        data.ctrl[:] = ctrl
+        self._acted = self._coupling(ctrl)
+        mujoco.mj_step(model, data, n_frames)
+        self._advance_command(ctrl)
+        self._read_contacts()
+
+    def _advance_command(self, ctrl: Array) -> None:
+        """Integrate the command; where the spring would pull with more than its limit, it slips."""
+        place = self.data.mocap_pos[0]
+        (ux, uy), (x, y) = ctrl.tolist(), self.data.qpos.tolist()
+        dx, dy = place[0] + ux * self.dt - x, place[1] + uy * self.dt - y
+        share = min(1.0, _SPRING_LIMIT / (self._stiffness * max(math.hypot(dx, dy), 1e-12)))
+        place[0], place[1] = x + share * dx, y + share * dy
+
+    def _coupling(self, ctrl: Array) -> list[float]:
+        """Force of spring and damper on the tool, at the present state."""
+        data, limit = self.data, self._damper_limit
+        force = []
+        for place, q, v, u in zip(
+            data.mocap_pos[0].tolist(), data.qpos.tolist(), data.qvel.tolist(), ctrl.tolist(), strict=False
+        ):
+            damper = self.port_feedthrough * (u - v)
+            force.append(self._stiffness * (place - q) + min(max(damper, -limit), limit))
+        return force
+
+    def _read_contacts(self) -> None:
+        """Normal forces of the contacts in the step that was made, N: contacts without friction have one row each."""
+        self._force = self._largest_force = 0.0
+        data = self.data
+        for i in range(data.ncon):
+            contact = data.contact[i]
+            if contact.efc_address < 0:
+                continue
+            force = float(data.efc_force[contact.efc_address])
+            self._largest_force = max(self._largest_force, force)
+            if self._wall in (contact.geom1, contact.geom2):
+                self._force += force
+
+    def _begin(self) -> None:
+        self._acted = self._coupling(self.data.ctrl)
+        self._read_contacts()
+        self._swept = 0.0
+        self._farthest = float(self.data.qpos[1])
+
+    def _pressing_reward(self) -> float:
+        error = abs(self._force - self._wanted) / self._wanted
+        self._pressed = error <= _PRESSING
+        return self.dt * max(1.0 - error, 0.0)
+
+    def _sweep_reward(self) -> float:
+        place = min(float(self.data.qpos[1]), CLAMP_Y - TOOL_RADIUS - CLOSE_TO_CLAMP)
+        gained = place - self._farthest
+        if gained <= 0.0 or not self._pressed:
+            return 0.0
+        self._farthest = place
+        self._swept += gained
+        return _SWEEP_REWARD * gained
+
+
+def _layout(options: Mapping[str, Any] | None) -> dict[str, Any]:
+    given = dict((options or {}).get("layout") or {})
+    shapes = {"tool": (2,), "velocity": (2,), "wanted_force": ()}
+    for key, value in given.items():
+        if key not in shapes:
+            raise UnknownNameError(f"unknown layout key {key!r}: valid keys are {', '.join(shapes)}")
+        try:
+            numbers = np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError):
+            numbers = np.full(1, np.nan)
+        if numbers.shape != shapes[key] or not np.isfinite(numbers).all():
+            raise ConfigurationError(f"{key} of a layout is of shape {shapes[key]} and finite; got {value!r}")
+        given[key] = numbers
+    if "wanted_force" in given and not 0.0 < given["wanted_force"] < _SPRING_LIMIT:
+        raise ConfigurationError(
+            f"wanted_force must be above 0 and below the spring's limit of {_SPRING_LIMIT} N; got "
+            f"{float(given['wanted_force'])}"
+        )
+    if "tool" in given:
+        x, y = given["tool"]
+        if x + TOOL_RADIUS > WALL_X or y + TOOL_RADIUS > CLAMP_Y:
+            raise ConfigurationError(
+                f"tool at {given['tool'].tolist()} m is inside the wall (x > {WALL_X - TOOL_RADIUS}) or the clamp "
+                f"(y > {CLAMP_Y - TOOL_RADIUS})"
+            )
+    return given

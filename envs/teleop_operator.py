@@ -1,0 +1,131 @@
+"""TeleopOperator: a scripted human at the near end of a teleoperation: an arm that feels, and eyes that are late."""
+
+from collections import deque
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.errors import ConfigurationError
+
+Array = NDArray[np.float64]
+
+REACTION_S: Final = (0.15, 0.25)
+"""Range of human reaction times, s, from which one is drawn."""
+
+_TOUCHED: Final = 1.0  # N, of what is seen: then the operator presses
+_RAMP_S: Final = 0.5  # of the pressing force
+_PRESSED_S: Final = 1.0  # at the latest the sweep begins
+
+
+class TeleopOperator:
+    """Presses the tool of `TeleopContact-v0` against the wall, sweeps it towards the clamp, and stops before it.
+
+    It sits outside the channel: give it the observations that the channel shows, send the actions that it returns.
+    Two things happen at different speeds. The **arm** is a mass and a damper, moved by an intended velocity and an
+    intended force, and pushed at once by the force that the handle returns (entries 4 and 5 of the observation):
+
+        mass dv/dt = damping (intended velocity - v) + intended force - returned force
+
+    The hand's velocity v is the action. The **mind** sees the observation one reaction time later, and decides from it
+    what to intend: approach until it touches, press with the wanted force, sweep while what it sees as the clearance
+    allows.
+
+    A model, not a human: a real one adapts, stiffens and tires, and is not passive without evidence.
+
+    Args:
+        seed: Of the reaction time and of the tremor.
+        reaction_s: s; None draws one from `REACTION_S`.
+        stops: Whether it stops before the clamp. False: it looks away and sweeps on.
+        approach_speed: m/s, intended.
+        sweep_speed: m/s, intended.
+        gap: Clearance at which it wants to stop, m.
+        tremor: Standard deviation of a random force of the arm, N.
+        mass: Of hand and handle, kg.
+        damping: Of the arm, N s/m.
+        step_s: Time between two actions, s.
+
+    Raises:
+        ConfigurationError: A mass, damping or time that is not positive.
+    """
+
+    def __init__(
+        self,
+        seed: int = 0,
+        reaction_s: float | None = None,
+        stops: bool = True,
+        approach_speed: float = 0.1,
+        sweep_speed: float = 0.1,
+        gap: float = 0.03,
+        tremor: float = 0.1,
+        mass: float = 1.5,
+        damping: float = 25.0,
+        step_s: float = 0.001,
+    ) -> None:
+        for name, value in {"mass": mass, "damping": damping, "step_s": step_s}.items():
+            if not (np.isfinite(value) and value > 0.0):
+                raise ConfigurationError(f"{name} must be a finite number > 0, got {value!r}")
+        if reaction_s is not None and not (np.isfinite(reaction_s) and reaction_s >= 0.0):
+            raise ConfigurationError(f"reaction_s must be a finite time of at least 0 s, got {reaction_s!r}")
+        self._random = np.random.default_rng(seed)
+        drawn = float(self._random.uniform(*REACTION_S))
+        self.reaction_s = drawn if reaction_s is None else float(reaction_s)
+        self._stops = stops
+        self._approach_speed, self._sweep_speed, self._gap = approach_speed, sweep_speed, gap
+        self._tremor, self._mass, self._damping, self._step_s = tremor, mass, damping, step_s
+        self.reset()
+
+    def reset(self) -> None:
+        """A new episode: the hand at rest, nothing seen."""
+        self._velocity = [0.0, 0.0]
+        self._on_its_way: deque[Any] = deque()
+        self.phase = "approach"
+        self._steps = 0
+        self._since = 0.0
+
+    def act(self, observation: Array) -> Array:
+        """The hand's velocity, shape (2,), m/s, within the action space.
+
+        Args:
+            observation: As the channel shows it now, shape (9,).
+        """
+        seen = self._perceived(observation)
+        intended, force = self._intention(seen)
+        shake = self._tremor * self._random.standard_normal(2)
+        for i in range(2):
+            push = self._damping * (intended[i] - self._velocity[i]) + force[i] + shake[i]
+            rate = (push - float(observation[4 + i])) / self._mass
+            self._velocity[i] = min(max(self._velocity[i] + rate * self._step_s, -1.0), 1.0)
+        self._steps += 1
+        return np.array(self._velocity)
+
+    def _perceived(self, observation: Array) -> list[float]:
+        """What was shown one reaction time ago."""
+        self._on_its_way.append(observation.tolist())
+        if len(self._on_its_way) > 1 + round(self.reaction_s / self._step_s):
+            self._on_its_way.popleft()
+        seen: list[float] = self._on_its_way[0]
+        return seen
+
+    def _intention(self, seen: list[float]) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Intended velocity and force."""
+        touching, clearance, wanted = seen[6:9]
+        now = self._steps * self._step_s
+        if self.phase == "approach":
+            if touching < _TOUCHED:
+                return (self._approach_speed, 0.0), (0.0, 0.0)
+            self.phase, self._since = "press", now
+        pressing = wanted * min((now - self._since) / _RAMP_S, 1.0)
+        if self.phase == "press":
+            if now - self._since < _PRESSED_S:
+                return (0.0, 0.0), (pressing, 0.0)
+            self.phase = "sweep"
+        along = self._sweep_speed
+        if self._stops:
+            along = min(along, max(clearance - self._gap, 0.0) / self._caution_s)
+        return (0.0, along), (wanted, 0.0)
+
+    @property
+    def _caution_s(self) -> float:
+        """Time constant of coming to a stop: longer than what is seen is late by one's own reaction."""
+        return 4.0 * max(self.reaction_s, 0.1)
