@@ -35,6 +35,7 @@ from safe_wrappers.control.projection import Projection, project
 from safe_wrappers.envs import register_envs as _register_envs
 from safe_wrappers.errors import SafeWrappersError, UnsafeStateWarning
 from safe_wrappers.plants.analytic import AnalyticPlant
+from safe_wrappers.plants.displacement import DisplacementPlant
 from safe_wrappers.plants.mujoco import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.protect import protect
@@ -62,6 +63,7 @@ __all__ = [
     "ContactMonitor",
     "Disc",
     "Discs",
+    "DisplacementPlant",
     "EscapeClearance",
     "HalfSpaces",
     "HeadingDriveClearance",

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -57,6 +58,7 @@ class Barrier:
     curvature: float = 0.0
 
     promise: Promise = field(default="best effort", init=False)
+    needs_acceleration: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if not callable(self.h):

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +71,7 @@ class Clearance:
     state_error: float = 0.0
 
     promise: Promise = field(default="best effort", init=False)
+    needs_acceleration: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         self.obstacles = obstacles_from(self.obstacles)

@@ -80,6 +80,7 @@ class ImpactSpeedLimit(Predicted):
 
     reach: float | None = field(default=None, init=False, repr=False)
     promise: Promise = field(default="best effort", init=False)
+    needs_acceleration: ClassVar[bool] = True
     unit: ClassVar[str] = "N"
 
     def __post_init__(self) -> None:

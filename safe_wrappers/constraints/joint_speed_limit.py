@@ -107,7 +107,9 @@ class JointSpeedLimit(Predicted):
         return np.concatenate([left.min(axis=0) + over, left[-1] + over * decay])
 
     def rows(self, plant: MujocoPlant) -> HalfSpaces:
-        """Two rows per joint that could reach its limit within the hold."""
+        """Two rows per joint that could reach its limit within the hold; none where controls are no forces."""
+        if not plant.has_acceleration:
+            return super().rows(plant)
         drift, effect = plant.acceleration
         v = plant.qvel[self._dofs]
         a0, a = drift[self._dofs], effect[self._dofs]

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,7 @@ class TrackPermission:
     tracks: Sequence[str] | None = None
 
     promise: Promise = field(default="best effort", init=False)
+    needs_acceleration: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         self.braking = positive("braking", self.braking, "m/s^2")

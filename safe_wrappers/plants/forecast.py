@@ -1,6 +1,6 @@
 """A forecast: what a MuJoCo model does under a held control, and under braking after it."""
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import mujoco
 import numpy as np
@@ -76,6 +76,9 @@ class Recorder:
         substeps: Physics substeps per control interval.
     """
 
+    settles: ClassVar[bool] = False
+    """Whether `settle` changes anything."""
+
     def __init__(self, model: mujoco.MjModel, substeps: int) -> None:
         self._model, self._substeps = model, substeps
         self._still = mujoco.MjData(model)
@@ -107,12 +110,13 @@ class Recorder:
         frames, centres = np.empty((holds, m.nbody, 3)), np.empty((holds, m.nbody, 3))
         data.warning.number[_RESETS] = 0
         self.place(data)
-        data.ctrl[:] = control
         for hold in range(holds):
-            if hold:
-                data.ctrl[:] = self.braking(data)
+            self.act(data, self.braking(data) if hold else control)
             for i in range(hold * n, hold * n + n):
                 mujoco.mj_step(m, data)
+                qpos[i], qvel[i] = data.qpos, data.qvel
+            if self.settles:
+                self.settle(data)
                 qpos[i], qvel[i] = data.qpos, data.qvel
             frames[hold], centres[hold] = data.xpos, data.xipos
             if data.warning.number[_RESETS].any():
@@ -120,6 +124,13 @@ class Recorder:
                 qpos[hold * n :] = qvel[hold * n :] = frames[hold:] = centres[hold:] = np.nan
                 break
         return Forecast(self, qpos, qvel, frames, centres)
+
+    def act(self, data: mujoco.MjData, control: Array) -> None:
+        """Give the machine a control, as its env does at the start of a control interval."""
+        data.ctrl[:] = control
+
+    def settle(self, data: mujoco.MjData) -> None:
+        """What the env does to its data at the end of a control interval."""
 
     def braking(self, data: mujoco.MjData) -> Array:
         """Every actuator against its own motion, shape (nu,); read once per control interval, as controllers do."""

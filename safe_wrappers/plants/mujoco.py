@@ -8,7 +8,7 @@ import copy
 from collections import deque
 from collections.abc import Iterator
 from fnmatch import fnmatchcase
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import mujoco
@@ -49,6 +49,8 @@ class MujocoPlant:
     """
 
     hold_s: float
+    has_acceleration: ClassVar[bool] = True
+    """Whether a control acts as a force, so that `f`, `g`, `acceleration` and `point` are known."""
     stamp: int
     """Counts observations, so that a constraint can keep what it has computed for one of them."""
     revision: int
@@ -95,17 +97,20 @@ class MujocoPlant:
         self._upper = np.where(limited, self.model.actuator_ctrlrange[:, 1], np.inf)
         self._check_action_space(env)
         refuse_changed_actions(env)
-        self.substeps = int(getattr(_stepped(raw), "frame_skip", 1))
+        self.substeps = physics_steps(raw)
         self.hold_s = control_interval(raw)
         check_timing(env, self.hold_s, self.delay_s)
         self._delay_steps = int(np.ceil(self.delay_s / self.model.opt.timestep - 1e-9))
         self._pending = deque(maxlen=max(1, -(-self._delay_steps // self.substeps)))
-        self._recorder = Recorder(self.model, self.substeps)
+        self._recorder = self._new_recorder()
         self._forecasts: dict[bytes, Forecast] = {}
         self._snapshot = np.zeros(mujoco.mj_stateSize(self.model, int(_STATE)))
         self._loaded = self._forwarded = False
         if self._factors != (1.0, 1.0):
             self.perturb(*self._factors)
+
+    def _new_recorder(self) -> Recorder:
+        return Recorder(self.model, self.substeps)
 
     def _check_action_space(self, env: gym.Env[Any, Any]) -> None:
         space = env.action_space
@@ -133,7 +138,7 @@ class MujocoPlant:
         self.model.body_inertia *= mass
         self.model.dof_damping *= damping
         mujoco.mj_setConst(self.model, self.data)
-        self._recorder = Recorder(self.model, self.substeps)  # its braking depends on the masses
+        self._recorder = self._new_recorder()  # its braking depends on the masses
         self._loaded = self._forwarded = False
         self._forecasts.clear()
 
@@ -163,6 +168,10 @@ class MujocoPlant:
         for i, control in enumerate(self._pending):
             self.data.ctrl[:] = control
             mujoco.mj_step(self.model, self.data, self.substeps + (min(early, 0) if i == 0 else 0))
+        self._keep()
+
+    def _keep(self) -> None:
+        """Take the data's state as the present one."""
         mujoco.mj_getState(self.model, self.data, self._snapshot, int(_STATE))
         self._loaded = False
 
@@ -170,6 +179,11 @@ class MujocoPlant:
         if not self._loaded:
             mujoco.mj_setState(self.model, self.data, self._snapshot, int(_STATE))
             self._loaded, self._forwarded = True, False
+
+    def _load_to_step(self) -> None:
+        """The data at the present state, about to leave it."""
+        self._load()
+        self._loaded = False
 
     def forward(self) -> mujoco.MjData:
         """The plant's data with every derived quantity up to date at the present state.
@@ -319,11 +333,12 @@ class MujocoPlant:
         Yields the plant's data after each physics substep (positions and velocities are new, derived
         quantities lag as MuJoCo leaves them). The present state is restored for the next question.
         """
-        self._load()
-        self._loaded = False
-        self.data.ctrl[:] = control
-        for _ in range(self.substeps):
+        self._load_to_step()
+        self._recorder.act(self.data, control)
+        for left in range(self.substeps - 1, -1, -1):
             mujoco.mj_step(self.model, self.data)
+            if left == 0:
+                self._recorder.settle(self.data)
             yield self.data
 
     def forecast(self, control: Array, holds: int = 1) -> Forecast:
@@ -339,8 +354,7 @@ class MujocoPlant:
         key = control.tobytes()
         known = self._forecasts.get(key)
         if known is None or len(known.published_frames) < holds:
-            self._load()
-            self._loaded = False
+            self._load_to_step()
             known = self._forecasts[key] = self._recorder.record(self.data, control, holds)
         return known.first(holds)
 
@@ -438,7 +452,13 @@ class MujocoPlant:
 
 def control_interval(raw: Any) -> float:
     """How long an unwrapped MuJoCo env holds one action, s."""
-    return int(getattr(_stepped(raw), "frame_skip", 1)) * float(raw.model.opt.timestep)
+    return physics_steps(raw) * float(raw.model.opt.timestep)
+
+
+def physics_steps(raw: Any) -> int:
+    """How many physics substeps an unwrapped MuJoCo env takes with one action."""
+    env = _stepped(raw)
+    return int(getattr(env, "frame_skip", getattr(env, "n_substeps", 1)))
 
 
 def _stepped(raw: Any) -> Any:

@@ -17,7 +17,7 @@ from safe_wrappers.constraints.constraint import Constraint, non_negative
 from safe_wrappers.constraints.plain_data import constraint_data, constraint_from
 from safe_wrappers.control.projection import check_solver
 from safe_wrappers.errors import ActionError, ConfigurationError, UnsafeStateWarning
-from safe_wrappers.plants.mujoco import MujocoPlant
+from safe_wrappers.plants.default import default_plant
 from safe_wrappers.plants.plant import Plant, check_actions, wrappers_of
 from safe_wrappers.wrappers.decision import Decider
 from safe_wrappers.wrappers.fallback import Fallback, FallbackFunction
@@ -105,10 +105,11 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         gym.Wrapper.__init__(self, env)
         self.constraints: list[Constraint] = [_with_margin(c, margin) for c in own] if margin else own
         self.constraint_names = _unique([type(c).__name__ for c in self.constraints])
-        self.plant: Plant = plant if plant is not None else MujocoPlant()
+        self.plant: Plant = plant if plant is not None else default_plant(env)
         self.plant.bind(env)
         for constraint in self.constraints:
             getattr(constraint, "bind", _nothing)(self.plant)
+        _refuse_without_acceleration(self.plant, self.constraints)
         self._barriers: list[Any] = [c for c in self.constraints if hasattr(c, "value")]
         self._reporting: list[Any] = [c for c in self.constraints if hasattr(c, "report")]
         _refuse_same_reports(self._reporting)
@@ -272,6 +273,13 @@ def _no_state() -> None:
 
 def _nothing(plant: Plant) -> None:
     """A constraint without `bind` resolves no names, one without `check` needs no state to be refused."""
+
+
+def _refuse_without_acceleration(plant: Any, constraints: Sequence[Constraint]) -> None:
+    """Rows say what a control does to accelerations; a plant may know of none."""
+    for constraint in constraints:
+        if getattr(constraint, "needs_acceleration", False) and not getattr(plant, "has_acceleration", True):
+            plant.refuse_acceleration(type(constraint).__name__)
 
 
 def _refuse_same_reports(reporting: list[Any]) -> None:

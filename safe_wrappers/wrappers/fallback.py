@@ -88,8 +88,11 @@ def brake(plant: MujocoPlant) -> Array:
     """The control that leaves the least kinetic energy at the end of the hold, in the linear model.
 
     Energies are counted joint by joint (the diagonal of the inertia). A small weight on the control settles
-    actuators that do not matter. Best effort: it opposes motion, it does not balance.
+    actuators that do not matter. Best effort: it opposes motion, it does not balance. A plant whose controls are no
+    forces brakes as its forecasts do.
     """
+    if not plant.has_acceleration:
+        return plant.braking()
     drift, effect = plant.acceleration
     weight = np.sqrt(plant.inertia_diagonal())
     a = effect * weight[:, None]

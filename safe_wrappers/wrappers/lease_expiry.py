@@ -15,7 +15,7 @@ from safe_wrappers.constraints.plain_data import constraint_data
 from safe_wrappers.control.leases import LeaseDelays
 from safe_wrappers.control.smoothstep import smoothstep
 from safe_wrappers.errors import ActionError, ConfigurationError
-from safe_wrappers.plants.mujoco import MujocoPlant
+from safe_wrappers.plants.default import default_plant
 from safe_wrappers.plants.plant import Plant, check_actions, refuse_changed_actions, wrappers_of
 from safe_wrappers.wrappers.admission import Admission, Measured
 from safe_wrappers.wrappers.cbf_action_filter import is_filtered
@@ -208,7 +208,7 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         )
         self._delays_s += _SAME_TIME * self.hold_s  # what a step may last beyond its lease
         if plant is None and constraint is not None:
-            plant = MujocoPlant()
+            plant = default_plant(env)
         backups = [constraint] if hasattr(constraint, "backup") else []
         self._stand_in = StandIn(env, fallback, plant, backups)
         if constraint is not None:

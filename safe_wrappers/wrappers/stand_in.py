@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.default import default_plant
 from safe_wrappers.plants.mujoco import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.fallback import Fallback, FallbackFunction
@@ -39,7 +40,7 @@ class StandIn:
         self._low, self._high = np.asarray(space.low, np.float64), np.asarray(space.high, np.float64)
         self._fallback = Fallback(choice, backups or [])
         needed = callable(choice) or choice == "brake"
-        self.plant: Plant | None = plant if plant is not None else (MujocoPlant() if needed else None)
+        self.plant: Plant | None = plant if plant is not None else (default_plant(env) if needed else None)
         if self.plant is not None:
             self.plant.bind(env)
             if choice == "brake" and not backups and not isinstance(self.plant, MujocoPlant):

@@ -1,0 +1,14 @@
+"""Which plant describes an env, where the user names none."""
+
+from typing import Any
+
+import gymnasium as gym
+
+from safe_wrappers.plants.displacement import DisplacementPlant
+from safe_wrappers.plants.displacement_step import moves_by_displacement
+from safe_wrappers.plants.mujoco import MujocoPlant
+
+
+def default_plant(env: gym.Env[Any, Any]) -> MujocoPlant:
+    """A `DisplacementPlant` for envs of the Fetch kind, else a `MujocoPlant`; not bound yet."""
+    return DisplacementPlant() if moves_by_displacement(env.unwrapped) else MujocoPlant()

@@ -1,0 +1,166 @@
+"""DisplacementPlant: an arm whose action is a displacement of its gripper, as in gymnasium-robotics' Fetch envs."""
+
+from typing import Any, ClassVar, NoReturn
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.plants.displacement_step import DisplacementRecorder, gripper_of, moves_by_displacement
+from safe_wrappers.plants.forecast import Forecast, Recorder
+from safe_wrappers.plants.mujoco import MujocoPlant
+
+Array = NDArray[np.float64]
+
+_WORKS = "Workspace, JointPositionLimit, JointSpeedLimit, SpeedLimit, Upright"
+
+
+class DisplacementPlant(MujocoPlant):
+    """Actions `(dx, dy, dz, fingers)` in [-1, 1] that move a mocap body, which pulls the gripper after it.
+
+    At the start of a step the env puts the mocap body where MuJoCo last evaluated the gripper (`data.xpos`: after a
+    step it lags one physics substep behind the positions, unless the env has called `mj_forward` since), moves it by
+    `metres_per_unit` times the action, and leaves a soft weld to pull the arm after it. This plant does the same to
+    its own copy of the model. So forecasts are the env's own step, bit for bit, for actions in the action space's
+    dtype; an action in another precision is rounded to it first (a displacement of some nm).
+
+    What it is not: a machine `x' = f(x) + g(x) u`. A displacement is no force, and no acceleration follows from it
+    that would hold over the step: `f`, `g`, `acceleration` and `point` are refused, and with them the constraints
+    that need rows. Those that forecast work: Workspace and its obstacles, joint positions and speeds, SpeedLimit.
+
+    Braking is a displacement of zero: the mocap body stays where the gripper is. After steps at full displacement
+    (0.8 m/s) the gripper moves on by 4 to 6 mm and rests within one control interval, but for 4 mm/s that its weight
+    pulls it down by. A displacement against the motion, of 0.02 s times the speed, stops it 2 to 3 mm earlier, and it
+    swings back: in the interval after that it is five times as fast.
+
+    Args:
+        model: The filter's model; None copies the env's. Pass another (other masses) to test mismatch.
+        delay_s: As in `MujocoPlant`, in whole control intervals; before the first command zero displacements act.
+        metres_per_unit: Displacement of an action of 1, m.
+
+    Attributes:
+        gripper: Name of the body that the mocap body pulls.
+        blocked: Whether the env keeps the fingers closed, so that the last entry of an action does nothing.
+
+    Raises:
+        UnsupportedEnvError: Not an env of the Fetch kind: one mocap body welded to one body, four actions in
+            [-1, 1], `n_substeps` and `block_gripper`.
+        ConfigurationError: A delay that is not a whole number of control intervals.
+    """
+
+    has_acceleration: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        model: mujoco.MjModel | None = None,
+        delay_s: float = 0.0,
+        metres_per_unit: float = 0.05,
+    ) -> None:
+        super().__init__(model, delay_s)
+        if not (np.isfinite(metres_per_unit) and metres_per_unit > 0.0):
+            raise ConfigurationError(
+                f"metres_per_unit is a displacement in m per unit of action, > 0; got {metres_per_unit!r}"
+            )
+        self.metres_per_unit = float(metres_per_unit)
+
+    def bind(self, env: gym.Env[Any, Any]) -> None:
+        """Attach to an env and copy its model."""
+        raw: Any = env.unwrapped
+        if not moves_by_displacement(raw):
+            raise UnsupportedEnvError(
+                f"{raw} is not moved by displacements of its gripper: expected one mocap body welded to one body of "
+                "the arm, four actions, n_substeps and block_gripper, as in FetchReach; for a MuJoCo env whose "
+                "actions are its controls take MujocoPlant()"
+            )
+        self._dtype = env.action_space.dtype
+        self.blocked = bool(raw.block_gripper)
+        self._pose = np.zeros(7)
+        self._body = gripper_of(raw.model)
+        super().bind(env)
+        self.gripper = self.model.body(self._body).name
+        delayed = self._delay_steps / self.substeps
+        if delayed != int(delayed):
+            raise ConfigurationError(
+                f"delay_s = {self.delay_s} s is not a whole number of control intervals of {self.hold_s} s: a "
+                "displacement counts from where the gripper is when a control interval starts"
+            )
+
+    def _check_action_space(self, env: gym.Env[Any, Any]) -> None:
+        space: Any = env.action_space
+        self._lower, self._upper = (np.asarray(end, dtype=np.float64) for end in (space.low, space.high))
+
+    def _new_recorder(self) -> Recorder:
+        return DisplacementRecorder(
+            self.model, self.substeps, self.metres_per_unit, self._dtype, self.blocked
+        )
+
+    def observe(self) -> None:
+        """Take the env's present state, and where MuJoCo last evaluated the gripper."""
+        data: mujoco.MjData = self._raw.data
+        self._pose[:3], self._pose[3:] = data.xpos[self._body], data.xquat[self._body]
+        super().observe()
+
+    def _load_to_step(self) -> None:
+        super()._load_to_step()
+        self.data.xpos[self._body], self.data.xquat[self._body] = self._pose[:3], self._pose[3:]
+
+    def _predict_over_delay(self) -> None:
+        self._load_to_step()
+        idle = self._delay_steps // self.substeps - len(self._pending)
+        for control in [np.zeros(self._lower.size)] * idle + list(self._pending):
+            self._recorder.act(self.data, control)
+            mujoco.mj_step(self.model, self.data, self.substeps)
+            self._recorder.settle(self.data)
+        self._keep()
+        self._pose[:3], self._pose[3:] = self.data.xpos[self._body], self.data.xquat[self._body]
+
+    def forecast(self, control: Array, holds: int = 1) -> Forecast:
+        """What a displacement leads to: held for one control interval, then none."""
+        if self.blocked:  # one forecast for all that differ in what does nothing
+            control = np.append(control[:3], 0.0)
+        return super().forecast(control, holds)
+
+    def forward(self) -> mujoco.MjData:
+        """The plant's data, every derived quantity up to date at the present state, mocap body and servos as set."""
+        self._load()
+        if not self._forwarded:
+            mujoco.mj_forward(self.model, self.data)
+            self._forwarded = True
+        return self.data
+
+    def braking(self) -> Array:
+        """No displacement, shape (4,)."""
+        return np.zeros(self._lower.size)
+
+    @property
+    def acting_range(self) -> tuple[Array, Array]:
+        """All of the action space acts."""
+        return self._lower, self._upper
+
+    @property
+    def f(self) -> Array:
+        """Refused: see the class."""
+        self.refuse_acceleration("f")
+
+    @property
+    def g(self) -> Array:
+        """Refused: see the class."""
+        self.refuse_acceleration("g")
+
+    @property
+    def acceleration(self) -> tuple[Array, Array]:
+        """Refused: see the class."""
+        self.refuse_acceleration("acceleration")
+
+    def point(self, kind: str, name: str) -> tuple[Array, Array, Array, Array]:
+        """Refused: see the class; `motion` has position and velocity."""
+        self.refuse_acceleration("point")
+
+    def refuse_acceleration(self, asker: str) -> NoReturn:
+        """Say to who asks for accelerations that there are none, and what to use instead."""
+        raise UnsupportedEnvError(
+            f"{asker} needs the acceleration that an action causes; on a {type(self).__name__} an action is a "
+            f"displacement of the gripper, from which none follows. Constraints that forecast work: {_WORKS}"
+        )
