@@ -10,6 +10,7 @@ from safe_wrappers.constraints.impact_speed_limit import ImpactSpeedLimit
 from safe_wrappers.constraints.joint_position_limit import JointPositionLimit
 from safe_wrappers.constraints.joint_speed_limit import JointSpeedLimit
 from safe_wrappers.constraints.obstacles import Box, Disc, Discs, Plane, Sphere
+from safe_wrappers.constraints.singularity_margin import SingularityMargin
 from safe_wrappers.constraints.speed_limit import SpeedLimit
 from safe_wrappers.constraints.track_permission import TrackPermission
 from safe_wrappers.constraints.tracked_discs import TrackedDiscs
@@ -34,6 +35,7 @@ __all__ = [
     "JointPositionLimit",
     "JointSpeedLimit",
     "Plane",
+    "SingularityMargin",
     "SpeedLimit",
     "Sphere",
     "TrackPermission",

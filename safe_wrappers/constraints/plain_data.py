@@ -15,6 +15,7 @@ from safe_wrappers.constraints.impact_speed_limit import ImpactSpeedLimit
 from safe_wrappers.constraints.joint_position_limit import JointPositionLimit
 from safe_wrappers.constraints.joint_speed_limit import JointSpeedLimit
 from safe_wrappers.constraints.obstacle_kinds import obstacle_data
+from safe_wrappers.constraints.singularity_margin import SingularityMargin
 from safe_wrappers.constraints.speed_limit import SpeedLimit
 from safe_wrappers.constraints.track_permission import TrackPermission
 from safe_wrappers.constraints.traction import Traction
@@ -32,6 +33,7 @@ KINDS: dict[str, Callable[..., Constraint]] = {
     "ImpactSpeedLimit": ImpactSpeedLimit,
     "JointPositionLimit": JointPositionLimit,
     "JointSpeedLimit": JointSpeedLimit,
+    "SingularityMargin": SingularityMargin,
     "SpeedLimit": SpeedLimit,
     "TrackPermission": TrackPermission,
     "Traction": Traction,
