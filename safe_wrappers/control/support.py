@@ -189,7 +189,9 @@ def support_margin(point: ArrayLike, polygon: ArrayLike, inset: float = 0.0) -> 
     """
     x, corners = np.asarray(point, dtype=np.float64), np.asarray(polygon, dtype=np.float64)
     if x.shape != (2,) or corners.ndim != 2 or corners.shape[1] != 2 or not len(corners):
-        raise ConfigurationError(f"expected a point (2,) and corners (v, 2), got {x.shape} and {corners.shape}")
+        raise ConfigurationError(
+            f"expected a point (2,) and corners (v, 2), got {x.shape} and {corners.shape}"
+        )
     if not (np.isfinite(inset) and inset >= 0.0):
         raise ConfigurationError(f"inset must be 0 m or more, got {inset}")
     if not np.isfinite(x).all():
