@@ -222,8 +222,10 @@ def round_trip_ceiling(
         ConfigurationError: For a negative delay, localisation bound, margin, acceleration or top speed.
     """
     _not_negative(video_s=video_s, human_s=human_s, act_s=act_s)
-    late_s = np.asarray(video_s, dtype=np.float64) + human_s + act_s
-    return longest_lease(clearance, speed, braking, late_s, localisation, margin, acceleration, top_speed)
+    video, human, act = (np.asarray(late, dtype=np.float64) for late in (video_s, human_s, act_s))
+    return longest_lease(
+        clearance, speed, braking, video + human + act, localisation, margin, acceleration, top_speed
+    )
 
 
 def longest_lease_of_room(room: ArrayLike, closing_speed: ArrayLike, delays_s: ArrayLike) -> Array:

@@ -293,8 +293,8 @@ class ChannelLedger:
             stored_j: What is in flight at its end, if known (`WaveLine.in_flight_j` and `reserve_j` of both
                 directions): it has to be paid for too.
         """
-        f_m, v_m = port_vectors(effort=effort_m, flow=flow_m)
-        f_s, v_s = port_vectors(effort=effort_s, flow=flow_s)
+        f_m, v_m = port_vectors(effort_m=effort_m, flow_m=flow_m)
+        f_s, v_s = port_vectors(effort_s=effort_s, flow_s=flow_s)
         self._both.add(np.concatenate([f_m, -f_s]), np.concatenate([v_m, v_s]), time_s, stored_j)
 
     @property

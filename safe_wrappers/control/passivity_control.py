@@ -25,7 +25,13 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.control.port_checks import energy_j, port_energy, port_vectors, positive
+from safe_wrappers.control.port_checks import (
+    energy_j,
+    port_energy,
+    port_vector,
+    port_vectors,
+    positive,
+)
 from safe_wrappers.control.running_sum import RunningSum
 from safe_wrappers.errors import ConfigurationError
 
@@ -217,9 +223,9 @@ class _Interval(NamedTuple):
         """The same with what was truly seen."""
         if actual is None:
             return self
-        given, _ = port_vectors(actual=actual, sampled=self.seen if np.ndim(actual) else self.seen.sum())
+        given = port_vector("actual", actual)
         if given.size != self.seen.size:
-            raise ConfigurationError(f"actual must have {self.seen.size} components, got a number")
+            raise ConfigurationError(f"actual must have {self.seen.size} components, got {given.size}")
         return self._replace(seen=given)
 
 

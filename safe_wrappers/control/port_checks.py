@@ -24,24 +24,34 @@ def same_shape(**values: ArrayLike) -> tuple[Array, Array]:
     return first, second
 
 
-def port_vectors(**values: ArrayLike) -> tuple[Array, Array]:
-    """Effort and flow of one port as (m,); numbers are (1,). Whether they are finite shows in `port_energy`.
+def port_vector(name: str, value: ArrayLike) -> Array:
+    """One quantity of a port as (m,); a number is (1,). Whether it is finite shows in `port_energy`.
 
     Raises:
-        ConfigurationError: What is no number, of two shapes, of more than one axis, or empty.
+        ConfigurationError: What is no number, of more than one axis, or empty.
     """
-    a, b = values
     try:
-        first, second = (np.asarray(value, dtype=np.float64) for value in values.values())
+        vector = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
+        raise ConfigurationError(f"{name} is a number or an array of numbers, got {value!r}") from None
+    if vector.ndim > 1 or vector.size == 0:
+        raise ConfigurationError(f"expected {name} as a number or of shape (m,), got {vector.shape}")
+    return vector.reshape(-1)
+
+
+def port_vectors(**values: ArrayLike) -> tuple[Array, Array]:
+    """Effort and flow of one port, see `port_vector`, of one size.
+
+    Raises:
+        ConfigurationError: What is no such vector, or of another size.
+    """
+    first, second = (port_vector(name, value) for name, value in values.items())
+    if first.size != second.size:
+        a, b = values
         raise ConfigurationError(
-            f"{a} and {b} are numbers or arrays of numbers, got {values[a]!r}, {values[b]!r}"
-        ) from None
-    if first.shape != second.shape or first.ndim > 1 or first.size == 0:
-        raise ConfigurationError(
-            f"expected {a} and {b} as numbers or of one shape (m,), got {first.shape} and {second.shape}"
+            f"expected {a} and {b} of one size, got {first.size} and {second.size} components"
         )
-    return first.reshape(-1), second.reshape(-1)
+    return first, second
 
 
 def port_energy(effort: Array, flow: Array, time_s: float) -> float:
@@ -51,7 +61,8 @@ def port_energy(effort: Array, flow: Array, time_s: float) -> float:
         ConfigurationError: For a product that is not finite: it has a factor that is not, or it overflows.
     """
     # One look at the product instead of two at the factors: this runs at every tick.
-    energy = float(effort @ flow) * time_s
+    with np.errstate(over="ignore", invalid="ignore"):
+        energy = float(effort @ flow) * time_s
     if not math.isfinite(energy):
         raise ConfigurationError(
             f"effort and flow must be finite, and so their product; got {effort} and {flow}"

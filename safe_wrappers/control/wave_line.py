@@ -7,9 +7,9 @@ puts out.
 
 Three rules say what is put out:
 
-- ``"queue"``: every wave that arrives is put out once, one per tick, in the order in which they were sent; zero
-  while there is none. Neither energy nor the wave's integral is lost to jitter, at the price of the delay of the
-  latest packet.
+- ``"queue"``: every wave that arrives is put out once, one per tick, the one that was sent first first; zero while
+  there is none. Neither energy nor the wave's integral is lost to jitter. The price is delay: every tick that found
+  the queue empty adds a tick, until it is that of the latest packet.
 - ``"hold"``: the newest wave that has arrived, as large as the reserve can pay for. The reserve is fed by packets
   that are overtaken or come several at once. The shortest delay; the wave's integral, and with it the position of
   the remote side, drifts.
@@ -28,7 +28,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.control.port_checks import port_energy, port_vectors, positive
+from safe_wrappers.control.port_checks import port_energy, port_vector, positive
 from safe_wrappers.control.running_sum import RunningSum
 from safe_wrappers.errors import ConfigurationError
 
@@ -192,7 +192,7 @@ class WaveLine:
         return 0.5 * port_energy(wave, wave, self._time)
 
     def _wave(self, given: ArrayLike) -> Array:
-        wave, _ = port_vectors(wave=given, other=given)
+        wave = port_vector("wave", given)
         if wave.size != self._components:
             raise ConfigurationError(f"expected a wave of {self._components} components, got {wave.size}")
         self._energy(wave)
