@@ -223,9 +223,9 @@ def round_trip_ceiling(
     """
     _not_negative(video_s=video_s, human_s=human_s, act_s=act_s)
     video, human, act = (np.asarray(late, dtype=np.float64) for late in (video_s, human_s, act_s))
-    return longest_lease(
-        clearance, speed, braking, video + human + act, localisation, margin, acceleration, top_speed
-    )
+    with np.errstate(over="ignore"):
+        late = video + human + act
+    return longest_lease(clearance, speed, braking, late, localisation, margin, acceleration, top_speed)
 
 
 def longest_lease_of_room(room: ArrayLike, closing_speed: ArrayLike, delays_s: ArrayLike) -> Array:
