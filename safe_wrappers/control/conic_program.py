@@ -17,9 +17,90 @@ Array = NDArray[np.float64]
 
 _UNBOUNDED = 1e30
 """What daqp takes as "no bound"."""
-_NO_ANSWER = "failed"
-_INFEASIBLE = "infeasible"
-_SOLVED = "solved"
+_ACCURACY = 1e-10
+"""What clarabel is asked for; a little less is taken, since the caller checks."""
+_FOUND = (
+    clarabel.SolverStatus.Solved,
+    clarabel.SolverStatus.AlmostSolved,
+    clarabel.SolverStatus.InsufficientProgress,
+)
+_NONE_EXISTS = (clarabel.SolverStatus.PrimalInfeasible, clarabel.SolverStatus.AlmostPrimalInfeasible)
+_FAILED, _INFEASIBLE, _SOLVED = "failed", "infeasible", "solved"
+
+
+class Program(NamedTuple):
+    """The program above, without cones where they are None.
+
+    Attributes:
+        hessian: Shape (n, n), positive definite.
+        linear: Shape (n,).
+        rows: Shape (k, n).
+        limits: Shape (k,).
+        lower: Shape (n,), -inf is no bound.
+        upper: Shape (n,), inf is no bound.
+        cones: C_i, shape (m, d, n).
+        cone_offsets: c_i, shape (m, d).
+    """
+
+    hessian: Array
+    linear: Array
+    rows: Array
+    limits: Array
+    lower: Array
+    upper: Array
+    cones: Array | None = None
+    cone_offsets: Array | None = None
+
+    def with_first(self, values: Array) -> "Program":
+        """The program in the other unknowns, the first ones given."""
+        i = len(values)
+        cones, offsets = self.cones, self.cone_offsets
+        if cones is not None and offsets is not None:
+            cones, offsets = cones[:, :, i:], offsets + cones[:, :, :i] @ values
+        return Program(
+            self.hessian[i:, i:],
+            self.linear[i:] + self.hessian[i:, :i] @ values,
+            self.rows[:, i:],
+            self.limits - self.rows[:, :i] @ values,
+            self.lower[i:],
+            self.upper[i:],
+            cones,
+            offsets,
+        )
+
+    def softened(self, count: int) -> "Program":
+        """The first rows may be broken: half the squares of what they are exceeded by is added to the objective."""
+        n, k = self.linear.size, self.limits.size
+        hessian = np.zeros((n + count, n + count))
+        hessian[:n, :n] = self.hessian
+        hessian[n:, n:] = np.eye(count)
+        give = np.zeros((k, count))
+        give[:count] = -np.eye(count)
+        none = np.full(count, np.inf)
+        cones = self.cones
+        if cones is not None:
+            cones = np.concatenate([cones, np.zeros((*cones.shape[:2], count))], axis=2)
+        return self._replace(
+            hessian=hessian,
+            linear=np.concatenate([self.linear, np.zeros(count)]),
+            rows=np.concatenate([self.rows, give], axis=1),
+            lower=np.concatenate([self.lower, -none]),
+            upper=np.concatenate([self.upper, none]),
+            cones=cones,
+        )
+
+    def scaled(self) -> tuple["Program", Array]:
+        """The same with unit curvature along each unknown, and what its answer is to be multiplied with."""
+        scale = 1.0 / np.sqrt(self.hessian.diagonal())
+        cones = None if self.cones is None else self.cones * scale
+        return self._replace(
+            hessian=self.hessian * scale * scale[:, None],
+            linear=self.linear * scale,
+            rows=self.rows * scale,
+            lower=self.lower / scale,
+            upper=self.upper / scale,
+            cones=cones,
+        ), scale
 
 
 class Candidate(NamedTuple):
@@ -34,69 +115,48 @@ class Candidate(NamedTuple):
     y: Array | None
 
 
-def by_daqp(
-    hessian: Array, linear: Array, rows: Array, limits: Array, lower: Array, upper: Array
-) -> Candidate:
-    """Active-set solution of a program without cones; `hessian` is positive definite."""
-    n, k = linear.size, limits.size
-    most = np.minimum(np.concatenate((upper, limits)), _UNBOUNDED)
-    least = np.concatenate((np.maximum(lower, -_UNBOUNDED), np.full(k, -_UNBOUNDED)))
+def by_daqp(program: Program) -> Candidate:
+    """Active-set solution of a program without cones."""
+    p, scale = program.scaled()
+    n, k = p.linear.size, p.limits.size
+    most = np.minimum(np.concatenate((p.upper, p.limits)), _UNBOUNDED)
+    least = np.concatenate((np.maximum(p.lower, -_UNBOUNDED), np.full(k, -_UNBOUNDED)))
     y, _, flag, _ = daqp.solve(
-        hessian, linear, np.ascontiguousarray(rows), most, least, np.zeros(n + k, np.int32)
+        p.hessian, p.linear, np.ascontiguousarray(p.rows), most, least, np.zeros(n + k, np.int32)
     )
     if flag == -1:
         return Candidate(_INFEASIBLE, None)
-    answer = np.asarray(y)
-    if flag < 1 or not np.isfinite(answer).all():
-        return Candidate(_NO_ANSWER, None)
-    return Candidate(_SOLVED, answer)
+    answer = np.asarray(y) * scale
+    return Candidate(_SOLVED, answer) if flag > 0 and np.isfinite(answer).all() else Candidate(_FAILED, None)
 
 
-def by_clarabel(
-    hessian: Array,
-    linear: Array,
-    rows: Array,
-    limits: Array,
-    lower: Array,
-    upper: Array,
-    cones: Array | None = None,
-    cone_offsets: Array | None = None,
-) -> Candidate:
-    """Interior-point solution, with cones or without.
-
-    Args:
-        hessian: Shape (n, n), positive semidefinite.
-        linear: Shape (n,).
-        rows: Shape (k, n).
-        limits: Shape (k,).
-        lower: Shape (n,), -inf is no bound.
-        upper: Shape (n,).
-        cones: C_i, shape (m, d, n).
-        cone_offsets: c_i, shape (m, d).
-    """
-    n = linear.size
-    at_most, at_least = np.flatnonzero(np.isfinite(upper)), np.flatnonzero(np.isfinite(lower))
+def by_clarabel(program: Program) -> Candidate:
+    """Interior-point solution, with cones or without."""
+    p, scale = program.scaled()
+    n = p.linear.size
+    at_most, at_least = np.flatnonzero(np.isfinite(p.upper)), np.flatnonzero(np.isfinite(p.lower))
     unit = np.eye(n)
-    matrix = [rows, unit[at_most], -unit[at_least]]
-    right = [limits, upper[at_most], -lower[at_least]]
-    count = limits.size + at_most.size + at_least.size
+    matrix = [p.rows, unit[at_most], -unit[at_least]]
+    right = [p.limits, p.upper[at_most], -p.lower[at_least]]
+    count = p.limits.size + at_most.size + at_least.size
     kinds = [clarabel.NonnegativeConeT(count)] if count else []
-    if cones is not None and cone_offsets is not None and len(cones):
-        matrix.append(-cones.reshape(-1, n))
-        right.append(cone_offsets.reshape(-1))
-        kinds += [clarabel.SecondOrderConeT(cones.shape[1])] * len(cones)
+    if p.cones is not None and p.cone_offsets is not None:
+        matrix.append(-p.cones.reshape(-1, n))
+        right.append(p.cone_offsets.reshape(-1))
+        kinds += [clarabel.SecondOrderConeT(p.cones.shape[1])] * len(p.cones)
     settings = clarabel.DefaultSettings()
     settings.verbose = False
-    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-10
-    upper_half = sparse.csc_matrix(np.triu(hessian))
-    constraints = sparse.csc_matrix(np.concatenate(matrix))
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = _ACCURACY
     solution = clarabel.DefaultSolver(
-        upper_half, linear, constraints, np.concatenate(right), kinds, settings
+        sparse.csc_matrix(np.triu(p.hessian)),
+        p.linear,
+        sparse.csc_matrix(np.concatenate(matrix)),
+        np.concatenate(right),
+        kinds,
+        settings,
     ).solve()
-    status = solution.status
-    if status in (clarabel.SolverStatus.PrimalInfeasible, clarabel.SolverStatus.AlmostPrimalInfeasible):
+    if solution.status in _NONE_EXISTS:
         return Candidate(_INFEASIBLE, None)
-    answer = np.asarray(solution.x)
-    if status not in (clarabel.SolverStatus.Solved, clarabel.SolverStatus.AlmostSolved):
-        return Candidate(_NO_ANSWER, None)
-    return Candidate(_SOLVED, answer) if np.isfinite(answer).all() else Candidate(_NO_ANSWER, None)
+    answer = np.asarray(solution.x) * scale
+    found = solution.status in _FOUND and np.isfinite(answer).all()
+    return Candidate(_SOLVED, answer) if found else Candidate(_FAILED, None)

@@ -130,7 +130,7 @@ def friction_pyramid(
     facing = np.stack([np.cos(middle), np.sin(middle)], axis=-1)
     slope = mu[..., None, None] * math.cos(math.pi / edges) * n[..., None, :]
     sides = facing @ frame - slope
-    return np.concatenate([sides, np.broadcast_to(-n, sides.shape[:-2] + (3,))[..., None, :]], axis=-2)
+    return np.concatenate([sides, np.broadcast_to(-n, (*sides.shape[:-2], 3))[..., None, :]], axis=-2)
 
 
 def _forces_and_normals(forces: ArrayLike, normals: ArrayLike) -> tuple[Array, Array]:

@@ -1,8 +1,8 @@
 """Joint positions within their range, not only now but until the end of a control step.
 
 Source: appendix "Hierarchical whole-body control quadratic program", its caveat: a bound on the present position is
-none on what happens between samples. With a constant acceleration the position is a parabola, and the largest one that
-keeps it below a limit all the way is known in closed form.
+none on what happens between samples. With a constant acceleration the position is a parabola, and the largest one
+that keeps it below a limit all the way is known in closed form.
 
 It is a bound for one step ahead. A joint that may still be stopped is another question: choose the horizon no shorter
 than stopping takes, or the next step finds no torque that is strong enough. And the acceleration of a machine is not

@@ -143,7 +143,7 @@ def _zmp(force: Array, moment: Array, ground: Plane) -> Array:
     arm = np.cross(ground.normal, moment)
     offset = np.full(arm.shape, np.nan)
     np.divide(arm, pressure[..., None], out=offset, where=pressure[..., None] > 0.0)
-    return ground.origin + offset
+    return np.asarray(ground.origin + offset)
 
 
 def support_polygon(points: ArrayLike) -> Array:

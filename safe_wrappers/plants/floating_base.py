@@ -5,9 +5,9 @@
 holds with MuJoCo's own accelerations and forces, to rounding. The base may float (a free joint) or not.
 
 Contacts are points: what MuJoCo adds for torsional and rolling friction (condim 4 and 6) is in `moments` and in no
-force. MuJoCo's contacts give way, and its solver asks for an acceleration `J qacc` of its own, without the drift `dJ/dt qvel`. The
-drift here is that of the points of the bodies that touch just now: where a round foot rolls, that point is drawn into
-the foot (by the square of the turning rate times the radius) while the contact lasts.
+force. MuJoCo's contacts give way, and its solver asks for an acceleration `J qacc` of its own, without the drift
+`dJ/dt qvel`. The drift here is that of the points of the bodies that touch just now: where a round foot rolls, that
+point is drawn into the foot (by the square of the turning rate times the radius) while the contact lasts.
 """
 
 from typing import NamedTuple
@@ -29,8 +29,8 @@ _CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
 class ContactPoints(NamedTuple):
     """The contacts that MuJoCo's solver has, k of them.
 
-    A contact's force acts on its `pushed` body, and against it on `pushed_by`. Of a contact with the world the world is
-    never the pushed one.
+    A contact's force acts on its `pushed` body, and against it on `pushed_by`. In a contact with the world, the world
+    is never the pushed one.
 
     Attributes:
         points: Shape (k, 3), m.
@@ -65,10 +65,10 @@ class FloatingBaseTerms(NamedTuple):
     Attributes:
         inertia: M with armature, shape (nv, nv).
         bias: h, shape (nv,): Coriolis, centrifugal and gravity forces, minus springs, damping and other passive
-            forces, minus forces applied from outside (`qfrc_applied`, `xfrc_applied`), minus what actuators do at zero
-            control (servos), minus constraint forces that are no contacts (joint limits, equalities, dry friction in
-            joints). The last depend on the accelerations: they are those that MuJoCo found for the control that
-            the data was made with.
+            forces, minus forces applied from outside (`qfrc_applied`, `xfrc_applied`), minus what actuators do at
+            zero control (servos), minus constraint forces that are no contacts (joint limits, equalities, dry
+            friction in joints). The last depend on the accelerations: they are those that MuJoCo found for the
+            control that the data was made with.
         actuation: B, shape (nv, nu): generalised force per control (gain, gear, moment arm), inside the actuators'
             force ranges.
         contacts: See `ContactPoints`.

@@ -1,0 +1,163 @@
+"""One instant of a robot in contact, as a whole-body controller is asked about it.
+
+Source: appendix "Floating-base equations of motion" and "Hierarchical whole-body control quadratic program":
+
+    M qacc + h = B u + sum J_k' f_k.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.errors import ConfigurationError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """Something to accelerate: `weight * |jacobian @ qacc + drift - target|^2` is added to the objective.
+
+    Attributes:
+        jacobian: Shape (r, nv).
+        drift: `dJ/dt qvel`, shape (r,).
+        target: Wanted acceleration, shape (r,).
+        weight: At least 0.
+    """
+
+    jacobian: Array
+    drift: Array
+    target: Array
+    weight: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class WholeBodyProblem:
+    """One instant of a robot in contact.
+
+    Attributes:
+        inertia: M, shape (nv, nv), positive definite.
+        bias: h, shape (nv,): Coriolis, centrifugal and gravity forces minus passive ones, on the left-hand side.
+        actuation: B, shape (nv, nu): generalised force per control.
+        jacobians: J_k of the contact points, shape (k, 3, nv); k may be 0.
+        drift: `dJ/dt qvel` of the contact points, shape (k, 3), m/s^2.
+        normals: Unit normals, pointing at what the forces push, shape (k, 3).
+        friction: Coefficients, at least 0, shape (k,). Without friction, at 0, a contact gives force, and is asked to
+            move as wanted, along its normal alone.
+        lower: Smallest control, shape (nu,).
+        upper: Largest control, shape (nu,).
+        nominal: The control to stay close to, shape (nu,).
+        contact_acceleration: Wanted of the contact points, shape (k, 3), m/s^2; None is none: the points stay.
+        control_weight: Of the squared distance from the nominal, positive, a number or shape (nu,).
+        force_weight: Of the squared contact forces, positive, per N^2. It chooses among forces that do the same;
+            a large one moves the control away from the nominal.
+        contact_softness: 0 asks for the wanted contact accelerations exactly. Larger: a miss r (m/s^2) costs
+            `r^2 / contact_softness` instead; a nominal that needs none is still left alone.
+        breaking: Contacts that are to open, shape (k,): their force is 0 and their acceleration along the normal is
+            at least the wanted one. None is none of them.
+        first_tangents: Direction of each pyramid's first edge, shape (k, 3); None chooses.
+        tasks: See `Task`; with any, no control is `inactive`.
+        acceleration_rows: G in `G qacc <= g`, shape (m, nv) (`predicted_position_rows` makes some).
+        acceleration_limits: g, shape (m,).
+        force_rows: R in `R f <= r`, f the stacked contact forces, shape (m', 3 k) (`support_rows` makes some).
+        force_limits: r, shape (m',).
+    """
+
+    inertia: Array
+    bias: Array
+    actuation: Array
+    jacobians: Array
+    drift: Array
+    normals: Array
+    friction: Array
+    lower: Array
+    upper: Array
+    nominal: Array
+    contact_acceleration: Array | None = None
+    control_weight: Array | float = 1.0
+    force_weight: float = 1e-8
+    contact_softness: float = 0.0
+    breaking: NDArray[np.bool_] | None = None
+    first_tangents: Array | None = None
+    tasks: Sequence[Task] = ()
+    acceleration_rows: Array | None = None
+    acceleration_limits: Array | None = None
+    force_rows: Array | None = None
+    force_limits: Array | None = None
+    stance: NDArray[np.intp] = field(init=False)
+    """Indices of the contacts that are to stay."""
+    opening: NDArray[np.intp] = field(init=False)
+    """Indices of the contacts that are to open."""
+    weights: Array = field(init=False)
+    """`control_weight` as an array, shape (nu,)."""
+    wanted: Array = field(init=False)
+    """`contact_acceleration`, or zeros, minus the drift: what `J qacc` is to be, shape (k, 3)."""
+
+    def __post_init__(self) -> None:
+        nv, nu, k = len(self.bias), len(self.nominal), len(self.normals)
+        limits = 0 if self.acceleration_limits is None else len(self.acceleration_limits)
+        force_limits = 0 if self.force_limits is None else len(self.force_limits)
+        for name, shape in (
+            ("inertia", (nv, nv)),
+            ("bias", (nv,)),
+            ("actuation", (nv, nu)),
+            ("jacobians", (k, 3, nv)),
+            ("drift", (k, 3)),
+            ("normals", (k, 3)),
+            ("friction", (k,)),
+            ("lower", (nu,)),
+            ("upper", (nu,)),
+            ("nominal", (nu,)),
+            ("contact_acceleration", (k, 3)),
+            ("breaking", (k,)),
+            ("first_tangents", (k, 3)),
+            ("acceleration_rows", (limits, nv)),
+            ("acceleration_limits", (limits,)),
+            ("force_rows", (force_limits, 3 * k)),
+            ("force_limits", (force_limits,)),
+        ):
+            value = getattr(self, name)
+            if value is None:
+                continue
+            if value.shape != shape:
+                raise ConfigurationError(f"expected {name} of shape {shape}, got {value.shape}")
+            if name not in ("lower", "upper") and not np.isfinite(value).all():
+                raise ConfigurationError(f"{name} must be finite, got {value}")
+        for task in self.tasks:
+            rows = len(task.target)
+            if task.jacobian.shape != (rows, nv) or task.drift.shape != (rows,):
+                raise ConfigurationError(
+                    f"expected a task's jacobian (r, {nv}), drift (r,) and target (r,), got "
+                    f"{task.jacobian.shape}, {task.drift.shape} and {task.target.shape}"
+                )
+            if not (0.0 <= task.weight < np.inf):
+                raise ConfigurationError(f"a task's weight must be 0 or more and finite, got {task.weight}")
+            if not all(np.isfinite(a).all() for a in (task.jacobian, task.drift, task.target)):
+                raise ConfigurationError("a task must be finite")
+        for rows_name, limits_name in (
+            ("acceleration_rows", "acceleration_limits"),
+            ("force_rows", "force_limits"),
+        ):
+            if (getattr(self, rows_name) is None) != (getattr(self, limits_name) is None):
+                raise ConfigurationError(f"{rows_name} and {limits_name} come together")
+        if not (self.lower <= self.upper).all():
+            raise ConfigurationError(f"lower must not exceed upper, got {self.lower} and {self.upper}")
+        if not (self.friction >= 0.0).all():
+            raise ConfigurationError(f"friction must be 0 or more, got {self.friction}")
+        weights = np.broadcast_to(np.asarray(self.control_weight, dtype=np.float64), (nu,))
+        if not (np.isfinite(weights).all() and (weights > 0.0).all()):
+            raise ConfigurationError(f"control_weight must be positive and finite, got {self.control_weight}")
+        if not 0.0 < self.force_weight < np.inf:
+            raise ConfigurationError(f"force_weight must be positive and finite, got {self.force_weight}")
+        if not 0.0 <= self.contact_softness < np.inf:
+            raise ConfigurationError(
+                f"contact_softness must be 0 or more and finite, got {self.contact_softness}"
+            )
+        opens = np.zeros(k, bool) if self.breaking is None else np.asarray(self.breaking, bool)
+        acceleration = 0.0 if self.contact_acceleration is None else self.contact_acceleration
+        object.__setattr__(self, "stance", np.flatnonzero(~opens))
+        object.__setattr__(self, "opening", np.flatnonzero(opens))
+        object.__setattr__(self, "weights", weights)
+        object.__setattr__(self, "wanted", acceleration - self.drift)
