@@ -73,6 +73,9 @@ def test_waves_by_hand():
     assert port_power(np.full((5, 2), 4.0), np.full((5, 2), 1.0)).tolist() == [8.0] * 5
 
 
+DT = 0.01
+
+
 class Machine:
     """m x'' + c x' + k x = F, from rest under a constant force: everything in closed form."""
 
@@ -164,8 +167,26 @@ def test_a_million_steps_do_not_drift():
     total = RunningSum(1.0)
     for value in values.tolist():
         total.add(value)
-    exact = math.fsum([1.0, *values.tolist()])
-    assert abs(total.value - exact) <= 1e-15 * abs(exact) + 1e-18 * np.abs(values).sum()
+    exact, size = math.fsum([1.0, *values.tolist()]), float(np.abs(values).sum())
+    eps = np.finfo(float).eps
+    bound = 2.0 * eps * abs(exact) + values.size * eps**2 * size
+    assert abs(total.value - exact) <= bound
+    assert abs(sum(values.tolist(), 1.0) - exact) > 1e3 * bound  # which adding up one by one is far from
+
+
+def test_rounding_is_not_activity():
+    rng, by_rounding = np.random.default_rng(0), 0
+    for _ in range(100):
+        ledger, pieces = EnergyLedger(), rng.uniform(0.1, 1.0, size=7)
+        for piece in pieces:
+            ledger.add(piece, 0.3, DT)
+        ledger.add(-math.fsum(pieces.tolist()), 0.3, DT)
+        by_rounding += ledger.extracted_j > 0.0
+        assert ledger.passive
+        assert ledger.extracted_j <= ledger.rounding_j < 1e-14
+        ledger.add(-1e-9, 0.3, DT)
+        assert not ledger.passive
+    assert by_rounding > 5
 
 
 class Behind:

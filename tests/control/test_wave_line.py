@@ -132,13 +132,13 @@ def test_hold_is_paid_from_what_came_in_surplus():
 
 
 def test_hold_takes_the_newest_and_an_older_one_pays_only():
-    line = WaveLine(DT, "hold")
-    line.send(1.0, 5)
-    line.send(3.0, 6)
-    assert line.deliver([(6, 3.0)]) == 3.0
-    late = line.deliver([(5, 1.0)])
-    assert late == pytest.approx(1.0)  # the newest, 3, made as small as the energy of 1
-    assert late**2 <= 1.0
+    line = WaveLine(DT, "hold", components=2)
+    line.send([1.0, 0.0], 5)
+    line.send([0.0, 3.0], 6)
+    np.testing.assert_array_equal(line.deliver([(6, [0.0, 3.0])]), [0.0, 3.0])
+    late = line.deliver([(5, [1.0, 0.0])])
+    np.testing.assert_allclose(late, [0.0, 1.0])  # the newest, made as small as the energy of the older
+    assert late @ late <= 1.0
 
 
 def test_zero_adds_what_comes_at_once_and_scales_it_to_its_energy():
