@@ -1,4 +1,4 @@
-"""A tool that is pressed against a stiff wall and swept along it towards a clamp: the remote end of a teleoperation."""
+"""A tool pressed against a stiff wall and swept along it towards a clamp: the remote end of a teleoperation."""
 
 import math
 from collections.abc import Mapping
@@ -173,7 +173,7 @@ class TeleopContactEnv(MujocoEnv, EzPickle):
         wall = float(-self.model.geom_solref[self._wall, 0] / self.model.body("tool").invweight0[0])
         pressed = max(x + TOOL_RADIUS - WALL_X, 0.0) ** 2 + max(y + TOOL_RADIUS - CLAMP_Y, 0.0) ** 2
         moving = float(self.model.body("tool").mass[0]) * (vx * vx + vy * vy)
-        return 0.5 * (moving + self._stiffness * stretched + wall * pressed)
+        return float(0.5 * (moving + self._stiffness * stretched + wall * pressed))
 
     # Gymnasium ---------------------------------------------------------------------------------------------
 

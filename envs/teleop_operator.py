@@ -27,9 +27,9 @@ class TeleopOperator:
 
         mass dv/dt = damping (intended velocity - v) + intended force - returned force
 
-    The hand's velocity v is the action. The **mind** sees the observation one reaction time later, and decides from it
-    what to intend: approach until it touches, press with the wanted force, sweep while what it sees as the clearance
-    allows.
+    The hand's velocity v is the action. The **mind** sees the observation one reaction time later, and decides from
+    it what to intend: approach until it touches, press with the wanted force, sweep while what it sees as the
+    clearance allows.
 
     A model, not a human: a real one adapts, stiffens and tires, and is not passive without evidence.
 

@@ -47,8 +47,12 @@ from safe_wrappers.wrappers.contact_monitor import ContactMonitor
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
+from safe_wrappers.wrappers.round_trip_watch import RoundTripCeiling
 from safe_wrappers.wrappers.sensor import Sensor
 from safe_wrappers.wrappers.slip_limiter import SlipLimiter
+from safe_wrappers.wrappers.teleop_channel import TeleopChannel
+from safe_wrappers.wrappers.teleop_link import Link
+from safe_wrappers.wrappers.teleop_port import TeleopPort
 from safe_wrappers.wrappers.track import Track
 
 __all__ = [
@@ -72,18 +76,22 @@ __all__ = [
     "JointPositionLimit",
     "JointSpeedLimit",
     "LeaseExpiry",
+    "Link",
     "MujocoPlant",
     "OcclusionPenalty",
     "Plane",
     "Plant",
     "Projection",
     "RecordInterventions",
+    "RoundTripCeiling",
     "SafeWrappersError",
     "Sensor",
     "SingularityMargin",
     "SlipLimiter",
     "SpeedLimit",
     "Sphere",
+    "TeleopChannel",
+    "TeleopPort",
     "Track",
     "TrackPermission",
     "TrackedDiscs",

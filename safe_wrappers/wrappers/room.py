@@ -111,6 +111,25 @@ class Room:
             self._plant.observe()
             self.constraint.check(self._plant)
 
+    def approach(self) -> tuple[Array, Array]:
+        """Clearances (m) and approach speeds (m/s) as they are now, reserves not taken off, shapes (k,).
+
+        Only where they are measured: by a constraint with `approach`, or by the user's function.
+        """
+        if self.constraint is not None:
+            self._plant.observe()
+        return self._read()
+
+    @property
+    def braking(self) -> dict[str, float]:
+        """What a stop takes, as the laws of `control.leases` want it; only where the approach is measured."""
+        return {"braking": self._braking, "localisation": self._localisation, "margin": self._margin}
+
+    @property
+    def driving(self) -> dict[str, float]:
+        """What any command may cause until then, likewise."""
+        return {"acceleration": self._acceleration, "top_speed": self._top_speed}
+
     def longest_lease(self, delays_s: float) -> float:
         """The longest lease from here, s; zero or less: revoke.
 
