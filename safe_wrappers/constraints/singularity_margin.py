@@ -57,6 +57,9 @@ class SingularityMargin(Predicted):
     It keeps away from one kind of failure of an inverse: it limits neither joint rates (`JointSpeedLimit`) nor
     torques, and what a drive does at its own limits is the drive's.
 
+    `value`, and so `cbf/margin`, is w over the threshold, less 1: -1 is singular. w itself has no fixed scale (it is
+    0.01 m^2 at most for Reacher, 0.003 m^6 for Fetch's hand), and tolerances need one.
+
     A start below the threshold (Reacher's and Pusher's arms begin stretched) counts as `cbf/unsafe`; the filter
     brings w up again. Whatever task needs the poses below loses them.
 
@@ -75,10 +78,10 @@ class SingularityMargin(Predicted):
             the frame. Where none does (Fetch's arm is pulled by its hand) name them.
         task_speed: That has to be possible in every direction, m/s (rad/s if the task is of rotations alone).
         rate_limit: Largest rate of each joint that this may take, rad/s for hinges, m/s for slides.
-        margin: Kept free above the threshold.
+        margin: Kept free above the threshold, as a share of it.
         holds: Control steps to look ahead; cover the time that braking takes.
-        reach: The most that w can fall within `holds` control steps in the declared envelope; states with more than
-            that left need no forecast. None forecasts always.
+        reach: The most that w can fall within `holds` control steps in the declared envelope, in shares of the
+            threshold; states with more than that left need no forecast. None forecasts always.
 
     Attributes:
         validated: What the sample said of the threshold; None if it was given, or before the constraint is bound.
@@ -101,7 +104,7 @@ class SingularityMargin(Predicted):
 
     promise: Promise = field(default="best effort", init=False)
     validated: ValidatedThreshold | None = field(default=None, init=False, repr=False, compare=False)
-    unit: ClassVar[str] = "units of manipulability"
+    unit: ClassVar[str] = "shares of the threshold"
 
     def __post_init__(self) -> None:
         speed, limit = self.task_speed, self.rate_limit
@@ -112,7 +115,7 @@ class SingularityMargin(Predicted):
                 f"threshold={self.threshold!r}, task_speed={self.task_speed!r}, rate_limit={self.rate_limit!r}"
             )
         if self.threshold is not None:
-            self.threshold = positive("threshold", self.threshold, self.unit)
+            self.threshold = positive("threshold", self.threshold, "units of manipulability")
         if speed is not None and limit is not None:
             self.task_speed = positive("task_speed", speed, "task units per second")
             self.rate_limit = positive("rate_limit", limit, "rad/s or m/s")
@@ -135,11 +138,6 @@ class SingularityMargin(Predicted):
                 raise ConfigurationError("joints is a list of names, or None for every driven joint; got []")
         self._rows, self._weights = task_rows(self.directions, self.rotations, self.length)
         self._check_shared()
-
-    @property
-    def scale(self) -> float:
-        """The threshold."""
-        return self._least_allowed
 
     def bind(self, plant: Plant) -> None:
         """Resolve frame and joints; refuse what no configuration can do."""
@@ -174,14 +172,14 @@ class SingularityMargin(Predicted):
         if self.threshold is None:
             assert self.task_speed is not None and self.rate_limit is not None
             self.validated = validated_threshold(self._task(sampled), self.task_speed, self.rate_limit)
-            self._least_allowed = self.validated.threshold
+            self._threshold = self.validated.threshold
         else:
-            self._least_allowed = self.threshold
-        if self._least_allowed + self.margin >= most:
+            self._threshold = self.threshold
+        if self._threshold * (1.0 + self.margin) >= most:
             raise ConfigurationError(
-                f"no configuration has a manipulability above {self._least_allowed:g} with a margin of "
-                f"{self.margin:g}: the largest of {_SAMPLES} in the joints' ranges is {most:.4g}, half of them are "
-                f"above {float(np.median(found)):.4g}"
+                f"no configuration has a manipulability above {self._threshold:g} with a margin of "
+                f"{self.margin:g} of it: the largest of {_SAMPLES} in the joints' ranges is {most:.4g}, half of "
+                f"them are above {float(np.median(found)):.4g}"
             )
 
     def _task(self, qpos: Array) -> Array:
@@ -211,10 +209,10 @@ class SingularityMargin(Predicted):
         w = self._measure(plant.qpos[None])
         if w[0] < 0.0:
             self._side, w = -1.0, -w
-        return np.asarray(w - self._least_allowed)
+        return np.asarray(w / self._threshold - 1.0)
 
     def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
-        return np.asarray(self._measure(forecast.qpos) - self._least_allowed)[:, None]
+        return np.asarray(self._measure(forecast.qpos) / self._threshold - 1.0)[:, None]
 
     def _slope(self, qpos: Array) -> Array:
         """dw/dq over the chain's joints, shape (k, n)."""
@@ -242,7 +240,7 @@ class SingularityMargin(Predicted):
         speeds = plant.qvel[self._chain.dofs]
         along = np.tile(plant.qpos, (3, 1))
         along[1:, self._chain.qpos] += np.outer([_ALONG_S, -_ALONG_S], speeds)
-        slope, ahead, behind = self._slope(along)
+        slope, ahead, behind = self._slope(along) / self._threshold
         curvature = (ahead - behind) @ speeds / (2.0 * _ALONG_S)
         a = 1.0 / (_DECAY_HOLDS * plant.hold_s)
         left = 2.0 * a * (slope @ speeds) + a * a * (self._least - self.margin)

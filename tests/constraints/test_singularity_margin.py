@@ -1,0 +1,519 @@
+"""SingularityMargin: w against MuJoCo's Jacobians, its row against accelerations, loops that seek singularity."""
+
+import copy
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from fetch_truth import ARM, watch
+from gymnasium.envs.registration import EnvSpec
+from judged_loops import DRIVERS, Judge, Scene, drive, flagged
+
+import safe_wrappers as sw
+from safe_wrappers.control.manipulability import validated_threshold
+from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+
+CHAIN = """<mujoco><compiler angle="radian"/><option timestep="0.002"><flag contact="disable"/></option><worldbody>
+<body name="base" pos=".1 0 1" euler="20 10 30"><joint name="rail" type="slide" axis="1 .2 0" range="-.5 .5"
+  limited="true"/><geom size=".05"/>
+<body name="upper" pos="0 .1 .1"><joint name="a" axis="0 1 0"/><joint name="b" axis=".3 0 1" pos=".1 0 0"/>
+<geom type="capsule" fromto="0 0 0 .3 .1 0" size=".02"/>
+<body name="lower" pos=".3 .1 0" euler="20 30 40"><joint name="c" axis="1 .2 0" range="-2 2" limited="true"/>
+<geom name="shin" type="box" pos=".1 .05 .02" quat=".5 .5 .1 .2" size=".05 .02 .03"/>
+<body name="hand" pos=".2 0 .1"><joint name="d" axis="0 0 1"/><geom size=".03"/>
+<site name="tip" pos=".2 -.1 .05" euler="10 0 70"/></body></body></body></body></worldbody>
+<actuator><motor joint="rail" ctrlrange="-50 50"/><motor joint="a" ctrlrange="-9 9"/>
+<motor joint="b" ctrlrange="-9 9"/><motor joint="c" ctrlrange="-3 3"/></actuator></mujoco>"""
+"""A slide and hinges, two in one body and off its origin, frames turned against each other; d has no motor."""
+DRIVEN = ["rail", "a", "b", "c"]
+
+
+def bound(env, limit, plant=None):
+    plant = plant or sw.MujocoPlant()
+    plant.bind(env)
+    limit.bind(plant)
+    limit.reset()
+    plant.observe()
+    return plant
+
+
+def true_w(model, data, kind, name, joints, directions="xyz", rotations="", length=1.0, own=False):
+    """sqrt(det) by the singular values of MuJoCo's own Jacobian; positions are up to date."""
+    mujoco.mj_comPos(model, data)
+    linear, angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+    index = getattr(model, kind)(name).id
+    call = {"body": mujoco.mj_jacBody, "site": mujoco.mj_jacSite, "geom": mujoco.mj_jacGeom}[kind]
+    call(model, data, linear, angular, index)
+    if own:
+        axes = getattr(data, {"body": "xmat", "site": "site_xmat", "geom": "geom_xmat"}[kind])[index]
+        linear, angular = axes.reshape(3, 3).T @ linear, axes.reshape(3, 3).T @ angular
+    rows = [linear["xyz".index(d)] for d in directions] + [
+        length * angular["xyz".index(r)] for r in rotations
+    ]
+    columns = model.jnt_dofadr[[model.joint(j).id for j in joints]]
+    return float(np.prod(np.linalg.svd(np.array(rows)[:, columns], compute_uv=False)))
+
+
+TASKS = {
+    "a site, all directions": ({"site": "tip"}, {}),
+    "a geom in its own axes": (
+        {"geom": "shin", "directions": "xz", "frame": "own"},
+        {"directions": "xz", "own": True},
+    ),
+    "a body in the world's": ({"body": "hand", "directions": "zy"}, {"directions": "zy"}),
+    "with a rotation": (
+        {"site": "tip", "directions": "xz", "rotations": "y", "length": 0.3, "frame": "own"},
+        {"directions": "xz", "rotations": "y", "length": 0.3, "own": True},
+    ),
+    "rotations alone, named joints": (
+        {"site": "tip", "directions": "", "rotations": "xz", "joints": ["d", "a", "b"]},
+        {"directions": "", "rotations": "xz", "joints": ["a", "b", "d"]},
+    ),
+    "as many joints as directions": (
+        {"site": "tip", "joints": ["a", "b", "c"]},
+        {"joints": ["a", "b", "c"]},
+    ),
+}
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_w_is_that_of_mujoco_s_jacobian_now_and_ahead(task):
+    arguments, truth = TASKS[task]
+    env, threshold = Scene(CHAIN), 1e-3
+    limit = sw.SingularityMargin(threshold, holds=2, **arguments)
+    plant = bound(env, limit)
+    kind = next(k for k in ("site", "body", "geom") if k in arguments)
+    rng, still = np.random.default_rng(0), mujoco.MjData(env.model)
+
+    def expected(qpos):
+        still.qpos[:] = qpos
+        mujoco.mj_kinematics(env.model, still)
+        return (
+            true_w(env.model, still, kind, arguments[kind], **{"joints": DRIVEN, **truth}) / threshold - 1.0
+        )
+
+    for _ in range(8):
+        env.data.qpos[:], env.data.qvel[:] = rng.uniform(-1.5, 1.5, (2, 5))
+        plant.observe()
+        assert limit.value(plant) == pytest.approx(expected(env.data.qpos), rel=1e-9, abs=1e-9)
+        forecast = plant.forecast(rng.uniform(-3.0, 3.0, 4), 2)
+        room = limit._room(plant, forecast)
+        assert room.shape == (10, 1)
+        for k in range(10):
+            # Beyond a singular pose a square task counts as negative; the difference has a test of its own.
+            assert abs(room[k, 0] + 1.0) == pytest.approx(
+                expected(forecast.qpos[k]) + 1.0, rel=1e-8, abs=1e-8
+            )
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_its_row_is_the_second_derivative_of_w_under_a_torque(task):
+    arguments, _ = TASKS[task]
+    env = Scene(CHAIN)
+    limit = sw.SingularityMargin(1e-2, margin=0.1, **arguments)
+    plant = bound(env, limit)
+    rng, data = np.random.default_rng(1), mujoco.MjData(env.model)
+    h, a, checked = 3e-5, 1.0 / (2.0 * plant.hold_s), 0
+    for _ in range(12):
+        env.data.qpos[:] = rng.uniform(-1.2, 1.2, 5) * [0.3, 1.0, 1.0, 1.0, 1.0]
+        env.data.qvel[:] = rng.uniform(-1.0, 1.0, 5)
+        plant.observe()
+        w = float(limit.value(plant)[0]) + 1.0
+        if w < 0.3:
+            continue  # near the kink of |w| differences are no judge
+        rows = limit.rows(plant)
+        assert rows.normals.shape == (1, 4)
+        for u in rng.uniform(-3.0, 3.0, (2, 4)):
+            data.qpos[:], data.qvel[:], data.ctrl[:] = env.data.qpos, env.data.qvel, u
+            mujoco.mj_forward(env.model, data)
+            acceleration, ways = data.qacc.copy(), []
+            for t in (-h, 0.0, h):
+                env.data.qpos[:] = data.qpos + t * data.qvel + 0.5 * t * t * acceleration
+                plant.observe()
+                ways.append(float(limit.value(plant)[0]))
+            env.data.qpos[:] = data.qpos
+            rate, curve = (ways[2] - ways[0]) / (2.0 * h), (ways[2] - 2.0 * ways[1] + ways[0]) / h**2
+            wanted = curve + 2.0 * a * rate + a * a * (w - 1.0 - 0.1)
+            left = float(rows.offsets[0] - rows.normals[0] @ u)
+            assert left == pytest.approx(wanted, rel=1e-3, abs=1e-3 * a * a)
+            checked += 1
+    assert checked >= 8
+
+
+def test_an_arm_on_a_base_that_floats_has_no_row_and_one_that_is_moved_by_hand_is_where_it_is():
+    floating = CHAIN.replace(
+        '<joint name="rail" type="slide" axis="1 .2 0" range="-.5 .5"\n  limited="true"/>', ""
+    )
+    floating = floating.replace('<motor joint="rail" ctrlrange="-50 50"/>', "")
+    env = Scene(floating.replace('<geom size=".05"/>', '<freejoint/><geom size=".05"/>'))
+    limit = sw.SingularityMargin(1e-3, site="tip", directions="xy")
+    plant = bound(env, limit)
+    assert limit.rows(plant).normals.shape == (0, 3)
+    env.data.qpos[3:7] = np.array([0.5, 0.1, 0.7, 0.5])
+    mujoco.mj_forward(env.model, env.data)
+    plant.observe()
+    wanted = true_w(env.model, env.data, "site", "tip", ["a", "b", "c"], "xy")
+    assert limit.value(plant) == pytest.approx(wanted / 1e-3 - 1.0)
+
+    env = Scene(floating.replace('<body name="base"', '<body name="base" mocap="true"'))
+    limit = sw.SingularityMargin(1e-3, site="tip", directions="xy")
+    plant = bound(env, limit)
+    env.data.mocap_quat[0] = [0.8, 0.0, 0.6, 0.0]
+    env.data.qpos[:] = 0.4
+    mujoco.mj_forward(env.model, env.data)
+    plant.observe()
+    wanted = true_w(env.model, env.data, "site", "tip", ["a", "b", "c"], "xy")
+    assert limit.value(plant) == pytest.approx(wanted / 1e-3 - 1.0)
+
+
+def test_a_square_task_is_not_passed_through_its_singular_pose():
+    env = gym.make("Reacher-v5")
+    limit = sw.SingularityMargin(0.003, body="fingertip", directions="xy")
+    for side in (1.0, -1.0):
+        env.reset(seed=0)
+        env.unwrapped.set_state(
+            np.array([0.3, side * 0.5, 0.1, -0.1]), np.array([0.0, -side * 40.0, 0.0, 0.0])
+        )
+        plant = bound(env, limit)
+        assert limit.value(plant) == pytest.approx(0.011 * np.sin(0.5) / 0.003 - 1.0)
+        forecast = plant.forecast(np.zeros(2), 2)
+        crossing = forecast.qpos[:, 1]
+        assert (crossing * side).min() < -0.2  # it does pass through, to where w is large again
+        np.testing.assert_allclose(
+            limit._room(plant, forecast)[:, 0], side * 0.011 * np.sin(crossing) / 0.003 - 1.0
+        )
+        assert not limit.admits(plant, np.zeros(2))
+
+
+def test_a_copy_has_kinematics_of_its_own():
+    env = Scene(CHAIN)
+    limit = sw.SingularityMargin(1e-3, site="tip")
+    plant = bound(env, limit)
+    twin = copy.deepcopy(limit)
+    env.data.qpos[:] = [0.1, 0.5, -0.4, 0.3, 0.2]
+    plant.observe()
+    assert twin.value(plant) == limit.value(plant)
+
+
+# A validated threshold ----------------------------------------------------------------------------------------
+
+
+def test_a_validated_threshold_is_that_of_the_sampled_configurations():
+    env = Scene(CHAIN)
+    limit = sw.SingularityMargin(site="tip", task_speed=0.1, rate_limit=2.0)
+    bound(env, limit)
+    found = limit.validated
+    assert found.samples == 2000 and 0 < found.exceeding < 2000 and found.above > 0
+    # A second draw, by MuJoCo's Jacobians: what exceeds above the threshold is as rare as the sample says.
+    rng, data, jacobians = np.random.default_rng(5), mujoco.MjData(env.model), []
+    for _ in range(2000):
+        data.qpos[:] = rng.uniform([-0.5, -np.pi, -np.pi, -2.0, -np.pi], [0.5, np.pi, np.pi, 2.0, np.pi])
+        mujoco.mj_kinematics(env.model, data)
+        mujoco.mj_comPos(env.model, data)
+        linear = np.zeros((3, 5))
+        mujoco.mj_jacSite(env.model, data, linear, None, env.model.site("tip").id)
+        jacobians.append(linear[:, :4])
+    again = validated_threshold(jacobians, 0.1, 2.0)
+    assert again.exceeding == pytest.approx(found.exceeding, rel=0.2)
+    w = np.prod(np.linalg.svd(jacobians, compute_uv=False), axis=1)
+    need = 0.1 * np.linalg.norm(np.linalg.pinv(jacobians), axis=2).max(axis=1)
+    assert ((w > found.threshold) & (need > 2.0)).mean() <= 2.0 * found.unseen(0.99)
+    given = sw.SingularityMargin(found.threshold, site="tip")
+    plant = bound(env, given)
+    assert given.validated is None and given.value(plant) == limit.value(plant)
+
+
+def test_no_threshold_that_keeps_the_rates_is_an_error():
+    with pytest.raises(ConfigurationError, match="no threshold on w keeps the rate limit"):
+        bound(Scene(CHAIN), sw.SingularityMargin(site="tip", task_speed=5.0, rate_limit=0.1))
+
+
+# Closed loops -------------------------------------------------------------------------------------------------
+
+
+def reacher_room(threshold):
+    return lambda model, data: 0.011 * abs(np.sin(data.qpos[1])) / threshold - 1.0
+
+
+def pusher_room(threshold):
+    joints = ["r_shoulder_pan_joint", "r_shoulder_lift_joint", "r_upper_arm_roll_joint", "r_elbow_flex_joint"]
+    return lambda model, data: true_w(model, data, "body", "tips_arm", joints) / threshold - 1.0
+
+
+CASES = {
+    "Reacher": ("Reacher-v5", 0.0033, {"body": "fingertip", "directions": "xy", "holds": 5}, reacher_room),
+    "Pusher": ("Pusher-v5", 0.05, {"body": "tips_arm", "holds": 8}, pusher_room),
+}
+
+
+def filtered(case, plant=None, **more):
+    env_id, threshold, arguments, _ = CASES[case]
+    # Braking from full speed takes Reacher's arm far longer than any sensible look-ahead.
+    speeds = [sw.JointSpeedLimit(10.0, margin=0.01)] if case == "Reacher" else []
+    limit = sw.SingularityMargin(threshold, **arguments, **more)
+    return sw.CBFActionFilter(gym.make(env_id, disable_env_checker=True), [*speeds, limit], plant)
+
+
+def check_closed_loop(case, driver, steps, seeds, plant=None, **more):
+    _, threshold, _, room = CASES[case]
+    with pytest.warns(sw.UnsafeStateWarning):  # these arms start stretched
+        seen = drive(filtered(case, plant, **more), room(threshold), driver, steps, seeds)
+    assert seen["intervened"] > 0 and seen["flagged"] <= 0.1 * seen["steps"]
+    assert (
+        seen["outside"] <= 0.7 * seen["steps"]
+    )  # the start, which a driver that seeks it does not end itself
+    return seen
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+@pytest.mark.parametrize("case", CASES)
+def test_no_step_that_is_not_flagged_goes_below_the_threshold(case, driver):
+    check_closed_loop(case, driver, 45, [1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("driver", DRIVERS)
+@pytest.mark.parametrize("case", CASES)
+def test_no_step_that_is_not_flagged_goes_below_the_threshold_for_long(case, driver):
+    check_closed_loop(case, driver, 400, range(3))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_margin_covers_a_plant_that_is_wrong(case):
+    plant = sw.MujocoPlant()
+    plant.perturb(mass=1.2, damping=0.8)
+    check_closed_loop(case, "bang_bang", 80, [1], plant, margin=0.1)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_from_the_stretched_start_it_comes_back_and_says_so(case):
+    _, threshold, _, room = CASES[case]
+    env = filtered(case)
+    judge = Judge(env, room(threshold))
+    with pytest.warns(sw.UnsafeStateWarning):
+        env.reset(seed=0)
+        rooms, unsafe = [judge.at(judge.raw.data)], []
+        assert rooms[0] < -0.5
+        for _ in range(30):
+            _, end, _, info = judge.step(env, np.zeros(env.action_space.shape, np.float32))
+            rooms.append(end)
+            unsafe.append(info["cbf/unsafe"])
+    inside = int(np.argmax(np.array(rooms) >= -1e-6))
+    assert 0 < inside <= 25 and min(rooms[inside:]) >= -1e-6
+    assert all(unsafe[: inside - 1]) and not any(unsafe[inside + 1 :])
+
+
+def test_far_above_the_threshold_the_actions_pass_bit_for_bit():
+    start = np.array([0.0, 1.5, 0.1, -0.1]), np.zeros(4)
+    bare = gym.make("Reacher-v5").unwrapped
+    env = sw.CBFActionFilter(
+        gym.make("Reacher-v5").unwrapped, [sw.SingularityMargin(1e-4, body="fingertip", directions="xy")]
+    )
+    rng = np.random.default_rng(0)
+    bare.reset(seed=3)
+    env.reset(seed=3)
+    bare.set_state(*start)
+    env.unwrapped.set_state(*start)
+    for _ in range(20):
+        action = rng.uniform(-0.2, 0.2, 2).astype(np.float32)
+        a, b = bare.step(action), env.step(action)
+        assert a[0].tobytes() == b[0].tobytes() and not b[4]["cbf/intervened"]
+
+
+def test_what_cannot_be_is_infeasible_and_the_action_stays_sound():
+    straight = sw.JointPositionLimit(-0.1, 0.1, joints=["joint1"])
+    bent = sw.SingularityMargin(0.0033, body="fingertip", directions="xy")
+    env = sw.CBFActionFilter(gym.make("Reacher-v5"), [straight, bent])
+    rng = np.random.default_rng(0)
+    with pytest.warns(sw.UnsafeStateWarning):
+        env.reset(seed=0)
+    for _ in range(10):
+        info = env.step(rng.uniform(-1.0, 1.0, 2).astype(np.float32))[4]
+        assert info["cbf/infeasible"] and info["cbf/fallback"]
+        assert np.isfinite(info["executed_action"]).all() and (np.abs(info["executed_action"]) <= 1.0).all()
+
+
+# Fetch --------------------------------------------------------------------------------------------------------
+
+LENGTH, FETCH_THRESHOLD = 0.3, 3e-4
+GRIP = {"site": "robot0:grip", "rotations": "xyz", "length": LENGTH, "joints": ARM}
+AWAY = np.array([[2.5, 0.75, 0.5], [1.3, 1.9, 0.5], [1.3, 0.75, 1.8], [1.9, 0.75, 1.0], [2.0, 1.5, 0.6]])
+"""Places that the arm cannot reach but stretched."""
+
+
+def fetch(env_id, limited=True):
+    gym.register_envs(pytest.importorskip("gymnasium_robotics"))
+    env = gym.make(env_id, max_episode_steps=1000, disable_env_checker=True)
+    seen = watch(env, LENGTH)
+    if limited:
+        env = sw.CBFActionFilter(env, [sw.SingularityMargin(FETCH_THRESHOLD, holds=5, **GRIP)])
+    return env, seen
+
+
+def stretched(env, k):
+    """Full speed to somewhere far away, and after 30 steps elsewhere."""
+    raw = env.unwrapped
+    away = AWAY[(k // 30) % len(AWAY)] - raw.data.site("robot0:grip").xpos
+    return np.append(np.clip(away / 0.05, -1.0, 1.0), 0.0).astype(np.float32)
+
+
+def turned(env, k):
+    return np.sign(np.random.default_rng(k // 12).normal(size=4)).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "driver", "steps"), [("FetchReach-v4", stretched, 45), ("FetchPush-v4", turned, 45)]
+)
+def test_on_fetch_no_step_that_is_not_flagged_goes_below_the_threshold(env_id, driver, steps):
+    env, seen = fetch(env_id)
+    assert isinstance(env.plant, sw.DisplacementPlant)
+    env.reset(seed=0)
+    assert env.constraints[0].rows(env.plant).normals.shape == (0, 4)  # a displacement is no force
+    changed = flags = 0
+    for k in range(steps):
+        info = env.step(driver(env, k))[4]
+        least = min(w for w, _ in seen)
+        assert least >= FETCH_THRESHOLD * (1.0 - 1e-5) or flagged(info) or info["cbf/unsafe"]
+        changed, flags = changed + info["cbf/intervened"], flags + flagged(info)
+    assert changed > 0 and flags <= 0.1 * steps
+
+
+def test_without_the_filter_fetch_s_arm_is_stretched():
+    env, seen = fetch("FetchReach-v4", limited=False)
+    env.reset(seed=0)
+    least = []
+    for k in range(30):
+        env.step(stretched(env, k))
+        least.append(min(w for w, _ in seen))
+    assert min(least) < 0.1 * FETCH_THRESHOLD
+
+
+def test_no_actuator_moves_fetch_s_arm_so_its_joints_have_to_be_named():
+    env, _ = fetch("FetchReach-v4", limited=False)
+    with pytest.raises(
+        ConfigurationError, match=r"no actuator drives .*name the joints .*shoulder_pan_joint"
+    ):
+        sw.CBFActionFilter(env, [sw.SingularityMargin(1e-3, site="robot0:grip")])
+
+
+# Plain data, and what is refused ------------------------------------------------------------------------------
+
+
+def test_it_is_rebuilt_from_the_spec_and_from_json():
+    limits = [
+        sw.SingularityMargin(
+            0.003, body="fingertip", directions="xy", joints=["joint0", "joint1"], margin=0.1
+        ),
+        sw.SingularityMargin(
+            geom="fingertip", directions="xy", frame="own", task_speed=0.1, rate_limit=6.0, holds=7, reach=2.0
+        ),
+    ]
+    env = sw.CBFActionFilter(gym.make("Reacher-v5"), limits)
+    for spec in (env.spec, EnvSpec.from_json(env.spec.to_json())):
+        again = gym.make(spec)
+        assert again.constraints == limits and type(again.constraints[0]) is sw.SingularityMargin
+        assert again.constraints[1].validated == env.constraints[1].validated is not None
+    assert limits[0].promise == "best effort"
+
+
+def test_an_analytic_plant_is_refused():
+    plant = sw.AnalyticPlant(f=lambda x: x, g=lambda x: np.eye(2), state=lambda env: np.zeros(2))
+    with pytest.raises(UnsupportedEnvError, match="SingularityMargin forecasts with a MuJoCo model"):
+        sw.SingularityMargin(1e-3, body="hand").bind(plant)
+
+
+TIP = {"body": "fingertip", "directions": "xy"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        (TIP, ConfigurationError, "give a threshold on the manipulability, or a task_speed and a rate_limit"),
+        (
+            {**TIP, "threshold": 1e-3, "task_speed": 1.0},
+            ConfigurationError,
+            "give a threshold .*task_speed=1.0",
+        ),
+        ({**TIP, "rate_limit": 1.0}, ConfigurationError, "give a threshold .*rate_limit=1.0"),
+        ({**TIP, "task_speed": -1.0, "rate_limit": 1.0}, ConfigurationError, "task_speed must be a finite"),
+        ({**TIP, "task_speed": 1.0, "rate_limit": np.inf}, ConfigurationError, "rate_limit must be a finite"),
+        ({**TIP, "threshold": 0.0}, ConfigurationError, "threshold must be a finite number > 0"),
+        ({**TIP, "threshold": np.nan}, ConfigurationError, "threshold must be a finite number > 0"),
+        (
+            {**TIP, "threshold": 1e-3, "margin": -1.0},
+            ConfigurationError,
+            "margin must be a finite number >= 0",
+        ),
+        ({"threshold": 1e-3}, ConfigurationError, "name the one site, body or geom .*site=None"),
+        (
+            {**TIP, "threshold": 1e-3, "geom": "fingertip"},
+            ConfigurationError,
+            "name the one site, body or geom",
+        ),
+        ({"threshold": 1e-3, "body": ["fingertip"]}, ConfigurationError, "name the one site, body or geom"),
+        ({**TIP, "threshold": 1e-3, "frame": "tool"}, ConfigurationError, '"world" or "own", got \'tool\''),
+        ({**TIP, "threshold": 1e-3, "directions": "xw"}, ConfigurationError, 'directions is some of "xyz"'),
+        ({**TIP, "threshold": 1e-3, "rotations": "z"}, ConfigurationError, r"give the length \(m\)"),
+        ({**TIP, "threshold": 1e-3, "joints": "joint0"}, ConfigurationError, "joints is a list of names"),
+        (
+            {**TIP, "threshold": 1e-3, "joints": []},
+            ConfigurationError,
+            r"joints is a list of names.*got \[\]",
+        ),
+        ({**TIP, "threshold": 1e-3, "holds": 0}, ConfigurationError, "holds is a whole number"),
+        ({**TIP, "threshold": 1e-3, "reach": 0.0}, ConfigurationError, "reach must be a finite number > 0"),
+        ({"threshold": 1e-3, "body": "hand"}, UnknownNameError, "no body 'hand'; it has: world, body0"),
+        ({"threshold": 1e-3, "site": "tip"}, UnknownNameError, "no site 'tip'"),
+        ({**TIP, "threshold": 1e-3, "joints": ["elbow"]}, UnknownNameError, "no joint 'elbow'"),
+        (
+            {"threshold": 1e-3, "geom": "sideN"},
+            ConfigurationError,
+            "no hinge or slide moves the geom 'sideN'",
+        ),
+        (
+            {"threshold": 1e-3, "body": "target", "directions": "xy"},
+            ConfigurationError,
+            "no actuator drives a joint that moves the body 'target': .*target_x, target_y",
+        ),
+        (
+            {**TIP, "threshold": 1e-3, "joints": ["joint0", "target_x"]},
+            ConfigurationError,
+            "'target_x' does not move the body 'fingertip'; those that do: joint0, joint1",
+        ),
+        ({**TIP, "threshold": 1e-3, "joints": ["joint0", "joint0"]}, ConfigurationError, "named twice"),
+        (
+            {"threshold": 1e-3, "body": "body1", "directions": "x", "joints": ["joint0", "joint1"]},
+            ConfigurationError,
+            "'joint1' moves the body 'body1' in none of the task's directions",
+        ),
+        (
+            {"threshold": 1e-3, "body": "body1", "directions": "xy"},
+            ConfigurationError,
+            "1 joints cannot move the body 'body1' in 2 directions at once .*the joints are joint0",
+        ),
+        (
+            {"threshold": 1e-3, "body": "fingertip"},
+            ConfigurationError,
+            "2 joints cannot move .*in 3 directions",
+        ),
+        (
+            {"threshold": 1e-3, "body": "fingertip", "directions": "xz"},
+            ConfigurationError,
+            "cannot be moved in all of these directions at once in any configuration",
+        ),
+        (
+            {**TIP, "threshold": 0.02},
+            ConfigurationError,
+            "no configuration has .*above 0.02 .*is 0.011, half",
+        ),
+        (
+            {**TIP, "threshold": 0.01, "margin": 0.2},
+            ConfigurationError,
+            "no configuration has a manipulability",
+        ),
+    ],
+)
+def test_nonsense_is_refused(arguments, error, message):
+    with pytest.raises(error, match=message):
+        sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.SingularityMargin(**arguments)])
