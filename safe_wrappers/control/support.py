@@ -9,6 +9,7 @@ general question whether the wrench is feasible (`whole_body`); here they are fl
 number. And crossing an edge predicts no particular fall: a robot may step, or tip about an edge and come back.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ COPLANAR_M = 0.01
 """m; contacts farther than this from one plane are not called coplanar unless the caller says otherwise."""
 COPLANAR_RAD = 0.05
 """rad; the same for the directions of their normals."""
+_ROUNDING = 1e-12
 
 
 class Plane(NamedTuple):
@@ -160,20 +162,27 @@ def support_polygon(points: ArrayLike) -> Array:
     ordered = np.unique(given, axis=0)  # sorted by x, then y
     if len(ordered) < 3:
         return ordered
-    scale = float(np.ptp(ordered, axis=0).max())
-    # Corners that stand out by less than rounding are points on an edge.
-    least = 1e-12 * scale * scale
 
     def half(chain: list[Array]) -> list[Array]:
         kept: list[Array] = []
         for point in chain:
-            while len(kept) > 1 and _turn(kept[-2], kept[-1], point) <= least:
+            while len(kept) > 1 and _turn(kept[-2], kept[-1], point) <= 0.0:
                 kept.pop()
             kept.append(point)
         return kept[:-1]
 
     chain = list(ordered)
-    return np.array(half(chain) + half(chain[::-1]))
+    corners = half(chain) + half(chain[::-1])
+    # What stands out by no more than rounding is a point on an edge.
+    least = _ROUNDING * float(np.ptp(ordered, axis=0).max())
+    i = 0
+    while i < len(corners) > 2:
+        before, after = corners[i - 1], corners[(i + 1) % len(corners)]
+        if _turn(before, corners[i], after) <= least * math.dist(before, after):
+            del corners[i]
+        else:
+            i += 1
+    return np.array(corners)
 
 
 def support_margin(point: ArrayLike, polygon: ArrayLike, inset: float = 0.0) -> float:

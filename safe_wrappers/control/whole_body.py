@@ -243,17 +243,16 @@ def _solve(problem: WholeBodyProblem, sides: Array | None, solver: str) -> Whole
     motion = motion_of(problem)
     rigid, loose = eliminate(motion)
     consistent = float(np.abs(rigid.contradiction).max(initial=0.0)) <= _acceleration_tolerance(problem)
-    if not problem.tasks and consistent:
-        unchanged = _nominal(problem, motion, rigid, sides, solver)
+    soft = problem.contact_softness > 0.0
+    question = _question(problem, motion, rigid, sides) if consistent else None
+    if question is not None and not problem.tasks:
+        unchanged = _nominal(problem, motion, question, solver)
         if unchanged is not None:
             return unchanged
-    soft = problem.contact_softness > 0.0
-    verdict = "infeasible"
     if soft:
         question = _question(problem, motion, loose, sides, 1.0 / problem.contact_softness)
-    elif consistent:
-        question = _question(problem, motion, rigid, sides)
-    if soft or consistent:
+    verdict = "infeasible"
+    if question is not None:
         candidate = _ask(question.program, solver)
         if candidate.y is not None:
             found = _checked(problem, motion, question, candidate.y, WholeBodyStatus.SOLVED)
@@ -273,17 +272,17 @@ def _ask(program: Program, solver: str) -> Candidate:
 
 
 def _nominal(
-    problem: WholeBodyProblem, motion: Motion, rigid: Elimination, sides: Array | None, solver: str
+    problem: WholeBodyProblem, motion: Motion, question: _Question, solver: str
 ) -> WholeBodySolution | None:
     """The nominal control, if contacts can hold it exactly with some forces that they can give."""
-    u = problem.nominal
+    u, inner = problem.nominal, question.elimination.size - len(problem.nominal)
     if not ((u >= problem.lower) & (u <= problem.upper)).all():
         return None
-    question = _question(problem, motion, rigid, sides)
-    y = np.concatenate([u, np.zeros(rigid.size - len(u))])
-    if rigid.size > len(u):
-        inner = by_daqp if sides is not None and solver == "daqp" else by_clarabel
-        found = inner(question.program.with_first(u))
+    y = np.concatenate([u, np.zeros(inner)])
+    if inner:
+        program = question.program.with_first(u)
+        # No second opinion here: where daqp finds no inner forces, the whole problem is solved next.
+        found = by_clarabel(program) if solver != "daqp" else by_daqp(program)
         if found.y is None:
             return None
         y[len(u) :] = found.y

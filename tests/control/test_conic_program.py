@@ -1,0 +1,115 @@
+"""Small programs against closed forms, against each other, and against their optimality conditions."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from safe_wrappers.control.conic_program import Program, by_clarabel, by_daqp
+
+FREE = np.full(3, np.inf)
+
+
+def nearest(point, **parts):
+    """The program of the closest point."""
+    n = len(point)
+    fields = {
+        "rows": np.zeros((0, n)),
+        "limits": np.zeros(0),
+        "lower": -np.full(n, np.inf),
+        "upper": np.full(n, np.inf),
+    }
+    return Program(np.eye(n), -np.array(point), **(fields | parts))
+
+
+@given(st.tuples(*[st.floats(-3, 3)] * 3))
+def test_the_closest_point_of_a_cone_is_known(point):
+    p = np.array(point)
+    t, x = p[0], p[1:]
+    size = float(np.linalg.norm(x))
+    if size <= t:
+        expected = p
+    elif size <= -t:
+        expected = np.zeros(3)
+    else:
+        expected = 0.5 * (t + size) * np.array([1.0, *(x / size)])
+    found = by_clarabel(nearest(p, cones=np.eye(3)[None], cone_offsets=np.zeros((1, 3))))
+    assert found.verdict == "solved"
+    assert found.y == pytest.approx(expected, abs=2e-5)
+
+
+@given(st.integers(0, 300))
+def test_two_backends_of_different_kinds_agree_and_the_answer_is_optimal(seed):
+    rng = np.random.default_rng(seed)
+    n, k = int(rng.integers(1, 7)), int(rng.integers(0, 9))
+    root = rng.normal(size=(n, n))
+    inside = rng.uniform(-0.5, 0.5, n)
+    rows = rng.normal(size=(k, n))
+    # Curvatures of very different sizes, as controls and forces have.
+    scale = 10.0 ** rng.uniform(-4, 2, n)
+    hessian = (root @ root.T + np.eye(n)) * scale * scale[:, None]
+    program = Program(
+        hessian,
+        rng.normal(size=n) * scale,
+        rows,
+        rows @ inside + rng.uniform(0.0, 0.5, k),
+        -np.ones(n),
+        np.ones(n),
+    )
+    one, other = by_daqp(program), by_clarabel(program)
+    assert one.verdict == other.verdict == "solved"
+
+    def value(y):
+        return 0.5 * y @ program.hessian @ y + program.linear @ y
+
+    assert value(one.y) == pytest.approx(value(other.y), rel=1e-6, abs=1e-7)
+    # From the optimum no feasible direction leads down: least squares over the active normals leaves nothing.
+    active = np.vstack(
+        [
+            rows[rows @ one.y > program.limits - 1e-7],
+            np.eye(n)[one.y > 1 - 1e-7],
+            -np.eye(n)[one.y < -1 + 1e-7],
+        ]
+    )
+    gradient = program.hessian @ one.y + program.linear
+    from scipy.optimize import nnls
+
+    left = nnls(active.T, -gradient)[1] if len(active) else float(np.linalg.norm(gradient))
+    assert left < 1e-6 * (1.0 + float(np.linalg.norm(program.linear)))
+
+
+def test_what_has_no_answer_is_said_to_have_none():
+    contradictory = nearest([0.0], rows=np.array([[1.0], [-1.0]]), limits=np.array([-1.0, -1.0]))
+    assert by_daqp(contradictory) == by_clarabel(contradictory)
+    assert by_daqp(contradictory).verdict == "infeasible" and by_daqp(contradictory).y is None
+    softened = contradictory.softened(2)
+    for found in (by_daqp(softened), by_clarabel(softened)):
+        assert found.y == pytest.approx([0.0, 1.0, 1.0], abs=1e-6)
+    one_only = contradictory.softened(1)  # the second row stays: y >= 1
+    for found in (by_daqp(one_only), by_clarabel(one_only)):
+        assert found.y == pytest.approx([1.0, 2.0], abs=1e-6)
+
+
+def test_what_is_not_finite_is_no_answer():
+    poisoned = nearest([np.nan, 0.0], rows=np.ones((1, 2)), limits=np.zeros(1))
+    assert by_daqp(poisoned).y is None
+    assert by_clarabel(poisoned).y is None
+
+
+@given(st.integers(0, 100))
+def test_given_the_first_unknowns_the_others_are_what_they_were(seed):
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(5, 5))
+    rows = rng.normal(size=(4, 5))
+    program = Program(
+        root @ root.T + np.eye(5), rng.normal(size=5), rows, rng.uniform(0.1, 1.0, 4), -np.ones(5), np.ones(5),
+        rng.normal(size=(1, 3, 5)) * 0.2, np.array([[1.0, 0.0, 0.0]]),
+    )  # fmt: skip
+    whole = by_clarabel(program)
+    assert whole.y is not None
+    rest = by_clarabel(program.with_first(whole.y[:2]))
+    assert rest.y == pytest.approx(whole.y[2:], abs=1e-5)
+    scaled, scale = program.scaled()
+    assert scaled.hessian.diagonal() == pytest.approx(np.ones(5))
+    assert by_clarabel(program.softened(2)).y is not None
+    assert scale.shape == (5,)

@@ -1,0 +1,153 @@
+"""Friction cones: forces on a slope, pyramids inside their cones, MuJoCo's own pyramid."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from safe_wrappers.control.friction_cone import (
+    cone_excess,
+    friction_pyramid,
+    friction_ratio,
+    in_cone,
+    normal_and_tangential,
+    tangents,
+)
+from safe_wrappers.errors import ConfigurationError
+
+UP = np.array([0.0, 0.0, 1.0])
+directions = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1)
+
+
+def unit(v):
+    return np.array(v) / np.linalg.norm(v)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 10.0, 30.0, 60.0])
+@pytest.mark.parametrize("friction", [0.2, 0.7, 1.5])
+def test_a_block_on_a_slope_uses_the_tangent_of_its_angle(degrees, friction):
+    slope = math.radians(degrees)
+    normal = np.array([-math.sin(slope), 0.0, math.cos(slope)])
+    holds = np.array([0.0, 0.0, 9.81 * 2.0])  # what keeps 2 kg at rest
+    along, rest = normal_and_tangential(holds, normal)
+    assert along == pytest.approx(19.62 * math.cos(slope))
+    assert np.linalg.norm(rest) == pytest.approx(19.62 * math.sin(slope))
+    assert friction_ratio(holds, normal, friction) == pytest.approx(math.tan(slope) / friction)
+    assert in_cone(holds, normal, friction) == (math.tan(slope) <= friction)
+    missed = 19.62 * (math.sin(slope) - friction * math.cos(slope))
+    assert cone_excess(holds, normal, friction) == pytest.approx(max(missed, -19.62 * math.cos(slope)))
+
+
+@pytest.mark.parametrize(
+    ("force", "friction", "ratio"),
+    [
+        ([0, 0, 0], 0.5, 0.0),
+        ([0, 0, 0], 0.0, 0.0),
+        ([0, 0, 5], 0.0, 0.0),
+        ([0, 0, -1e-9], 0.5, math.inf),
+        ([1, 0, 0], 0.5, math.inf),
+        ([1, 0, 5], 0.0, math.inf),
+        ([1, 0, -5], 0.5, math.inf),
+        ([3, 4, 10], 0.5, 1.0),
+    ],
+)
+def test_no_force_uses_nothing_and_what_no_ground_gives_is_infinite(force, friction, ratio):
+    found = friction_ratio(force, UP, friction)
+    assert found == ratio
+    assert in_cone(force, UP, friction) == (ratio <= 1.0)
+
+
+def test_many_contacts_at_once():
+    forces = np.array([[[1.0, 0, 2.0]], [[0, 0, -1.0]]])
+    normals = np.array([UP, UP])
+    assert friction_ratio(forces, normals, [1.0, 0.5]).tolist() == [[0.5, 1.0], [math.inf, math.inf]]
+    assert in_cone(forces, normals, 1.0).shape == (2, 2)
+    assert friction_pyramid(normals, [0.1, 0.2], 5).shape == (2, 6, 3)
+    assert friction_pyramid(np.zeros((0, 3)), np.zeros(0)).shape == (0, 5, 3)
+
+
+@given(directions, directions)
+def test_tangents_are_a_right_handed_frame(normal, first):
+    n = unit(normal)
+    for frame in (
+        tangents(n),
+        tangents(n, first) if np.linalg.norm(np.cross(n, first)) > 1e-3 else tangents(n),
+    ):
+        axes = np.vstack([frame, n])
+        assert np.allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(axes) == pytest.approx(1.0)
+    if np.linalg.norm(np.cross(n, first)) > 1e-3:
+        assert tangents(n, first)[0] @ np.array(first) > 0.0
+
+
+def reach(rows, normal, tangent):
+    """How far along a tangent the rows allow a force with one newton along the normal."""
+    slope, at = rows @ tangent, -(rows @ normal)
+    return float(np.min(at[slope > 1e-12] / slope[slope > 1e-12]))
+
+
+@given(directions, st.floats(0.01, 3.0), st.integers(3, 40), st.floats(0.0, math.tau))
+def test_a_pyramid_is_inside_its_cone_for_any_number_of_edges(normal, friction, edges, angle):
+    n = unit(normal)
+    rows = friction_pyramid(n, friction, edges)
+    one, two = tangents(n)
+    farthest = reach(rows, n, math.cos(angle) * one + math.sin(angle) * two)
+    assert friction * math.cos(math.pi / edges) * (1 - 1e-9) <= farthest <= friction * (1 + 1e-9)
+    # Its edges are on the cone, the middles of its sides where the figure says.
+    assert reach(rows, n, one) == pytest.approx(friction)
+    half = math.pi / edges
+    middle = math.cos(half) * one + math.sin(half) * two
+    assert reach(rows, n, middle) == pytest.approx(friction * math.cos(half))
+
+
+@pytest.mark.parametrize("edges", [3, 4, 8, 16])
+def test_the_share_of_the_cone_that_a_pyramid_covers(edges):
+    rows = friction_pyramid(UP, 0.6, edges)
+    angles = np.linspace(0.0, math.tau, 4800, endpoint=False)
+    radii = np.array([reach(rows, UP, np.array([math.cos(a), math.sin(a), 0.0])) for a in angles])
+    area = 0.5 * float((radii**2).sum()) * math.tau / len(angles)
+    share = math.sin(math.tau / edges) / (math.tau / edges)
+    assert area / (math.pi * 0.36) == pytest.approx(share, rel=1e-4)
+
+
+@given(st.tuples(*[st.floats(-10.0, 10.0)] * 3), st.floats(0.0, 2.0), st.integers(3, 12))
+def test_whatever_the_rows_allow_the_cone_allows(force, friction, edges):
+    rows = friction_pyramid(UP, friction, edges)
+    if (rows @ np.array(force) <= 0.0).all():
+        assert in_cone(force, UP, friction, tolerance=1e-9)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+def test_no_pyramid_lets_the_ground_pull(friction):
+    rows = friction_pyramid(UP, friction, 4)
+    assert (rows @ -UP).max() > 0.0
+    assert (rows @ UP).max() <= 0.0
+
+
+def test_four_edges_along_a_contact_frame_are_mujocos_pyramid():
+    first = unit([1.0, 2.0, 0.0])
+    rows = friction_pyramid(UP, 0.8, 4, first)
+    second = np.cross(UP, first)
+    for force in np.random.default_rng(0).normal(0.5, 1.0, size=(500, 3)):
+        inside = abs(force @ first) + abs(force @ second) <= 0.8 * force[2]
+        assert (rows @ force <= 0.0).all() == inside
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: friction_pyramid(UP, 0.5, 2), "edges"),
+        (lambda: friction_pyramid(UP, 0.5, 4.5), "edges"),
+        (lambda: friction_pyramid(UP, -0.1), "friction"),
+        (lambda: friction_pyramid(2.0 * UP, 0.5), "length 1"),
+        (lambda: friction_pyramid(UP, 0.5, 4, UP), "parallel"),
+        (lambda: friction_ratio([0, 0, math.nan], UP, 0.5), "forces must be finite"),
+        (lambda: friction_ratio([0, 0, 1], UP, math.inf), "friction must be finite"),
+        (lambda: normal_and_tangential([0, 1], [0, 1]), "shape"),
+    ],
+)
+def test_bad_input_is_refused(call, said):
+    with pytest.raises(ConfigurationError, match=said):
+        call()

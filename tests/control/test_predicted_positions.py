@@ -1,0 +1,82 @@
+"""Joint ranges kept until the end of a step, against parabolas looked at everywhere."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from safe_wrappers.control.predicted_positions import largest_acceleration, predicted_position_rows
+from safe_wrappers.errors import ConfigurationError
+
+
+def top(speed, acceleration, horizon):
+    """How far a parabola comes, its top looked for on a fine grid and refined by nothing: an oracle."""
+    t = np.linspace(0.0, horizon, 4001)
+    return float((speed * t + 0.5 * acceleration * t * t).max())
+
+
+@given(st.floats(1e-3, 3.0), st.floats(-5.0, 5.0), st.floats(0.005, 0.5))
+def test_the_largest_acceleration_comes_up_to_the_limit_and_no_farther(distance, speed, horizon):
+    a = float(largest_acceleration(distance, speed, horizon))
+    scale = distance + abs(speed) * horizon
+    assert top(speed, a, horizon) == pytest.approx(distance, abs=1e-4 * scale)
+    assert top(speed, a + 0.02 * (abs(a) + 1.0), horizon) > distance
+
+
+def test_the_end_alone_would_let_it_through():
+    # Fast, close, strong enough a brake that it is back at the end: in between it was beyond.
+    distance, speed, horizon = 0.01, 1.0, 0.1
+    end = 2.0 * (distance - horizon * speed) / horizon**2
+    assert top(speed, end, horizon) > 2.0 * distance
+    assert largest_acceleration(distance, speed, horizon) == pytest.approx(-(speed**2) / (2 * distance))
+
+
+@given(st.floats(-1.0, 0.0), st.floats(-5.0, 5.0), st.floats(0.005, 0.5))
+def test_from_beyond_it_is_back_by_the_end(distance, speed, horizon):
+    a = float(largest_acceleration(distance, speed, horizon))
+    assert speed * horizon + 0.5 * a * horizon**2 == pytest.approx(distance, abs=1e-9)
+
+
+def test_rows_name_the_right_joints_and_leave_unlimited_ones_out():
+    rows, limits = predicted_position_rows(
+        [6, 8, 7], [0.1, 0.0, -0.2], [1.0, 0.0, -1.0], [-1.0, -np.inf, -0.5], [0.5, np.inf, np.inf], 0.1, 9
+    )
+    assert rows.tolist() == [np.eye(9)[6].tolist(), (-np.eye(9)[6]).tolist(), (-np.eye(9)[7]).tolist()]
+    expected = [
+        largest_acceleration(0.4, 1.0, 0.1),
+        largest_acceleration(1.1, -1.0, 0.1),
+        largest_acceleration(0.3, 1.0, 0.1),
+    ]
+    assert limits == pytest.approx(np.array(expected))
+    nothing, none = predicted_position_rows(np.zeros(0, int), [], [], [], [], 0.1, 4)
+    assert nothing.shape == (0, 4) and none.shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"horizon_s": 0.0}, "horizon_s"),
+        ({"horizon_s": math.inf}, "horizon_s"),
+        ({"positions": [math.nan]}, "positions must be finite"),
+        ({"dofs": [3]}, "indices from 0 to 2"),
+        ({"dofs": [-1]}, "indices"),
+        ({"dofs": [0.5]}, "indices"),
+        ({"lower": [2.0]}, "lower must not exceed"),
+        ({"lower": [math.nan]}, "lower must not exceed"),
+        ({"upper": [1.0, 2.0]}, "one shape"),
+    ],
+)
+def test_bad_input_is_refused(change, said):
+    given_input = {
+        "dofs": [0],
+        "positions": [0.0],
+        "velocities": [0.0],
+        "lower": [-1.0],
+        "upper": [1.0],
+        "horizon_s": 0.1,
+        "nv": 3,
+    }
+    with pytest.raises(ConfigurationError, match=said):
+        predicted_position_rows(**(given_input | change))

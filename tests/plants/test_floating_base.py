@@ -1,0 +1,399 @@
+"""Floating-base terms against MuJoCo: its forces, its subtree momentum, its motion over small steps."""
+
+import math
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+
+import safe_wrappers as sw
+from safe_wrappers.control.centroidal import (
+    centroidal_bias_rate,
+    centroidal_momentum,
+    centroidal_momentum_matrix,
+    momentum_rate,
+)
+from safe_wrappers.control.friction_cone import friction_pyramid, friction_ratio, in_cone
+from safe_wrappers.control.support import balance
+from safe_wrappers.control.whole_body import WholeBodyProblem, rigid_forces, solve_pyramid
+from safe_wrappers.errors import UnsupportedEnvError
+from safe_wrappers.plants.floating_base import (
+    contact_points,
+    equations_of_motion,
+    floating_base_terms,
+    moving_bodies,
+)
+
+ZOO = """
+<mujoco>
+  <option timestep="0.001" cone="{cone}" integrator="Euler"/>
+  <worldbody>
+    <geom type="plane" size="5 5 1" condim="{condim}"/>
+    <body pos="0 0 0.3"><freejoint/>
+      <geom type="box" size="0.2 0.1 0.05" mass="2" condim="{condim}"/>
+      <body pos="0.2 0 0"><joint name="hip" axis="0 1 0" damping="0.3" stiffness="2" armature="0.05"
+          limited="true" range="-20 20" frictionloss="0.1"/>
+        <geom type="capsule" fromto="0 0 0 0.2 0 -0.2" size="0.03" mass="0.4" condim="{condim}"/>
+        <body pos="0.2 0 -0.2"><joint name="knee" axis="0 1 0" damping="0.1"/>
+          <geom type="capsule" fromto="0 0 0 0 0.1 -0.1" size="0.03" mass="0.2" condim="{condim}"/></body>
+      </body>
+    </body>
+    <body pos="0.6 0 0.1"><freejoint/><geom type="sphere" size="0.1" mass="0.5" condim="{condim}"/></body>
+  </worldbody>
+  <equality><joint joint1="knee" joint2="hip" polycoef="0 0.5 0 0 0" active="false"/></equality>
+  <actuator><motor joint="hip" gear="3" ctrllimited="true" ctrlrange="-1 1"/><position joint="knee" kp="5" kv="0.4"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def zoo(cone="pyramidal", condim=3, seed=0, settle=0.35):
+    model = mujoco.MjModel.from_xml_string(ZOO.format(cone=cone, condim=condim))
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(seed)
+    data.qvel[:] = rng.normal(size=model.nv) * 0.5
+    while data.time < settle:
+        data.ctrl[:] = rng.uniform(-1, 1, 2)
+        mujoco.mj_step(model, data)
+    return model, data
+
+
+@pytest.fixture(params=["Ant-v5", "Humanoid-v5"])
+def walker(request):
+    """An env that falls and struggles, and the plant that observes it."""
+    env = gym.make(request.param)
+    plant = sw.MujocoPlant()
+    plant.bind(env)
+    env.reset(seed=3)
+    env.action_space.seed(3)
+
+    def states(count):
+        for step in range(count):
+            env.step(env.action_space.sample() * (0.2 if step % 3 else 1.0))
+            plant.observe()
+            yield plant
+
+    return states
+
+
+def pushed(terms):
+    contacts = terms.contacts
+    return np.einsum("kiv,ki->v", contacts.jacobians, contacts.forces)
+
+
+def test_the_equations_of_motion_hold_with_mujocos_own_accelerations_and_forces(walker):
+    touched = 0
+    for plant in walker(40):
+        terms, data = floating_base_terms(plant), plant.data
+        left = terms.inertia @ data.qacc + terms.bias
+        right = terms.actuation @ data.ctrl + pushed(terms)
+        assert left == pytest.approx(right, abs=1e-9 * (1.0 + np.abs(right).max()))
+        touched += len(terms.contacts.points)
+    assert touched > 20
+
+
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+@pytest.mark.parametrize("condim", [1, 3])
+def test_they_hold_for_servos_limits_equalities_dry_friction_and_pushes_from_outside(cone, condim):
+    model, data = zoo(cone, condim)
+    data.eq_active[:] = 1
+    data.ctrl[:] = [5.0, 0.3]  # the first is beyond its range
+    data.qfrc_applied[7] = 0.5
+    data.xfrc_applied[2] = [1.0, 2.0, -3.0, 0.1, 0.2, 0.3]
+    mujoco.mj_forward(model, data)
+    kinds = set(data.efc_type.tolist())
+    assert len(kinds) > 2  # contact, dry friction, equality or limit
+    terms = equations_of_motion(model, data)
+    right = terms.actuation @ [1.0, 0.3] + pushed(terms)
+    assert terms.inertia @ data.qacc + terms.bias == pytest.approx(right, abs=1e-8)
+    assert terms.contacts.forces.any()
+    if condim == 1:
+        assert not terms.contacts.friction.any()
+
+
+def test_the_bias_does_not_hang_on_the_control():
+    model, data = zoo()
+    one = equations_of_motion(model, data)
+    mujoco.mj_forward(model, data)
+    one = equations_of_motion(model, data)
+    no_dry_friction = data.efc_type >= int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
+    own = np.zeros(model.nv)
+    mujoco.mj_mulJacTVec(model, data, own, np.where(no_dry_friction, 0.0, data.efc_force))
+    data.ctrl[:] = [0.7, -0.4]
+    mujoco.mj_forward(model, data)
+    other = equations_of_motion(model, data)
+    own_other = np.zeros(model.nv)
+    mujoco.mj_mulJacTVec(model, data, own_other, np.where(no_dry_friction, 0.0, data.efc_force))
+    # Only what other constraints give may differ.
+    assert one.bias + own == pytest.approx(other.bias + own_other, abs=1e-10)
+    assert one.actuation == pytest.approx(other.actuation)
+    assert one.actuation[6] == pytest.approx([3.0, 0.0])
+    assert one.actuation[7] == pytest.approx([0.0, 5.0])
+
+
+def test_torsional_and_rolling_friction_are_in_the_moments():
+    model, data = zoo("elliptic", 6)
+    mujoco.mj_forward(model, data)
+    contacts = contact_points(model, data)
+    assert np.abs(contacts.moments).max() > 1e-6
+    turning = np.zeros((len(contacts.points), 3, model.nv))
+    for row, (body, other) in enumerate(zip(contacts.pushed, contacts.pushed_by, strict=True)):
+        for which, sign in ((body, 1.0), (other, -1.0)):
+            jac = np.zeros((3, model.nv))
+            mujoco.mj_jac(model, data, None, jac, contacts.points[row], which)
+            turning[row] += sign * jac
+    terms = equations_of_motion(model, data)
+    right = terms.actuation @ data.ctrl + pushed(terms) + np.einsum("kiv,ki->v", turning, contacts.moments)
+    assert terms.inertia @ data.qacc + terms.bias == pytest.approx(right, abs=1e-8)
+
+
+def test_the_world_is_never_the_pushed_one_and_pairs_push_each_other():
+    model, data = zoo(settle=0.0)
+    data.qpos[[9, 10, 11]] = [0.0, 0.0, 0.44]  # the ball on the box
+    data.qpos[2] = 0.3
+    mujoco.mj_forward(model, data)
+    contacts = contact_points(model, data)
+    assert len(contacts.points) == 1
+    assert {int(contacts.pushed[0]), int(contacts.pushed_by[0])} == {1, 4}
+    upwards = 1.0 if contacts.pushed[0] == 4 else -1.0
+    assert contacts.normals[0] == pytest.approx([0.0, 0.0, upwards])
+    assert contacts.gaps[0] == pytest.approx(-0.01)
+    # What pushes one way on the one pushes the other way on the other: no change of the sum.
+    bodies = moving_bodies(model, data)
+    matrix = centroidal_momentum_matrix(*bodies_of(bodies))
+    force = np.linalg.solve(
+        equations_of_motion(model, data).inertia, pushed(equations_of_motion(model, data))
+    )
+    assert np.abs(force).max() > 1.0
+    assert matrix[:3] @ force == pytest.approx(np.zeros(3), abs=1e-9)
+    # A geom of the world that comes second in MuJoCo's order is still the world.
+    slab = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body pos='0 0 0.099'><freejoint/><geom type='sphere' size='0.1'/></body>"
+        "<geom type='box' size='1 1 0.1' pos='0 0 -0.1'/></worldbody></mujoco>"
+    )
+    resting = mujoco.MjData(slab)
+    mujoco.mj_forward(slab, resting)
+    assert slab.geom_bodyid[resting.contact.geom[0]].tolist() == [1, 0]  # MuJoCo's normal points down here
+    found = contact_points(slab, resting)
+    assert found.pushed.tolist() == [1] and found.pushed_by.tolist() == [0]
+    assert found.normals[0] == pytest.approx([0, 0, 1])
+    assert found.forces[0, 2] > 0.0
+
+
+def bodies_of(bodies):
+    return bodies.masses, bodies.positions, bodies.inertias, bodies.linear_jacobians, bodies.angular_jacobians
+
+
+def test_forces_are_what_mujocos_own_friction_allows(walker):
+    seen = 0
+    for plant in walker(40):
+        contacts = floating_base_terms(plant).contacts
+        assert in_cone(contacts.forces, contacts.normals, contacts.friction, 1e-6).all()
+        # Its pyramid, edge on its first tangent.
+        sides = friction_pyramid(contacts.normals, contacts.friction, 4, contacts.first_tangents)
+        assert (np.einsum("kei,ki->ke", sides, contacts.forces) <= 1e-6).all()
+        seen += int((friction_ratio(contacts.forces, contacts.normals, contacts.friction) > 0.1).sum())
+    assert seen > 5
+
+
+def test_drifts_are_what_jacobians_change_by(walker):
+    compared = 0
+    for plant in walker(25):
+        terms, model = floating_base_terms(plant), plant.model
+        contacts, bodies = terms.contacts, moving_bodies(model, plant.data)
+        moved = mujoco.MjData(model)
+        dt = 1e-6
+        moved.qpos[:], moved.qvel[:] = plant.qpos, plant.qvel
+        mujoco.mj_integratePos(model, moved.qpos, plant.qvel.copy(), dt)
+        mujoco.mj_forward(model, moved)
+        after = moving_bodies(model, moved)
+        tolerance = 1e-4 * (1.0 + np.abs(plant.qvel).max() ** 2)
+        change = (after.velocities - bodies.velocities) / dt
+        assert change == pytest.approx(bodies.linear_drifts, abs=tolerance)
+        assert (after.angular_velocities - bodies.angular_velocities) / dt == pytest.approx(
+            bodies.angular_drifts, abs=tolerance
+        )
+        for row in range(len(contacts.points)):
+            velocities = []
+            for data in (plant.data, moved):
+                jac = np.zeros((3, model.nv))
+                for body, sign in ((contacts.pushed[row], 1.0), (contacts.pushed_by[row], -1.0)):
+                    # The same material point, wherever its body has gone.
+                    local = plant.data.xmat[body].reshape(3, 3).T @ (
+                        contacts.points[row] - plant.data.xpos[body]
+                    )
+                    point = data.xpos[body] + data.xmat[body].reshape(3, 3) @ local
+                    part = np.zeros((3, model.nv))
+                    mujoco.mj_jac(model, data, part, None, point, body)
+                    jac += sign * part
+                velocities.append(jac @ plant.qvel)
+            assert velocities[0] == pytest.approx(contacts.jacobians[row] @ plant.qvel, abs=1e-9)
+            drift = (velocities[1] - velocities[0]) / dt
+            assert drift == pytest.approx(contacts.drift[row], abs=tolerance)
+            compared += 1
+    assert compared > 10
+
+
+def test_momentum_is_mujocos_subtree_momentum(walker):
+    for plant in walker(20):
+        model, data = plant.model, plant.forward()
+        bodies = moving_bodies(model, data)
+        found = centroidal_momentum(
+            bodies.masses, bodies.positions, bodies.velocities, bodies.inertias, bodies.angular_velocities
+        )
+        mujoco.mj_subtreeVel(model, data)
+        assert found.com == pytest.approx(data.subtree_com[0])
+        assert found.com_velocity == pytest.approx(data.subtree_linvel[0])
+        assert found.mass == pytest.approx(model.body_subtreemass[0])
+        assert found.angular == pytest.approx(data.subtree_angmom[0], abs=1e-9)
+        matrix = centroidal_momentum_matrix(*bodies_of(bodies))
+        assert matrix @ plant.qvel == pytest.approx(np.concatenate([found.linear, found.angular]))
+
+
+def test_the_tree_below_a_body_is_a_robot_of_its_own():
+    model, data = zoo()
+    mujoco.mj_forward(model, data)
+    mujoco.mj_subtreeVel(model, data)
+    for root in (1, 2, 4):
+        b = moving_bodies(model, data, root)
+        found = centroidal_momentum(b.masses, b.positions, b.velocities, b.inertias, b.angular_velocities)
+        assert found.angular == pytest.approx(data.subtree_angmom[root], abs=1e-9)
+        assert found.com == pytest.approx(data.subtree_com[root])
+    assert moving_bodies(model, data, 1).ids.tolist() == [1, 2, 3]
+    assert moving_bodies(model, data).ids.tolist() == [1, 2, 3, 4]
+
+
+def test_the_momentum_rate_is_that_of_the_contact_wrenches(walker):
+    for plant in walker(30):
+        terms, data = floating_base_terms(plant), plant.data
+        bodies = moving_bodies(plant.model, data)
+        rate = centroidal_momentum_matrix(*bodies_of(bodies)) @ data.qacc + centroidal_bias_rate(
+            bodies.masses,
+            bodies.positions,
+            bodies.inertias,
+            bodies.angular_velocities,
+            bodies.linear_drifts,
+            bodies.angular_drifts,
+        )
+        contacts, com = terms.contacts, data.subtree_com[0]
+        world = contacts.pushed_by == 0  # what the robot does to itself changes nothing
+        mass = plant.model.body_subtreemass[0]
+        linear, angular = momentum_rate(
+            mass, com, plant.model.opt.gravity, contacts.points[world], contacts.forces[world]
+        )
+        size = 1.0 + np.abs(data.qacc).max()
+        assert rate[:3] == pytest.approx(linear, abs=1e-9 * size)
+        assert rate[3:] == pytest.approx(angular, abs=1e-9 * size)
+
+
+def test_over_small_steps_the_momentum_changes_as_the_wrenches_say():
+    model, data = zoo(settle=0.12)
+    model.opt.timestep = 1e-5
+    compared = 0
+    for _ in range(300):
+        mujoco.mj_forward(model, data)
+        before, contacts = momentum(model, data), contact_points(model, data)
+        world = contacts.pushed_by == 0
+        linear, angular = momentum_rate(
+            model.body_mass.sum(),
+            data.subtree_com[0],
+            model.opt.gravity,
+            contacts.points[world],
+            contacts.forces[world],
+        )
+        expected = np.concatenate([linear, angular])
+        mujoco.mj_step(model, data)
+        mujoco.mj_forward(model, data)
+        change = (momentum(model, data) - before) / model.opt.timestep
+        assert change == pytest.approx(expected, abs=2e-2 + 1e-3 * np.abs(expected).max())
+        compared += bool(world.any())
+    assert compared > 50
+
+
+def momentum(model, data):
+    b = moving_bodies(model, data)
+    found = centroidal_momentum(b.masses, b.positions, b.velocities, b.inertias, b.angular_velocities)
+    return np.concatenate([found.linear, found.angular])
+
+
+def stance(slope=0.0, friction=1.0):
+    """A settled 2 kg box on a plane that is tilted about y."""
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option timestep="0.002" gravity="{-9.81 * math.sin(slope)} 0 {-9.81 * math.cos(slope)}"/>
+        <worldbody><geom type="plane" size="5 5 1" friction="{friction} 0 0"/>
+        <body pos="0 0 0.0999"><freejoint/><geom type="box" size="0.2 0.15 0.1" mass="2" friction="{friction} 0 0"/>
+        </body></worldbody></mujoco>"""
+    )
+    data = mujoco.MjData(model)
+    for _ in range(1000):
+        mujoco.mj_step(model, data)
+    mujoco.mj_forward(model, data)
+    return model, data
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.1, 0.25])
+def test_a_box_on_a_slope_is_held_by_the_weight_it_has(slope):
+    _, data = model_and_data = stance(slope)
+    contacts = contact_points(*model_and_data)
+    total = contacts.forces.sum(axis=0)
+    assert total == pytest.approx([19.62 * math.sin(slope), 0, 19.62 * math.cos(slope)], abs=1e-3)
+    assert friction_ratio(total, [0, 0, 1], 1.0) == pytest.approx(math.tan(slope), abs=1e-4)
+    # Its weight's line meets the plane downhill of the middle, by h tan(slope) with h the height of the centre.
+    found = balance(contacts.points, contacts.normals, contacts.forces, inset=0.02)
+    assert found.coplanar
+    x = data.qpos[0] - data.qpos[2] * math.tan(slope)
+    assert found.zmp[:2] == pytest.approx([x, 0.0], abs=1e-3)
+    assert found.margin == pytest.approx(min(0.15, 0.2 - 0.1 * math.tan(slope)) - 0.02, abs=2e-3)
+
+
+def test_the_rigid_forces_of_a_standing_ant_are_its_weight_and_need_no_change():
+    env = gym.make("Ant-v5")
+    plant = sw.MujocoPlant()
+    plant.bind(env)
+    env.reset(seed=0)
+    for _ in range(60):
+        env.step(np.zeros(8, np.float32))
+    plant.observe()
+    terms = floating_base_terms(plant)
+    c = terms.contacts
+    assert len(c.points) >= 3
+    problem = WholeBodyProblem(
+        terms.inertia, terms.bias, terms.actuation, c.jacobians, c.drift, c.normals, c.friction,
+        plant.lower, plant.upper, np.zeros(8),
+    )  # fmt: skip
+    forces, acceleration = rigid_forces(problem, np.zeros(8))
+    weight = 9.81 * plant.model.body_subtreemass[0]
+    assert forces[:, 2].sum() == pytest.approx(weight, rel=0.02)
+    assert forces[:, 2].sum() == pytest.approx(c.forces[:, 2].sum(), rel=0.02)
+    assert np.abs(acceleration[:3]).max() < 0.2
+    found = solve_pyramid(problem)
+    assert found.status == "inactive"
+    assert found.control is problem.nominal
+    ground = balance(c.points, c.normals, forces)
+    assert ground.coplanar and ground.margin > 0.05
+
+
+def test_something_flexible_in_contact_is_refused():
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><geom type="plane" size="1 1 1"/>
+        <flexcomp name="cloth" type="grid" dim="2" count="3 3 1" spacing=".1 .1 .1" pos="0 0 0.004" radius="0.01"
+        mass="0.1"><contact selfcollide="none"/></flexcomp></worldbody></mujoco>"""
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert data.ncon > 0
+    with pytest.raises(UnsupportedEnvError, match="flexible"):
+        contact_points(model, data)
+
+
+def test_in_the_air_there_are_no_contacts():
+    model, data = zoo(settle=0.0)
+    data.qpos[2] += 1.0
+    data.qpos[11] += 1.0
+    mujoco.mj_forward(model, data)
+    terms = equations_of_motion(model, data)
+    assert terms.contacts.points.shape == (0, 3)
+    assert terms.contacts.jacobians.shape == (0, 3, model.nv)
+    assert terms.contacts.friction.shape == (0,)
+    assert terms.inertia @ data.qacc + terms.bias == pytest.approx(terms.actuation @ data.ctrl, abs=1e-9)
