@@ -13,6 +13,7 @@ from safe_wrappers.constraints import (
     Clearance,
     CoastingClearance,
     Constraint,
+    ContactFeasibility,
     Disc,
     Discs,
     EscapeClearance,
@@ -25,6 +26,8 @@ from safe_wrappers.constraints import (
     SingularityMargin,
     SpeedLimit,
     Sphere,
+    Stance,
+    SupportMargin,
     TrackedDiscs,
     TrackPermission,
     Traction,
@@ -54,6 +57,7 @@ from safe_wrappers.wrappers.teleop_channel import TeleopChannel
 from safe_wrappers.wrappers.teleop_link import Link
 from safe_wrappers.wrappers.teleop_port import TeleopPort
 from safe_wrappers.wrappers.track import Track
+from safe_wrappers.wrappers.whole_body_filter import WholeBodyFilter
 
 __all__ = [
     "AdaptionPenalty",
@@ -65,6 +69,7 @@ __all__ = [
     "Clearance",
     "CoastingClearance",
     "Constraint",
+    "ContactFeasibility",
     "ContactMonitor",
     "Disc",
     "Discs",
@@ -90,6 +95,8 @@ __all__ = [
     "SlipLimiter",
     "SpeedLimit",
     "Sphere",
+    "Stance",
+    "SupportMargin",
     "TeleopChannel",
     "TeleopPort",
     "Track",
@@ -99,6 +106,7 @@ __all__ = [
     "UnsafeStateWarning",
     "Upright",
     "WallClearance",
+    "WholeBodyFilter",
     "Workspace",
     "project",
     "protect",

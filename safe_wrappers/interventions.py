@@ -47,6 +47,18 @@ SLIP_MU_ESTIMATE: Final = "slip/mu_estimate"
 SLIP_MU_STD: Final = "slip/mu_std"
 """float64 array, one per wheel: the estimate's standard deviation (of its model; no error bound)."""
 
+# ContactFeasibility and SupportMargin in a filter, WholeBodyFilter: every step -------------------------------------
+WHOLE_BODY_CONTACTS: Final = "whole_body/contacts"
+"""int64: contacts of the robot with the fixed world at the state before the step."""
+WHOLE_BODY_CONE_MARGIN: Final = "whole_body/cone_margin"
+"""float64: by how much the contact forces stay inside the narrowed friction cones at worst, forecast for the executed
+action over its control step, as a share of the robot's weight; negative outside, 0 where nothing touches."""
+WHOLE_BODY_ZMP_MARGIN: Final = "whole_body/zmp_margin"
+"""float64: m, least distance of the zero moment point from the edge of the support polygon, forecast for the executed
+action, while there is a polygon; 0 where there is none."""
+WHOLE_BODY_SUPPORTED: Final = "whole_body/supported"
+"""float64: share of the forecast's instants at which there is a polygon: three contact points of one plane."""
+
 # Tasks, every step: the env's own truth, never the filter's plant ------------------------------------------
 COST: Final = "cost"
 """float64: cost of this control step, judged at its end, as Safety-Gymnasium publishes it."""

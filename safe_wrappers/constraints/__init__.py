@@ -4,6 +4,7 @@ from safe_wrappers.constraints.barrier import Barrier
 from safe_wrappers.constraints.clearance import Clearance
 from safe_wrappers.constraints.coasting_clearance import CoastingClearance
 from safe_wrappers.constraints.constraint import CertifyingConstraint, Constraint, HalfSpaces
+from safe_wrappers.constraints.contact_feasibility import ContactFeasibility
 from safe_wrappers.constraints.escape_clearance import EscapeClearance
 from safe_wrappers.constraints.heading_drive_clearance import HeadingDriveClearance
 from safe_wrappers.constraints.impact_speed_limit import ImpactSpeedLimit
@@ -12,6 +13,8 @@ from safe_wrappers.constraints.joint_speed_limit import JointSpeedLimit
 from safe_wrappers.constraints.obstacles import Box, Disc, Discs, Plane, Sphere
 from safe_wrappers.constraints.singularity_margin import SingularityMargin
 from safe_wrappers.constraints.speed_limit import SpeedLimit
+from safe_wrappers.constraints.stance import Stance
+from safe_wrappers.constraints.support_margin import SupportMargin
 from safe_wrappers.constraints.track_permission import TrackPermission
 from safe_wrappers.constraints.tracked_discs import TrackedDiscs
 from safe_wrappers.constraints.traction import Traction
@@ -26,6 +29,7 @@ __all__ = [
     "Clearance",
     "CoastingClearance",
     "Constraint",
+    "ContactFeasibility",
     "Disc",
     "Discs",
     "EscapeClearance",
@@ -38,6 +42,8 @@ __all__ = [
     "SingularityMargin",
     "SpeedLimit",
     "Sphere",
+    "Stance",
+    "SupportMargin",
     "TrackPermission",
     "TrackedDiscs",
     "Traction",

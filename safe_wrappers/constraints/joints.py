@@ -3,12 +3,24 @@
 from collections.abc import Sequence
 
 import mujoco
+import numpy as np
+from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco import MujocoPlant
 
 _HINGE_OR_SLIDE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 _DRIVES = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+
+
+def stops(model: mujoco.MjModel) -> tuple[list[int], NDArray[np.float64], NDArray[np.float64]]:
+    """The driven hinges and slides that have a range, and its ends, rad or m."""
+    driven = {
+        int(model.actuator_trnid[a, 0]) for a in range(model.nu) if model.actuator_trntype[a] in _DRIVES
+    }
+    limited = [j for j in sorted(driven) if model.jnt_type[j] in _HINGE_OR_SLIDE and model.jnt_limited[j]]
+    low, high = model.jnt_range[limited].T
+    return limited, low, high
 
 
 def scalar_joints(plant: MujocoPlant, names: Sequence[str] | None) -> list[int]:

@@ -9,6 +9,7 @@ from safe_wrappers.constraints.barrier import Barrier
 from safe_wrappers.constraints.clearance import Clearance
 from safe_wrappers.constraints.coasting_clearance import CoastingClearance
 from safe_wrappers.constraints.constraint import Constraint
+from safe_wrappers.constraints.contact_feasibility import ContactFeasibility
 from safe_wrappers.constraints.escape_clearance import EscapeClearance
 from safe_wrappers.constraints.heading_drive_clearance import HeadingDriveClearance
 from safe_wrappers.constraints.impact_speed_limit import ImpactSpeedLimit
@@ -17,6 +18,8 @@ from safe_wrappers.constraints.joint_speed_limit import JointSpeedLimit
 from safe_wrappers.constraints.obstacle_kinds import obstacle_data
 from safe_wrappers.constraints.singularity_margin import SingularityMargin
 from safe_wrappers.constraints.speed_limit import SpeedLimit
+from safe_wrappers.constraints.stance import Stance
+from safe_wrappers.constraints.support_margin import SupportMargin
 from safe_wrappers.constraints.track_permission import TrackPermission
 from safe_wrappers.constraints.traction import Traction
 from safe_wrappers.constraints.upright import Upright
@@ -28,6 +31,7 @@ KINDS: dict[str, Callable[..., Constraint]] = {
     "Barrier": Barrier,
     "Clearance": Clearance,
     "CoastingClearance": CoastingClearance,
+    "ContactFeasibility": ContactFeasibility,
     "EscapeClearance": EscapeClearance,
     "HeadingDriveClearance": HeadingDriveClearance,
     "ImpactSpeedLimit": ImpactSpeedLimit,
@@ -35,6 +39,8 @@ KINDS: dict[str, Callable[..., Constraint]] = {
     "JointSpeedLimit": JointSpeedLimit,
     "SingularityMargin": SingularityMargin,
     "SpeedLimit": SpeedLimit,
+    "Stance": Stance,
+    "SupportMargin": SupportMargin,
     "TrackPermission": TrackPermission,
     "Traction": Traction,
     "Upright": Upright,

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.actuators import AffineActuators
+from safe_wrappers.plants.contact_forecast import ContactForecast, ContactReader, forecast_contacts
 from safe_wrappers.plants.forecast import Forecast, Poses, Recorder
 from safe_wrappers.plants.plant import (
     check_timing,
@@ -104,6 +105,8 @@ class MujocoPlant:
         self._pending = deque(maxlen=max(1, -(-self._delay_steps // self.substeps)))
         self._recorder = self._new_recorder()
         self._forecasts: dict[bytes, Forecast] = {}
+        self._contact_forecasts: dict[bytes, ContactForecast] = {}
+        self._contact_reader = ContactReader(self.model)
         self._snapshot = np.zeros(mujoco.mj_stateSize(self.model, int(_STATE)))
         self._loaded = self._forwarded = False
         if self._factors != (1.0, 1.0):
@@ -141,12 +144,14 @@ class MujocoPlant:
         self._recorder = self._new_recorder()  # its braking depends on the masses
         self._loaded = self._forwarded = False
         self._forecasts.clear()
+        self._contact_forecasts.clear()
 
     def observe(self) -> None:
         """Take the env's present state; nothing is computed until it is asked for."""
         mujoco.mj_getState(self._raw.model, self._raw.data, self._snapshot, int(_STATE))
         self._loaded = self._forwarded = False
         self._forecasts.clear()
+        self._contact_forecasts.clear()
         self.stamp += 1
         # MuJoCo resets a state that is not a number, which a prediction would hide.
         if self._delay_steps and bool(np.isfinite(self._snapshot).all()):
@@ -357,6 +362,34 @@ class MujocoPlant:
             self._load_to_step()
             known = self._forecasts[key] = self._recorder.record(self.data, control, holds)
         return known.first(holds)
+
+    def contact_forecast(self, control: Array) -> ContactForecast:
+        """The contacts with the fixed world while a control is held for one control interval, shape (nu,).
+
+        Kept until the next observation.
+        """
+        key = control.tobytes()
+        if key not in self._contact_forecasts:
+            self._load_to_step()
+            self._recorder.act(self.data, control)
+            self._contact_forecasts[key] = forecast_contacts(
+                self.model, self.data, self.substeps, self._contact_reader
+            )
+        return self._contact_forecasts[key]
+
+    def under(self, control: Array) -> mujoco.MjData:
+        """The plant's data with every derived quantity at the present state under a control, shape (nu,)."""
+        self._load_to_step()
+        self._recorder.act(self.data, control)
+        mujoco.mj_forward(self.model, self.data)
+        return self.data
+
+    @property
+    def weight_n(self) -> float:
+        """Of everything that moves, N; without gravity its mass in kg."""
+        moving = self.model.body_weldid != 0
+        gravity = float(np.linalg.norm(self.model.opt.gravity))
+        return float(self.model.body_mass[moving].sum()) * (gravity or 1.0)
 
     def braking(self) -> Array:
         """The control with which a forecast goes on after its held control, shape (nu,), from the present state."""

@@ -67,16 +67,21 @@ class Replay:
         step_s = float(model.opt.timestep)
         by_stages = model.opt.integrator == _RK4
         for _ in range(round((there.time - data.time) / step_s)):
-            if by_stages:
-                _runge_kutta(model, data, visit)
-            else:
-                mujoco.mj_step(model, data)  # it leaves the forces that it has integrated
-                visit(data, step_s)
+            evaluations(model, data, visit)
         mujoco.mj_getState(model, data, self._end, int(_PHYSICS))
         mujoco.mj_getState(model, there, self._there, int(_PHYSICS))
         if by_stages:
             return bool(np.allclose(self._end, self._there, rtol=_ROUNDING, atol=_ROUNDING))
         return np.array_equal(self._end, self._there)
+
+
+def evaluations(model: mujoco.MjModel, data: mujoco.MjData, visit: Visit) -> None:
+    """One physics substep, with every evaluation of the physics in sight; of Runge-Kutta there are four."""
+    if model.opt.integrator == _RK4:
+        _runge_kutta(model, data, visit)
+        return
+    mujoco.mj_step(model, data)  # it leaves the forces that it has integrated
+    visit(data, float(model.opt.timestep))
 
 
 def _runge_kutta(model: mujoco.MjModel, data: mujoco.MjData, visit: Visit) -> None:
