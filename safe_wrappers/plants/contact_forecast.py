@@ -93,12 +93,13 @@ def forecast_contacts(
         evaluations(model, data, visit)
     finite = bool(np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all())
     body, point, normal, force, friction = zip(*rows, strict=True) if rows else ((),) * 5
-    vectors = (np.array(v, dtype=np.float64).reshape(-1, 3) for v in (point, normal, force))
     return ContactForecast(
-        count,
-        np.array(step, dtype=np.int64),
-        np.array(body, dtype=np.int64),
-        *vectors,
-        np.array(friction),
-        finite,
+        steps=count,
+        step=np.array(step, dtype=np.int64),
+        body=np.array(body, dtype=np.int64),
+        point=np.array(point, dtype=np.float64).reshape(-1, 3),
+        normal=np.array(normal, dtype=np.float64).reshape(-1, 3),
+        force=np.array(force, dtype=np.float64).reshape(-1, 3),
+        friction=np.array(friction, dtype=np.float64),
+        finite=finite,
     )
