@@ -26,7 +26,8 @@ def protect(env: gym.Env[Any, Any], **options: Any) -> CBFActionFilter:
         options: Passed to `CBFActionFilter`: `margin` (added to the recipe's own), `fallback`, `solver`,
             `plant`. SafePointGoal also takes `detour` (go around a hazard instead of stopping before it,
             default True), `brake` (count on the drive to stop, default True) and `uncertainty` (of mass and
-            damping, a fraction, default 0); SafeCarGoal takes `detour`.
+            damping, a fraction, default 0); SafeCarGoal takes `detour`; Fetch takes `low` and `high` (corners of the
+            gripper's box, m), `keep_out` (obstacles for its fingers) and `table` (keep them off it, default True).
 
     Raises:
         UnsupportedEnvError: No recipe for this env; the message has the lines that protect it by hand.

@@ -1,6 +1,6 @@
 """The constraints that `protect` puts on each env it knows: limits, reserves, and why these numbers."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -160,6 +160,48 @@ def _ant_maze(env: gym.Env[Any, Any]) -> list[Constraint]:
     return [Workspace(keep_out=walls, bodies=["torso"], radius=0.4, margin=0.01, holds=5, reach=1.0)]
 
 
+FINGER_RADIUS_M = 0.0414
+"""Around the centre of a Fetch finger, a box of 77 x 14 x 27 mm: to its corners, rounded up."""
+
+
+def _fetch(
+    env: gym.Env[Any, Any],
+    low: Sequence[float | None] | None = None,
+    high: Sequence[float | None] | None = None,
+    keep_out: Sequence[Any] = (),
+    table: bool = True,
+) -> list[Constraint]:
+    raw: Any = env.unwrapped
+    start = raw.initial_gripper_xpos
+    geom = int(raw.model.body("table0").geomadr[0])
+    middle = raw.model.geom_pos[geom] + raw.model.body("table0").pos
+    half = raw.model.geom_size[geom]
+    top = float(middle[2] + half[2])
+    # Goals and objects lie within 0.15 m of where the gripper starts (FetchSlide's goals are out of its reach on
+    # purpose), and whoever pushes an object comes from 0.06 m beyond it; a block is lifted to 0.48 m above the table.
+    # In the whole box the gripper comes within 15 mm of where it is sent, and tilts by less than 30 degrees.
+    least = [float(start[0]) - 0.25, float(start[1]) - 0.25, top + 0.02]
+    most = [float(start[0]) + 0.25, float(start[1]) + 0.25, top + 0.5]
+    # Two control steps: a displacement of zero stops the gripper within one. It covers 33 mm per axis in one step.
+    grip = Workspace(
+        least if low is None else low,
+        most if high is None else high,
+        sites=["robot0:grip"],
+        margin=0.001,
+        holds=2,
+        reach=0.07,
+    )
+    # An upright finger's tip stays 4 mm above the table, where it still meets the lower half of block and puck.
+    obstacles = [*([Box(middle.tolist(), half.tolist())] if table else []), *keep_out]
+    if not obstacles:
+        return [grip]
+    fingers = [f"robot0:{side}_gripper_finger_link" for side in "lr"]
+    clear = Workspace(
+        keep_out=obstacles, geoms=fingers, radius=FINGER_RADIUS_M, margin=0.001, holds=2, reach=0.12
+    )
+    return [grip, clear]
+
+
 def _velocity(robot: str, margin: float, holds: int = 3) -> Callable[..., list[Constraint]]:
     plane = robot in ("Ant", "Humanoid")
 
@@ -194,6 +236,11 @@ RECIPES: dict[str, Callable[..., list[Constraint]]] = {
     "PointMaze": _point_maze,
     "PatrolledPointMaze": _patrolled_maze,
     "AntMaze": _ant_maze,
+    **{
+        f"Fetch{task}{reward}": _fetch
+        for task in ("Reach", "Push", "Slide", "PickAndPlace")
+        for reward in ("", "Dense")
+    },
     # A policy trained through three steps ahead found states with no way out (1 violation in 1000 steps).
     "HalfCheetah": _velocity("HalfCheetah", margin=0.02, holds=5),
     "Hopper": _velocity("Hopper", margin=0.02),

@@ -35,5 +35,10 @@ def cut(slacks: Callable[[Array], Array], control: Array, low: Array, high: Arra
         moved = control.copy()
         moved[j] += width[j]
         jacobian[:, j] = (slacks(moved) - base) / width[j] if width[j] else 0.0
+    return through(base, control, jacobian)
+
+
+def through(base: Array, control: Array, jacobian: Array) -> HalfSpaces:
+    """Rows of slacks that are `base` at a control and change by a Jacobian, aimed a little inward where violated."""
     wanted = _INWARD * np.maximum(-base, 0.0)
     return HalfSpaces(-jacobian, base - jacobian @ control - wanted)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.constraints.constraint import HalfSpaces, positive
-from safe_wrappers.constraints.cut import cut
+from safe_wrappers.constraints.cut import cut, through
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.forecast import Forecast
 from safe_wrappers.plants.mujoco import MujocoPlant
@@ -18,6 +18,14 @@ from safe_wrappers.plants.plant import Plant
 Array = NDArray[np.float64]
 
 _ROUNDING = 1e-9
+_STEP = 1e-4
+"""Width of the differences about braking, as a share of the control's range."""
+_KEPT = 10
+"""Control steps for which a response is kept: it is a guess that forecasts check, and differences cost one each."""
+_SAME_RESPONSE = 1
+"""Cuts of one step that take the kept response for theirs."""
+_RESOLUTION = 1e-6
+"""Of controls, in their units: aimed farther inward by what rounding them may change."""
 RECOVERY_S = 0.1
 """Time constant, s, in which a state outside has to come back."""
 
@@ -73,12 +81,14 @@ class Predicted(ABC):
                 "Barrier(h) or Clearance(...)"
             )
         self._stamp: int | None = None
+        self._response: Array | None = None
         self._recent: deque[float] = deque(maxlen=self.holds)
         self._reach = self.reach
 
     def reset(self) -> None:
         """Forget the episode."""
         self._stamp = None
+        self._response = None
         self._recent.clear()
 
     def value(self, plant: MujocoPlant) -> Array:
@@ -90,6 +100,8 @@ class Predicted(ABC):
         if self._stamp == plant.stamp:
             return
         self._value = self._now(plant)
+        self._linear: HalfSpaces | None = None
+        self._cuts = 0
         self._least = float(self._value.min(initial=np.inf))
         self._stamp = plant.stamp
         if self._reach is not None:
@@ -120,8 +132,11 @@ class Predicted(ABC):
         if not self._outside.any():
             return np.asarray(left.min(axis=0))
         # From outside, bound by bound: no farther out on the way, and closer at the end.
-        closer = self._outside * np.exp(-self.holds * plant.hold_s / RECOVERY_S)
-        return np.concatenate([left.min(axis=0) - self._outside, left[-1] - closer])
+        return np.concatenate([left.min(axis=0) - self._outside, left[-1] - self._closer(plant)])
+
+    def _closer(self, plant: MujocoPlant) -> Array:
+        """What is left of the present violations at the end of a forecast, <= 0, shape (n,)."""
+        return np.asarray(self._outside * np.exp(-self.holds * plant.hold_s / RECOVERY_S))
 
     def admits(self, plant: MujocoPlant, control: Array) -> bool:
         """Whether the forecast keeps the margin (from outside: whether it comes back towards it)."""
@@ -135,8 +150,45 @@ class Predicted(ABC):
 
     def cut(self, plant: MujocoPlant, control: Array) -> HalfSpaces:
         """The forecast, linearised about a refused control."""
-        return cut(lambda u: self.slacks(plant, u), control, plant.lower, plant.upper)
+        if plant.has_acceleration:
+            return cut(lambda u: self.slacks(plant, u), control, plant.lower, plant.upper)
+        self._cuts += 1
+        if self._cuts > _SAME_RESPONSE:
+            self._respond(plant, control)
+        return self._instants(plant, control)
 
     def rows(self, plant: Any) -> HalfSpaces:
-        """None: what counts is the forecast, linearised where a control has been refused."""
-        return HalfSpaces.none(plant.lower.size)
+        """None: what counts is the forecast, linearised where a control has been refused.
+
+        Where controls are no forces: the forecast linearised about braking, instant by instant. A displacement that
+        is refused may press the machine against something, and says little about one that does not.
+        """
+        if plant.has_acceleration:
+            return HalfSpaces.none(plant.lower.size)
+        self._look(plant)
+        if self._linear is None:
+            braking = plant.braking()
+            if self._response is None or plant.stamp >= self._response_until:
+                self._respond(plant, braking)
+            self._linear = self._instants(plant, braking)
+        return self._linear
+
+    def _respond(self, plant: MujocoPlant, control: Array) -> None:
+        """How what is left at every instant changes with a control, by differences, shape (instants, n, nu)."""
+        room = self._room(plant, plant.forecast(control, self.holds))
+        step = np.where(control < 0.0, _STEP, -_STEP) * (plant.upper - plant.lower)
+        changed = [self._room(plant, plant.forecast(control + part, self.holds)) for part in np.diag(step)]
+        parts = [(other - room) / width for other, width in zip(changed, step, strict=True)]
+        self._response, self._response_until = np.stack(parts, axis=-1), plant.stamp + _KEPT
+
+    def _instants(self, plant: MujocoPlant, control: Array) -> HalfSpaces:
+        """A row for every instant and bound of a control's forecast that some control could break."""
+        response = self._response
+        assert response is not None  # `rows` is asked first
+        left = self._room(plant, plant.forecast(control, self.holds)) - self.margin - self._outside
+        left[-1] += self._outside - self._closer(plant)
+        away = np.where(response > 0.0, plant.lower - control, plant.upper - control)
+        least = left + (response * away).sum(axis=-1)
+        near = ~(least > 0.0)
+        left -= _RESOLUTION * np.abs(response).sum(axis=-1)
+        return through(left[near], control, response[near])

@@ -130,10 +130,6 @@ class DisplacementPlant(MujocoPlant):
             self._forwarded = True
         return self.data
 
-    def braking(self) -> Array:
-        """No displacement, shape (4,)."""
-        return np.zeros(self._lower.size)
-
     @property
     def acting_range(self) -> tuple[Array, Array]:
         """All of the action space acts."""
