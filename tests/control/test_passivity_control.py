@@ -211,6 +211,16 @@ def test_energy_that_one_end_dissipated_is_not_told_to_the_other():
     assert end.budget_j == 0.0
 
 
+def test_what_comes_in_does_not_pay_a_debt_as_the_other_end_hears_of_it():
+    end = EnergyReference(limit=1.6)
+    assert end.modify(-4.0, 1.0, 0.5).debt_j == pytest.approx(1.2)  # 2 J less 0.8 J
+    pays = end.modify(3.0, 2.0, 0.5)
+    assert pays.correction == pytest.approx(1.2)
+    assert pays.debt_j == 0.0
+    end.modify(0.0, 0.0, 0.5)
+    assert (end.message_j, end.budget_j) == (3.0, pytest.approx(0.0, abs=1e-15))
+
+
 def test_an_end_gives_what_it_has_heard_of():
     end = EnergyReference("admittance")
     end.receive(1.5, 1.0)

@@ -1,0 +1,310 @@
+"""A tool pressed against a wall through a late network: energy made, chatter, force, and clearance, by coding.
+
+    python -m benchmarks.teleop              # 5 seeds of everything: an hour on one core; goes on where it stopped
+    python -m benchmarks.teleop --seeds 1    # a look
+
+`TeleopContact-v0` behind a `TeleopChannel`, 6 s an episode at 1 kHz. The delay is that of *each* direction, so the
+round trip is twice that. Networks: **steady** has nothing but the delay; **rough** has up to 30 % more, drawn for
+each packet, 5 % of loss, and packets that overtake each other; **outages** is rough and goes silent for 0.3 s every
+2 s, on average. Operators (`TeleopOperator`): the **careful** one stops before the clamp, as far as what he sees lets
+him; the other **looks away** and sweeps on. Everyone has his own reaction time, from 0.15 to 0.25 s.
+
+Judged from outside the channel. Energy: of the operator's hand at the force that he is shown, and of what acted on
+the tool by the env's own account; the channel's word is taken for what is in flight only. Chatter: how often per
+second the tool touches the wall anew after the first time, and the standard deviation of the wall's force from 1.5 s
+after the first touch. Clearance: the env's, at every physics substep.
+
+The hand of the scripted operator answers a force one tick after it was shown. `made_at_hand_j` counts energy with
+that force instead: what sampling at the operator's end adds, which no channel sees.
+
+Extractable energy: what comes out of both ports together between any two ticks, less what goes in, may not be above
+what was in flight at the first of them. The excess over that is computed for every pair of ticks.
+"""
+
+import argparse
+import json
+import math
+import multiprocessing
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+import safe_wrappers as sw
+from safe_wrappers.envs.teleop_contact import TELEOP_ACCELERATION, TELEOP_BRAKING, TELEOP_TOP_SPEED
+from safe_wrappers.envs.teleop_operator import TeleopOperator
+
+Array = NDArray[np.float64]
+
+RESULTS = Path(__file__).parent / "results"
+DELAYS_S = (0.0, 0.025, 0.05, 0.1, 0.2, 0.3)
+"""Of each direction."""
+JITTER = 0.3
+"""Of the delay."""
+LOSS = 0.05
+OUTAGE_BETWEEN_S, OUTAGE_LENGTH_S = 2.0, 0.3
+SETTLED_S = 1.5
+"""After the first touch the force is ramped up until then."""
+CODINGS: Final[dict[str, dict[str, Any]]] = {
+    "plain": {"coding": "plain"},
+    "controller": {"coding": "plain", "passivity": "controller", "storage_j": 0.02},
+    "wave": {"coding": "wave", "impedance": 40.0},
+}
+RULES: Final[dict[str, dict[str, Any]]] = {
+    "wave, hold": {**CODINGS["wave"], "wave_rule": "hold"},
+    "wave, zero": {**CODINGS["wave"], "wave_rule": "zero"},
+}
+"""Other rules for packets that are late; where no packet is, they are all the same."""
+NETWORKS = ("steady", "rough", "outages")
+OPERATORS = ("careful", "looks away")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One combination, and one seed of env, network and operator."""
+
+    coding: str
+    network: str
+    delay_s: float
+    operator: str
+    revocation: bool
+    seed: int
+    steps: int = 6000
+
+
+def link(network: str, delay_s: float) -> sw.Link:
+    """One direction."""
+    if network == "steady":
+        return sw.Link(delay_s)
+    silent = (OUTAGE_BETWEEN_S, OUTAGE_LENGTH_S) if network == "outages" else (None, None)
+    return sw.Link(delay_s, JITTER * delay_s, LOSS, False, *silent)
+
+
+def reading(env: gym.Env[Any, Any]) -> tuple[list[float], list[float]]:
+    """Clearance to the clamp and approach speed."""
+    raw: Any = env.unwrapped
+    return [raw.clearance], [float(raw.tool_velocity[1])]
+
+
+def channel(job: Job) -> sw.TeleopChannel:
+    """The env behind its channel."""
+    ceiling = sw.RoundTripCeiling(
+        reading, braking=TELEOP_BRAKING, acceleration=TELEOP_ACCELERATION, top_speed=TELEOP_TOP_SPEED
+    )
+    ways = (link(job.network, job.delay_s) for _ in range(2))
+    return sw.TeleopChannel(
+        gym.make("TeleopContact-v0", max_episode_steps=job.steps, disable_env_checker=True),
+        *ways,
+        ceiling=ceiling if job.revocation else None,
+        **{**CODINGS, **RULES}[job.coding],
+    )
+
+
+def excess(net_j: Array, in_flight_j: Array) -> float:
+    """By how much more came out after any tick than was in flight at it, at most, J.
+
+    Args:
+        net_j: Energy that went in less what came out, at the end of each tick, shape (n,).
+        in_flight_j: At the end of each tick, shape (n,).
+    """
+    net, flying = np.concatenate([[0.0], net_j]), np.concatenate([[0.0], in_flight_j])
+    lowest_from_here = np.minimum.accumulate(net[::-1])[::-1]
+    return float(np.max(net - flying - lowest_from_here))
+
+
+def chatter(force: Array, step_s: float) -> dict[str, float | None]:
+    """Of the wall's force over an episode, shape (n,), N: None where there was no time to see it."""
+    touching = force > 0.0
+    first = int(np.argmax(touching)) if touching.any() else force.size
+    since_s = (force.size - first) * step_s
+    again = int((~touching[first:-1] & touching[first + 1 :]).sum()) if first < force.size else 0
+    settled = force[first + round(SETTLED_S / step_s) :]
+    return {
+        "contacts_per_s": again / since_s if since_s > 0.5 else None,
+        "ripple_n": float(settled.std()) if settled.size * step_s > 0.5 else None,
+        "peak_n": float(force.max()),
+    }
+
+
+def run(job: Job) -> dict[str, Any]:
+    """One episode."""
+    env = channel(job)
+    raw: Any = env.unwrapped
+    operator = TeleopOperator(job.seed, stops=job.operator == "careful")
+    observation, _ = env.reset(seed=job.seed)
+    felt_at_once = job.coding != "plain"  # the force for this very motion, not the last that arrived
+    effort = np.array(env.port.effort)  # type: ignore[union-attr]
+    net, flying, force = (np.zeros(job.steps) for _ in range(3))
+    total, late, at_hand = 0.0, 0.0, 0.0
+    least, breached, revoked, created = math.inf, 0, 0, 0.0
+    for n in range(job.steps):
+        action, shown = operator.act(observation), observation
+        observation, _, _, _, info = env.step(action)
+        felt = (observation if felt_at_once else shown)[effort]
+        total += float(felt @ action) * raw.dt
+        late += float((shown[effort] - felt) @ action) * raw.dt
+        if not info["teleop/revoked"]:
+            total -= float(raw.port_effort_acted @ info["executed_action"]) * raw.dt
+        net[n], flying[n], force[n] = total, info["teleop/in_flight_j"], info["contact_force"]
+        at_hand = min(at_hand, total + late)
+        least = min(least, info["clearance"])
+        breached += int(info["cost"] > 0.0)
+        revoked += int(info["teleop/revoked"])
+        created = info["teleop/created_j"]
+    storage = 2.0 * float(CODINGS.get(job.coding, {}).get("storage_j", 0.0))  # at each end
+    return {
+        **asdict(job),
+        "excess_j": excess(net, flying),
+        "made_j": max(-float(net.min()) - storage, 0.0),
+        "made_at_hand_j": max(-at_hand - storage, 0.0),
+        "created_j": created,
+        "flying_j": float(flying.max()),
+        "breached_steps": breached,
+        "least_m": least,
+        "revoked_steps": revoked,
+        "swept_m": info["swept"],
+        **chatter(force, raw.dt),
+    }
+
+
+# Tables ------------------------------------------------------------------------------------------------------
+
+
+def _some(rows: list[dict[str, Any]], **wanted: Any) -> list[dict[str, Any]]:
+    return [r for r in rows if all(r[k] == v for k, v in wanted.items())]
+
+
+def _mean(rows: list[dict[str, Any]], key: str, form: str) -> str:
+    known = [r[key] for r in rows if r[key] is not None]
+    return format(float(np.mean(known)), form) if known else "-"
+
+
+def energy_table(rows: list[dict[str, Any]], codings: tuple[str, ...], networks: tuple[str, ...]) -> str:
+    """Markdown: careful operators without revocation; one line per network and delay, codings side by side."""
+    names = " / ".join(codings)
+    lines = [
+        f"| network | delay each way (ms) | energy made (J): {names} | touches per s | force ripple (N) "
+        "| peak force (N) | swept (cm) |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for network in networks:
+        for delay in DELAYS_S:
+            parts = [
+                _some(rows, coding=c, network=network, delay_s=delay, operator="careful", revocation=False)
+                for c in codings
+            ]
+            if not all(parts):
+                continue
+            cells = [
+                " / ".join(energy(float(np.mean([r["made_j"] for r in p]))) for p in parts),
+                " / ".join(_mean(p, "contacts_per_s", ".1f") for p in parts),
+                " / ".join(_mean(p, "ripple_n", ".2f") for p in parts),
+                " / ".join(f"{max(r['peak_n'] for r in p):.0f}" for p in parts),
+                " / ".join(f"{100.0 * float(np.mean([r['swept_m'] for r in p])):.0f}" for p in parts),
+            ]
+            lines.append(f"| {network} | {1e3 * delay:g} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def energy(joule: float) -> str:
+    """0 only where it is, to rounding."""
+    return "0" if joule < 1e-9 else f"{joule:.3f}" if joule < 0.1 else f"{joule:.1f}"
+
+
+def clearance_table(rows: list[dict[str, Any]]) -> str:
+    """Markdown: episodes that touched the clamp, with revocation and without, all delays together."""
+    lines = [
+        "| operator | network | coding | episodes each | breached, no revocation | with revocation "
+        "| least clearance (mm) | time revoked |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for operator in OPERATORS:
+        for network in NETWORKS:
+            for coding in (*CODINGS, *RULES):
+                off, on = (
+                    _some(rows, operator=operator, network=network, coding=coding, revocation=r)
+                    for r in (False, True)
+                )
+                if not on:
+                    continue
+                breached = [
+                    str(sum(r["breached_steps"] > 0 for r in part)) if part else "-" for part in (off, on)
+                ]
+                share = sum(r["revoked_steps"] for r in on) / sum(r["steps"] for r in on)
+                lines.append(
+                    f"| {operator} | {network} | {coding} | {len(on)} | {breached[0]} | {breached[1]} | "
+                    f"{1e3 * min(r['least_m'] for r in on):.2f} | {share:.1%} |"
+                )
+    return "\n".join(lines)
+
+
+def both_table(rows: list[dict[str, Any]]) -> str:
+    """Markdown: both invariants in the same runs, with revocation."""
+    lines = [
+        "| coding | episodes | ticks | extracted beyond what was in flight, at most (J) | most in flight (J) "
+        "| made, with the hand a tick late (J) | breaches |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for coding in ("wave", *RULES):
+        part = _some(rows, coding=coding, revocation=True)
+        if part:
+            lines.append(
+                f"| {coding} | {len(part)} | {sum(r['steps'] for r in part):,} | "
+                f"{max(r['excess_j'] for r in part):.1e} | {max(r['flying_j'] for r in part):.2f} | "
+                f"{max(r['made_at_hand_j'] for r in part):.1e} | "
+                f"{sum(r['breached_steps'] > 0 for r in part)} |"
+            )
+    return "\n".join(lines)
+
+
+def tables(rows: list[dict[str, Any]]) -> str:
+    """All of them."""
+    return "\n\n".join(
+        [
+            energy_table(rows, tuple(CODINGS), NETWORKS),
+            energy_table(rows, ("wave", *RULES), ("rough", "outages")),
+            clearance_table(rows),
+            both_table(rows),
+        ]
+    )
+
+
+def jobs(seeds: int) -> list[Job]:
+    """Seed by seed, so that every look is at all of it."""
+    return [
+        Job(coding, network, delay, operator, revocation, seed)
+        for seed in range(seeds)
+        for network in NETWORKS
+        for delay in DELAYS_S
+        for coding in (*CODINGS, *(RULES if network != "steady" else ()))
+        for operator in OPERATORS
+        for revocation in (False, True)
+        if coding not in RULES or operator == "careful"
+    ]
+
+
+def main() -> None:
+    """Run what is missing, keep every episode, print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--workers", type=int, default=multiprocessing.cpu_count())
+    arguments = parser.parse_args()
+    RESULTS.mkdir(exist_ok=True)
+    kept = RESULTS / "teleop.jsonl"
+    rows = [json.loads(line) for line in kept.read_text().splitlines()] if kept.exists() else []
+    done = {tuple(r[f] for f in Job.__dataclass_fields__) for r in rows}
+    missing = [j for j in jobs(arguments.seeds) if tuple(asdict(j).values()) not in done]
+    with multiprocessing.get_context("spawn").Pool(arguments.workers) as pool, kept.open("a") as file:
+        for row in pool.imap_unordered(run, missing):
+            rows.append(row)
+            file.write(json.dumps(row) + "\n")
+            file.flush()
+    (RESULTS / "teleop.md").write_text(tables(rows) + "\n")
+    print(tables(rows))
+
+
+if __name__ == "__main__":
+    main()
