@@ -47,8 +47,8 @@ class SingularityMargin(Predicted):
 
     A torque changes w through two integrations. So the forecast goes on after the held control, braking every
     actuated joint, for `holds` control steps in all; w has to stay at every physics substep of it. Rows
-    `w'' + 2 a w' + a^2 (w - threshold) >= 0` are the first guess; what counts is the forecast. On a plant whose
-    action is no force there are none. With as many joints as directions the determinant's sign is watched too: an arm
+    `w'' + 2 a w' + a^2 (w - threshold) >= 0` are the first guess where controls are forces; what counts is
+    the forecast. With as many joints as directions the determinant's sign is watched too: an arm
     does not pass through the singular pose between two substeps.
 
     What it promises: an executed control that is not flagged keeps the threshold at every substep of its step, for a
@@ -231,7 +231,7 @@ class SingularityMargin(Predicted):
     def rows(self, plant: MujocoPlant) -> HalfSpaces:
         """One row, a first guess for the forecast.
 
-        None where a ball or free joint carries the frame as well, and where controls are no forces.
+        Where a ball or free joint carries the frame as well, or controls are no forces, it is that of every forecast.
         """
         if not (self._chain.scalar and plant.has_acceleration):
             return super().rows(plant)
