@@ -226,8 +226,9 @@ def _rows(
         rows.append(problem.acceleration_rows @ slope)
         limits.append(problem.acceleration_limits - problem.acceleration_rows @ start)
     if problem.force_rows is not None and problem.force_limits is not None:
-        part = problem.force_rows.reshape(-1, len(problem.normals), 3)[:, problem.stance]
-        stance = part.reshape(-1, 3 * len(problem.stance))
+        count = len(problem.force_limits)
+        part = problem.force_rows.reshape(count, len(problem.normals), 3)[:, problem.stance]
+        stance = part.reshape(count, 3 * len(problem.stance))
         rows.append(stance @ elimination.matrix)
         limits.append(problem.force_limits - stance @ elimination.offset)
     if problem.opening.size:

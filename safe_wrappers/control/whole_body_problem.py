@@ -96,6 +96,9 @@ class WholeBodyProblem:
     """`contact_acceleration`, or zeros, minus the drift: what `J qacc` is to be, shape (k, 3)."""
 
     def __post_init__(self) -> None:
+        for rows, limits_of in (("acceleration_rows", "acceleration_limits"), ("force_rows", "force_limits")):
+            if (getattr(self, rows) is None) != (getattr(self, limits_of) is None):
+                raise ConfigurationError(f"{rows} and {limits_of} come together")
         nv, nu, k = len(self.bias), len(self.nominal), len(self.normals)
         limits = 0 if self.acceleration_limits is None else len(self.acceleration_limits)
         force_limits = 0 if self.force_limits is None else len(self.force_limits)
@@ -136,19 +139,16 @@ class WholeBodyProblem:
                 raise ConfigurationError(f"a task's weight must be 0 or more and finite, got {task.weight}")
             if not all(np.isfinite(a).all() for a in (task.jacobian, task.drift, task.target)):
                 raise ConfigurationError("a task must be finite")
-        for rows_name, limits_name in (
-            ("acceleration_rows", "acceleration_limits"),
-            ("force_rows", "force_limits"),
-        ):
-            if (getattr(self, rows_name) is None) != (getattr(self, limits_name) is None):
-                raise ConfigurationError(f"{rows_name} and {limits_name} come together")
         if not (self.lower <= self.upper).all():
             raise ConfigurationError(f"lower must not exceed upper, got {self.lower} and {self.upper}")
         if not (self.friction >= 0.0).all():
             raise ConfigurationError(f"friction must be 0 or more, got {self.friction}")
-        weights = np.broadcast_to(np.asarray(self.control_weight, dtype=np.float64), (nu,))
-        if not (np.isfinite(weights).all() and (weights > 0.0).all()):
-            raise ConfigurationError(f"control_weight must be positive and finite, got {self.control_weight}")
+        given = np.asarray(self.control_weight, dtype=np.float64)
+        weights = np.full(nu, given) if given.ndim == 0 else given
+        if not (weights.shape == (nu,) and np.isfinite(weights).all() and (weights > 0.0).all()):
+            raise ConfigurationError(
+                f"control_weight must be positive and finite, one or ({nu},), got {given}"
+            )
         if not 0.0 < self.force_weight < np.inf:
             raise ConfigurationError(f"force_weight must be positive and finite, got {self.force_weight}")
         if not 0.0 <= self.contact_softness < np.inf:

@@ -1,0 +1,572 @@
+"""Whole-body programs against problems solved by hand, and against the same program with nothing eliminated."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import qpsolvers
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import lsq_linear, minimize
+
+from safe_wrappers.control import whole_body
+from safe_wrappers.control.conic_program import Candidate
+from safe_wrappers.control.friction_cone import friction_pyramid, in_cone
+from safe_wrappers.control.support import plane, support_rows
+from safe_wrappers.control.whole_body import (
+    Task,
+    WholeBodyProblem,
+    attainable_contact_acceleration,
+    rigid_forces,
+    solve_cone,
+    solve_pyramid,
+)
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
+
+UP = np.array([0.0, 0.0, 1.0])
+SOLVERS = {
+    "daqp": solve_pyramid,
+    "clarabel": lambda problem: solve_pyramid(problem, solver="clarabel"),
+    "cone": solve_cone,
+}
+
+
+def foot(nominal, friction=0.5, mass=2.0, bound=100.0, **more):
+    """A point mass that is pushed by three motors and stands on a floor, in newtons: f = m g e_z - u."""
+    return WholeBodyProblem(
+        inertia=mass * np.eye(3),
+        bias=np.array([0.0, 0.0, mass * 9.81]),
+        actuation=np.eye(3),
+        jacobians=np.eye(3)[None],
+        drift=np.zeros((1, 3)),
+        normals=UP[None],
+        friction=np.array([friction]),
+        lower=-np.full(3, bound),
+        upper=np.full(3, bound),
+        nominal=np.array(nominal, dtype=float),
+        **more,
+    )
+
+
+def robot(seed, nv=8, nu=5, k=3, **more):
+    """A made-up robot at an instant in which some control in the box has forces in the pyramids."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(nv, nv))
+    inertia, actuation = root @ root.T / nv + np.eye(nv), rng.normal(size=(nv, nu)) * 3.0
+    jacobians, drift = rng.normal(size=(k, 3, nv)), rng.normal(size=(k, 3))
+    normals = rng.normal(size=(k, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    friction = rng.uniform(0.3, 1.2, k)
+    sideways = rng.normal(size=(k, 3)) * 0.1
+    forces = 5.0 * rng.uniform(0.2, 1.0, k)[:, None] * (normals + friction[:, None] * sideways)
+    bias, control = rng.normal(size=nv) * 3.0, rng.uniform(-0.8, 0.8, nu)
+    pushed = np.einsum("kiv,ki->v", jacobians, forces)
+    acceleration = np.linalg.solve(inertia, actuation @ control + pushed - bias)
+    fields = {"contact_acceleration": jacobians @ acceleration + drift, "force_weight": 1e-3} | more
+    return WholeBodyProblem(
+        inertia, bias, actuation, jacobians, drift, normals, friction, -np.ones(nu), np.ones(nu),
+        rng.uniform(-1.5, 1.5, nu), **fields,
+    )  # fmt: skip
+
+
+def in_full(problem, edges=4):
+    """The same program in (u, qacc, f), nothing eliminated, by qpsolvers: control and half the weighted squares."""
+    nv, nu, k = len(problem.bias), len(problem.nominal), len(problem.normals)
+    n = nu + nv + 3 * k
+    stacked = problem.jacobians.reshape(3 * k, nv)
+    hessian, linear, constant = np.zeros((n, n)), np.zeros(n), 0.0
+    u, a, f = slice(0, nu), slice(nu, nu + nv), slice(nu + nv, n)
+    hessian[u, u] = np.diag(problem.weights)
+    linear[u] = -problem.weights * problem.nominal
+    constant += problem.weights @ problem.nominal**2
+    hessian[f, f] = problem.force_weight * np.eye(3 * k)
+    squares = [(t.weight, t.jacobian, t.target - t.drift) for t in problem.tasks]
+    dynamics = np.hstack([-problem.actuation, problem.inertia, -stacked.T])
+    equal, value = [dynamics], [-problem.bias]
+    stay = problem.stance
+    wanted = (problem.contact_acceleration - problem.drift)[stay].ravel()
+    held = problem.jacobians[stay].reshape(-1, nv)
+    if problem.contact_softness > 0.0:
+        squares.append((1.0 / problem.contact_softness, held, wanted))
+    else:
+        rows = np.zeros((len(wanted), n))
+        rows[:, a] = held
+        equal.append(rows)
+        value.append(wanted)
+    for weight, jacobian, target in squares:
+        hessian[a, a] += weight * jacobian.T @ jacobian
+        linear[a] -= weight * jacobian.T @ target
+        constant += weight * float(target @ target)
+    rows, limits = [np.zeros((0, n))], []
+    sides = friction_pyramid(problem.normals, problem.friction, edges)
+    for i in range(k):
+        block = np.zeros((edges + 1, n))
+        block[:, nu + nv + 3 * i : nu + nv + 3 * i + 3] = sides[i]
+        rows.append(block)
+        limits += [0.0] * (edges + 1)
+    for i in problem.opening:
+        rows_i = np.zeros((1, n))
+        rows_i[0, a] = -problem.normals[i] @ problem.jacobians[i]
+        rows.append(rows_i)
+        limits.append(-float(problem.normals[i] @ (problem.contact_acceleration - problem.drift)[i]))
+        none = np.zeros((3, n))
+        none[:, nu + nv + 3 * i : nu + nv + 3 * i + 3] = np.eye(3)
+        equal.append(none)
+        value.append(np.zeros(3))
+    for given_rows, given_limits, where in (
+        (problem.acceleration_rows, problem.acceleration_limits, a),
+        (problem.force_rows, problem.force_limits, f),
+    ):
+        if given_rows is not None:
+            block = np.zeros((len(given_limits), n))
+            block[:, where] = given_rows
+            rows.append(block)
+            limits += list(given_limits)
+    free = np.full(n - nu, np.inf)
+    x = qpsolvers.solve_qp(
+        hessian, linear, np.vstack(rows), np.array(limits), np.vstack(equal), np.concatenate(value),
+        np.concatenate([problem.lower, -free]), np.concatenate([problem.upper, free]), solver="clarabel",
+        tol_gap_abs=1e-10, tol_gap_rel=1e-10, tol_feas=1e-10,
+    )  # fmt: skip
+    return None if x is None else (x[:nu], 0.5 * (x @ hessian @ x + constant) + linear @ x)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    k=st.integers(0, 5),
+    softness=st.sampled_from([0.0, 0.0, 0.1]),
+    extra=st.sampled_from(["nothing", "task", "rows", "forces", "weights"]),
+)
+def test_elimination_changes_nothing(seed, k, softness, extra):
+    # Five contacts of three axes on eight degrees of freedom: seven inner forces.
+    problem = robot(seed, k=k, contact_softness=softness)
+    rng = np.random.default_rng(seed + 1)
+    more = {
+        "nothing": {},
+        "task": {"tasks": [Task(rng.normal(size=(2, 8)), rng.normal(size=2), rng.normal(size=2), 0.3)]},
+        "rows": {
+            "acceleration_rows": (rows := rng.normal(size=(2, 8))),
+            "acceleration_limits": rows @ rigid_forces(problem, np.zeros(5))[1] + 5.0,
+        },
+        "forces": {"force_rows": rng.normal(size=(1, 3 * k)), "force_limits": np.array([40.0])},
+        "weights": {"control_weight": rng.uniform(0.2, 5.0, 5)},
+    }[extra]
+    problem = dataclasses.replace(problem, **more)
+    expected = in_full(problem)
+    for name in ("daqp", "clarabel"):
+        found = SOLVERS[name](problem)
+        if expected is None:
+            assert found.status in ("infeasible", "failed")
+            continue
+        assert found.status in ("solved", "inactive")
+        if found.status == "solved":
+            assert found.control == pytest.approx(expected[0], abs=3e-4)
+            assert found.objective == pytest.approx(expected[1], rel=1e-5, abs=1e-6)
+        else:
+            assert found.control is problem.nominal
+            if softness == 0.0:
+                assert found.objective >= expected[1] - 1e-6
+        assert_says_the_truth(problem, found)
+
+
+def assert_says_the_truth(problem, found):
+    """Every residual by hand."""
+    f, a, u = found.forces, found.acceleration, found.control
+    pushed = np.einsum("kiv,ki->v", problem.jacobians, f)
+    miss = problem.inertia @ a + problem.bias - problem.actuation @ u - pushed
+    scale = 1.0 + np.abs(f).max(initial=0.0) + np.abs(a).max()
+    assert np.abs(miss).max() < 1e-8 * scale
+    assert found.residuals.dynamics == pytest.approx(np.abs(miss).max(), abs=1e-9 * scale)
+    assert (u >= problem.lower).all() and (u <= problem.upper).all() and found.residuals.bounds == 0.0
+    assert in_cone(f, problem.normals, problem.friction, 1e-6 * scale).all()
+    grips = problem.stance[problem.friction[problem.stance] > 0.0]
+    missed = (problem.jacobians @ a - problem.wanted)[grips]
+    assert found.residuals.contact >= np.abs(missed).max(initial=0.0) - 1e-9 * scale
+    if found.status in ("solved", "inactive") and problem.contact_softness == 0.0:
+        assert np.abs(missed).max(initial=0.0) < 1e-5 * scale
+
+
+@pytest.mark.parametrize("solve", SOLVERS.values(), ids=SOLVERS)
+def test_a_foot_that_is_pushed_within_its_friction_is_left_alone_bit_for_bit(solve):
+    problem = foot([3.0, 1.0, -2.0])
+    found = solve(problem)
+    assert found.status == "inactive"
+    assert found.control is problem.nominal
+    assert found.forces[0] == pytest.approx([-3.0, -1.0, 2.0 * 9.81 + 2.0])
+    assert found.acceleration == pytest.approx(np.zeros(3), abs=1e-12)
+
+
+def test_a_foot_that_is_pushed_too_hard_gets_the_closest_push_of_its_cone():
+    # Allowed pushes are the cone |u_t| <= mu (m g - u_z) with its apex at m g e_z: its projection is known.
+    mu, weight, nominal = 0.5, 19.62, np.array([12.0, 5.0, 3.0])
+    found = solve_cone(foot(nominal, mu))
+    # Along (radius, height below the apex): the nearest point of the ray (mu, 1).
+    sideways, below = np.linalg.norm(nominal[:2]), weight - nominal[2]
+    t = (mu * sideways + below) / (1.0 + mu * mu)
+    expected = np.array([*(nominal[:2] / sideways * mu * t), weight - t])
+    assert found.status == "solved"
+    assert found.control == pytest.approx(expected, abs=1e-5)
+    assert np.linalg.norm(found.forces[0, :2]) == pytest.approx(mu * found.forces[0, 2], rel=1e-5)
+    # By hand: what is left, nominal minus answer, is a multiple of the cone's outer normal there.
+    outwards = np.array([*(nominal[:2] / sideways), mu])
+    left = nominal - found.control
+    assert left == pytest.approx(outwards * np.linalg.norm(left) / np.linalg.norm(outwards), abs=1e-4)
+
+
+@pytest.mark.parametrize("direction", [0.0, 0.3, 1.0])
+def test_the_pyramids_answer_closes_in_on_the_cones_as_the_cosine_does(direction):
+    # With the vertical motor weighted out, the push is cut to mu m g, or to what the pyramid has in that direction.
+    mu, weight = 0.5, 19.62
+    push = 15.0 * np.array([math.cos(direction), math.sin(direction), 0.0])
+    heavy = {"control_weight": np.array([1.0, 1.0, 1e6]), "first_tangents": np.array([[1.0, 0.0, 0.0]])}
+    exact = solve_cone(foot(push, mu, **heavy))
+    assert np.linalg.norm(exact.control[:2]) == pytest.approx(mu * weight, rel=1e-5)
+    gaps = []
+    for edges in (4, 8, 16, 64):
+        found = solve_pyramid(foot(push, mu, **heavy), edges)
+        # The closest point of a polygon whose corners are on the circle.
+        corners = mu * weight * np.exp(2j * math.pi * np.arange(edges) / edges)
+        target = push[0] + 1j * push[1]
+        nearest = min(
+            (segment_point(c, corners[(i + 1) % edges], target) for i, c in enumerate(corners)),
+            key=lambda z: abs(z - target),
+        )
+        assert found.control[:2] == pytest.approx([nearest.real, nearest.imag], abs=1e-4)
+        gaps.append(found.objective - exact.objective)
+        # Never better than the cone; worse by no more than the sagitta of a side, to first order.
+        sagitta = mu * weight * (1.0 - math.cos(math.pi / edges))
+        most = 0.5 * ((15.0 - mu * weight + sagitta) ** 2 - (15.0 - mu * weight) ** 2)
+        assert -1e-5 <= gaps[-1] <= most * 1.001 + 1e-4
+    if direction == 0.0:  # a corner
+        assert max(gaps) < 1e-4
+    if direction == 1.0:
+        assert gaps[0] > 10.0
+
+
+def segment_point(a, b, z):
+    along = ((z - a) / (b - a)).real
+    return a + (b - a) * min(max(along, 0.0), 1.0)
+
+
+@settings(max_examples=12, deadline=None)
+@given(seed=st.integers(0, 1000), k=st.integers(1, 3))
+def test_the_cone_is_at_least_as_good_as_any_pyramid_and_many_edges_come_close(seed, k):
+    problem = robot(seed, k=k)
+    exact = solve_cone(problem)
+    assert exact.status in ("solved", "inactive")
+    assert_says_the_truth(problem, exact)
+    by_edges = [solve_pyramid(problem, edges) for edges in (4, 48)]
+    if exact.status == "solved":
+        for found in by_edges:
+            assert found.objective >= exact.objective - 1e-6 * (1.0 + abs(exact.objective))
+        # Radii shrink by 1 - cos(pi / 48) = 0.2 %.
+        assert by_edges[1].control == pytest.approx(exact.control, abs=0.15)
+
+
+def test_the_cone_by_a_solver_that_knows_no_cones():
+    problem = robot(5, k=2)
+
+    def forces(u):
+        return rigid_forces(problem, u)[0]
+
+    def slack(u):
+        f = forces(u)
+        along = np.einsum("ki,ki->k", f, problem.normals)
+        across = f - along[:, None] * problem.normals
+        return np.concatenate([(problem.friction * along) ** 2 - (across**2).sum(axis=1), along])
+
+    start = solve_pyramid(problem).control
+    other = minimize(
+        lambda u: 0.5 * ((u - problem.nominal) ** 2).sum() + 0.5e-3 * (forces(u) ** 2).sum(),
+        start,
+        bounds=[(-1, 1)] * 5,
+        constraints={"type": "ineq", "fun": slack},
+        method="SLSQP",
+        options={"ftol": 1e-12, "maxiter": 500},
+    )
+    found = solve_cone(problem)
+    assert found.status == "solved"
+    assert other.success
+    assert found.objective == pytest.approx(other.fun, rel=1e-5)
+    assert found.control == pytest.approx(other.x, abs=1e-3)
+
+
+def table(load_at, legs, friction=0.5):
+    """A 10 kg plate on legs, its centre of mass somewhere, six motors on its centre that are not used."""
+    legs = np.array(legs, dtype=float)
+    arms = legs - np.array([*load_at, 0.5])
+    jacobians = np.zeros((len(legs), 3, 6))
+    for jac, (x, y, z) in zip(jacobians, arms, strict=True):
+        jac[:, :3] = np.eye(3)
+        jac[:, 3:] = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])
+    k = len(legs)
+    return WholeBodyProblem(
+        np.diag([10.0, 10, 10, 1, 1, 2]), np.array([0, 0, 98.1, 0, 0, 0]), np.eye(6), jacobians, np.zeros((k, 3)),
+        np.tile(UP, (k, 1)), np.full(k, friction), -np.full(6, 1e-3), np.full(6, 1e-3), np.zeros(6),
+    )  # fmt: skip
+
+
+def test_a_plate_on_two_legs_and_its_third_shares_its_weight_by_the_lever():
+    # Frictionless legs: three unknown reactions, three equations.
+    legs = [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    for x, y in ((0.3, 0.2), (0.5, 0.0), (0.0, 1.0)):
+        found = solve_pyramid(table((x, y), legs, friction=0.0))
+        assert found.status == "inactive"
+        assert found.forces[:, 2] == pytest.approx(98.1 * np.array([1 - x - y, x, y]), abs=1e-6)
+        assert np.abs(found.forces[:, :2]).max() < 1e-9
+    # Overhanging: a leg would have to pull, so nothing keeps all three in place.
+    tipping = solve_pyramid(table((1.2, 0.0), legs, friction=0.0))
+    assert tipping.status == "infeasible"
+    assert tipping.forces[:, 2].min() >= -1e-9
+    assert tipping.residuals.contact > 0.1
+    assert (np.abs(tipping.control) <= 1e-3).all()
+
+
+def test_a_table_with_four_legs_stands_with_inner_forces_to_spare():
+    problem = table((0.8, 0.5), [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    for solve in SOLVERS.values():
+        found = solve(problem)
+        assert found.status == "inactive"
+        assert found.forces.sum(axis=0) == pytest.approx([0.0, 0.0, 98.1], abs=1e-5)
+        right = found.forces[[1, 2], 2].sum()
+        assert right == pytest.approx(0.8 * 98.1, abs=1e-4)
+    # A support row with an inset that the load's line misses leaves no forces at all.
+    points = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
+    for inset, status in ((0.15, "inactive"), (0.25, "infeasible")):
+        rows = support_rows(points, plane([0, 0, 0], UP), inset)
+        asked = dataclasses.replace(problem, force_rows=rows, force_limits=np.zeros(len(rows)))
+        assert solve_pyramid(asked).status == status
+        assert solve_cone(asked).status == status
+
+
+@pytest.mark.parametrize("solve", SOLVERS.values(), ids=SOLVERS)
+def test_what_no_control_does_is_infeasible_and_misses_least(solve):
+    # The floor is to rise at 3 m/s^2: with motors of 5 N the mass can follow, but sink at 20 it cannot.
+    problem = foot([0.0, 0.0, 0.0], bound=5.0, contact_acceleration=np.array([[0.0, 0.0, 3.0]]))
+    assert solve(problem).status == "inactive"
+    sinking = dataclasses.replace(problem, contact_acceleration=np.array([[0.0, 0.0, -20.0]]))
+    found = solve(sinking)
+    assert found.status == "infeasible"
+    # Least miss: the motor pulls down with all it has and the floor pushes with nothing.
+    assert found.control[2] == pytest.approx(-5.0, abs=1e-3)
+    assert found.forces[0] == pytest.approx([0, 0, 0], abs=1e-3)
+    assert found.residuals.contact == pytest.approx(20.0 - 9.81 - 2.5, abs=1e-3)
+    assert_says_the_truth(sinking, found)
+
+
+@settings(max_examples=12, deadline=None)
+@given(seed=st.integers(0, 1000))
+def test_the_least_violation_is_the_least(seed):
+    # Frictionless contacts: forces are pressures, and the oracle is a bounded least squares problem.
+    rng = np.random.default_rng(seed)
+    problem = robot(seed, k=3)
+    problem = dataclasses.replace(
+        problem,
+        friction=np.zeros(3),
+        contact_acceleration=rng.normal(size=(3, 3)) * 30.0,
+    )
+    along = np.einsum("ki,kiv->kv", problem.normals, problem.jacobians)
+    by_u = np.linalg.solve(problem.inertia, problem.actuation)
+    by_f = np.linalg.solve(problem.inertia, along.T)
+    target = np.einsum("ki,ki->k", problem.normals, problem.wanted) + along @ np.linalg.solve(
+        problem.inertia, problem.bias
+    )
+    oracle = lsq_linear(
+        along @ np.hstack([by_u, by_f]),
+        target,
+        (np.concatenate([-np.ones(5), np.zeros(3)]), np.concatenate([np.ones(5), np.full(3, np.inf)])),
+        tol=1e-14,
+    )
+    missed = np.linalg.norm(oracle.fun)
+    for solve in SOLVERS.values():
+        found = solve(problem)
+        mine = np.einsum("ki,ki->k", problem.normals, problem.jacobians @ found.acceleration - problem.wanted)
+        if missed > 1e-3:
+            assert found.status == "infeasible"
+            assert np.linalg.norm(mine) == pytest.approx(missed, rel=1e-3)
+        elif missed < 1e-9:
+            assert found.status in ("solved", "inactive")
+
+
+def test_wanted_accelerations_that_contradict_each_other_are_infeasible_until_made_attainable():
+    # Two points of one plate drawn apart.
+    problem = table((0.3, 0.2), [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    apart = dataclasses.replace(
+        problem, contact_acceleration=np.array([[-1.0, 0, 0], [1.0, 0, 0], [0, 0, 0]])
+    )
+    found = solve_pyramid(apart)
+    assert found.status == "infeasible"
+    assert found.residuals.contact > 0.5
+    attainable = attainable_contact_acceleration(apart)
+    assert np.abs(attainable[0, 0] - attainable[1, 0]) < 1e-9
+    assert solve_pyramid(dataclasses.replace(apart, contact_acceleration=attainable)).status == "inactive"
+    # What is attainable already stays as it is.
+    consistent = robot(0, k=3)
+    assert attainable_contact_acceleration(consistent) == pytest.approx(consistent.contact_acceleration)
+
+
+def test_softness_lets_contacts_give_way_and_leaves_alone_what_needs_none_of_it():
+    rising = {"contact_acceleration": np.array([[0.0, 0.0, -20.0]]), "bound": 5.0}
+    assert solve_pyramid(foot([0.0, 0.0, 0.0], **rising)).status == "infeasible"
+    misses = []
+    for softness in (1e-4, 1.0, 1e4):
+        found = solve_pyramid(foot([0.0, 0.0, 0.0], contact_softness=softness, **rising))
+        assert found.status == "solved"
+        misses.append(found.residuals.contact)
+    assert misses[0] == pytest.approx(20.0 - 9.81 - 2.5, abs=1e-3)
+    assert misses == sorted(misses)
+    assert misses[2] > 10.0  # the motor hardly moves for it
+    soft = foot([3.0, 1.0, -2.0], contact_softness=10.0)
+    assert solve_pyramid(soft).control is soft.nominal
+
+
+def test_a_contact_that_opens_gives_no_force_and_moves_away():
+    opening = {"breaking": np.array([True]), "contact_acceleration": np.array([[0.0, 0.0, 1.0]])}
+    for solve in SOLVERS.values():
+        found = solve(foot([2.0, 0.0, 0.0], **opening))
+        assert found.status == "solved"
+        assert not found.forces.any()
+        # m (g + 1) is the least that lifts; sideways it is free.
+        assert found.control == pytest.approx([2.0, 0.0, 2.0 * 10.81], abs=1e-5)
+        free = foot([2.0, 0.0, 30.0], **opening)
+        assert solve(free).control is free.nominal
+        weak = solve(foot([2.0, 0.0, 0.0], bound=10.0, **opening))
+        assert weak.status == "infeasible"
+        assert weak.control[2] == pytest.approx(10.0, abs=1e-3)
+        assert weak.residuals.contact == pytest.approx(10.81 - 5.0, abs=1e-3)
+
+
+def test_a_frictionless_contact_holds_along_its_normal_alone():
+    found = solve_pyramid(foot([4.0, 0.0, -1.0], friction=0.0))
+    assert found.status == "inactive"
+    assert found.forces[0] == pytest.approx([0.0, 0.0, 20.62])
+    assert found.acceleration == pytest.approx([2.0, 0.0, 0.0])
+    assert found.residuals.contact < 1e-12
+    pulled = foot([0.0, 0.0, 25.0], friction=0.0)
+    for solve in SOLVERS.values():
+        found = solve(pulled)
+        assert found.status == "solved"
+        assert found.control == pytest.approx([0.0, 0.0, 19.62], abs=1e-5)
+        assert found.forces[0, 2] >= -1e-6
+    # Beside one that grips.
+    both = robot(2, k=3)
+    both = dataclasses.replace(both, friction=np.array([0.8, 0.0, 0.5]), contact_softness=1e-2)
+    for solve in SOLVERS.values():
+        found = solve(both)
+        assert found.status == "solved"
+        assert_says_the_truth(both, found)
+        slides = found.forces[1] - (found.forces[1] @ both.normals[1]) * both.normals[1]
+        assert np.abs(slides).max() < 1e-9
+
+
+def test_a_limit_on_accelerations_holds():
+    problem = foot(
+        [0.0, 0.0, 0.0],
+        breaking=np.array([True]),
+        contact_acceleration=np.array([[0.0, 0.0, 0.0]]),
+        acceleration_rows=np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
+        acceleration_limits=np.array([5.0, -2.0]),
+    )
+    found = solve_pyramid(problem)
+    assert found.status == "solved"
+    assert found.acceleration == pytest.approx([-2.0, 0.0, 0.0], abs=1e-6)
+    assert found.residuals.rows <= 1e-6
+    lower = dataclasses.replace(problem, acceleration_limits=np.array([-3.0, 0.0]))
+    against = solve_pyramid(lower)  # up by the opening contact, down by the limit
+    assert against.status == "infeasible"
+    assert against.residuals.rows == pytest.approx(1.5, abs=1e-3)  # half each, in squares
+    assert against.residuals.contact == pytest.approx(1.5, abs=1e-3)
+
+
+def test_a_task_is_followed_as_far_as_friction_goes():
+    pull = Task(np.array([[1.0, 0.0, 0.0]]), np.zeros(1), np.array([2.0]), weight=1e6)
+    free = foot([0.0, 0.0, 0.0], tasks=[pull], friction=0.0)
+    found = solve_pyramid(free)
+    assert found.status == "solved"
+    assert found.acceleration[0] == pytest.approx(2.0, abs=1e-4)
+    assert found.control[0] == pytest.approx(4.0, abs=1e-3)
+    # A gripping foot that is to stay does not move for any task.
+    held = solve_pyramid(foot([0.0, 0.0, 0.0], tasks=[pull]))
+    assert held.acceleration[0] == pytest.approx(0.0, abs=1e-6)
+    # With no wish but the nominal, a task that is met already still makes the answer an optimum, not "inactive".
+    idle = Task(np.array([[1.0, 0.0, 0.0]]), np.zeros(1), np.zeros(1), weight=0.0)
+    assert solve_pyramid(foot([1.0, 0.0, 0.0], tasks=[idle])).status == "solved"
+
+
+def test_without_contacts_only_the_box_and_the_rows_are_left():
+    fields = robot(3, k=0)
+    found = solve_pyramid(fields)
+    assert found.status == "solved"
+    assert found.control == pytest.approx(np.clip(fields.nominal, -1, 1), abs=1e-8)
+    assert solve_cone(fields).control == pytest.approx(np.clip(fields.nominal, -1, 1), abs=1e-5)
+    inside = dataclasses.replace(fields, nominal=np.full(5, 0.5))
+    assert solve_cone(inside).control is inside.nominal
+    assert found.forces.shape == (0, 3)
+
+
+@pytest.mark.parametrize("lie", ["zeros", "huge", "nothing", "claims infeasible"])
+def test_a_backend_is_not_believed(monkeypatch, lie):
+    problem = foot([12.0, 5.0, 3.0])
+
+    def backend(program):
+        n = program.linear.size
+        return {
+            "zeros": Candidate("solved", np.array([0.0, 0.0, 50.0] + [0.0] * (n - 3))[:n]),
+            "huge": Candidate("solved", np.full(n, 1e9)),
+            "nothing": Candidate("failed", None),
+            "claims infeasible": Candidate("infeasible", None),
+        }[lie]
+
+    monkeypatch.setattr(whole_body, "by_daqp", backend)
+    truthful = solve_pyramid(problem)
+    if lie in ("nothing", "claims infeasible"):  # the second opinion has the answer
+        assert truthful.status == "solved"
+    else:
+        assert truthful.status == "failed"
+    monkeypatch.setattr(whole_body, "by_clarabel", backend)
+    found = solve_pyramid(problem)
+    assert found.status == "failed"
+    assert np.isfinite(found.control).all() and (np.abs(found.control) <= 100.0).all()
+    assert np.isfinite(found.forces).all() and np.isfinite(found.acceleration).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"inertia": np.eye(2)}, "inertia of shape"),
+        ({"bias": np.array([0.0, 0.0, math.nan])}, "bias must be finite"),
+        ({"nominal": np.array([0.0, 0.0, math.nan])}, "nominal must be finite"),
+        ({"nominal": np.zeros(2)}, "actuation of shape"),
+        ({"jacobians": np.zeros((2, 3, 3))}, "jacobians of shape"),
+        ({"normals": np.array([[0.0, 0.0, 2.0]])}, "length 1"),
+        ({"friction": np.array([-0.5])}, "friction must be 0 or more"),
+        ({"lower": np.full(3, 200.0)}, "lower must not exceed"),
+        ({"upper": np.full(3, math.nan)}, "lower must not exceed"),
+        ({"control_weight": 0.0}, "control_weight"),
+        ({"control_weight": np.array([1.0, 1.0, -1.0])}, "control_weight"),
+        ({"control_weight": np.ones(2)}, "control_weight"),
+        ({"force_weight": 0.0}, "force_weight"),
+        ({"contact_softness": -1.0}, "contact_softness"),
+        ({"contact_softness": math.inf}, "contact_softness"),
+        ({"breaking": np.array([True, False])}, "breaking of shape"),
+        ({"acceleration_rows": np.zeros((1, 3))}, "come together"),
+        ({"force_limits": np.zeros(1)}, "come together"),
+        ({"force_rows": np.zeros((1, 2)), "force_limits": np.zeros(1)}, "force_rows of shape"),
+        ({"tasks": [Task(np.zeros((1, 2)), np.zeros(1), np.zeros(1))]}, "task's jacobian"),
+        ({"tasks": [Task(np.zeros((1, 3)), np.zeros(1), np.zeros(1), -1.0)]}, "weight"),
+        ({"tasks": [Task(np.full((1, 3), math.inf), np.zeros(1), np.zeros(1))]}, "task must be finite"),
+    ],
+)
+def test_bad_problems_are_refused(change, said):
+    with pytest.raises(ConfigurationError, match=said):
+        solve_pyramid(dataclasses.replace(foot([0.0, 0.0, 0.0]), **change))
+
+
+def test_bad_solvers_and_edges_are_refused():
+    with pytest.raises(UnknownNameError, match="daqp, clarabel"):
+        solve_pyramid(foot([0.0, 0.0, 0.0]), solver="gurobi")
+    with pytest.raises(ConfigurationError, match="edges"):
+        solve_pyramid(foot([0.0, 0.0, 0.0]), edges=2)
