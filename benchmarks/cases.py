@@ -14,6 +14,7 @@ from benchmarks.crossing_drivers import DRIVERS as CROSSING
 from benchmarks.drivers import DRIVERS as POINT_GOAL
 from benchmarks.judges import Judge, Replay, Reported, Worst
 from benchmarks.mujoco_drivers import Maker
+from safe_wrappers.envs.teleop_contact import CLAMP_Y, TOOL_RADIUS
 
 
 @dataclass(frozen=True)
@@ -195,6 +196,16 @@ def _rover() -> Case:
     )
 
 
+def _teleop() -> Case:
+    # A step is 1 ms: half a minute of the others' pulses is half a second here.
+    return Case(
+        "TeleopContact-v0",
+        judge=lambda env: Replay(env, judges.joint_above(env.model, "y", CLAMP_Y - TOOL_RADIUS)),
+        drivers=_BLIND
+        | {"pulse of 0.3 s": drivers.corners(hold=300), "clamp-seeking": drivers.clamp_seeking},
+    )
+
+
 def _fallen(env_id: str) -> Case:
     """A pendulum whose episodes go on after the fall: the cart goes far before the pole does only by chance."""
     return Case(env_id, _rail, _RAIL, note="on after the fall", past_termination=True, max_episode_steps=500)
@@ -220,6 +231,7 @@ PROTECTED: dict[str, Case] = _by_name(
     _velocity("Humanoid", 1.4149, plane=True),
     Case("HumanoidStandup-v5", _joint_speeds(20.0), _SPEED),
     _rover(),
+    _teleop(),
     _crossing(),
     _point_maze("UMaze"),
     _patrolled_maze(),

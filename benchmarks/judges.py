@@ -122,6 +122,12 @@ def joint_beyond(model: mujoco.MjModel, joint: str, limit: float) -> Truth:
     return lambda data: abs(float(data.qpos[address])) - limit
 
 
+def joint_above(model: mujoco.MjModel, joint: str, limit: float) -> Truth:
+    """A joint above `limit`, m or rad."""
+    address = int(model.joint(joint).qposadr[0])
+    return lambda data: float(data.qpos[address]) - limit
+
+
 def joints_too_fast(model: mujoco.MjModel, limit: float) -> Truth:
     """A joint with a motor faster than `limit`, rad/s."""
     driven = model.jnt_dofadr[model.actuator_trnid[:, 0]]

@@ -50,6 +50,22 @@ bang_bang = corners(hold=1)
 pulse = corners(hold=15)
 
 
+def clamp_seeking(env: Any, rng: np.random.Generator) -> Driver:
+    """At full speed along the last axis, now and then a little back, and anything along the others."""
+    low, high = _box(env)
+    state: dict[str, Any] = {"left": 0, "action": high}
+
+    def act() -> Action:
+        if state["left"] == 0:
+            action = rng.uniform(low, high)
+            action[-1] = high[-1] if rng.random() < 0.8 else 0.2 * low[-1]
+            state.update(left=int(rng.integers(50, 500)), action=action)
+        state["left"] -= 1
+        return np.asarray(state["action"])
+
+    return act
+
+
 def end_seeking(env: Any, rng: np.random.Generator) -> Driver:
     """Everything towards one end, long enough to get there, then towards the other."""
     low, high = _box(env)

@@ -26,6 +26,7 @@ from safe_wrappers.constraints.constraint import Constraint
 from safe_wrappers.control.rectangles import merged
 from safe_wrappers.envs.car import CAR
 from safe_wrappers.envs.speed_limits import SPEED_LIMITS
+from safe_wrappers.envs.teleop_contact import CLAMP_Y, TELEOP_BRAKING, TOOL_RADIUS
 from safe_wrappers.errors import UnknownNameError
 
 POINT_HULL_RADIUS_M = 0.1585
@@ -93,6 +94,12 @@ def _safe_rover(
     env: gym.Env[Any, Any], max_slip: float = 0.15, friction: float | None = None
 ) -> list[Constraint]:
     return [Traction(env.unwrapped.wheels, max_slip, friction)]  # type: ignore[attr-defined]
+
+
+def _teleop_contact(env: gym.Env[Any, Any]) -> list[Constraint]:
+    # Half-way round the clamp is no way: its face is a line across everything that the tool reaches.
+    face = Plane([0.0, CLAMP_Y], [0.0, -1.0])
+    return [Clearance([face], TELEOP_BRAKING, bodies=["tool"], radius=TOOL_RADIUS, margin=0.001)]
 
 
 def _of_what_is_known(
@@ -230,6 +237,7 @@ RECIPES: dict[str, Callable[..., list[Constraint]]] = {
     "FlexJointReach": _flex_joint_reach,
     "Reacher": _reacher,
     "SafeRover": _safe_rover,
+    "TeleopContact": _teleop_contact,
     "OccludedCrossing": _occluded_crossing,
     "Pusher": _pusher,
     "HumanoidStandup": _humanoid_standup,

@@ -31,6 +31,7 @@ KNOWN = {
     "Pusher-v5": [sw.JointSpeedLimit, sw.Workspace],
     "HumanoidStandup-v5": [sw.JointSpeedLimit],
     "SafeRover-v0": [sw.Traction],
+    "TeleopContact-v0": [sw.Clearance],
     "OccludedCrossing-v0": [sw.EscapeClearance],
     "PointMaze_UMaze-v3": [sw.WallClearance],
     "PatrolledPointMaze-v0": [sw.WallClearance, sw.EscapeClearance],

@@ -15,6 +15,8 @@ _SUMS: Final = (
     keys.OCCLUSION_PENALTY,
     keys.OCCLUSION_TASK_REWARD,
     keys.CONTACT_IMPULSE,
+    keys.TELEOP_LOST,
+    keys.TELEOP_LATE,
 )
 _LEASE_BOOLS: Final = (keys.LEASE_EXPIRED, keys.LEASE_REFUSED, keys.LEASE_BRAKING)
 _ANY: Final = (
@@ -25,20 +27,21 @@ _ANY: Final = (
     keys.FAULT_ACTIVE,
     keys.OCCLUSION_EXPIRED,
     keys.CONTACT_PARTIAL,
+    keys.TELEOP_REVOKED,
 )
 _CONTACT_PEAKS: Final = (keys.CONTACT_PEAK_FORCE, keys.CONTACT_PENETRATION, keys.CONTACT_RESIDUAL)
 _LARGEST: Final = (keys.CBF_CORRECTION, keys.CBF_CLIPPED, keys.SPIN_OUT, *_CONTACT_PEAKS)
-_SMALLEST: Final = (keys.CBF_MARGIN,)
+_SMALLEST: Final = (keys.CBF_MARGIN, keys.TELEOP_CLEARANCE_M)
 
 
 def macro_info(infos: list[dict[str, Any]]) -> dict[str, Any]:
     """The last control step's info, in which costs are summed up and no intervention of the others is lost.
 
-    Costs, collisions, impulses, and what `AdaptionPenalty` and `OcclusionPenalty` say of the reward, are sums; what
-    is a flag is True if it was at any control step; corrections, contact forces and a spin-out are the largest, the
-    margin is the smallest. Everything else is the last control step's: the running counts of `RecordInterventions`,
-    and which tracks are seen, how uncertain they are. A key that only some control steps have counts where it is
-    there.
+    Costs, collisions, impulses, packets lost or late, and what `AdaptionPenalty` and `OcclusionPenalty` say of the
+    reward, are sums; what is a flag is True if it was at any control step; corrections, contact forces and a spin-out
+    are the largest, the margin and a channel's clearance are the smallest. Everything else is the last control
+    step's: the running counts of `RecordInterventions`, and which tracks are seen, how uncertain they are. A key that
+    only some control steps have counts where it is there.
     """
     last = infos[-1]
     if len(infos) == 1:

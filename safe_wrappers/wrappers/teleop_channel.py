@@ -67,8 +67,8 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
     operator could still stop in time, by the clearance and approach speed of this very moment. When the round trip
     is longer, or when the machine could not stop by itself after the command, authority is revoked and the local
     brake (`fallback`) acts. It comes back with a command made from an image taken since, when the round trip is below
-    `release` times the ceiling and the machine could stop after it. While it is revoked, a wave port stands still and
-    throws waves back: the operator feels a locked tool.
+    `release` times the ceiling and the machine could stop after it. Meanwhile a wave port stands still and throws
+    waves back: the operator feels a locked tool.
 
     On `TeleopContact-v0` a control step is one physics substep, so this is watched at 1 kHz. On an env with longer
     steps it is watched once per step; each decision covers all its substeps: the ceiling is lowered by one step, and
@@ -80,8 +80,9 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
     a line that the brake acts along (a plane, an axis) that is proved; for a point that passes a corner or a disc
     sideways, or a fallback whose deceleration nobody has verified, it is best effort. With wave coding the energy
     that has come out of the channel at its two ports is never above what went in, less what is in flight, as long as
-    the machine's effort is what the port says; what saturation, a wrong `feedthrough` or a filter inside makes of it
-    is in `teleop/created_j`. Both hold at once, and both are in the info of every step.
+    the machine's effort is what the port says; what saturation or a wrong `feedthrough` makes of it is in
+    `teleop/created_j`. In a step in which the brake acts, or a filter inside changes the action, the channel's port
+    counts as still: what these do is their energy. Both hold at once, and both are in the info of every step.
 
     **What it does not.** Passivity is no limit of force: a tool that hits a wall with stored energy hurts. It bounds
     no displacement either; that is the ceiling's part. The operator is not passive without evidence. Plain coding
@@ -252,11 +253,12 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         order = self._coding.far(arrived, self._newest[1])
         round_trip_s = now_s - order.seen_s
         ceiling_s, clearance_m = self._ceiling_s, self._clearance_m
+        operators = not (self._missing == "fallback" and not fresh)
         command = self._commanded(order.flow, fresh)
         self._judge(command, order.seen_s, round_trip_s, now_s)
         if self._revoked:
             assert self._stand_in is not None
-            command = self._stand_in.command().astype(self._dtype)
+            command, operators = self._stand_in.command().astype(self._dtype), False
         executed = np.array(command, dtype=np.float64)
         observation, reward, terminated, truncated, info = self.env.step(command)
         if self._filtered:
@@ -266,7 +268,9 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         if self._stand_in is not None:
             self._stand_in.executed(executed)
         self._steps_done += 1
-        shown = self._send_down(executed, observation)
+        # What the brake or a filter inside does is not the operator's: the channel's port stood still.
+        obeyed = operators and np.array_equal(executed, np.asarray(command, dtype=np.float64))
+        shown = self._send_down(executed, observation, obeyed)
         if self._watch is not None:
             self._watch.look()
         self._report(info, round_trip_s, ceiling_s, min(clearance_m, self._clearance_m))
@@ -381,10 +385,10 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
 
     # Back at the operator's end ----------------------------------------------------------------------------
 
-    def _send_down(self, executed: Array, observation: Any) -> Any:
+    def _send_down(self, executed: Array, observation: Any, obeyed: bool) -> Any:
         now_s, coding = self.now_s, self._coding
         flow = executed[list(self.port.flow)] if self.port is not None else executed
-        extra, exchanged = coding.settle(flow, observation, not self._revoked)
+        extra, exchanged = coding.settle(flow, observation, obeyed)
         sequence, lost = self._down.send(Down(copy.copy(observation), now_s, extra), now_s)
         coding.sent_down(sequence, extra, lost)
         self._lost += lost

@@ -48,11 +48,11 @@ def test_the_judge_means_the_limit_that_the_filter_keeps(name):
                 assert judge.start() == pytest.approx(0.0, abs=1e-12)
                 raw.data.qvel[:] = 0.0
             case sw.Clearance():
-                ends = sorted(o.point[0] for o in constraint.obstacles)
-                for end in ends:
-                    raw.data.qpos[0] = end
+                for plane in constraint.obstacles:
+                    (axis,) = np.flatnonzero(plane.normal)
+                    raw.data.qpos[axis] = plane.point[axis] + constraint.radius * plane.normal[axis]
                     assert judge.start() == pytest.approx(0.0, abs=1e-12)
-                assert len(ends) == 2
+                assert len(constraint.obstacles) == (1 if "Teleop" in name else 2)
             case sw.JointPositionLimit():
                 for end in (constraint.lower, constraint.upper):
                     raw.data.qpos[0] = end

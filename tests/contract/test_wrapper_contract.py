@@ -155,6 +155,44 @@ EXAMPLES = {
             },
         ),
     },
+    "TeleopChannel": {
+        "plain, any env": (
+            "Reacher-v5",
+            lambda: {
+                "uplink": sw.Link(0.04, 0.03, loss=0.1, in_order=False),
+                "downlink": {"delay_s": 0.02, "outage_between_s": 0.5, "outage_length_s": 0.1},
+                "missing": "zero",
+                "seed": 3,
+            },
+        ),
+        "waves under a ceiling": (
+            "TeleopContact-v0",
+            lambda: {
+                "uplink": sw.Link(0.003, 0.004, loss=0.05),
+                "downlink": 0.002,
+                "coding": "wave",
+                "impedance": 40.0,
+                "wave_rule": "hold",
+                "ceiling": sw.RoundTripCeiling(
+                    sw.Clearance([sw.Plane([0, 0.25], [0, -1])], 24.0, bodies=["tool"], radius=0.015),
+                    acceleration=55.0,
+                    top_speed=1.4,
+                ),
+            },
+        ),
+        "a passivity controller": (
+            "TeleopContact-v0",
+            lambda: {
+                "uplink": 0.01,
+                "downlink": 0.01,
+                "passivity": "controller",
+                "damping_limit": 20.0,
+                "storage_j": 0.01,
+                "missing": "fallback",
+                "port": sw.TeleopPort([0, 1], [4, 5], feedthrough=40.0),
+            },
+        ),
+    },
 }
 """Wrapper name -> what it shows -> (env id, function of its arguments): plain data or what becomes it."""
 
@@ -503,6 +541,8 @@ def harmless(name, case):
     if name == "SlipLimiter":  # a ground that is said to carry any torque
         return sw.SlipLimiter(Witness(gym.make("SafeRover-v0")), list(WHEELS), friction=1e9)
     env_id, arguments = example(name, case)
+    if name == "TeleopChannel":
+        return sw.TeleopChannel(Witness(gym.make("Reacher-v5")), 0.0, 0.0)
     return getattr(sw, name)(Witness(inside(name, gym.make(env_id))), **arguments())
 
 
