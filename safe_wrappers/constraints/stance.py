@@ -175,8 +175,9 @@ class Stance:
         self._look(plant, control)
         assert self._problem is not None
         if self._answer is not None:
-            solved = self._answer.status is not WholeBodyStatus.INFEASIBLE
-            if solved and float(np.abs(control - self._answer.control).max()) <= _SAME:
+            if self._answer.status is WholeBodyStatus.INFEASIBLE:
+                return False  # whatever the control
+            if float(np.abs(control - self._answer.control).max()) <= _SAME:
                 return self._answer.status is not WholeBodyStatus.FAILED
         found = self._solve(replace(self._problem, nominal=control))
         if self._answer is None:
