@@ -1,0 +1,249 @@
+"""Learned Ant and Humanoid policies without and with `WholeBodyFilter`: contacts, balance, joints, falls, time.
+
+    safe-wrappers train configs/velocity_experts.yaml     # once: the policies (about two hours on two cores)
+    python -m benchmarks.whole_body                       # the table
+    python -m benchmarks.whole_body --episodes 2 --robots Humanoid
+
+The policies were trained by PPO without a filter and act deterministically, on Ant-v5 and Humanoid-v5, the same
+episode seeds for every arm. The judge is the env's own simulation: every control step is made once more with all
+evaluations of the physics in sight (each of the four stages of a Runge-Kutta step), and the forces of contacts
+between the robot and the fixed world are read there.
+
+- cone left: share of control steps in which a contact force leaves the cone of `SHARE` of the model's friction, at
+  all, and by more than 1 % of the robot's weight; `unflagged` are the latter of them that the filter did not flag.
+- zmp: of the evaluations at which there is a support polygon (three contact points of one plane), the share at which
+  the zero moment point is within 1 cm of its edge or beyond; and how many evaluations have a polygon at all.
+- joints: share of control steps with a driven joint more than 0.1 rad beyond its stop.
+- falls: episodes that the env ended as unhealthy.
+"""
+
+import argparse
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+
+import safe_wrappers as sw
+from safe_wrappers.control.support import common_plane, support_margin, support_polygon, zmp_of_forces
+from safe_wrappers.plants.replay import Replay
+
+RESULTS = Path(__file__).parent / "results"
+CONFIG = Path(__file__).parents[1] / "configs" / "velocity_experts.yaml"
+SHARE, TOLERANCE, INSET_M, STOP_RAD = 0.7, 0.01, 0.01, 0.1
+_ROUNDING = 1e-6
+
+ARMS: dict[str, Callable[[Any], Any]] = {
+    "no filter": lambda env: env,
+    "program, pyramids": lambda env: sw.WholeBodyFilter(env, contacts="pyramid"),
+    "program, exact cones": lambda env: sw.WholeBodyFilter(env, contacts="cone"),
+    "forecast, contacts alone": lambda env: sw.WholeBodyFilter(env, joint_tolerance=None),
+    "forecast": lambda env: sw.WholeBodyFilter(env),
+    "forecast, zmp inset 1 cm": lambda env: sw.WholeBodyFilter(env, zmp_inset=INSET_M),
+    "forecast, share 0.9": lambda env: sw.WholeBodyFilter(env, friction_share=0.9),
+}
+
+
+@dataclass
+class Row:
+    """One arm of one robot, summed over its steps."""
+
+    robot: str
+    arm: str
+    episodes: int = 0
+    steps: int = 0
+    falls: int = 0
+    reward: float = 0.0
+    forward_m: float = 0.0
+    seconds: float = 0.0
+    left_cone: int = 0
+    left_cone_by_tolerance: int = 0
+    unflagged: int = 0
+    evaluations: int = 0
+    polygons: int = 0
+    near_edge: int = 0
+    beyond_stop: int = 0
+    changed: int = 0
+    infeasible: int = 0
+    correction: float = 0.0
+    decision_ms: list[float] = field(default_factory=list)
+
+
+class Judge:
+    """What the contacts of a step were, on the env's own model, with no code of a constraint in it."""
+
+    def __init__(self, raw: Any) -> None:
+        self._raw, self._replay = raw, Replay(raw)
+        m = raw.model
+        self._fixed = m.body_weldid == 0
+        self._weight = float(m.body_mass.sum() * np.linalg.norm(m.opt.gravity))
+        joints = m.actuator_trnid[:, 0]
+        self._qpos, self._range = m.jnt_qposadr[joints], m.jnt_range[joints]
+
+    def before(self) -> None:
+        """Keep the state that the step starts from."""
+        self._replay.before()
+
+    def after(self, row: Row, flagged: bool) -> None:
+        """Make the step once more and count."""
+        excess = [0.0]
+
+        def visit(data: mujoco.MjData, _: float) -> None:
+            points, normals, forces = self._contacts(data, excess)
+            row.evaluations += 1
+            if len(points) < 3:
+                return
+            ground = common_plane(np.array(points), np.array(normals))
+            polygon = None if ground is None else support_polygon(ground.flat(points))
+            if ground is None or polygon is None or len(polygon) < 3:
+                return
+            zmp = zmp_of_forces(points, forces, ground)
+            row.polygons += 1
+            row.near_edge += not support_margin(ground.flat(zmp), polygon, INSET_M) >= 0.0
+
+        if not self._replay.after(visit):
+            raise RuntimeError(
+                "the replay of a step does not end where the env did: its contacts are not known"
+            )
+        row.left_cone += max(excess) > _ROUNDING * self._weight
+        beyond = max(excess) > (TOLERANCE + _ROUNDING) * self._weight
+        row.left_cone_by_tolerance += beyond
+        row.unflagged += beyond and not flagged
+        at = self._raw.data.qpos[self._qpos]
+        past = np.maximum(self._range[:, 0] - at, at - self._range[:, 1])
+        row.beyond_stop += bool((past > STOP_RAD + _ROUNDING).any())
+
+    def _contacts(self, data: mujoco.MjData, excess: list[float]) -> tuple[list[Any], list[Any], list[Any]]:
+        points, normals, forces = [], [], []
+        m, wrench = self._raw.model, np.zeros(6)
+        for i in range(data.ncon):
+            contact = data.contact[i]
+            first, second = (bool(self._fixed[m.geom_bodyid[g]]) for g in (contact.geom1, contact.geom2))
+            if first == second or contact.efc_address < 0:
+                continue
+            mujoco.mj_contactForce(m, data, i, wrench)
+            sideways = float(np.hypot(wrench[1], wrench[2]))
+            excess.append(sideways - SHARE * float(contact.friction[0]) * float(wrench[0]))
+            sign = 1.0 if first else -1.0
+            frame = contact.frame.reshape(3, 3)
+            points.append(contact.pos.copy())
+            normals.append(sign * frame[0])
+            forces.append(sign * (wrench[:3] @ frame))
+        return points, normals, forces
+
+
+def learned(robot: str) -> Callable[[Any], Any]:
+    """The trained policy of a robot; says how to train it where there is none."""
+    from safe_wrappers.train.config import parse_experiment
+    from safe_wrappers.train.config_file import read_config
+    from safe_wrappers.train.policy import TrainedPolicy
+    from safe_wrappers.train.run import finished_checkpoint
+
+    experiment = parse_experiment(read_config(CONFIG))
+    arm = next(a for a in experiment.arms if a.name == robot)
+    return TrainedPolicy(arm, finished_checkpoint(arm, 0, experiment.run_folder(arm, 0)))
+
+
+def drive(robot: str, arm: str, policy: Callable[[Any], Any], episodes: int, limit: int) -> Row:
+    """One arm of the table."""
+    row = Row(robot, arm)
+    bare = gym.make(f"{robot}-v5", max_episode_steps=limit)
+    env, judge = ARMS[arm](bare), Judge(bare.unwrapped)
+    filtered = isinstance(env, sw.CBFActionFilter)
+    for episode in range(episodes):
+        observation, _ = env.reset(seed=episode)
+        start, done = float(bare.unwrapped.data.qpos[0]), False
+        while not done:
+            judge.before()
+            began = env.filter_seconds if filtered else 0.0
+            observation, reward, fell, out_of_time, info = env.step(policy(observation))
+            done = fell or out_of_time
+            row.steps += 1
+            row.reward += float(reward)
+            row.falls += fell
+            flagged = filtered and (info["cbf/infeasible"] or info["cbf/fallback"])
+            judge.after(row, bool(flagged))
+            if filtered:
+                row.changed += bool(info["cbf/intervened"])
+                row.infeasible += bool(info["cbf/infeasible"])
+                row.correction += float(info["cbf/correction"])
+                row.decision_ms.append(1e3 * (env.filter_seconds - began))
+        row.forward_m += float(bare.unwrapped.data.qpos[0]) - start
+        row.episodes += 1
+    row.seconds = row.steps * float(bare.unwrapped.dt)
+    env.close()
+    return row
+
+
+HEADER = (
+    "| robot | arm | falls | steps per episode | reward per step | m/s forward | cone left "
+    "| by more than 1 % of weight | unflagged | with a polygon | zmp near its edge | joint beyond | changed | infeasible | correction "
+    "| ms per decision: median, 99 % |\n" + "|---" * 16 + "|"
+)
+
+
+def line(row: Row) -> str:
+    """A row of the Markdown table."""
+    n = row.steps
+    near = f"{row.near_edge / row.polygons:.0%}" if row.polygons else "-"
+    times = row.decision_ms
+    spent = f"{np.median(times):.1f}, {np.quantile(times, 0.99):.1f}" if times else "-"
+    cells = (
+        row.robot,
+        row.arm,
+        f"{row.falls} of {row.episodes}",
+        f"{n / row.episodes:.0f}",
+        f"{row.reward / n:.2f}",
+        f"{row.forward_m / row.seconds:.2f}",
+        f"{row.left_cone / n:.1%}",
+        f"{row.left_cone_by_tolerance / n:.1%}",
+        f"{row.unflagged}" if times else "-",
+        f"{row.polygons / row.evaluations:.1%}",
+        near,
+        f"{row.beyond_stop / n:.1%}",
+        f"{row.changed / n:.0%}" if times else "-",
+        f"{row.infeasible / n:.1%}" if times else "-",
+        f"{row.correction / n:.2f}" if times else "-",
+        spent,
+    )
+    return "| " + " | ".join(cells) + " |"
+
+
+def main() -> None:
+    """Print the table and write it."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--robots", nargs="+", default=["Ant", "Humanoid"], choices=["Ant", "Humanoid"])
+    parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=list(ARMS))
+    parser.add_argument("--episodes", type=int, default=10)
+    parser.add_argument("--limit", type=int, default=500, help="steps per episode at most")
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    arguments = parser.parse_args()
+    print(HEADER)
+    rows: list[Row] = []
+    for robot in arguments.robots:
+        policy = learned(robot)
+        for arm in arguments.arms:
+            rows.append(drive(robot, arm, policy, arguments.episodes, arguments.limit))
+            print(line(rows[-1]), flush=True)
+    arguments.results.mkdir(parents=True, exist_ok=True)
+    table = "\n".join([HEADER, *map(line, rows)])
+    text = f"{arguments.episodes} episodes of at most {arguments.limit} steps\n\n{table}\n"
+    (arguments.results / "whole_body.md").write_text(text)
+    with (arguments.results / "whole_body.jsonl").open("w") as out:
+        for row in rows:
+            data = asdict(row)
+            times = data.pop("decision_ms")
+            data["decision_ms"] = (
+                [float(np.median(times)), float(np.quantile(times, 0.99))] if times else None
+            )
+            out.write(json.dumps(data) + "\n")
+
+
+if __name__ == "__main__":
+    main()
