@@ -163,8 +163,9 @@ def test_elimination_changes_nothing(seed, k, softness, extra):
             continue
         assert found.status in ("solved", "inactive")
         if found.status == "solved":
-            assert found.control == pytest.approx(expected[0], abs=3e-4)
-            assert found.objective == pytest.approx(expected[1], rel=1e-5, abs=1e-6)
+            # No worse, and better by no more than what the large program leaves inexact.
+            assert -1e-5 <= found.objective - expected[1] <= 1e-7 * (1.0 + abs(expected[1]))
+            assert found.control == pytest.approx(expected[0], abs=3e-3)
         else:
             assert found.control is problem.nominal
             if softness == 0.0:
