@@ -102,6 +102,8 @@ class Judge:
             if ground is None or polygon is None or len(polygon) < 3:
                 return
             zmp = zmp_of_forces(points, forces, ground)
+            if not np.isfinite(zmp).all():
+                return  # they touch, and nothing presses
             row.polygons += 1
             row.near_edge += not support_margin(ground.flat(zmp), polygon, INSET_M) >= 0.0
 

@@ -74,7 +74,7 @@ def edge_distances(contacts: ContactForecast) -> list[float]:
         if ground is None:
             continue
         polygon = support_polygon(ground.flat(points))
-        distance = support_margin(ground.flat(zmp_of_forces(points, forces, ground)), polygon)
-        if len(polygon) > 2 and distance == distance:
-            found.append(distance)
+        zmp = zmp_of_forces(points, forces, ground)
+        if len(polygon) > 2 and np.isfinite(zmp).all():  # contacts may touch, and nothing press
+            found.append(support_margin(ground.flat(zmp), polygon))
     return found
