@@ -233,7 +233,7 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         self._steps_done = 0
         self._evidence: float | None = 0.0
         self._images: list[float] = [0.0]  # taken when, of the one that was shown after each step
-        self._shown: tuple[int, Any] = (-1, observation)
+        self._shown: tuple[int, Any] = (-1, _copy(observation))
         self._newest: tuple[int, Up | None] = (-1, None)
         self._revoked_s = -math.inf
         self._revoked = False
@@ -389,7 +389,7 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         now_s, coding = self.now_s, self._coding
         flow = executed[list(self.port.flow)] if self.port is not None else executed
         extra, exchanged = coding.settle(flow, observation, obeyed)
-        sequence, lost = self._down.send(Down(copy.copy(observation), now_s, extra), now_s)
+        sequence, lost = self._down.send(Down(_copy(observation), now_s, extra), now_s)
         coding.sent_down(sequence, extra, lost)
         self._lost += lost
         arrived = self._down.arrived(now_s)
@@ -402,7 +402,7 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             self._ledger.add(*exchanged, self.hold_s, coding.stored_j)
             self._energy_in.add(port_energy(exchanged.near_effort, exchanged.near_flow, self.hold_s))
             self._energy_out.add(port_energy(exchanged.far_effort, exchanged.far_flow, self.hold_s))
-        return coding.shown(arrived, copy.copy(self._shown[1]))
+        return coding.shown(arrived, _copy(self._shown[1]))
 
     @property
     def _ceiling_s(self) -> float:
@@ -457,6 +457,11 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         if impedance is None:
             raise ConfigurationError('coding="wave" needs an impedance, in N s/m')
         return WaveCoding(reading, self.hold_s, positive("impedance", impedance, "N s/m"), rule)
+
+
+def _copy(observation: Any) -> Any:
+    """An env may reuse its arrays, a policy may change them."""
+    return observation.copy() if isinstance(observation, np.ndarray) else copy.deepcopy(observation)
 
 
 def _refuse_order(env: gym.Env[Any, Any]) -> None:

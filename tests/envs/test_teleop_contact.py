@@ -1,0 +1,319 @@
+"""TeleopContact: coupling, wall and clamp against closed forms, an energy balance and an independent integration."""
+
+import math
+import pickle
+import warnings
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from scipy.integrate import solve_ivp
+
+import safe_wrappers as sw
+from safe_wrappers.envs.teleop_contact import (
+    CLAMP_Y,
+    FORCE_LIMIT,
+    TELEOP_ACCELERATION,
+    TELEOP_BRAKING,
+    TELEOP_TOP_SPEED,
+    TOOL_RADIUS,
+    WALL_X,
+)
+from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError
+
+STIFFNESS, DAMPING, DAMPER_LIMIT, SLIP, WALL = 400.0, 40.0, 40.0, 15.0, 20_000.0
+
+
+@pytest.fixture
+def env():
+    return gym.make("TeleopContact-v0")
+
+
+def start(env, tool=(0.0, 0.0), velocity=(0.0, 0.0), wanted=10.0):
+    layout = {"tool": list(tool), "velocity": list(velocity), "wanted_force": wanted}
+    return env.reset(seed=0, options={"layout": layout})
+
+
+# Gymnasium ------------------------------------------------------------------------------------------------------
+
+
+def test_check_env_passes_without_warnings(env):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*A Box observation space (minimum|maximum) value is")
+        check_env(env.unwrapped, skip_render_check=True)
+
+
+def test_spaces_timing_and_truncation(env):
+    assert env.action_space == gym.spaces.Box(-1, 1, (2,), np.float32)
+    assert env.observation_space.shape == (9,) and env.unwrapped.dt == 0.001
+    env.reset(seed=0)
+    ends = [env.step(np.zeros(2))[2:4] for _ in range(6000)]
+    assert ends[-1] == (False, True) and not any(any(end) for end in ends[:-1])
+
+
+def test_pickled_it_is_the_same_task(env):
+    again = pickle.loads(pickle.dumps(env.unwrapped))
+    assert np.array_equal(again.reset(seed=5)[0], env.reset(seed=5)[0])
+
+
+def test_the_seed_draws_place_and_force(env):
+    seen = [env.reset(seed=seed)[0] for seed in range(20)]
+    assert np.array_equal(seen[3], env.reset(seed=3)[0])
+    places, forces = np.array([o[:2] for o in seen]), np.array([o[8] for o in seen])
+    assert places[:, 0].min() >= 0.0 and places[:, 0].max() <= 0.1 and np.ptp(places[:, 0]) > 0.05
+    assert places[:, 1].min() >= -0.05 and places[:, 1].max() <= 0.0
+    assert forces.min() >= 6.0 and forces.max() <= 12.0 and np.ptp(forces) > 3.0
+
+
+def test_mujocos_state_is_the_whole_state(env):
+    raw = env.unwrapped
+    start(env, (0.15, 0.0))
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        env.step(rng.uniform(-1, 1, 2))
+    kind = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+    state = np.zeros(mujoco.mj_stateSize(raw.model, kind))
+    mujoco.mj_getState(raw.model, raw.data, state, kind)
+    actions = rng.uniform(-1, 1, (100, 2))
+    first = [raw.step(a)[0] for a in actions]
+    mujoco.mj_setState(raw.model, raw.data, state, kind)
+    assert all(np.array_equal(raw.step(a)[0], o) for a, o in zip(actions, first, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("layout", "error"),
+    [
+        ({"tol": [0, 0]}, UnknownNameError),
+        ({"tool": [0, 0, 0]}, ConfigurationError),
+        ({"tool": "here"}, ConfigurationError),
+        ({"tool": [0.19, 0.0]}, ConfigurationError),
+        ({"tool": [0.0, 0.24]}, ConfigurationError),
+        ({"velocity": [np.nan, 0.0]}, ConfigurationError),
+        ({"wanted_force": 0.0}, ConfigurationError),
+        ({"wanted_force": 15.0}, ConfigurationError),
+    ],
+)
+def test_layouts_that_cannot_be_are_refused(env, layout, error):
+    with pytest.raises(error):
+        env.reset(options={"layout": layout})
+
+
+@pytest.mark.parametrize("action", [[np.nan, 0.0], [0.0], [0.0, 0.0, 0.0], [np.inf, 0.0]])
+def test_actions_that_are_none_are_refused(env, action):
+    env.reset(seed=0)
+    before = env.unwrapped.data.time
+    with pytest.raises(ActionError, match="2 finite numbers"):
+        env.unwrapped.step(np.array(action))
+    assert env.unwrapped.data.time == before
+
+
+# The coupling ---------------------------------------------------------------------------------------------------
+
+
+def test_free_motion_is_that_of_a_mass_on_a_spring_and_a_damper(env):
+    # Independent: m x'' = K (xc - x) + B (u - x'), xc' = u, with commands that neither slip nor clamp.
+    start(env, (0.0, -0.3))
+
+    def command(t):
+        return np.array([0.08 * math.sin(6.0 * t), -0.1 * math.cos(4.0 * t)])
+
+    def rate(t, s):
+        x, v, c = s[:2], s[2:4], s[4:]
+        u = command(t)
+        return np.concatenate([v, STIFFNESS * (c - x) + DAMPING * (u - v), u])
+
+    begin = np.array([0.0, -0.3, 0.0, 0.0, 0.0, -0.3])
+    truth = solve_ivp(rate, (0.0, 1.0), begin, rtol=1e-10, atol=1e-12)
+    for k in range(1000):
+        observation = env.step(command(k * 0.001))[0]
+    np.testing.assert_allclose(observation[:2], truth.y[:2, -1], atol=2e-4)
+    np.testing.assert_allclose(observation[2:4], truth.y[2:4, -1], atol=2e-3)
+
+
+def test_the_force_that_is_observed_is_spring_and_damper_at_the_state(env):
+    rng = np.random.default_rng(1)
+    observation, _ = start(env, (0.1, 0.0))
+    raw = env.unwrapped
+    clamped = slipped = 0
+    for _ in range(400):
+        action = rng.uniform(-1, 1, 2) if rng.random() < 0.05 else np.array([0.9, -0.9])
+        place, position, velocity = raw.commanded_position, raw.tool_position, raw.tool_velocity
+        damper = np.clip(DAMPING * (action - velocity), -DAMPER_LIMIT, DAMPER_LIMIT)
+        clamped += int((np.abs(damper) == DAMPER_LIMIT).any())
+        observation = raw.step(action)[0]
+        np.testing.assert_allclose(raw.port_effort_acted, STIFFNESS * (place - position) + damper, atol=1e-9)
+        np.testing.assert_array_equal(observation[4:6], raw.port_effort)
+        stretch = STIFFNESS * math.dist(raw.commanded_position, raw.tool_position)
+        assert stretch <= SLIP + 1e-9
+        slipped += stretch > SLIP - 1e-9
+    assert clamped > 5 and slipped > 20
+
+
+def test_what_acted_is_what_mujoco_integrated(env):
+    start(env, (0.0, -0.2))
+    rng = np.random.default_rng(2)
+    raw = env.unwrapped
+    for _ in range(200):
+        before = raw.tool_velocity
+        raw.step(rng.uniform(-1, 1, 2))
+        np.testing.assert_allclose((raw.tool_velocity - before) / raw.dt, raw.port_effort_acted, atol=1e-8)
+
+
+def test_the_feedthrough_says_how_the_effort_answers_the_flow(env):
+    start(env, (0.0, -0.2))
+    raw = env.unwrapped
+    rng, last = np.random.default_rng(3), np.zeros(2)
+    for _ in range(200):
+        action = last + rng.uniform(-0.1, 0.1, 2)
+        foreseen = raw.port_effort + raw.port_feedthrough * (action - last)
+        raw.step(action)
+        np.testing.assert_allclose(raw.port_effort_acted, foreseen, atol=1e-9)
+        last = action
+
+
+def test_the_port_generates_no_energy(env):
+    # Whatever is commanded: what was stored at the end was put in. Sampling at 1 ms may miss that by little.
+    rng = np.random.default_rng(4)
+    raw = env.unwrapped
+    for seed in range(3):
+        env.reset(seed=seed)
+        absorbed, missing, through = raw.stored_energy, 0.0, 0.0
+        for k in range(1500):
+            if k % int(rng.integers(1, 100)) == 0:
+                action = rng.uniform(-1, 1, 2)
+            raw.step(action)
+            energy = float(raw.port_effort_acted @ action) * raw.dt
+            absorbed += energy
+            through += abs(energy)
+            missing = max(missing, raw.stored_energy - absorbed)
+        assert missing < 1e-3 * through and through > 1.0
+
+
+# Wall and clamp -------------------------------------------------------------------------------------------------
+
+
+def test_a_pressed_wall_is_a_spring(env):
+    start(env, (0.17, 0.0))
+    for _ in range(600):
+        env.step(np.array([0.05, 0.0]))
+    for _ in range(1500):
+        observation, *_, info = env.step(np.zeros(2))
+    depth = observation[0] + TOOL_RADIUS - WALL_X
+    assert info["contact_force"] == pytest.approx(WALL * depth, rel=2e-3)
+    assert info["contact_force"] == pytest.approx(observation[4], rel=1e-3)  # at rest the spring carries it
+    assert observation[6] == info["contact_force"]
+
+
+@pytest.mark.parametrize("speed", [0.05, 0.2, 0.5])
+def test_an_impact_has_the_peak_force_of_a_mass_on_a_spring(env, speed):
+    # v sqrt(k m), less what 60 N s/m take off (a damping ratio of 0.2) and the coupling, which holds back.
+    start(env, (WALL_X - TOOL_RADIUS - 0.0005, 0.0), (speed, 0.0))
+    peak = max(env.step(np.array([speed, 0.0]))[4]["contact_force"] for _ in range(40))
+    ideal = speed * math.sqrt(WALL)
+    assert 0.7 * ideal < peak < 1.05 * ideal
+
+
+def test_contacts_never_pull(env):
+    rng = np.random.default_rng(5)
+    start(env, (0.18, 0.2))
+    for k in range(600):
+        if k % 40 == 0:
+            action = rng.uniform(-1, 1, 2)
+        assert env.step(action)[4]["contact_force"] >= 0.0
+
+
+def test_the_costs_are_the_truth(env):
+    raw = env.unwrapped
+    _, info = start(env, (0.0, CLAMP_Y - TOOL_RADIUS - 0.002))
+    assert info["cost"] == info["cost_substep"] == 0.0 and info["clearance"] == pytest.approx(0.002)
+    touched = hard = 0
+    for _ in range(150):
+        info = env.step(np.array([0.0, 1.0]))[4]
+        inside = raw.tool_position[1] + TOOL_RADIUS >= CLAMP_Y
+        assert info["cost"] == info["cost_substep"] == float(inside)
+        touched += inside
+        hard += info["cost_force"]
+        assert info["contact_force"] == 0.0  # that is the wall's
+    assert touched > 10 and hard > 0
+    start(env, (WALL_X - TOOL_RADIUS - 0.001, 0.0), (0.2, 0.0))
+    assert all(env.step(np.array([0.1, 0.0]))[4]["cost_force"] == 0.0 for _ in range(50))
+    start(env, (WALL_X - TOOL_RADIUS - 0.001, 0.0), (0.5, 0.0))
+    infos = [env.step(np.array([0.1, 0.0]))[4] for _ in range(50)]
+    assert [i["cost_force"] for i in infos] == [float(i["contact_force"] > FORCE_LIMIT) for i in infos]
+    assert any(i["cost_force"] for i in infos)
+
+
+def test_pressing_and_sweeping_are_rewarded(env):
+    start(env, (0.18, -0.1), wanted=8.0)
+    for _ in range(600):
+        env.step(np.array([0.05, 0.0]))
+    observation = env.unwrapped.observe()
+    for _ in range(600):
+        push = (8.0 - observation[6]) / DAMPING
+        observation, reward, *_, info = env.step(np.array([0.2 * push, 0.0]))
+    assert reward == pytest.approx(0.001 * (1.0 - abs(info["contact_force"] - 8.0) / 8.0))
+    assert reward > 0.0009 and info["swept"] == 0.0
+    before = observation[1]
+    rewards, infos = [], []
+    for _ in range(400):
+        push = (8.0 - observation[6]) / DAMPING
+        observation, reward, *_, info = env.step(np.array([0.2 * push, 0.1]))
+        rewards.append(reward)
+        infos.append(info)
+    assert infos[-1]["swept"] == pytest.approx(observation[1] - before, abs=1e-3)
+    assert sum(rewards) == pytest.approx(10.0 * infos[-1]["swept"] + 0.4, rel=0.1)
+    # Not without pressing.
+    start(env, (0.0, -0.1))
+    assert env.step(np.array([0.0, 1.0]))[1] == 0.0
+    assert sum(env.step(np.array([0.0, 0.5]))[1] for _ in range(200)) == 0.0
+
+
+# What a brake may count on --------------------------------------------------------------------------------------
+
+
+def test_full_reverse_brakes_and_nothing_accelerates_faster(env):
+    # From every stretch of the spring up to where it slips, whether or not a driver gets there.
+    raw = env.unwrapped
+    least, most = np.inf, 0.0
+    for speed in np.linspace(0.0, TELEOP_TOP_SPEED, 8):
+        for stretch in np.linspace(-SLIP, SLIP, 7) / STIFFNESS:
+            for action in (-1.0, 1.0):
+                start(env, (0.0, -1.0), (0.0, speed))
+                raw.data.mocap_pos[0, 1] += stretch
+                raw.step(np.array([0.0, action]))
+                rate = (raw.tool_velocity[1] - speed) / raw.dt
+                most = max(most, rate)
+                if action < 0.0:
+                    least = min(least, -rate)
+    assert TELEOP_BRAKING <= least < TELEOP_BRAKING + 2.0
+    assert TELEOP_ACCELERATION - 1.0 < most <= TELEOP_ACCELERATION + 1e-9
+
+
+def test_no_command_drives_faster(env):
+    raw = env.unwrapped
+    rng = np.random.default_rng(6)
+    fastest = 0.0
+    for _ in range(20):
+        start(env, (0.0, -1.0))
+        for _ in range(300):
+            raw.step(np.array([0.0, 1.0]) if rng.random() < 0.9 else rng.uniform(-1, 1, 2))
+            fastest = max(fastest, raw.tool_velocity[1])
+    assert 0.7 * TELEOP_TOP_SPEED < fastest <= TELEOP_TOP_SPEED
+
+
+def test_a_copied_model_foresees_the_step(env):
+    plant = sw.MujocoPlant()
+    plant.bind(env)
+    rng = np.random.default_rng(7)
+    start(env, (0.17, 0.2))
+    for k in range(300):
+        if k % 30 == 0:
+            action = rng.uniform(-1, 1, 2)
+        plant.observe()
+        foreseen = plant.forecast(action).qpos[-1], plant.forecast(action).qvel[-1]
+        env.step(action)
+        assert np.array_equal(foreseen[0], env.unwrapped.data.qpos)
+        assert np.array_equal(foreseen[1], env.unwrapped.data.qvel)
