@@ -7,7 +7,8 @@
 round trip is twice that. Networks: **steady** has nothing but the delay; **rough** has up to 30 % more, drawn for
 each packet, 5 % of loss, and packets that overtake each other; **outages** is rough and goes silent for 0.3 s every
 2 s, on average. Operators (`TeleopOperator`): the **careful** one stops before the clamp, as far as what he sees lets
-him; the other **looks away** and sweeps on. Everyone has his own reaction time, from 0.15 to 0.25 s.
+him; the other **looks away** and sweeps on. Both have a reaction time of their own, from 0.15 to 0.25 s, and an arm
+that gives way. **Corners** is no human: it holds +-1 m/s against any force and switches at random.
 
 Judged from outside the channel. Energy: of the operator's hand at the force that he is shown, and of what acted on
 the tool by the env's own account; the channel's word is taken for what is in flight only. Chatter: how often per
@@ -59,7 +60,10 @@ RULES: Final[dict[str, dict[str, Any]]] = {
 }
 """Other rules for packets that are late; where no packet is, they are all the same."""
 NETWORKS = ("steady", "rough", "outages")
-OPERATORS = ("careful", "looks away")
+OPERATORS = ("careful", "looks away", "corners")
+CORNERS_DELAYS_S = (0.0, 0.05, 0.2)
+CORNERS_HOLD = (20, 200)
+"""Ticks between two switches, from and below."""
 
 
 @dataclass(frozen=True)
@@ -94,13 +98,36 @@ def channel(job: Job) -> sw.TeleopChannel:
     ceiling = sw.RoundTripCeiling(
         reading, braking=TELEOP_BRAKING, acceleration=TELEOP_ACCELERATION, top_speed=TELEOP_TOP_SPEED
     )
-    ways = (link(job.network, job.delay_s) for _ in range(2))
     return sw.TeleopChannel(
         gym.make("TeleopContact-v0", max_episode_steps=job.steps, disable_env_checker=True),
-        *ways,
+        uplink=link(job.network, job.delay_s),
+        downlink=link(job.network, job.delay_s),
         ceiling=ceiling if job.revocation else None,
         **{**CODINGS, **RULES}[job.coding],
     )
+
+
+class Corners:
+    """Holds a corner of the action space for a random time, then another; no force moves it."""
+
+    def __init__(self, seed: int) -> None:
+        self._random = np.random.default_rng(seed)
+        self._left = 0
+
+    def act(self, observation: Array) -> Array:
+        """Shape (2,), m/s."""
+        if self._left == 0:
+            self._left = int(self._random.integers(*CORNERS_HOLD))
+            self._corner = self._random.choice([-1.0, 1.0], size=2)
+        self._left -= 1
+        return np.array(self._corner)
+
+
+def operator_of(job: Job) -> TeleopOperator | Corners:
+    """Who steers."""
+    if job.operator == "corners":
+        return Corners(job.seed)
+    return TeleopOperator(job.seed, stops=job.operator == "careful")
 
 
 def excess(net_j: Array, in_flight_j: Array) -> float:
@@ -133,7 +160,7 @@ def run(job: Job) -> dict[str, Any]:
     """One episode."""
     env = channel(job)
     raw: Any = env.unwrapped
-    operator = TeleopOperator(job.seed, stops=job.operator == "careful")
+    operator = operator_of(job)
     observation, _ = env.reset(seed=job.seed)
     felt_at_once = job.coding != "plain"  # the force for this very motion, not the last that arrived
     effort = np.array(env.port.effort)  # type: ignore[union-attr]
@@ -244,19 +271,20 @@ def clearance_table(rows: list[dict[str, Any]]) -> str:
 def both_table(rows: list[dict[str, Any]]) -> str:
     """Markdown: both invariants in the same runs, with revocation."""
     lines = [
-        "| coding | episodes | ticks | extracted beyond what was in flight, at most (J) | most in flight (J) "
-        "| made, with the hand a tick late (J) | breaches |",
-        "|---|---|---|---|---|---|---|",
+        "| coding | operators | episodes | ticks | extracted beyond what was in flight, at most (J) "
+        "| most in flight (J) | made, with the hand a tick late (J) | breaches |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for coding in ("wave", *RULES):
-        part = _some(rows, coding=coding, revocation=True)
-        if part:
-            lines.append(
-                f"| {coding} | {len(part)} | {sum(r['steps'] for r in part):,} | "
-                f"{max(r['excess_j'] for r in part):.1e} | {max(r['flying_j'] for r in part):.2f} | "
-                f"{max(r['made_at_hand_j'] for r in part):.1e} | "
-                f"{sum(r['breached_steps'] > 0 for r in part)} |"
-            )
+        for operators in (OPERATORS[:2], OPERATORS[2:]):
+            part = [r for r in _some(rows, coding=coding, revocation=True) if r["operator"] in operators]
+            if part:
+                lines.append(
+                    f"| {coding} | {', '.join(operators)} | {len(part)} | {sum(r['steps'] for r in part):,} | "
+                    f"{max(r['excess_j'] for r in part):.1e} | {max(r['flying_j'] for r in part):.2f} | "
+                    f"{max(r['made_at_hand_j'] for r in part):.1e} | "
+                    f"{sum(r['breached_steps'] > 0 for r in part)} |"
+                )
     return "\n".join(lines)
 
 
@@ -282,7 +310,8 @@ def jobs(seeds: int) -> list[Job]:
         for coding in (*CODINGS, *(RULES if network != "steady" else ()))
         for operator in OPERATORS
         for revocation in (False, True)
-        if coding not in RULES or operator == "careful"
+        if (coding not in RULES or operator == "careful")
+        and (operator != "corners" or delay in CORNERS_DELAYS_S)
     ]
 
 

@@ -53,6 +53,14 @@ def test_who_looks_away_breaches_unless_authority_is_revoked():
     assert on["breached_steps"] == 0 and on["least_m"] > 0.0 and on["revoked_steps"] > 0
 
 
+def test_corners_are_held_against_any_force():
+    operator = benchmark.operator_of(Job("wave", "steady", 0.0, "corners", True, 3))
+    actions = np.array([operator.act(np.full(9, 100.0)) for _ in range(2000)])
+    assert set(map(tuple, actions)) == {(a, b) for a in (-1.0, 1.0) for b in (-1.0, 1.0)}
+    held = np.diff(np.flatnonzero(np.any(np.diff(actions, axis=0), axis=1)))
+    assert held.min() >= 20 and held.max() < 600  # the same corner may be drawn again
+
+
 def test_tables_have_a_line_for_all_that_was_run():
     rows = []
     for job in jobs(1):
@@ -67,9 +75,9 @@ def test_tables_have_a_line_for_all_that_was_run():
         "| steady | 0 | 0 / 0 / 0 | 1.5 / 1.5 / 1.5 | - / - / - | 12 / 12 / 12 | 20 / 20 / 20 |"
     )
     assert len(rules.splitlines()) == 2 + 2 * 2
-    assert len(clearance.splitlines()) == 2 + 2 * 3 * 3 + 2 * 2
+    assert len(clearance.splitlines()) == 2 + 3 * 3 * 3 + 2 * 2
     assert clearance.splitlines()[2] == "| careful | steady | plain | 2 | 0 | 0 | 1.00 | 50.0% |"
-    assert len(both.splitlines()) == 2 + 3
+    assert len(both.splitlines()) == 2 + 4
 
 
 def test_jobs_are_all_different_and_seeds_come_one_after_the_other():
