@@ -37,7 +37,7 @@ def manipulability(jacobian: ArrayLike) -> Array:
 
     By a QR factorisation of J'. The determinant of `J J'` itself squares the condition: its relative error grows with
     the square of it, and near rank loss it is negative, whose root is not a number. QR and SVD are both good
-    to the condition times the rounding; QR costs a third.
+    to the condition times the rounding; QR takes a quarter of the time.
 
     Args:
         jacobian: Shape (..., m, n). With fewer joints than task directions w is zero everywhere.
