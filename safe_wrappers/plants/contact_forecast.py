@@ -6,9 +6,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.plants.forecast import RESETS
 from safe_wrappers.plants.replay import evaluations
 
 Array = NDArray[np.float64]
+
+_FASTEST = float(mujoco.mjMAXVAL) ** 2
+"""Of squared lengths. MuJoCo answers numbers out of bounds with a reset, after which all may look well; and nothing
+checks the stages of a Runge-Kutta step that are made here."""
 
 
 class ContactForecast(NamedTuple):
@@ -21,8 +26,10 @@ class ContactForecast(NamedTuple):
         point: Shape (n, 3), m.
         normal: Pointing at the robot, shape (n, 3).
         force: On the robot, shape (n, 3), N.
-        friction: Coefficient that the model has for it, shape (n,).
-        finite: False where the simulation ends in numbers that are none; then the contacts say nothing.
+        friction: Coefficient of sliding that the model has for it, shape (n,); of two that differ with the direction
+            the smaller one, and 0 for a contact without friction (condim 1).
+        finite: False where the simulation left the numbers that MuJoCo takes (it answers with a reset); then the
+            contacts say nothing.
     """
 
     steps: int
@@ -38,6 +45,8 @@ class ContactForecast(NamedTuple):
 class ContactReader:
     """Reads the contacts of moving bodies with the fixed world.
 
+    What MuJoCo has is copied as it is, and made sense of once for many readings: Python is slower than the physics.
+
     Args:
         model: Whose data will be read.
     """
@@ -45,26 +54,65 @@ class ContactReader:
     def __init__(self, model: mujoco.MjModel) -> None:
         self._model = model
         fixed = model.body_weldid == 0
-        # Geom -1, of something flexible, is the last entry: no robot's body.
-        self._body_of_geom: list[int] = [*np.where(fixed, 0, np.arange(model.nbody))[model.geom_bodyid], 0]
+        # Geom -1, of something flexible, is the last entry: it moves, and is no body of the robot.
+        bodies = np.where(fixed, 0, np.arange(model.nbody))
+        self._body_of_geom = np.append(bodies[model.geom_bodyid], -1)
         self._wrench = np.zeros(6)
+        self.clear()
 
-    def read(self, data: mujoco.MjData) -> list[tuple[int, Array, Array, Array, float]]:
-        """Body, point, normal, force and friction of every contact as MuJoCo has computed them last."""
-        found = []
-        for i in range(data.ncon):
-            contact = data.contact[i]
-            first, second = self._body_of_geom[contact.geom1], self._body_of_geom[contact.geom2]
-            if contact.efc_address < 0 or (first == 0) == (second == 0):
-                continue
+    def clear(self) -> None:
+        """Forget what has been read."""
+        self._steps: list[int] = []
+        self._bodies: list[NDArray[np.int64]] = []
+        self._points: list[Array] = []
+        self._frames: list[Array] = []
+        self._friction: list[Array] = []
+        self._sliding: list[NDArray[np.bool_]] = []
+        self._forces: list[Array] = []
+        self.count = 0
+
+    def read(self, data: mujoco.MjData) -> None:
+        """Keep every contact that counts, as MuJoCo has computed them last."""
+        step = self.count
+        self.count += 1
+        if not data.ncon:
+            return
+        contact = data.contact
+        bodies = self._body_of_geom[contact.geom]
+        low, high = bodies.min(axis=1), bodies.max(axis=1)
+        kept = ((low == 0) & (high > 0) & (contact.efc_address >= 0)).nonzero()[0]
+        if not kept.size:
+            return
+        for i in kept:
             mujoco.mj_contactForce(self._model, data, i, self._wrench)
-            frame = contact.frame.reshape(3, 3)
-            # MuJoCo's normal points from the first geom to the second, and the force is on the second.
-            sign = 1.0 if first == 0 else -1.0
-            friction = float(contact.friction[0]) if contact.dim > 1 else 0.0
-            force = sign * (self._wrench[:3] @ frame)
-            found.append((first or second, contact.pos.copy(), sign * frame[0], force, friction))
-        return found
+            self._forces.append(self._wrench[:3].copy())
+            self._steps.append(step)
+        self._bodies.append(bodies[kept])
+        self._points.append(contact.pos[kept])
+        self._frames.append(contact.frame[kept])
+        self._friction.append(contact.friction[kept, :2])
+        self._sliding.append(contact.dim[kept] > 1)
+
+    def forecast(self, finite: bool) -> ContactForecast:
+        """All that has been read."""
+        if not self._steps:
+            none, nowhere = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+            return ContactForecast(self.count, none, none, nowhere, nowhere, nowhere, np.zeros(0), finite)
+        bodies, frames = np.concatenate(self._bodies), np.concatenate(self._frames).reshape(-1, 3, 3)
+        # MuJoCo's normal points from the first geom to the second, and the force is on the second.
+        sign = np.where(bodies[:, 0] == 0, 1.0, -1.0)[:, None]
+        # Where the two directions differ, the weaker one is counted on in all.
+        friction = np.concatenate(self._friction).min(axis=1)
+        return ContactForecast(
+            steps=self.count,
+            step=np.array(self._steps, dtype=np.int64),
+            body=bodies.max(axis=1).astype(np.int64),
+            point=np.concatenate(self._points),
+            normal=sign * frames[:, 0],
+            force=sign * np.einsum("ki,kij->kj", np.array(self._forces), frames),
+            friction=np.where(np.concatenate(self._sliding), friction, 0.0),
+            finite=finite,
+        )
 
 
 def forecast_contacts(
@@ -78,28 +126,16 @@ def forecast_contacts(
         substeps: Physics substeps per control interval.
         reader: For this model.
     """
-    step: list[int] = []
-    rows: list[tuple[int, Array, Array, Array, float]] = []
-    count = 0
+    reader.clear()
+    data.warning.number[RESETS] = 0
+    inside = True
 
     def visit(at: mujoco.MjData, _: float) -> None:
-        nonlocal count
-        found = reader.read(at)
-        rows.extend(found)
-        step.extend([count] * len(found))
-        count += 1
+        nonlocal inside
+        reader.read(at)
+        inside = inside and bool(at.qacc @ at.qacc < _FASTEST)
 
     for _ in range(substeps):
         evaluations(model, data, visit)
-    finite = bool(np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all())
-    body, point, normal, force, friction = zip(*rows, strict=True) if rows else ((),) * 5
-    return ContactForecast(
-        steps=count,
-        step=np.array(step, dtype=np.int64),
-        body=np.array(body, dtype=np.int64),
-        point=np.array(point, dtype=np.float64).reshape(-1, 3),
-        normal=np.array(normal, dtype=np.float64).reshape(-1, 3),
-        force=np.array(force, dtype=np.float64).reshape(-1, 3),
-        friction=np.array(friction, dtype=np.float64),
-        finite=finite,
-    )
+    inside = inside and bool(data.qvel @ data.qvel < _FASTEST and data.qpos @ data.qpos < _FASTEST)
+    return reader.forecast(finite=inside and not data.warning.number[RESETS].any())

@@ -10,7 +10,7 @@ Array = NDArray[np.float64]
 
 _BRAKING = 0.5
 """Share of an actuated joint's own motion that braking takes away per control interval; more would chatter."""
-_RESETS = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
+RESETS = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
 """The warnings after which MuJoCo resets the state."""
 
 
@@ -108,7 +108,7 @@ class Recorder:
         m, n = self._model, self._substeps
         qpos, qvel = np.empty((holds * n, m.nq)), np.empty((holds * n, m.nv))
         frames, centres = np.empty((holds, m.nbody, 3)), np.empty((holds, m.nbody, 3))
-        data.warning.number[_RESETS] = 0
+        data.warning.number[RESETS] = 0
         self.place(data)
         for hold in range(holds):
             self.act(data, self.braking(data) if hold else control)
@@ -119,7 +119,7 @@ class Recorder:
                 self.settle(data)
                 qpos[i], qvel[i] = data.qpos, data.qvel
             frames[hold], centres[hold] = data.xpos, data.xipos
-            if data.warning.number[_RESETS].any():
+            if data.warning.number[RESETS].any():
                 # MuJoCo answers numbers out of bounds with a reset, after which all may look well.
                 qpos[hold * n :] = qvel[hold * n :] = frames[hold:] = centres[hold:] = np.nan
                 break
