@@ -56,20 +56,20 @@ class ContactReader:
         fixed = model.body_weldid == 0
         # Geom -1, of something flexible, is the last entry: it moves, and is no body of the robot.
         bodies = np.where(fixed, 0, np.arange(model.nbody))
-        self._body_of_geom = np.append(bodies[model.geom_bodyid], -1)
+        self._body_of_geom: list[int] = [*bodies[model.geom_bodyid].tolist(), -1]
         self._wrench = np.zeros(6)
         self.clear()
 
     def clear(self) -> None:
         """Forget what has been read."""
-        self._steps: list[int] = []
-        self._bodies: list[NDArray[np.int64]] = []
+        self.count = 0
+        self._kept: list[tuple[int, int, int, int]] = []
+        self._forces: list[Array] = []
+        self._copied = 0
         self._points: list[Array] = []
         self._frames: list[Array] = []
         self._friction: list[Array] = []
-        self._sliding: list[NDArray[np.bool_]] = []
-        self._forces: list[Array] = []
-        self.count = 0
+        self._dims: list[Array] = []
 
     def read(self, data: mujoco.MjData) -> None:
         """Keep every contact that counts, as MuJoCo has computed them last."""
@@ -77,40 +77,42 @@ class ContactReader:
         self.count += 1
         if not data.ncon:
             return
-        contact = data.contact
-        bodies = self._body_of_geom[contact.geom]
-        low, high = bodies.min(axis=1), bodies.max(axis=1)
-        kept = ((low == 0) & (high > 0) & (contact.efc_address >= 0)).nonzero()[0]
-        if not kept.size:
-            return
-        for i in kept:
+        contact, body, before = data.contact, self._body_of_geom, len(self._kept)
+        geoms, addresses = contact.geom.tolist(), contact.efc_address.tolist()
+        for i, ((one, other), address) in enumerate(zip(geoms, addresses, strict=True)):
+            first, second = body[one], body[other]
+            if address < 0 or first == second or min(first, second) != 0:
+                continue
             mujoco.mj_contactForce(self._model, data, i, self._wrench)
-            self._forces.append(self._wrench[:3].copy())
-            self._steps.append(step)
-        self._bodies.append(bodies[kept])
-        self._points.append(contact.pos[kept])
-        self._frames.append(contact.frame[kept])
-        self._friction.append(contact.friction[kept, :2])
-        self._sliding.append(contact.dim[kept] > 1)
+            self._forces.append(self._wrench.copy())
+            # MuJoCo's normal points from the first geom to the second, and the force is on the second.
+            self._kept.append((step, self._copied + i, first or second, 1 if first == 0 else -1))
+        if len(self._kept) == before:
+            return
+        self._copied += len(geoms)
+        self._points.append(contact.pos.copy())
+        self._frames.append(contact.frame.copy())
+        self._friction.append(contact.friction.copy())
+        self._dims.append(contact.dim.copy())
 
     def forecast(self, finite: bool) -> ContactForecast:
         """All that has been read."""
-        if not self._steps:
+        if not self._kept:
             none, nowhere = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
             return ContactForecast(self.count, none, none, nowhere, nowhere, nowhere, np.zeros(0), finite)
-        bodies, frames = np.concatenate(self._bodies), np.concatenate(self._frames).reshape(-1, 3, 3)
-        # MuJoCo's normal points from the first geom to the second, and the force is on the second.
-        sign = np.where(bodies[:, 0] == 0, 1.0, -1.0)[:, None]
+        step, which, body, side = np.array(self._kept, dtype=np.int64).T
+        frames = np.concatenate(self._frames)[which].reshape(-1, 3, 3)
+        sign = side[:, None].astype(np.float64)
         # Where the two directions differ, the weaker one is counted on in all.
-        friction = np.concatenate(self._friction).min(axis=1)
+        friction = np.concatenate(self._friction)[which, :2].min(axis=1)
         return ContactForecast(
             steps=self.count,
-            step=np.array(self._steps, dtype=np.int64),
-            body=bodies.max(axis=1).astype(np.int64),
-            point=np.concatenate(self._points),
+            step=step,
+            body=body,
+            point=np.concatenate(self._points)[which],
             normal=sign * frames[:, 0],
-            force=sign * np.einsum("ki,kij->kj", np.array(self._forces), frames),
-            friction=np.where(np.concatenate(self._sliding), friction, 0.0),
+            force=sign * np.einsum("ki,kij->kj", np.array(self._forces)[:, :3], frames),
+            friction=np.where(np.concatenate(self._dims)[which] > 1, friction, 0.0),
             finite=finite,
         )
 

@@ -96,13 +96,15 @@ def _runge_kutta(model: mujoco.MjModel, data: mujoco.MjData, visit: Visit) -> No
         visit(data, weight * step_s)
         velocity += weight * qvel
         acceleration += weight * qacc
-        activation += weight * act_dot
+        if model.na:
+            activation += weight * act_dot
         if ahead:
             rate = ahead * qvel
             qpos[:] = qpos0
             mujoco.mj_integratePos(model, qpos, rate, step_s)
             qvel[:] = qvel0 + step_s * (ahead * qacc)
-            act[:] = act0 + step_s * (ahead * act_dot)
+            if model.na:
+                act[:] = act0 + step_s * (ahead * act_dot)
             data.time = time + ahead * step_s
     qpos[:] = qpos0
     mujoco.mj_integratePos(model, qpos, velocity, step_s)
