@@ -237,8 +237,8 @@ def energy_table(rows: list[dict[str, Any]], codings: tuple[str, ...], networks:
 
 
 def energy(joule: float) -> str:
-    """0 only where it is, to rounding."""
-    return "0" if joule < 1e-9 else f"{joule:.3f}" if joule < 0.1 else f"{joule:.1f}"
+    """0 below a microjoule."""
+    return "0" if joule < 1e-6 else f"{joule:.2g}"
 
 
 def clearance_table(rows: list[dict[str, Any]]) -> str:
