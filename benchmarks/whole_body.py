@@ -15,6 +15,9 @@ between the robot and the fixed world are read there.
   the zero moment point is within 1 cm of its edge or beyond; and how many evaluations have a polygon at all.
 - joints: share of control steps with a driven joint more than 0.1 rad beyond its stop.
 - falls: episodes that the env ended as unhealthy.
+
+The second table asks, along the unfiltered policies, what the program's answer is worth where the forecast of the
+whole control step refuses the policy's torques: whether the forecast admits it, and how far it is from them.
 """
 
 import argparse
@@ -181,6 +184,67 @@ def drive(robot: str, arm: str, policy: Callable[[Any], Any], episodes: int, lim
     return row
 
 
+@dataclass
+class Answers:
+    """What the programs say where the forecast refuses the policy."""
+
+    robot: str
+    refused: int = 0
+    admitted: dict[str, int] = field(default_factory=dict)
+    corrections: dict[str, list[float]] = field(default_factory=dict)
+
+
+def ask_programs(robot: str, policy: Callable[[Any], Any], episodes: int, limit: int) -> Answers:
+    """The programs' answers, judged by the forecast."""
+    answers = Answers(robot)
+    env = gym.make(f"{robot}-v5", max_episode_steps=limit)
+    plant = sw.MujocoPlant()
+    plant.bind(env)
+    forecast = sw.ContactFeasibility(SHARE, TOLERANCE)
+    programs = {
+        "pyramids": sw.Stance(SHARE, joint_tolerance=None),
+        "exact cones": sw.Stance(SHARE, cone="exact", joint_tolerance=None),
+    }
+    for constraint in (forecast, *programs.values()):
+        constraint.bind(plant)
+    for episode in range(episodes):
+        observation, _ = env.reset(seed=episode)
+        done = False
+        while not done:
+            action = policy(observation)
+            proposed = np.asarray(action, dtype=np.float64)
+            plant.observe()
+            if not forecast.admits(plant, proposed):
+                answers.refused += 1
+                for name, program in programs.items():
+                    program.admits(plant, proposed)
+                    (answer,) = program.suggestions(plant, proposed)
+                    if forecast.admits(plant, answer):
+                        answers.admitted[name] = answers.admitted.get(name, 0) + 1
+                    distance = float(np.linalg.norm(answer - proposed))
+                    answers.corrections.setdefault(name, []).append(distance)
+            observation, _, fell, out_of_time, _ = env.step(action)
+            done = fell or out_of_time
+    env.close()
+    return answers
+
+
+ANSWERS_HEADER = (
+    "| robot | program | steps that the forecast refuses | answer admitted by the forecast | mean correction |\n"
+    + "|---" * 5
+    + "|"
+)
+
+
+def answer_lines(answers: Answers) -> list[str]:
+    """Rows of the second table."""
+    return [
+        f"| {answers.robot} | {name} | {answers.refused} | {answers.admitted.get(name, 0) / answers.refused:.0%} "
+        f"| {np.mean(distances):.2f} |"
+        for name, distances in answers.corrections.items()
+    ]
+
+
 HEADER = (
     "| robot | arm | falls | steps per episode | reward per step | m/s forward | cone left "
     "| by more than 1 % of weight | unflagged | with a polygon | zmp near its edge | joint beyond | changed "
@@ -226,16 +290,25 @@ def main() -> None:
     parser.add_argument("--limit", type=int, default=500, help="steps per episode at most")
     parser.add_argument("--results", type=Path, default=RESULTS)
     arguments = parser.parse_args()
+    policies = {robot: learned(robot) for robot in arguments.robots}
+    print(ANSWERS_HEADER)
+    second = [ANSWERS_HEADER]
+    for robot, policy in policies.items():
+        second += answer_lines(ask_programs(robot, policy, arguments.episodes, arguments.limit))
+    print("\n".join(second[1:]))
     print(HEADER)
     rows: list[Row] = []
-    for robot in arguments.robots:
-        policy = learned(robot)
+    for robot, policy in policies.items():
         for arm in arguments.arms:
             rows.append(drive(robot, arm, policy, arguments.episodes, arguments.limit))
             print(line(rows[-1]), flush=True)
     arguments.results.mkdir(parents=True, exist_ok=True)
     table = "\n".join([HEADER, *map(line, rows)])
-    text = f"{arguments.episodes} episodes of at most {arguments.limit} steps\n\n{table}\n"
+    text = (
+        f"{arguments.episodes} episodes of at most {arguments.limit} steps\n\n{table}\n\n"
+        + "\n".join(second)
+        + "\n"
+    )
     (arguments.results / "whole_body.md").write_text(text)
     with (arguments.results / "whole_body.jsonl").open("w") as out:
         for row in rows:

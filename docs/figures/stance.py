@@ -1,0 +1,47 @@
+"""What the whole-body program changes, by the friction that it may count on: pyramids and the exact cone."""
+
+import gymnasium as gym
+import numpy as np
+from matplotlib.figure import Figure
+
+import safe_wrappers as sw
+from _ant import gait
+from _style import OFF, ON, OTHER, SAFE
+
+BEFORE = 16
+"""Control steps of the gait, after which a foot stands and the next torques would make it slide."""
+SHARES = np.linspace(0.05, 1.0, 39)
+
+
+def draw() -> Figure:
+    """Distance of the answer from the gait's torques over the share of friction."""
+    env = gym.make("Ant-v5", healthy_z_range=(0.1, 2.0))
+    env.reset(seed=0)
+    act = gait(env)
+    for step in range(BEFORE):
+        env.step(act(step))
+    plant = sw.MujocoPlant()
+    plant.bind(env)
+    plant.observe()
+    wanted = act(BEFORE).astype(np.float64)
+    figure = Figure(figsize=(7.2, 3.0))
+    ax = figure.subplots()
+    for options, color, label in (
+        ({"edges": 4}, OFF, "pyramid, 4 edges"),
+        ({"edges": 8}, OTHER, "8 edges"),
+        ({"edges": 16}, SAFE, "16 edges"),
+        ({"cone": "exact"}, ON, "exact cone"),
+    ):
+        distances = []
+        for share in SHARES:
+            stance = sw.Stance(float(share), joint_tolerance=None, **options)
+            stance.bind(plant)
+            stance.admits(plant, wanted)
+            (answer,) = stance.suggestions(plant, wanted)
+            distances.append(np.linalg.norm(answer - wanted) if stance.admits(plant, answer) else np.nan)
+        ax.plot(SHARES, distances, color=color, label=label)
+    ax.set_xlabel("share of the model's friction")
+    ax.set_ylabel("correction of the torques")
+    ax.legend(loc="upper right")
+    env.close()
+    return figure
