@@ -141,6 +141,9 @@ class EnergyReference:
     never below minus the initial storages (and debts), whatever the network does to the messages: the number sent
     only grows, and only the largest that was heard counts. Power is positive into the channel at *both* ends.
 
+    Without any storage two such ends may never start: an end that moves something waits for energy, and the other
+    takes none in while it feels no force. The price of starting is what is declared here, once.
+
     Args:
         causality: Which of the two this end changes, see above.
         initial_storage_j: What this end may give out without having heard anything, at least 0 J.

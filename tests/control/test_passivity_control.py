@@ -233,6 +233,22 @@ def test_an_end_gives_what_it_has_heard_of():
     assert held.debt_j == 0.0
 
 
+@pytest.mark.parametrize(("storage", "moves"), [(0.0, False), (0.01, True)])
+def test_two_ends_need_some_storage_to_start(storage, moves):
+    """A hand at constant speed, a mass behind a damper at the other end, no delay: nobody pays first."""
+    m, s = EnergyReference(), EnergyReference("admittance", storage)
+    x, v, felt = 0.0, 0.0, 0.0
+    for _ in range(2000):
+        m.receive(s.message_j)
+        s.receive(m.message_j)
+        m.modify(felt, 0.1, DT)
+        flow = float(s.modify(-20.0 * (0.1 - v), 0.1, DT).flow[0])
+        felt = 20.0 * (flow - v)
+        v += felt * DT
+        x += v * DT
+    assert (x > 0.1) is moves
+
+
 def test_a_delayed_spring_that_is_active_is_not_with_energy_references():
     """The plain channel of 45 degrees: it makes energy at every turn; with references it cannot."""
     omega, delay, stiffness = 8.0, 98, 300.0
