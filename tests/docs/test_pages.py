@@ -8,6 +8,8 @@ from unittest import mock
 import gymnasium as gym
 import pytest
 
+import safe_wrappers  # noqa: F401  (its ids must outlast the first page)
+
 DOCS = Path(__file__).parents[2] / "docs"
 PAGES = runpy.run_path(str(DOCS / "pages.py"))
 OPTIONAL = {
