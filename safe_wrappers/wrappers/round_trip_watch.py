@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.constraints.clearance import Clearance
 from safe_wrappers.constraints.constraint import Constraint, non_negative, positive
 from safe_wrappers.constraints.plain_data import constraint_data, constraint_from
 from safe_wrappers.control.leases import longest_lease, round_trip_ceiling
@@ -114,22 +115,34 @@ class RoundTripWatch:
     def __init__(
         self, env: gym.Env[Any, Any], ceiling: RoundTripCeiling, plant: Plant | None, hold_s: float
     ) -> None:
-        given = ceiling.clearance
-        measures = given if callable(given) else constraint_from(given)
-        if hasattr(measures, "rows") and not hasattr(measures, "approach"):
-            raise ConfigurationError(
-                f"{type(measures).__name__} does not say how fast it is approached, which a ceiling is made from: "
-                "give a Clearance, or a function of the env that returns clearances in m and approach speeds in m/s"
+        measured = ceiling.clearance
+        if isinstance(measured, dict) or hasattr(measured, "rows"):
+            measured = constraint_from(measured)
+            if not hasattr(measured, "approach"):
+                raise ConfigurationError(
+                    f"{type(measured).__name__} does not say how fast it is approached, which a ceiling is made from: "
+                    "give a Clearance, or a function of the env that returns clearances in m and approach speeds in m/s"
+                )
+        # Rows know nothing of reserves that are not their constraint's own, nor of a brake that is late.
+        own = isinstance(measured, Clearance)
+        self._rows = own and ceiling.act_s == 0.0
+        reserves = {"localisation": ceiling.localisation, "margin": ceiling.margin}
+        if isinstance(measured, Clearance):
+            measured = replace(
+                measured,
+                braking=measured.braking if ceiling.braking is None else ceiling.braking,
+                margin=measured.margin + ceiling.margin,
+                state_error=measured.state_error + ceiling.localisation,
             )
+            reserves = dict.fromkeys(reserves, 0.0)
         self._room = Room(
             env,
-            given,
-            braking=ceiling.braking,
+            measured,
+            braking=None if own else ceiling.braking,
             acceleration=ceiling.acceleration,
             closing_speed=None,
             top_speed=ceiling.top_speed,
-            localisation=ceiling.localisation,
-            margin=ceiling.margin,
+            **reserves,
         )
         self._ceiling, self._plant, self._hold_s = ceiling, plant, hold_s
         if self._room.constraint is not None:
@@ -171,12 +184,13 @@ class RoundTripWatch:
     def can_stop_after(self, command: Array) -> bool:
         """Whether the machine can stop by itself after a command for one control step.
 
-        First by the declared accelerations, whatever the command is; else by the constraint's own rows, which know
-        how the machine answers this one.
+        First by the declared accelerations, whatever the command is; else by the rows of a `Clearance`, which know how
+        the machine answers this one. Where the brake is late (`act_s`), and with other readings, there is no else:
+        next to the limit no command is admitted then, not even one that leads away.
         """
         if self._stop_s >= self._hold_s:
             return True
-        if self._room.constraint is None or not self.readable:
+        if not (self._rows and self.readable):
             return False
         rows = self._room.constraint.rows(self._plant)
         return bool((rows.normals @ command <= rows.offsets + _ROUNDING).all())

@@ -326,6 +326,7 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         flow = None
         if action is not None and self.port is not None:
             flow = np.clip(action.astype(np.float64), self._low, self._high)[list(self.port.flow)]
+        self._moved = flow
         extra = self._coding.near(flow)
         if action is None or evidence is None:
             return
@@ -388,7 +389,7 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
     def _send_down(self, executed: Array, observation: Any, obeyed: bool) -> Any:
         now_s, coding = self.now_s, self._coding
         flow = executed[list(self.port.flow)] if self.port is not None else executed
-        extra, exchanged = coding.settle(flow, observation, obeyed)
+        extra, given = coding.settle(flow, observation, obeyed)
         sequence, lost = self._down.send(Down(_copy(observation), now_s, extra), now_s)
         coding.sent_down(sequence, extra, lost)
         self._lost += lost
@@ -398,11 +399,15 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
                 self._shown = packet.sequence, packet.load.observation
                 self._seen_s = packet.load.taken_s
         self._images.append(max(self._images[-1], self._seen_s if self._shown[0] >= 0 else 0.0))
-        if exchanged is not None:
-            self._ledger.add(*exchanged, self.hold_s, coding.stored_j)
-            self._energy_in.add(port_energy(exchanged.near_effort, exchanged.near_flow, self.hold_s))
-            self._energy_out.add(port_energy(exchanged.far_effort, exchanged.far_flow, self.hold_s))
-        return coding.shown(arrived, _copy(self._shown[1]))
+        shown = coding.shown(arrived, _copy(self._shown[1]))
+        if given is not None:
+            assert self.port is not None
+            felt = np.asarray(shown[list(self.port.effort)], dtype=np.float64)
+            moved = np.zeros_like(felt) if self._moved is None else self._moved
+            self._ledger.add(felt, moved, *given, self.hold_s, coding.stored_j)
+            self._energy_in.add(port_energy(felt, moved, self.hold_s))
+            self._energy_out.add(port_energy(*given, self.hold_s))
+        return shown
 
     @property
     def _ceiling_s(self) -> float:

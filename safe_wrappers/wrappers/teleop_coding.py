@@ -59,13 +59,11 @@ class Order(NamedTuple):
     seen_s: float
 
 
-class Exchanged(NamedTuple):
-    """Effort and flow at both ports in one tick, shapes (m,): energy goes in at the near one, out at the far one."""
+class Given(NamedTuple):
+    """Effort and flow with which the channel acted on the machine in one tick, shapes (m,)."""
 
-    near_effort: Array
-    near_flow: Array
-    far_effort: Array
-    far_flow: Array
+    effort: Array
+    flow: Array
 
 
 class PlainCoding:
@@ -87,14 +85,10 @@ class PlainCoding:
         self._seen_s = 0.0
         if self._reading is not None:
             self._reading.reset(observation)
-            self._felt = self._reading.effort
-            self._still = np.zeros(self._felt.size)
-            self._near = self._felt, self._still
+            self._still = np.zeros(self._reading.effort.size)
 
     def near(self, flow: Array | None) -> Any:
         """The operator moves with this flow, or is not there; returns what the packet up carries besides."""
-        if self._reading is not None:
-            self._near = self._feel(self._still if flow is None else flow), flow
         return None
 
     def sent_up(self, sequence: int, extra: Any, lost: bool) -> None:
@@ -106,8 +100,8 @@ class PlainCoding:
             self._seen_s = newest.seen_s
         return Order(None, self._seen_s)
 
-    def settle(self, flow: Array, observation: Any, obeyed: bool) -> tuple[Any, Exchanged | None]:
-        """After the env's step: what the packet down carries besides, and what was exchanged.
+    def settle(self, flow: Array, observation: Any, obeyed: bool) -> tuple[Any, Given | None]:
+        """After the env's step: what the packet down carries besides, and what the machine was given.
 
         Args:
             flow: That was executed, shape (m,).
@@ -117,29 +111,22 @@ class PlainCoding:
         if self._reading is None:
             return None, None
         acted = self._reading.acted(flow, observation)
-        effort, near_flow = self._near
-        far = (acted, flow) if obeyed else (self._still, self._still)
-        return None, Exchanged(effort, self._still if near_flow is None else near_flow, *far)
+        return None, Given(acted, flow) if obeyed else Given(self._still, self._still)
 
     def sent_down(self, sequence: int, extra: Any, lost: bool) -> None:
         """The packet left."""
 
     def shown(self, arrived: list[Packet], observation: Any) -> Any:
-        """The observation that the operator gets, from the newest one and all that has arrived in this tick."""
-        if self._reading is not None:
-            self._felt = self._reading.of(observation)
+        """The observation that the operator gets, from the newest one and all that has arrived in this tick.
+
+        Its effort is the one against which the operator has moved in this tick.
+        """
         return observation
 
     @property
     def stored_j(self) -> float:
         """Energy on its way, J."""
         return 0.0
-
-    _near: tuple[Array, Array | None]
-
-    def _feel(self, flow: Array) -> Array:
-        """The force against which the operator moves in this tick."""
-        return self._felt
 
 
 class PaidCoding(PlainCoding):
@@ -162,18 +149,15 @@ class PaidCoding(PlainCoding):
         super().reset(observation)
         near = EnergyReference("impedance", self._storage_j, self._limit)
         self._ends = near, EnergyReference("admittance", self._storage_j)
-        self._damped = self._felt
+        self._late = self._felt = self._port.effort
         self._acted: Array | None = None
         self._given_j = 0.0
 
     def near(self, flow: Array | None) -> Any:
         """As `PlainCoding.near`."""
-        super().near(flow)
+        moved = self._still if flow is None else flow
+        self._felt = self._ends[0].modify(self._late, moved, self._tick_s).effort
         return self._ends[0].message_j
-
-    def _feel(self, flow: Array) -> Array:
-        self._damped = self._ends[0].modify(self._felt, flow, self._tick_s).effort
-        return self._damped
 
     def far(self, arrived: list[Packet], newest: Up | None) -> Order:
         """As `PlainCoding.far`."""
@@ -202,19 +186,19 @@ class PaidCoding(PlainCoding):
         share = 2.0 * budget_j / (steady + root) if steady > 0.0 else (root - steady) / (2.0 * damped)
         return flow * min(share, 1.0)
 
-    def settle(self, flow: Array, observation: Any, obeyed: bool) -> tuple[Any, Exchanged | None]:
+    def settle(self, flow: Array, observation: Any, obeyed: bool) -> tuple[Any, Given | None]:
         """As `PlainCoding.settle`."""
-        _, exchanged = super().settle(flow, observation, obeyed)
-        assert exchanged is not None
-        self._acted = -exchanged.far_effort
-        self._given_j = max(port_energy(exchanged.far_effort, exchanged.far_flow, self._tick_s), 0.0)
-        return self._ends[1].message_j, exchanged
+        _, given = super().settle(flow, observation, obeyed)
+        assert given is not None
+        self._acted = -given.effort
+        self._given_j = max(port_energy(*given, self._tick_s), 0.0)
+        return self._ends[1].message_j, given
 
     def shown(self, arrived: list[Packet], observation: Any) -> Any:
         """As `PlainCoding.shown`."""
         self._ends[0].receive(*(packet.load.extra for packet in arrived))
-        super().shown(arrived, observation)
-        return self._port.replaced(observation, self._damped)
+        self._late = self._port.of(observation)
+        return self._port.replaced(observation, self._felt)
 
 
 class WaveCoding(PlainCoding):
@@ -234,11 +218,11 @@ class WaveCoding(PlainCoding):
     def reset(self, observation: Any) -> None:
         """As `PlainCoding.reset`."""
         super().reset(observation)
-        m = self._felt.size
+        m = self._still.size
         self._up, self._down = (WaveLine(self._tick_s, self._rule, m) for _ in range(2))
         self._back: list[tuple[int, Array]] = []
         self._waiting: list[tuple[int, float]] = []
-        self._incoming = np.zeros(m)
+        self._incoming = self._felt = self._still
         self._owed_j = 0.0
 
     def near(self, flow: Array | None) -> Any:
@@ -246,10 +230,9 @@ class WaveCoding(PlainCoding):
         incoming = self._down.deliver(self._back)
         self._back = []
         if flow is None:
-            self._near = self._still, None
+            self._felt = self._still
             return None
-        effort, outgoing = effort_and_outgoing(flow, incoming, self._impedance)
-        self._near = effort, flow
+        self._felt, outgoing = effort_and_outgoing(flow, incoming, self._impedance)
         return outgoing
 
     def sent_up(self, sequence: int, extra: Any, lost: bool) -> None:
@@ -274,13 +257,13 @@ class WaveCoding(PlainCoding):
         flow = (math.sqrt(2.0 * b) * wave - self._port.base) / (b + self._port.feedthrough)
         return Order(flow, self._seen_s)
 
-    def settle(self, flow: Array, observation: Any, obeyed: bool) -> tuple[Any, Exchanged | None]:
+    def settle(self, flow: Array, observation: Any, obeyed: bool) -> tuple[Any, Given | None]:
         """As `PlainCoding.settle`; a port that is still, because the brake acts, throws the wave back."""
-        _, exchanged = super().settle(flow, observation, obeyed)
-        assert exchanged is not None
+        _, given = super().settle(flow, observation, obeyed)
+        assert given is not None
         if not obeyed:
-            return self._incoming, exchanged
-        acted, moved = exchanged.far_effort, exchanged.far_flow
+            return self._incoming, given
+        acted, moved = given
         _, outgoing = to_waves(acted, moved, self._impedance)
         # Where the machine saturates, or a filter inside has changed the flow, the two waves do not match.
         left = self._energy(self._incoming) - port_energy(acted, moved, self._tick_s)
@@ -290,7 +273,7 @@ class WaveCoding(PlainCoding):
             outgoing = np.zeros_like(outgoing)
         elif energy > left:
             outgoing = outgoing * (math.sqrt(left / energy) * (1.0 - 1e-15))
-        return outgoing, exchanged
+        return outgoing, given
 
     def sent_down(self, sequence: int, extra: Any, lost: bool) -> None:
         """As `PlainCoding.sent_down`."""
@@ -301,7 +284,7 @@ class WaveCoding(PlainCoding):
     def shown(self, arrived: list[Packet], observation: Any) -> Any:
         """As `PlainCoding.shown`: what the operator felt stands where the machine's effort was."""
         self._back += [(packet.sequence, packet.load.extra) for packet in arrived]
-        return self._port.replaced(observation, self._near[0])
+        return self._port.replaced(observation, self._felt)
 
     @property
     def stored_j(self) -> float:

@@ -1,0 +1,296 @@
+"""TeleopChannel, plain: an ideal one is none; a delay is a delay; the age of what is seen is known; wrong use."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from teleop_worlds import ceiling, channel, clamp, place
+
+import safe_wrappers as sw
+from safe_wrappers.envs.teleop_operator import TeleopOperator
+from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.wrappers.faults import Jitter, Outages
+
+
+def rollout(env, actions, seed=0):
+    seen = [env.reset(seed=seed)[0]]
+    rewards = []
+    for action in actions:
+        observation, reward, terminated, truncated, _ = env.step(action)
+        seen.append(observation)
+        rewards.append((reward, terminated, truncated))
+    return np.array(seen), rewards
+
+
+def some_actions(env, steps, seed=0):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(env.action_space.low, env.action_space.high, (steps, *env.action_space.shape)).astype(
+        np.float32
+    )
+
+
+@pytest.mark.parametrize("env_id", ["Reacher-v5", "Ant-v5", "TeleopContact-v0", "Pendulum-v1"])
+def test_an_ideal_channel_is_no_channel(env_id):
+    bare = gym.make(env_id)
+    actions = some_actions(bare, 40)
+    options = {"hold_s": 0.05} if env_id == "Pendulum-v1" else {}
+    env = sw.TeleopChannel(gym.make(env_id), 0.0, sw.Link(), **options)
+    (seen, rewards), (expected, expected_rewards) = rollout(env, actions), rollout(bare, actions)
+    assert np.array_equal(seen, expected) and rewards == expected_rewards
+    info = env.step(actions[0])[4]
+    assert info["teleop/round_trip_s"] == 0.0 and info["teleop/ceiling_s"] == np.inf
+    assert not info["teleop/revoked"] and info["teleop/lost"] == info["teleop/late"] == 0
+
+
+@pytest.mark.parametrize(("up", "down"), [(3, 0), (0, 5), (4, 2)])
+def test_actions_and_observations_come_late_by_their_delay_and_rewards_do_not(up, down):
+    bare = gym.make("Reacher-v5")
+    actions = some_actions(bare, 40)
+    zero = np.zeros((up, *actions[0].shape), np.float32)
+    expected, rewards = rollout(bare, np.concatenate([zero, actions[: 40 - up]]))
+    tick = bare.unwrapped.dt
+    env = sw.TeleopChannel(gym.make("Reacher-v5"), up * tick, down * tick)
+    seen, late = rollout(env, actions)
+    assert np.array_equal(seen[down:], expected[: 41 - down])
+    assert all(np.array_equal(o, expected[0]) for o in seen[: down + 1])
+    assert late == rewards
+
+
+def test_the_round_trip_is_the_age_of_what_the_command_was_made_from():
+    env = channel(0.007, 0.004)
+    place(env)
+    ages = [env.step(np.zeros(2))[4]["teleop/round_trip_s"] for _ in range(40)]
+    # At first the time since the reset, whose observation was known; then what both ways take.
+    np.testing.assert_allclose(ages[:12], np.arange(12) * 0.001, atol=1e-12)
+    np.testing.assert_allclose(ages[12:], 0.011, atol=1e-12)
+
+
+def test_a_silent_operator_grows_old_and_a_stamp_from_the_future_is_not_believed():
+    env = channel(0.002, 0.0)
+    place(env)
+    for _ in range(10):
+        env.step(np.zeros(2))
+    for k in range(5):
+        env.deliver(None)
+        age = env.step(np.full(2, 0.9))[4]["teleop/round_trip_s"]
+    assert age == pytest.approx(0.002 + 0.003) and k == 4
+    for _ in range(3):
+        env.deliver(env.now_s + 0.1)
+        info = env.step(np.full(2, 0.9))[4]
+    assert info["teleop/round_trip_s"] > age and (info["executed_action"] == 0.0).all()
+    # An older image, by a fault outside: the command is as old as that.
+    for _ in range(6):
+        env.deliver(env.now_s - 0.004)
+        age = env.step(np.zeros(2))[4]["teleop/round_trip_s"]
+    assert age == pytest.approx(0.006)
+    with pytest.raises(ActionError, match="time in seconds"):
+        env.deliver(np.nan)
+
+
+def test_faults_and_recording_belong_outside():
+    env = Outages(sw.RecordInterventions(channel(0.003, 0.003)), mean_between_s=0.05, mean_length_s=0.05)
+    env.reset(seed=0)
+    ages = [env.step(np.zeros(2))[4]["teleop/round_trip_s"] for _ in range(400)]
+    assert max(ages) > 0.03 and min(ages[10:]) == pytest.approx(0.006)
+    env = Jitter(channel(), longest_s=0.01)
+    env.reset(seed=0)
+    assert max(env.step(np.zeros(2))[4]["teleop/round_trip_s"] for _ in range(200)) > 0.003
+
+
+@pytest.mark.parametrize(("missing", "expected"), [("hold", 0.5), ("zero", 0.0), ("fallback", None)])
+def test_what_acts_while_nothing_arrives_is_declared(missing, expected):
+    env = channel(missing=missing)
+    place(env)
+    env.deliver(None)
+    first = env.step(np.full(2, 0.5))[4]["executed_action"]
+    if missing != "fallback":
+        assert (first == 0.0).all()  # before the first command
+    for _ in range(30):
+        info = env.step(np.array([0.0, 0.5]))[4]
+    assert info["executed_action"][1] == 0.5
+    env.deliver(None)
+    executed = env.step(np.full(2, 0.9))[4]["executed_action"]
+    if expected is None:
+        assert executed[1] < 0.0  # it brakes
+    else:
+        assert executed[1] == expected
+
+
+def test_overtaken_and_lost_packets_are_counted_and_the_newest_acts():
+    env = channel(sw.Link(0.002, 0.01, 0.2, in_order=False), sw.Link(loss=0.1))
+    place(env)
+    raw, lost, late, stamps = env.unwrapped, 0, 0, []
+    for k in range(1000):
+        info = env.step(np.array([k * 1e-4, 0.0]))[4]
+        stamps.append(info["executed_action"][0])
+        lost += info["teleop/lost"]
+        late += info["teleop/late"]
+    assert raw.data.time == pytest.approx(1.0)
+    assert (np.diff(stamps) >= 0.0).all()  # never back to an older one
+    assert 240 < lost < 360 and late > 300
+    executed = len(set(stamps))
+    assert executed + late <= 1000 - 0.15 * 1000 + 5
+
+
+def test_links_and_operators_are_seeded_bit_for_bit():
+    runs = []
+    for seed in (0, 0, 1):
+        env = channel(sw.Link(0.01, 0.02, 0.1, False), sw.Link(0.01, 0.02, 0.1, False), seed=7)
+        observation, _ = env.reset(seed=3)
+        operator = TeleopOperator(seed)
+        for _ in range(400):
+            observation = env.step(operator.act(observation))[0]
+        runs.append(observation)
+    assert np.array_equal(runs[0], runs[1]) and not np.array_equal(runs[0], runs[2])
+    late = [channel(sw.Link(0.0, 0.05), seed=seed) for seed in (0, 1)]
+    ages = []
+    for env in late:
+        env.reset(seed=0)
+        ages.append([env.step(np.zeros(2))[4]["teleop/round_trip_s"] for _ in range(100)])
+    assert ages[0] != ages[1]
+
+
+def test_the_observation_is_the_operators_own():
+    env = channel(0.0, 0.002)
+    place(env)
+    seen = env.step(np.zeros(2))[0]
+    seen[:] = 99.0
+    assert (env.step(np.zeros(2))[0] != 99.0).any()
+    action = np.array([0.3, 0.3], np.float32)
+    late = channel(0.001, 0.0)
+    place(late)
+    late.step(action)
+    action[:] = -1.0  # a policy that reuses its buffer
+    assert (late.step(action)[4]["executed_action"] == np.float64(np.float32(0.3))).all()
+
+
+def test_an_action_that_is_not_finite_is_not_sent():
+    env = channel()
+    place(env)
+    env.step(np.full(2, 0.5))
+    with pytest.warns(UserWarning, match="not sent"):
+        info = env.step(np.array([np.nan, 0.0]))[4]
+    assert (info["executed_action"] == 0.5).all() and info["teleop/round_trip_s"] > 0.0
+    for wrong in (np.zeros(3), "left"):
+        with pytest.raises(ActionError, match="shape"):
+            env.step(wrong)
+
+
+def test_the_spec_rebuilds_it_with_all_that_it_holds():
+    env = sw.TeleopChannel(
+        sw.CBFActionFilter(gym.make("TeleopContact-v0"), [clamp()]),
+        sw.Link(0.01, 0.02, 0.1, False, 1.0, 0.1),
+        0.005,
+        coding="wave",
+        impedance=30.0,
+        ceiling=ceiling(release=0.5),
+        port=sw.TeleopPort([0, 1], [4, 5], 40.0),
+    )
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    actions = some_actions(env, 100)
+    assert np.array_equal(rollout(env, actions)[0], rollout(again, actions)[0])
+    assert again.uplink == env.uplink and again.port == env.port
+
+
+# Wrong use ------------------------------------------------------------------------------------------------------
+
+
+def refused(error=ConfigurationError, inside=None, env_id="TeleopContact-v0", match=None, **options):
+    arguments = {"uplink": 0.1, "downlink": 0.1} | options
+    env = gym.make(env_id)
+    with pytest.raises(error, match=match):
+        sw.TeleopChannel(env if inside is None else inside(env), **arguments)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"uplink": -0.1}, "delay_s"),
+        ({"downlink": {"loss": 2.0}}, "loss"),
+        ({"coding": "waves"}, "coding is one of plain, wave"),
+        ({"coding": "wave"}, "impedance"),
+        ({"coding": "wave", "impedance": 0.0}, "impedance"),
+        ({"coding": "wave", "impedance": -1.0}, "impedance"),
+        ({"impedance": 40.0}, "plain coding"),
+        ({"coding": "wave", "impedance": 40.0, "passivity": "controller"}, "pay for"),
+        ({"passivity": "observer"}, "passivity is one of"),
+        ({"damping_limit": 5.0}, "controller"),
+        ({"storage_j": 0.1}, "controller"),
+        ({"passivity": "controller", "storage_j": -0.1}, "storage_j"),
+        ({"passivity": "controller", "damping_limit": 0.0}, "damping_limit"),
+        ({"missing": "wait"}, "missing is one of"),
+        ({"wave_rule": "wait"}, "wave_rule is one of"),
+        ({"seed": 0.5}, "seed"),
+        ({"port": {"flow": [0]}}, "flow and effort"),
+        ({"port": {"flow": [0, 1], "effort": [4]}}, "as many"),
+        ({"port": {"flow": [0, 0], "effort": [4, 5]}}, "once"),
+        ({"port": {"flow": [0, 2], "effort": [4, 5]}}, "only 2"),
+        ({"port": {"flow": [0, 1], "effort": [4, 9]}}, "only 9"),
+        ({"port": {"flow": [0], "effort": [4], "feedthrough": -1.0}}, "feedthrough"),
+        ({"port": 3}, "TeleopPort"),
+        ({"ceiling": 0.2}, "RoundTripCeiling"),
+        (
+            {"ceiling": {"clearance": sw.JointSpeedLimit(1.0), "acceleration": 1.0}},
+            "how fast it is approached",
+        ),
+        ({"ceiling": {"clearance": lambda env: (1.0, 0.0), "acceleration": 1.0}}, "braking is missing"),
+        ({"ceiling": {"clearance": lambda env: (1.0, 0.0), "braking": 1.0}}, "acceleration is missing"),
+        ({"hold_s": 0.002}, "hold_s"),
+    ],
+)
+def test_what_cannot_be_is_refused_when_it_is_built(options, match):
+    refused(match=match, **options)
+
+
+def test_unknown_names_are_refused_with_those_there_are():
+    refused(UnknownNameError, uplink={"delay": 0.1}, match="delay_s")
+    refused(UnknownNameError, port={"flows": [0], "effort": [1]}, match="feedthrough")
+    refused(UnknownNameError, ceiling={"clearence": None}, match="clearance")
+    refused(UnknownNameError, missing="fallback", fallback="stop", match="brake")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"video_s": -0.1}, {"human_s": np.nan}, {"longest_s": 0.0}, {"release": 1.2}, {"release": 0.0}],
+)
+def test_ceilings_that_cannot_be_are_refused(changes):
+    with pytest.raises(ConfigurationError):
+        ceiling(**changes)
+
+
+def test_waves_and_controllers_need_a_port():
+    for options in ({"coding": "wave", "impedance": 10.0}, {"passivity": "controller"}):
+        refused(env_id="Reacher-v5", match="needs a port", **options)
+
+
+def test_envs_that_do_not_fit_are_refused():
+    refused(env_id="CartPole-v1", match="Box action space")
+    refused(UnsupportedEnvError, env_id="Pendulum-v1", missing="fallback", hold_s=0.05, match="MuJoCo")
+
+
+def test_wrong_orders_are_refused():
+    link = {"uplink": 0.1, "downlink": 0.1}
+    refused(inside=sw.RecordInterventions, match="put it outside")
+    refused(inside=lambda env: sw.TeleopChannel(env, **link), match="TeleopChannel inside")
+    refused(inside=lambda env: sw.ChunkHandover(env, 4, 2), match="ChunkHandover inside")
+    lease = {"clearance": clamp(), "acceleration": 55.0}
+    refused(inside=lambda env: sw.LeaseExpiry(env, **lease), match="LeaseExpiry inside")
+    late = sw.TeleopChannel(gym.make("TeleopContact-v0"), **link)
+    for outside in (
+        lambda: sw.CBFActionFilter(late, [clamp()]),
+        lambda: sw.LeaseExpiry(late, **lease),
+    ):
+        with pytest.raises(ConfigurationError, match="TeleopChannel inside"):
+            outside()
+    scaled = gym.wrappers.RescaleAction(gym.make("TeleopContact-v0"), -2.0, 2.0)
+    with pytest.raises(ConfigurationError, match="RescaleAction"):
+        sw.TeleopChannel(scaled, **link, coding="wave", impedance=40.0)
+
+
+def test_chunks_may_come_through_a_channel():
+    env = sw.ChunkHandover(channel(0.002, 0.002, ceiling=ceiling()), 8, 4, inference_delay=2)
+    env.reset(seed=0)
+    for _ in range(20):
+        info = env.step(np.full((8, 2), 0.1))[4]
+    assert info["teleop/round_trip_s"] >= 0.004 and not info["teleop/revoked"]
+    assert isinstance(info["teleop/late"], int)

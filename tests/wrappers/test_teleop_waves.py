@@ -1,0 +1,173 @@
+"""Energy through a TeleopChannel, counted from outside: waves create none whatever the network does; plain does."""
+
+import numpy as np
+import pytest
+from teleop_worlds import Energies, ceiling, channel, clamp, place
+
+import safe_wrappers as sw
+from safe_wrappers.envs.teleop_operator import TeleopOperator
+
+B = 40.0
+NETWORKS = {
+    "ideal": (sw.Link(), sw.Link()),
+    "300 ms": (sw.Link(0.15), sw.Link(0.15)),
+    "jitter, stream": (sw.Link(0.05, 0.03), sw.Link(0.05, 0.03)),
+    "jitter, datagrams, loss": (sw.Link(0.02, 0.03, 0.1, False), sw.Link(0.04, 0.05, 0.2, False)),
+    "outages": (sw.Link(0.01, 0.0, 0.0, True, 0.2, 0.1), sw.Link(0.02, 0.01, 0.05, False, 0.3, 0.05)),
+}
+
+
+def hectic(seed, steps):
+    """Drivers that put all of the box to use, and dead time."""
+    rng = np.random.default_rng(seed)
+    action = np.zeros(2)
+    for k in range(steps):
+        if k % int(rng.integers(20, 80)) == 0:
+            action = rng.uniform(-1, 1, 2) * rng.choice([0.0, 0.2, 1.0])
+        yield action
+
+
+@pytest.mark.parametrize("network", NETWORKS)
+@pytest.mark.parametrize("rule", ["queue", "hold", "zero"])
+def test_waves_never_give_out_more_than_went_in_less_what_is_in_flight(network, rule):
+    up, down = NETWORKS[network]
+    env = channel(up, down, coding="wave", impedance=B, wave_rule=rule)
+    energies = Energies(env)
+    place(env, (0.1, 0.0))
+    for action in hectic(1, 800):
+        info = energies.step(action)[4]
+    # What is over is what saturation has made of the machine's effort: a share of what went through, and reported.
+    assert energies.through > 0.1
+    assert energies.worst <= 1e-12 * energies.through + info["teleop/created_j"] + 1e-12
+    assert info["teleop/created_j"] < 1e-3 * energies.through
+    assert info["teleop/energy_in_j"] == pytest.approx(energies.into, abs=1e-9)
+    assert info["teleop/energy_out_j"] == pytest.approx(energies.out, abs=1e-9)
+
+
+@pytest.mark.parametrize(("seed", "rule"), [(0, "queue"), (1, "hold")])
+def test_an_operator_in_contact_gets_not_one_picojoule(seed, rule):
+    up = sw.Link(0.05, 0.02, 0.05, False)
+    env = channel(up, up, coding="wave", impedance=B, wave_rule=rule)
+    energies, operator = Energies(env), TeleopOperator(seed)
+    observation, _ = place(env, (0.15, 0.0), seed=seed)
+    touched = 0
+    for _ in range(2000):
+        observation, *_, info = energies.step(operator.act(observation))
+        touched += info["contact_force"] > 0.0
+    assert touched > 500 and energies.into > 1e-3
+    assert energies.worst < 1e-12 and info["teleop/created_j"] < 1e-12
+
+
+def test_the_same_network_with_plain_coding_creates_energy_and_chatters():
+    contacts, created = {}, {}
+    for coding in ("plain", "wave"):
+        env = channel(0.1, 0.1, coding=coding, impedance=B if coding == "wave" else None)
+        energies, operator = Energies(env), TeleopOperator(0)
+        observation, _ = place(env, (0.15, 0.0))
+        touching, contacts[coding], peak = False, 0, 0.0
+        for _ in range(4000):
+            observation, *_, info = energies.step(operator.act(observation))
+            now = info["contact_force"] > 0.0
+            contacts[coding] += now and not touching
+            touching, peak = now, max(peak, info["contact_force"])
+        created[coding] = info["teleop/created_j"]
+        assert created[coding] == pytest.approx(max(energies.worst, 0.0), abs=1e-9)
+        if coding == "wave":
+            assert peak < 12.0
+        else:
+            assert peak > 30.0
+    assert created["plain"] > 1.0 and created["wave"] < 1e-12
+    assert contacts["plain"] >= 4 and contacts["wave"] <= 2
+
+
+def test_the_operator_feels_a_damper_first_and_the_machine_after_the_round_trip():
+    env = channel(0.05, 0.05, coding="wave", impedance=B)
+    place(env, (0.0, -0.2))
+    flow = np.array([0.1, 0.0])
+    felt = np.array([env.step(flow)[0][4] for _ in range(900)])
+    np.testing.assert_allclose(felt[:100], B * 0.1, atol=1e-9)
+    assert abs(felt[-1]) < 0.2  # it moves freely
+    # The flow arrives: the tool moves as the hand does.
+    assert env.unwrapped.tool_velocity[0] == pytest.approx(0.1, abs=0.01)
+
+
+def test_pressing_with_a_still_hand_both_forces_agree():
+    env = channel(0.02, 0.02, coding="wave", impedance=B)
+    observation, _ = place(env, (0.18, 0.0))
+    velocity = 0.0
+    for _ in range(4000):  # a mass of 1.5 kg, a damper of 10 N s/m, pushed with 8 N
+        velocity += 0.001 / 1.5 * (8.0 - 10.0 * velocity - observation[4])
+        observation, *_, info = env.step(np.array([velocity, 0.0]))
+    assert abs(velocity) < 1e-3
+    assert observation[4] == pytest.approx(8.0, abs=0.05)
+    assert info["contact_force"] == pytest.approx(8.0, abs=0.05)
+
+
+def test_a_wave_that_is_held_by_the_plant_would_create_energy():
+    # The test of the test: hold the last wave at the machine instead of paying for it, and count.
+    env = channel(0.0, 0.0, coding="wave", impedance=B)
+    energies = Energies(env)
+    place(env, (0.1, 0.0))
+    line = env._coding._up
+    held = []
+
+    def never_empty(packets):
+        held.extend(wave for _, wave in packets)
+        return np.array(held[0])
+
+    line.deliver = never_empty
+    for k in range(300):
+        energies.step(np.array([0.2, 0.0]) if k < 3 else np.zeros(2))
+    assert energies.worst > 0.01
+
+
+def test_a_filter_inside_pays_for_itself():
+    # It brakes hard before the clamp, again and again; none of that is the channel's energy.
+    env = channel(
+        0.02, 0.02, coding="wave", impedance=B, inside=lambda env: sw.CBFActionFilter(env, [clamp()])
+    )
+    energies, operator = Energies(env), TeleopOperator(0, stops=False, sweep_speed=0.4)
+    observation, _ = place(env, (0.184, 0.2))
+    changed = 0
+    for _ in range(1600):
+        observation, *_, info = energies.step(operator.act(observation))
+        changed += info["cbf/intervened"]
+        assert info["cost"] == 0.0
+    assert changed > 20 and info["clearance"] < 0.01
+    assert info["teleop/created_j"] < 1e-12
+
+
+def test_while_authority_is_revoked_the_operator_feels_a_locked_tool():
+    env = channel(0.002, 0.002, coding="wave", impedance=B, ceiling=ceiling())
+    place(env, (0.0, 0.1))
+    push, seen = np.array([0.0, 0.8]), []
+    for _ in range(400):
+        observation, *_, info = env.step(push)
+        seen.append((info["teleop/revoked"], observation[5]))
+    forces = np.array([f for revoked, f in seen if revoked])
+    # Waves come back whole: the force of a hand that moves on grows beyond its damper's.
+    assert len(forces) > 100 and forces.max() > 1.5 * B * 0.8
+    assert info["teleop/created_j"] < 1e-8  # flows are rounded to the action space's float32
+
+
+@pytest.mark.parametrize("delay_s", [0.05, 0.15])
+def test_a_passivity_controller_keeps_plain_coding_within_its_storage(delay_s):
+    env = channel(delay_s, delay_s, passivity="controller", damping_limit=20.0, storage_j=0.02)
+    energies, operator = Energies(env), TeleopOperator(0)
+    observation, _ = place(env, (0.15, 0.0))
+    pressed = 0.0
+    for _ in range(3500):
+        observation, *_, info = energies.step(operator.act(observation))
+        pressed = max(pressed, info["contact_force"])
+    assert 5.0 < pressed < 30.0
+    assert energies.worst < 2 * 0.02 + 1e-6
+    assert info["teleop/created_j"] < 1e-6
+
+
+def test_named_by_the_user_a_port_is_the_published_one():
+    runs = []
+    for port in (None, sw.TeleopPort([0, 1], [4, 5], 40.0), {"flow": [0, 1], "effort": [4, 5]}):
+        env = channel(0.005, 0.005, coding="wave", impedance=B, port=port)
+        place(env)
+        runs.append([env.step(np.array([0.1, 0.05]))[0] for _ in range(200)])
+    assert np.array_equal(runs[0], runs[1]) and not np.array_equal(runs[0], runs[2])
