@@ -120,8 +120,9 @@ class RoundTripWatch:
             measured = constraint_from(measured)
             if not hasattr(measured, "approach"):
                 raise ConfigurationError(
-                    f"{type(measured).__name__} does not say how fast it is approached, which a ceiling is made from: "
-                    "give a Clearance, or a function of the env that returns clearances in m and approach speeds in m/s"
+                    f"{type(measured).__name__} does not say how fast it is approached, which a ceiling is made "
+                    "from: give a Clearance, or a function of the env that returns clearances in m and approach "
+                    "speeds in m/s"
                 )
         # Rows know nothing of reserves that are not their constraint's own, nor of a brake that is late.
         own = isinstance(measured, Clearance)
@@ -184,9 +185,9 @@ class RoundTripWatch:
     def can_stop_after(self, command: Array) -> bool:
         """Whether the machine can stop by itself after a command for one control step.
 
-        First by the declared accelerations, whatever the command is; else by the rows of a `Clearance`, which know how
-        the machine answers this one. Where the brake is late (`act_s`), and with other readings, there is no else:
-        next to the limit no command is admitted then, not even one that leads away.
+        First by the declared accelerations, whatever the command is; else by the rows of a `Clearance`, which know
+        how the machine answers this one. Where the brake is late (`act_s`), and with other readings, there is no
+        else: next to the limit no command is admitted then, not even one that leads away.
         """
         if self._stop_s >= self._hold_s:
             return True
