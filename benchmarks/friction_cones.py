@@ -52,14 +52,15 @@ SOLVERS: dict[str, Callable[[WholeBodyProblem], WholeBodySolution]] = {
     "8 edges, clarabel": lambda problem: solve_pyramid(problem, 8, "clarabel"),
 }
 EXACT = "cone, clarabel"
+POLICIES = ("standing", "random", "learned")
 ANSWERED = ("inactive", "solved")
 
 Policy = Callable[[Any], Any]
 
 
-def policies(robot: str, space: gym.spaces.Box, rng: np.random.Generator) -> dict[str, Policy]:
-    """By name, those there are; a learned one only where it has been trained."""
-    held = {"action": space.sample(), "left": 0}
+def policy_of(name: str, robot: str, space: gym.spaces.Box, rng: np.random.Generator) -> Policy | None:
+    """A policy by name; None where the learned one has not been trained."""
+    held = {"action": np.zeros(space.shape), "left": 0}
 
     def standing(_: Any) -> Any:
         return (0.05 * rng.uniform(space.low, space.high)).astype(space.dtype)
@@ -70,18 +71,21 @@ def policies(robot: str, space: gym.spaces.Box, rng: np.random.Generator) -> dic
         held["left"] -= 1
         return np.asarray(held["action"], dtype=space.dtype)
 
-    found: dict[str, Policy] = {"standing": standing, "random": random}
-    with contextlib.suppress(SafeWrappersError, OSError, ImportError):
-        found["learned"] = learned(robot)
-    return found
+    if name == "learned":
+        with contextlib.suppress(SafeWrappersError, OSError, ImportError):
+            return learned(robot)
+        return None
+    return {"standing": standing, "random": random}[name]
 
 
 def record(robot: str, policy: str, count: int, seed: int = 0) -> Iterator[WholeBodyProblem]:
-    """Problems of one policy, from as many episodes as it takes."""
+    """Problems of one policy, from as many episodes as it takes; none of a policy that is not there."""
     env: Any = gym.make(f"{robot}-v5", max_episode_steps=LONGEST)
     plant = sw.MujocoPlant()
     plant.bind(env)
-    act = policies(robot, env.action_space, np.random.default_rng(seed))[policy]
+    act = policy_of(policy, robot, env.action_space, np.random.default_rng(seed))
+    if act is None:
+        return
     episode = found = 0
     while found < count:
         observation, _ = env.reset(seed=1000 * seed + episode)
@@ -197,19 +201,17 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--robots", nargs="+", default=["Ant", "Humanoid"], choices=["Ant", "Humanoid"])
-    parser.add_argument("--policies", nargs="+", default=["standing", "random", "learned"])
+    parser.add_argument("--policies", nargs="+", default=list(POLICIES), choices=POLICIES)
     parser.add_argument("--problems", type=int, default=500, help="per robot and policy")
     parser.add_argument("--results", type=Path, default=RESULTS)
     arguments = parser.parse_args()
     rows: list[dict[str, Any]] = []
     for robot in arguments.robots:
-        space: Any = gym.make(f"{robot}-v5").action_space
-        there = policies(robot, space, np.random.default_rng(0))
         for policy in arguments.policies:
-            if policy not in there:
+            problems = list(record(robot, policy, arguments.problems))
+            if not problems:
                 print(f"{robot}: no policy {policy!r} here")
                 continue
-            problems = list(record(robot, policy, arguments.problems))
             for name, row in compare(problems).items():
                 rows.append({"robot": robot, "policy": policy, "solver": name} | row)
     print(table(rows))

@@ -41,8 +41,12 @@ Array = NDArray[np.float64]
 
 TOLERANCE = 1e-6
 """Largest residual that counts as met: relative to 1 plus the size of the forces (N) or accelerations (m/s^2)."""
-_OBJECTIVE_IN_LEAST_VIOLATION = 1e-6
-"""Share of the objective where violations are minimised instead; it chooses among equals."""
+_OBJECTIVE_IN_LEAST_VIOLATION = 1e-3
+"""What half the range of a control costs where violations are minimised instead, in squares of their units, at most.
+
+It chooses among what misses about as little. A much smaller one leaves the solvers without digits for the cones: with
+1e-6 some answers were half a newton outside.
+"""
 
 
 class WholeBodyStatus(StrEnum):
@@ -53,9 +57,9 @@ class WholeBodyStatus(StrEnum):
     SOLVED = "solved"
     """The best control that satisfies everything, residuals checked."""
     INFEASIBLE = "infeasible"
-    """No control does; `control` violates contact accelerations and rows least, box and cones not at all."""
+    """No control does. `control` misses contact accelerations and rows least (in squares), box and cones not."""
     FAILED = "failed"
-    """No backend gave an answer that passed the check; `control` is only inside the box."""
+    """No backend gave an answer that passed the check; `control` is inside the box, `forces` may be zeros."""
 
 
 class Residuals(NamedTuple):
@@ -86,7 +90,7 @@ class WholeBodySolution(NamedTuple):
         status: See `WholeBodyStatus`; compares equal to its string.
         residuals: See `Residuals`.
         objective: Half the weighted squares that were minimised, of a problem with `contact_softness` its contact
-            term included; it ranks answers to one problem.
+            term included; it ranks answers to one problem. Infinite where there is none.
     """
 
     control: Array
@@ -294,6 +298,10 @@ def _acceleration_tolerance(problem: WholeBodyProblem) -> float:
     return TOLERANCE * (1.0 + float(np.abs(problem.wanted).max(initial=0.0)))
 
 
+def _force_tolerance(forces: Array) -> float:
+    return TOLERANCE * (1.0 + float(np.abs(forces).max(initial=0.0)))
+
+
 def _checked(
     problem: WholeBodyProblem, motion: Motion, question: _Question, y: Array, status: WholeBodyStatus
 ) -> WholeBodySolution | None:
@@ -303,7 +311,7 @@ def _checked(
     inside[:nu] = np.clip(y[:nu], problem.lower, problem.upper)  # a backend's round-off at the box
     answer = _answer(problem, motion, question, inside, status)
     missed = answer.residuals
-    force = TOLERANCE * (1.0 + float(np.abs(answer.forces).max(initial=0.0)))
+    force = _force_tolerance(answer.forces)
     exact = problem.contact_softness == 0.0 or status is WholeBodyStatus.INACTIVE
     program, soft = question.program, question.softenable
     over = program.rows @ inside - program.limits
@@ -381,18 +389,26 @@ def _least_violation(
     plain = _question(problem, motion, loose, sides, 1.0 / softness if softness > 0.0 else 0.0)
     nu = len(problem.nominal)
     misses = np.arange(nu, nu + loose.misses)
-    hessian = _OBJECTIVE_IN_LEAST_VIOLATION * plain.program.hessian
+    half = 0.5 * (problem.upper - problem.lower)
+    costs = problem.weights * half**2
+    share = _OBJECTIVE_IN_LEAST_VIOLATION / max(1.0, float(costs[np.isfinite(costs)].max(initial=0.0)))
+    hessian = share * plain.program.hessian
     hessian[misses, misses] += 1.0
-    softer = plain.program._replace(
-        hessian=hessian, linear=_OBJECTIVE_IN_LEAST_VIOLATION * plain.program.linear
-    ).softened(plain.softenable)
-    candidate = _ask(softer, solver)
-    if candidate.y is None:
-        y = np.concatenate(
-            [np.clip(problem.nominal, problem.lower, problem.upper), np.zeros(loose.size - nu)]
-        )
-        return _answer(problem, motion, plain, y, WholeBodyStatus.FAILED)
-    y = candidate.y[: loose.size].copy()
-    y[:nu] = np.clip(y[:nu], problem.lower, problem.upper)
-    status = WholeBodyStatus.INFEASIBLE if verdict == "infeasible" else WholeBodyStatus.FAILED
-    return _answer(problem, motion, plain, y, status)
+    softer = plain.program._replace(hessian=hessian, linear=share * plain.program.linear)
+    candidate = _ask(softer.softened(plain.softenable), solver)
+    if candidate.y is not None:
+        y = candidate.y[: loose.size].copy()
+        y[:nu] = np.clip(y[:nu], problem.lower, problem.upper)
+        status = WholeBodyStatus.INFEASIBLE if verdict == "infeasible" else WholeBodyStatus.FAILED
+        answer = _answer(problem, motion, plain, y, status)
+        if answer.residuals.cone <= _force_tolerance(answer.forces):
+            return answer
+    return _nothing(problem, motion)
+
+
+def _nothing(problem: WholeBodyProblem, motion: Motion) -> WholeBodySolution:
+    """No answer: the nominal control in its box, and contacts without force."""
+    control = np.clip(problem.nominal, problem.lower, problem.upper)
+    acceleration, forces = motion.free + motion.by_control @ control, np.zeros(problem.normals.shape)
+    missed = _residuals(problem, control, acceleration, forces)
+    return WholeBodySolution(control, acceleration, forces, WholeBodyStatus.FAILED, missed, np.inf)

@@ -378,6 +378,28 @@ def test_the_rigid_forces_of_a_standing_ant_are_its_weight_and_need_next_to_no_c
     assert ground.coplanar and ground.margin > 0.05
 
 
+def test_every_answer_on_a_struggling_robot_is_inside_its_cones_whatever_its_status(walker):
+    seen = set()
+    for plant in walker(120):
+        terms = floating_base_terms(plant)
+        c = terms.contacts
+        if not len(c.points):
+            continue
+        problem = WholeBodyProblem(
+            terms.inertia, terms.bias, terms.actuation, c.jacobians, c.drift, c.normals, 0.7 * c.friction,
+            plant.lower, plant.upper, plant.upper * np.sin(np.arange(len(plant.upper)) + plant.time),
+            contact_acceleration=-(c.jacobians @ plant.qvel) / 0.05,
+        )  # fmt: skip
+        for found in (solve_pyramid(problem, 8), solve_cone(problem)):
+            seen.add(str(found.status))
+            size = 1.0 + np.abs(found.forces).max()
+            assert found.status != "failed"
+            assert in_cone(found.forces, c.normals, 0.7 * c.friction, 2e-6 * size).all()
+            assert ((found.control >= plant.lower) & (found.control <= plant.upper)).all()
+            assert found.residuals.dynamics < 1e-9 * (1.0 + np.abs(found.acceleration).max() * size)
+    assert {"solved", "infeasible"} <= seen
+
+
 def test_something_flexible_in_contact_is_refused():
     model = mujoco.MjModel.from_xml_string(
         """<mujoco><worldbody><geom type="plane" size="1 1 1"/>
