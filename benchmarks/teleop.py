@@ -162,7 +162,6 @@ def run(job: Job) -> dict[str, Any]:
     raw: Any = env.unwrapped
     operator = operator_of(job)
     observation, _ = env.reset(seed=job.seed)
-    felt_at_once = job.coding != "plain"  # the force for this very motion, not the last that arrived
     effort = np.array(env.port.effort)  # type: ignore[union-attr]
     net, flying, force = (np.zeros(job.steps) for _ in range(3))
     total, late, at_hand = 0.0, 0.0, 0.0
@@ -170,7 +169,7 @@ def run(job: Job) -> dict[str, Any]:
     for n in range(job.steps):
         action, shown = operator.act(observation), observation
         observation, _, _, _, info = env.step(action)
-        felt = (observation if felt_at_once else shown)[effort]
+        felt = observation[effort]
         total += float(felt @ action) * raw.dt
         late += float((shown[effort] - felt) @ action) * raw.dt
         if not info["teleop/revoked"]:
