@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +12,7 @@ from safe_wrappers.constraints.constraint import Promise, non_negative, positive
 from safe_wrappers.constraints.contact_limit import ContactLimit
 from safe_wrappers.control.friction_cone import normal_and_tangential
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.plants.contact_forecast import can_touch_the_world
 from safe_wrappers.plants.mujoco import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 
@@ -40,7 +40,7 @@ class ContactFeasibility(ContactLimit):
         friction_share: Of the model's friction coefficient, in (0, 1].
         tolerance: By how much a force may miss its cone, as a share of the robot's weight: light touches scrape.
         bodies: Names of the bodies whose contacts count; None is every moving body.
-        margin: Kept free inside the cone, as a share of the weight.
+        margin: Kept free inside the cone, as a share of the weight. More than the tolerance refuses light touches.
 
     Source: appendix "Physical contact feasibility constraints".
     """
@@ -64,7 +64,8 @@ class ContactFeasibility(ContactLimit):
         self.tolerance = non_negative("tolerance", self.tolerance, "shares of the weight")
         self.margin = non_negative("margin", self.margin, "shares of the weight")
         if self.bodies is not None:
-            if isinstance(self.bodies, str) or not isinstance(self.bodies, Sequence) or not len(self.bodies):
+            listed = isinstance(self.bodies, Sequence) and not isinstance(self.bodies, str)
+            if not (listed and self.bodies and all(isinstance(name, str) for name in self.bodies)):
                 raise ConfigurationError(
                     f"bodies is a list of names, or None for every body; got {self.bodies!r}"
                 )
@@ -75,34 +76,36 @@ class ContactFeasibility(ContactLimit):
         super().bind(plant)
         assert isinstance(plant, MujocoPlant)
         m = plant.model
-        moving = m.body_weldid != 0
-        chosen = moving
-        if self.bodies is not None:
-            chosen = np.zeros(m.nbody, dtype=bool)
-            for name in self.bodies:
-                i = plant.named("body", name)
-                if not moving[i]:
-                    raise ConfigurationError(f"the body {name!r} does not move, so the ground is part of it")
-                chosen[i] = True
-        touching = _can_touch_the_world(m)
-        if not (chosen & touching).any():
-            where = "no body of this model" if self.bodies is None else "none of these bodies"
+        touching = can_touch_the_world(m)
+        if not touching.any():
             raise UnsupportedEnvError(
-                f"{where} can touch the fixed world with friction: there is no cone to stay in"
+                "no body of this model can touch the fixed world with friction: there is no cone to stay in"
             )
+        chosen = np.flatnonzero(touching)
+        if self.bodies is not None:
+            chosen = np.array([self._resting(plant, name, touching) for name in self.bodies])
         self._index = np.full(m.nbody, -1)
-        self._watched = np.flatnonzero(chosen & touching)
-        self._index[self._watched] = np.arange(self._watched.size)
+        self._index[chosen] = np.arange(chosen.size)
+        self._size = chosen.size
+
+    @staticmethod
+    def _resting(plant: MujocoPlant, name: str, touching: NDArray[np.bool_]) -> int:
+        i = plant.named("body", name)
+        if plant.model.body_weldid[i] == 0:
+            raise ConfigurationError(f"the body {name!r} does not move, so the ground is part of it")
+        if not touching[i]:
+            raise UnsupportedEnvError(f"the body {name!r} cannot touch the fixed world with friction")
+        return i
 
     def insides(self, plant: MujocoPlant, control: Array) -> Array:
         """By how much each body's contact forces stay inside the cone, at worst, shape (k,), shares of the weight.
 
-        0 for a body that touches nothing; not a number where the simulation is none.
+        Infinite for a body that touches nothing; not a number where the simulation is none.
         """
         found = plant.contact_forecast(control)
         if not found.finite:
-            return np.full(self._watched.size, np.nan)
-        worst = np.zeros(self._watched.size)
+            return np.full(self._size, np.nan)
+        worst = np.full(self._size, np.inf)
         which = self._index[found.body]
         seen = which >= 0
         normal, tangential = normal_and_tangential(found.force[seen], found.normal[seen])
@@ -113,7 +116,9 @@ class ContactFeasibility(ContactLimit):
 
     def slacks(self, plant: MujocoPlant, control: Array) -> Array:
         """What is left of the cone, tolerance added and margin taken off, per body, shares of the weight."""
-        return self.insides(plant, control) + self.tolerance - self.margin
+        # What is inside by more than asked for, or in the air, is all the same: differences between a touch and none
+        # would say nothing of the touch.
+        return np.minimum(self.insides(plant, control), self.margin) + self.tolerance - self.margin
 
     def report(self, proposed: Array, executed: Array) -> dict[str, Any]:
         """The info keys `whole_body/cone_margin` and `whole_body/contacts`: forecast for the executed control."""
@@ -124,16 +129,5 @@ class ContactFeasibility(ContactLimit):
             margin = float(self.insides(self._plant, executed).min())
         return {
             keys.WHOLE_BODY_CONTACTS: contacts,
-            keys.WHOLE_BODY_CONE_MARGIN: margin if margin == margin else 0.0,
+            keys.WHOLE_BODY_CONE_MARGIN: margin if np.isfinite(margin) else 0.0,
         }
-
-
-def _can_touch_the_world(model: mujoco.MjModel) -> NDArray[np.bool_]:
-    """Which bodies have a geom that may meet one of the fixed world's with friction, shape (nbody,)."""
-    fixed = model.body_weldid[model.geom_bodyid] == 0
-    kind, other, size = model.geom_contype, model.geom_conaffinity, model.geom_condim
-    found = np.zeros(model.nbody, dtype=bool)
-    for ground in np.flatnonzero(fixed):
-        meets = (kind & other[ground]) | (kind[ground] & other)
-        found[model.geom_bodyid[~fixed & (meets != 0) & (np.maximum(size, size[ground]) > 1)]] = True
-    return found

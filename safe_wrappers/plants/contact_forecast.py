@@ -141,3 +141,17 @@ def forecast_contacts(
         evaluations(model, data, visit)
     inside = inside and bool(data.qvel @ data.qvel < _FASTEST and data.qpos @ data.qpos < _FASTEST)
     return reader.forecast(finite=inside and not data.warning.number[RESETS].any())
+
+
+def can_touch_the_world(model: mujoco.MjModel) -> NDArray[np.bool_]:
+    """Which moving bodies have a geom that may meet one of the fixed world's with friction, shape (nbody,)."""
+    fixed = model.body_weldid[model.geom_bodyid] == 0
+    kind, other, size = model.geom_contype, model.geom_conaffinity, model.geom_condim
+    found = np.zeros(model.nbody, dtype=bool)
+    for ground in np.flatnonzero(fixed):
+        meets = (kind & other[ground]) | (kind[ground] & other)
+        found[model.geom_bodyid[~fixed & (meets != 0) & (np.maximum(size, size[ground]) > 1)]] = True
+    for one, two, dim in zip(model.pair_geom1, model.pair_geom2, model.pair_dim, strict=True):
+        if dim > 1 and fixed[one] != fixed[two]:
+            found[model.geom_bodyid[two if fixed[one] else one]] = True
+    return found
