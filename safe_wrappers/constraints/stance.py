@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +24,7 @@ from safe_wrappers.control.whole_body import (
     solve_pyramid,
 )
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.plants.contact_forecast import can_touch_the_world
 from safe_wrappers.plants.floating_base import equations_of_motion
 from safe_wrappers.plants.mujoco import MujocoPlant
 from safe_wrappers.plants.plant import Plant
@@ -90,6 +92,10 @@ class Stance:
             raise UnsupportedEnvError(
                 "Stance reads inertia and contacts from a MujocoPlant whose controls are forces"
             )
+        if not can_touch_the_world(plant.model).any():
+            raise UnsupportedEnvError(
+                "no body of this model can touch the fixed world with friction: there is nothing to stand on"
+            )
         self._plant = plant
         self._joints, low, high = stops(plant.model)
         wider = self.joint_tolerance or 0.0
@@ -103,17 +109,26 @@ class Stance:
         self._stamp: int | None = None
         self._problem: WholeBodyProblem | None = None
         self._answer: WholeBodySolution | None = None
+        self._asked: Array | None = None
         self._contacts = 0
 
     def _look(self, plant: MujocoPlant, control: Array) -> None:
         """Write the program down, once per observation; the first control asked for says which contacts open."""
         if self._stamp == plant.stamp:
             return
-        self._stamp, self._answer = plant.stamp, None
+        self._stamp, self._answer, self._asked = plant.stamp, None, None
+        self._problem, self._contacts = None, 0
         data = plant.under(control)
         motion = equations_of_motion(plant.model, data, plant.actuators)
         found = motion.contacts
+        within = bool(
+            (np.abs(plant.state) < mujoco.mjMAXVAL).all()
+        )  # else MuJoCo resets the state in its step
+        if not (within and np.isfinite(motion.bias).all() and np.isfinite(found.forces).all()):
+            return  # nothing can be said
         ground = plant.model.body_weldid[found.pushed_by] == 0
+        # What the robot's bodies do to each other, and other things to it, stays as it is.
+        bias = motion.bias - np.einsum("kiv,ki->v", found.jacobians[~ground], found.forces[~ground])
         jacobians, drift, normals = found.jacobians[ground], found.drift[ground], found.normals[ground]
         pressing = np.einsum("ki,ki->k", found.forces[ground], normals) > 0.0
         acceleration = -(jacobians @ plant.qvel) / self.settle_s
@@ -134,7 +149,7 @@ class Stance:
                 limits["force_rows"], limits["force_limits"] = rows, np.zeros(len(rows))
         problem = WholeBodyProblem(
             motion.inertia,
-            motion.bias,
+            bias,
             motion.actuation,
             jacobians,
             drift,
@@ -173,28 +188,41 @@ class Stance:
         # An action space of another precision than the model's range may be a rounding wider.
         control = np.clip(control, plant.lower, plant.upper)
         self._look(plant, control)
-        assert self._problem is not None
-        if self._answer is not None:
-            if self._answer.status is WholeBodyStatus.INFEASIBLE:
-                return False  # whatever the control
-            if float(np.abs(control - self._answer.control).max()) <= _SAME:
-                return self._answer.status is not WholeBodyStatus.FAILED
-        found = self._solve(replace(self._problem, nominal=control))
-        if self._answer is None:
-            self._answer = found  # of the proposal
-        return found.status is WholeBodyStatus.INACTIVE
+        if self._problem is None:
+            return False
+        answer = self._answer
+        if answer is None or self._asked is None:
+            answer = self._ask(self._problem, control)
+        if np.array_equal(control, self._asked):
+            return answer.status is WholeBodyStatus.INACTIVE
+        if answer.status is WholeBodyStatus.INFEASIBLE:
+            return False  # whatever the control
+        if float(np.abs(control - answer.control).max()) <= _SAME:
+            return answer.status is not WholeBodyStatus.FAILED
+        return self._solve(replace(self._problem, nominal=control)).status is WholeBodyStatus.INACTIVE
+
+    def _ask(self, problem: WholeBodyProblem, proposed: Array) -> WholeBodySolution:
+        """Solve for a proposal, and keep the answer."""
+        self._asked, self._answer = proposed.copy(), self._solve(replace(problem, nominal=proposed))
+        return self._answer
 
     def suggestions(self, plant: MujocoPlant, proposed: Array) -> Iterator[Array]:
         """The program's answer; where there is none, the control that misses least, which is refused."""
-        self._look(plant, np.clip(proposed, plant.lower, plant.upper))
-        if self._answer is not None:
-            yield self._answer.control
+        proposed = np.clip(proposed, plant.lower, plant.upper)
+        self._look(plant, proposed)
+        if self._problem is None:
+            return
+        if self._answer is None:  # another constraint was asked first, and has refused
+            self._ask(self._problem, proposed)
+        assert self._answer is not None
+        yield self._answer.control
 
     def shortfall(self, plant: MujocoPlant, control: Array) -> float:
         """By how much the forces that would hold the contacts miss their cones, shares of the weight; <= 0: not."""
         control = np.clip(control, plant.lower, plant.upper)
         self._look(plant, control)
-        assert self._problem is not None
+        if self._problem is None:
+            return float("inf")
         forces, _ = rigid_forces(self._problem, control)
         if not len(forces):
             return 0.0
@@ -207,7 +235,7 @@ class Stance:
 
     def report(self, proposed: Array, executed: Array) -> dict[str, Any]:
         """The info keys `whole_body/contacts` and `whole_body/cone_margin`: of the forces that would hold them."""
-        margin = 0.0
+        contacts, margin = 0, 0.0
         if self._stamp == self._plant.stamp and self._problem is not None:
-            margin = -self.shortfall(self._plant, executed)
-        return {keys.WHOLE_BODY_CONTACTS: self._contacts, keys.WHOLE_BODY_CONE_MARGIN: margin}
+            contacts, margin = self._contacts, 0.0 - self.shortfall(self._plant, executed)
+        return {keys.WHOLE_BODY_CONTACTS: contacts, keys.WHOLE_BODY_CONE_MARGIN: margin}

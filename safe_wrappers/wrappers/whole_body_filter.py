@@ -141,6 +141,10 @@ def _constraints(
             raise UnsupportedEnvError(
                 "no driven joint of this model has a range: joint_tolerance=None leaves the joints alone"
             )
+    elif holds is not None:
+        raise ConfigurationError(
+            "holds is how far to look ahead for the joints, which joint_tolerance=None leaves alone"
+        )
     if contacts in ("pyramid", "cone"):
         _only_for_forecasts(contacts, tolerance=tolerance, bodies=bodies, holds=holds)
         cone: Any = "exact" if contacts == "cone" else "pyramid"
@@ -153,10 +157,15 @@ def _constraints(
     if zmp_inset is not None:
         found.append(SupportMargin(zmp_inset))
     if joint_tolerance is not None:
+        names = [model.joint(j).name for j in joints]
+        if not all(names):
+            raise UnsupportedEnvError(
+                "a driven joint of this model has a range but no name: joint_tolerance=None leaves the joints alone"
+            )
         within = JointPositionLimit(
             lower=(low - joint_tolerance).tolist(),
             upper=(high + joint_tolerance).tolist(),
-            joints=[model.joint(j).name for j in joints],
+            joints=names,
             holds=HOLDS if holds is None else holds,
         )
         found.append(within)
