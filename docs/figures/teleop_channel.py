@@ -1,0 +1,53 @@
+"""The same operator through the same delay: the wall's force and the energy, plain and with waves; and the clamp."""
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from _style import FORBIDDEN, GRID, OFF, ON, OTHER
+from _teleop import STEP_S, ceiling, episode
+
+DELAY_S = 0.1
+SECONDS = 4.0
+
+
+def draw() -> Figure:
+    """Above force and energy over time; below the clearance, authority revoked and not."""
+    figure = Figure(figsize=(7.2, 5.2))
+    grid = figure.add_gridspec(2, 2)
+    force, energy = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
+    clearance = figure.add_subplot(grid[1, :])
+    time = STEP_S * np.arange(round(SECONDS / STEP_S))
+    for coding, impedance, color in (("plain", None, OFF), ("wave", 40.0, ON)):
+        seen = episode(DELAY_S, SECONDS, (0.17, 0.0), coding=coding, impedance=impedance)
+        force.plot(time, seen["contact_force"], color=color, lw=1.2, label=coding)
+        taken = seen["teleop/energy_out_j"] - seen["teleop/energy_in_j"]
+        energy.plot(time, taken + seen["teleop/in_flight_j"], color=color, label=coding)
+    force.axhline(8.0, color=GRID, lw=1.0)
+    force.text(0.05, 9.0, "wanted", color=GRID)
+    force.set_ylabel("force of the wall (N)")
+    energy.axhline(0.0, color=FORBIDDEN, lw=1.0)
+    energy.text(0.05, 0.3, "created above here", color=FORBIDDEN)
+    energy.set_ylabel("out + in flight - in (J)")
+    for ax in (force, energy):
+        ax.set_xlabel("time (s)")
+        ax.legend(loc="upper left" if ax is energy else "upper right")
+    for watched, color, label in (
+        (False, OFF, "without a ceiling"),
+        (True, ON, "with a ceiling"),
+    ):
+        watch = ceiling() if watched else None
+        seen = episode(DELAY_S, SECONDS, (0.18, 0.1), False, coding="wave", impedance=40.0, ceiling=watch)
+        time = STEP_S * np.arange(len(seen["clearance"]))
+        clearance.plot(time, 1000.0 * seen["clearance"], color=color, label=label)
+        if watched:
+            low, high = -8.0, 150.0
+            clearance.fill_between(
+                time, low, high, where=seen["teleop/revoked"], color=OTHER, alpha=0.2, lw=0, label="revoked"
+            )
+            clearance.set_ylim(low, high)
+    clearance.axhline(0.0, color=FORBIDDEN, lw=1.0)
+    clearance.text(0.02, 3.0, "clamp", color=FORBIDDEN)
+    clearance.set_ylabel("clearance (mm)")
+    clearance.set_xlabel("time (s)")
+    clearance.legend(loc="upper right")
+    return figure
