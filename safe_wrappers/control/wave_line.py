@@ -61,7 +61,9 @@ class WaveLine:
         self._components = int(components)
         self._last_sent = -1
         self._flying: dict[int, float] = {}
+        self._in_flight = RunningSum()
         self._queue: list[tuple[int, float, tuple[float, ...]]] = []
+        self._queued = RunningSum()
         self._newest = -1
         self._held = np.zeros(self._components)
         self._reserve = 0.0
@@ -80,12 +82,12 @@ class WaveLine:
     @property
     def in_flight_j(self) -> float:
         """Energy of the packets that have neither arrived nor been declared lost, J."""
-        return math.fsum(self._flying.values())
+        return max(self._in_flight.value, 0.0)
 
     @property
     def reserve_j(self) -> float:
         """Energy that has arrived and may still be put out, J."""
-        return math.fsum(energy for _, energy, _ in self._queue) if self.rule == "queue" else self._reserve
+        return max(self._queued.value, 0.0) if self.rule == "queue" else self._reserve
 
     @property
     def lost_j(self) -> float:
@@ -109,6 +111,7 @@ class WaveLine:
         energy = self._energy(self._wave(wave))
         self._last_sent = int(sequence)
         self._flying[self._last_sent] = energy
+        self._in_flight.add(energy)
         self._put_in.add(energy)
 
     def lose(self, sequence: int) -> None:
@@ -119,7 +122,7 @@ class WaveLine:
         """
         if sequence not in self._flying:
             raise ConfigurationError(f"packet {sequence} is not in flight, so it cannot get lost")
-        self._lost.add(self._flying.pop(sequence))
+        self._lost.add(self._landed(sequence))
 
     def deliver(self, packets: Iterable[tuple[int, ArrayLike]]) -> Array:
         """What is put out during this tick. Call it once per tick, also when nothing has arrived.
@@ -141,7 +144,7 @@ class WaveLine:
         for sequence, wave in arrived:
             if sequence in self._flying:
                 # What was sent pays, not what has become of it on the way.
-                fresh.append((int(sequence), self._flying.pop(sequence), wave))
+                fresh.append((int(sequence), self._landed(sequence), wave))
         if self.rule == "queue":
             return self._next_in_queue(fresh)
         wanted = self._sum(fresh) if self.rule == "zero" else self._newest_of(fresh)
@@ -154,12 +157,24 @@ class WaveLine:
             self._reserve = available - energy
         return put_out
 
+    def _landed(self, sequence: int) -> float:
+        """Energy of a packet that is in flight no longer."""
+        energy = self._flying.pop(sequence)
+        self._in_flight.add(-energy)
+        if not self._flying:
+            self._in_flight = RunningSum()  # exactly
+        return energy
+
     def _next_in_queue(self, fresh: list[tuple[int, float, Array]]) -> Array:
         for sequence, energy, wave in fresh:
             heapq.heappush(self._queue, (sequence, energy, tuple(wave.tolist())))
+            self._queued.add(energy)
         if not self._queue:
             return np.zeros(self._components)
         _, available, values = heapq.heappop(self._queue)
+        self._queued.add(-available)
+        if not self._queue:
+            self._queued = RunningSum()
         put_out, energy = self._affordable(np.array(values), available)
         self._put_out.add(energy)
         self._lost.add(available - energy)
