@@ -1,21 +1,16 @@
 """ContactMonitor: what the contacts of a MuJoCo env did in each control step."""
 
 import math
-import warnings
 from collections.abc import Sequence
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 
 from safe_wrappers import interventions as keys
 from safe_wrappers.control.contact import complementarity_residuals
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.contacts import Contacts, NormalContact
-from safe_wrappers.plants.plant import wrappers_of
-from safe_wrappers.plants.replay import Replay
-from safe_wrappers.wrappers.chunk_handover import ChunkHandover
+from safe_wrappers.wrappers.step_watch import StepWatch
 
 
 class ContactMonitor(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
@@ -78,23 +73,14 @@ class ContactMonitor(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructo
         bodies: Sequence[str] | None = None,
         against: Sequence[str] | None = None,
     ) -> None:
+        watch = StepWatch("ContactMonitor", env, keys.CONTACT_PARTIAL)
         raw: Any = env.unwrapped
-        if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
-            raise UnsupportedEnvError(
-                f"ContactMonitor needs an env with MuJoCo's .model and .data; {raw} has none"
-            )
-        if any(isinstance(inner, ChunkHandover) for inner in wrappers_of(env)):
-            raise ConfigurationError(
-                "ContactMonitor outside of ChunkHandover would see chunks, not control steps; put it inside: "
-                "ChunkHandover(ContactMonitor(...), ...)"
-            )
         self._contacts = Contacts(raw.model, bodies, against)
         self.bodies = None if bodies is None else list(bodies)
         self.against = None if against is None else list(against)
         gym.utils.RecordConstructorArgs.__init__(self, bodies=self.bodies, against=self.against)
         gym.Wrapper.__init__(self, env)
-        self._replay = Replay(raw)
-        self._warned = False
+        self._watch = watch
         self._seen = _Seen()
 
     @property
@@ -117,32 +103,19 @@ class ContactMonitor(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructo
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Step the env, and look at the contacts of that step."""
-        self._replay.before()
+        self._watch.before()
         observation, reward, terminated, truncated, info = self.env.step(action)
         raw: Any = self.unwrapped
         if self._contacts.model is not raw.model:  # the env has made itself another one, or was unpickled
             self._contacts = Contacts(raw.model, self.bodies, self.against)
         contacts, seen = self._contacts, _Seen()
-        whole = self._replay.after(lambda data, time_s: seen.add(contacts.read(data), time_s))
+        whole = self._watch.after(lambda data, time_s: seen.add(contacts.read(data), time_s))
         if not whole:
-            self._warn()
             seen = _Seen()
             seen.add(contacts.read(raw.data), float(raw.model.opt.timestep))
         self._seen = seen
         seen.write(info, partial=not whole)
         return observation, reward, terminated, truncated, info
-
-    def _warn(self) -> None:
-        if not self._warned:
-            self._warned = True
-            warnings.warn(
-                f"a control step of {self.unwrapped}, made once more, does not end where the env's did: the env "
-                "changes its inputs or its state between physics substeps, or MuJoCo has reset it. For such steps "
-                "ContactMonitor reads only the contacts that the step has left behind, and says so in "
-                "info['contact/partial']; forces before are missed",
-                UserWarning,
-                stacklevel=3,
-            )
 
 
 class _Seen:
