@@ -342,12 +342,13 @@ AWAY = np.array([[2.5, 0.75, 0.5], [1.3, 1.9, 0.5], [1.3, 0.75, 1.8], [1.9, 0.75
 """Places that the arm cannot reach but stretched."""
 
 
-def fetch(env_id, limited=True):
+def fetch(env_id, limited=True, plant=None, margin=0.0):
     gym.register_envs(pytest.importorskip("gymnasium_robotics"))
     env = gym.make(env_id, max_episode_steps=1000, disable_env_checker=True)
     seen = watch(env, LENGTH)
     if limited:
-        env = sw.CBFActionFilter(env, [sw.SingularityMargin(FETCH_THRESHOLD, holds=5, **GRIP)])
+        limit = sw.SingularityMargin(FETCH_THRESHOLD, holds=5, margin=margin, **GRIP)
+        env = sw.CBFActionFilter(env, [limit], plant)
     return env, seen
 
 
@@ -362,12 +363,7 @@ def turned(env, k):
     return np.sign(np.random.default_rng(k // 12).normal(size=4)).astype(np.float32)
 
 
-@pytest.mark.parametrize(
-    ("env_id", "driver", "steps"), [("FetchReach-v4", stretched, 45), ("FetchPush-v4", turned, 45)]
-)
-def test_on_fetch_no_step_that_is_not_flagged_goes_below_the_threshold(env_id, driver, steps):
-    env, seen = fetch(env_id)
-    assert isinstance(env.plant, sw.DisplacementPlant)
+def check_fetch(env, seen, driver, steps):
     env.reset(seed=0)
     changed = flags = 0
     for k in range(steps):
@@ -376,6 +372,20 @@ def test_on_fetch_no_step_that_is_not_flagged_goes_below_the_threshold(env_id, d
         assert least >= FETCH_THRESHOLD * (1.0 - 1e-5) or flagged(info) or info["cbf/unsafe"]
         changed, flags = changed + info["cbf/intervened"], flags + flagged(info)
     assert changed > 0 and flags <= 0.1 * steps
+
+
+@pytest.mark.parametrize(("env_id", "driver"), [("FetchReach-v4", stretched), ("FetchPush-v4", turned)])
+def test_on_fetch_no_step_that_is_not_flagged_goes_below_the_threshold(env_id, driver):
+    env, seen = fetch(env_id)
+    assert isinstance(env.plant, sw.DisplacementPlant)
+    check_fetch(env, seen, driver, 40)
+
+
+def test_on_fetch_a_margin_covers_a_plant_that_is_wrong():
+    plant = sw.DisplacementPlant()
+    plant.perturb(mass=1.2, damping=0.8)
+    env, seen = fetch("FetchReach-v4", plant=plant, margin=0.1)
+    check_fetch(env, seen, stretched, 40)
 
 
 def test_without_the_filter_fetch_s_arm_is_stretched():
