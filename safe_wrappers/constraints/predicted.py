@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 _ROUNDING = 1e-9
 _STEP = 1e-4
 """Width of the differences about braking, as a share of the control's range."""
+_INSTANTS = (1, 2, 3, 5, 8, 13, 21, 34, 55)
+"""Instants of a control interval that rows are made of, beside its last; forecasts are judged at all of them."""
 _KEPT = 10
 """Control steps for which a response is kept: it is a guess that forecasts check, and differences cost one each."""
 _SAME_RESPONSE = 1
@@ -166,6 +168,8 @@ class Predicted(ABC):
         if plant.has_acceleration:
             return HalfSpaces.none(plant.lower.size)
         self._look(plant)
+        if self._far:
+            return HalfSpaces.none(plant.lower.size)
         if self._linear is None:
             braking = plant.braking()
             if self._response is None or plant.stamp >= self._response_until:
@@ -182,11 +186,13 @@ class Predicted(ABC):
         self._response, self._response_until = np.stack(parts, axis=-1), plant.stamp + _KEPT
 
     def _instants(self, plant: MujocoPlant, control: Array) -> HalfSpaces:
-        """A row for every instant and bound of a control's forecast that some control could break."""
-        response = self._response
-        assert response is not None  # `rows` is asked first
+        """A row for every bound that some control could break, at a few instants of a control's forecast."""
+        assert self._response is not None  # `rows` is asked first
         left = self._room(plant, plant.forecast(control, self.holds)) - self.margin - self._outside
         left[-1] += self._outside - self._closer(plant)
+        each = len(left) // self.holds
+        chosen = [i for i in range(len(left)) if i % each + 1 in (*_INSTANTS, each)]
+        left, response = left[chosen], self._response[chosen]
         away = np.where(response > 0.0, plant.lower - control, plant.upper - control)
         least = left + (response * away).sum(axis=-1)
         near = ~(least > 0.0)

@@ -1,0 +1,138 @@
+"""What a Fetch arm may not do, judged after every physics substep of the env's own step; no code of a constraint.
+
+The judge makes the env take its physics substeps one by one and looks at the env's own positions after each, and
+after what the env does to its fingers at the end of a step. Nothing is replayed or predicted.
+"""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+Array = np.ndarray
+
+REACH_M = 0.25
+"""Of the gripper's box, from where an episode starts, along x and y."""
+FLOOR_M, CEILING_M = 0.02, 0.5
+"""Of the gripper's box, above the table's top."""
+GRACE = 10
+"""Control steps within which fingers that a reset has put into the table must have left it; later it counts."""
+BALL_RADIUS_M = 0.05
+_CORNERS = np.array([[i, j, k] for i in (-1.0, 1.0) for j in (-1.0, 1.0) for k in (-1.0, 1.0)])
+
+
+def box_of(raw: Any) -> tuple[Array, Array]:
+    """Corners of the box that the gripper stays in, m."""
+    x, y, _ = raw.initial_gripper_xpos
+    table = raw.model.body("table0")
+    geom = int(table.geomadr[0])
+    top = float(table.pos[2] + raw.model.geom_pos[geom][2] + raw.model.geom_size[geom][2])
+    low = np.array([x - REACH_M, y - REACH_M, top + FLOOR_M])
+    return low, np.array([x + REACH_M, y + REACH_M, top + CEILING_M])
+
+
+def ball_of(raw: Any) -> tuple[Array, float]:
+    """Centre of a ball in the way, m, and its radius: beside where the gripper starts, off the table."""
+    return np.asarray(raw.initial_gripper_xpos + np.array([0.02, 0.13, 0.08])), BALL_RADIUS_M
+
+
+class FetchJudge:
+    """The gripper in its box, nothing of the robot in contact with the table, fingers out of a ball, if there is one.
+
+    A contact counts from MuJoCo's contact margin on (1 mm here), where it begins to push. FetchPush and FetchSlide
+    start with their fingers 3 mm in the table. From there neither contacts with the table nor the box's floor count
+    until the first step that keeps both, `GRACE` steps at most.
+
+    Args:
+        raw: Unwrapped env; its `_mujoco_step` is replaced by one that does the same substep by substep.
+        ball: Whether the fingers keep out of the ball of `ball_of`, too.
+
+    Attributes:
+        low: Corner of the gripper's box, m.
+        high: Likewise.
+        excused: Control steps that began in grace so far.
+    """
+
+    def __init__(self, raw: Any, ball: bool = False) -> None:
+        self._raw, self._model = raw, raw.model
+        self._ball = ball_of(raw) if ball else None
+        model: mujoco.MjModel = raw.model
+        self._look_at = mujoco.MjData(model)
+        self._site = model.site("robot0:grip").id
+        self._fingers = [model.geom(f"robot0:{side}_gripper_finger_link").id for side in "lr"]
+        owner = [model.body(i).name for i in model.geom_bodyid]
+        self._robot = {g for g, name in enumerate(owner) if name.startswith("robot0:")}
+        self._table = {g for g, name in enumerate(owner) if name == "table0"}
+        self.low, self.high = box_of(raw)
+        self._missed = np.full(3, -np.inf)
+        self._left = self.excused = 0
+        raw._mujoco_step = self._step
+
+    def _step(self, action: Array) -> None:
+        for _ in range(self._raw.n_substeps):
+            mujoco.mj_step(self._model, self._raw.data)
+            self._look()
+
+    def _look(self) -> None:
+        data = self._look_at
+        data.qpos[:] = self._raw.data.qpos
+        mujoco.mj_kinematics(self._model, data)
+        mujoco.mj_collision(self._model, data)
+        place = data.site_xpos[self._site]
+        now = np.array([self._elsewhere(data, place), self.low[2] - place[2], self._touch(data)])
+        self._missed = np.maximum(self._missed, now)  # what is not a number stays
+
+    def _elsewhere(self, data: mujoco.MjData, place: Array) -> float:
+        """By how much the gripper is beyond its box's sides and ceiling, or a finger in the ball, m."""
+        missed = float(max((self.low - place)[:2].max(), (place - self.high).max()))
+        if self._ball is None:
+            return missed
+        centre, radius = self._ball
+        return max(missed, *(radius - self._distance(data, finger, centre) for finger in self._fingers))
+
+    def _distance(self, data: mujoco.MjData, finger: int, point: Array) -> float:
+        """From a point to a finger, an oriented box, m."""
+        inside = data.geom_xmat[finger].reshape(3, 3).T @ (point - data.geom_xpos[finger])
+        return float(np.linalg.norm(np.maximum(np.abs(inside) - self._model.geom_size[finger], 0.0)))
+
+    def _touch(self, data: mujoco.MjData) -> float:
+        """By how much a contact of robot and table is closer than where contacts begin, m; without one below zero."""
+        deepest = -np.inf
+        for contact in data.contact[: data.ncon]:
+            pair = {int(contact.geom1), int(contact.geom2)}
+            if pair & self._table and pair & self._robot:
+                deepest = max(deepest, float(contact.includemargin - contact.dist))
+        return deepest if deepest > -np.inf else min(-self._room_over_table(data), 0.0)
+
+    def _room_over_table(self, data: mujoco.MjData) -> float:
+        """Height of the lowest of the fingers' corners that are over the table, above its top, m."""
+        corners = np.concatenate(
+            [
+                data.geom_xpos[g] + (_CORNERS * self._model.geom_size[g]) @ data.geom_xmat[g].reshape(3, 3).T
+                for g in self._fingers
+            ]
+        )
+        (table,) = self._table
+        away = corners - data.geom_xpos[table]
+        over = (np.abs(away) <= self._model.geom_size[table])[:, :2].all(axis=1)
+        return float((away[over, 2] - self._model.geom_size[table][2]).min(initial=np.inf))
+
+    def start(self) -> float:
+        """The truth of the env's present state; a table that the reset itself touches is excused."""
+        self.before()
+        self._look()
+        self._left = GRACE if self._missed[2] > 0.0 else 0
+        return float(self._missed[0] if self._left else self._missed.max())
+
+    def before(self) -> None:
+        """Forget the last step."""
+        self._missed = np.full(3, -np.inf)
+
+    def after(self, executed: Array, info: dict[str, Any]) -> float:
+        """The worst of the step's substeps and of its end."""
+        self._look()
+        if not self._left:
+            return float(self._missed.max())
+        self.excused += 1
+        self._left = self._left - 1 if self._missed.max() > 0.0 else 0
+        return float(self._missed[0])
