@@ -34,8 +34,6 @@ from safe_wrappers.errors import UnsafeStateWarning
 RESULTS = Path(__file__).parent / "results"
 ENVS = ("FetchReach-v4", "FetchPush-v4", "FetchSlide-v4", "FetchPickAndPlace-v4")
 EPISODES = (50, 1000)
-CHUNKS = 4
-"""Parts of each driver's steps, so that not much is lost when a run is killed."""
 _FLAGS = ("intervened", "infeasible", "fallback", "unsafe")
 
 
@@ -112,13 +110,12 @@ def jobs(arguments: argparse.Namespace) -> list[Job]:
     """What to run: the steps are split between envs, drivers and lengths of episodes."""
     envs = [e for e in ENVS if not arguments.envs or any(word in e for word in arguments.envs)]
     names = [n for n in drivers(ball=True) if not arguments.drivers or n in arguments.drivers]
-    parts = len(envs) * len(names) * len(EPISODES) * CHUNKS
+    parts = len(envs) * len(names) * len(EPISODES)
     return [
-        Job(env_id, name, filtered, length, -(-steps // parts), arguments.seed + 2 * chunk + k)
-        for chunk in range(CHUNKS)
+        Job(env_id, name, filtered, length, -(-steps // parts), arguments.seed + k)
         for filtered, steps in ((False, arguments.off), (True, arguments.steps))
-        for k, length in enumerate(EPISODES)
         for name in names
+        for k, length in enumerate(EPISODES)
         for env_id in envs
     ]
 
