@@ -250,11 +250,12 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         self._send_up(self._checked(action), now_s)
         arrived = self._up.arrived(now_s)
         fresh = self._take(arrived)
-        order = self._coding.far(arrived, self._newest[1])
+        command, operators = self._in_force(fresh)
+        order = self._coding.far(arrived, self._newest[1], self._flow_of(command) if operators else None)
+        if order.flow is not None:
+            command, operators = self._with_flow(command, order.flow), True
         round_trip_s = now_s - order.seen_s
         ceiling_s, clearance_m = self._ceiling_s, self._clearance_m
-        operators = not (self._missing == "fallback" and not fresh)
-        command = self._commanded(order.flow, fresh)
         self._judge(command, order.seen_s, round_trip_s, now_s)
         if self._revoked:
             assert self._stand_in is not None
@@ -323,10 +324,7 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         evidence, self._evidence = self._evidence, self.now_s + self.hold_s
         if evidence is None or evidence > now_s + _SAME_TIME * self.hold_s:
             action = None
-        flow = None
-        if action is not None and self.port is not None:
-            flow = np.clip(action.astype(np.float64), self._low, self._high)[list(self.port.flow)]
-        self._moved = flow
+        self._moved = flow = None if action is None else self._flow_of(action)
         extra = self._coding.near(flow)
         if action is None or evidence is None:
             return
@@ -348,21 +346,25 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
                 self._late += 1
         return self._newest[0] > before
 
-    def _commanded(self, flow: Array | None, fresh: bool) -> Any:
-        """The operator's command for this step, decoded; it may be executed or not."""
+    def _in_force(self, fresh: bool) -> tuple[Any, bool]:
+        """The command for this step as far as it is plain, and whether it is the operator's."""
         newest = self._newest[1]
-        stay = np.clip(np.zeros(self._shape), self._low, self._high).astype(self._dtype)
-        if newest is None or (not fresh and self._missing == "zero"):
-            command = stay
-        elif not fresh and self._missing == "fallback":
+        if not fresh and self._missing == "fallback":
             assert self._stand_in is not None
-            command = self._stand_in.command().astype(self._dtype)
-        else:
-            command = newest.action.copy()
-        if flow is None:
-            return command
+            return self._stand_in.command().astype(self._dtype), False
+        if newest is None or (not fresh and self._missing == "zero"):
+            return np.clip(np.zeros(self._shape), self._low, self._high).astype(self._dtype), True
+        return newest.action.copy(), True
+
+    def _flow_of(self, command: Any) -> Array | None:
+        """In the box, as the machine will take it."""
+        if self.port is None:
+            return None
+        return np.clip(np.asarray(command, dtype=np.float64), self._low, self._high)[list(self.port.flow)]
+
+    def _with_flow(self, command: Any, flow: Array) -> Any:
         assert self.port is not None
-        whole = command.astype(np.float64)
+        whole = np.asarray(command, dtype=np.float64).copy()
         whole[list(self.port.flow)] = flow
         return np.clip(whole, self._low, self._high).astype(self._dtype)
 

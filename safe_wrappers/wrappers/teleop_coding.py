@@ -51,7 +51,7 @@ class Order(NamedTuple):
     """What is to be executed at the machine.
 
     Attributes:
-        flow: To replace the port's entries of the newest action; None: that action as it is.
+        flow: To replace the port's entries of what would be executed; None: as it is.
         seen_s: When the image was taken that it was made from.
     """
 
@@ -94,8 +94,14 @@ class PlainCoding:
     def sent_up(self, sequence: int, extra: Any, lost: bool) -> None:
         """The packet left."""
 
-    def far(self, arrived: list[Packet], newest: Up | None) -> Order:
-        """Decode what has arrived; `newest` is the newest command that ever has."""
+    def far(self, arrived: list[Packet], newest: Up | None, flow: Array | None) -> Order:
+        """Decode what has arrived.
+
+        Args:
+            arrived: In this tick.
+            newest: The newest command that ever has.
+            flow: What would be executed as it is, shape (m,); None: nothing of the operator's.
+        """
         if newest is not None:
             self._seen_s = newest.seen_s
         return Order(None, self._seen_s)
@@ -159,18 +165,16 @@ class PaidCoding(PlainCoding):
         self._felt = self._ends[0].modify(self._late, moved, self._tick_s).effort
         return self._ends[0].message_j
 
-    def far(self, arrived: list[Packet], newest: Up | None) -> Order:
+    def far(self, arrived: list[Packet], newest: Up | None, flow: Array | None) -> Order:
         """As `PlainCoding.far`."""
         end = self._ends[1]
         end.receive(*(packet.load.extra for packet in arrived))
-        order = super().far(arrived, newest)
-        if newest is None:
-            return order
-        wanted = np.asarray(newest.action, dtype=np.float64)[self._port.flow_entries]
-        flow = self._affordable(wanted, max(end.budget_j - self._given_j, 0.0))
-        effort = -self._port.effort_at(flow)  # power is positive into the channel at both ends
-        end.modify(effort, flow, self._tick_s, self._acted)
-        return Order(None if flow is wanted else flow, order.seen_s)
+        order = super().far(arrived, newest, flow)
+        wanted = self._still if flow is None else flow
+        paid = self._affordable(wanted, max(end.budget_j - self._given_j, 0.0))
+        effort = -self._port.effort_at(paid)  # power is positive into the channel at both ends
+        end.modify(effort, paid, self._tick_s, self._acted)
+        return Order(None if paid is wanted else paid, order.seen_s)
 
     def _affordable(self, flow: Array, budget_j: float) -> Array:
         """The flow, or as much of it as its energy is paid for; the effort answers it at once where it can.
@@ -241,8 +245,8 @@ class WaveCoding(PlainCoding):
         if lost:
             self._up.lose(sequence)
 
-    def far(self, arrived: list[Packet], newest: Up | None) -> Order:
-        """As `PlainCoding.far`."""
+    def far(self, arrived: list[Packet], newest: Up | None, flow: Array | None) -> Order:
+        """As `PlainCoding.far`; it asks the waves alone."""
         wave = self._up.deliver([(packet.sequence, packet.load.extra) for packet in arrived])
         self._note_age(arrived, newest)
         # What the machine took beyond what had arrived is paid first.
@@ -254,8 +258,8 @@ class WaveCoding(PlainCoding):
         self._incoming = wave
         b = self._impedance
         # The effort answers the flow at once where there is a damper, so both are solved for together.
-        flow = (math.sqrt(2.0 * b) * wave - self._port.base) / (b + self._port.feedthrough)
-        return Order(flow, self._seen_s)
+        decoded = (math.sqrt(2.0 * b) * wave - self._port.base) / (b + self._port.feedthrough)
+        return Order(decoded, self._seen_s)
 
     def settle(self, flow: Array, observation: Any, obeyed: bool) -> tuple[Any, Given | None]:
         """As `PlainCoding.settle`; a port that is still, because the brake acts, throws the wave back."""

@@ -122,11 +122,6 @@ class PortReading:
         self.effort = self.of(observation)
 
     @property
-    def flow_entries(self) -> list[int]:
-        """Of the action."""
-        return list(self._port.flow)
-
-    @property
     def feedthrough(self) -> float:
         """N s/m."""
         return self._port.feedthrough

@@ -150,6 +150,29 @@ def test_while_authority_is_revoked_the_operator_feels_a_locked_tool():
     assert info["teleop/created_j"] < 1e-8  # flows are rounded to the action space's float32
 
 
+@pytest.mark.parametrize("missing", ["zero", "fallback"])
+@pytest.mark.parametrize("coding", ["wave", "controller"])
+def test_energy_is_kept_whatever_acts_while_nothing_arrives(missing, coding):
+    waves = {"coding": "wave", "impedance": B}
+    options = waves if coding == "wave" else {"passivity": "controller", "damping_limit": 20.0}
+    link = sw.Link(0.01, 0.01, 0.4, False)
+    env = channel(link, link, missing=missing, **options)
+    raw, allowed = env.unwrapped, 1e-8 if coding == "wave" else 2 * 0.02 + 1e-6
+    place(env, (0.17, 0.0))
+    into = out = 0.0
+    still = 0
+    for action in hectic(2, 700):
+        observation, *_, info = env.step(0.2 * action)
+        into += float(observation[4:6] @ (0.2 * action)) * raw.dt
+        # Of what acts while nothing arrives, the wave's entries are the wave's, others the fallback's own.
+        before = info["teleop/energy_out_j"]
+        share = float(raw.port_effort_acted @ info["executed_action"]) * raw.dt
+        still += abs(before - out) < 1e-15 and abs(share) > 1e-12
+        out = before
+        assert out + info["teleop/in_flight_j"] - into <= allowed
+    assert (still > 50) == (coding == "controller" and missing == "fallback")
+
+
 @pytest.mark.parametrize("delay_s", [0.05, 0.15])
 def test_a_passivity_controller_keeps_plain_coding_within_its_storage(delay_s):
     env = channel(delay_s, delay_s, passivity="controller", damping_limit=20.0, storage_j=0.02)
