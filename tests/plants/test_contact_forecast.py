@@ -1,0 +1,381 @@
+"""Forecasts of contacts against the env's own step, MuJoCo's solver decoded by hand, and Newton's laws."""
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+
+import safe_wrappers as sw
+from safe_wrappers.plants.contact_forecast import can_touch_the_world
+from safe_wrappers.plants.replay import Replay
+
+ROBOTS = ("Ant-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Humanoid-v5")
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+
+
+class Legs(gym.Env):
+    """A trunk on two driven legs beside other things that move; the action is the control."""
+
+    metadata = {"render_modes": []}  # noqa: RUF012
+    XML = """<mujoco><option timestep="0.002" integrator="{integrator}" cone="{cone}"/>
+    <default><geom condim="{condim}" friction="0.6 0.01 0.002"/></default>
+    <worldbody>
+      <geom name="floor" type="plane" size="5 5 .1"/>
+      <body name="step" pos=".35 0 0"><geom name="step" type="box" size=".1 .3 .06"/></body>
+      <body name="lift" mocap="true" pos="-.35 0 0"><geom name="lift" type="box" size=".1 .3 .05"/></body>
+      <body name="trunk" pos="0 0 .42"><freejoint/>
+        <geom name="trunk" type="box" size=".3 .1 .05" mass="4"/>
+        <body name="front" pos=".3 0 0"><joint name="hip" axis="0 1 0" range="-40 40" damping=".5"/>
+          <geom name="front" type="capsule" fromto="0 0 0 0 0 -.3" size=".05" mass=".6"/></body>
+        <body name="back" pos="-.3 0 0"><joint name="tail" axis="0 1 0" range="-40 40" damping=".5"/>
+          <geom name="back" type="capsule" fromto="0 0 0 0 0 -.3" size=".05" mass=".6"/></body>
+      </body>
+      <body name="load" pos="0 0 .55"><freejoint/><geom name="load" type="box" size=".1 .1 .06" mass="1"/></body>
+      {more}
+    </worldbody>
+    <actuator><motor name="hip" joint="hip" gear="40" ctrllimited="true" ctrlrange="-1 1"/>
+      <motor name="tail" joint="tail" gear="40" ctrllimited="true" ctrlrange="-1 1"/>{act}</actuator>
+    {end}</mujoco>"""
+
+    def __init__(self, integrator="Euler", cone="pyramidal", condim=3, more="", act="", end=""):
+        text = self.XML.format(integrator=integrator, cone=cone, condim=condim, more=more, act=act, end=end)
+        self.model = mujoco.MjModel.from_xml_string(text)
+        self.data = mujoco.MjData(self.model)
+        self.frame_skip = 5
+        low, high = self.model.actuator_ctrlrange.T
+        self.action_space = gym.spaces.Box(low, high, dtype=np.float64)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        return np.zeros(1), {}
+
+    def step(self, action):
+        self.data.ctrl[:] = action
+        mujoco.mj_step(self.model, self.data, self.frame_skip)
+        return np.zeros(1), 0.0, False, False, {}
+
+
+def bound(env, **options):
+    plant = sw.MujocoPlant(**options)
+    plant.bind(env)
+    return plant
+
+
+def decoded(model, data, contact):
+    """The contact's force on its second geom, in the world, from the rows of the solver, N."""
+    rows = data.efc_force[contact.efc_address :]
+    frame = contact.frame.reshape(3, 3)
+    if contact.dim == 1:
+        return rows[0] * frame[0]
+    if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
+        return rows[:3] @ frame
+    edges = rows[: 2 * (contact.dim - 1)].reshape(-1, 2)
+    return edges.sum() * frame[0] + ((edges[:2, 0] - edges[:2, 1]) * contact.friction[:2]) @ frame[1:]
+
+
+def happened(env, action):
+    """Every contact of moving bodies with the fixed world at every evaluation of the env's own step."""
+    raw, replay, seen = env.unwrapped, Replay(env.unwrapped), []
+    model = raw.model
+    jointed = model.body_dofnum > 0
+
+    def moving(geom):
+        body = int(model.geom_bodyid[geom])
+        while body and not jointed[body]:
+            body = model.body_parentid[body]
+        return body > 0
+
+    def look(data, _):
+        here = []
+        for contact in data.contact:
+            first, second = (moving(g) for g in contact.geom)
+            if first != second and contact.efc_address >= 0:
+                side = 1.0 if second else -1.0
+                body = model.geom_bodyid[contact.geom[1 if second else 0]]
+                force = side * decoded(model, data, contact)
+                here.append((body, *contact.pos, *side * contact.frame[:3], *force))
+        seen.append(np.array(here).reshape(-1, 10))
+
+    replay.before()
+    env.step(action)
+    assert replay.after(look)
+    return seen
+
+
+def same(found, seen, rounding=1e-9):
+    assert found.finite and found.steps == len(seen)
+    np.testing.assert_array_equal(found.step, np.repeat(np.arange(len(seen)), [len(at) for at in seen]))
+    mine, theirs = np.column_stack([found.body, found.point, found.normal, found.force]), np.concatenate(seen)
+    np.testing.assert_allclose(
+        mine, theirs, rtol=rounding, atol=rounding * (1.0 + np.abs(theirs).max(initial=0))
+    )
+    return len(theirs)
+
+
+@pytest.mark.parametrize("env_id", ROBOTS)
+def test_it_is_what_the_env_does_then(env_id):
+    env = gym.make(env_id)
+    plant = bound(env)
+    rng = np.random.default_rng(0)
+    env.reset(seed=0)
+    touched = 0
+    for k in range(15):
+        action = rng.uniform(env.action_space.low, env.action_space.high) * (0.2 if k % 2 else 1.0)
+        plant.observe()
+        found = plant.contact_forecast(action)
+        assert found.steps == env.unwrapped.frame_skip * (4 if env.unwrapped.model.opt.integrator == 1 else 1)
+        touched += same(found, happened(env, action), 1e-7)
+    assert touched > 5
+
+
+@pytest.mark.parametrize(
+    ("integrator", "cone", "condim"),
+    [
+        ("Euler", "pyramidal", 3),
+        ("Euler", "elliptic", 4),
+        ("RK4", "pyramidal", 4),
+        ("RK4", "elliptic", 3),
+        ("implicitfast", "pyramidal", 6),
+        ("implicitfast", "elliptic", 1),
+    ],
+)
+def test_of_every_kind_of_contact_on_floors_steps_and_lifts(integrator, cone, condim):
+    env = Legs(integrator, cone, condim)
+    plant = bound(env)
+    rng = np.random.default_rng(1)
+    env.reset()
+    bodies, normals = set(), 0.0
+    for k in range(25):
+        env.data.mocap_pos[0, 2] = 0.05 + 0.02 * np.sin(k)
+        action = rng.choice([-1.0, 1.0], 2)
+        plant.observe()
+        found = plant.contact_forecast(action)
+        same(found, happened(env, action))
+        bodies |= set(found.body.tolist())
+        names = {env.model.body(b).name for b in found.body}
+        assert not names & {"step", "lift", "world"}
+        np.testing.assert_array_equal(found.friction, 0.0 if condim == 1 else 0.6)
+        pressing = np.einsum("ki,ki->k", found.force, found.normal)
+        normals += pressing.sum()
+        assert (pressing >= 0.0).all()
+    assert len(bodies) >= 2 and normals > 0.0
+
+
+@pytest.mark.parametrize("env_id", ["Ant-v5", "Humanoid-v5", "HalfCheetah-v5"])
+def test_the_forces_are_those_that_move_the_robot(env_id):
+    # Newton, of the whole robot and at every evaluation: the sum of forces is m (a - g), whatever happens inside.
+    env = gym.make(env_id)
+    plant, raw = bound(env), env.unwrapped
+    m, still = raw.model, mujoco.MjData(raw.model)
+    by_stages = m.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    axes = [0, 2] if env_id == "HalfCheetah-v5" else [0, 1, 2]  # it lives in a plane
+    mass, weight = m.body_mass[1:], m.body_mass[1:].sum() * 9.81
+    env.reset(seed=3)
+    for _ in range(25):
+        env.step(np.zeros(m.nu))
+    rng = np.random.default_rng(3)
+    heaviest = 0.0
+    for _ in range(4):
+        action = rng.uniform(env.action_space.low, env.action_space.high)
+        plant.observe()
+        found = plant.contact_forecast(action)
+        replay, expected = Replay(raw), []
+        at = [raw.data.qpos.copy(), raw.data.qvel.copy()]
+
+        def look(data, _, at=at, out=expected):
+            if by_stages:
+                at[:] = data.qpos, data.qvel
+            still.qpos[:], still.qvel[:] = at
+            mujoco.mj_fwdPosition(m, still)
+            mujoco.mj_fwdVelocity(m, still)
+            jac, dot, total = np.zeros((3, m.nv)), np.zeros((3, m.nv)), 0.0
+            for b in range(1, m.nbody):
+                mujoco.mj_jacBodyCom(m, still, jac, None, b)
+                mujoco.mj_jacDot(m, still, dot, None, still.xipos[b], b)
+                total += mass[b - 1] * (jac @ data.qacc + dot @ at[1] - m.opt.gravity)
+            out.append(total)
+            at[:] = data.qpos.copy(), data.qvel.copy()  # where an Euler step's next evaluation is
+
+        replay.before()
+        env.step(action)
+        assert replay.after(look)
+        sums = np.array([found.force[found.step == k].sum(axis=0) for k in range(found.steps)])
+        expected = np.array(expected)
+        np.testing.assert_allclose(
+            sums[:, axes], expected[:, axes], atol=1e-7 * (weight + np.abs(expected).max())
+        )
+        heaviest = max(heaviest, float(sums[:, 2].max()))
+    assert heaviest > 0.5 * weight
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: gym.make("Ant-v5"), lambda: Legs("Euler"), lambda: gym.make("Hopper-v5")]
+)
+def test_asking_changes_nothing(make):
+    env, twin = make(), make()
+    plant, other = bound(env), bound(twin)
+    env.reset(seed=5), twin.reset(seed=5)
+    rng = np.random.default_rng(5)
+    nu = env.unwrapped.model.nu
+
+    def whole(raw):
+        state = np.zeros(mujoco.mj_stateSize(raw.model, int(STATE)))
+        mujoco.mj_getState(raw.model, raw.data, state, int(STATE))
+        return state.tobytes() + raw.data.efc_force.tobytes() + raw.data.xpos.tobytes()
+
+    def answers(p, u):
+        drift, effect = p.acceleration
+        return [
+            a.tobytes() for a in (p.f, p.g, drift, effect, p.state, p.forecast(u, 2).qpos, p.forward().xpos)
+        ]
+
+    for _ in range(12):
+        action, asked = rng.uniform(-0.4, 0.4, (2, nu))
+        plant.observe(), other.observe()
+        before = whole(env.unwrapped)
+        first = plant.contact_forecast(asked)
+        mine = answers(plant, asked)
+        under = plant.under(asked)
+        np.testing.assert_array_equal(under.ctrl, asked)
+        again = plant.contact_forecast(np.array(asked))
+        assert again is first  # kept until the next observation
+        plant.contact_forecast(action)
+        assert mine == answers(plant, asked) == answers(other, asked)
+        assert whole(env.unwrapped) == before
+        plant.observe()
+        fresh = plant.contact_forecast(asked)
+        assert all(np.array_equal(a, b) for a, b in zip(fresh, first, strict=True))
+        env.step(action), twin.step(action)
+        assert whole(env.unwrapped) == whole(twin.unwrapped)
+
+
+def test_what_moves_is_no_ground_and_either_geom_may_come_first():
+    # The load lies on the trunk; the floor's geom comes before the legs' and the ledge's after them.
+    ledge = '<body pos="0 0 .3"><geom name="ledge" type="box" size=".2 .2 .07"/></body>'
+    env = Legs(more=ledge)
+    plant = bound(env)
+    env.reset()
+    seen, inside = set(), 0
+    for _ in range(40):
+        plant.observe()
+        found = plant.contact_forecast(np.zeros(2))
+        same(found, happened(env, np.zeros(2)))
+        data = env.data
+        inside += sum(env.model.geom(int(g)).name == "load" for c in data.contact for g in c.geom)
+        seen |= {
+            (env.model.body(b).name, round(float(z), 6))
+            for b, z in zip(found.body, found.normal[:, 2], strict=True)
+        }
+    assert inside and ("trunk", 1.0) in seen and ("load", 1.0) not in seen
+
+
+def test_a_plant_with_other_masses_forecasts_its_own_contacts():
+    env = gym.make("HalfCheetah-v5")
+    plant = bound(env)
+    env.reset(seed=0)
+    for _ in range(50):
+        env.step(np.zeros(6))
+    plant.observe()
+    weight, right = plant.weight_n, plant.contact_forecast(np.zeros(6))
+    assert weight == pytest.approx(env.unwrapped.model.body_mass[1:].sum() * 9.81)
+    plant.perturb(mass=2.0)
+    assert plant.weight_n == pytest.approx(2.0 * weight)
+    wrong = plant.contact_forecast(np.zeros(6))
+    # At rest the ground carries the weight, whoever's it is.
+    assert right.force[right.step == 4, 2].sum() == pytest.approx(weight, rel=0.02)
+    assert wrong.force[wrong.step == 4, 2].sum() != pytest.approx(weight, rel=0.2)
+
+
+def test_under_a_delay_it_starts_where_the_commands_in_flight_lead():
+    env, twin = gym.make("Hopper-v5"), gym.make("Hopper-v5")
+    plant = bound(env, delay_s=env.unwrapped.dt)
+    env.reset(seed=2), twin.reset(seed=2)
+    rng = np.random.default_rng(2)
+    sent = rng.uniform(-1, 1, (20, 3))
+    plant.observe()
+    for k in range(1, 20):
+        plant.executed(sent[k - 1])
+        plant.observe()
+        found = plant.contact_forecast(sent[k])
+        twin.reset(seed=2)
+        for action in sent[:k]:
+            twin.unwrapped.step(action)
+        same(found, happened(twin.unwrapped, sent[k]))
+        env.unwrapped.step(sent[k - 1])
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
+@pytest.mark.parametrize("fast", [1e11, 1e30, 1e200])
+def test_numbers_that_mujoco_resets_are_no_forecast(integrator, fast):
+    env = Legs(integrator)
+    plant = bound(env)
+    env.reset()
+    for _ in range(20):
+        env.step(np.zeros(2))
+    for where, index in (("qvel", 6), ("qvel", 2), ("qpos", 7)):
+        at = getattr(env.data, where)
+        kept = at[index]
+        plant.observe()
+        assert plant.contact_forecast(np.zeros(2)).finite
+        at[index] = fast
+        plant.observe()
+        assert not plant.contact_forecast(np.zeros(2)).finite
+        at[index] = kept
+
+
+def test_the_weaker_of_two_directions_counts_and_so_do_declared_pairs():
+    pair = '<contact><pair geom1="front" geom2="step" friction="0.9 0.3 .01 .001 .001"/></contact>'
+    env = Legs(end=pair)
+    plant = bound(env)
+    env.reset()
+    frictions = {}
+    for _ in range(40):
+        plant.observe()
+        found = plant.contact_forecast(np.zeros(2))
+        for body, friction in zip(found.body, found.friction, strict=True):
+            frictions.setdefault(env.model.body(body).name, set()).add(friction)
+        same(found, happened(env, np.zeros(2)))
+    assert frictions["front"] - {0.6} == {0.3} and frictions["back"] == {0.6}
+
+
+def test_soft_things_that_move_are_no_ground():
+    cloth = """<flexcomp name="cloth" type="grid" count="4 4 1" spacing=".1 .1 .1" pos=".0 0 .5" radius=".01"
+      mass=".3" dim="2"><contact selfcollide="none"/></flexcomp>"""
+    env = Legs(more=cloth.replace('pos=".0 0 .5"', 'pos="0 0 .62"'))
+    plant = bound(env)
+    env.reset()
+    flexible = 0
+    for _ in range(25):
+        plant.observe()
+        found = plant.contact_forecast(np.zeros(2))
+        assert found.finite and (found.body > 0).all()
+        env.step(np.zeros(2))
+        soft = [c for c in env.data.contact if -1 in c.geom]
+        flexible += len(soft)
+        rigid = {env.model.body(b).name for b in found.body}
+        assert "load" not in rigid
+    assert flexible
+
+
+def names(model, found):
+    return {model.body(int(b)).name for b in np.flatnonzero(found)}
+
+
+def test_who_can_touch_the_world():
+    whole = Legs().model
+    assert names(whole, can_touch_the_world(whole)) == {"trunk", "front", "back", "load"}
+    frictionless = Legs(condim=1).model
+    assert not can_touch_the_world(frictionless).any()
+    pairs = (("lift", "back"), ("front", "back"))
+    pair = "".join(f'<pair geom1="{one}" geom2="{two}" condim="3"/>' for one, two in pairs)
+    only = Legs(condim=1, end=f"<contact>{pair}</contact>").model
+    assert names(only, can_touch_the_world(only)) == {"back"}
+    for env_id, some in (
+        ("Ant-v5", True),
+        ("Humanoid-v5", True),
+        ("Reacher-v5", False),
+        ("Swimmer-v5", False),
+    ):
+        assert can_touch_the_world(gym.make(env_id).unwrapped.model).any() == some
