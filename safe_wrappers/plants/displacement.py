@@ -31,9 +31,10 @@ class DisplacementPlant(MujocoPlant):
     that need rows. Those that forecast work: Workspace and its obstacles, joint positions and speeds, SpeedLimit.
 
     Braking is a displacement of zero: the mocap body stays where the gripper is. After steps at full displacement
-    (0.8 m/s) the gripper moves on by 4 to 6 mm and rests within one control interval, but for 4 mm/s that its weight
-    pulls it down by. A displacement against the motion, of 0.02 s times the speed, stops it 2 to 3 mm earlier, and it
-    swings back: in the interval after that it is five times as fast.
+    (31 to 33 mm each) the gripper moves on by 4 to 6 mm, and in the control interval after that it is slower than 0.03 m/s.
+    Then it sinks under its weight, by 4 mm/s, and where the arm is nearly stretched and the gripper tilted, it is
+    pulled upright and back, by up to 6 mm per step. A displacement against the motion, of 0.02 s times the speed,
+    stops it 2 to 3 mm earlier, and it swings back five times as fast.
 
     Args:
         model: The filter's model; None copies the env's. Pass another (other masses) to test mismatch.
@@ -59,11 +60,14 @@ class DisplacementPlant(MujocoPlant):
         metres_per_unit: float = 0.05,
     ) -> None:
         super().__init__(model, delay_s)
-        if not (np.isfinite(metres_per_unit) and metres_per_unit > 0.0):
+        try:
+            self.metres_per_unit = float(metres_per_unit)
+        except (TypeError, ValueError):
+            self.metres_per_unit = np.nan
+        if not 0.0 < self.metres_per_unit < np.inf:
             raise ConfigurationError(
                 f"metres_per_unit is a displacement in m per unit of action, > 0; got {metres_per_unit!r}"
             )
-        self.metres_per_unit = float(metres_per_unit)
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
         """Attach to an env and copy its model."""

@@ -126,7 +126,8 @@ class MujocoPlant:
         if not fits:
             raise UnsupportedEnvError(
                 f"the action space {space} is not the model's control range {self._lower} to {self._upper}; "
-                "put the filter inside wrappers that rescale actions, or describe the env with AnalyticPlant"
+                "put the filter inside wrappers that rescale actions, or describe the env with AnalyticPlant; an env "
+                "of gymnasium-robotics' Fetch takes DisplacementPlant()"
             )
 
     def perturb(self, mass: float = 1.0, damping: float = 1.0) -> None:
