@@ -44,6 +44,7 @@ from safe_wrappers.plants.mujoco import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.protect import protect
 from safe_wrappers.wrappers.adaption_penalty import AdaptionPenalty
+from safe_wrappers.wrappers.balance_monitor import BalanceMonitor
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.chunk_handover import ChunkHandover
 from safe_wrappers.wrappers.contact_monitor import ContactMonitor
@@ -62,6 +63,7 @@ from safe_wrappers.wrappers.whole_body_filter import WholeBodyFilter
 __all__ = [
     "AdaptionPenalty",
     "AnalyticPlant",
+    "BalanceMonitor",
     "Barrier",
     "Box",
     "CBFActionFilter",

@@ -156,6 +156,25 @@ CONTACT_RESIDUAL: Final = "contact/residual"
 CONTACT_PARTIAL: Final = "contact/partial"
 """bool: not every substep was seen; the others are of the contacts that the step left behind, for one substep."""
 
+# BalanceMonitor, every step: of the robot and its contacts with the fixed world ------------------------------------
+BALANCE_LINEAR_MOMENTUM: Final = "balance/linear_momentum"
+"""float64 array (3,): kg m/s, after the step."""
+BALANCE_ANGULAR_MOMENTUM: Final = "balance/angular_momentum"
+"""float64 array (3,): kg m^2/s about the centre of mass, after the step."""
+BALANCE_FRICTION_USED: Final = "balance/friction_used"
+"""float64: the largest ``|f_t| / (share mu f_n)`` of a contact that carries 1 % of the weight or more, over all
+evaluations of the physics."""
+BALANCE_ZMP_MARGIN: Final = "balance/zmp_margin"
+"""float64: m, least distance of the zero moment point from the edge of the support polygon minus the inset, over the
+evaluations with a polygon; 0 where there is none."""
+BALANCE_SUPPORTED: Final = "balance/supported"
+"""float64: share of the evaluations with a polygon: three contact points of one plane, not on a line."""
+BALANCE_AIRBORNE: Final = "balance/airborne"
+"""float64: share of the evaluations without a contact point."""
+BALANCE_PARTIAL: Final = "balance/partial"
+"""bool: not every evaluation was seen, and the others are of the contacts that the step left behind; or numbers were
+not finite, and are reported as 0."""
+
 # OcclusionPenalty, every step: one entry per track, after the step ------------------------------------------------
 OCCLUSION_VISIBLE: Final = "occlusion/visible"
 """bool array, one per track: it was measured at the end of this step (in sight, in range, and not dropped out)."""

@@ -28,25 +28,38 @@ _ANY: Final = (
     keys.OCCLUSION_EXPIRED,
     keys.CONTACT_PARTIAL,
     keys.TELEOP_REVOKED,
+    keys.BALANCE_PARTIAL,
 )
 _CONTACT_PEAKS: Final = (keys.CONTACT_PEAK_FORCE, keys.CONTACT_PENETRATION, keys.CONTACT_RESIDUAL)
-_LARGEST: Final = (keys.CBF_CORRECTION, keys.CBF_CLIPPED, keys.SPIN_OUT, *_CONTACT_PEAKS)
+_LARGEST: Final = (
+    keys.CBF_CORRECTION,
+    keys.CBF_CLIPPED,
+    keys.SPIN_OUT,
+    *_CONTACT_PEAKS,
+    keys.BALANCE_FRICTION_USED,
+)
 _SMALLEST: Final = (keys.CBF_MARGIN, keys.TELEOP_CLEARANCE_M)
+_MEANS: Final = (keys.BALANCE_SUPPORTED, keys.BALANCE_AIRBORNE)
 
 
 def macro_info(infos: list[dict[str, Any]]) -> dict[str, Any]:
     """The last control step's info, in which costs are summed up and no intervention of the others is lost.
 
     Costs, collisions, impulses, packets lost or late, and what `AdaptionPenalty` and `OcclusionPenalty` say of the
-    reward, are sums; what is a flag is True if it was at any control step; corrections, contact forces and a spin-out
-    are the largest, the margin and a channel's clearance are the smallest. Everything else is the last control
-    step's: the running counts of `RecordInterventions`, and which tracks are seen, how uncertain they are. A key that
-    only some control steps have counts where it is there.
+    reward, are sums; what is a flag is True if it was at any control step; corrections, contact forces, used friction
+    and a spin-out are the largest, the margin and a channel's clearance are the smallest, and so is the zero moment
+    point's, over the control steps that have one; `BalanceMonitor`'s shares are means. Everything else is the last
+    control step's: the running counts of `RecordInterventions`, momentum, and which tracks are seen, how uncertain
+    they are. A key that only some control steps have counts where it is there.
     """
     last = infos[-1]
     if len(infos) == 1:
         return last
-    for names, merge in ((_SUMS, np.sum), (_ANY, np.any), (_LARGEST, np.max), (_SMALLEST, np.min)):
+    if keys.BALANCE_ZMP_MARGIN in last:
+        margins = [i[keys.BALANCE_ZMP_MARGIN] for i in infos if i.get(keys.BALANCE_SUPPORTED)]
+        last[keys.BALANCE_ZMP_MARGIN] = min(margins, default=0.0)
+    merges = ((_SUMS, np.sum), (_ANY, np.any), (_LARGEST, np.max), (_SMALLEST, np.min), (_MEANS, np.mean))
+    for names, merge in merges:
         for name in names:
             values = [info[name] for info in infos if name in info]
             if values:

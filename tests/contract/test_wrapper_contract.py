@@ -32,6 +32,13 @@ EXAMPLES = {
     "AdaptionPenalty": {
         "a constant and a part that grows": (TASK, lambda: {"penalty": 0.5, "per_correction": 0.25})
     },
+    "BalanceMonitor": {
+        "everything": ("HalfCheetah-v5", dict),
+        "a trunk and its legs": (
+            "Ant-v5",
+            lambda: {"friction_share": 0.7, "inset": 0.05, "bodies": ["torso"]},
+        ),
+    },
     "CBFActionFilter": {
         "a HeadingDriveClearance": (TASK, lambda: {"constraints": [_clearance()]}),
         "a JointSpeedLimit with options": (
@@ -205,7 +212,7 @@ CHUNKED = ("ChunkHandover",)
 FILTERS = ("CBFActionFilter", "SlipLimiter")
 """Wrappers that let no action through that is not finite or outside the action space."""
 
-ONLY_LOOKING = ("ContactMonitor", "OcclusionPenalty", "RecordInterventions")
+ONLY_LOOKING = ("BalanceMonitor", "ContactMonitor", "OcclusionPenalty", "RecordInterventions")
 """Wrappers that look on and pass every action as it is."""
 
 EXPORTED = sorted(

@@ -1,0 +1,115 @@
+"""Distances of zero moment points from edges, all at once: statics, and polygons built one by one."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from safe_wrappers.control import support_distances as module
+from safe_wrappers.control.friction_cone import tangents
+from safe_wrappers.control.support import balance, common_plane, support_polygon
+from safe_wrappers.control.support_distances import support_distances
+from safe_wrappers.errors import ConfigurationError
+
+UP = np.array([0.0, 0.0, 1.0])
+CORNERS = np.array([[0.2, 0.1, 0.0], [-0.2, 0.1, 0.0], [-0.2, -0.1, 0.0], [0.2, -0.1, 0.0]])
+UPRIGHT = np.tile(UP, (4, 1))
+
+
+def one_by_one(instant, points, normals, forces):
+    """Each instant's, by the polygon that `control.support` builds."""
+    found = []
+    for when in np.unique(instant):
+        here = instant == when
+        ground = common_plane(points[here], normals[here])
+        if ground is None or len(support_polygon(ground.flat(points[here]))) < 3:
+            continue
+        margin = balance(points[here], normals[here], forces[here]).margin
+        if np.isfinite(margin):
+            found.append(margin)
+    return np.array(found)
+
+
+@pytest.mark.parametrize(
+    ("shares", "distance"),
+    [
+        ([1, 1, 1, 1], 0.1),
+        ([1, 0, 0, 1], 0.0),  # it begins to tip
+        ([9, 1, 1, 9], 0.04),  # 0.16 ahead of the middle
+        ([0, 0, 0, 1], 0.0),
+        ([-1, 3, 3, -1], -0.2),  # beyond an edge: something pulls
+        ([0, -1, 0, 2], -np.hypot(0.4, 0.2)),  # beyond a corner: at (0.6, -0.3)
+    ],
+)
+def test_a_pressed_square(shares, distance):
+    forces = np.outer(shares, UP)
+    assert support_distances(np.zeros(4), CORNERS, UPRIGHT, forces) == pytest.approx([distance], abs=1e-12)
+    assert one_by_one(np.zeros(4), CORNERS, UPRIGHT, forces) == pytest.approx([distance], abs=1e-12)
+
+
+def test_a_sideways_force_moves_the_point_by_its_height_over_the_plane_and_not_along_it():
+    # All at the corners themselves: friction has no arm.
+    pushed = UPRIGHT + np.array([0.4, -0.3, 0.0])
+    assert support_distances(np.zeros(4), CORNERS, UPRIGHT, pushed) == pytest.approx([0.1])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda p, n, f: (p + np.outer([0, 0, 0, 0.05], UP), n, f),  # several heights
+        lambda p, n, f: (p, np.array([UP, UP, UP, [0.1, 0.0, np.sqrt(0.99)]]), f),  # a slope beside the plane
+        lambda p, n, f: (p * [1, 0, 1], n, f),  # on a line
+        lambda p, n, f: (p * 0, n, f),  # at a point
+        lambda p, n, f: (p, n, 0 * f),  # nothing presses
+        lambda p, n, f: (p, np.outer([1, -1, 1, -1], UP), f),  # a wedge
+        lambda p, n, f: (p[:2], n[:2], f[:2]),
+        lambda p, n, f: (p[:0], n[:0], f[:0]),
+    ],
+)
+def test_what_is_no_support_gives_no_number_and_harms_no_other(change):
+    p, n, f = change(CORNERS, UPRIGHT, UPRIGHT)
+    assert support_distances(np.zeros(len(p)), p, n, f).shape == (0,)
+    both = [np.concatenate([a, b, a]) for a, b in zip((p, n, f), (CORNERS, UPRIGHT, UPRIGHT), strict=True)]
+    instant = np.repeat([4, 5, 6], [len(p), 4, len(p)])
+    assert support_distances(instant, *both) == pytest.approx([0.1])
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 6), st.integers(0, 40), st.booleans(), st.booleans())
+def test_as_one_by_one(seed, instants, contacts, coarse, rough):
+    rng = np.random.default_rng(seed)
+    normal = UP + rng.normal(0.0, 0.5, 3)
+    normal /= np.linalg.norm(normal)
+    flat = rng.uniform(-1.0, 1.0, (contacts, 2))
+    flat = np.round(flat, 1) if coarse else flat  # with duplicates, and several on one edge
+    heights = rng.uniform(-0.007, 0.007, (contacts, 1)) * rough
+    points = flat @ tangents(normal) + heights * normal + [3.0, -2.0, 1.0]
+    normals = normal + rng.normal(0.0, 0.02, (contacts, 3)) * rough
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    forces = rng.normal(0.0, 1.0, (contacts, 3)) + rng.uniform(0.5, 3.0) * normal
+    instant = rng.integers(0, instants, contacts)
+    expected = one_by_one(instant, points, normals, forces)
+    np.testing.assert_allclose(
+        support_distances(instant, points, normals, forces), expected, rtol=1e-6, atol=1e-9
+    )
+
+
+def test_many_contacts_are_taken_a_few_instants_at_a_time(monkeypatch):
+    rng = np.random.default_rng(0)
+    instant = np.repeat(np.arange(7), 5)
+    points = np.column_stack([rng.uniform(-1.0, 1.0, (35, 2)), np.zeros(35)])
+    normals, forces = np.tile(UP, (35, 1)), np.outer(rng.uniform(0.0, 1.0, 35), UP)
+    whole = support_distances(instant, points, normals, forces)
+    for products in (1, 300):
+        monkeypatch.setattr(module, "_PRODUCTS", products)
+        np.testing.assert_array_equal(support_distances(instant, points, normals, forces), whole)
+    assert whole.shape == (7,)
+
+
+def test_bad_input_is_refused_in_words():
+    with pytest.raises(ConfigurationError, match=r"expected instants \(n,\) and points \(n, 3\)"):
+        support_distances(np.zeros(3), CORNERS, UPRIGHT, UPRIGHT)
+    with pytest.raises(ConfigurationError, match=r"expected instants"):
+        support_distances(np.zeros(4), CORNERS[:, :2], UPRIGHT[:, :2], UPRIGHT[:, :2])
+    with pytest.raises(ConfigurationError, match="forces must be finite"):
+        support_distances(np.zeros(4), CORNERS, UPRIGHT, np.full((4, 3), np.nan))
