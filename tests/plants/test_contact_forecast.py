@@ -325,6 +325,23 @@ def test_numbers_that_mujoco_resets_are_no_forecast(integrator, fast):
         at[index] = kept
 
 
+@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
+def test_accelerations_that_end_in_a_reset_are_found_where_speeds_are_not_out_of_bounds(integrator):
+    rail = '<joint name="rail" axis="1 0 0" type="slide"/>'
+    cart = f'<body name="cart" pos="2 2 1">{rail}<geom size=".1" mass="1"/></body>'
+    env = Legs(
+        integrator, more=cart, act='<motor joint="rail" gear="1e11" ctrlrange="-1 1" ctrllimited="true"/>'
+    )
+    plant = bound(env)
+    for push in (1e-3, 1.0):
+        env.reset()
+        plant.observe()
+        found = plant.contact_forecast(np.array([0.0, 0.0, push]))
+        env.step(np.array([0.0, 0.0, push]))
+        resets = bool(env.data.warning.number.any())
+        assert resets == (push == 1.0) and found.finite == (not resets)
+
+
 def test_the_weaker_of_two_directions_counts_and_so_do_declared_pairs():
     pair = '<contact><pair geom1="front" geom2="step" friction="0.9 0.3 .01 .001 .001"/></contact>'
     env = Legs(end=pair)
@@ -368,8 +385,8 @@ def test_who_can_touch_the_world():
     assert names(whole, can_touch_the_world(whole)) == {"trunk", "front", "back", "load"}
     frictionless = Legs(condim=1).model
     assert not can_touch_the_world(frictionless).any()
-    pairs = (("lift", "back"), ("front", "back"))
-    pair = "".join(f'<pair geom1="{one}" geom2="{two}" condim="3"/>' for one, two in pairs)
+    pairs = (("lift", "back", 3), ("front", "back", 3), ("trunk", "lift", 1))
+    pair = "".join(f'<pair geom1="{one}" geom2="{two}" condim="{dim}"/>' for one, two, dim in pairs)
     only = Legs(condim=1, end=f"<contact>{pair}</contact>").model
     assert names(only, can_touch_the_world(only)) == {"back"}
     for env_id, some in (
