@@ -41,6 +41,8 @@ Array = NDArray[np.float64]
 
 TOLERANCE = 1e-6
 """Largest residual that counts as met: relative to 1 plus the size of the forces (N) or accelerations (m/s^2)."""
+_INNER_IN_LEAST_VIOLATION = 1e-8
+"""What a squared newton of inner force costs there: they would have next to no curvature, and cost digits as well."""
 _OBJECTIVE_IN_LEAST_VIOLATION = 1e-3
 """What half the range of a control costs where violations are minimised instead, in squares of their units, at most.
 
@@ -394,6 +396,8 @@ def _least_violation(
     share = _OBJECTIVE_IN_LEAST_VIOLATION / max(1.0, float(costs[np.isfinite(costs)].max(initial=0.0)))
     hessian = share * plain.program.hessian
     hessian[misses, misses] += 1.0
+    inner = np.arange(nu + loose.misses, loose.size)
+    hessian[inner, inner] += _INNER_IN_LEAST_VIOLATION
     softer = plain.program._replace(hessian=hessian, linear=share * plain.program.linear)
     candidate = _ask(softer.softened(plain.softenable), solver)
     if candidate.y is not None:
