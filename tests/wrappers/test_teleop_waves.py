@@ -6,6 +6,8 @@ from teleop_worlds import Energies, ceiling, channel, clamp, place
 
 import safe_wrappers as sw
 from safe_wrappers.envs.teleop_operator import TeleopOperator
+from safe_wrappers.wrappers.teleop_coding import Up, WaveCoding
+from safe_wrappers.wrappers.teleop_link import Packet
 
 B = 40.0
 NETWORKS = {
@@ -185,6 +187,43 @@ def test_a_passivity_controller_keeps_plain_coding_within_its_storage(delay_s):
     assert 5.0 < pressed < 30.0
     assert energies.worst < 2 * 0.02 + 1e-6
     assert info["teleop/created_j"] < 1e-6
+
+
+class Machine:
+    """A port whose effort is what a test says."""
+
+    feedthrough = 0.0
+
+    def reset(self, observation):
+        self.effort = self.base = np.zeros(1)
+
+    def acted(self, flow, observation):
+        return self.true
+
+    def replaced(self, observation, effort):
+        return effort
+
+
+def test_what_a_machine_took_unpaid_is_paid_by_the_next_waves():
+    machine, tick = Machine(), 0.001
+    coding = WaveCoding(machine, tick, 2.0, "queue")
+    coding.reset(np.zeros(1))
+    flows, out = [], 0.0
+    for sequence in range(14):
+        wave = coding.near(np.array([0.5]))  # sqrt(2 b) v = 1 sqrt(W): half a watt
+        coding.sent_up(sequence, wave, False)
+        order = coding.far([Packet(sequence, Up(None, 0.0, wave))], Up(None, 0.0, wave), None)
+        # At first it resists with 5 N although it said 0; then as it says.
+        machine.true = np.array([5.0 if sequence == 0 else 0.0])
+        back, taken = coding.settle(order.flow, None, True)
+        coding.sent_down(sequence, back, False)
+        out += float(taken.effort @ taken.flow + 0.5 * back @ back) * tick
+        flows.append(float(order.flow[0]))
+        if sequence == 0:
+            assert out == pytest.approx(5.0 * tick)
+    # 4.5 mJ too much: the next nine waves of half a millijoule are kept for it.
+    np.testing.assert_allclose(flows, [1.0] + 9 * [0.0] + 4 * [1.0], atol=1e-6)
+    assert out <= 14 * 0.5 * tick + 1e-12
 
 
 def test_named_by_the_user_a_port_is_the_published_one():
