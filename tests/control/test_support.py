@@ -120,6 +120,9 @@ def test_contacts_at_several_heights_are_flagged_and_get_no_number():
     assert math.isnan(found.margin)
     # A wall beside a floor is no common plane either.
     assert common_plane(CORNERS[:2], np.array([UP, [1.0, 0.0, 0.0]])) is None
+    ridge = np.array([[0.0, 0.1, 0.0], [0.0, -0.1, 0.0]])  # level with the mean of two normals, which differ
+    assert common_plane(ridge, np.array([UP, [1.0, 0.0, 0.0]])) is None
+    assert common_plane(ridge, np.array([UP, [math.sin(0.04), 0.0, math.cos(0.04)]])) is not None
     assert common_plane(np.zeros((0, 3)), np.zeros((0, 3))) is None
     # One inclined plane is: height alone does not decide.
     slope = np.array([-math.sin(0.3), 0.0, math.cos(0.3)])
