@@ -1,0 +1,312 @@
+"""ContactFeasibility: where a pushed ball would slide, and closed loops judged on the env's own contacts."""
+
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from contact_judge import DRIVERS, ConeJudge, touches
+from judged_loops import Scene, flagged
+
+import safe_wrappers as sw
+from safe_wrappers.constraints.plain_data import constraint_data, constraint_from
+from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+
+ROUNDING = 1e-6
+"""Executed actions are rounded to float32, and a robot in contact makes more of it."""
+
+BALLS = """<mujoco><option timestep="0.005" cone="{cone}"/>
+<default><geom friction="0.8 0 0" condim="{condim}"/></default>
+<worldbody><geom name="floor" type="plane" size="9 9 1"/>{balls}</worldbody>
+<actuator>{motors}</actuator></mujoco>"""
+BALL = """<body name="{0}" pos="0 {1} .1"><joint name="{0}x" type="slide" axis="1 0 0"/>
+<joint type="slide" axis="0 0 1"/><geom size=".1" mass="2"/></body>"""
+MOTOR = '<motor joint="{0}x" ctrllimited="true" ctrlrange="-1 1" gear="50"/>'
+
+
+def pushed_balls(names=("left",), cone="pyramidal", condim=3, more=""):
+    """Balls of 2 kg that do not roll, on a floor with a friction of 0.8; a control of 1 pushes with 50 N."""
+    balls = "".join(BALL.format(name, 2 * i) for i, name in enumerate(names)) + more
+    motors = "".join(MOTOR.format(name) for name in names)
+    return Scene(BALLS.format(cone=cone, condim=condim, balls=balls, motors=motors))
+
+
+def settled(env, constraint, control):
+    """A plant that observes the env after the control has acted for a second."""
+    plant = sw.MujocoPlant()
+    plant.bind(env)
+    constraint.bind(plant)
+    env.reset()
+    for _ in range(40):
+        env.step(control)
+    plant.observe()
+    return plant
+
+
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+@pytest.mark.parametrize(
+    ("share", "tolerance", "margin"),
+    [(0.7, 0.0, 0.0), (0.5, 0.0, 0.0), (0.7, 0.1, 0.0), (0.7, 0.0, 0.1), (0.7, 0.02, 0.12), (1.0, 0.0, 0.2)],
+)
+def test_it_admits_pushes_up_to_the_share_and_the_tolerance_and_less_by_the_margin(
+    cone, share, tolerance, margin
+):
+    # One ball, one contact: its pressure is the weight, and what holds it is what pushes it.
+    largest = share * 0.8 + tolerance - margin  # of the weight
+    weight = 2.0 * 9.81
+    limit = sw.ContactFeasibility(share, tolerance, margin=margin)
+    for part, admitted in ((0.99, True), (1.01, False), (-0.99, True), (-1.01, False)):
+        control = np.array([part * largest * weight / 50.0])
+        plant = settled(pushed_balls(cone=cone), limit, control)
+        assert plant.weight_n == pytest.approx(weight)
+        assert limit.admits(plant, control) is admitted
+        inside = share * 0.8 - abs(part) * largest
+        assert limit.insides(plant, control)[0] == pytest.approx(inside, abs=2e-3)
+        assert limit.shortfall(plant, control) == pytest.approx(
+            margin - tolerance - min(inside, margin), abs=2e-3
+        )
+
+
+def test_in_the_air_nothing_is_missed_whatever_the_margin():
+    limit = sw.ContactFeasibility(0.7, 0.0, margin=0.3)
+    env = pushed_balls(("left", "right"))
+    env.start = np.array([0.0, 3.0, 0.0, 3.0]), np.zeros(4)
+    plant = settled(env, limit, np.zeros(2))
+    env.reset()
+    plant.observe()
+    control = np.array([1.0, -1.0])
+    assert np.isinf(limit.insides(plant, control)).all()
+    assert limit.admits(plant, control) and limit.slacks(plant, control).tolist() == [0.0, 0.0]
+
+
+def test_a_contact_without_friction_has_no_cone_to_leave():
+    ball = '<body name="b" pos="5 5 .1"><freejoint/><geom condim="3" size=".1"/></body>'
+    env = pushed_balls(condim=1, more=ball)
+    limit = sw.ContactFeasibility(0.7, 0.0)
+    plant = settled(env, limit, np.ones(1))
+    assert limit.admits(plant, np.ones(1)) and limit.slacks(plant, np.ones(1)).size == 1
+
+
+def test_only_the_named_bodies_count():
+    control = np.array([0.0, 0.3])  # 15 N on 11 N: only the second ball slides
+    for bodies, admitted in ((None, False), (["left"], True), (["right"], False), (("left", "right"), False)):
+        limit = sw.ContactFeasibility(0.7, 0.0, bodies)
+        plant = settled(pushed_balls(("left", "right")), limit, control)
+        assert limit.admits(plant, control) is admitted
+        assert limit.slacks(plant, control).size == (1 if bodies and len(bodies) == 1 else 2)
+
+
+def test_the_cut_of_a_refused_push_is_where_the_ball_would_slide():
+    limit = sw.ContactFeasibility(0.7, 0.0)
+    plant = settled(pushed_balls(), limit, np.array([0.2]))
+    for control in (np.array([0.25]), np.array([-0.25])):
+        rows = limit.cut(plant, control)
+        border = rows.offsets[0] / rows.normals[0, 0]
+        assert np.sign(border) == np.sign(control[0])
+        assert rows.normals[0] @ control > rows.offsets[0]
+        assert limit.shortfall(plant, np.array([border])) < 0.2 * limit.shortfall(plant, control)
+    assert limit.rows(plant).offsets.size == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"friction_share": 0.0}, "friction_share"),
+        ({"friction_share": -0.5}, "friction_share"),
+        ({"friction_share": 1.1}, r"\(0, 1\]"),
+        ({"friction_share": np.nan}, "friction_share"),
+        ({"friction_share": "all"}, "friction_share"),
+        ({"tolerance": -0.01}, "tolerance"),
+        ({"tolerance": np.inf}, "tolerance"),
+        ({"margin": np.nan}, "margin"),
+        ({"bodies": "torso"}, "list of names"),
+        ({"bodies": []}, "list of names"),
+        ({"bodies": [3]}, "list of names"),
+        ({"bodies": 3}, "list of names"),
+    ],
+)
+def test_bad_arguments_are_refused_in_words(arguments, words):
+    with pytest.raises(ConfigurationError, match=words):
+        sw.ContactFeasibility(**arguments)
+
+
+def test_what_it_cannot_watch_is_refused_when_it_is_bound():
+    def bound(env, **arguments):
+        plant = sw.MujocoPlant()
+        plant.bind(env)
+        sw.ContactFeasibility(**arguments).bind(plant)
+
+    still = '<body name="block" pos="3 3 0"><geom type="box" size=".1 .1 .1"/></body>'
+    slick = '<body name="slick" pos="3 -3 1"><freejoint/><geom size=".1" contype="0" conaffinity="0"/></body>'
+    env = pushed_balls(more=still + slick)
+    bound(env)
+    with pytest.raises(UnknownNameError, match="no body 'foot'"):
+        bound(env, bodies=["left", "foot"])
+    with pytest.raises(ConfigurationError, match="'block' does not move"):
+        bound(env, bodies=["block"])
+    with pytest.raises(UnsupportedEnvError, match="'slick' cannot touch"):
+        bound(env, bodies=["left", "slick"])
+    with pytest.raises(UnsupportedEnvError, match="no body of this model"):
+        bound(pushed_balls(condim=1))
+    with pytest.raises(UnsupportedEnvError, match="no body of this model"):
+        bound(gym.make("Reacher-v5"))
+    plant = sw.AnalyticPlant(f=lambda x: x, g=lambda x: np.ones((1, 1)), state=lambda e: e.state, hold_s=0.1)
+    with pytest.raises(UnsupportedEnvError, match="AnalyticPlant"):
+        sw.ContactFeasibility().bind(plant)
+
+
+def test_it_is_plain_data():
+    limit = sw.ContactFeasibility(0.6, 0.02, ["torso"], 0.01)
+    again = constraint_from(json.loads(json.dumps(constraint_data(limit))))
+    assert again == limit and again.promise == "best effort"
+
+
+CASES = [
+    ("Ant-v5", "bang_bang", 12),
+    ("Ant-v5", "noisy", 12),
+    ("Humanoid-v5", "at_random", 30),
+    ("HalfCheetah-v5", "at_random", 40),
+    ("HalfCheetah-v5", "bang_bang", 40),
+    ("HalfCheetah-v5", "noisy", 40),
+    ("Hopper-v5", "at_random", 60),
+    ("Walker2d-v5", "bang_bang", 60),
+]
+LONG = [
+    (env_id, driver, 400)
+    for env_id in ("Ant-v5", "Humanoid-v5", "HalfCheetah-v5", "Walker2d-v5")
+    for driver in DRIVERS
+]
+
+
+def filtered(env_id, plant=None, **arguments):
+    return sw.CBFActionFilter(gym.make(env_id), [sw.ContactFeasibility(**arguments)], plant=plant)
+
+
+def loop(env, driver, steps, share=0.7, tolerance=0.01, bodies=None, seed=1):
+    """Counts of a closed loop: steps outside, flagged, unflagged ones outside, changed; and unflagged excesses."""
+    judge, rng = ConeJudge(env, share, bodies), np.random.default_rng(seed)
+    seen = {"outside": 0, "flagged": 0, "unflagged": 0, "changed": 0, "worst": -np.inf}
+    env.reset(seed=seed)
+    for k in range(steps):
+        action = DRIVERS[driver](env.action_space, k, rng).astype(np.float32)
+        excess, (*_, terminated, truncated, info) = judge.step(env, action)
+        beyond = excess - tolerance
+        seen["outside"] += beyond > ROUNDING
+        seen["flagged"] += flagged(info)
+        seen["changed"] += info["cbf/intervened"]
+        if not flagged(info):
+            seen["worst"] = max(seen["worst"], beyond)
+            seen["unflagged"] += beyond > ROUNDING
+        # What it reports is what the env's own contacts were.
+        reported = info["whole_body/cone_margin"]
+        assert reported == (pytest.approx(-excess, abs=1e-7) if np.isfinite(excess) else 0.0)
+        count = sum(bodies is None or body in bodies for body, *_ in judge.instants[0])
+        assert info["whole_body/contacts"] == count or bodies is not None
+        if terminated or truncated:
+            env.reset()
+    return seen
+
+
+@pytest.mark.parametrize(("env_id", "driver", "steps"), CASES)
+def test_unflagged_steps_stay_in_the_cone(env_id, driver, steps):
+    seen = loop(filtered(env_id), driver, steps)
+    assert seen["unflagged"] == 0 and seen["worst"] <= ROUNDING, seen
+    assert seen["changed"] > 0 and seen["flagged"] < steps, seen
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("env_id", "driver", "steps"), LONG)
+def test_unflagged_steps_stay_in_the_cone_for_long(env_id, driver, steps):
+    seen = loop(filtered(env_id), driver, steps)
+    assert seen["unflagged"] == 0 and seen["changed"] > 0, seen
+
+
+def test_without_it_they_leave_the_cone():
+    judge, rng = ConeJudge(gym.make("HalfCheetah-v5"), 0.7), np.random.default_rng(1)
+    bare = judge.raw
+    bare.reset(seed=1)
+    outside = sum(
+        judge.step(bare, DRIVERS["at_random"](bare.action_space, k, rng))[0] > 0.01 for k in range(60)
+    )
+    assert outside > 10
+
+
+@pytest.mark.parametrize("arguments", [{"tolerance": 0.0}, {"friction_share": 0.5}, {"margin": 0.005}])
+def test_share_tolerance_and_margin_hold_in_closed_loop(arguments):
+    tolerance = arguments.get("tolerance", 0.01) - arguments.get("margin", 0.0)
+    seen = loop(
+        filtered("HalfCheetah-v5", **arguments), "noisy", 40, arguments.get("friction_share", 0.7), tolerance
+    )
+    assert seen["unflagged"] == 0 and seen["changed"] > 0
+
+
+def test_the_filters_margin_counts_too():
+    env = sw.CBFActionFilter(gym.make("HalfCheetah-v5"), [sw.ContactFeasibility()], margin=0.006)
+    assert env.constraints[0].margin == 0.006
+    assert loop(env, "noisy", 30, tolerance=0.004)["unflagged"] == 0
+
+
+def test_named_bodies_alone_stay_in_the_cone():
+    env = filtered("HalfCheetah-v5", bodies=["bfoot"])
+    model = env.unwrapped.model
+    watched = {model.body("bfoot").id}
+    seen = loop(env, "at_random", 50, bodies=watched)
+    assert seen["unflagged"] == 0 and seen["changed"] > 0
+
+
+@pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Ant-v5", "Humanoid-v5"])
+def test_the_whole_cone_is_never_left_so_it_is_inactive_bit_for_bit(env_id):
+    env, twin = filtered(env_id, friction_share=1.0, tolerance=0.0), gym.make(env_id)
+    env.reset(seed=4), twin.reset(seed=4)
+    rng = np.random.default_rng(4)
+    for k in range(25):
+        action = rng.choice([env.action_space.low, env.action_space.high, np.zeros(env.action_space.shape)])
+        action = (action if k % 2 else env.action_space.sample()).astype(np.float32)
+        observation, reward, *_, info = env.step(action)
+        expected, as_much, *_ = twin.step(action)
+        assert observation.tobytes() == expected.tobytes() and reward == as_much
+        assert not info["cbf/intervened"] and not flagged(info)
+
+
+def test_a_plant_with_other_masses_is_only_as_good_as_it_is():
+    wrong = sw.MujocoPlant()
+    wrong.perturb(mass=0.5)
+    judge_of = {"right": None, "wrong": wrong}
+    unflagged = {}
+    for name, plant in judge_of.items():
+        env = filtered("HalfCheetah-v5", plant)
+        judge, rng = ConeJudge(env, 0.7), np.random.default_rng(2)
+        env.reset(seed=2)
+        unflagged[name] = 0
+        for k in range(50):
+            excess, (*_, info) = judge.step(
+                env, DRIVERS["at_random"](env.action_space, k, rng).astype(np.float32)
+            )
+            unflagged[name] += excess > 0.01 + ROUNDING and not flagged(info)
+    assert unflagged["right"] == 0
+    assert unflagged["wrong"] > 5  # of 50, and nothing in the info says so
+
+
+def test_reset_forgets():
+    env = filtered("HalfCheetah-v5")
+    env.reset(seed=0)
+    for _ in range(40):
+        info = env.step(np.zeros(6, np.float32))[4]
+    assert info["whole_body/contacts"] > 0
+    _, info = env.reset(seed=0)
+    assert info["whole_body/contacts"] == 0 and info["whole_body/cone_margin"] == 0.0
+    rng = np.random.default_rng(0)
+    actions = [DRIVERS["at_random"](env.action_space, k, rng).astype(np.float32) for k in range(10)]
+    first = [env.step(a)[4]["executed_action"] for a in actions]
+    env.reset(seed=0)
+    again = [env.step(a)[4]["executed_action"] for a in actions]
+    assert np.array_equal(first, again)
+
+
+def test_the_judge_reads_forces_that_carry_the_weight():
+    env = gym.make("HalfCheetah-v5").unwrapped
+    env.reset(seed=0)
+    for _ in range(100):
+        env.step(np.zeros(6))
+    forces = np.array([force for _, _, _, force, _ in touches(env.model, env.data)])
+    assert forces[:, 2].sum() == pytest.approx(env.model.body_mass[1:].sum() * 9.81, rel=0.02)
