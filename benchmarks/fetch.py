@@ -114,8 +114,8 @@ def jobs(arguments: argparse.Namespace) -> list[Job]:
     return [
         Job(env_id, name, filtered, length, -(-steps // parts), arguments.seed + k)
         for filtered, steps in ((False, arguments.off), (True, arguments.steps))
-        for name in names
         for k, length in enumerate(EPISODES)
+        for name in names
         for env_id in envs
     ]
 

@@ -98,12 +98,14 @@ def margin_reading(ball: bool) -> Maker:
 
         def act() -> Action:
             plant.observe()
+            for constraint in constraints:
+                constraint.reset()  # nobody says when an episode begins
             if rng.random() < 0.04:
                 state["way"] = rng.normal(size=3)
             fingers = rng.choice([-1.0, 1.0])
             noisy = 3.0 * (state["way"] + 0.7 * rng.normal(size=3))
             tries = [np.append(np.clip(noisy, -1.0, 1.0), fingers)]
-            tries += [np.where(rng.random(4) < 0.5, -1.0, 1.0) for _ in range(3)]
+            tries += [np.where(rng.random(4) < 0.5, -1.0, 1.0) for _ in range(2)]
             found = [(left(action), k) for k, action in enumerate(tries)]
             admitted = [pair for pair in found if pair[0] >= 0.0]
             return tries[min(admitted)[1] if admitted else max(found)[1]]

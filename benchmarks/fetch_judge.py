@@ -15,6 +15,9 @@ REACH_M = 0.25
 """Of the gripper's box, from where an episode starts, along x and y."""
 FLOOR_M, CEILING_M = 0.02, 0.5
 """Of the gripper's box, above the table's top."""
+_ONES = np.ones(2)
+_FINGER_M = 0.15
+"""No part of a finger is farther from the gripper's site."""
 GRACE = 10
 """Control steps within which fingers that a reset has put into the table must have left it; later it counts."""
 BALL_RADIUS_M = 0.05
@@ -57,12 +60,12 @@ class FetchJudge:
         self._raw, self._model = raw, raw.model
         self._ball = ball_of(raw) if ball else None
         model: mujoco.MjModel = raw.model
-        self._look_at = mujoco.MjData(model)
+        self._now = mujoco.MjData(model)
         self._site = model.site("robot0:grip").id
         self._fingers = [model.geom(f"robot0:{side}_gripper_finger_link").id for side in "lr"]
         owner = [model.body(i).name for i in model.geom_bodyid]
-        self._robot = {g for g, name in enumerate(owner) if name.startswith("robot0:")}
-        self._table = {g for g, name in enumerate(owner) if name == "table0"}
+        self._robot = np.array([name.startswith("robot0:") for name in owner], dtype=np.float64)
+        self._table = np.array([name == "table0" for name in owner], dtype=np.float64)
         self.low, self.high = box_of(raw)
         self._missed = np.full(3, -np.inf)
         self._left = self.excused = 0
@@ -71,13 +74,17 @@ class FetchJudge:
     def _step(self, action: Array) -> None:
         for _ in range(self._raw.n_substeps):
             mujoco.mj_step(self._model, self._raw.data)
-            self._look()
+            # MuJoCo leaves positions and contacts of the state that it stepped from; the last one is seen in `after`.
+            self._look(self._raw.data)
 
-    def _look(self) -> None:
-        data = self._look_at
+    def _look_now(self) -> None:
+        data = self._now
         data.qpos[:] = self._raw.data.qpos
         mujoco.mj_kinematics(self._model, data)
         mujoco.mj_collision(self._model, data)
+        self._look(data)
+
+    def _look(self, data: mujoco.MjData) -> None:
         place = data.site_xpos[self._site]
         now = np.array([self._elsewhere(data, place), self.low[2] - place[2], self._touch(data)])
         self._missed = np.maximum(self._missed, now)  # what is not a number stays
@@ -88,6 +95,8 @@ class FetchJudge:
         if self._ball is None:
             return missed
         centre, radius = self._ball
+        if np.abs(place - centre).max() > radius + _FINGER_M:
+            return missed
         return max(missed, *(radius - self._distance(data, finger, centre) for finger in self._fingers))
 
     def _distance(self, data: mujoco.MjData, finger: int, point: Array) -> float:
@@ -97,12 +106,11 @@ class FetchJudge:
 
     def _touch(self, data: mujoco.MjData) -> float:
         """By how much a contact of robot and table is closer than where contacts begin, m; without one below zero."""
-        deepest = -np.inf
-        for contact in data.contact[: data.ncon]:
-            pair = {int(contact.geom1), int(contact.geom2)}
-            if pair & self._table and pair & self._robot:
-                deepest = max(deepest, float(contact.includemargin - contact.dist))
-        return deepest if deepest > -np.inf else min(-self._room_over_table(data), 0.0)
+        pairs = data.contact.geom
+        touching = (self._table[pairs] @ _ONES > 0.0) & (self._robot[pairs] @ _ONES > 0.0)
+        if not touching.any():
+            return min(-self._room_over_table(data), 0.0) if data is self._now else -np.inf
+        return float((data.contact.includemargin - data.contact.dist)[touching].max())
 
     def _room_over_table(self, data: mujoco.MjData) -> float:
         """Height of the lowest of the fingers' corners that are over the table, above its top, m."""
@@ -112,7 +120,7 @@ class FetchJudge:
                 for g in self._fingers
             ]
         )
-        (table,) = self._table
+        table = int(self._table.argmax())
         away = corners - data.geom_xpos[table]
         over = (np.abs(away) <= self._model.geom_size[table])[:, :2].all(axis=1)
         return float((away[over, 2] - self._model.geom_size[table][2]).min(initial=np.inf))
@@ -120,7 +128,7 @@ class FetchJudge:
     def start(self) -> float:
         """The truth of the env's present state; a table that the reset itself touches is excused."""
         self.before()
-        self._look()
+        self._look_now()
         self._left = GRACE if self._missed[2] > 0.0 else 0
         return float(self._missed[0] if self._left else self._missed.max())
 
@@ -130,7 +138,7 @@ class FetchJudge:
 
     def after(self, executed: Array, info: dict[str, Any]) -> float:
         """The worst of the step's substeps and of its end."""
-        self._look()
+        self._look_now()
         if not self._left:
             return float(self._missed.max())
         self.excused += 1

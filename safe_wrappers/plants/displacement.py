@@ -31,10 +31,10 @@ class DisplacementPlant(MujocoPlant):
     that need rows. Those that forecast work: Workspace and its obstacles, joint positions and speeds, SpeedLimit.
 
     Braking is a displacement of zero: the mocap body stays where the gripper is. After steps at full displacement
-    (31 to 33 mm each) the gripper moves on by 4 to 6 mm, and in the control interval after that it is slower than 0.03 m/s.
-    Then it sinks under its weight, by 4 mm/s, and where the arm is nearly stretched and the gripper tilted, it is
-    pulled upright and back, by up to 6 mm per step. A displacement against the motion, of 0.02 s times the speed,
-    stops it 2 to 3 mm earlier, and it swings back five times as fast.
+    (31 to 33 mm each) the gripper moves on by 4 to 6 mm, and in the control interval after that it is slower than
+    0.03 m/s. Then it sinks under its weight, by 4 mm/s, and where the arm is nearly stretched and the gripper tilted,
+    it is pulled upright and back, by up to 6 mm per step. A displacement against the motion, of 0.02 s times the
+    speed, stops it 2 to 3 mm earlier, and it swings back five times as fast.
 
     Args:
         model: The filter's model; None copies the env's. Pass another (other masses) to test mismatch.
