@@ -12,6 +12,8 @@ from benchmarks import mujoco_drivers as drivers
 from benchmarks.car_drivers import DRIVERS as CAR_GOAL
 from benchmarks.crossing_drivers import DRIVERS as CROSSING
 from benchmarks.drivers import DRIVERS as POINT_GOAL
+from benchmarks.fetch_drivers import drivers as fetch_drivers
+from benchmarks.fetch_judge import FetchJudge
 from benchmarks.judges import Judge, Replay, Reported, Worst
 from benchmarks.mujoco_drivers import Maker
 from safe_wrappers.envs.teleop_contact import CLAMP_Y, TOOL_RADIUS
@@ -48,7 +50,7 @@ class Case:
 
     def make(self) -> gym.Env[Any, Any]:
         """The env without the filter."""
-        if "Maze" in self.env_id:
+        if "Maze" in self.env_id or self.env_id.startswith("Fetch"):
             import gymnasium_robotics
 
             gym.register_envs(gymnasium_robotics)
@@ -175,6 +177,10 @@ def _patrolled_maze() -> Case:
     )
 
 
+def _fetch(task: str) -> Case:
+    return Case(f"Fetch{task}-v4", judge=FetchJudge, drivers=fetch_drivers(ball=False))
+
+
 def _ant_maze(maze: str) -> Case:
     return Case(
         f"AntMaze_{maze}-v5",
@@ -236,6 +242,7 @@ PROTECTED: dict[str, Case] = _by_name(
     _point_maze("UMaze"),
     _patrolled_maze(),
     _ant_maze("UMaze"),
+    *(_fetch(task) for task in ("Reach", "Push", "Slide", "PickAndPlace")),
 )
 """Every env that `protect` knows, by the name of its row."""
 

@@ -39,7 +39,7 @@ def protect(env: gym.Env[Any, Any], **options: Any) -> CBFActionFilter:
     if not isinstance(env, gym.Env):
         raise UnsupportedEnvError(f"expected an env, got {env!r}; write protect(gym.make({str(env)!r}))")
     env_id = env.spec.id if env.spec is not None else ""
-    family = env_id.rpartition("/")[2].rpartition("-v")[0]
+    family = env_id.rpartition("/")[2].rpartition("-v")[0].removesuffix("Dense")
     robot = family.removeprefix("Safe").removesuffix("Velocity") if family.endswith("Velocity") else family
     recipe = RECIPES.get(robot, RECIPES.get(robot.partition("_")[0]))
     if recipe is None:

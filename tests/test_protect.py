@@ -37,9 +37,8 @@ KNOWN = {
     "PatrolledPointMaze-v0": [sw.WallClearance, sw.EscapeClearance],
     "AntMaze_UMaze-v5": [sw.Workspace],
     **{
-        f"Fetch{task}{reward}-v4": [sw.Workspace, sw.Workspace]
-        for task in ("Reach", "Push", "Slide", "PickAndPlace")
-        for reward in ("", "Dense")
+        f"Fetch{task}-v4": [sw.Workspace, sw.Workspace]
+        for task in ("Reach", "Push", "Slide", "PickAndPlaceDense")
     },
     **{f"{robot}-{version}": [sw.SpeedLimit] for robot in RUNNERS for version in ("v4", "v5")},
     **{f"Safe{robot}Velocity-v0": [sw.SpeedLimit] for robot in RUNNERS},
@@ -132,6 +131,24 @@ def test_the_version_does_not_matter(version):
     assert isinstance(sw.protect(env).constraints[0], sw.JointSpeedLimit)
 
 
+def test_what_a_fetch_arm_keeps_can_be_chosen():
+    ball = sw.Sphere([1.4, 0.8, 0.6], 0.05)
+    box, clear = sw.protect(make("FetchReach-v4"), low=[1.2, None, 0.45], keep_out=[ball]).constraints
+    assert box.low == [1.2, None, 0.45] and len(box.high) == 3
+    assert len(clear.keep_out) == 2 and clear.keep_out[1] == ball
+    (alone,) = sw.protect(make("FetchReach-v4"), table=False).constraints
+    assert alone.sites == ["robot0:grip"] and not alone.keep_out
+    _, only = sw.protect(make("FetchReach-v4"), table=False, keep_out=[ball]).constraints
+    assert only.keep_out == [ball]
+
+
+def test_the_fingers_are_inside_the_radius_that_the_recipe_gives_them():
+    for env_id in ("FetchReach-v4", "FetchPickAndPlace-v4"):
+        env = sw.protect(make(env_id))
+        half = [env.unwrapped.model.geom(name).size for name in env.constraints[1].geoms]
+        assert all(0.0 <= env.constraints[1].radius - np.linalg.norm(size) < 1e-4 for size in half)
+
+
 def test_a_namespace_does_not_matter():
     gym.register("lab/Reacher-v7", entry_point="gymnasium.envs.mujoco.reacher_v5:ReacherEnv")
     try:
@@ -216,7 +233,7 @@ def test_an_unknown_env_is_refused_with_lines_that_work(lab):
         sw.protect(env)
     message = str(caught.value)
     listed = message.partition("there are recipes for ")[2].partition(". By hand")[0].split(", ")
-    families = {env_id.rpartition("-v")[0].partition("_")[0] for env_id in KNOWN}
+    families = {env_id.rpartition("-v")[0].partition("_")[0].removesuffix("Dense") for env_id in KNOWN}
     families = {
         f.removeprefix("Safe").removesuffix("Velocity") if f.endswith("Velocity") else f for f in families
     }
