@@ -46,6 +46,9 @@ def test_what_recedes_or_stands_has_the_highest_ceiling_there_is(env):
         place(env, (0.0, 0.0), velocity)
         looking.look()
         assert looking.ceiling_s == 2.0
+    place(env, (0.0, ROOM - 0.0005), (0.0, -0.1))  # inside its margin, on its way out
+    looking.look()
+    assert looking.ceiling_s == 2.0
     place(env, (0.0, 0.234), (0.0, 1.0))
     looking.look()
     assert -2.0 <= looking.ceiling_s < 0.0

@@ -204,6 +204,18 @@ class Machine:
         return effort
 
 
+def test_waves_in_a_queue_are_as_old_as_they_are():
+    # A queue puts every wave out in turn, so it is as late as the latest; a single command overtakes.
+    ages = {}
+    for rule in ("queue", "hold"):
+        env = channel(sw.Link(0.01, 0.05, 0.0, False), 0.0, coding="wave", impedance=B, wave_rule=rule)
+        place(env)
+        for _ in range(400):
+            info = env.step(np.zeros(2))[4]
+            ages.setdefault(rule, []).append(info["teleop/round_trip_s"])
+    assert np.mean(ages["queue"][200:]) > 0.03 and np.mean(ages["hold"][200:]) < 0.02
+
+
 def test_what_a_machine_took_unpaid_is_paid_by_the_next_waves():
     machine, tick = Machine(), 0.001
     coding = WaveCoding(machine, tick, 2.0, "queue")
