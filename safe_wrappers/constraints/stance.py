@@ -83,7 +83,7 @@ class Stance:
         if self.joint_tolerance is not None:
             self.joint_tolerance = non_negative("joint_tolerance", self.joint_tolerance, "rad or m")
         if self.zmp_inset is not None:
-            self.zmp_inset = non_negative("zmp_inset", self.zmp_inset, "m")
+            self.zmp_inset = positive("zmp_inset", self.zmp_inset, "m: forces that push do the rest")
         self.settle_s = positive("settle_s", self.settle_s, "s")
 
     def bind(self, plant: Plant) -> None:

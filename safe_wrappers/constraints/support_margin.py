@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import interventions as keys
-from safe_wrappers.constraints.constraint import Promise, non_negative
+from safe_wrappers.constraints.constraint import Promise, non_negative, positive
 from safe_wrappers.constraints.contact_limit import ContactLimit
-from safe_wrappers.control.support import common_plane, support_margin, support_polygon, zmp_of_forces
+from safe_wrappers.control.support import common_plane, support_margin, support_polygon
 from safe_wrappers.plants.contact_forecast import ContactForecast
 from safe_wrappers.plants.mujoco import MujocoPlant
 
@@ -29,7 +29,10 @@ class SupportMargin(ContactLimit):
     promised, nor that the next step has one; and crossing an edge predicts no particular fall. Hence best effort.
 
     Args:
-        inset: m.
+        inset: m, positive: forces that push keep the point inside the hull by themselves, and on its edge while the
+            robot tips. A foot that leaves the ground between two evaluations takes the polygon along, so an inset of
+            millimetres can be jumped; and how far a control is beyond the edge cannot be seen, so that the answer
+            may be the fallback, checked, where a closer one exists.
         margin: Kept free inside the inset, m.
 
     Source: appendix "Physical contact feasibility constraints", third condition and footnote 8.
@@ -41,22 +44,39 @@ class SupportMargin(ContactLimit):
     promise: Promise = field(default="best effort", init=False)
 
     def __post_init__(self) -> None:
-        self.inset = non_negative("inset", self.inset, "m")
+        self.inset = positive("inset", self.inset, "m: forces that push keep the point inside by themselves")
         self.margin = non_negative("margin", self.margin, "m")
+
+    def reset(self) -> None:
+        """Forget the episode."""
+        super().reset()
+        self._known_at: int | None = None
+        self._known: list[tuple[ContactForecast, list[float]]] = []
+
+    def _distances(self, found: ContactForecast) -> list[float]:
+        """Of a forecast, computed once: a refused control is asked about several times."""
+        for other, distances in self._known:
+            if other is found:
+                return distances
+        if self._known_at != self._plant.stamp:
+            self._known_at, self._known = self._plant.stamp, []
+        distances = edge_distances(found)
+        self._known.append((found, distances))
+        return distances
 
     def slacks(self, plant: MujocoPlant, control: Array) -> Array:
         """Distance to the edge minus inset and margin where it is least, shape (1,), m; 0 where there is none."""
         found = plant.contact_forecast(control)
         if not found.finite:
             return np.full(1, np.nan)
-        return np.full(1, min((d - self.inset - self.margin for d in edge_distances(found)), default=0.0))
+        return np.full(1, min((d - self.inset - self.margin for d in self._distances(found)), default=0.0))
 
     def report(self, proposed: Array, executed: Array) -> dict[str, Any]:
         """The info keys `whole_body/zmp_margin` and `whole_body/supported`: forecast for the executed control."""
         least, share = 0.0, 0.0
         if self._has_decided:
             found = self._plant.contact_forecast(executed)
-            distances = edge_distances(found) if found.finite else []
+            distances = self._distances(found) if found.finite else []
             least = min(distances, default=0.0)
             share = len(distances) / found.steps
         return {keys.WHOLE_BODY_ZMP_MARGIN: least, keys.WHOLE_BODY_SUPPORTED: share}
@@ -73,8 +93,14 @@ def edge_distances(contacts: ContactForecast) -> list[float]:
         ground = common_plane(points, contacts.normal[here])
         if ground is None:
             continue
-        polygon = support_polygon(ground.flat(points))
-        zmp = zmp_of_forces(points, forces, ground)
-        if len(polygon) > 2 and np.isfinite(zmp).all():  # contacts may touch, and nothing press
-            found.append(support_margin(ground.flat(zmp), polygon))
+        # In coordinates of the plane, the last along its normal: the library's functions check what is checked here.
+        frame = np.vstack([ground.axes, ground.normal])
+        at, push = (points - ground.origin) @ frame.T, forces @ frame.T
+        pressure = float(push[:, 2].sum())
+        if not pressure > 0.0:
+            continue  # contacts may touch, and nothing press
+        zmp = (push[:, 2] @ at[:, :2] - at[:, 2] @ push[:, :2]) / pressure
+        polygon = support_polygon(at[:, :2])
+        if len(polygon) > 2:
+            found.append(support_margin(zmp, polygon))
     return found

@@ -54,8 +54,8 @@ class WholeBodyFilter(CBFActionFilter):
         friction_share: Of the model's friction coefficient that may be counted on, in (0, 1].
         joint_tolerance: How far a joint may press its stop, rad or m: stops in MuJoCo are soft, and policies lean on
             them. None leaves the joints alone.
-        zmp_inset: Distance of the zero moment point from the edge of the support polygon, m, wherever there is a
-            polygon. None does not ask.
+        zmp_inset: Distance of the zero moment point from the edge of the support polygon, m, positive, wherever
+            there is a polygon. None does not ask.
         tolerance: By how much a forecast contact force may miss its cone, as a share of the robot's weight; None is
             0.01. For forecasts only.
         bodies: Names of the bodies whose contacts count; None is every moving body. For forecasts only.
