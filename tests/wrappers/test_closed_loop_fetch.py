@@ -17,7 +17,10 @@ ARM = [
     f"robot0:{name}_joint"
     for name in ("shoulder_pan", "shoulder_lift", "upperarm_roll", "elbow_flex", "wrist_flex")
 ]
-pytestmark = pytest.mark.filterwarnings("ignore::safe_wrappers.errors.UnsafeStateWarning")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::safe_wrappers.errors.UnsafeStateWarning"),
+    pytest.mark.filterwarnings("error:.*declared reach"),
+]
 
 
 def fetch(env_id, steps=50):
