@@ -70,6 +70,8 @@ ROWS: list[tuple[str, str, Wrap]] = [
         lambda env: Outages(protected_lease(env), mean_between_s=1.0, mean_length_s=0.2),
     ),
     ("Reacher-v5", "RecordInterventions", sw.RecordInterventions),
+    ("HalfCheetah-v5", "BalanceMonitor", sw.BalanceMonitor),
+    ("Ant-v5", "BalanceMonitor", sw.BalanceMonitor),
 ]
 
 

@@ -28,18 +28,21 @@ class BalanceMonitor(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructo
 
     Like `ContactMonitor` it makes each control step once more on data of its own, and looks at the contacts of the
     robot with what does not move at every evaluation of the physics, all four of a Runge-Kutta step. The env's data
-    is only read, so the physics stays the same bit for bit.
+    is only read, so the physics stays the same bit for bit. The price: a step of HalfCheetah-v5 takes 0.29 ms instead
+    of 0.03, of an Ant-v5 on its feet 1.2 ms instead of 0.17.
 
     **The zero moment point** is where the ground's forces have no tangential moment. There is one only while three or
     more contact points, not on a line, are in one plane (within 1 cm and 0.05 rad) and something presses on it.
     Contacts at several heights, or on a slope and beside it, need the general question whether the wrench is
     feasible; they get no number here, and count as not supported. Since ground only pushes, the point is never beyond
     the hull of the contact points but by what these miss the plane; on its edge the robot begins to tip about it,
-    which predicts no particular fall.
+    which predicts no particular fall. Close to tipping the far contacts come and go between substeps, and with them
+    the polygon: a crate that was pushed with 97 % of what tips it had one at 3 to 6 of 10 evaluations. So look at
+    `balance/supported` as well.
 
     **Friction used** is measured against the round cone. MuJoCo's default cones are pyramids inside it: there a foot
-    slides from 0.71 on, depending on the direction. And an ideal figure is not a real foothold: the model's friction
-    is a number that somebody chose.
+    slides from 0.71 on, depending on the direction. And the model's friction is a number that somebody chose, not a
+    measured foothold.
 
     **Momentum** changes by forces from outside alone: gravity, the ground, things that the robot pushes, and a joint
     that ties it to the world. A planar robot (HalfCheetah, Hopper, Walker2d) is tied so, and stands on a line, which
@@ -67,8 +70,8 @@ class BalanceMonitor(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructo
     - ``balance/partial`` (bool): the step could not be replayed, and the others are of the contacts that it has left
       behind; or it held numbers that are not finite, which are reported as 0.
 
-    Forces are those of contact points; moments about them (condim 4 and 6: torsional and rolling friction) are left
-    out.
+    Forces are those of contact points. Moments about them (condim 4 and 6: torsional and rolling friction) are left
+    out, and so is what an env pushes with by itself: SafeRover's tyres.
 
     Raises:
         UnsupportedEnvError: No MuJoCo model, or nothing of the robot can touch the fixed world with friction.
@@ -137,7 +140,9 @@ class BalanceMonitor(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructo
         momentum = self._robot.momentum.read(raw.data)
         info[keys.BALANCE_LINEAR_MOMENTUM] = np.zeros(3) if momentum is None else momentum.linear
         info[keys.BALANCE_ANGULAR_MOMENTUM] = np.zeros(3) if momentum is None else momentum.angular
-        info[keys.BALANCE_PARTIAL] = not whole or found is None or momentum is None
+        info[
+            keys.BALANCE_PARTIAL
+        ] = not whole  # what is no number is never replayed: it does not equal itself
         return observation, reward, terminated, truncated, info
 
     def _figures(self, found: ContactForecast) -> dict[str, float]:
