@@ -156,7 +156,7 @@ def test_a_table_that_is_pushed_over_stays_up_and_keeps_its_inset():
     assert abs(env.unwrapped.data.qpos[2]) < 0.2
     bare = table()
     bare.reset()
-    for push in [1.0] * 25:
+    for push in [1.0] * 60:
         bare.step(np.array([push]))
     assert abs(bare.data.qpos[2]) > 0.5  # without it the table falls
 

@@ -1,0 +1,368 @@
+"""Stance on a table with driven legs, against the whole program put together from MuJoCo by hand, and on robots."""
+
+import json
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from judged_loops import Scene, flagged
+from qpsolvers import solve_qp
+from scipy.sparse import csc_matrix
+
+import safe_wrappers as sw
+from safe_wrappers.constraints.plain_data import constraint_data, constraint_from
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+
+LEGS = [(x, y) for x in (-0.3, 0.3) for y in (-0.2, 0.2)]
+FRICTION = 0.8
+
+
+def table(gravity="0 0 -9.81", friction=FRICTION, cone="pyramidal", more="", range_=""):
+    """Four legs that swing along x, each with a motor of 30 N m and a spring that holds it upright."""
+    legs = "".join(
+        f'<body pos="{x} {y} 0"><joint name="j{i}" axis="0 1 0" stiffness="300" damping="6" {range_}/>'
+        f'<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass=".4" contype="0" conaffinity="0"/>'
+        f'<geom pos="0 0 -.3" size=".03" mass=".2"/></body>'
+        for i, (x, y) in enumerate(LEGS)
+    )
+    motors = "".join(f'<motor joint="j{i}" gear="30" ctrllimited="true" ctrlrange="-1 1"/>' for i in range(4))
+    return Scene(
+        f"""<mujoco><compiler angle="radian"/><option timestep="0.002" gravity="{gravity}" cone="{cone}"/>
+        <default><geom friction="{friction} 0 0"/></default>
+        <worldbody><geom name="floor" type="plane" size="9 9 1"/>
+        <body name="trunk" pos="0 0 .33"><freejoint/>
+        <geom type="box" size=".35 .25 .05" mass="6"/>{legs}{more}</body></worldbody>
+        <actuator>{motors}</actuator></mujoco>"""
+    )
+
+
+STILL = np.zeros(4)
+
+
+def settled(env, stance, control=STILL, steps=100):
+    plant = sw.MujocoPlant()
+    plant.bind(env)
+    stance.bind(plant)
+    env.reset()
+    for _ in range(steps):
+        env.step(control)
+    plant.observe()
+    return plant
+
+
+def whole_program(env, nominal, share, edges, settle_s, outer=False):
+    """The closest controls, by an interior-point solver on controls and forces, nothing eliminated; None: none."""
+    m, d = env.model, mujoco.MjData(env.model)
+    d.qpos[:], d.qvel[:], d.ctrl[:] = env.data.qpos, env.data.qvel, nominal
+    mujoco.mj_forward(m, d)
+    inertia = np.zeros((m.nv, m.nv))
+    mujoco.mj_fullM(m, d, inertia)
+    bias = d.qfrc_bias - d.qfrc_passive
+    moments = np.zeros((m.nu, m.nv))
+    mujoco.mju_sparse2dense(moments, d.actuator_moment, d.moment_rownnz, d.moment_rowadr, d.moment_colind)
+    drive = (moments * m.actuator_gainprm[:, :1]).T
+    jacobians, sides, drifts = [], [], []
+    for contact in d.contact:
+        jac, dot = np.zeros((2, 3, m.nv))
+        frame, body = contact.frame.reshape(3, 3), m.geom_bodyid[contact.geom[1]]
+        assert contact.geom[0] == 0 and frame[0] @ [0, 0, 1] == pytest.approx(1.0)
+        mujoco.mj_jac(m, d, jac, None, contact.pos, body)
+        mujoco.mj_jacDot(m, d, dot, None, contact.pos, body)
+        jacobians.append(jac)
+        drifts.append(dot @ d.qvel)
+        around = 2.0 * np.pi * (np.arange(edges) + 0.5) / edges
+        slope = share * FRICTION * (1.0 if outer else np.cos(np.pi / edges))
+        # Sides between edges that lie on the cone, the first along the frame's first tangent; or around the cone.
+        sides.append(
+            np.outer(np.cos(around), frame[1]) + np.outer(np.sin(around), frame[2]) - slope * frame[0]
+        )
+    held = np.concatenate(jacobians)
+    aim = -held @ d.qvel / settle_s - np.concatenate(drifts)
+    aim = (
+        held @ np.linalg.lstsq(held, aim, rcond=1e-5)[0]
+    )  # feet that belong together cannot all come to rest alone
+    k, nu = len(held), m.nu
+    response = np.linalg.solve(inertia, np.column_stack([drive, held.T, -bias]))
+    left, size, right = np.linalg.svd(held @ response[:, :-1], full_matrices=False)
+    rank = int((size > 1e-9 * size[0]).sum())
+    equal = (right[:rank] * size[:rank, None], left[:, :rank].T @ (aim - held @ response[:, -1]))
+    rows = np.zeros((len(sides) * edges, nu + k))
+    for i, side in enumerate(sides):
+        rows[i * edges : (i + 1) * edges, nu + 3 * i : nu + 3 * i + 3] = side
+    cost = csc_matrix(np.diag(np.concatenate([np.ones(nu), np.full(k, 1e-8)])))
+    low, high = np.concatenate([m.actuator_ctrlrange, np.tile([[-np.inf, np.inf]], (k, 1))]).T
+    linear = np.concatenate([-np.asarray(nominal), np.zeros(k)])
+    equal, aims = csc_matrix(equal[0]), equal[1]
+    zeros, rows = np.zeros(len(rows)), csc_matrix(rows)
+    found = solve_qp(cost, linear, rows, zeros, equal, aims, low, high, solver="clarabel", tol_gap_abs=1e-12)
+    return None if found is None else found[:nu]
+
+
+STANCE = {"joint_tolerance": None}
+PUSHES = [(1.0, 1.0, -1.0, -1.0), (0.9, -0.7, 0.8, 0.2), (1.0, 1.0, 1.0, 1.0), (-1.0, 0.4, 0.1, 0.9)]
+
+
+@pytest.mark.parametrize("share", [0.7, 0.3])
+@pytest.mark.parametrize("cone", ["pyramid", "exact"])
+def test_its_answer_is_that_of_the_whole_program(share, cone):
+    changed = 0
+    stance = sw.Stance(share, cone, **STANCE)
+    env = table()
+    plant = settled(env, stance)
+    for push in map(np.array, PUSHES):
+        plant.observe()
+        admitted = stance.admits(plant, push)
+        (answer,) = stance.suggestions(plant, push)
+        if cone == "pyramid":
+            expected = whole_program(env, push, share, 8, 0.05)
+            np.testing.assert_allclose(answer, expected, atol=2e-5)
+            assert admitted == bool(np.abs(expected - push).max() < 2e-5)
+        else:  # between a pyramid inside and one around it
+            inner, outer = (whole_program(env, push, share, 64, 0.05, outer=o) for o in (False, True))
+            far = [np.linalg.norm(u - push) for u in (outer, answer, inner)]
+            assert far[0] - 1e-5 <= far[1] <= far[2] + 1e-5
+            np.testing.assert_allclose(answer, inner, atol=5e-3)
+        if not admitted:
+            changed += 1
+            assert stance.admits(plant, answer)
+    assert changed >= 2
+
+
+def test_at_rest_the_admitted_torques_are_those_with_the_solvers_forces_in_the_cone():
+    # Legs that push outwards against each other: MuJoCo's own forces, after they have settled, are the program's.
+    env, stance = table(), sw.Stance(0.7, "exact", **STANCE)
+    for push in (0.0, 0.2, 0.5, 0.9):
+        control = push * np.array([1.0, 1.0, -1.0, -1.0])
+        plant = settled(env, stance, control)
+        inside = []
+        for i in range(env.data.ncon):
+            wrench = np.zeros(6)
+            mujoco.mj_contactForce(env.model, env.data, i, wrench)
+            inside.append(0.7 * FRICTION * wrench[0] - np.hypot(*wrench[1:3]))
+        clear = min(inside) / plant.weight_n
+        if abs(clear) > 0.01:
+            assert stance.admits(plant, control) == (clear > 0.0)
+            assert -stance.shortfall(plant, control) == pytest.approx(clear, abs=0.01)
+        report = stance.report(control, control)
+        assert report["whole_body/contacts"] == 4
+        assert report["whole_body/cone_margin"] == pytest.approx(clear, abs=0.01)
+
+
+def test_what_the_pyramid_admits_the_cone_admits():
+    env = table()
+    rng = np.random.default_rng(0)
+    pushes = rng.uniform(-0.15, 0.15, (40, 4))
+    admitted = {}
+    for name, options in {"4": {"edges": 4}, "8": {"edges": 8}, "exact": {"cone": "exact"}}.items():
+        stance = sw.Stance(0.4, **options, **STANCE)
+        plant = settled(env, stance)
+        admitted[name] = []
+        for push in pushes:
+            plant.observe()
+            admitted[name].append(stance.admits(plant, push))
+    four, eight, exact = (np.array(admitted[name]) for name in ("4", "8", "exact"))
+    assert (exact | ~eight).all() and (exact | ~four).all()
+    assert 0 < four.sum() <= exact.sum() < 40
+
+
+def test_contacts_that_the_torques_lift_open():
+    # Two legs on one side pull up with all they have, and stand beside a floor that falls away: no force, no demand.
+    env, stance = table(gravity="0 0 -1"), sw.Stance(0.7, **STANCE)
+    env.start = np.r_[0, 0, 0.33, 1, 0, 0, 0, 0, 0, 0, 0], np.r_[0, 0, 0.4, np.zeros(7)]
+    plant = settled(env, stance, steps=0)
+    env.reset()
+    env.data.qvel[2] = 0.4  # the whole robot on its way up
+    plant.observe()
+    assert stance.admits(plant, np.full(4, 0.3))
+    problem = stance._problem
+    assert problem.breaking.all() or not len(problem.normals)
+    assert stance.shortfall(plant, np.full(4, 0.3)) <= 0.0
+
+
+@pytest.mark.parametrize("cone", ["pyramid", "exact"])
+@pytest.mark.parametrize("hopeless", ["slope", "inset"])
+def test_where_no_torques_will_do_it_says_so_and_stays_finite(cone, hopeless):
+    env = table(gravity="0 4 -9", friction=0.05) if hopeless == "slope" else table()
+    more = {"zmp_inset": 0.5} if hopeless == "inset" else {}
+    filtered = sw.CBFActionFilter(env, [sw.Stance(0.7, cone, **STANCE, **more)])
+    filtered.reset()
+    standing = 0
+    for _ in range(25):
+        info = filtered.step(STILL)[4]
+        assert np.isfinite(info["executed_action"]).all() and np.isfinite(info["whole_body/cone_margin"])
+        if info["whole_body/contacts"] == 4:
+            standing += 1
+            assert info["cbf/infeasible"] and info["cbf/fallback"]
+            if hopeless == "slope":
+                assert info["whole_body/cone_margin"] < 0.0
+    assert standing > 5
+
+
+def test_an_inset_of_the_zero_moment_point_is_kept_by_the_forces():
+    # On a slope of 15 degrees the point is 0.3 tan(15 deg) off the middle, of 0.3 m to the edge.
+    tilt = np.radians(15.0)
+    env = table(gravity=f"{9.81 * np.sin(tilt)} 0 {-9.81 * np.cos(tilt)}", friction=2.0)
+    verdicts = []
+    for inset in (0.3 - 0.34 * np.tan(tilt) - 0.1, 0.3 - 0.2 * np.tan(tilt)):
+        stance = sw.Stance(1.0, zmp_inset=inset, **STANCE)
+        plant = settled(env, stance, steps=60)
+        verdicts.append(stance.admits(plant, STILL))
+        assert stance._problem.force_rows is not None
+    assert verdicts == [True, False]
+
+
+def test_joints_are_predicted_to_stay_in_range():
+    env = table(range_='limited="true" range="-.1 .1"')
+    inside, alone = sw.Stance(1.0, joint_tolerance=0.0), sw.Stance(1.0, **STANCE)
+    env.start = np.r_[0, 0, 3, 1, 0, 0, 0, np.zeros(4)], np.zeros(10)
+    for speed, fits in ((0.5, True), (30.0, False)):
+        answers = []
+        for stance in (inside, alone):
+            plant = settled(env, stance, steps=0)
+            env.data.qvel[6:] = speed  # in the air; 0.01 s to go
+            plant.observe()
+            answers.append(stance.admits(plant, np.zeros(4)))
+        assert answers == [fits, True]
+
+
+def test_other_contacts_count_as_the_forces_that_they_are():
+    # A load on the trunk presses on the feet, whatever the torques.
+    load = '</body><body pos="0 0 .43"><freejoint/><geom type="box" size=".2 .2 .05" mass="6" contype="1"/>'
+    heavy, light = table(more=load), table()
+    pressures = []
+    for env in (light, heavy):
+        stance = sw.Stance(0.5, "exact", **STANCE)
+        plant = settled(env, stance, STILL, 200)
+        assert stance.admits(plant, STILL)
+        pressures.append(stance._solve(stance._problem).forces[:, 2].sum())
+        assert pressures[-1] == pytest.approx(plant.weight_n, rel=0.02)
+        assert stance.report(STILL, STILL)["whole_body/contacts"] == 4
+    assert pressures[1] > 1.6 * pressures[0]
+
+
+def test_asked_second_it_still_answers_the_proposal():
+    env = table()
+    alone = sw.CBFActionFilter(env, [sw.Stance(0.3, **STANCE)])
+    both = sw.CBFActionFilter(table(), [sw.JointSpeedLimit(1e3, holds=1), sw.Stance(0.3, **STANCE)])
+    executed = []
+    for filtered in (alone, both):
+        filtered.reset()
+        rng = np.random.default_rng(0)
+        executed.append([filtered.step(rng.uniform(-1, 1, 4))[4]["executed_action"] for _ in range(30)])
+    np.testing.assert_array_equal(*executed)
+    assert any((u != 0).any() for u in executed[0])
+
+
+class Refusing:
+    """Refuses whatever is not zero in the first control, before `Stance` is asked."""
+
+    promise = "best effort"
+
+    def rows(self, plant):
+        return sw.Stance().rows(plant)
+
+    def admits(self, plant, control):
+        return bool(abs(control[0]) < 0.9)
+
+
+def test_behind_a_constraint_that_refuses_first_it_offers_the_programs_answer():
+    env = table()
+    env.reset()
+    filtered = sw.CBFActionFilter(env, [Refusing(), sw.Stance(0.3, **STANCE)])
+    filtered.reset()
+    for _ in range(60):
+        filtered.step(np.zeros(4))
+    expected = whole_program(env, np.array([1.0, 1.0, -1.0, -1.0]), 0.3, 8, 0.05)
+    info = filtered.step(np.array([1.0, 1.0, -1.0, -1.0]))[4]
+    np.testing.assert_allclose(info["executed_action"], expected, atol=1e-4)
+    assert not flagged(info) and info["cbf/refused"].all()
+
+
+@pytest.mark.parametrize("env_id", ["Humanoid-v5", "Ant-v5", "HalfCheetah-v5"])
+@pytest.mark.parametrize("cone", ["pyramid", "exact"])
+def test_robots_unflagged_steps_have_forces_at_the_first_instant(env_id, cone):
+    env = sw.CBFActionFilter(gym.make(env_id), [sw.Stance(0.7, cone, joint_tolerance=0.1)])
+    rng = np.random.default_rng(0)
+    env.reset(seed=0)
+    stance, counts = env.constraints[0], {"flagged": 0, "changed": 0, "same": 0}
+    for _ in range(40):
+        action = rng.uniform(env.action_space.low, env.action_space.high).astype(np.float32)
+        info = env.step(action)[4]
+        counts["flagged"] += flagged(info)
+        counts["changed"] += info["cbf/intervened"]
+        if not flagged(info):
+            # The same program with the executed action as the nominal one: nothing is left to change.
+            problem = stance._problem
+            asked = np.clip(info["executed_action"], problem.lower, problem.upper)
+            answer = stance._solve(type(problem)(**{**fields_of(problem), "nominal": asked}))
+            assert answer.residuals.cone < 1e-4 and answer.residuals.contact < 1e-3
+            # Rounded to float32 it may have to move again, and then the price of forces moves it too.
+            assert np.abs(answer.control - asked).max() < 2e-3
+            counts["same"] += 1
+    assert counts["same"] > 10 and (counts["changed"] > 0 or env_id == "Humanoid-v5")
+
+
+def fields_of(problem):
+    return {
+        name: getattr(problem, name)
+        for name, field in type(problem).__dataclass_fields__.items()
+        if field.init
+    }
+
+
+class Witness(gym.Wrapper):
+    def step(self, action):
+        self.action = action
+        return super().step(action)
+
+
+def test_inactive_is_bit_for_bit_at_bounds_that_float32_rounds_outwards():
+    # 0.4 as float32 is more than the model's 0.4.
+    witness = Witness(gym.make("Humanoid-v5"))
+    env = sw.CBFActionFilter(witness, [sw.Stance(1.0, joint_tolerance=9.0)])
+    assert float(env.action_space.high[0]) > env.plant.upper[0]
+    env.reset(seed=0)
+    silent = 0
+    for k in range(8):
+        action = env.action_space.high if k % 2 else env.action_space.low
+        info = env.step(action)[4]
+        if not info["cbf/intervened"]:
+            silent += 1
+            assert witness.action.tobytes() == action.tobytes() and witness.action.dtype == np.float32
+    assert silent > 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"friction_share": 0.0}, "friction_share"),
+        ({"friction_share": 1.1}, r"\(0, 1\]"),
+        ({"friction_share": np.nan}, "friction_share"),
+        ({"cone": "round"}, "pyramid"),
+        ({"edges": 2}, "edges"),
+        ({"edges": 4.0}, "edges"),
+        ({"edges": True}, "edges"),
+        ({"joint_tolerance": -0.1}, "joint_tolerance"),
+        ({"zmp_inset": 0.0}, "zmp_inset"),
+        ({"settle_s": 0.0}, "settle_s"),
+    ],
+)
+def test_bad_arguments_are_refused_in_words(arguments, words):
+    with pytest.raises(ConfigurationError, match=words):
+        sw.Stance(**arguments)
+
+
+def test_plants_that_it_cannot_read_are_refused():
+    plant = sw.AnalyticPlant(f=lambda x: x, g=lambda x: np.ones((1, 1)), state=lambda e: e.state, hold_s=0.1)
+    with pytest.raises(UnsupportedEnvError, match="MujocoPlant"):
+        sw.Stance().bind(plant)
+    reacher = sw.MujocoPlant()
+    reacher.bind(gym.make("Reacher-v5"))
+    with pytest.raises(UnsupportedEnvError, match="nothing to stand on"):
+        sw.Stance().bind(reacher)
+
+
+def test_it_is_plain_data():
+    stance = sw.Stance(0.6, "exact", 6, None, 0.02, 0.1)
+    assert constraint_from(json.loads(json.dumps(constraint_data(stance)))) == stance
