@@ -158,7 +158,7 @@ class BalanceMonitor(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructo
             keys.BALANCE_FRICTION_USED: float(used.max(initial=0.0)),
             keys.BALANCE_ZMP_MARGIN: float(distances.min()) - self.inset if distances.size else 0.0,
             keys.BALANCE_SUPPORTED: distances.size / found.steps,
-            keys.BALANCE_AIRBORNE: 1.0 - np.unique(found.step).size / found.steps,
+            keys.BALANCE_AIRBORNE: (found.steps - np.unique(found.step).size) / found.steps,
         }
 
 
