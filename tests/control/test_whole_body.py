@@ -144,6 +144,9 @@ def test_elimination_changes_nothing(seed, k, softness, extra):
     # Five contacts of three axes on eight degrees of freedom: seven inner forces.
     problem = robot(seed, k=k, contact_softness=softness)
     rng = np.random.default_rng(seed + 1)
+    if softness > 0.0:  # what contradicts itself has its price, too
+        elsewhere = problem.contact_acceleration + 0.3 * rng.normal(size=(k, 3))
+        problem = dataclasses.replace(problem, contact_acceleration=elsewhere)
     more = {
         "nothing": {},
         "task": {"tasks": [Task(rng.normal(size=(2, 8)), rng.normal(size=2), rng.normal(size=2), 0.3)]},
@@ -532,6 +535,30 @@ def test_a_backend_is_not_believed(monkeypatch, lie):
     assert found.status == "failed"
     assert np.isfinite(found.control).all() and (np.abs(found.control) <= 100.0).all()
     assert np.isfinite(found.forces).all() and np.isfinite(found.acceleration).all()
+
+
+def test_nor_is_the_elimination(monkeypatch):
+    true = whole_body.eliminate
+
+    def wrong(motion):
+        rigid, loose = true(motion)
+        return rigid._replace(offset=rigid.offset + np.array([0.5, 0.0, 0.0])), loose
+
+    problem = foot([3.0, 1.0, -2.0])
+    assert solve_pyramid(problem).status == "inactive"
+    monkeypatch.setattr(whole_body, "eliminate", wrong)
+    for solve in SOLVERS.values():
+        assert solve(problem).status == "failed"  # the contact would slide, and forces alone do not say so
+
+
+@pytest.mark.parametrize("beyond", [1e-9, 1e-3, 30.0])
+def test_a_nominal_that_is_not_in_the_box_is_not_left_alone(beyond):
+    problem = foot([2.0 + beyond, 0.0, 0.0], bound=2.0)
+    for solve in SOLVERS.values():
+        found = solve(problem)
+        assert found.status == "solved"
+        assert (found.control <= 2.0).all()
+        assert found.control == pytest.approx([2.0, 0.0, 0.0], abs=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -215,24 +215,56 @@ def test_drifts_are_what_jacobians_change_by(walker):
             bodies.angular_drifts, abs=tolerance
         )
         for row in range(len(contacts.points)):
-            velocities = []
-            for data in (plant.data, moved):
-                jac = np.zeros((3, model.nv))
-                for body, sign in ((contacts.pushed[row], 1.0), (contacts.pushed_by[row], -1.0)):
-                    # The same material point, wherever its body has gone.
-                    local = plant.data.xmat[body].reshape(3, 3).T @ (
-                        contacts.points[row] - plant.data.xpos[body]
-                    )
-                    point = data.xpos[body] + data.xmat[body].reshape(3, 3) @ local
-                    part = np.zeros((3, model.nv))
-                    mujoco.mj_jac(model, data, part, None, point, body)
-                    jac += sign * part
-                velocities.append(jac @ plant.qvel)
-            assert velocities[0] == pytest.approx(contacts.jacobians[row] @ plant.qvel, abs=1e-9)
-            drift = (velocities[1] - velocities[0]) / dt
-            assert drift == pytest.approx(contacts.drift[row], abs=tolerance)
+            before, later = (
+                relative_velocity(model, plant.data, d, contacts, row) for d in (plant.data, moved)
+            )
+            assert before == pytest.approx(contacts.jacobians[row] @ plant.qvel, abs=1e-9)
+            assert (later - before) / dt == pytest.approx(contacts.drift[row], abs=tolerance)
             compared += 1
     assert compared > 10
+
+
+def relative_velocity(model, start, data, contacts, row):
+    """Of the two material points that touch at the start, wherever their bodies are now."""
+    total = np.zeros(3)
+    for body, sign in ((contacts.pushed[row], 1.0), (contacts.pushed_by[row], -1.0)):
+        local = start.xmat[body].reshape(3, 3).T @ (contacts.points[row] - start.xpos[body])
+        point = data.xpos[body] + data.xmat[body].reshape(3, 3) @ local
+        jac = np.zeros((3, model.nv))
+        mujoco.mj_jac(model, data, jac, None, point, body)
+        total += sign * (jac @ start.qvel)
+    return total
+
+
+def test_a_drift_is_of_both_bodies_that_touch():
+    model, data = zoo(settle=0.0)
+    data.qpos[[2, 9, 10, 11]] = [1.0, 0.0, 0.0, 1.14]  # the ball on the box, both in the air
+    data.qvel[:] = np.random.default_rng(4).normal(size=model.nv) * 3.0
+    mujoco.mj_forward(model, data)
+    contacts = contact_points(model, data)
+    assert len(contacts.points) == 1 and contacts.pushed_by[0] > 0
+    moved = mujoco.MjData(model)
+    moved.qpos[:], dt = data.qpos, 1e-6
+    mujoco.mj_integratePos(model, moved.qpos, data.qvel, dt)
+    mujoco.mj_forward(model, moved)
+    before, later = (relative_velocity(model, data, d, contacts, 0) for d in (data, moved))
+    assert (later - before) / dt == pytest.approx(contacts.drift[0], abs=1e-3)
+    assert np.abs(contacts.drift).max() > 0.5
+
+
+def test_what_is_near_but_gives_no_force_is_no_contact():
+    near = 0
+    for margin in (0.0, 0.05):  # MuJoCo has changed from which distance on the gap counts
+        model = mujoco.MjModel.from_xml_string(
+            f"""<mujoco><worldbody><geom type="plane" size="1 1 1"/><body pos="0 0 0.11"><freejoint/>
+            <geom type="sphere" size="0.1" margin="{margin}" gap="0.05"/></body></worldbody></mujoco>"""
+        )
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        if data.nefc == 0 and data.ncon:
+            near += 1
+            assert contact_points(model, data).points.shape == (0, 3)
+    assert near
 
 
 def test_momentum_is_mujocos_subtree_momentum(walker):
