@@ -200,6 +200,24 @@ EXAMPLES = {
             },
         ),
     },
+    "WholeBodyFilter": {
+        "forecasts of some bodies": (
+            "Hopper-v5",
+            lambda: {
+                "friction_share": 0.6,
+                "joint_tolerance": 0.2,
+                "zmp_inset": 0.01,
+                "tolerance": 0.02,
+                "bodies": ["foot"],
+                "holds": 2,
+                "fallback": "zero",
+            },
+        ),
+        "the program with exact cones": (
+            "HalfCheetah-v5",
+            lambda: {"contacts": "cone", "friction_share": 0.5, "joint_tolerance": None, "zmp_inset": 0.01},
+        ),
+    },
 }
 """Wrapper name -> what it shows -> (env id, function of its arguments): plain data or what becomes it."""
 
@@ -209,7 +227,7 @@ INSIDE = {"AdaptionPenalty": lambda env: sw.CBFActionFilter(env, [_clearance()])
 CHUNKED = ("ChunkHandover",)
 """Wrappers whose action is a chunk, shape (chunk_size, controls), executed over several control steps."""
 
-FILTERS = ("CBFActionFilter", "SlipLimiter")
+FILTERS = ("CBFActionFilter", "SlipLimiter", "WholeBodyFilter")
 """Wrappers that let no action through that is not finite or outside the action space."""
 
 ONLY_LOOKING = ("BalanceMonitor", "ContactMonitor", "OcclusionPenalty", "RecordInterventions")
@@ -547,6 +565,9 @@ def harmless(name, case):
         return sw.LeaseExpiry(Witness(gym.make("Reacher-v5")), far, closing_speed=1.0)
     if name == "SlipLimiter":  # a ground that is said to carry any torque
         return sw.SlipLimiter(Witness(gym.make("SafeRover-v0")), list(WHEELS), friction=1e9)
+    if name == "WholeBodyFilter":
+        cheetah = Witness(gym.make("HalfCheetah-v5"))
+        return sw.WholeBodyFilter(cheetah, friction_share=1.0, tolerance=1e3, joint_tolerance=1e3)
     env_id, arguments = example(name, case)
     if name == "TeleopChannel":
         return sw.TeleopChannel(Witness(gym.make("Reacher-v5")), 0.0, 0.0)
