@@ -157,15 +157,10 @@ def _constraints(
     if zmp_inset is not None:
         found.append(SupportMargin(zmp_inset))
     if joint_tolerance is not None:
-        names = [model.joint(j).name for j in joints]
-        if not all(names):
-            raise UnsupportedEnvError(
-                "a driven joint of this model has a range but no name: joint_tolerance=None leaves the joints alone"
-            )
         within = JointPositionLimit(
             lower=(low - joint_tolerance).tolist(),
             upper=(high + joint_tolerance).tolist(),
-            joints=names,
+            joints=[model.joint(j).name for j in joints],
             holds=HOLDS if holds is None else holds,
         )
         found.append(within)

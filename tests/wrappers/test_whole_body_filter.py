@@ -1,0 +1,230 @@
+"""WholeBodyFilter: which constraints it is, what it refuses, and hostile states and actions."""
+
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+
+import safe_wrappers as sw
+from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.plants.replay import Replay
+
+KINDS = ("forecast", "pyramid", "cone")
+KEYS = {"whole_body/contacts", "whole_body/cone_margin"}
+
+
+def flagged(info):
+    return bool(info["cbf/infeasible"] or info["cbf/fallback"])
+
+
+def test_it_is_these_constraints():
+    env = sw.WholeBodyFilter(
+        gym.make("Hopper-v5"), friction_share=0.6, zmp_inset=0.02, tolerance=0.03, bodies=["foot"], holds=4
+    )
+    contact, support, joints = env.constraints
+    assert contact == sw.ContactFeasibility(0.6, 0.03, ["foot"])
+    assert support == sw.SupportMargin(0.02)
+    names = ["thigh_joint", "leg_joint", "foot_joint"]
+    stops = np.array([env.unwrapped.model.joint(name).range for name in names])
+    assert joints.joints == names and joints.holds == 4
+    np.testing.assert_allclose([joints.lower, joints.upper], stops.T + np.array([[-0.1], [0.1]]))
+    for kind, cone in (("pyramid", "pyramid"), ("cone", "exact")):
+        (stance,) = sw.WholeBodyFilter(gym.make("Hopper-v5"), kind, 0.6, 0.05, 0.02).constraints
+        assert stance == sw.Stance(0.6, cone, joint_tolerance=0.05, zmp_inset=0.02)
+    (alone,) = sw.WholeBodyFilter(gym.make("Hopper-v5"), joint_tolerance=None).constraints
+    assert alone == sw.ContactFeasibility(0.7, 0.01)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "words"),
+    [
+        ({"contacts": "x"}, UnknownNameError, '"forecast", "pyramid" or "cone"'),
+        ({"contacts": None}, UnknownNameError, '"forecast"'),
+        ({"friction_share": 0.0}, ConfigurationError, "friction_share"),
+        ({"friction_share": 1.1}, ConfigurationError, "friction_share"),
+        ({"friction_share": np.nan, "contacts": "cone"}, ConfigurationError, "friction_share"),
+        ({"friction_share": 1.1, "contacts": "pyramid"}, ConfigurationError, "friction_share"),
+        (
+            {"tolerance": 0.01, "contacts": "pyramid"},
+            ConfigurationError,
+            'tolerance is for contacts="forecast"',
+        ),
+        ({"bodies": ["foot"], "contacts": "cone"}, ConfigurationError, "bodies is for"),
+        ({"holds": 3, "contacts": "cone"}, ConfigurationError, "holds is for"),
+        ({"holds": 3, "joint_tolerance": None}, ConfigurationError, "holds is how far"),
+        ({"holds": 0}, ConfigurationError, "holds"),
+        ({"tolerance": -1.0}, ConfigurationError, "tolerance"),
+        ({"joint_tolerance": -0.1}, ConfigurationError, "joint_tolerance"),
+        ({"joint_tolerance": "wide", "contacts": "cone"}, ConfigurationError, "joint_tolerance"),
+        ({"zmp_inset": 0.0}, ConfigurationError, "inset"),
+        ({"zmp_inset": 0.0, "contacts": "cone"}, ConfigurationError, "inset"),
+        ({"bodies": ["hand"]}, UnknownNameError, "no body 'hand'"),
+        ({"bodies": "foot"}, ConfigurationError, "list of names"),
+        ({"fallback": "sleep"}, UnknownNameError, "sleep"),
+        ({"solver": "none"}, sw.SafeWrappersError, "none"),
+        ({"plant": sw.MujocoPlant}, ConfigurationError, "plant"),
+    ],
+)
+def test_bad_arguments_are_refused_in_words(arguments, error, words):
+    with pytest.raises(error, match=words):
+        sw.WholeBodyFilter(gym.make("Hopper-v5"), **arguments)
+
+
+@pytest.mark.parametrize("contacts", KINDS)
+def test_envs_that_have_no_contacts_to_keep_are_refused(contacts):
+    for env_id in ("Reacher-v5", "InvertedPendulum-v5", "Swimmer-v5"):
+        with pytest.raises(UnsupportedEnvError, match="no body of this model can touch"):
+            sw.WholeBodyFilter(gym.make(env_id), contacts)
+    with pytest.raises(UnsupportedEnvError, match=r"MuJoCo's \.model"):
+        sw.WholeBodyFilter(gym.make("Pendulum-v1"), contacts)
+    with pytest.raises(UnsupportedEnvError, match="joint_tolerance=None"):
+        sw.WholeBodyFilter(gym.make("SafePointGoal1-v0"), contacts)
+    with pytest.raises(ConfigurationError, match="filtered already"):
+        sw.WholeBodyFilter(sw.WholeBodyFilter(gym.make("Hopper-v5"), contacts), contacts)
+
+
+@pytest.mark.parametrize("contacts", KINDS)
+def test_a_recorded_filter_is_the_same_filter(contacts):
+    env = sw.WholeBodyFilter(gym.make("Walker2d-v5"), contacts, 0.5, 0.2, 0.01)
+    again = gym.make(EnvSpec.from_json(json.dumps(json.loads(env.spec.to_json()))))
+    executed = []
+    for each in (env, again):
+        rng = np.random.default_rng(0)
+        each.reset(seed=0)
+        actions = [
+            each.step(rng.uniform(-1, 1, 6).astype(np.float32))[4]["executed_action"] for _ in range(20)
+        ]
+        executed.append(np.array(actions))
+    assert executed[0].tobytes() == executed[1].tobytes()
+    assert again.constraints == env.constraints
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("contacts", KINDS)
+@pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Walker2d-v5"])
+def test_states_that_are_none_and_states_that_mujoco_resets_never_pass_in_silence(env_id, contacts):
+    env = sw.WholeBodyFilter(gym.make(env_id), contacts, zmp_inset=0.01)
+    for where, value in (
+        ("qpos", np.nan),
+        ("qvel", np.nan),
+        ("qvel", np.inf),
+        ("qvel", 1e11),
+        ("qvel", 1e160),
+        ("qvel", 1e300),
+        ("qpos", 1e12),
+    ):
+        _, first = env.reset(seed=0)
+        for _ in range(3):
+            env.step(np.zeros(6, np.float32))
+        getattr(env.unwrapped.data, where)[-1] = value
+        info = env.step(np.full(6, 0.3, np.float32))[4]
+        assert flagged(info), (where, value)
+        assert np.isfinite(info["executed_action"]).all()
+        assert env.action_space.contains(info["executed_action"].astype(np.float32))
+        assert info.keys() >= first.keys() and all(
+            np.isfinite(info[key]).all() for key in first if "/" in key
+        )
+        assert info["whole_body/cone_margin"] <= 0.0
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("contacts", KINDS)
+def test_actions_that_are_none_or_outside_do_not_get_through(contacts):
+    env = sw.WholeBodyFilter(gym.make("HalfCheetah-v5"), contacts)
+    env.reset(seed=0)
+    for bad in (np.nan, np.inf, -np.inf, 1e30, 5.0):
+        action = np.zeros(6)
+        action[2] = bad
+        info = env.step(action)[4]
+        assert np.isfinite(info["executed_action"]).all() and (np.abs(info["executed_action"]) <= 1.0).all()
+        assert info["cbf/fallback"] == (not np.isfinite(bad)) or flagged(info)
+        assert info["cbf/intervened"] or info["cbf/clipped"] > 0.0
+
+
+@pytest.mark.parametrize("contacts", KINDS)
+def test_reports_have_the_same_keys_and_types_at_every_reset_and_step(contacts):
+    env = sw.WholeBodyFilter(gym.make("Walker2d-v5"), contacts, zmp_inset=0.01)
+    own = KEYS | ({"whole_body/zmp_margin", "whole_body/supported"} if contacts == "forecast" else set())
+    rng = np.random.default_rng(0)
+    infos = [env.reset(seed=0)[1]]
+    infos += [env.step(rng.uniform(-1, 1, 6).astype(np.float32))[4] for _ in range(15)]
+    infos.append(env.reset(seed=0)[1])
+    for info in infos:
+        assert {key for key in info if key.startswith("whole_body/")} == own
+        assert type(info["whole_body/contacts"]) is int
+        assert all(
+            type(info[key]) is float and np.isfinite(info[key]) for key in own - {"whole_body/contacts"}
+        )
+    for info in (infos[0], infos[-1]):
+        assert all(info[key] == 0 for key in own)
+
+
+def test_joints_stay_off_their_stops_at_every_evaluation():
+    def beyond(env, action):
+        replay, worst = Replay(env.unwrapped), [-np.inf]
+
+        def look(data, _):
+            at = data.qpos[3:9]
+            worst.append(float(np.maximum(low - at, at - high).max()))
+
+        replay.before()
+        info = env.step(action)[-1]
+        assert replay.after(look)
+        return max(worst), info
+
+    env, bare = sw.WholeBodyFilter(gym.make("HalfCheetah-v5")), gym.make("HalfCheetah-v5")
+    low, high = env.unwrapped.model.jnt_range[3:9].T
+    counts = {}
+    for name, each in (("filtered", env), ("bare", bare)):
+        outside = unflagged = 0
+        each.reset(seed=0)
+        for k in range(40):
+            action = np.sign(np.random.default_rng(k // 8).normal(size=6)).astype(np.float32)
+            far, info = beyond(each, action)
+            outside += far > 0.1 + 1e-6
+            unflagged += far > 0.1 + 1e-6 and name == "filtered" and not (flagged(info) or info["cbf/unsafe"])
+        counts[name] = outside, unflagged
+    assert counts["filtered"][1] == 0 and counts["bare"][0] > counts["filtered"][0]
+
+
+def test_its_constraints_compose_in_one_projection():
+    limits = [
+        sw.ContactFeasibility(0.7),
+        sw.JointSpeedLimit(12.0, holds=1),
+        sw.JointPositionLimit(-0.9, 1.4, margin=0.0, holds=2),
+    ]
+    env = sw.CBFActionFilter(gym.make("HalfCheetah-v5"), limits)
+    rng = np.random.default_rng(0)
+    env.reset(seed=0)
+    fast, changed, silent = 0.0, 0, 0
+    for _ in range(30):
+        info = env.step(rng.uniform(-1, 1, 6).astype(np.float32))[4]
+        changed += info["cbf/intervened"]
+        if not flagged(info) and not info["cbf/unsafe"]:
+            silent += 1
+            assert info["whole_body/cone_margin"] >= -0.01 - 1e-6
+            fast = max(fast, float(np.abs(env.unwrapped.data.qvel[3:9]).max()))
+    assert changed > 5 and silent > 5 and fast <= 12.0 + 1e-5
+
+
+@pytest.mark.parametrize("kind", ["ContactFeasibility", "SupportMargin", "Stance"])
+def test_two_that_would_write_the_same_report_are_refused(kind):
+    one = {"ContactFeasibility": sw.ContactFeasibility, "Stance": sw.Stance}.get(
+        kind, lambda: sw.SupportMargin(0.1)
+    )
+    with pytest.raises(ConfigurationError, match="2 times"):
+        sw.CBFActionFilter(gym.make("Hopper-v5"), [one(), one()])
+
+
+def test_a_delay_and_other_masses_are_the_plants_business():
+    heavy = sw.MujocoPlant(delay_s=0.008)
+    heavy.perturb(mass=1.5)
+    env = sw.WholeBodyFilter(gym.make("Walker2d-v5"), plant=heavy)
+    again = gym.make(env.spec)
+    assert again.plant is not env.plant and again.plant.delay_s == 0.008
+    assert again.plant.weight_n == env.plant.weight_n > 1.4 * 9.81 * env.unwrapped.model.body_mass.sum()
+    env.reset(seed=0)
+    for _ in range(5):
+        assert np.isfinite(env.step(env.action_space.sample())[4]["whole_body/cone_margin"])
