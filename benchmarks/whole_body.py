@@ -10,7 +10,8 @@ evaluations of the physics in sight (each of the four stages of a Runge-Kutta st
 between the robot and the fixed world are read there.
 
 - cone left: share of control steps in which a contact force leaves the cone of `SHARE` of the model's friction, at
-  all, and by more than 1 % of the robot's weight; `unflagged` are the latter of them that the filter did not flag.
+  all, and by more than 1 % of the robot's weight; `unflagged` are steps that leave the cone of the filter's own share
+  by that much, and that the filter did not flag.
 - zmp: of the evaluations at which there is a support polygon (three contact points of one plane), the share at which
   the zero moment point is within 1 cm of its edge or beyond; and how many evaluations have a polygon at all.
 - joints: share of control steps with a driven joint more than 0.1 rad beyond its stop.
@@ -49,6 +50,8 @@ ARMS: dict[str, Callable[[Any], Any]] = {
     "forecast, zmp inset 1 cm": lambda env: sw.WholeBodyFilter(env, zmp_inset=INSET_M),
     "forecast, share 0.9": lambda env: sw.WholeBodyFilter(env, friction_share=0.9),
 }
+OWN_SHARE = {"forecast, share 0.9": 0.9}
+"""Of the arms that count on more friction than `SHARE`."""
 
 
 @dataclass
@@ -77,10 +80,15 @@ class Row:
 
 
 class Judge:
-    """What the contacts of a step were, on the env's own model, with no code of a constraint in it."""
+    """What the contacts of a step were, on the env's own model, with no code of a constraint in it.
 
-    def __init__(self, raw: Any) -> None:
-        self._raw, self._replay = raw, Replay(raw)
+    Args:
+        raw: The env.
+        share: That the filter counts on.
+    """
+
+    def __init__(self, raw: Any, share: float = SHARE) -> None:
+        self._raw, self._share, self._replay = raw, share, Replay(raw)
         m = raw.model
         self._fixed = m.body_weldid == 0
         self._weight = float(m.body_mass.sum() * np.linalg.norm(m.opt.gravity))
@@ -93,10 +101,10 @@ class Judge:
 
     def after(self, row: Row, flagged: bool) -> None:
         """Make the step once more and count."""
-        excess = [0.0]
+        held = [(0.0, 0.0)]
 
         def visit(data: mujoco.MjData, _: float) -> None:
-            points, normals, forces = self._contacts(data, excess)
+            points, normals, forces = self._contacts(data, held)
             row.evaluations += 1
             if len(points) < 3:
                 return
@@ -114,15 +122,19 @@ class Judge:
             raise RuntimeError(
                 "the replay of a step does not end where the env did: its contacts are not known"
             )
-        row.left_cone += max(excess) > _ROUNDING * self._weight
-        beyond = max(excess) > (TOLERANCE + _ROUNDING) * self._weight
-        row.left_cone_by_tolerance += beyond
-        row.unflagged += beyond and not flagged
+        sideways, most = np.array(held).T
+        excess, own = (float((sideways - share * most).max()) for share in (SHARE, self._share))
+        tolerated = (TOLERANCE + _ROUNDING) * self._weight
+        row.left_cone += excess > _ROUNDING * self._weight
+        row.left_cone_by_tolerance += excess > tolerated
+        row.unflagged += own > tolerated and not flagged
         at = self._raw.data.qpos[self._qpos]
         past = np.maximum(self._range[:, 0] - at, at - self._range[:, 1])
         row.beyond_stop += bool((past > STOP_RAD + _ROUNDING).any())
 
-    def _contacts(self, data: mujoco.MjData, excess: list[float]) -> tuple[list[Any], list[Any], list[Any]]:
+    def _contacts(
+        self, data: mujoco.MjData, held: list[tuple[float, float]]
+    ) -> tuple[list[Any], list[Any], list[Any]]:
         points, normals, forces = [], [], []
         m, wrench = self._raw.model, np.zeros(6)
         for i in range(data.ncon):
@@ -131,8 +143,8 @@ class Judge:
             if first == second or contact.efc_address < 0:
                 continue
             mujoco.mj_contactForce(m, data, i, wrench)
-            sideways = float(np.hypot(wrench[1], wrench[2]))
-            excess.append(sideways - SHARE * float(contact.friction[0]) * float(wrench[0]))
+            # What it holds sideways, and the most that all of its friction could.
+            held.append((float(np.hypot(wrench[1], wrench[2])), float(contact.friction[0] * wrench[0])))
             sign = 1.0 if first else -1.0
             frame = contact.frame.reshape(3, 3)
             points.append(contact.pos.copy())
@@ -157,7 +169,7 @@ def drive(robot: str, arm: str, policy: Callable[[Any], Any], episodes: int, lim
     """One arm of the table."""
     row = Row(robot, arm)
     bare = gym.make(f"{robot}-v5", max_episode_steps=limit)
-    env, judge = ARMS[arm](bare), Judge(bare.unwrapped)
+    env, judge = ARMS[arm](bare), Judge(bare.unwrapped, OWN_SHARE.get(arm, SHARE))
     filtered = isinstance(env, sw.CBFActionFilter)
     for episode in range(episodes):
         observation, _ = env.reset(seed=episode)
