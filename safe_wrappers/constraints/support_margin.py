@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from safe_wrappers import interventions as keys
 from safe_wrappers.constraints.constraint import Promise, non_negative, positive
 from safe_wrappers.constraints.contact_limit import ContactLimit
-from safe_wrappers.control.support import common_plane, support_margin, support_polygon
+from safe_wrappers.control.support_distances import support_distances
 from safe_wrappers.plants.contact_forecast import ContactForecast
 from safe_wrappers.plants.mujoco import MujocoPlant
 
@@ -84,23 +84,5 @@ class SupportMargin(ContactLimit):
 
 def edge_distances(contacts: ContactForecast) -> list[float]:
     """Distance of the zero moment point from the polygon's edge, at every evaluation at which there is one, m."""
-    found = []
-    for step in range(contacts.steps):
-        here = contacts.step == step
-        if np.count_nonzero(here) < 3:
-            continue
-        points, forces = contacts.point[here], contacts.force[here]
-        ground = common_plane(points, contacts.normal[here])
-        if ground is None:
-            continue
-        # In coordinates of the plane, the last along its normal: the library's functions check what is checked here.
-        frame = np.vstack([ground.axes, ground.normal])
-        at, push = (points - ground.origin) @ frame.T, forces @ frame.T
-        pressure = float(push[:, 2].sum())
-        if not pressure > 0.0:
-            continue  # contacts may touch, and nothing press
-        zmp = (push[:, 2] @ at[:, :2] - at[:, 2] @ push[:, :2]) / pressure
-        polygon = support_polygon(at[:, :2])
-        if len(polygon) > 2:
-            found.append(support_margin(zmp, polygon))
-    return found
+    found = support_distances(contacts.step, contacts.point, contacts.normal, contacts.force)
+    return [float(distance) for distance in found]
