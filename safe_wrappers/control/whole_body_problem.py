@@ -96,9 +96,9 @@ class WholeBodyProblem:
     """`contact_acceleration`, or zeros, minus the drift: what `J qacc` is to be, shape (k, 3)."""
 
     def __post_init__(self) -> None:
-        for rows, limits_of in (("acceleration_rows", "acceleration_limits"), ("force_rows", "force_limits")):
-            if (getattr(self, rows) is None) != (getattr(self, limits_of) is None):
-                raise ConfigurationError(f"{rows} and {limits_of} come together")
+        for one, other in (("acceleration_rows", "acceleration_limits"), ("force_rows", "force_limits")):
+            if (getattr(self, one) is None) != (getattr(self, other) is None):
+                raise ConfigurationError(f"{one} and {other} come together")
         nv, nu, k = len(self.bias), len(self.nominal), len(self.normals)
         limits = 0 if self.acceleration_limits is None else len(self.acceleration_limits)
         force_limits = 0 if self.force_limits is None else len(self.force_limits)
