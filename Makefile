@@ -67,6 +67,11 @@ figures: .venv/installed
 	$(BIN)/python -m benchmarks.traction
 	$(BIN)/python -m benchmarks.impact
 	$(BIN)/python -m benchmarks.occlusion --steps 40000
+	$(BIN)/python -m benchmarks.singularity
+	$(BIN)/python -m benchmarks.fetch
+	$(BIN)/python -m benchmarks.friction_cones
+	$(BIN)/python -m benchmarks.whole_body
+	$(BIN)/python -m benchmarks.teleop
 
 .venv/docs: .venv/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'

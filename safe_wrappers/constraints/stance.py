@@ -193,7 +193,7 @@ class Stance:
         answer = self._answer
         if answer is None or self._asked is None:
             answer = self._ask(self._problem, control)
-        if np.array_equal(control, self._asked):
+        if self._asked is not None and np.array_equal(control, self._asked):
             return answer.status is WholeBodyStatus.INACTIVE
         if answer.status is WholeBodyStatus.INFEASIBLE:
             return False  # whatever the control
