@@ -60,7 +60,8 @@ class FetchJudge:
         self._raw, self._model = raw, raw.model
         self._ball = ball_of(raw) if ball else None
         model: mujoco.MjModel = raw.model
-        self._now = mujoco.MjData(model)
+        self._at = mujoco.MjData(model)
+        self._passed: list[Array] = []
         self._site = model.site("robot0:grip").id
         self._fingers = [model.geom(f"robot0:{side}_gripper_finger_link").id for side in "lr"]
         owner = [model.body(i).name for i in model.geom_bodyid]
@@ -74,17 +75,13 @@ class FetchJudge:
     def _step(self, action: Array) -> None:
         for _ in range(self._raw.n_substeps):
             mujoco.mj_step(self._model, self._raw.data)
-            # MuJoCo leaves positions and contacts of the state that it stepped from; the last one is seen in `after`.
-            self._look(self._raw.data)
+            self._passed.append(self._raw.data.qpos.copy())
 
-    def _look_now(self) -> None:
-        data = self._now
-        data.qpos[:] = self._raw.data.qpos
+    def _look(self, qpos: Array) -> None:
+        data = self._at
+        data.qpos[:] = qpos
         mujoco.mj_kinematics(self._model, data)
         mujoco.mj_collision(self._model, data)
-        self._look(data)
-
-    def _look(self, data: mujoco.MjData) -> None:
         place = data.site_xpos[self._site]
         now = np.array([self._elsewhere(data, place), self.low[2] - place[2], self._touch(data)])
         self._missed = np.maximum(self._missed, now)  # what is not a number stays
@@ -109,7 +106,7 @@ class FetchJudge:
         pairs = data.contact.geom
         touching = (self._table[pairs] @ _ONES > 0.0) & (self._robot[pairs] @ _ONES > 0.0)
         if not touching.any():
-            return min(-self._room_over_table(data), 0.0) if data is self._now else -np.inf
+            return min(-self._room_over_table(data), 0.0)
         return float((data.contact.includemargin - data.contact.dist)[touching].max())
 
     def _room_over_table(self, data: mujoco.MjData) -> float:
@@ -128,17 +125,19 @@ class FetchJudge:
     def start(self) -> float:
         """The truth of the env's present state; a table that the reset itself touches is excused."""
         self.before()
-        self._look_now()
+        self._look(self._raw.data.qpos)
         self._left = GRACE if self._missed[2] > 0.0 else 0
         return float(self._missed[0] if self._left else self._missed.max())
 
     def before(self) -> None:
         """Forget the last step."""
+        self._passed.clear()
         self._missed = np.full(3, -np.inf)
 
     def after(self, executed: Array, info: dict[str, Any]) -> float:
         """The worst of the step's substeps and of its end."""
-        self._look_now()
+        for qpos in (*self._passed, self._raw.data.qpos):
+            self._look(qpos)
         if not self._left:
             return float(self._missed.max())
         self.excused += 1
