@@ -197,11 +197,25 @@ class EnergyReference:
         result, self._last = self._damper.dissipate(interval, owed)
         return result
 
+    def account(self, effort: ArrayLike, flow: ArrayLike, time_s: float) -> None:
+        """Account an interval in which nothing was damped: for who keeps to `budget_j` by other means than `modify`.
+
+        Args:
+            effort: N, shape (m,), or a number; held over the interval, or its mean.
+            flow: m/s, of the same shape; the other way round.
+            time_s: Length of the interval, > 0.
+        """
+        f, v = port_vectors(effort=effort, flow=flow)
+        self._book(port_energy(f, v, positive("time_s", time_s)))
+
     def _settle(self, last: "_Interval", actual: ArrayLike | None) -> None:
         interval = last.settled(actual)
         through, damped = interval.energy_j, interval.damped_j
         self._dissipated.add(damped)
-        (self._taken_in if through > 0.0 else self._given_out).add(abs(through))
+        self._book(through)
+
+    def _book(self, through_j: float) -> None:
+        (self._taken_in if through_j > 0.0 else self._given_out).add(abs(through_j))
 
 
 class _Interval(NamedTuple):

@@ -221,6 +221,19 @@ def test_what_comes_in_does_not_pay_a_debt_as_the_other_end_hears_of_it():
     assert (end.message_j, end.budget_j) == (3.0, pytest.approx(0.0, abs=1e-15))
 
 
+def test_an_end_that_is_only_accounted_damps_nothing_and_owes():
+    end = EnergyReference("admittance", 0.5)
+    end.account([2.0, 0.0], [3.0, 9.0], 0.5)
+    assert (end.message_j, end.budget_j) == (3.0, 0.5)
+    end.account(-2.0, 1.0, 0.5)
+    assert (end.message_j, end.budget_j) == (3.0, -0.5)
+    end.receive(2.0)
+    assert end.budget_j == 1.5
+    with pytest.raises(ConfigurationError, match="finite"):
+        end.account(math.nan, 1.0, 0.5)
+    assert end.budget_j == 1.5
+
+
 def test_an_end_gives_what_it_has_heard_of():
     end = EnergyReference("admittance")
     end.receive(1.5, 1.0)
