@@ -237,7 +237,7 @@ def energy_table(rows: list[dict[str, Any]], codings: tuple[str, ...], networks:
 
 def energy(joule: float) -> str:
     """0 below a microjoule."""
-    return "0" if joule < 1e-6 else f"{joule:.2g}"
+    return "0" if joule < 1e-6 else f"{joule:.2g}" if joule < 99.5 else f"{joule:.0f}"
 
 
 def clearance_table(rows: list[dict[str, Any]]) -> str:
@@ -280,7 +280,7 @@ def both_table(rows: list[dict[str, Any]]) -> str:
         if part:
             lines.append(
                 f"| {', '.join(operators)} | {len(part)} | {sum(r['steps'] for r in part):,} | "
-                f"{max(r['excess_j'] for r in part):.1e} | {max(r['flying_j'] for r in part):.2g} | "
+                f"{max(r['excess_j'] for r in part):.1e} | {energy(max(r['flying_j'] for r in part))} | "
                 f"{max(r['made_at_hand_j'] for r in part):.1e} | "
                 f"{sum(r['breached_steps'] > 0 for r in part)} |"
             )
