@@ -67,8 +67,8 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
     operator could still stop in time, by the clearance and approach speed of this very moment. When the round trip
     is longer, or when the machine could not stop by itself after the command, authority is revoked and the local
     brake (`fallback`) acts. It comes back with a command made from an image taken since, when the round trip is below
-    `release` times the ceiling and the machine could stop after it. Meanwhile a wave port stands still and throws
-    waves back: the operator feels a locked tool.
+    `release` times the ceiling and the machine could stop after it. Meanwhile a wave port stands still and
+    swallows the waves: the operator feels a damper of `impedance`, and nothing piles up in the channel.
 
     On `TeleopContact-v0` a control step is one physics substep, so this is watched at 1 kHz. On an env with longer
     steps it is watched once per step; each decision covers all its substeps: the ceiling is lowered by one step, and

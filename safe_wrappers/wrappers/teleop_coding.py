@@ -156,8 +156,6 @@ class PaidCoding(PlainCoding):
         near = EnergyReference("impedance", self._storage_j, self._limit)
         self._ends = near, EnergyReference("admittance", self._storage_j)
         self._late = self._felt = self._port.effort
-        self._acted: Array | None = None
-        self._given_j = 0.0
 
     def near(self, flow: Array | None) -> Any:
         """As `PlainCoding.near`."""
@@ -171,9 +169,7 @@ class PaidCoding(PlainCoding):
         end.receive(*(packet.load.extra for packet in arrived))
         order = super().far(arrived, newest, flow)
         wanted = self._still if flow is None else flow
-        paid = self._affordable(wanted, max(end.budget_j - self._given_j, 0.0))
-        effort = -self._port.effort_at(paid)  # power is positive into the channel at both ends
-        end.modify(effort, paid, self._tick_s, self._acted)
+        paid = self._affordable(wanted, max(end.budget_j, 0.0))
         return Order(None if paid is wanted else paid, order.seen_s)
 
     def _affordable(self, flow: Array, budget_j: float) -> Array:
@@ -194,8 +190,8 @@ class PaidCoding(PlainCoding):
         """As `PlainCoding.settle`."""
         _, given = super().settle(flow, observation, obeyed)
         assert given is not None
-        self._acted = -given.effort
-        self._given_j = max(port_energy(*given, self._tick_s), 0.0)
+        # Power is positive into the channel at both ends. The flow was scaled, not damped: no damping to credit.
+        self._ends[1].account(-given.effort, given.flow, self._tick_s)
         return self._ends[1].message_j, given
 
     def shown(self, arrived: list[Packet], observation: Any) -> Any:
@@ -262,11 +258,15 @@ class WaveCoding(PlainCoding):
         return Order(decoded, self._seen_s)
 
     def settle(self, flow: Array, observation: Any, obeyed: bool) -> tuple[Any, Given | None]:
-        """As `PlainCoding.settle`; a port that is still, because the brake acts, throws the wave back."""
+        """As `PlainCoding.settle`; a port that is still, because the brake acts, swallows the wave.
+
+        Thrown back, as by a locked tool, waves of a hand that does not give way would pile up without bound in the
+        channel, and come out when authority is given back.
+        """
         _, given = super().settle(flow, observation, obeyed)
         assert given is not None
         if not obeyed:
-            return self._incoming, given
+            return self._still, given
         acted, moved = given
         _, outgoing = to_waves(acted, moved, self._impedance)
         # Where the machine saturates, or a filter inside has changed the flow, the two waves do not match.
