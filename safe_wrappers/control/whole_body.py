@@ -399,14 +399,16 @@ def _least_violation(
     inner = np.arange(nu + loose.misses, loose.size)
     hessian[inner, inner] += _INNER_IN_LEAST_VIOLATION
     softer = plain.program._replace(hessian=hessian, linear=share * plain.program.linear)
-    candidate = _ask(softer.softened(plain.softenable), solver)
-    if candidate.y is not None:
-        y = candidate.y[: loose.size].copy()
-        y[:nu] = np.clip(y[:nu], problem.lower, problem.upper)
-        status = WholeBodyStatus.INFEASIBLE if verdict == "infeasible" else WholeBodyStatus.FAILED
-        answer = _answer(problem, motion, plain, y, status)
-        if answer.residuals.cone <= _force_tolerance(answer.forces):
-            return answer
+    program = softer.softened(plain.softenable)
+    status = WholeBodyStatus.INFEASIBLE if verdict == "infeasible" else WholeBodyStatus.FAILED
+    for backend in dict.fromkeys((solver, "clarabel")):  # a second opinion where the first misses its cones
+        candidate = _ask(program, backend)
+        if candidate.y is not None:
+            y = candidate.y[: loose.size].copy()
+            y[:nu] = np.clip(y[:nu], problem.lower, problem.upper)
+            answer = _answer(problem, motion, plain, y, status)
+            if answer.residuals.cone <= _force_tolerance(answer.forces):
+                return answer
     return _nothing(problem, motion)
 
 
