@@ -126,7 +126,7 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         >>> _ = env.reset(seed=0)
         >>> for _ in range(1000):
         ...     info = env.step(np.array([0.1, 0.0]))[4]
-        >>> round(info["teleop/round_trip_s"], 3), info["teleop/created_j"] < 1e-12
+        >>> round(info["teleop/round_trip_s"], 3), info["teleop/created_j"] < 1e-8  # float32 actions
         (0.2, True)
 
     Change log:
