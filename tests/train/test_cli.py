@@ -18,9 +18,18 @@ FILTERED = "arms={filtered: {filter: {factory: 'fake_task:shield'}}}"
 COMMAND = [sys.executable, "-m", "safe_wrappers.train.cli"]
 
 
+def heed_interrupts():
+    """Tests that are started in a shell's background ignore SIGINT, and so would their children."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def start(command, *overrides):
     return subprocess.Popen(
-        [*COMMAND, command, str(FAKE), *overrides], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [*COMMAND, command, str(FAKE), *overrides],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=heed_interrupts,
     )
 
 
