@@ -354,7 +354,11 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             return self._stand_in.command().astype(self._dtype), False
         if newest is None or (not fresh and self._missing == "zero"):
             return np.clip(np.zeros(self._shape), self._low, self._high).astype(self._dtype), True
-        return newest.action.copy(), True
+        command = newest.action.copy()
+        # What is judged is what is executed; without a ceiling nothing is judged, and nothing changed.
+        if self._watch is not None and ((command < self._low) | (command > self._high)).any():
+            command = np.clip(command, self._low, self._high).astype(self._dtype)
+        return command, True
 
     def _flow_of(self, command: Any) -> Array | None:
         """In the box, as the machine will take it."""

@@ -178,3 +178,13 @@ def test_an_arm_that_is_far_from_the_task_is_watched_as_well():
             env.step(np.array([1.5], np.float32))
             farthest = max(farthest, env.unwrapped.data.qpos[0])
         assert (farthest < 0.9) == (wanted is not None)
+
+
+def test_what_is_judged_is_what_is_executed_and_without_a_ceiling_nothing_is_changed():
+    loud, quiet = np.array([1e9, -0.5], np.float32), np.array([0.3, -0.5], np.float32)
+    for watched, expected in ((ceiling(), 1.0), (None, 1e9)):
+        env = channel(ceiling=watched)
+        place(env)
+        sent = env.step(loud)[4]["executed_action"]
+        assert sent[0] == np.float32(expected) and sent[1] == -0.5
+        assert np.array_equal(env.step(quiet)[4]["executed_action"], quiet.astype(np.float64))
