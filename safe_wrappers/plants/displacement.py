@@ -14,7 +14,7 @@ from safe_wrappers.plants.mujoco import MujocoPlant
 
 Array = NDArray[np.float64]
 
-_WORKS = "Workspace, JointPositionLimit, JointSpeedLimit, SpeedLimit, Upright"
+_WORKS = "Workspace, JointPositionLimit, JointSpeedLimit, SpeedLimit, SingularityMargin, Upright"
 
 
 class DisplacementPlant(MujocoPlant):
