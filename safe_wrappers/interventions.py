@@ -140,7 +140,8 @@ TELEOP_IN_FLIGHT_J: Final = "teleop/in_flight_j"
 TELEOP_CREATED_J: Final = "teleop/created_j"
 """float64: J, the most that came out, or was in flight, beyond what went in, at any time so far; 0: passive."""
 TELEOP_LOST: Final = "teleop/lost"
-"""int64: packets sent in this step, in both directions, that got lost."""
+"""int64: packets of this step, in both directions, that got lost; an action that is not finite, which is not sent, is
+one."""
 TELEOP_LATE: Final = "teleop/late"
 """int64: commands that arrived in this step behind or together with a newer one."""
 

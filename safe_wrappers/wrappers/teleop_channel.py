@@ -247,7 +247,9 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         """Send the action, step the env with what has arrived, and return what has come back."""
         now_s = self.now_s
         self._lost = self._late = 0
-        self._send_up(self._checked(action), now_s)
+        sendable = self._checked(action)
+        self._lost += sendable is None
+        self._send_up(sendable, now_s)
         arrived = self._up.arrived(now_s)
         fresh = self._take(arrived)
         command, operators = self._in_force(fresh)

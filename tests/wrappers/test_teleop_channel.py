@@ -167,10 +167,12 @@ def test_the_observation_is_the_operators_own():
 def test_an_action_that_is_not_finite_is_not_sent():
     env = channel()
     place(env)
-    env.step(np.full(2, 0.5))
+    assert env.step(np.full(2, 0.5))[4]["teleop/lost"] == 0
     with pytest.warns(UserWarning, match="not sent"):
         info = env.step(np.array([np.nan, 0.0]))[4]
     assert (info["executed_action"] == 0.5).all() and info["teleop/round_trip_s"] > 0.0
+    assert info["teleop/lost"] == 1  # warned of once, counted each time
+    assert env.step(np.array([np.inf, 0.0]))[4]["teleop/lost"] == 1
     for wrong in (np.zeros(3), "left"):
         with pytest.raises(ActionError, match="shape"):
             env.step(wrong)
