@@ -1,10 +1,12 @@
 PYTHON ?= python3
 BIN := .venv/bin
-export MUJOCO_GL ?= disabled
 # One BLAS thread: the matrices are tiny and the runs are parallel processes.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test test-library test-slow lint check bench figures docs clean
+.PHONY: demo test test-library test-slow fuzz lint check bench figures docs clean
+
+# Tests draw nothing; the demo tries which GL can.
+test test-library test-slow fuzz: export MUJOCO_GL ?= disabled
 
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
@@ -26,6 +28,14 @@ test-library:
 
 test-slow: .venv/installed
 	$(BIN)/python -m pytest -n 2 -m slow
+
+# Property tests with random examples, again and again; what fails becomes an explicit example of its test.
+MINUTES ?= 60
+fuzz: .venv/installed
+	@end=$$(($$(date +%s) + 60 * $(MINUTES))); failed=0; \
+	while [ $$(date +%s) -lt $$end ]; do \
+		$(BIN)/python -m pytest -q -n 2 -m "hypothesis and not slow" --hypothesis-profile=fuzz tests || failed=1; \
+	done; exit $$failed
 
 lint: .venv/installed
 	$(BIN)/ruff check .
