@@ -16,7 +16,10 @@ _ARRAY = re.compile(
 def _escape(
     app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]
 ) -> None:
-    """`|x|` is an absolute value here and a substitution there; types of returns are in the signature."""
+    """`|x|` is an absolute value here and a substitution there; types of returns are in the signature.
+
+    And whoever reads of "the appendix" finds which one.
+    """
     for i, line in enumerate(lines):
         if i and lines[i - 1].strip() == "Returns:":
             # What stands before a colon would be taken for a type: let that be nothing.
@@ -24,7 +27,8 @@ def _escape(
             line = line[:indent] + ": " + line[indent:]
             lines[i] = line
         if not line.lstrip().startswith((">>>", "...")):
-            lines[i] = _BAR.sub(lambda m: m[0] if m[0] != "|" else r"\|", line)
+            line = _BAR.sub(lambda m: m[0] if m[0] != "|" else r"\|", line)
+            lines[i] = line.replace("Source: appendix", "Source: :doc:`appendix </references>`")
 
 
 def _shorten(

@@ -100,3 +100,13 @@ def test_every_constraint_and_wrapper_has_a_page_with_a_picture(folder, module):
         if where.startswith(module) and where.removeprefix(module) not in told_elsewhere:
             page = DOCS / folder / (where.removeprefix(module).replace("_", "-") + ".md")
             assert "```{drawn}" in page.read_text(encoding="utf-8"), page
+
+
+def test_whoever_reads_of_the_appendix_can_follow_to_the_book(pages):
+    api = {path: page for path, page in pages.items() if path.parent.name == "api"}
+    assert sum(any("references.html" in link for link in page.links) for page in api.values()) >= 4
+    (references,) = (page for path, page in pages.items() if path.name == "references.html")
+    assert "https://mlsysbook.ai/vol4/" in references.links
+    for path, page in api.items():
+        said = path.read_text(encoding="utf-8").count("Source: appendix")
+        assert said == 0, path
