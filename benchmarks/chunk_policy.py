@@ -52,6 +52,7 @@ class Task:
         seed: Of the training.
         range_per_second: Of the action, that the bound on the rate lets it go through, where no arm says more.
         bounded: Trained through the blend and its bounds, not through replacement.
+        rollout: Chunks of each of the four envs between two updates.
     """
 
     env: str
@@ -63,6 +64,7 @@ class Task:
     seed: int = 0
     range_per_second: float = 1.0
     bounded: bool = False
+    rollout: int = 512
 
     @property
     def name(self) -> str:
@@ -122,7 +124,7 @@ def train(task: Task) -> tuple[Any, VecNormalize]:
     model = PPO(
         "MlpPolicy",
         envs,
-        n_steps=512,
+        n_steps=task.rollout,
         batch_size=256,
         n_epochs=10,
         gamma=0.95,

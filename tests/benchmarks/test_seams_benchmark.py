@@ -19,7 +19,7 @@ from benchmarks.seams import Job, Recorder, alone, episode, faded_in, jobs, tabl
 from safe_wrappers.control.flexible_joint import smoothstep_energy, step_energy
 
 FLEX, REACHER = TASKS[:2]
-TINY = tuple(dataclasses.replace(task, steps=1) for task in TASKS[:2])  # one rollout
+TINY = tuple(dataclasses.replace(task, steps=1, rollout=64) for task in TASKS[:2])  # one rollout
 LONG_AGO = 10**6
 
 

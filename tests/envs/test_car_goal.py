@@ -103,13 +103,14 @@ def violated(model, data, env, fresh):
     if not env.level.vases_cost:
         return False
     fresh.qpos[:], fresh.qvel[:] = data.qpos, data.qvel
-    mujoco.mj_forward(model, fresh)
-    car = {"agent", "left", "right", "rear"}
-    bodies = [{model.geom(g).bodyid[0] for g in (c.geom1, c.geom2)} for c in fresh.contact[: fresh.ncon]]
-    names = [{model.body(b).name for b in pair} for pair in bodies]
-    touching = any(pair & car and any(n.startswith("vase") for n in pair) for pair in names)
-    speeds = [np.linalg.norm(data.joint(f"vase{i}").qvel[:3]) for i in range(env.level.vases)]
-    return touching or max(speeds) > 1e-4
+    mujoco.mj_fwdPosition(model, fresh)
+    bodies = model.geom_bodyid[fresh.contact.geom]
+    car = [model.body(name).id for name in ("agent", "left", "right", "rear")]
+    vases = [model.body(f"vase{i}").id for i in range(env.level.vases)]
+    pairs = np.isin(bodies, car), np.isin(bodies, vases)
+    touching = bool((pairs[0] & pairs[1][:, ::-1]).any())
+    starts = [model.body_dofadr[vase] for vase in vases]
+    return touching or max(np.linalg.norm(data.qvel[at : at + 3]) for at in starts) > 1e-4
 
 
 @pytest.mark.parametrize("level", [1, 2])

@@ -28,19 +28,19 @@ def chase(env, rng, target=None, noise=0.3):
     return np.clip(np.array([np.cos(bearing), turn]) + rng.normal(0, noise, 2), -1, 1)
 
 
-def violated(model, data, env):
-    """The rules, read from a state: centre in a hazard; at level 2 a vase touched or moving."""
+def violated(model, data, env, fresh):
+    """The rules, read from a state, on data of their own: centre in a hazard; at level 2 a vase touched or moving."""
     if any(np.hypot(*(data.qpos[:2] - hazard)) <= 0.2 for hazard in env.hazard_positions):
         return True
     if not env.level.vases_cost:
         return False
-    fresh = mujoco.MjData(model)  # so that asking changes nothing
     fresh.qpos[:], fresh.qvel[:] = data.qpos, data.qvel
-    mujoco.mj_forward(model, fresh)
-    names = [{model.geom(g).name[:4] for g in (c.geom1, c.geom2)} for c in fresh.contact[: fresh.ncon]]
-    touching = {"agen", "vase"} in names or {"poin", "vase"} in names
-    speeds = [np.linalg.norm(data.joint(f"vase{i}").qvel[:3]) for i in range(env.level.vases)]
-    return touching or max(speeds) > 1e-4
+    mujoco.mj_fwdPosition(model, fresh)
+    bodies = model.geom_bodyid[fresh.contact.geom]
+    vases = [model.body(f"vase{i}").id for i in range(env.level.vases)]
+    touching = bool(((bodies == model.body("agent").id) & np.isin(bodies, vases)[:, ::-1]).any())
+    starts = [model.body_dofadr[vase] for vase in vases]
+    return touching or max(np.linalg.norm(data.qvel[at : at + 3]) for at in starts) > 1e-4
 
 
 @pytest.mark.parametrize("level", [1, 2])
@@ -49,6 +49,7 @@ def test_costs_equal_substep_by_substep_judging(make_env, level):
     env = make_env(level)
     rng = np.random.default_rng(level)
     seen = {(0.0, 0.0): 0, (0.0, 1.0): 0, (1.0, 1.0): 0}
+    fresh = mujoco.MjData(env.model)
     env.reset(seed=level)
     for t in range(1500):
         if t % 300 == 0:
@@ -61,7 +62,7 @@ def test_costs_equal_substep_by_substep_judging(make_env, level):
         substeps = []
         for _ in range(env.frame_skip):
             mujoco.mj_step(env.model, data)
-            substeps.append(violated(env.model, data, env))
+            substeps.append(violated(env.model, data, env, fresh))
         info = env.step(action)[4]
         assert info["cost"] == float(substeps[-1])
         assert info["cost_substep"] == float(any(substeps))
