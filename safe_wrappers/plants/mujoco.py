@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.actuators import AffineActuators
 from safe_wrappers.plants.contact_forecast import ContactForecast, ContactReader, forecast_contacts
+from safe_wrappers.plants.fixed_bodies import fixed_bodies
 from safe_wrappers.plants.forecast import Forecast, Poses, Recorder
 from safe_wrappers.plants.plant import (
     check_timing,
@@ -30,6 +31,7 @@ from safe_wrappers.plants.plant import (
 Array = NDArray[np.float64]
 
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+_FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 _QUADRATIC = int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC)
 
 
@@ -288,10 +290,10 @@ class MujocoPlant:
         for j in range(self.model.njnt):
             q, v = int(self.model.jnt_qposadr[j]), int(self.model.jnt_dofadr[j])
             kind = self.model.jnt_type[j]
-            if kind == mujoco.mjtJoint.mjJNT_FREE:
+            if kind == _FREE:
                 rate[q : q + 3] = self.qvel[v : v + 3]
                 q, v = q + 3, v + 3
-            if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
+            if kind in (_FREE, _BALL):
                 # Angular velocities of these joints are in the body's frame; mju_derivQuat wants the world's.
                 turn = np.zeros(4)
                 mujoco.mju_mulQuatAxis(turn, self.qpos[q : q + 4].copy(), self.qvel[v : v + 3].copy())
@@ -388,7 +390,7 @@ class MujocoPlant:
     @property
     def weight_n(self) -> float:
         """Of everything that moves, N; without gravity its mass in kg."""
-        moving = self.model.body_weldid != 0
+        moving = ~fixed_bodies(self.model)
         gravity = float(np.linalg.norm(self.model.opt.gravity))
         return float(self.model.body_mass[moving].sum()) * (gravity or 1.0)
 
