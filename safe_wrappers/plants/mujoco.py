@@ -32,6 +32,7 @@ Array = NDArray[np.float64]
 
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
+_LAST_INTEGRATOR = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
 _QUADRATIC = int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC)
 
 
@@ -90,6 +91,12 @@ class MujocoPlant:
             raise ConfigurationError(
                 f"the plant's model must take the env's physics steps: expected a timestep of {expected} s, "
                 f"got {timestep} s"
+            )
+        if self.model.opt.integrator > _LAST_INTEGRATOR:
+            raise UnsupportedEnvError(
+                "the model's integrator is 'discrete' (MuJoCo 3.13 and later), whose accelerations are those of a "
+                "whole step, which MujocoPlant's g is not; it handles: Euler, RK4, implicit, implicitfast. Use "
+                "AnalyticPlant with your own f and g."
             )
         self.data = mujoco.MjData(self.model)
         self._nq, self._nv = int(self.model.nq), int(self.model.nv)
