@@ -19,11 +19,13 @@ demo: .venv/installed
 test: .venv/installed
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 
-# The library alone, without torch: make test-library PYTHON=python3.13
-LIBRARY_VENV = .venv-$(notdir $(PYTHON))
+# The library alone, without torch and gymnasium-robotics: make test-library PYTHON=python3.13 MUJOCO=4.0.0
+MUJOCO = $(shell sed -n 's/^mujoco==//p' constraints.txt)
+LIBRARY_VENV = .venv-$(notdir $(PYTHON))-mujoco-$(MUJOCO)
 test-library:
-	$(PYTHON) -m venv $(LIBRARY_VENV)
-	$(LIBRARY_VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]'
+	$(PYTHON) -m venv --clear $(LIBRARY_VENV)
+	sed 's/^mujoco==.*/mujoco==$(MUJOCO)/' constraints.txt > $(LIBRARY_VENV)/constraints.txt
+	$(LIBRARY_VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c $(LIBRARY_VENV)/constraints.txt -e '.[test]'
 	$(LIBRARY_VENV)/bin/python -m pytest -n 2 --dist loadfile --ignore tests/train --ignore tests/sb3
 
 test-slow: .venv/installed

@@ -34,6 +34,7 @@ import numpy as np
 
 import safe_wrappers as sw
 from safe_wrappers.control.support import common_plane, support_margin, support_polygon, zmp_of_forces
+from safe_wrappers.plants.fixed_bodies import fixed_bodies
 from safe_wrappers.plants.replay import Replay
 
 RESULTS = Path(__file__).parent / "results"
@@ -90,7 +91,7 @@ class Judge:
     def __init__(self, raw: Any, share: float = SHARE) -> None:
         self._raw, self._share, self._replay = raw, share, Replay(raw)
         m = raw.model
-        self._fixed = m.body_weldid == 0
+        self._fixed = fixed_bodies(m)
         self._weight = float(m.body_mass.sum() * np.linalg.norm(m.opt.gravity))
         joints = m.actuator_trnid[:, 0]
         self._qpos, self._range = m.jnt_qposadr[joints], m.jnt_range[joints]

@@ -117,6 +117,8 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
         if hasattr(mujoco.mjtEnableBit, "mjENBL_SLEEP"):
             self.model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
             self.model.opt.sleep_tolerance = _SLEEP_TOLERANCE
+            # With sleeping on, MuJoCo computes the poses of what never moves here alone (3.13 and later).
+            mujoco.mj_resetData(self.model, self.data)
         self._given = PartialLayout()
         self._path = np.zeros((_FRAME_SKIP, 2))
         self._apply(Layout(np.zeros(3), np.zeros(2), np.zeros((0, 2)), np.zeros((0, 2))))

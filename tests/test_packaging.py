@@ -12,6 +12,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 SITE = sysconfig.get_paths()["purelib"]
@@ -109,6 +110,13 @@ def test_metadata(wheel):
     plain = [r for r in metadata.get_all("Requires-Dist") if "extra ==" not in r]
     needed = {re.split(r"[\s<>=\[;!~]", r)[0].lower() for r in plain}
     assert needed == {"numpy", "scipy", "gymnasium", "mujoco", "qpsolvers", "daqp", "clarabel", "ruckig"}
+    mujoco = [Requirement(r) for r in metadata.get_all("Requires-Dist") if r.startswith("mujoco")]
+    for version, extra, taken in (
+        ("3.3.6", "", False), ("3.3.7", "", True), ("4.0.0", "", True), ("5.0.0", "", False),
+        ("3.11.0", "robotics", True), ("3.12.0", "robotics", False),
+    ):  # fmt: skip
+        asked = [r for r in mujoco if r.marker is None or r.marker.evaluate({"extra": extra})]
+        assert all(r.specifier.contains(version) for r in asked) == taken, (version, extra)
     (scripts,) = [n for n in archive.namelist() if n.endswith("entry_points.txt")]
     assert "safe-wrappers = safe_wrappers.train.cli:main" in archive.read(scripts).decode()
 

@@ -112,14 +112,14 @@ def _joint_names(model: Any) -> tuple[str, ...]:
     for at in range(model.njnt):
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, at) or f"joint {at}"
         kind = int(model.jnt_type[at])
-        if kind == mujoco.mjtJoint.mjJNT_HINGE:
+        if kind == int(mujoco.mjtJoint.mjJNT_HINGE):
             places.append(f"{name}, angle (rad)")
             speeds.append(f"{name}, speed (rad/s)")
-        elif kind == mujoco.mjtJoint.mjJNT_SLIDE:
+        elif kind == int(mujoco.mjtJoint.mjJNT_SLIDE):
             places.append(f"{name}, position (m)")
             speeds.append(f"{name}, speed (m/s)")
         else:
-            free = kind == mujoco.mjtJoint.mjJNT_FREE
+            free = kind == int(mujoco.mjtJoint.mjJNT_FREE)
             places += [f"{name}, {part}" for part in (_FREE_PLACES if free else _FREE_PLACES[3:])]
             speeds += [f"{name}, {part}" for part in (_FREE_SPEEDS if free else _FREE_SPEEDS[3:])]
     return (*places, *speeds)

@@ -13,6 +13,7 @@ from safe_wrappers.constraints.contact_limit import ContactLimit
 from safe_wrappers.control.friction_cone import normal_and_tangential
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.contact_forecast import can_touch_the_world
+from safe_wrappers.plants.fixed_bodies import fixed_bodies
 from safe_wrappers.plants.mujoco import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 
@@ -91,7 +92,7 @@ class ContactFeasibility(ContactLimit):
     @staticmethod
     def _resting(plant: MujocoPlant, name: str, touching: NDArray[np.bool_]) -> int:
         i = plant.named("body", name)
-        if plant.model.body_weldid[i] == 0:
+        if fixed_bodies(plant.model)[i]:
             raise ConfigurationError(f"the body {name!r} does not move, so the ground is part of it")
         if not touching[i]:
             raise UnsupportedEnvError(f"the body {name!r} cannot touch the fixed world with friction")

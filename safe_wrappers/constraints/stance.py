@@ -25,6 +25,7 @@ from safe_wrappers.control.whole_body import (
 )
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.contact_forecast import can_touch_the_world
+from safe_wrappers.plants.fixed_bodies import fixed_bodies
 from safe_wrappers.plants.floating_base import equations_of_motion
 from safe_wrappers.plants.mujoco import MujocoPlant
 from safe_wrappers.plants.plant import Plant
@@ -126,7 +127,7 @@ class Stance:
         )  # else MuJoCo resets the state in its step
         if not (within and np.isfinite(motion.bias).all() and np.isfinite(found.forces).all()):
             return  # nothing can be said
-        ground = plant.model.body_weldid[found.pushed_by] == 0
+        ground = fixed_bodies(plant.model)[found.pushed_by]
         # What the robot's bodies do to each other, and other things to it, stays as it is.
         bias = motion.bias - np.einsum("kiv,ki->v", found.jacobians[~ground], found.forces[~ground])
         jacobians, drift, normals = found.jacobians[ground], found.drift[ground], found.normals[ground]

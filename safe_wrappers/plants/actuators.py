@@ -13,33 +13,30 @@ from safe_wrappers.errors import UnsupportedEnvError
 
 Array = NDArray[np.float64]
 
-_TRANSMISSIONS = {
-    mujoco.mjtTrn.mjTRN_JOINT,
-    mujoco.mjtTrn.mjTRN_JOINTINPARENT,
-    mujoco.mjtTrn.mjTRN_SITE,
-    mujoco.mjtTrn.mjTRN_TENDON,
-}
-
 _JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_TRANSMISSIONS = (*_JOINT_TRANSMISSIONS, int(mujoco.mjtTrn.mjTRN_SITE), int(mujoco.mjtTrn.mjTRN_TENDON))
+_NO_DYNAMICS = int(mujoco.mjtDyn.mjDYN_NONE)
+_FIXED_GAIN, _AFFINE_GAIN = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)
+_NO_BIAS, _AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
 
 
 def refuse_unsupported(model: mujoco.MjModel) -> None:
     """Raise for any actuator whose force is not affine in its control at a given state."""
-    for i in range(model.nu):
+    for i in range(
+        len(model.actuator_trntype)
+    ):  # not nu: from 3.12 on an actuator may have no control at all
         name = model.actuator(i).name or f"#{i}"
-        transmission = mujoco.mjtTrn(model.actuator_trntype[i])
-        dynamics = mujoco.mjtDyn(model.actuator_dyntype[i])
-        gain, bias = mujoco.mjtGain(model.actuator_gaintype[i]), mujoco.mjtBias(model.actuator_biastype[i])
+        transmission, dynamics = int(model.actuator_trntype[i]), int(model.actuator_dyntype[i])
+        gain, bias = int(model.actuator_gaintype[i]), int(model.actuator_biastype[i])
         if transmission not in _TRANSMISSIONS:
-            _refuse(
-                name, f"transmission {transmission.name[6:].lower()}", "joint, jointinparent, site, tendon"
-            )
-        if dynamics != mujoco.mjtDyn.mjDYN_NONE:
-            _refuse(name, f"activation dynamics {dynamics.name[6:].lower()}", "none")
-        if gain not in (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE):
-            _refuse(name, f"gain type {gain.name[7:].lower()}", "fixed, affine")
-        if bias not in (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE):
-            _refuse(name, f"bias type {bias.name[7:].lower()}", "none, affine")
+            kind = mujoco.mjtTrn(transmission).name[6:].lower()
+            _refuse(name, f"transmission {kind}", "joint, jointinparent, site, tendon")
+        if dynamics != _NO_DYNAMICS:
+            _refuse(name, f"activation dynamics {mujoco.mjtDyn(dynamics).name[6:].lower()}", "none")
+        if gain not in (_FIXED_GAIN, _AFFINE_GAIN):
+            _refuse(name, f"gain type {mujoco.mjtGain(gain).name[7:].lower()}", "fixed, affine")
+        if bias not in (_NO_BIAS, _AFFINE_BIAS):
+            _refuse(name, f"bias type {mujoco.mjtBias(bias).name[7:].lower()}", "none, affine")
         if hasattr(model, "actuator_delay") and model.actuator_delay[i] > 0.0:
             _refuse(name, f"a delay of {model.actuator_delay[i]} s", "none (say delay_s instead)")
     if model.jnt_actfrclimited.any():
@@ -80,11 +77,11 @@ class AffineActuators:
     def gain_and_bias(self, length: Array, velocity: Array) -> tuple[Array, Array]:
         """Force per control and force at zero control, shapes (nu,) and (nu,)."""
         m = self._model
-        affine = m.actuator_gaintype == mujoco.mjtGain.mjGAIN_AFFINE
+        affine = m.actuator_gaintype == _AFFINE_GAIN
         gain = m.actuator_gainprm[:, 0] + affine * (
             m.actuator_gainprm[:, 1] * length + m.actuator_gainprm[:, 2] * velocity
         )
-        biased = m.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
+        biased = m.actuator_biastype == _AFFINE_BIAS
         bias = biased * (
             m.actuator_biasprm[:, 0] + m.actuator_biasprm[:, 1] * length + m.actuator_biasprm[:, 2] * velocity
         )

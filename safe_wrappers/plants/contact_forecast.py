@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.plants.fixed_bodies import fixed_bodies
 from safe_wrappers.plants.forecast import RESETS
 from safe_wrappers.plants.replay import evaluations
 
@@ -53,7 +54,7 @@ class ContactReader:
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self._model = model
-        fixed = model.body_weldid == 0
+        fixed = fixed_bodies(model)
         # Geom -1, of something flexible, is the last entry: it moves, and is no body of the robot.
         bodies = np.where(fixed, 0, np.arange(model.nbody))
         self._body_of_geom: list[int] = [*bodies[model.geom_bodyid].tolist(), -1]
@@ -145,7 +146,7 @@ def forecast_contacts(
 
 def can_touch_the_world(model: mujoco.MjModel) -> NDArray[np.bool_]:
     """Which moving bodies have a geom that may meet one of the fixed world's with friction, shape (nbody,)."""
-    fixed = model.body_weldid[model.geom_bodyid] == 0
+    fixed = fixed_bodies(model)[model.geom_bodyid]
     kind, other, size = model.geom_contype, model.geom_conaffinity, model.geom_condim
     found = np.zeros(model.nbody, dtype=bool)
     for ground in np.flatnonzero(fixed):

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.actuators import AffineActuators
+from safe_wrappers.plants.fixed_bodies import fixed_bodies
 from safe_wrappers.plants.mujoco import MujocoPlant
 
 Array = NDArray[np.float64]
@@ -150,6 +151,7 @@ def contact_points(model: mujoco.MjModel, data: mujoco.MjData) -> ContactPoints:
         UnsupportedEnvError: Something flexible is in contact, which has no body.
     """
     touching = [i for i in range(data.ncon) if data.contact.efc_address[i] >= 0]
+    fixed = fixed_bodies(model)
     k = len(touching)
     jacobians, drift = np.zeros((k, 3, model.nv)), np.zeros((k, 3))
     forces, moments, normals, first = (np.zeros((k, 3)) for _ in range(4))
@@ -165,7 +167,7 @@ def contact_points(model: mujoco.MjModel, data: mujoco.MjData) -> ContactPoints:
         one, other = (int(b) for b in model.geom_bodyid[geoms])
         # MuJoCo's normal points from the first geom to the second, and its force pushes the second.
         sign = 1.0
-        if model.body_weldid[other] == 0:
+        if fixed[other]:
             one, other, sign = other, one, -1.0
         frame = data.contact.frame[i].reshape(3, 3)
         mujoco.mj_contactForce(model, data, i, wrench)
@@ -173,7 +175,7 @@ def contact_points(model: mujoco.MjModel, data: mujoco.MjData) -> ContactPoints:
         forces[row], moments[row] = sign * (wrench[:3] @ frame), sign * (wrench[3:] @ frame)
         pushed[row], pushed_by[row] = other, one
         for body, side in ((other, 1.0), (one, -1.0)):
-            if model.body_weldid[body] == 0:
+            if fixed[body]:
                 continue
             mujoco.mj_jac(model, data, jac, None, data.contact.pos[i], body)
             mujoco.mj_jacDot(model, data, dot, None, data.contact.pos[i], body)

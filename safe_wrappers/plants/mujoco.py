@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.actuators import AffineActuators
 from safe_wrappers.plants.contact_forecast import ContactForecast, ContactReader, forecast_contacts
+from safe_wrappers.plants.fixed_bodies import fixed_bodies
 from safe_wrappers.plants.forecast import Forecast, Poses, Recorder
 from safe_wrappers.plants.plant import (
     check_timing,
@@ -30,6 +31,8 @@ from safe_wrappers.plants.plant import (
 Array = NDArray[np.float64]
 
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+_FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
+_LAST_INTEGRATOR = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
 _QUADRATIC = int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC)
 
 
@@ -88,6 +91,12 @@ class MujocoPlant:
             raise ConfigurationError(
                 f"the plant's model must take the env's physics steps: expected a timestep of {expected} s, "
                 f"got {timestep} s"
+            )
+        if self.model.opt.integrator > _LAST_INTEGRATOR:
+            raise UnsupportedEnvError(
+                "the model's integrator is 'discrete' (MuJoCo 3.13 and later), whose accelerations are those of a "
+                "whole step, which MujocoPlant's g is not; it handles: Euler, RK4, implicit, implicitfast. Use "
+                "AnalyticPlant with your own f and g."
             )
         self.data = mujoco.MjData(self.model)
         self._nq, self._nv = int(self.model.nq), int(self.model.nv)
@@ -288,10 +297,10 @@ class MujocoPlant:
         for j in range(self.model.njnt):
             q, v = int(self.model.jnt_qposadr[j]), int(self.model.jnt_dofadr[j])
             kind = self.model.jnt_type[j]
-            if kind == mujoco.mjtJoint.mjJNT_FREE:
+            if kind == _FREE:
                 rate[q : q + 3] = self.qvel[v : v + 3]
                 q, v = q + 3, v + 3
-            if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
+            if kind in (_FREE, _BALL):
                 # Angular velocities of these joints are in the body's frame; mju_derivQuat wants the world's.
                 turn = np.zeros(4)
                 mujoco.mju_mulQuatAxis(turn, self.qpos[q : q + 4].copy(), self.qvel[v : v + 3].copy())
@@ -388,7 +397,7 @@ class MujocoPlant:
     @property
     def weight_n(self) -> float:
         """Of everything that moves, N; without gravity its mass in kg."""
-        moving = self.model.body_weldid != 0
+        moving = ~fixed_bodies(self.model)
         gravity = float(np.linalg.norm(self.model.opt.gravity))
         return float(self.model.body_mass[moving].sum()) * (gravity or 1.0)
 

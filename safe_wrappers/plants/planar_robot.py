@@ -9,6 +9,10 @@ from safe_wrappers.control.heading_drive import HeadingDrive, Motion
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco import MujocoPlant
 
+_SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
+_AT_SITE = int(mujoco.mjtTrn.mjTRN_SITE)
+_AT_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+
 
 class PlanarFrame:
     """Where the planar robot's joints and actuators sit in the model, and its motion in the world."""
@@ -17,11 +21,10 @@ class PlanarFrame:
         m = plant.model
         b = plant.named("body", body)
         joints = list(range(int(m.body_jntadr[b]), int(m.body_jntadr[b]) + int(m.body_jntnum[b])))
-        kinds = [mujoco.mjtJoint(m.jnt_type[j]) for j in joints]
-        slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+        kinds = [int(m.jnt_type[j]) for j in joints]
         axes = m.jnt_axis[joints] if joints else np.zeros((0, 3))
         planar = (
-            kinds == [slide, slide, hinge]
+            kinds == [_SLIDE, _SLIDE, _HINGE]
             and m.body_parentid[b] == 0
             and np.allclose(axes, np.eye(3), atol=1e-9)
             and np.allclose(m.body_quat[b], [1, 0, 0, 0], atol=1e-9)
@@ -30,7 +33,8 @@ class PlanarFrame:
         if not planar:
             raise UnsupportedEnvError(
                 f"body {body!r} must slide along world x and y and turn about z (slide, slide, hinge, in this "
-                f"order); it has {[k.name[6:].lower() for k in kinds]}. Use Clearance for other machines."
+                f"order); it has {[mujoco.mjtJoint(k).name[6:].lower() for k in kinds]}. Use Clearance for "
+                "other machines."
             )
         self.joints = joints
         self._q = [int(m.jnt_qposadr[j]) for j in joints]
@@ -41,15 +45,12 @@ class PlanarFrame:
                 f"expected a drive and a turning actuator, the model has {m.nu} actuators"
             )
         turning = [
-            a
-            for a in range(2)
-            if m.actuator_trntype[a] in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-            and m.actuator_trnid[a, 0] == joints[2]
+            a for a in range(2) if m.actuator_trntype[a] in _AT_JOINT and m.actuator_trnid[a, 0] == joints[2]
         ]
         pushing = [
             a
             for a in range(2)
-            if m.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_SITE
+            if m.actuator_trntype[a] == _AT_SITE
             and m.site_bodyid[m.actuator_trnid[a, 0]] == b
             and np.allclose(m.site_quat[m.actuator_trnid[a, 0]], [1, 0, 0, 0], atol=1e-9)
             and np.count_nonzero(m.actuator_gear[a]) == 1

@@ -14,6 +14,7 @@ from safe_wrappers.control.friction_cone import normal_and_tangential
 from safe_wrappers.control.support_distances import support_distances
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.contact_forecast import ContactForecast, ContactReader, can_touch_the_world
+from safe_wrappers.plants.fixed_bodies import fixed_bodies
 from safe_wrappers.plants.momentum import MomentumReader
 from safe_wrappers.wrappers.step_watch import StepWatch
 
@@ -174,7 +175,7 @@ class _Robot:
     def __init__(self, model: mujoco.MjModel, roots: Sequence[str] | None) -> None:
         self.model = model
         self._own = _trees(model, roots)
-        moving = self._own & (model.body_weldid != 0) & (model.body_mass > 0.0)
+        moving = self._own & ~fixed_bodies(model) & (model.body_mass > 0.0)
         which = "of this model" if roots is None else f"of bodies={list(roots)}"
         if not moving.any():
             raise ConfigurationError(f"no body {which} moves and has mass")

@@ -94,7 +94,7 @@ def test_an_approach_that_follows_a_rebound_begins_anew(plant):
 
 
 def test_boxes_are_as_far_apart_as_a_least_squares_solver_finds_them():
-    # MuJoCo alone says 0 of some that are far apart.
+    # MuJoCo alone says 0 of some that are far apart, up to 3.11; 3.12 has another algorithm for two boxes.
     boxes = """<mujoco><worldbody><geom name="a" type="box" size=".1 .05 .2"/>
     <body><freejoint/><geom name="b" type="box" size=".12 .04 .02"/></body></worldbody></mujoco>"""
     env = Scene(boxes)
@@ -117,7 +117,8 @@ def test_boxes_are_as_far_apart_as_a_least_squares_solver_finds_them():
             assert gaps.distances(m, data)[0] == pytest.approx(distance, abs=2e-7)
             assert gaps.nearest(m, data, 0)[0] == pytest.approx(distance, abs=2e-7)
             wrong += mujoco.mj_geomDistance(m, data, 1, 0, 9.0, None) == 0.0
-    assert apart > 1500 and wrong > 10
+    assert apart > 1500
+    assert wrong == 0 if mujoco.mj_version() >= 3_012_000 else wrong > 10
 
 
 def test_normals_point_from_the_machine_to_the_world_on_both_sides_of_the_surface(plant):

@@ -21,6 +21,7 @@ from safe_wrappers.envs.speed_limits import SPEED_LIMITS
 from safe_wrappers.envs.velocity import make_velocity_env
 from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.plants.mujoco import MujocoPlant
+from safe_wrappers.plants.replay import evaluations
 
 PUBLISHED = {
     "HalfCheetah": 3.2096,
@@ -159,17 +160,10 @@ def judged_point(robot, model, qpos):
 
 def last_trial(model, data):
     """Joint positions of the last of the four trial states of one Runge-Kutta step."""
-    trial, step = copy.copy(data), model.opt.timestep
-    mujoco.mj_forward(model, trial)
-    for _ in range(2):
-        velocity, acceleration = trial.qvel.copy(), trial.qacc.copy()
-        trial.qpos[:] = data.qpos
-        mujoco.mj_integratePos(model, trial.qpos, velocity, step / 2)
-        trial.qvel[:] = data.qvel + step / 2 * acceleration
-        mujoco.mj_forward(model, trial)
-    qpos = data.qpos.copy()
-    mujoco.mj_integratePos(model, qpos, trial.qvel, step)
-    return qpos
+    trials = []
+    evaluations(model, copy.copy(data), lambda trial, _: trials.append(trial.qpos.copy()))
+    assert len(trials) == 4
+    return trials[-1]
 
 
 def integrate(robot, model, start, control, frame_skip):

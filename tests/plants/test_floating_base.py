@@ -84,7 +84,7 @@ def pushed(terms):
 
 def test_the_equations_of_motion_hold_with_mujocos_own_accelerations_and_forces(walker):
     touched = 0
-    for plant in walker(40):
+    for plant in walker(60):
         terms, data = floating_base_terms(plant), plant.data
         left = terms.inertia @ data.qacc + terms.bias
         right = terms.actuation @ data.ctrl + pushed(terms)
@@ -400,9 +400,13 @@ def test_the_rigid_forces_of_a_standing_ant_are_its_weight_and_need_next_to_no_c
     assert forces[:, 2].sum() == pytest.approx(c.forces[:, 2].sum(), rel=0.02)
     assert np.abs(acceleration[:3]).max() < 0.2
     # Four rigid feet share the load in another way than soft ones, one beyond its friction: a thousandth of the
-    # torque is enough to share it as the ground can give it.
-    for found in (solve_pyramid(problem), solve_cone(problem)):
-        assert found.status == "solved"
+    # torque is enough to share it as the ground can give it. MuJoCo 4.0's Runge-Kutta puts the ant down in another
+    # pose: there the shares are inside their cones as they are, but not inside the pyramids in these.
+    inside = mujoco.mj_version() >= 4_000_000
+    assert in_cone(forces, c.normals, c.friction, 1e-6).all() == inside
+    pyramid, cone = solve_pyramid(problem), solve_cone(problem)
+    assert (pyramid.status, cone.status) == ("solved", "inactive" if inside else "solved")
+    for found in (pyramid, cone):
         assert np.abs(found.control).max() < 2e-3
         assert in_cone(found.forces, c.normals, c.friction, 1e-6).all()
         assert found.forces[:, 2].sum() == pytest.approx(weight, rel=0.02)

@@ -268,6 +268,26 @@ def test_a_delayed_actuator_is_refused():
         bound(env)
 
 
+@pytest.mark.skipif(mujoco.mj_version() < 3_012_000, reason="before 3.12 every actuator has a control")
+@pytest.mark.parametrize("motor_first", [True, False])
+def test_an_actuator_without_control_is_refused(motor_first):
+    motor = '<motor joint="hinge" ctrlrange="-1 1"/>'
+    brake = '<dcmotor name="brake" joint="slide" input="none" motorconst="1" resistance="1"/>'
+    env = scene(f"<actuator>{motor + brake if motor_first else brake + motor}</actuator>")
+    with pytest.raises(UnsupportedEnvError, match=r"'brake' has activation dynamics dcmotor"):
+        bound(env)
+
+
+def test_an_integrator_that_mixes_forces_and_steps_is_refused():
+    env = gym.make("Reacher-v5")
+    for integrator in range(4):
+        env.unwrapped.model.opt.integrator = integrator
+        bound(env)
+    env.unwrapped.model.opt.integrator = 4  # "discrete", from 3.13 on
+    with pytest.raises(UnsupportedEnvError, match=r"integrator is 'discrete'.*AnalyticPlant"):
+        bound(env)
+
+
 def test_an_env_without_mujoco_and_a_foreign_model_are_refused():
     with pytest.raises(UnsupportedEnvError, match=r"no MuJoCo .model and .data"):
         bound(gym.make("Pendulum-v1"))

@@ -5,10 +5,11 @@ import mujoco
 import numpy as np
 import pytest
 from dropped_ball import DroppedBall
+from scipy.spatial.transform import Rotation
 
 from safe_wrappers.control.impact import peak_force
 from safe_wrappers.plants.contacts import Contacts
-from safe_wrappers.plants.replay import Replay
+from safe_wrappers.plants.replay import Replay, _rotation_vector_rate
 
 INTEGRATORS = ("Euler", "implicit", "implicitfast", "RK4")
 RAW = ("HalfCheetah-v5", "Pusher-v5", "Hopper-v5", "Ant-v5", "Humanoid-v5", "SafePointGoal2-v0")
@@ -74,6 +75,17 @@ def test_every_integrator_with_activations_applied_forces_and_mocap_bodies(integ
         assert stepped(env, replay, rng.uniform(-1.0, 1.0, 3))
     # The limited activation has been at its limit, and the puck has been lifted where the hand moves.
     assert np.abs(env.data.act[0]) <= 0.3 and env.data.act.any()
+
+
+def test_the_rate_of_a_rotation_vector_turns_by_the_angular_velocity():
+    rng, short = np.random.default_rng(0), 1e-6
+    for length in (0.0, 1e-9, 1e-3, 0.5, 3.0):
+        turned, velocity = rng.normal(size=(2, 5, 3))
+        turned *= length / np.linalg.norm(turned, axis=1, keepdims=True)
+        rate = _rotation_vector_rate(turned, velocity)
+        after = Rotation.from_rotvec(turned + short * rate)
+        difference = (Rotation.from_rotvec(turned) * Rotation.from_rotvec(short * velocity)).inv() * after
+        assert difference.magnitude().max() < 20.0 * short**2
 
 
 def test_a_limited_activation_stays_in_its_range_in_runge_kutta_steps():
