@@ -163,8 +163,8 @@ def check_actions(env: gym.Env[Any, Any]) -> gym.spaces.Box:
     discrete = [part for part in _parts(space) if not _is_floating(part)]
     if discrete:
         raise ConfigurationError(
-            f"expected a Box action space of floating numbers, got {space}: for discrete actions such as "
-            f"{discrete[0]} there is no closest safe action to project to"
+            f"expected a continuous Box action space, got {space}: for the discrete actions of {discrete[0]} there "
+            "is no closest safe action to project to"
         )
     if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
         raise ConfigurationError(

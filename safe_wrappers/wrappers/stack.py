@@ -68,7 +68,10 @@ _NOT_TOGETHER: Final = {
         Layer.CHANNEL,
         Layer.CHANNEL,
     ): "one network is between operator and machine; give one channel all the delay",
-    (Layer.ADAPTION, Layer.ADAPTION): "this env has a penalty already, which would be taken twice",
+    (
+        Layer.ADAPTION,
+        Layer.ADAPTION,
+    ): "this env has an AdaptionPenalty already, and its penalty would be taken twice",
     (Layer.HANDOVER, Layer.HANDOVER): "this env takes chunks already, and a chunk of chunks has no meaning",
 }
 """By the outer layer and the inner one: why not both."""
