@@ -27,9 +27,9 @@ class Block(NamedTuple):
 
 
 def pages() -> list[str]:
-    """Every page that has code, as a path under docs/."""
+    """Every page that has code, the README among them, as a path under docs/."""
     found = (p.relative_to(DOCS).as_posix() for p in sorted(DOCS.rglob("*.md")))
-    return [page for page in found if blocks(page)]
+    return [page for page in ["../README.md", *found] if blocks(page)]
 
 
 def blocks(page: str) -> list[Block]:

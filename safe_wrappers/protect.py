@@ -4,10 +4,14 @@ import inspect
 from typing import Any
 
 import gymnasium as gym
+import mujoco
 
-from safe_wrappers.errors import UnknownNameError, UnsupportedEnvError
+from safe_wrappers.constraints.joint_speed_limit import JointSpeedLimit
+from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.plants.plant import check_actions
 from safe_wrappers.recipes import RECIPES
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
+from safe_wrappers.wrappers.stack import refuse_order
 
 
 def protect_options() -> frozenset[str]:
@@ -30,14 +34,16 @@ def protect(env: gym.Env[Any, Any], **options: Any) -> CBFActionFilter:
             gripper's box, m), `keep_out` (obstacles for its fingers) and `table` (keep them off it, default True).
 
     Raises:
-        UnsupportedEnvError: No recipe for this env; the message has the lines that protect it by hand.
+        UnsupportedEnvError: Not one env, or no recipe for it; the message has the lines that protect it by hand.
+        ConfigurationError: A layer inside that belongs outside, such as `RecordInterventions`.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
         >>> env = sw.protect(gym.make("SafePointGoal1-v0"))
     """
     if not isinstance(env, gym.Env):
-        raise UnsupportedEnvError(f"expected an env, got {env!r}; write protect(gym.make({str(env)!r}))")
+        raise UnsupportedEnvError(f"expected one env, got {env!r}; {_of_no_env(env)}")
+    refuse_order(env, CBFActionFilter.layer, "protect")
     env_id = env.spec.id if env.spec is not None else ""
     family = env_id.rpartition("/")[2].rpartition("-v")[0].removesuffix("Dense")
     robot = family.removeprefix("Safe").removesuffix("Velocity") if family.endswith("Velocity") else family
@@ -45,10 +51,7 @@ def protect(env: gym.Env[Any, Any], **options: Any) -> CBFActionFilter:
     if recipe is None:
         raise UnsupportedEnvError(
             f"no recipe for {env_id or env.unwrapped!r}; there are recipes for {', '.join(sorted(RECIPES))}. "
-            "By hand it is three lines:\n"
-            "    import safe_wrappers as sw\n"
-            "    limit = sw.JointSpeedLimit(limit=4.0)  # or sw.Clearance(...), sw.Barrier(h, alpha=...)\n"
-            "    env = sw.CBFActionFilter(env, [limit])"
+            f"{_by_hand(env)}"
         )
     of_recipe = [name for name in inspect.signature(recipe).parameters if name != "env"]
     of_filter = [n for n in inspect.signature(CBFActionFilter).parameters if n not in ("env", "constraints")]
@@ -59,3 +62,42 @@ def protect(env: gym.Env[Any, Any], **options: Any) -> CBFActionFilter:
             )
     constraints = recipe(env, **{n: options.pop(n) for n in of_recipe if n in options})
     return CBFActionFilter(env, constraints, **options)
+
+
+def _by_hand(env: gym.Env[Any, Any]) -> str:
+    """The lines that protect an env without a recipe, tried on it, or why there are none."""
+    try:
+        check_actions(env)
+        if isinstance(getattr(env.unwrapped, "model", None), mujoco.MjModel):
+            CBFActionFilter(env, [JointSpeedLimit(limit=4.0)])
+            return (
+                "By hand it is three lines:\n"
+                "    import safe_wrappers as sw\n"
+                "    limit = sw.JointSpeedLimit(limit=4.0)  # rad/s, m/s; or another constraint\n"
+                "    env = sw.CBFActionFilter(env, [limit])"
+            )
+    except ConfigurationError as error:
+        return f"A filter by hand is refused, too: {error}"
+    named = env.has_wrapper_attr("dt")
+    return (
+        "It has no MuJoCo model. Describe it by x' = f(x) + g(x) u with x = state(env), and what must stay positive "
+        f"by h(x){'' if named else ', and say with hold_s how long a step lasts, in s'}; then it is three lines:\n"
+        "    import safe_wrappers as sw\n"
+        f"    plant = sw.AnalyticPlant(f, g, state{'' if named else ', hold_s=hold_s'})\n"
+        "    env = sw.CBFActionFilter(env, [sw.Barrier(h)], plant=plant)"
+    )
+
+
+def _of_no_env(given: Any) -> str:
+    """What to write in place of what is no env."""
+    if isinstance(given, str):
+        return f"write protect(gym.make({given!r}))"
+    if isinstance(given, gym.vector.VectorEnv):
+        if given.spec is None:
+            envs = f"[lambda: sw.protect(gym.make(...))] * {given.num_envs}"
+            return f"protect each env of it: gym.vector.{type(given.unwrapped).__name__}({envs})"
+        options = "".join(f"{name}={value!r}, " for name, value in given.spec.kwargs.items())
+        return f"protect each env of it: gym.make_vec({given.spec.id!r}, {options}wrappers=[sw.protect])"
+    if hasattr(given, "num_envs"):
+        return f"protect each env of it: make_vec_env(..., n_envs={given.num_envs}, wrapper_class=sw.protect)"
+    return "write protect(gym.make(...))"

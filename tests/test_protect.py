@@ -257,8 +257,127 @@ def test_an_env_without_a_spec_is_refused_and_not_a_crash():
 
 
 def test_a_discrete_env_is_refused():
-    with pytest.raises(ConfigurationError, match=r"no recipe for '?CartPole-v1"):
+    with pytest.raises(
+        ConfigurationError, match=r"no recipe for '?CartPole-v1.*got Discrete\(2\).*no closest"
+    ):
         sw.protect(gym.make("CartPole-v1"))
+
+
+def refusal(env):
+    with pytest.raises(ConfigurationError) as caught:
+        sw.protect(env)
+    return str(caught.value)
+
+
+MACHINES = {
+    "Pendulum-v1": {
+        "f": lambda x: np.array([x[1], 15.0 * np.sin(x[0])]),
+        "g": lambda x: np.array([[0.0], [3.0]]),
+        "h": lambda x: 36.0 - x[1] ** 2,
+    },
+    "MountainCarContinuous-v0": {
+        "f": lambda x: np.array([x[1], -0.0025 * np.cos(3.0 * x[0])]),
+        "g": lambda x: np.array([[0.0], [0.0015]]),
+        "h": lambda x: 0.06 - x[1],
+        "hold_s": 1.0,
+    },
+}
+
+
+@pytest.mark.parametrize("env_id", MACHINES)
+def test_an_env_without_mujoco_gets_lines_for_it(env_id):
+    env = gym.make(env_id)
+    message = refusal(env)
+    assert "JointSpeedLimit" not in message
+    lines = textwrap.dedent("\n".join(message.splitlines()[1:]))
+    assert len(lines.splitlines()) == 3 and ("hold_s" in message) == ("hold_s" in MACHINES[env_id])
+    scope = {"env": env, "state": lambda env: env.state, **MACHINES[env_id]}
+    exec(lines, scope)
+    scope["env"].reset(seed=0)
+    for _ in range(30):
+        *_, info = scope["env"].step(scope["env"].action_space.sample())
+        assert info["cbf/margin"] >= 0.0 or info["cbf/unsafe"]
+
+
+@pytest.mark.parametrize("mode", ["sync", "async"])
+def test_a_vector_env_is_told_how_to_protect_each_env(mode):
+    vector = gym.make_vec("Reacher-v5", num_envs=2, vectorization_mode=mode, max_episode_steps=7)
+    message = refusal(vector)
+    vector.close()
+    protected = eval(message.partition("protect each env of it: ")[2], {"gym": gym, "sw": sw})
+    _, info = protected.reset(seed=0)
+    assert protected.num_envs == 2 and info["cbf/margin"].shape == (2,)
+    assert protected.spec.kwargs["max_episode_steps"] == 7 and type(protected) is type(vector)
+    protected.close()
+
+
+def test_vector_envs_of_other_makes_are_told_too():
+    by_hand = gym.vector.SyncVectorEnv([lambda: gym.make("Reacher-v5")] * 3)
+    code = refusal(by_hand).partition("protect each env of it: ")[2]
+    assert (
+        eval(code.replace("...", "'Reacher-v5'"), {"gym": gym, "sw": sw}).reset(seed=0)[1]["cbf/margin"].size
+        == 3
+    )
+    make_vec_env = pytest.importorskip("stable_baselines3.common.env_util").make_vec_env
+    code = refusal(make_vec_env("Reacher-v5", 2)).partition("protect each env of it: ")[2]
+    made = eval(code.replace("...", "'Reacher-v5'"), {"make_vec_env": make_vec_env, "sw": sw})
+    assert made.num_envs == 2 and all(
+        f is not None for f in made.env_method("get_wrapper_attr", "filter_calls")
+    )
+    assert "write protect(gym.make(...))" in refusal(7)
+
+
+HANDS = ["AdroitHandDoor-v1", "HandReach-v3", "FrankaKitchen-v1"]
+
+
+@pytest.mark.parametrize("env_id", HANDS)
+@pytest.mark.filterwarnings("ignore")
+def test_envs_that_rescale_in_their_own_step_are_named_and_not_blamed_on_wrappers(env_id):
+    gym.register_envs(pytest.importorskip("gymnasium_robotics"))
+    env = gym.make(env_id)
+    says = (
+        rf"{env_id} rescales or limits actions in its own step; filters on such an env are not supported yet"
+    )
+    for refused in (lambda: sw.protect(env), lambda: sw.CBFActionFilter(env, [sw.SpeedLimit(1.0)])):
+        with pytest.raises(UnsupportedEnvError, match=says) as caught:
+            refused()
+        assert "wrapper" not in str(caught.value)
+    effect = np.ones((1, *env.action_space.shape))
+    hold_s = None if env.has_wrapper_attr("dt") else 0.1
+    plant = sw.AnalyticPlant(np.zeros_like, lambda x: effect, lambda env: np.zeros(1), hold_s=hold_s)
+    filtered = sw.CBFActionFilter(
+        env, [sw.Barrier(lambda x: 1.0 - x[0])], plant=plant
+    )  # what the message suggests
+    filtered.reset(seed=0)
+    filtered.step(env.action_space.sample())
+
+
+def test_a_fetch_arm_with_the_wrong_plant_is_told_the_right_one():
+    gym.register_envs(pytest.importorskip("gymnasium_robotics"))
+    limit = sw.Workspace([None, None, 0.3], [None, None, 1.0], sites=["robot0:grip"])
+    with pytest.raises(UnsupportedEnvError, match=r"take DisplacementPlant\(\), or leave plant out"):
+        sw.CBFActionFilter(gym.make("FetchReach-v4"), [limit], plant=sw.MujocoPlant())
+    sw.CBFActionFilter(gym.make("FetchReach-v4"), [limit], plant=sw.DisplacementPlant())
+    sw.CBFActionFilter(gym.make("FetchReach-v4"), [limit])
+
+
+class Rescaled(gym.Wrapper):
+    """No ActionWrapper: nothing says what it does but its action space."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.action_space = gym.spaces.Box(-2.0, 2.0, env.action_space.shape)
+
+    def step(self, action):
+        return self.env.step(action / 2.0)
+
+
+def test_a_wrapper_that_changes_the_action_space_belongs_outside():
+    with pytest.raises(UnsupportedEnvError, match="the filter must be inside of that wrapper"):
+        sw.protect(Rescaled(gym.make("Reacher-v5")))
+    env = Rescaled(sw.protect(gym.make("Reacher-v5")))
+    env.reset(seed=0)
+    assert "cbf/margin" in env.step(env.action_space.sample())[4]
 
 
 @pytest.mark.filterwarnings(

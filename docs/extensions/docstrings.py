@@ -28,7 +28,9 @@ def _escape(
             lines[i] = line
         if not line.lstrip().startswith((">>>", "...")):
             line = _BAR.sub(lambda m: m[0] if m[0] != "|" else r"\|", line)
-            lines[i] = line.replace("Source: appendix", "Source: :doc:`appendix </references>`")
+            lines[i] = line.replace(
+                "Source: appendix", "Source: :doc:`appendix </references>`"
+            )
 
 
 def _shorten(

@@ -35,7 +35,8 @@ class JointPositionLimit(Predicted):
         lower: Smallest position, rad for hinges, m for slides; one number, or one per joint. None is the
             model's own range.
         upper: Largest, likewise.
-        joints: Names. None takes every hinge and slide that an actuator drives directly.
+        joints: Names. None takes every hinge and slide that an actuator drives directly, and is refused where an
+            action moves others as well.
         margin: Kept free inside the range, in the same units.
         holds: Control steps to look ahead; cover the time that braking takes.
         reach: The farthest that a joint can move within `holds` control steps in the declared envelope, rad or m;

@@ -33,7 +33,8 @@ class JointSpeedLimit(Predicted):
 
     Args:
         limit: In rad/s for hinges, m/s for slides; one number, or one per named joint.
-        joints: Joint names. None takes every hinge and slide that an actuator drives directly.
+        joints: Joint names. None takes every hinge and slide that an actuator drives directly, and is refused where
+            an action moves others as well.
         margin: Kept free below the limit, for model and state error, in the same units.
         holds: Control steps to look ahead; the actuated joints are braked after the first.
         reach: The most that a joint's speed can rise within `holds` control steps in the declared envelope, rad/s

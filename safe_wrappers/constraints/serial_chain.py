@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.constraints.joints import scalar_joints
+from safe_wrappers.constraints.joints import driven_joints, refuse_uncovered, scalar_joints
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco import MujocoPlant
 
@@ -15,7 +15,6 @@ Array = NDArray[np.float64]
 FrameKind = Literal["site", "body", "geom"]
 
 _HINGE_OR_SLIDE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-_DRIVES = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
 class SerialChain:
@@ -75,14 +74,15 @@ class SerialChain:
         model = self._model
         there = ", ".join(str(model.joint(j).name) for j in self.joints)
         if names is None:
-            kinds = model.actuator_trntype
-            driven = {int(model.actuator_trnid[a, 0]) for a in range(model.nu) if kinds[a] in _DRIVES}
+            driven = driven_joints(model)
             found = [i for i, j in enumerate(self.joints) if int(j) in driven]
             if not found:
                 raise ConfigurationError(
                     f"no actuator drives a joint that moves {self._what}: name the joints that move it; there are "
                     + there
                 )
+            remedy = "Name those that do the task: joints=[...]"
+            refuse_uncovered(model, self.joints.tolist(), remedy, self._plant.has_acceleration)
             return found
         places = {int(j): i for i, j in enumerate(self.joints)}
         ids = scalar_joints(self._plant, names)

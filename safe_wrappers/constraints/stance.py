@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers import interventions as keys
 from safe_wrappers.constraints.constraint import HalfSpaces, Promise, non_negative, positive
-from safe_wrappers.constraints.joints import stops
+from safe_wrappers.constraints.joints import refuse_uncovered_stops, stops
 from safe_wrappers.control.friction_cone import cone_excess
 from safe_wrappers.control.predicted_positions import predicted_position_rows
 from safe_wrappers.control.support import common_plane, support_polygon, support_rows
@@ -98,6 +98,8 @@ class Stance:
                 "no body of this model can touch the fixed world with friction: there is nothing to stand on"
             )
         self._plant = plant
+        if self.joint_tolerance is not None:
+            refuse_uncovered_stops(plant.model)
         self._joints, low, high = stops(plant.model)
         wider = self.joint_tolerance or 0.0
         self._low, self._high = low - wider, high + wider

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.plant import check_timing, read_attribute, refuse_second_env, seconds
+from safe_wrappers.plants.plant import check_delay, check_timing, read_attribute, refuse_second_env, seconds
 
 Array = NDArray[np.float64]
 
@@ -23,21 +23,25 @@ class AnalyticPlant:
         state: Takes the (unwrapped) env, returns x.
         lower: Smallest control, shape (m,) or scalar; None takes the action space's.
         upper: Largest control, likewise.
-        hold_s: Control interval in s; compared with the env's `dt` where it has one.
+        hold_s: Control interval in s; None takes the env's `dt`. An env that names none needs it.
         delay_s: Delay from measurement to effect in s; predicted over with the commands in flight.
 
     Raises:
-        ConfigurationError: Shapes that do not fit, values that are not finite, or a wrong hold interval.
+        ConfigurationError: Shapes that do not fit, values that are not finite, or a hold interval that is wrong or
+            missing.
 
     Example:
         >>> import gymnasium as gym, numpy as np, safe_wrappers as sw
         >>> plant = sw.AnalyticPlant(
-        ...     f=lambda x: np.array([x[1], 15.0 * np.sin(x[0])]),
-        ...     g=lambda x: np.array([[0.0], [3.0]]),
-        ...     state=lambda env: env.state, lower=-2.0, upper=2.0, hold_s=0.05)
+        ...     f=lambda x: np.array([x[1], 2.43 * np.sin(x[0])]),  # a pendulum on the Moon: its motor is
+        ...     g=lambda x: np.array([[0.0], [3.0]]),               # stronger than gravity at every angle
+        ...     state=lambda env: env.state)
         >>> slow = sw.Barrier(lambda x: 4.0 - x[1] ** 2, alpha=2.0)
-        >>> env = sw.CBFActionFilter(gym.make("Pendulum-v1"), [slow], plant=plant)
+        >>> env = sw.CBFActionFilter(gym.make("Pendulum-v1", g=1.62), [slow], plant=plant)
     """
+
+    hold_s: float
+    """Control interval, s; without a `hold_s` of the user's known once the plant is bound to an env."""
 
     def __init__(
         self,
@@ -46,14 +50,17 @@ class AnalyticPlant:
         state: Callable[[Any], ArrayLike],
         lower: ArrayLike | None = None,
         upper: ArrayLike | None = None,
-        hold_s: float = 0.05,
+        hold_s: float | None = None,
         delay_s: float = 0.0,
     ) -> None:
         for name, function in (("f", f), ("g", g), ("state", state)):
             if not callable(function):
                 raise ConfigurationError(f"{name} must be a function, got {function!r}")
         self._f, self._g, self._state_of = f, g, state
-        self.hold_s, self.delay_s = seconds("hold_s", hold_s), seconds("delay_s", delay_s)
+        self._given_hold_s = None if hold_s is None else seconds("hold_s", hold_s)
+        if self._given_hold_s is not None:
+            self.hold_s = self._given_hold_s
+        self.delay_s = seconds("delay_s", delay_s)
         self._box = (lower, upper)
         self._env: gym.Env[Any, Any] | None = None
         self._x = np.zeros(0)
@@ -64,7 +71,8 @@ class AnalyticPlant:
     def bind(self, env: gym.Env[Any, Any]) -> None:
         """Attach to an env: checks the time step and the bounds."""
         refuse_second_env(self._env, env)
-        check_timing(env, self.hold_s, self.delay_s)
+        self.hold_s = check_timing(env, self._given_hold_s)
+        check_delay(self.delay_s)
         self._pending = deque(maxlen=max(1, int(np.ceil(self.delay_s / self.hold_s - 1e-9))))
         space = env.action_space
         assert isinstance(space, gym.spaces.Box)  # the filter has refused every other space

@@ -18,10 +18,13 @@ from numpy.typing import NDArray
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.actuators import AffineActuators
 from safe_wrappers.plants.contact_forecast import ContactForecast, ContactReader, forecast_contacts
+from safe_wrappers.plants.displacement_step import moves_by_displacement
 from safe_wrappers.plants.fixed_bodies import fixed_bodies
 from safe_wrappers.plants.forecast import Forecast, Poses, Recorder
 from safe_wrappers.plants.plant import (
+    check_delay,
     check_timing,
+    name_of,
     read_attribute,
     refuse_changed_actions,
     refuse_second_env,
@@ -105,11 +108,11 @@ class MujocoPlant:
         limited = self.model.actuator_ctrllimited.astype(bool)
         self._lower = np.where(limited, self.model.actuator_ctrlrange[:, 0], -np.inf)
         self._upper = np.where(limited, self.model.actuator_ctrlrange[:, 1], np.inf)
-        self._check_action_space(env)
         refuse_changed_actions(env)
+        self._check_action_space(env)
         self.substeps = physics_steps(raw)
-        self.hold_s = control_interval(raw)
-        check_timing(env, self.hold_s, self.delay_s)
+        self.hold_s = check_timing(env, control_interval(raw))
+        check_delay(self.delay_s)
         self._delay_steps = int(np.ceil(self.delay_s / self.model.opt.timestep - 1e-9))
         self._pending = deque(maxlen=max(1, -(-self._delay_steps // self.substeps)))
         self._recorder = self._new_recorder()
@@ -132,12 +135,22 @@ class MujocoPlant:
             np.allclose(space.low[limited], self._lower[limited], atol=1e-6)
             and np.allclose(space.high[limited], self._upper[limited], atol=1e-6)
         )
-        if not fits:
+        if fits:
+            return
+        ranges = f"the action space is {space}, the model's control range {self._lower} to {self._upper}"
+        if space != env.unwrapped.action_space:
             raise UnsupportedEnvError(
-                f"the action space {space} is not the model's control range {self._lower} to {self._upper}; "
-                "put the filter inside wrappers that rescale actions, or describe the env with AnalyticPlant; an env "
-                "of gymnasium-robotics' Fetch takes DisplacementPlant()"
+                f"a wrapper of {name_of(env)} changes its action space; the filter must be inside of that wrapper: "
+                + ranges
             )
+        if moves_by_displacement(env.unwrapped):
+            raise UnsupportedEnvError(
+                f"{name_of(env)} moves its gripper by displacements: take DisplacementPlant(), or leave plant out"
+            )
+        raise UnsupportedEnvError(
+            f"{name_of(env)} rescales or limits actions in its own step; filters on such an env are not supported "
+            f"yet, except with an AnalyticPlant(f=..., g=..., state=...) of your own: {ranges}"
+        )
 
     def perturb(self, mass: float = 1.0, damping: float = 1.0) -> None:
         """Scale the masses (and inertias) and joint damping of the plant's own model, now or once it has one."""
@@ -501,7 +514,14 @@ def control_interval(raw: Any) -> float:
 def physics_steps(raw: Any) -> int:
     """How many physics substeps an unwrapped MuJoCo env takes with one action."""
     env = _stepped(raw)
-    return int(getattr(env, "frame_skip", getattr(env, "n_substeps", 1)))
+    named = getattr(env, "frame_skip", getattr(env, "n_substeps", None))
+    if named is not None:
+        return int(named)
+    if not hasattr(env, "dt"):
+        raise UnsupportedEnvError(
+            f"{raw} does not say how long a step lasts: give it an attribute dt (s) or frame_skip (physics steps)"
+        )
+    return round(float(env.dt) / float(raw.model.opt.timestep))
 
 
 def _stepped(raw: Any) -> Any:

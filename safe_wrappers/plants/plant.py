@@ -98,6 +98,12 @@ def wrappers_of(env: gym.Env[Any, Any]) -> Iterator[Any]:
         inner = inner.env
 
 
+def name_of(env: gym.Env[Any, Any]) -> str:
+    """What to call an env in a message: its id, or what it says of itself."""
+    spec = env.unwrapped.spec
+    return spec.id if spec is not None else repr(env.unwrapped)
+
+
 _REPEATS = ("StickyAction", "MaxAndSkipObservation", "RepeatAction")
 
 
@@ -119,34 +125,64 @@ def seconds(name: str, value: Any) -> float:
         raise ConfigurationError(f"{name} is a time in seconds, got {value!r}") from None
 
 
-def check_timing(env: gym.Env[Any, Any], hold_s: float, delay_s: float) -> None:
-    """Refuse a hold interval that is not the env's own, or a negative delay."""
-    if not (np.isfinite(hold_s) and hold_s > 0.0):
-        raise ConfigurationError(f"hold_s is the control interval in seconds, > 0; got {hold_s}")
+def check_delay(delay_s: float) -> None:
+    """Refuse a delay that is negative or not finite."""
     if not (np.isfinite(delay_s) and delay_s >= 0.0):
         raise ConfigurationError(f"delay_s is a time in seconds, >= 0; got {delay_s}")
+
+
+def check_timing(env: gym.Env[Any, Any], hold_s: float | None) -> float:
+    """How long one action is held, s: the env's `dt`, or `hold_s` where the env has none.
+
+    Raises:
+        ConfigurationError: Neither is there, or they disagree, or it is no time above 0.
+    """
     try:
         dt = float(env.get_wrapper_attr("dt"))
     except (AttributeError, TypeError, ValueError):
-        return  # the env names no time step: nothing to compare with
-    if not np.isclose(dt, hold_s, rtol=1e-6):
+        dt = None
+    if hold_s is None and dt is None:
         raise ConfigurationError(
-            f"hold_s = {hold_s} s, but one step of this env lasts dt = {dt} s; a filter that looks ahead by "
+            f"{name_of(env)} does not say how long a step lasts (it has no attribute dt): pass hold_s, in seconds"
+        )
+    hold = seconds("hold_s", dt if hold_s is None else hold_s)
+    if not (np.isfinite(hold) and hold > 0.0):
+        whose = "the env's dt" if hold_s is None else "hold_s"
+        raise ConfigurationError(f"{whose} is the control interval in seconds, > 0; got {hold}")
+    if dt is not None and not np.isclose(dt, hold, rtol=1e-6):
+        raise ConfigurationError(
+            f"hold_s = {hold} s, but one step of this env lasts dt = {dt} s; a filter that looks ahead by "
             "another interval than the env's promises nothing: pass hold_s equal to env.unwrapped.dt"
         )
+    return hold
 
 
 def check_actions(env: gym.Env[Any, Any]) -> gym.spaces.Box:
     """The env's action space, refused unless it is a one-dimensional, floating Box."""
     space = env.action_space
-    if not isinstance(space, gym.spaces.Box) or not np.issubdtype(space.dtype, np.floating):
+    discrete = [part for part in _parts(space) if not _is_floating(part)]
+    if discrete:
         raise ConfigurationError(
-            f"a filter needs a continuous Box action space, got {space}; for a discrete env there is no "
-            "closest safe action to project to"
+            f"expected a continuous Box action space, got {space}: for the discrete actions of {discrete[0]} there "
+            "is no closest safe action to project to"
         )
-    if len(space.shape) != 1:
+    if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
         raise ConfigurationError(
-            f"expected actions of shape (m,), got {space.shape}; flatten them with "
-            "gymnasium.wrappers.TransformAction outside the filter"
+            f"expected actions of shape (m,), got {space}. Give the env one flat Box of its own, from this space: "
+            "`action_space = gymnasium.spaces.flatten_space(space)`, and in its step "
+            "`action = gymnasium.spaces.unflatten(space, action)`"
         )
     return space
+
+
+def _parts(space: gym.Space[Any]) -> Iterator[gym.Space[Any]]:
+    """What a Dict or Tuple is made of; any other space is its own part."""
+    if not isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
+        yield space
+        return
+    for part in space.values() if isinstance(space, gym.spaces.Dict) else space:
+        yield from _parts(part)
+
+
+def _is_floating(space: gym.Space[Any]) -> bool:
+    return isinstance(space, gym.spaces.Box) and np.issubdtype(space.dtype, np.floating)

@@ -1,15 +1,14 @@
 """AdaptionPenalty: the learner's reward is reduced where the filter changed its action."""
 
-from typing import Any, SupportsFloat
+from typing import Any, ClassVar, SupportsFloat
 
 import gymnasium as gym
 
 from safe_wrappers import interventions as keys
 from safe_wrappers.constraints.constraint import non_negative
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.plant import wrappers_of
-from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
-from safe_wrappers.wrappers.chunk_handover import ChunkHandover
+from safe_wrappers.wrappers.cbf_action_filter import is_filtered
+from safe_wrappers.wrappers.stack import Layer, refuse_order
 
 
 class AdaptionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
@@ -55,8 +54,15 @@ class AdaptionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         * v0.1.0: added.
     """
 
+    layer: ClassVar = Layer.ADAPTION
+
     def __init__(self, env: gym.Env[Any, Any], penalty: float = 0.0, per_correction: float = 0.0) -> None:
-        _check_inside(env)
+        refuse_order(env, self.layer, type(self).__name__)
+        if not is_filtered(env):
+            raise ConfigurationError(
+                "AdaptionPenalty needs a CBFActionFilter inside, which says when an action was changed:"
+                " AdaptionPenalty(sw.protect(env), penalty=...)"
+            )
         penalty = non_negative("penalty", penalty, "the task's reward")
         per_correction = non_negative("per_correction", per_correction, "reward per action unit")
         if penalty == 0.0 and per_correction == 0.0:
@@ -87,23 +93,3 @@ class AdaptionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
             reward = float(reward) - penalty
         info[keys.ADAPTION_PENALTY] = penalty
         return observation, reward, terminated, truncated, info
-
-
-def _check_inside(env: gym.Env[Any, Any]) -> None:
-    filtered = False
-    for inner in wrappers_of(env):
-        if isinstance(inner, AdaptionPenalty):
-            raise ConfigurationError(
-                "this env has an AdaptionPenalty already; its penalty would be taken twice"
-            )
-        if isinstance(inner, ChunkHandover):
-            raise ConfigurationError(
-                "AdaptionPenalty outside of ChunkHandover would see one step per chunk; put it inside: "
-                "ChunkHandover(AdaptionPenalty(...), ...)"
-            )
-        filtered = filtered or isinstance(inner, CBFActionFilter)
-    if not filtered:
-        raise ConfigurationError(
-            "AdaptionPenalty needs a CBFActionFilter inside, which says when an action was changed:"
-            " AdaptionPenalty(sw.protect(env), penalty=...)"
-        )

@@ -1,7 +1,7 @@
 """BalanceMonitor: momentum, friction and support of a legged robot in each control step."""
 
 from collections.abc import Sequence
-from typing import Any, Final, SupportsFloat
+from typing import Any, ClassVar, Final, SupportsFloat
 
 import gymnasium as gym
 import mujoco
@@ -16,6 +16,7 @@ from safe_wrappers.errors import ConfigurationError, UnknownNameError, Unsupport
 from safe_wrappers.plants.contact_forecast import ContactForecast, ContactReader, can_touch_the_world
 from safe_wrappers.plants.fixed_bodies import fixed_bodies
 from safe_wrappers.plants.momentum import MomentumReader
+from safe_wrappers.wrappers.stack import Layer
 from safe_wrappers.wrappers.step_watch import StepWatch
 
 PRESSING: Final = 0.01
@@ -93,6 +94,8 @@ class BalanceMonitor(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructo
     Change log:
         * v0.1.0: added.
     """
+
+    layer: ClassVar = Layer.MONITOR
 
     def __init__(
         self,

@@ -6,7 +6,7 @@ import time
 import warnings
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass, replace
-from typing import Any, SupportsFloat
+from typing import Any, ClassVar, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
@@ -22,8 +22,8 @@ from safe_wrappers.plants.plant import Plant, check_actions, wrappers_of
 from safe_wrappers.wrappers.decision import Decider
 from safe_wrappers.wrappers.fallback import Fallback, FallbackFunction
 from safe_wrappers.wrappers.own_plant import PlantOfSpec, own_plant
-from safe_wrappers.wrappers.receiver import CommandReceiver
 from safe_wrappers.wrappers.rounding import cast_inside
+from safe_wrappers.wrappers.stack import Layer, refuse_order
 
 Array = NDArray[np.float64]
 
@@ -77,6 +77,8 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         True
     """
 
+    layer: ClassVar = Layer.FILTER
+
     def __init__(
         self,
         env: gym.Env[Any, Any],
@@ -86,7 +88,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         solver: str = "daqp",
         margin: float = 0.0,
     ) -> None:
-        _refuse_nesting(env)
+        refuse_order(env, self.layer, type(self).__name__)
         space = check_actions(env)
         plant = own_plant(plant)
         if isinstance(constraints, str | dict) or not isinstance(constraints, Sequence) or not constraints:
@@ -296,21 +298,6 @@ def _refuse_same_reports(reporting: list[Any]) -> None:
 def is_filtered(env: gym.Env[Any, Any]) -> bool:
     """Whether there is a filter among an env's wrappers."""
     return any(isinstance(inner, CBFActionFilter) for inner in wrappers_of(env))
-
-
-def _refuse_nesting(env: gym.Env[Any, Any]) -> None:
-    """Layers that filter one after another undo each other, and the outer one's report would be wrong."""
-    for inner in wrappers_of(env):
-        if isinstance(inner, CBFActionFilter):
-            raise ConfigurationError(
-                "this env is filtered already; constraints compose in one projection, so pass all of them to one "
-                "filter: CBFActionFilter(env, [*inner.constraints, more])"
-            )
-        if isinstance(inner, CommandReceiver):
-            raise ConfigurationError(
-                f"{type(inner).__name__} inside the filter changes the actions that the filter has checked; the "
-                "filter has the last word: ChunkHandover(LeaseExpiry(CBFActionFilter(env, ...), ...), ...)"
-            )
 
 
 def _with_margin(constraint: Constraint, margin: float) -> Constraint:

@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections.abc import Sequence
-from typing import Any, Final, SupportsFloat
+from typing import Any, ClassVar, Final, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 from safe_wrappers import interventions as keys
 from safe_wrappers.constraints.constraint import non_negative
 from safe_wrappers.control.seams import BLENDS, DIFFERENCES
-from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError
-from safe_wrappers.plants.plant import Plant, check_actions, wrappers_of
+from safe_wrappers.errors import ActionError, UnknownNameError
+from safe_wrappers.plants.plant import Plant, check_actions, check_timing
 from safe_wrappers.wrappers.chunk_queue import BASELINES, ChunkQueue, Command
 from safe_wrappers.wrappers.chunk_sizes import ChunkSizes, blend_bounds
-from safe_wrappers.wrappers.control_interval import control_interval
 from safe_wrappers.wrappers.fallback import FallbackFunction
 from safe_wrappers.wrappers.lease_expiry import lease_inside
 from safe_wrappers.wrappers.macro_info import macro_info
 from safe_wrappers.wrappers.own_plant import PlantOfSpec, own_plant
 from safe_wrappers.wrappers.own_random import OwnRandom
 from safe_wrappers.wrappers.receiver import CommandReceiver, receiver_inside
+from safe_wrappers.wrappers.stack import Layer, refuse_order
 from safe_wrappers.wrappers.stand_in import StandIn
 from safe_wrappers.wrappers.upsampling import Upsampling
 
@@ -114,6 +114,8 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         * v0.1.0: added.
     """
 
+    layer: ClassVar = Layer.HANDOVER
+
     _evidence: float | None
     _executed: Array
 
@@ -133,7 +135,8 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         steps_per_entry: int = 1,
         clock_error_s: float = 0.0,
     ) -> None:
-        _refuse_order(env)  # first: with a handover inside the actions are no vector either
+        # First: with a handover inside the actions are no vector either.
+        refuse_order(env, self.layer, type(self).__name__)
         space = check_actions(env)
         plant = own_plant(plant)
         sizes = ChunkSizes.checked(chunk_size, execution_horizon, inference_delay, steps_per_entry)
@@ -158,7 +161,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         )
         gym.Wrapper.__init__(self, env)
         self.chunk_size, self.execution_horizon, self.blend = sizes.entries, sizes.horizon, blend
-        self.hold_s = control_interval(env, hold_s)
+        self.hold_s = check_timing(env, hold_s)
         self._delay = sizes.delay
         self._clock_error_s = non_negative("clock_error_s", clock_error_s, "s")
         self._upsampling = Upsampling(sizes.entries, sizes.steps_per_entry)
@@ -331,11 +334,3 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
 def _plain(value: Any) -> Any:
     """A spec is written as JSON, which knows no NumPy."""
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
-
-
-def _refuse_order(env: gym.Env[Any, Any]) -> None:
-    for inner in wrappers_of(env):
-        if isinstance(inner, ChunkHandover):
-            raise ConfigurationError(
-                "this env takes chunks already, from a ChunkHandover inside, and a chunk of chunks has no meaning"
-            )

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, SupportsFloat
+from typing import Any, ClassVar, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from safe_wrappers import interventions as keys
 from safe_wrappers.control.contact import complementarity_residuals
 from safe_wrappers.plants.contacts import Contacts, NormalContact
+from safe_wrappers.wrappers.stack import Layer
 from safe_wrappers.wrappers.step_watch import StepWatch
 
 
@@ -66,6 +67,8 @@ class ContactMonitor(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructo
     Change log:
         * v0.1.0: added.
     """
+
+    layer: ClassVar = Layer.MONITOR
 
     def __init__(
         self,

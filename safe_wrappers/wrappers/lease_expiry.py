@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections.abc import Mapping
-from typing import Any, Final, SupportsFloat
+from typing import Any, ClassVar, Final, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
@@ -16,14 +16,14 @@ from safe_wrappers.control.leases import LeaseDelays
 from safe_wrappers.control.smoothstep import smoothstep
 from safe_wrappers.errors import ActionError, ConfigurationError
 from safe_wrappers.plants.default import default_plant
-from safe_wrappers.plants.plant import Plant, check_actions, refuse_changed_actions, wrappers_of
+from safe_wrappers.plants.plant import Plant, check_actions, check_timing, refuse_changed_actions, wrappers_of
 from safe_wrappers.wrappers.admission import Admission, Measured
 from safe_wrappers.wrappers.cbf_action_filter import is_filtered
-from safe_wrappers.wrappers.control_interval import control_interval
 from safe_wrappers.wrappers.fallback import FallbackFunction
 from safe_wrappers.wrappers.own_plant import PlantOfSpec, own_plant
 from safe_wrappers.wrappers.receiver import CommandReceiver
 from safe_wrappers.wrappers.room import ClearanceFunction, Room
+from safe_wrappers.wrappers.stack import Layer, refuse_order
 from safe_wrappers.wrappers.stand_in import StandIn
 
 Array = NDArray[np.float64]
@@ -117,6 +117,8 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         * v0.1.0: added.
     """
 
+    layer: ClassVar = Layer.LEASE
+
     _until_s: float
     _newest_s: float
     _evidence: float | None
@@ -150,7 +152,7 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         plant: Plant | None = None,
         hold_s: float | None = None,
     ) -> None:
-        _refuse_order(env)
+        refuse_order(env, self.layer, type(self).__name__)
         space = check_actions(env)
         refuse_changed_actions(env)
         plant = own_plant(plant)
@@ -190,7 +192,7 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
             hold_s=hold_s,
         )
         gym.Wrapper.__init__(self, env)
-        self.hold_s = control_interval(env, hold_s)
+        self.hold_s = check_timing(env, hold_s)
         self._longest_s = positive("longest_s", longest_s, "s")
         if self._longest_s < (1.0 - _SAME_TIME) * self.hold_s:
             raise ConfigurationError(
@@ -390,22 +392,6 @@ def _least(env: gym.Env[Any, Any], least_s: float, longest_s: float) -> float:
             "leave it 0, or put the filter inside, LeaseExpiry(sw.protect(env), ...)"
         )
     return least_s
-
-
-def _refuse_order(env: gym.Env[Any, Any]) -> None:
-    """One lease, and inside whatever carries commands to it."""
-    for inner in wrappers_of(env):
-        if isinstance(inner, CommandReceiver):
-            raise ConfigurationError(
-                f"{type(inner).__name__} inside LeaseExpiry: the lease must be inside of what hands commands over, "
-                "once: ChunkHandover(LeaseExpiry(CBFActionFilter(env, ...), ...), ...)"
-            )
-        # By name: it imports ChunkHandover, which imports this.
-        if type(inner).__name__ == "RecordInterventions":
-            raise ConfigurationError(
-                "RecordInterventions inside LeaseExpiry would count no lease that expires; put it outside: "
-                "RecordInterventions(LeaseExpiry(...))"
-            )
 
 
 def lease_inside(env: gym.Env[Any, Any]) -> LeaseExpiry | None:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
-from typing import Any, SupportsFloat
+from typing import Any, ClassVar, SupportsFloat
 
 import gymnasium as gym
 import mujoco
@@ -19,11 +19,10 @@ from safe_wrappers.control.tracks import Tracks, largest_deviation
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.line_of_sight import LineOfSight
 from safe_wrappers.plants.mujoco import control_interval
-from safe_wrappers.plants.plant import read_attribute, wrappers_of
-from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
-from safe_wrappers.wrappers.chunk_handover import ChunkHandover
+from safe_wrappers.plants.plant import read_attribute
 from safe_wrappers.wrappers.own_random import OwnRandom
 from safe_wrappers.wrappers.sensor import Sensor, sensor_from
+from safe_wrappers.wrappers.stack import Layer, refuse_order
 from safe_wrappers.wrappers.track import Track, track_from
 
 Array = NDArray[np.float64]
@@ -102,6 +101,8 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         * v0.1.0: added.
     """
 
+    layer: ClassVar = Layer.OCCLUSION
+
     def __init__(
         self,
         env: gym.Env[Any, Any],
@@ -115,6 +116,7 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
     ) -> None:
         raw: Any = env.unwrapped
         _check_env(env)
+        refuse_order(env, self.layer, type(self).__name__)
         if isinstance(tracks, str | dict) or not isinstance(tracks, Sequence) or not tracks:
             raise ConfigurationError(f"tracks is a list with at least one Track, got {tracks!r}")
         self.tracks = [track_from(t) for t in tracks]
@@ -389,19 +391,6 @@ def _check_env(env: gym.Env[Any, Any]) -> None:
         raise UnsupportedEnvError(
             f"OcclusionPenalty casts rays in MuJoCo: it needs an env with .model and .data; {raw} has none"
         )
-    for inner in wrappers_of(env):
-        if isinstance(inner, OcclusionPenalty):
-            raise ConfigurationError("this env has an OcclusionPenalty already; give that one all the tracks")
-        if isinstance(inner, CBFActionFilter):
-            raise ConfigurationError(
-                "OcclusionPenalty outside of the filter tells it nothing; put it inside: "
-                "CBFActionFilter(OcclusionPenalty(env, ...), ...)"
-            )
-        if isinstance(inner, ChunkHandover):
-            raise ConfigurationError(
-                "OcclusionPenalty outside of ChunkHandover would look once per chunk; put it inside: "
-                "ChunkHandover(OcclusionPenalty(...), ...)"
-            )
 
 
 def _with_tracks(space: gym.Space[Any], size: int) -> gym.Space[Any]:

@@ -7,15 +7,14 @@ import io
 import math
 import os
 from pathlib import Path
-from typing import Any, Final, SupportsFloat
+from typing import Any, ClassVar, Final, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
 
 from safe_wrappers import interventions as keys
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.plant import wrappers_of
-from safe_wrappers.wrappers.chunk_handover import ChunkHandover
+from safe_wrappers.wrappers.stack import Layer, refuse_order
 
 COLUMNS: Final = (
     "length",
@@ -62,14 +61,16 @@ class RecordInterventions(
 ):
     """Counts interventions, corrections and costs; changes neither actions, rewards nor observations.
 
-    Put it outside the filter and `LeaseExpiry`, and inside `ChunkHandover` and SB3's `Monitor`. Without a filter
+    Put it outside the filter, `LeaseExpiry`, `TeleopChannel` and `OcclusionPenalty`, and inside `ChunkHandover` and
+    SB3's `Monitor`; other orders of our own wrappers are refused (`wrappers/stack.py`). Without a filter
     inside (the unfiltered arm of a comparison) the missing `cbf/*` keys count as zero, and so do `cost` and
     `cost_substep` of a task that has none.
 
     At every step `info` gains the keys of `safe_wrappers.interventions.RUNNING` (float64, the episode so
     far), and at an episode's last step `info["interventions"]`, a dict:
 
-    - `length`, `return` (of the task: what an `OcclusionPenalty` inside has taken off is added back);
+    - `length`, `return` (of the task: what an `OcclusionPenalty` or `AdaptionPenalty` inside has taken off is added
+      back);
     - `intervention_rate`: intervened steps / length;
     - `correction_mean`, `correction_p95`: over all steps of the episode, also those with no correction;
     - `infeasible`, `fallback`, `nonfinite`, `unsafe`: numbers of steps;
@@ -89,7 +90,7 @@ class RecordInterventions(
             that a killed process left half-written is removed first. Give every env its own file.
 
     Raises:
-        ConfigurationError: `path` is a folder, or a file with other columns.
+        ConfigurationError: `path` is a folder, or a file with other columns; or a `ChunkHandover` inside.
 
     Example:
         >>> import gymnasium as gym
@@ -105,11 +106,13 @@ class RecordInterventions(
         * v0.1.0: added.
     """
 
+    layer: ClassVar = Layer.RECORDER
+
     _expired: Any
     """Permissions that had run out at the step before; None: nothing is tracked."""
 
     def __init__(self, env: gym.Env[Any, Any], path: str | os.PathLike[str] | None = None) -> None:
-        _refuse_chunks(env)
+        refuse_order(env, self.layer, type(self).__name__)
         text = None if path is None else os.fspath(path)
         if text is not None:
             _continue_file(Path(text))
@@ -166,7 +169,8 @@ class RecordInterventions(
         self._expired = None
 
     def _count(self, reward: float, info: dict[str, Any]) -> None:
-        self._return += reward + float(info.get(keys.OCCLUSION_PENALTY, 0.0))
+        penalties = info.get(keys.OCCLUSION_PENALTY, 0.0) + info.get(keys.ADAPTION_PENALTY, 0.0)
+        self._return += reward + float(penalties)
         correction = float(info.get(keys.CBF_CORRECTION, 0.0))
         self._corrections.append(correction)
         self._correction_sum += correction
@@ -232,15 +236,6 @@ class RecordInterventions(
 
     def _finite_margin(self) -> float:
         return self._margin_min if math.isfinite(self._margin_min) else 0.0
-
-
-def _refuse_chunks(env: gym.Env[Any, Any]) -> None:
-    for inner in wrappers_of(env):
-        if isinstance(inner, ChunkHandover):
-            raise ConfigurationError(
-                "RecordInterventions outside of ChunkHandover would count chunks, not control steps; put it inside: "
-                "ChunkHandover(RecordInterventions(...), ...)"
-            )
 
 
 def read_episodes(path: str | os.PathLike[str]) -> list[dict[str, float]]:

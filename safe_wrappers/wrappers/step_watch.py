@@ -6,10 +6,9 @@ from typing import Any
 import gymnasium as gym
 import mujoco
 
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.plants.plant import wrappers_of
+from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.replay import Replay, Visit
-from safe_wrappers.wrappers.chunk_handover import ChunkHandover
+from safe_wrappers.wrappers.stack import Layer, refuse_order
 
 
 class StepWatch:
@@ -22,18 +21,14 @@ class StepWatch:
 
     Raises:
         UnsupportedEnvError: No MuJoCo model.
-        ConfigurationError: A `ChunkHandover` inside, whose step is many control steps.
+        ConfigurationError: A `ChunkHandover` inside, whose step is many control steps, or a second of its kind.
     """
 
     def __init__(self, name: str, env: gym.Env[Any, Any], partial: str) -> None:
         raw: Any = env.unwrapped
         if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
             raise UnsupportedEnvError(f"{name} needs an env with MuJoCo's .model and .data; {raw} has none")
-        if any(isinstance(inner, ChunkHandover) for inner in wrappers_of(env)):
-            raise ConfigurationError(
-                f"{name} outside of ChunkHandover would see chunks, not control steps; put it inside: "
-                f"ChunkHandover({name}(...), ...)"
-            )
+        refuse_order(env, Layer.MONITOR, name)
         self._name, self._raw, self._partial = name, raw, partial
         self._replay = Replay(raw)
         self._warned = False

@@ -3,7 +3,7 @@
 import copy
 import math
 import warnings
-from typing import Any, Final, Literal, SupportsFloat, get_args
+from typing import Any, ClassVar, Final, Literal, SupportsFloat, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -17,9 +17,8 @@ from safe_wrappers.control.running_sum import RunningSum
 from safe_wrappers.control.wave_line import Rule
 from safe_wrappers.errors import ActionError, ConfigurationError
 from safe_wrappers.plants.default import default_plant
-from safe_wrappers.plants.plant import Plant, check_actions, refuse_changed_actions, wrappers_of
+from safe_wrappers.plants.plant import Plant, check_actions, check_timing, refuse_changed_actions
 from safe_wrappers.wrappers.cbf_action_filter import is_filtered
-from safe_wrappers.wrappers.control_interval import control_interval
 from safe_wrappers.wrappers.fallback import FallbackFunction
 from safe_wrappers.wrappers.own_plant import PlantOfSpec, own_plant
 from safe_wrappers.wrappers.receiver import CommandReceiver
@@ -29,6 +28,7 @@ from safe_wrappers.wrappers.round_trip_watch import (
     ceiling_data,
     ceiling_from,
 )
+from safe_wrappers.wrappers.stack import Layer, refuse_order
 from safe_wrappers.wrappers.stand_in import StandIn
 from safe_wrappers.wrappers.teleop_coding import Coding, Down, PaidCoding, PlainCoding, Up, WaveCoding
 from safe_wrappers.wrappers.teleop_link import Line, Link, Packet, link_data, link_from
@@ -133,6 +133,8 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         * v0.1.0: added.
     """
 
+    layer: ClassVar = Layer.CHANNEL
+
     def __init__(
         self,
         env: gym.Env[Any, Any],
@@ -152,7 +154,7 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         hold_s: float | None = None,
         seed: int = 0,
     ) -> None:
-        _refuse_order(env)
+        refuse_order(env, self.layer, type(self).__name__)
         space = check_actions(env)
         plant = own_plant(plant)
         up, down = link_from("uplink", uplink), link_from("downlink", downlink)
@@ -186,7 +188,7 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             seed=seed,
         )
         gym.Wrapper.__init__(self, env)
-        self.hold_s = control_interval(env, hold_s)
+        self.hold_s = check_timing(env, hold_s)
         self.uplink, self.downlink = up, down
         self.port = port_from(port, env)
         if passivity == "none" and not (damping_limit is None and storage_j is None):
@@ -475,20 +477,3 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
 def _copy(observation: Any) -> Any:
     """An env may reuse its arrays, a policy may change them."""
     return observation.copy() if isinstance(observation, np.ndarray) else copy.deepcopy(observation)
-
-
-def _refuse_order(env: gym.Env[Any, Any]) -> None:
-    """Outermost of what carries commands, and inside of what counts."""
-    for inner in wrappers_of(env):
-        if isinstance(inner, CommandReceiver):
-            raise ConfigurationError(
-                f"{type(inner).__name__} inside TeleopChannel: the channel hands commands over and ends their "
-                "authority itself; put it outside of the filter and inside of the others: "
-                "RecordInterventions(TeleopChannel(CBFActionFilter(env, ...), ...))"
-            )
-        # By name: it imports ChunkHandover, which imports what this does.
-        if type(inner).__name__ == "RecordInterventions":
-            raise ConfigurationError(
-                "RecordInterventions inside TeleopChannel would see no revoked authority; put it outside: "
-                "RecordInterventions(TeleopChannel(...))"
-            )

@@ -9,7 +9,7 @@ import mujoco
 from safe_wrappers.constraints.constraint import Constraint, non_negative
 from safe_wrappers.constraints.contact_feasibility import ContactFeasibility
 from safe_wrappers.constraints.joint_position_limit import JointPositionLimit
-from safe_wrappers.constraints.joints import stops
+from safe_wrappers.constraints.joints import refuse_uncovered_stops, stops
 from safe_wrappers.constraints.stance import Stance
 from safe_wrappers.constraints.support_margin import SupportMargin
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
@@ -137,6 +137,7 @@ def _constraints(
     joints, low, high = stops(model)
     if joint_tolerance is not None:
         joint_tolerance = non_negative("joint_tolerance", joint_tolerance, "rad or m")
+        refuse_uncovered_stops(model)
         if not joints:
             raise UnsupportedEnvError(
                 "no driven joint of this model has a range: joint_tolerance=None leaves the joints alone"

@@ -52,6 +52,55 @@ def test_bounds_default_to_the_action_space_and_broadcast():
     np.testing.assert_array_equal([plant.lower, plant.upper], [[-1.0], [0.5]])
 
 
+class Slow(gym.Env):
+    """A cart, v' = u, in steps of 1 s; it says nothing of its time unless told."""
+
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,))
+
+    def __init__(self, **told):
+        vars(self).update(told)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.v = np.zeros(1)
+        return self.v, {}
+
+    def step(self, action):
+        self.v = self.v + 1.0 * action
+        return self.v, 0.0, False, False, {}
+
+
+def on_cart(env, **timing):
+    plant = sw.AnalyticPlant(np.zeros_like, lambda x: np.eye(1), lambda env: env.v, **timing)
+    return sw.CBFActionFilter(
+        env, [sw.Barrier(lambda x: 1.5 - x[0], gradient=lambda x: -np.ones(1))], plant=plant
+    )
+
+
+def test_a_step_of_unknown_length_is_asked_for_and_not_assumed():
+    # With an assumed 0.05 s every step of this env left the limit behind, some of them unflagged.
+    with pytest.raises(ConfigurationError, match=r"Slow.* no attribute dt\): pass hold_s, in seconds"):
+        on_cart(Slow())
+    for filtered in (on_cart(Slow(), hold_s=1.0), on_cart(Slow(dt=1.0)), on_cart(Slow(dt=1.0), hold_s=1.0)):
+        assert filtered.plant.hold_s == 1.0
+        filtered.reset(seed=0)
+        for _ in range(6):
+            filtered.step(np.ones(1, np.float32))
+            assert filtered.unwrapped.v[0] <= 1.5
+
+
+def test_the_envs_own_time_step_is_taken():
+    env = gym.make("Pendulum-v1")
+    assert plant_on(env, hold_s=None).hold_s == 0.05 == env.unwrapped.dt
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.1, np.nan])
+def test_a_senseless_time_step_of_the_env_is_refused(dt):
+    with pytest.raises(ConfigurationError, match="the env's dt is the control interval in seconds, > 0"):
+        on_cart(Slow(dt=dt))
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

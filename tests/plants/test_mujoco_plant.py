@@ -26,6 +26,7 @@ class Scene(gym.Env):
     """Any MJCF as an env: the least that a MujocoPlant may ask for."""
 
     def __init__(self, xml, frame_skip=5):
+        self.xml = xml
         self.model = mujoco.MjModel.from_xml_string(xml)
         self.data = mujoco.MjData(self.model)
         self.frame_skip = frame_skip
@@ -35,6 +36,9 @@ class Scene(gym.Env):
         high = np.where(limited, self.model.actuator_ctrlrange[:, 1], np.inf)
         self.action_space = gym.spaces.Box(low, high, dtype=np.float64)
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (1,))
+
+
+HINGE_MOTOR = '<actuator><motor joint="hinge" ctrlrange="-1 1"/></actuator>'
 
 
 def bound(env, **options):
@@ -293,6 +297,29 @@ def test_an_env_without_mujoco_and_a_foreign_model_are_refused():
         bound(gym.make("Pendulum-v1"))
     with pytest.raises(ConfigurationError, match=r"expected \(nq, nv, nu\) = \(4, 4, 2\), got \(2, 2, 1\)"):
         bound(gym.make("Reacher-v5"), model=gym.make("InvertedPendulum-v5").unwrapped.model)
+
+
+class Timeless(Scene):
+    """Says what it is told to say of its time."""
+
+    def __init__(self, told):
+        super().__init__(scene(HINGE_MOTOR).xml)
+        del self.dt, self.frame_skip
+        vars(self).update(told)
+
+
+def test_a_step_of_unknown_length_is_not_taken_for_one_physics_step():
+    with pytest.raises(
+        UnsupportedEnvError, match=r"does not say how long a step lasts: give it an attribute dt"
+    ):
+        bound(Timeless({}))
+    for told in ({"dt": 0.04}, {"frame_skip": 4}, {"n_substeps": 4}):
+        plant = bound(Timeless(told))
+        assert (plant.substeps, plant.hold_s) == (4, 0.04)
+    with pytest.raises(
+        ConfigurationError, match=r"hold_s = 0.04 s, but one step of this env lasts dt = 0.044"
+    ):
+        bound(Timeless({"dt": 0.044}))  # no whole number of physics steps
 
 
 # Its own model ------------------------------------------------------------------------------------------------

@@ -357,13 +357,13 @@ def test_chunks_under_a_lease_hit_nothing_whatever_is_lost(blend):
 @pytest.mark.parametrize(
     ("layers", "says"),
     [
-        (["expiry", "filter"], "ChunkHandover\\(LeaseExpiry\\(CBFActionFilter"),
+        (["expiry", "filter"], "LeaseExpiry\\(CBFActionFilter"),
         (["handover", "expiry"], "ChunkHandover\\(LeaseExpiry"),
-        (["handover", "filter"], "ChunkHandover\\(LeaseExpiry"),
+        (["handover", "filter"], "ChunkHandover\\(CBFActionFilter"),
         (["handover", "record"], "ChunkHandover\\(RecordInterventions"),
         (["filter", "handover", "penalty"], "ChunkHandover\\(AdaptionPenalty"),
         (["outages", "expiry"], "inside LeaseExpiry"),
-        (["outages", "filter"], "inside the filter"),
+        (["outages", "filter"], "Outages inside CBFActionFilter"),
         (["expiry", "expiry"], "inside LeaseExpiry"),
         (["handover", "handover"], "chunk"),
         (["filter", "filter"], "one filter"),

@@ -6,6 +6,7 @@ belongs to a wrapper of a later release and is left out here.
 
 import copy
 import pickle
+import re
 import warnings
 
 import gymnasium as gym
@@ -290,9 +291,96 @@ def test_an_env_without_mujoco_asks_for_an_analytic_plant():
 
 
 def test_a_rescaled_action_space_is_refused():
-    env = gym.wrappers.RescaleAction(gym.make("Reacher-v5"), np.float32(0.0), np.float32(1.0))
-    with pytest.raises(UnsupportedEnvError, match="not the model's control range"):
-        sw.CBFActionFilter(env, [sw.JointSpeedLimit(4.0)])
+    def rescaled(env):
+        return gym.wrappers.RescaleAction(env, np.float32(0.0), np.float32(1.0))
+
+    with pytest.raises(ConfigurationError, match=r"RescaleAction inside the filter .* put it outside"):
+        sw.CBFActionFilter(rescaled(gym.make("Reacher-v5")), [sw.JointSpeedLimit(4.0)])
+    rescaled(sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(4.0)]))
+
+
+PARTS = {"a": gym.spaces.Box(-1.0, 1.0, (2,)), "b": gym.spaces.Box(0.0, 1.0, (1, 2))}
+COMPOSED = {
+    "Dict": gym.spaces.Dict(PARTS),
+    "Tuple": gym.spaces.Tuple(tuple(PARTS.values())),
+    "matrix": gym.spaces.Box(-1.0, 1.0, (2, 3)),
+    "nested": gym.spaces.Dict(inner=gym.spaces.Tuple([PARTS["a"]]), outer=PARTS["b"]),
+}
+
+
+class Composed(gym.Env):
+    """Takes actions of any space, and keeps the last."""
+
+    observation_space = gym.spaces.Box(-1.0, 1.0, (1,))
+    dt = 0.1
+
+    def __init__(self, space):
+        self.action_space = space
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        self.given = action
+        return np.zeros(1, np.float32), 0.0, False, False, {}
+
+
+@pytest.mark.parametrize("kind", COMPOSED)
+def test_composed_actions_are_not_called_discrete_and_the_remedy_works(kind):
+    space = COMPOSED[kind]
+
+    def filtered(env):
+        effect = np.ones((1, gym.spaces.flatdim(env.action_space)))
+        plant = sw.AnalyticPlant(np.zeros_like, lambda x: effect, lambda env: np.zeros(1))
+        return sw.CBFActionFilter(env, [sw.Barrier(lambda x: 1.0 - x[0])], plant=plant)
+
+    wraps = (
+        filtered,
+        lambda env: sw.LeaseExpiry(
+            env, lambda env: (9.0, 0.0), braking=1.0, acceleration=1.0, fallback="zero"
+        ),
+        lambda env: sw.ChunkHandover(env, 1, 1, fallback="zero", blend_time=0.2),
+        lambda env: sw.TeleopChannel(env, 0.0, 0.0),
+    )
+    for wrap in wraps:
+        with pytest.raises(ConfigurationError, match=r"expected actions of shape \(m,\), got") as caught:
+            wrap(Composed(space))
+        assert "discrete" not in str(caught.value)
+        flat, unflat = re.findall("`(.*?)`", str(caught.value))
+
+        class Flat(Composed):
+            """As the message says."""
+
+            def step(self, action, unflat=unflat):
+                scope = {"gymnasium": gym, "space": space, "action": action}
+                exec(unflat, scope)
+                assert space.contains(scope["action"])
+                return super().step(action)
+
+        scope = {"gymnasium": gym, "space": space}
+        exec(flat, scope)
+        env = wrap(Flat(scope["action_space"]))
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        gym.spaces.Dict(PARTS | {"grip": gym.spaces.Discrete(2)}),
+        gym.spaces.Tuple([PARTS["a"], gym.spaces.MultiBinary(3)]),
+        gym.spaces.MultiDiscrete([2, 3]),
+    ],
+)
+def test_a_discrete_part_is_named(space):
+    part = [*space.values()][-1] if isinstance(space, gym.spaces.Dict) else space
+    part = space[-1] if isinstance(space, gym.spaces.Tuple) else part
+    with pytest.raises(
+        ConfigurationError, match=rf"for the discrete actions of {re.escape(str(part))} there is"
+    ):
+        sw.CBFActionFilter(Composed(space), [wall(1.0)])
 
 
 @pytest.mark.parametrize("hold", [0.05, 0.2])

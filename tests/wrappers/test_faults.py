@@ -539,7 +539,7 @@ def test_orders_that_are_refused():
     with pytest.raises(ConfigurationError, match="Outages inside LeaseExpiry"):
         leased_over = faulty("Outages", BrakedCart())
         sw.LeaseExpiry(leased_over, read_cart, braking=1.0, acceleration=1.0, fallback="zero")
-    with pytest.raises(ConfigurationError, match="Outages inside the filter"):
+    with pytest.raises(ConfigurationError, match="Outages inside CBFActionFilter"):
         sw.CBFActionFilter(faulty("Outages", gym.make("Reacher-v5")), [sw.JointSpeedLimit(4.0)])
 
 

@@ -679,7 +679,7 @@ def test_orders_that_are_refused():
     chunked = sw.ChunkHandover(BrakedCart(), 4, 2, jerk_limit=10.0, fallback="zero")
     with pytest.raises(ConfigurationError, match=r"ChunkHandover\(LeaseExpiry"):
         sw.LeaseExpiry(chunked, read_cart, braking=1.0, acceleration=1.0, fallback="zero")
-    with pytest.raises(ConfigurationError, match=r"ChunkHandover\(LeaseExpiry"):
+    with pytest.raises(ConfigurationError, match=r"LeaseExpiry\(CBFActionFilter"):
         sw.CBFActionFilter(once, [sw.Barrier(lambda x: 1.0 - x[1])], plant=cart_plant(0.1))
     with pytest.raises(ConfigurationError, match="outside"):
         changed = gym.wrappers.RescaleAction(BrakedCart(), 0.0, 1.0)

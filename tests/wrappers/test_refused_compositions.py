@@ -115,8 +115,9 @@ def lease(env):
         (lambda env: on_wheels(on_wheels(env)), "filtered already"),
         (lambda env: on_wheels(sw.protect(env)), "filtered already"),
         (lambda env: sw.CBFActionFilter(on_wheels(env), [speed()]), "filtered already"),
-        (lambda env: on_wheels(sw.ChunkHandover(env, 4, 2)), "inside the filter"),
-        (lambda env: on_wheels(lease(env)), "inside the filter"),
+        (lambda env: on_wheels(sw.ChunkHandover(env, 4, 2)), "ChunkHandover inside SlipLimiter"),
+        (lambda env: on_wheels(lease(env)), "LeaseExpiry inside SlipLimiter"),
+        (lambda env: on_wheels(sw.RecordInterventions(env)), "RecordInterventions inside SlipLimiter"),
         (lambda env: on_wheels(gym.wrappers.StickyAction(env, 0.5)), "inside the filter"),
     ],
 )
@@ -129,7 +130,7 @@ def test_a_slip_limiter_has_the_last_word(wrap, message):
     "wrap",
     [
         lambda env: sw.ChunkHandover(sw.RecordInterventions(lease(on_wheels(env))), 4, 2),
-        lambda env: on_wheels(sw.RecordInterventions(env)),
+        lambda env: sw.RecordInterventions(on_wheels(env)),
         lambda env: sw.RecordInterventions(on_wheels(sw.ContactMonitor(env))),
     ],
 )

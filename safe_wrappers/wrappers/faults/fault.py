@@ -2,17 +2,17 @@
 
 import copy
 from abc import abstractmethod
-from typing import Any, NamedTuple, SupportsFloat
+from typing import Any, ClassVar, NamedTuple, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
 
 from safe_wrappers import interventions as keys
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.plant import wrappers_of
-from safe_wrappers.wrappers.control_interval import control_interval
+from safe_wrappers.plants.plant import check_timing, wrappers_of
 from safe_wrappers.wrappers.own_random import OwnRandom
 from safe_wrappers.wrappers.receiver import CommandReceiver, receiver_inside
+from safe_wrappers.wrappers.stack import Layer
 
 
 class Carried(NamedTuple):
@@ -41,6 +41,8 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
         hold_s: The time that a step lasts, s; None reads the env's.
     """
 
+    layer: ClassVar = Layer.FAULT
+
     _evidence: float | None
     _last: Any
 
@@ -49,7 +51,7 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
         if not isinstance(env.action_space, gym.spaces.Box):
             raise ConfigurationError(f"a fault carries actions of a Box action space, got {env.action_space}")
         self._inside = receiver_inside(env)
-        self._hold_s = 0.0 if self._inside is not None else control_interval(env, hold_s)
+        self._hold_s = 0.0 if self._inside is not None else check_timing(env, hold_s)
         if self._inside is not None and hold_s is not None:
             raise ConfigurationError(
                 f"{type(self._inside).__name__} inside counts the time: leave hold_s out"

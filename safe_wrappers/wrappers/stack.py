@@ -1,0 +1,108 @@
+"""The legal order of the layers: which wrapper may not be inside which other, why, and what to write instead."""
+
+from enum import Enum, auto
+from typing import Any, Final
+
+import gymnasium as gym
+
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.plant import wrappers_of
+
+
+class Layer(Enum):
+    """What a wrapper of this library does in a stack; each names its own in the class attribute `layer`."""
+
+    OCCLUSION = auto()
+    FILTER = auto()
+    LEASE = auto()
+    CHANNEL = auto()
+    MONITOR = auto()
+    ADAPTION = auto()
+    RECORDER = auto()
+    HANDOVER = auto()
+    FAULT = auto()
+
+
+_PER_CHUNK: Final = {Layer.HANDOVER: "its step is a whole chunk, not a control step"}
+_LAST_WORD: Final = "it changes actions that the filter has checked, and the filter has the last word"
+_AGE: Final = "it hands commands over, and the lease must hear how old each one is"
+_NETWORK: Final = "it hands commands over, which the channel must do at every control step"
+
+_WRONG_WAY_ROUND: Final = {
+    Layer.OCCLUSION: {
+        Layer.FILTER: "the filter reads the estimates, so they must be there before it decides",
+        Layer.CHANNEL: "estimates of now would stand beside an image that is delayed",
+        Layer.RECORDER: "it would not count what is seen",
+        **_PER_CHUNK,
+    },
+    Layer.FILTER: {
+        Layer.RECORDER: "it would see no report of the filter, and count no intervention",
+        **dict.fromkeys((Layer.LEASE, Layer.CHANNEL, Layer.HANDOVER, Layer.FAULT), _LAST_WORD),
+    },
+    Layer.LEASE: {
+        Layer.RECORDER: "it would count no lease that expires",
+        **dict.fromkeys((Layer.HANDOVER, Layer.FAULT), _AGE),
+    },
+    Layer.CHANNEL: {
+        Layer.RECORDER: "it would see no revoked authority",
+        **dict.fromkeys((Layer.HANDOVER, Layer.FAULT), _NETWORK),
+    },
+    **dict.fromkeys((Layer.MONITOR, Layer.ADAPTION, Layer.RECORDER), _PER_CHUNK),
+}
+"""By the outer layer, then the inner one: why not. The other way round is right."""
+
+_BOTH_END_AUTHORITY: Final = "both decide when a command's authority ends; use one of them"
+_NOT_TOGETHER: Final = {
+    (
+        Layer.OCCLUSION,
+        Layer.OCCLUSION,
+    ): "this env has an OcclusionPenalty already; give that one all the tracks",
+    (Layer.FILTER, Layer.FILTER): (
+        "this env is filtered already; constraints compose in one projection, so pass all of them to one filter: "
+        "CBFActionFilter(env, [*inner.constraints, more])"
+    ),
+    (Layer.LEASE, Layer.LEASE): _BOTH_END_AUTHORITY,
+    (Layer.LEASE, Layer.CHANNEL): _BOTH_END_AUTHORITY,
+    (Layer.CHANNEL, Layer.LEASE): _BOTH_END_AUTHORITY,
+    (
+        Layer.CHANNEL,
+        Layer.CHANNEL,
+    ): "one network is between operator and machine; give one channel all the delay",
+    (
+        Layer.ADAPTION,
+        Layer.ADAPTION,
+    ): "this env has an AdaptionPenalty already, and its penalty would be taken twice",
+    (Layer.HANDOVER, Layer.HANDOVER): "this env takes chunks already, and a chunk of chunks has no meaning",
+}
+"""By the outer layer and the inner one: why not both."""
+
+
+def refuse_order(env: gym.Env[Any, Any], layer: Layer, name: str) -> None:
+    """Refuse a layer around an env whose wrappers it must be inside of, or cannot go together with.
+
+    Args:
+        env: What it is to be put around.
+        layer: The layer.
+        name: What the user calls it.
+
+    Raises:
+        ConfigurationError: Why not, and the order that works where there is one.
+    """
+    for inner in wrappers_of(env):
+        other = getattr(inner, "layer", None)
+        if not isinstance(other, Layer):
+            continue
+        inside = type(inner).__name__
+        why = _WRONG_WAY_ROUND.get(layer, {}).get(other)
+        if why is not None:
+            raise ConfigurationError(
+                f"{inside} inside {name}: {why}; put it outside: {inside}({name}(env, ...), ...)"
+            )
+        why = _NOT_TOGETHER.get((layer, other))
+        if why is not None:
+            raise ConfigurationError(f"{inside} inside {name}: {why}")
+        if layer is Layer.MONITOR and inside == name:
+            raise ConfigurationError(
+                f"{inside} inside {name}: the outer one would overwrite the info keys of the inner one; use one for "
+                "everything it watches"
+            )
