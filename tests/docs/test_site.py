@@ -107,6 +107,5 @@ def test_whoever_reads_of_the_appendix_can_follow_to_the_book(pages):
     assert sum(any("references.html" in link for link in page.links) for page in api.values()) >= 4
     (references,) = (page for path, page in pages.items() if path.name == "references.html")
     assert "https://mlsysbook.ai/vol4/" in references.links
-    for path, page in api.items():
-        said = path.read_text(encoding="utf-8").count("Source: appendix")
-        assert said == 0, path
+    for path in api:
+        assert "Source: appendix" not in path.read_text(encoding="utf-8"), path
