@@ -22,26 +22,25 @@ def told(experiment, **more):
             {"violations": 5, "return": 20},
             {"return": 10},
             "With the filter none of 2,400 steps was in violation; without it 120 of 2,400 steps (5 %) were."
-            " The return per episode was 50 % lower (from 20 to 10; the intervals over 2 seeds lie apart).",
+            " The policy trained without the filter returned",
         ),
         (
             {"violations": 5, "return": -20},
             {"violations": 1, "return": -10},
             "The filter lowered violations without removing them: 24 of 2,400 steps (1 %) with it,"
-            " 120 of 2,400 steps (5 %) without. The return per episode went from -20 to -10"
-            " (the intervals over 2 seeds lie apart).",
+            " 120 of 2,400 steps (5 %) without. The policy trained without the filter returned -20 [-20, -20]",
         ),
         (
             {"violations": 1, "return": 10},
             {"violations": 1, "return": 10},
             "The filter did not lower violations: 24 of 2,400 steps (1 %) with it, 24 of 2,400 steps (1 %)"
-            " without. The return per episode stayed the same (from 10 to 10; the intervals over 2 seeds overlap).",
+            " without. The policy trained without the filter returned 10",
         ),
         (
             {"return": 10},
             {"return": 12},
             "No violation with the filter, and none without it: the task did not put it to the test."
-            " The return per episode was 20 % higher",
+            " The policy trained without the filter returned 10 [10, 10] without it (no step in violation)",
         ),
         (
             {"violations": 1},
@@ -57,7 +56,7 @@ def told(experiment, **more):
         (
             {"violations": 5, "collisions": 2, "return": 10},
             {"return": 10},
-            "without it 120 of 2,400 steps (5 %) were. Collisions begun: 0 with it, 48 without. The return",
+            "without it 120 of 2,400 steps (5 %) were. Collisions begun: 0 with it, 48 without. The policy",
         ),
         ({"violations": 1}, {}, "It changed none of the evaluation steps; no step was infeasible"),
     ],
@@ -66,9 +65,87 @@ def test_verdicts(fake_experiment, off, on, sentence):
     assert sentence in told(fake_experiment(), off=off, on=on)
 
 
-def test_one_seed_says_little(fake_experiment):
-    said = told(fake_experiment("seeds=[0]"), off={"return": 20}, on={"return": 10})
-    assert "50 % lower (from 20 to 10; one seed says little)" in said
+def four_ways(experiment, spread=0.0):
+    """Either policy in evaluation without and with the filter: 21.1, 12.7; 9.4, 5.03 in the mean of the seeds."""
+    for seed in experiment.seeds:
+        off = spread * (seed - (len(experiment.seeds) - 1) / 2)
+        for arm, condition, returns, violations in (
+            (0, "filter_off", 21.1, 5),
+            (0, "filter_on", 12.7, 0),
+            (1, "filter_off", 9.4, 3),
+            (1, "filter_on", 5.03, 0),
+        ):
+            row = episode(**{"return": returns + off, "violations": violations})
+            write_evaluation(experiment, arm, seed, condition, [row])
+    return summarize(experiment)
+
+
+def test_the_verdict_names_what_either_policy_returns_without_and_with_the_filter(fake_experiment):
+    experiment = fake_experiment()
+    numbers = four_ways(experiment, spread=1.0)
+    assert verdict(experiment, numbers).startswith(
+        "With the filter none of 200 steps was in violation; without it 10 of 200 steps (5 %) were."
+        " The policy trained without the filter returned 21.1 [20.6, 21.6] without it (10 of 200 steps in violation,"
+        " 5 %) and 12.7 [12.2, 13.2] with it added afterwards (no step in violation), per evaluation episode."
+        " The policy trained through the filter returned 9.4 [8.9, 9.9] with it taken off (6 of 200 steps in"
+        " violation, 3 %) and 5.03 [4.53, 5.53] with it (no step in violation), per evaluation episode."
+        " With the filter on, the policy trained without it returned more (2 seeds say little)."
+        " In brackets the range over 2 seeds, which is not an interval."
+    )
+    page = cards(experiment, numbers)
+    for title, value, what, hurt in (
+        ("Trained without the filter, filter off", "21.1", "20.6 to 21.6", "10 of 200 steps in violation"),
+        ("Trained without the filter, filter on", "12.7", "12.2 to 13.2", "no step in violation"),
+        ("Trained through the filter, filter off", "9.4", "8.9 to 9.9", "6 of 200 steps in violation"),
+        ("Trained through the filter, filter on", "5.03", "4.53 to 5.53", "no step in violation"),
+    ):
+        assert (
+            f'<h3>{title}</h3><p class="value ">{value}</p><p>return per episode, range {what}</p>'
+            f'<p class="other">{hurt}</p>'
+        ) in page
+
+
+@pytest.mark.parametrize(
+    ("seeds", "spread", "surely", "brackets"),
+    [
+        ("[0]", 0.0, "one seed says little", "One seed: no interval."),
+        (
+            "[0, 1]",
+            0.1,
+            "2 seeds say little",
+            "In brackets the range over 2 seeds, which is not an interval.",
+        ),
+        (
+            "[0, 1, 2]",
+            0.1,
+            "the intervals over 3 seeds lie apart",
+            "In brackets bootstrap 95 % intervals over seeds.",
+        ),
+        (
+            "[0, 1, 2]",
+            9.0,
+            "the intervals over 3 seeds overlap",
+            "In brackets bootstrap 95 % intervals over seeds.",
+        ),
+    ],
+)
+def test_fewer_than_three_seeds_have_no_interval(fake_experiment, seeds, spread, surely, brackets):
+    experiment = fake_experiment(f"seeds={seeds}")
+    said = verdict(experiment, four_ways(experiment, spread))
+    assert f"trained without it returned more ({surely}). {brackets}" in said
+    if len(experiment.seeds) < 3:
+        assert "lie apart" not in said and "overlap" not in said and "95 %" not in said
+
+
+def test_more_return_through_training_with_the_filter_is_said_too(fake_experiment):
+    experiment = fake_experiment("seeds=[0]")
+    write_evaluation(experiment, 0, 0, "filter_on", [episode(**{"return": 1})])
+    write_evaluation(experiment, 0, 0, "filter_off", [episode(**{"return": 3})])
+    write_evaluation(experiment, 1, 0, "filter_on", [episode(**{"return": 2})])
+    said = verdict(experiment, summarize(experiment))
+    assert "the policy trained through it returned more" in said
+    # What has not been evaluated is not told.
+    assert "The policy trained through the filter returned 2 with it (no step in violation), per" in said
 
 
 def test_a_task_without_a_cost_has_no_violations_to_count(fake_experiment):
@@ -76,11 +153,12 @@ def test_a_task_without_a_cost_has_no_violations_to_count(fake_experiment):
     silent = steps(cost=steps().cost * float("nan"))
     said = told(experiment, off={}, on={"unsafe": 3}, log_off=silent, log_on=silent)
     assert said.startswith(
-        "The task reports no cost, so violations cannot be counted; by the filter's own measure 72 of 2,400 steps"
-        " with it began outside the safe set."
+        "By the filter's own measure 72 of 2,400 steps with it began outside the safe set. Violations are not judged:"
+        " the task reports no cost."
     )
     assert "in violation" not in said
-    assert "Steps in violation" not in cards(experiment, summarize(experiment))
+    page = cards(experiment, summarize(experiment))
+    assert "in violation" not in page and page.count("violations not judged") == 4
 
 
 def test_without_an_arm_that_has_none_the_filter_is_switched_off(fake_experiment):
@@ -122,7 +200,7 @@ def test_policies_of_several_tasks_driven_through_the_evaluations_filter(fake_ex
     )
     page = cards(experiment, summarize(experiment))
     assert "The same policies, “one”, “two”, with the filter on and off." in page
-    assert "Return per episode" not in page  # of two tasks there is no common one
+    assert "return per episode" not in page  # of two tasks there is no common one
     assert "50 µs" in page
 
 
@@ -155,8 +233,8 @@ def test_the_cards(fake_experiment):
         '<h3>Steps in violation</h3><p class="value good">0</p>',
         "with the filter, of 2,400 of training and evaluation",
         "without: 120 of 2,400",
-        '<h3>Return per episode</h3><p class="value ">10</p>',
-        "without: 20",
+        '<h3>Trained without the filter, filter off</h3><p class="value ">20</p>',
+        '<h3>Trained through the filter, filter on</h3><p class="value ">10</p>',
         '<h3>Steps changed</h3><p class="value ">12 %</p>',
         '<h3>Infeasible steps</h3><p class="value ">24</p>',
         "fallback: 48 steps",
