@@ -69,7 +69,7 @@ def _run(options: argparse.Namespace, console: Console) -> None:
     summary = summarize_experiment(experiment)
     if options.command in ("evaluate", "compare"):
         console.print(comparison_table(experiment, summary))
-        console.print(verdict(experiment, summary), highlight=False, markup=False)
+        console.print("\n".join(verdict(experiment, summary)), highlight=False, markup=False)
     if getattr(options, "report", False):
         path = write_report(experiment, summary, _compare_command(config, options.overrides))
         console.print(f"Report: {path}", soft_wrap=True, highlight=False)

@@ -12,7 +12,7 @@ from safe_wrappers.train.summary import summarize
 
 def told(experiment, **more):
     fill(experiment, **more)
-    return verdict(experiment, summarize(experiment))
+    return " ".join(verdict(experiment, summarize(experiment)))
 
 
 @pytest.mark.parametrize(
@@ -22,43 +22,45 @@ def told(experiment, **more):
             {"violations": 5, "return": 20},
             {"return": 10},
             "With the filter none of 2,400 steps was in violation; without it 120 of 2,400 steps (5 %) were."
-            " The policy trained without the filter returned",
+            " Trained without the filter, the policy returned",
         ),
         (
             {"violations": 5, "return": -20},
             {"violations": 1, "return": -10},
             "The filter lowered violations without removing them: 24 of 2,400 steps (1 %) with it,"
-            " 120 of 2,400 steps (5 %) without. The policy trained without the filter returned -20 [-20, -20]",
+            " 120 of 2,400 steps (5 %) without. Trained without the filter, the policy returned per evaluation"
+            " episode -20 [-20, -20] without",
         ),
         (
             {"violations": 1, "return": 10},
             {"violations": 1, "return": 10},
             "The filter did not lower violations: 24 of 2,400 steps (1 %) with it, 24 of 2,400 steps (1 %)"
-            " without. The policy trained without the filter returned 10",
+            " without. Trained without the filter, the policy returned per evaluation"
+            " episode 10",
         ),
         (
             {"return": 10},
             {"return": 12},
             "No violation with the filter, and none without it: the task did not put it to the test."
-            " The policy trained without the filter returned 10 [10, 10] without it (no step in violation)",
+            " Trained without the filter, the policy returned per evaluation episode 10 [10, 10] without it (no",
         ),
         (
             {"violations": 1},
             {"intervention_rate": 0.25, "infeasible": 2, "fallback": 3},
-            "It changed 25 % of the evaluation steps; 48 steps were infeasible and 72 ran the fallback.",
+            "The filter changed 25 % of the evaluation steps; 48 steps were infeasible and 72 ran the fallback.",
         ),
         (
             {"violations": 1},
             {"intervention_rate": 0.00001},
-            "It changed less than 0.01 % of the evaluation steps; no step was infeasible and none ran the"
+            "The filter changed less than 0.01 % of the evaluation steps; no step was infeasible and none ran the"
             " fallback.",
         ),
         (
             {"violations": 5, "collisions": 2, "return": 10},
             {"return": 10},
-            "without it 120 of 2,400 steps (5 %) were. Collisions begun: 0 with it, 48 without. The policy",
+            "without it 120 of 2,400 steps (5 %) were. Collisions begun: 0 with it, 48 without. Trained",
         ),
-        ({"violations": 1}, {}, "It changed none of the evaluation steps; no step was infeasible"),
+        ({"violations": 1}, {}, "The filter changed none of the evaluation steps; no step was infeasible"),
     ],
 )
 def test_verdicts(fake_experiment, off, on, sentence):
@@ -83,15 +85,15 @@ def four_ways(experiment, spread=0.0):
 def test_the_verdict_names_what_either_policy_returns_without_and_with_the_filter(fake_experiment):
     experiment = fake_experiment()
     numbers = four_ways(experiment, spread=1.0)
-    assert verdict(experiment, numbers).startswith(
-        "With the filter none of 200 steps was in violation; without it 10 of 200 steps (5 %) were."
-        " The policy trained without the filter returned 21.1 [20.6, 21.6] without it (10 of 200 steps in violation,"
-        " 5 %) and 12.7 [12.2, 13.2] with it added afterwards (no step in violation), per evaluation episode."
-        " The policy trained through the filter returned 9.4 [8.9, 9.9] with it taken off (6 of 200 steps in"
-        " violation, 3 %) and 5.03 [4.53, 5.53] with it (no step in violation), per evaluation episode."
-        " With the filter on, the policy trained without it returned more (2 seeds say little)."
-        " In brackets the range over 2 seeds, which is not an interval."
-    )
+    assert verdict(experiment, numbers)[:4] == [
+        "With the filter none of 200 steps was in violation; without it 10 of 200 steps (5 %) were.",
+        "Trained without the filter, the policy returned per evaluation episode 21.1 [20.6, 21.6] without it (10 of"
+        " 200 steps in violation, 5 %) and 12.7 [12.2, 13.2] with it added afterwards (no step in violation).",
+        "Trained through the filter, the policy returned per evaluation episode 9.4 [8.9, 9.9] with it taken off"
+        " (6 of 200 steps in violation, 3 %) and 5.03 [4.53, 5.53] with it (no step in violation).",
+        "With the filter on, the policy trained without it returned more (2 seeds say little)."
+        " In brackets the range over 2 seeds, which is not an interval.",
+    ]
     page = cards(experiment, numbers)
     for title, value, what, hurt in (
         ("Trained without the filter, filter off", "21.1", "20.6 to 21.6", "10 of 200 steps in violation"),
@@ -100,8 +102,8 @@ def test_the_verdict_names_what_either_policy_returns_without_and_with_the_filte
         ("Trained through the filter, filter on", "5.03", "4.53 to 5.53", "no step in violation"),
     ):
         assert (
-            f'<h3>{title}</h3><p class="value ">{value}</p><p>return per episode, range {what}</p>'
-            f'<p class="other">{hurt}</p>'
+            f'<h3>{title}</h3><p class="value ">{value}</p><p>return per episode</p>'
+            f'<p class="other">range {what}</p><p class="other">{hurt}</p>'
         ) in page
 
 
@@ -131,7 +133,7 @@ def test_the_verdict_names_what_either_policy_returns_without_and_with_the_filte
 )
 def test_fewer_than_three_seeds_have_no_interval(fake_experiment, seeds, spread, surely, brackets):
     experiment = fake_experiment(f"seeds={seeds}")
-    said = verdict(experiment, four_ways(experiment, spread))
+    said = " ".join(verdict(experiment, four_ways(experiment, spread)))
     assert f"trained without it returned more ({surely}). {brackets}" in said
     if len(experiment.seeds) < 3:
         assert "lie apart" not in said and "overlap" not in said and "95 %" not in said
@@ -142,10 +144,10 @@ def test_more_return_through_training_with_the_filter_is_said_too(fake_experimen
     write_evaluation(experiment, 0, 0, "filter_on", [episode(**{"return": 1})])
     write_evaluation(experiment, 0, 0, "filter_off", [episode(**{"return": 3})])
     write_evaluation(experiment, 1, 0, "filter_on", [episode(**{"return": 2})])
-    said = verdict(experiment, summarize(experiment))
+    said = " ".join(verdict(experiment, summarize(experiment)))
     assert "the policy trained through it returned more" in said
     # What has not been evaluated is not told.
-    assert "The policy trained through the filter returned 2 with it (no step in violation), per" in said
+    assert "Trained through the filter, the policy returned per evaluation episode 2 with it (no step" in said
 
 
 def test_a_task_without_a_cost_has_no_violations_to_count(fake_experiment):
@@ -178,7 +180,7 @@ def test_an_arm_of_another_env_is_not_compared_with(fake_experiment):
     )
     fill(experiment, off={"violations": 5}, on={})
     assert "Without: “third”" not in cards(experiment, summarize(experiment))  # nothing of it is there yet
-    assert verdict(experiment, summarize(experiment)).startswith("There is no filter to compare with yet.")
+    assert verdict(experiment, summarize(experiment))[0].startswith("There is no filter to compare with yet.")
 
 
 def test_policies_of_several_tasks_driven_through_the_evaluations_filter(fake_experiment):
@@ -193,10 +195,10 @@ def test_policies_of_several_tasks_driven_through_the_evaluations_filter(fake_ex
         log_on=steps(),
     )
     # The evaluation of both arms: 2 episodes of 100 steps for 2 seeds each.
-    assert verdict(experiment, summarize(experiment)) == (
+    assert " ".join(verdict(experiment, summarize(experiment))) == (
         "With the filter none of 800 steps was in violation; without it 40 of 800 steps (5 %) were."
         " The return per episode went: one 20 to 10, two 20 to 10."
-        " It changed 50 % of the evaluation steps; no step was infeasible and none ran the fallback."
+        " The filter changed 50 % of the evaluation steps; no step was infeasible and none ran the fallback."
     )
     page = cards(experiment, summarize(experiment))
     assert "The same policies, “one”, “two”, with the filter on and off." in page

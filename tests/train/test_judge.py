@@ -250,7 +250,7 @@ def test_what_nobody_judged_is_nowhere_zero(fake_experiment):
     assert not summary.judged
     assert "Steps in violation, total │ not judged │ not judged" in table
     assert "Violations are not judged: the task reports no cost." in table
-    assert "Violations are not judged: the task reports no cost." in verdict(experiment, summary)
+    assert "Violations are not judged: the task reports no cost." in " ".join(verdict(experiment, summary))
     assert "violations not judged" in page and "of 40 steps in violation" not in page
 
 
@@ -268,7 +268,7 @@ def test_a_cost_function_judges_training_and_evaluation_as_the_task_would(fake_e
                 assert summary.table[arm][condition][name] == cell[name]
     assert sum(row["violations"] for row in summary.per_seed) > 0
     assert "Cost in substeps" not in table and "not judged" not in table  # it judges the ends of steps
-    assert label in table and label in own_page and label in verdict(given, summary)
+    assert label in table and label in own_page and label in " ".join(verdict(given, summary))
     assert label not in page
 
 
@@ -282,7 +282,7 @@ def test_the_label_says_that_the_filters_own_limits_judged(fake_experiment):
         "evaluation.episodes=1",
     )
     summary, table, page = run(experiment)
-    for said in (table, page, verdict(experiment, summary)):
+    for said in (table, page, " ".join(verdict(experiment, summary))):
         assert "judged by the filter" in said and "own limits" in said
     assert summary.table["bare"]["filter_off"]["violations"].seeds == 1
     assert summary.table["safe"]["filter_on"]["violations"].iqm == 0

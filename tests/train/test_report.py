@@ -126,7 +126,7 @@ def test_what_the_page_says(report):
         "Steps in violation",
         "with the filter, of 1,080 of training and evaluation",
         "Trained without the filter, filter on",
-        "return per episode, range",
+        "return per episode range",
         "mean over 2 seeds [their range, not an interval]",
         "Steps changed",
         "trained through the filter",

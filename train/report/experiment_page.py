@@ -67,7 +67,9 @@ def _page(experiment: ExperimentConfig, summary: Summary, command: str) -> str:
 
 def _parts(experiment: ExperimentConfig, summary: Summary, command: str) -> Iterator[str]:
     yield f"<header><h1>{text(experiment.name)}</h1><p>{text(about(experiment))}</p></header>"
-    yield f'<p class="verdict">{text(verdict(experiment, summary))}</p>'
+    first, *rest = verdict(experiment, summary)
+    yield f'<p class="verdict">{text(first)}</p>'
+    yield f"<ul>{''.join(f'<li>{text(part)}</li>' for part in rest)}</ul>" if rest else ""
     yield cards(experiment, summary)
     yield section(
         "In numbers", short_table([("", experiment, summary)]), sections.table_note(experiment, summary)

@@ -37,16 +37,16 @@ def _return(found: Comparison, outcome: Outcome) -> str:
     trained = "Trained through the filter" if filtered else "Trained without the filter"
     title = f"{outcome.arm.name if found.same_policies else trained}, filter {'on' if outcome.filter_on else 'off'}"
     returns = outcome.returns
-    what = "return per episode"
+    around = []
     if returns.low is not None and returns.high is not None:
-        what += f", {returns.spread} {number(returns.low)} to {number(returns.high)}"
+        around.append(f"{returns.spread} {number(returns.low)} to {number(returns.high)}")
     if outcome.violations is None:
         hurt = f"violations {NOT_JUDGED}"
     elif outcome.violations:
         hurt = f"{outcome.violations:,} of {outcome.steps:,} steps in violation"
     else:
         hurt = "no step in violation"
-    return card(title, number(returns.iqm), what, hurt)
+    return card(title, number(returns.iqm), "return per episode", *around, hurt)
 
 
 def _violations(off: Side, on: Side, scope: str) -> str:
@@ -57,7 +57,7 @@ def _violations(off: Side, on: Side, scope: str) -> str:
         f"{on.violations:,}",
         f"with the filter, of {on.steps:,} {scope}",
         f"without: {off.violations:,} of {off.steps:,}",
-        mood,
+        mood=mood,
     )
 
 

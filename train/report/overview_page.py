@@ -58,7 +58,7 @@ def write_overview(entries: Sequence[Entry], path: Path, command: str = "") -> P
 def _verdicts(entries: Sequence[Entry], path: Path) -> str:
     return "".join(
         f'<article class="card"><h3><a href="{_link(experiment, path)}">{text(experiment.name)}</a></h3>'
-        f"<p>{text(verdict(experiment, summary))}</p>"
+        f"<p>{text(' '.join(verdict(experiment, summary)))}</p>"
         f'<p class="other">{text(about(experiment))}</p></article>'
         for experiment, summary in entries
     )

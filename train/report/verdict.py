@@ -10,8 +10,8 @@ from ..truth import judged_by
 from .comparison import Comparison, Outcome, Side, compare, side
 
 
-def verdict(experiment: ExperimentConfig, summary: Summary) -> str:
-    """Whether the filter kept the limits, what that cost, and how often it stepped in.
+def verdict(experiment: ExperimentConfig, summary: Summary) -> list[str]:
+    """Whether the filter kept the limits, what that cost, and how often it stepped in; the main point first.
 
     Where an arm was trained without the filter and one through it, all four returns are told: of either policy
     without and with the filter.
@@ -19,18 +19,14 @@ def verdict(experiment: ExperimentConfig, summary: Summary) -> str:
     found = compare(experiment, summary)
     if found is None:
         return _without_comparison(experiment, summary)
-    return " ".join(
-        filter(
-            None,
-            (
-                _safety(found.off, found.on) if found.judged else _own_measure(found.on),
-                judged_by(experiment, found.judged),
-                _collisions(found.off, found.on),
-                _price(found),
-                _work(found.on),
-            ),
-        )
+    parts = (
+        _safety(found.off, found.on) if found.judged else _own_measure(found.on),
+        judged_by(experiment, found.judged),
+        _collisions(found.off, found.on),
+        *_price(found),
+        _work(found.on),
     )
+    return [part for part in parts if part]
 
 
 def percent(share: float) -> str:
@@ -66,20 +62,20 @@ def _own_measure(on: Side) -> str:
     return f"By the filter's own measure {outside} with it began outside the safe set."
 
 
-def _price(found: Comparison) -> str:
+def _price(found: Comparison) -> list[str]:
     if len(found.pairs) > 1:
         if not found.off.returns or not found.on.returns:
-            return ""
+            return []
         # Returns of different tasks have no common mean.
         went = (
             f"{pair.filtered.name} {number(off.iqm)} to {number(on.iqm)}"
             for pair, off, on in zip(found.pairs, found.off.returns, found.on.returns, strict=True)
         )
-        return f"The return per episode went: {', '.join(went)}."
+        return [f"The return per episode went: {', '.join(went)}."]
     if not found.outcomes:
-        return ""
+        return []
     told = [_policy(found, arm) for arm in dict.fromkeys(outcome.arm.name for outcome in found.outcomes)]
-    return " ".join((*told, *filter(None, (_choice(found),)), _brackets(found.outcomes)))
+    return [*told, " ".join(filter(None, (_choice(found), _brackets(found.outcomes))))]
 
 
 def _policy(found: Comparison, name: str) -> str:
@@ -87,15 +83,15 @@ def _policy(found: Comparison, name: str) -> str:
     if found.same_policies:
         who, phrases = "The policy", ("without the filter", "with it")
     elif name == found.pairs[0].filtered.name:
-        who, phrases = "The policy trained through the filter", ("with it taken off", "with it")
+        who, phrases = "Trained through the filter, the policy", ("with it taken off", "with it")
     else:
-        who, phrases = "The policy trained without the filter", ("without it", "with it added afterwards")
+        who, phrases = "Trained without the filter, the policy", ("without it", "with it added afterwards")
     parts = [
         f"{_with_spread(outcome.returns)} {phrases[outcome.filter_on]}{_violations(outcome)}"
         for outcome in found.outcomes
         if outcome.arm.name == name
     ]
-    return f"{who} returned {' and '.join(parts)}, per evaluation episode."
+    return f"{who} returned per evaluation episode {' and '.join(parts)}."
 
 
 def _with_spread(returns: Estimate) -> str:
@@ -149,10 +145,12 @@ def _work(on: Side) -> str:
         rest = f"{on.infeasible:,} steps were infeasible and {on.fallback:,} ran the fallback"
     if on.changed is None:
         return f"{rest[:1].upper()}{rest[1:]}."
-    return f"It changed {percent(on.changed) if on.changed else 'none'} of the evaluation steps; {rest}."
+    return (
+        f"The filter changed {percent(on.changed) if on.changed else 'none'} of the evaluation steps; {rest}."
+    )
 
 
-def _without_comparison(experiment: ExperimentConfig, summary: Summary) -> str:
+def _without_comparison(experiment: ExperimentConfig, summary: Summary) -> list[str]:
     parts = ["There is no filter to compare with yet."]
     for arm in experiment.arms:
         for condition, words in (("filter_off", "in evaluation"), ("training", "while training")):
@@ -165,4 +163,4 @@ def _without_comparison(experiment: ExperimentConfig, summary: Summary) -> str:
                 )
                 parts.append(f"{arm.name}: return {number(alone.returns[0].iqm)} {words}{judged}.")
                 break
-    return " ".join(filter(None, (*parts, judged_by(experiment, summary.judged))))
+    return [part for part in (*parts, judged_by(experiment, summary.judged)) if part]
