@@ -96,7 +96,8 @@ def outcome(experiment: ExperimentConfig, summary: Summary) -> str:
         if judged or metric != "cost"
     ]
     drawn = [item for item in finals if item.svg]
-    return pictures([*([plane_picture(summary, names)] if judged else []), *drawn])
+    plane = [plane_picture(summary, names)] if judged else []
+    return pictures([*plane, *drawn] or finals[:1])  # of nothing, that nothing has been evaluated
 
 
 def interventions(experiment: ExperimentConfig) -> str:
