@@ -114,8 +114,8 @@ class RecordInterventions(
         >>> _ = env.reset(seed=0)
         >>> for _ in range(3):
         ...     _, _, _, _, info = env.step(env.action_space.low)
-        >>> info["interventions"].keys(), info["interventions/cost"]  # no filter, and a task without a cost
-        (dict_keys(['length', 'return']), nan)
+        >>> print(list(info["interventions"]), info["interventions/cost"])  # no filter, and a task without a cost
+        ['length', 'return'] nan
 
     Change log:
         * v0.1.0: added.
