@@ -154,10 +154,8 @@ def test_a_task_without_a_cost_has_no_violations_to_count(fake_experiment):
     experiment = fake_experiment()
     silent = steps(cost=steps().cost * float("nan"))
     said = told(experiment, off={}, on={"unsafe": 3}, log_off=silent, log_on=silent)
-    assert said.startswith(
-        "By the filter's own measure 72 of 2,400 steps with it began outside the safe set. Violations are not judged:"
-        " the task reports no cost."
-    )
+    assert said.startswith("Violations are not judged: the task reports no cost.")
+    assert "By the filter's own measure 72 of 2,400 steps with it began outside the safe set." in said
     assert "in violation" not in said
     page = cards(experiment, summarize(experiment))
     assert "in violation" not in page and page.count("violations not judged") == 4

@@ -19,9 +19,9 @@ def verdict(experiment: ExperimentConfig, summary: Summary) -> list[str]:
     found = compare(experiment, summary)
     if found is None:
         return _without_comparison(experiment, summary)
+    judge = judged_by(experiment, found.judged)
     parts = (
-        _safety(found.off, found.on) if found.judged else _own_measure(found.on),
-        judged_by(experiment, found.judged),
+        *((_safety(found.off, found.on), judge) if found.judged else (judge, _own_measure(found.on))),
         _collisions(found.off, found.on),
         *_price(found),
         _work(found.on),
