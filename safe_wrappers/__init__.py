@@ -48,6 +48,7 @@ from safe_wrappers.wrappers.balance_monitor import BalanceMonitor
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.chunk_handover import ChunkHandover
 from safe_wrappers.wrappers.contact_monitor import ContactMonitor
+from safe_wrappers.wrappers.cost_function import CostFunction
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
@@ -73,6 +74,7 @@ __all__ = [
     "Constraint",
     "ContactFeasibility",
     "ContactMonitor",
+    "CostFunction",
     "Disc",
     "Discs",
     "DisplacementPlant",

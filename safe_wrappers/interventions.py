@@ -61,7 +61,8 @@ WHOLE_BODY_SUPPORTED: Final = "whole_body/supported"
 
 # Tasks, every step: the env's own truth, never the filter's plant ------------------------------------------
 COST: Final = "cost"
-"""float64: cost of this control step, judged at its end, as Safety-Gymnasium publishes it."""
+"""float64: cost of this control step, judged at its end, as Safety-Gymnasium publishes it; `CostFunction` writes it
+for a task that reports none."""
 COST_SUBSTEP: Final = "cost_substep"
 """float64: 1 if the constraint was violated at any physics substep of this control step, else 0."""
 SPIN_OUT: Final = "spin_out"
@@ -82,7 +83,8 @@ RUNNING: Final = (
     "interventions/cost",
     "interventions/cost_substep",
 )
-"""float64, every step: the episode so far. Monitor reads them at the terminal step (`info_keywords`)."""
+"""float64, every step: the episode so far, NaN where the task or the stack does not report what it is made from.
+Monitor reads them at the terminal step (`info_keywords`)."""
 
 # AdaptionPenalty, every step --------------------------------------------------------------------------------
 ADAPTION_PENALTY: Final = "adaption/penalty"

@@ -16,7 +16,7 @@ from safe_wrappers.errors import ConfigurationError, SafeWrappersError
 from .config import parse_experiment
 from .config_file import read_config
 from .experiment import evaluate_experiment, summarize_experiment, train_experiment
-from .report import write_overview, write_report
+from .report import verdict, write_overview, write_report
 from .table import comparison_table
 
 _COMMANDS = {
@@ -69,6 +69,7 @@ def _run(options: argparse.Namespace, console: Console) -> None:
     summary = summarize_experiment(experiment)
     if options.command in ("evaluate", "compare"):
         console.print(comparison_table(experiment, summary))
+        console.print("\n".join(verdict(experiment, summary)), highlight=False, markup=False)
     if getattr(options, "report", False):
         path = write_report(experiment, summary, _compare_command(config, options.overrides))
         console.print(f"Report: {path}", soft_wrap=True, highlight=False)

@@ -6,7 +6,7 @@ import inspect
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -55,19 +55,27 @@ _EXECUTED: Final = ("safe_action", "both")
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """Which env: `env: Id-v0`, or `env: {id: Id-v0, kwargs: {...}, occlusion: {...}, faults: {Outages: {...}}}`.
+    """Which env: `env: Id-v0`, or `env: {id: Id-v0, kwargs: {...}, occlusion: {...}, faults: {Outages: {...}}, ...}`.
 
     `occlusion` holds the arguments of an `OcclusionPenalty` around the task and inside the filter, in training and
     evaluation. Its penalty is the learner's: every return that is reported is the task's own.
 
     `faults` go wrong between the policy and the robot in all arms, filtered or not, in training and evaluation:
     names and arguments of `safe_wrappers.wrappers.faults`, the innermost first.
+
+    A task that reports no cost is judged, in all arms, in training and evaluation, by one of
+
+    - `cost: module:function`, a `CostFunction`: the function takes the unwrapped env and returns a number;
+    - `judge: constraints`: the limits of the evaluation's filter, a `ConstraintJudge`.
     """
 
     id: str
     kwargs: dict[str, Any] = field(default_factory=dict)
     faults: dict[str, dict[str, Any]] = field(default_factory=dict)
     occlusion: dict[str, Any] | None = None
+    cost: str | None = None
+    judge: FilterConfig | None = None
+    """Whose constraints judge."""
 
 
 @dataclass(frozen=True)
@@ -158,8 +166,9 @@ class ArmConfig:
             del values["learner"]
         if not self.env.faults:
             del values["env"]["faults"]
-        if self.env.occlusion is None:
-            del values["env"]["occlusion"]
+        for optional in ("occlusion", "cost", "judge"):
+            if values["env"][optional] is None:
+                del values["env"][optional]
         if self.filter.lease is None:
             del values["filter"]["lease"]
         return values
@@ -219,7 +228,7 @@ def parse_experiment(settings: Mapping[str, Any]) -> ExperimentConfig:
         raise ConfigurationError("arms: expected at least one, such as `unfiltered: {filter: none}`.")
     workers = settings.get("workers")
     filter_given = _mapping(settings.get("evaluation"), "evaluation").get("filter")
-    return ExperimentConfig(
+    experiment = ExperimentConfig(
         name=_folder_name(settings["name"], "name"),
         arms=tuple(_arm(name, _mapping(arm, f"arms.{name}"), common) for name, arm in arms.items()),
         seeds=_seeds(settings["seeds"]),
@@ -228,6 +237,20 @@ def parse_experiment(settings: Mapping[str, Any]) -> ExperimentConfig:
         workers=None if workers is None else _integer(workers, "workers", 1),
         given_evaluation_filter=None if filter_given is None else _filter(filter_given, "evaluation.filter"),
     )
+    return replace(experiment, arms=tuple(_judged(arm, experiment) for arm in experiment.arms))
+
+
+def _judged(arm: ArmConfig, experiment: ExperimentConfig) -> ArmConfig:
+    """With the filter whose constraints judge: the same one for all arms, so that they can be compared."""
+    if arm.env.judge is None:
+        return arm
+    judge = replace(experiment.evaluation_filter, lease=None)
+    if judge.kind == "none":
+        raise ConfigurationError(
+            "env.judge: there is no filter whose constraints could judge; give an arm or the evaluation one "
+            "(evaluation: {filter: protect}), or use env.cost: module:function."
+        )
+    return replace(arm, env=replace(arm.env, judge=judge))
 
 
 def _arm(name: object, own: Mapping[str, Any], common: Mapping[str, Any]) -> ArmConfig:
@@ -304,9 +327,7 @@ def _filter(value: Any, where: str) -> FilterConfig:
             check_name(key, _PROTECT_OPTIONS, f"{where}.protect")
         return FilterConfig("protect", options, lease=lease)
     if "factory" in value and "protect" not in value:
-        factory = _text(value["factory"], f"{where}.factory")
-        if not re.fullmatch(r"[\w.]+:\w+", factory):
-            raise ConfigurationError(f"{where}.factory: expected 'module:function', got {factory!r}.")
+        factory = _function_name(value["factory"], f"{where}.factory")
         return FilterConfig("factory", dict(_mapping(value.get("kwargs"), f"{where}.kwargs")), factory, lease)
     raise ConfigurationError(f"{where}: {expected}; got {value!r}.")
 
@@ -363,7 +384,7 @@ def _env(value: Any) -> EnvConfig:
         value = {"id": value}
     value = _mapping(value, "env")
     for key in value:
-        check_name(key, ("id", "kwargs", "faults", "occlusion"), "env")
+        check_name(key, ("id", "kwargs", "faults", "occlusion", "cost", "judge"), "env")
     env_id = _text(value.get("id"), "env.id")
     if ":" not in env_id:  # `module:Id-v0` is registered by importing the module, when the env is made
         try:
@@ -376,7 +397,14 @@ def _env(value: Any) -> EnvConfig:
         for key in occlusion:
             check_name(key, _OCCLUSION_OPTIONS, "env.occlusion")
     kwargs = dict(_mapping(value.get("kwargs"), "env.kwargs"))
-    return EnvConfig(env_id, kwargs, _faults(value.get("faults")), occlusion)
+    cost = None if value.get("cost") is None else _function_name(value["cost"], "env.cost")
+    judge = None
+    if value.get("judge") is not None:
+        check_name(value["judge"], ("constraints",), "env.judge")
+        judge = FilterConfig()  # whose constraints they are is known when all arms are
+        if cost is not None:
+            raise ConfigurationError("env: cost and judge both say who judges the task; leave one out.")
+    return EnvConfig(env_id, kwargs, _faults(value.get("faults")), occlusion, cost, judge)
 
 
 def _faults(value: Any) -> dict[str, dict[str, Any]]:
@@ -450,6 +478,13 @@ def _text(value: Any, where: str) -> str:
     if not isinstance(value, str) or not value:
         raise ConfigurationError(f"{where}: expected a text, got {value!r}.")
     return value
+
+
+def _function_name(value: Any, where: str) -> str:
+    name = _text(value, where)
+    if not re.fullmatch(r"[\w.]+:\w+", name):
+        raise ConfigurationError(f"{where}: expected 'module:function', got {name!r}.")
+    return name
 
 
 def _folder_name(value: Any, where: str) -> str:

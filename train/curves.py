@@ -1,4 +1,4 @@
-"""Learning curves: each metric over training steps, interquartile mean and interval over seeds."""
+"""Learning curves: each metric over training steps, interquartile mean and interval (of two, range) over seeds."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from .config import ArmConfig, ExperimentConfig
-from .summary import interquartile_mean
+from .summary import SEEDS_FOR_AN_INTERVAL, interquartile_mean
 from .tables import read_rows
 
 _MOST_BINS = 40
@@ -17,7 +17,7 @@ _MOST_BINS = 40
 
 @dataclass(frozen=True)
 class Curve:
-    """One arm's metric over B bins of steps; no interval with one seed."""
+    """One arm's metric over B bins of steps; of two seeds their range, of one none."""
 
     steps: NDArray[np.float64]
     """(B,)"""
@@ -72,13 +72,14 @@ def event_rate(
 
     Returns:
         Edges of bins of training steps, shape (B + 1,), events per 1000 steps in each, shape (B,), NaN where
-        no episode ended, and their number in all; None without any episode.
+        no episode ended, and their number in all; None without any episode that reports it.
     """
     rows = np.array(
         [
             (row["timesteps"], row[event], row["length"])
             for seed in experiment.seeds
             for row in read_rows(experiment.run_folder(arm, seed) / "episodes.csv")
+            if event in row
         ]
     )
     if not rows.size:
@@ -104,6 +105,8 @@ def _bin_means(run: NDArray[np.float64], edges: NDArray[np.float64]) -> NDArray[
 def _interval(means: NDArray[np.float64]) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
     if len(means) < 2:
         return None, None
+    if len(means) < SEEDS_FOR_AN_INTERVAL:
+        return means.min(axis=0), means.max(axis=0)
     interval = stats.bootstrap(
         (means,),
         interquartile_mean,

@@ -87,13 +87,13 @@ def shown_episode(experiment: ExperimentConfig) -> ShownEpisode | None:
 def _totals(
     experiment: ExperimentConfig, arms: list[ArmConfig], seed: int, condition: str, column: str
 ) -> dict[int, float]:
-    """A column's sum over arms, by episode seed."""
+    """A column's sum over arms, by episode seed; what was not judged or reported moves no choice."""
     totals: dict[int, float] = {}
     for arm in arms:
         path = evaluation_folder(experiment.run_folder(arm, seed)) / f"{condition}.csv"
         for row in read_rows(path):
             episode_seed = int(row["episode_seed"])
-            totals[episode_seed] = totals.get(episode_seed, 0.0) + row[column]
+            totals[episode_seed] = totals.get(episode_seed, 0.0) + row.get(column, 0.0)
     return totals
 
 

@@ -14,19 +14,21 @@ import safe_wrappers
 from safe_wrappers import interventions as keys
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.adaption_penalty import AdaptionPenalty
+from safe_wrappers.wrappers.cost_function import CostFunction
 from safe_wrappers.wrappers.faults import FAULTS
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
 
 from .config import NAIVE, EnvConfig, FilterConfig, LearnerConfig
+from .judge import ConstraintJudge
 from .names import check_name
 
 
 def make_stack(
     env: EnvConfig, action_filter: FilterConfig, learner: LearnerConfig = NAIVE
 ) -> gym.Env[Any, Any]:
-    """Makes the task; OcclusionPenalty, filter, lease if there are any; recorder, faults, Monitor, AdaptionPenalty.
+    """Makes the task; judge, OcclusionPenalty, filter, lease if any; recorder, faults, Monitor, AdaptionPenalty.
 
     The recorder counts the task's own reward, whatever the learner sees. Monitor does too, but for OcclusionPenalty,
     which is inside of it.
@@ -43,21 +45,16 @@ def make_stack(
         task: gym.Env[Any, Any] = gym.make(env.id, **env.kwargs)
     except (TypeError, gym.error.Error, ImportError) as error:
         raise ConfigurationError(f"env: {env.id} with kwargs {env.kwargs} cannot be made: {error}") from error
+    if env.cost is not None:
+        task = CostFunction(task, _function(env.cost, "env.cost"))
+    if env.judge is not None:
+        task = ConstraintJudge(task, _filtered(task, env.judge))
     if env.occlusion is not None:
         try:
             task = OcclusionPenalty(task, **env.occlusion)
         except TypeError as error:
             raise ConfigurationError(f"env.occlusion: {error}") from None
-    if action_filter.kind == "protect":
-        task = safe_wrappers.protect(task, **action_filter.kwargs)
-    elif action_filter.kind == "factory":
-        factory = _factory(action_filter)
-        try:
-            task = factory(task, **action_filter.kwargs)
-        except TypeError as error:
-            raise ConfigurationError(
-                f"filter: {action_filter.factory} refuses its kwargs: {error}"
-            ) from error
+    task = _filtered(task, action_filter)
     if action_filter.lease is not None:
         task = _leased(task, action_filter.lease)
     recorded: gym.Env[Any, Any] = RecordInterventions(task)
@@ -70,6 +67,22 @@ def make_stack(
     if not learner.penalised:
         return monitored
     return AdaptionPenalty(monitored, penalty=learner.penalty, per_correction=learner.per_correction)
+
+
+def _filtered(task: gym.Env[Any, Any], action_filter: FilterConfig) -> gym.Env[Any, Any]:
+    """The task in its filter; as it is if there is none."""
+    if action_filter.kind == "protect":
+        return safe_wrappers.protect(task, **action_filter.kwargs)
+    if action_filter.kind == "factory":
+        factory = _function(action_filter.factory, "filter.factory")
+        try:
+            filtered: gym.Env[Any, Any] = factory(task, **action_filter.kwargs)
+        except TypeError as error:
+            raise ConfigurationError(
+                f"filter: {action_filter.factory} refuses its kwargs: {error}"
+            ) from error
+        return filtered
+    return task
 
 
 def _leased(task: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> LeaseExpiry:
@@ -85,11 +98,12 @@ def _leased(task: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> LeaseExpir
     return LeaseExpiry(task, copy.deepcopy(constraints[0]), **arguments)
 
 
-def _factory(action_filter: FilterConfig) -> Any:
-    module_name, _, function = action_filter.factory.partition(":")
+def _function(name: str, where: str) -> Any:
+    """What a config calls `module:function`."""
+    module_name, _, function = name.partition(":")
     try:
         module = importlib.import_module(module_name)
     except ImportError as error:
-        raise ConfigurationError(f"filter.factory: cannot import {module_name!r}: {error}") from None
+        raise ConfigurationError(f"{where}: cannot import {module_name!r}: {error}") from None
     check_name(function, [name for name in dir(module) if not name.startswith("_")], f"{module_name}")
     return getattr(module, function)

@@ -15,6 +15,7 @@ from .atomic import write_json
 from .config import ExperimentConfig, FilterConfig
 from .evaluate import evaluation_folder
 from .tables import read_rows, write_rows
+from .truth import evaluated_without_cost
 
 CONDITIONS: Final = {
     "training": "Training, all episodes",
@@ -85,20 +86,53 @@ OF_THE_FILTER: Final = (
 OF_THE_LEASE: Final = ("lease_braking", "lease_expired")
 """Left out where there is no lease."""
 
+OF_THE_JUDGE: Final = ("cost", "cost_substep", "violations", "violations_per_1000")
+"""Left out where nobody judged: a zero there would be a lie."""
+NOT_JUDGED: Final = "not judged"
+
+SEEDS_FOR_AN_INTERVAL: Final = 3
+"""Fewer say nothing about others: their range is given, and called so."""
+
 
 @dataclass(frozen=True)
 class Estimate:
-    """The interquartile mean over seeds and its bootstrap 95 % interval (None with one seed)."""
+    """The interquartile mean over seeds and its bootstrap 95 % interval.
+
+    With two seeds `low` and `high` are their range, with one seed None.
+    """
 
     iqm: float
     low: float | None
     high: float | None
     seeds: int
 
+    @property
+    def spread(self) -> str:
+        """What `low` and `high` are."""
+        return spread(self.seeds)
+
     def __str__(self) -> str:
         if self.low is None or self.high is None:
             return f"{number(self.iqm)} [n/a]"
         return f"{number(self.iqm)} [{number(self.low)}, {number(self.high)}]"
+
+
+def spread(seeds: int) -> str:
+    """What is given beside a mean over so many seeds: "", "range" or "95 % interval"."""
+    if seeds < 2:
+        return ""
+    return "range" if seeds < SEEDS_FOR_AN_INTERVAL else "95 % interval"
+
+
+def over_seeds(fewest: int, most: int) -> str:
+    """What the numbers of a table are, and what stands in their brackets, by the seeds that are finished."""
+    if most < 2:
+        return "one seed, no interval"
+    seeds = f"{most} seeds" if fewest == most else f"{fewest} to {most} seeds"
+    if most < SEEDS_FOR_AN_INTERVAL:
+        return f"mean over {seeds} [their range, not an interval]"
+    rest = "" if fewest >= SEEDS_FOR_AN_INTERVAL else "; of two seeds their range"
+    return f"interquartile mean over {seeds} [bootstrap 95 % interval{rest}]"
 
 
 Table = dict[str, dict[str, dict[str, Estimate]]]
@@ -112,6 +146,22 @@ class Summary:
     per_seed: list[dict[str, Any]]
     table: Table
 
+    @property
+    def seeds(self) -> tuple[int, int]:
+        """How many seeds a number is over, the fewest and the most; zeros where there is no number yet."""
+        counts = [
+            estimate.seeds
+            for arm in self.table.values()
+            for cell in arm.values()
+            for estimate in cell.values()
+        ]
+        return min(counts, default=0), max(counts, default=0)
+
+    @property
+    def judged(self) -> bool:
+        """Whether somebody judged: some row has violations, be it none of them."""
+        return any("violations" in row for row in self.per_seed)
+
 
 def interquartile_mean(values: ArrayLike, axis: int = -1) -> NDArray[np.float64]:
     """The mean of the middle half: a quarter of the values (rounded down) is cut at either end.
@@ -122,17 +172,17 @@ def interquartile_mean(values: ArrayLike, axis: int = -1) -> NDArray[np.float64]
 
 
 def estimate(values: Sequence[float]) -> Estimate:
-    """Interquartile mean and 95 % percentile-bootstrap interval over seeds.
+    """Interquartile mean and 95 % percentile-bootstrap interval over seeds; of two seeds their range.
 
     The percentile method, because BCa is undefined when all seeds agree (as with zero violations) and
-    unstable for a handful of seeds. With few seeds any bootstrap interval is too narrow; with one there is
-    none.
+    unstable for a handful of seeds. With few seeds any bootstrap interval is too narrow; with two it would only be
+    their range under another name.
     """
     iqm = float(interquartile_mean(values))
     if len(values) < 2:
         return Estimate(iqm, None, None, len(values))
-    if np.ptp(values) == 0:
-        return Estimate(iqm, iqm, iqm, len(values))
+    if len(values) < SEEDS_FOR_AN_INTERVAL or np.ptp(values) == 0:
+        return Estimate(iqm, float(np.min(values)), float(np.max(values)), len(values))
     interval = stats.bootstrap(
         (np.asarray(values, dtype=float),),
         interquartile_mean,
@@ -149,6 +199,7 @@ def summarize(experiment: ExperimentConfig) -> Summary:
     table: Table = {}
     for arm in experiment.arms:
         table[arm.name] = {}
+        unjudged = OF_THE_JUDGE if evaluated_without_cost(experiment, arm) else ()
         for condition in CONDITIONS:
             own = condition == "training" or arm.filter.kind != "none"
             used = (
@@ -161,45 +212,61 @@ def summarize(experiment: ExperimentConfig) -> Summary:
             left_out = (OF_THE_FILTER if used.kind == "none" else ()) + (
                 OF_THE_LEASE if used.lease is None else ()
             )
+            metrics = [metric for metric in METRICS if metric not in (*left_out, *unjudged)]
             rows = []
             for seed in experiment.seeds:
                 episodes = read_rows(_episode_file(experiment.run_folder(arm, seed), condition))
                 if episodes:
                     rows.append(
-                        {"arm": arm.name, "seed": seed, "condition": condition, **_seed_row(episodes)}
+                        {
+                            "arm": arm.name,
+                            "seed": seed,
+                            "condition": condition,
+                            **_seed_row(episodes, metrics),
+                        }
                     )
             per_seed += rows
             table[arm.name][condition] = {
                 metric: estimate([row[metric] for row in rows])
-                for metric in METRICS
-                if rows and all(metric in row for row in rows) and metric not in left_out
+                for metric in metrics
+                if rows and all(metric in row for row in rows)
             }
     return Summary(per_seed, table)
 
 
 def write_summary(summary: Summary, folder: Path) -> None:
-    """Writes `per_seed.csv` (one row per arm, seed and condition), `summary.csv` and `summary.json`."""
+    """Writes `per_seed.csv` (one row per arm, seed and condition), `summary.csv` and `summary.json`.
+
+    What was not judged or not reported has no row in the summary and an empty cell in the seeds' table. `spread` says
+    what `low` and `high` are: the range of two seeds, or an interval over more.
+    """
     write_rows(
         folder / "per_seed.csv", ("arm", "seed", "condition", "episodes", "steps", *METRICS), summary.per_seed
     )
     rows = [
         {"arm": arm, "condition": condition, "metric": metric}
-        | {key: "" if value is None else value for key, value in asdict(result).items()}
+        | {key: "" if value is None else value for key, value in _plain(result).items()}
         for arm, conditions in summary.table.items()
         for condition, metrics in conditions.items()
         for metric, result in metrics.items()
     ]
-    write_rows(folder / "summary.csv", ("arm", "condition", "metric", "iqm", "low", "high", "seeds"), rows)
+    write_rows(
+        folder / "summary.csv", ("arm", "condition", "metric", "iqm", "low", "high", "seeds", "spread"), rows
+    )
     write_json(
         folder / "summary.json",
         {
             arm: {
-                condition: {metric: asdict(result) for metric, result in metrics.items()}
+                condition: {metric: _plain(result) for metric, result in metrics.items()}
                 for condition, metrics in conditions.items()
             }
             for arm, conditions in summary.table.items()
         },
     )
+
+
+def _plain(result: Estimate) -> dict[str, Any]:
+    return asdict(result) | {"spread": result.spread}
 
 
 def number(value: float) -> str:
@@ -215,10 +282,10 @@ def _episode_file(run_folder: Path, condition: str) -> Path:
     return evaluation_folder(run_folder) / f"{condition}.csv"
 
 
-def _seed_row(episodes: Sequence[Mapping[str, float]]) -> dict[str, Any]:
+def _seed_row(episodes: Sequence[Mapping[str, float]], metrics: Sequence[str]) -> dict[str, Any]:
     steps = sum(episode["length"] for episode in episodes)
     row: dict[str, Any] = {"episodes": len(episodes), "steps": int(steps)}
-    for metric in METRICS:
+    for metric in metrics:
         source, per = RATES.get(metric, (metric, 1.0))
         if all(source in episode for episode in episodes):
             values = [episode[source] for episode in episodes]

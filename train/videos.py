@@ -72,10 +72,13 @@ def record_videos(experiment: ExperimentConfig, console: Console) -> None:
     if shown is None:
         return
     problem = ""
-    for env in dict.fromkeys(json.dumps(asdict(arm.env)) for arm in experiment.arms):
-        config = EnvConfig(**json.loads(env))
-        arms = [arm for arm in experiment.arms if arm.env == config]
-        problem = _record_arms(experiment, arms, config, shown, console) or problem
+    envs: list[EnvConfig] = []
+    for arm in experiment.arms:
+        if arm.env not in envs:
+            envs.append(arm.env)
+    for env in envs:
+        arms = [arm for arm in experiment.arms if arm.env == env]
+        problem = _record_arms(experiment, arms, env, shown, console) or problem
     path = experiment.folder / "videos" / _PROBLEM
     path.unlink(missing_ok=True)
     if problem:

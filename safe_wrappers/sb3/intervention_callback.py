@@ -58,6 +58,9 @@ class InterventionCallback(BaseCallback):
       `cost_substep`, `goals_reached`, `spin_outs`, `success`, `collisions`, `seen`, `expiries`: over the episodes
       that ended, from `RecordInterventions`.
 
+    What neither the task nor a layer of the stack reports is not logged: no filter, no `rate`; no cost, no
+    `violations`.
+
     It reads infos only, so it works the same with `DummyVecEnv` and `SubprocVecEnv`. For evaluation use
     `InterventionEvalCallback`.
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from safe_wrappers import interventions as keys
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.not_judged import NOT_JUDGED
 from safe_wrappers.wrappers.stack import Layer, refuse_order
 
 COLUMNS: Final = (
@@ -40,10 +41,11 @@ COLUMNS: Final = (
     "seen",
     "expiries",
 )
-"""The CSV file's columns. Those from `goals_reached` on stay empty for tasks and stacks that do not report them."""
+"""The CSV file's columns. Cells stay empty where the task or the stack does not report what they hold."""
 
 
-_COUNTED: Final = {
+_FLAGS: Final = {
+    "intervened": keys.CBF_INTERVENED,
     "infeasible": keys.CBF_INFEASIBLE,
     "fallback": keys.CBF_FALLBACK,
     "nonfinite": keys.CBF_NONFINITE,
@@ -52,7 +54,18 @@ _COUNTED: Final = {
     "lease_refused": keys.LEASE_REFUSED,
     "lease_braking": keys.LEASE_BRAKING,
 }
-"""Steps at which a flag was up, by the summary's name for it."""
+"""Counted: steps at which a flag was up."""
+_OF_THE_TASK: Final = ("violations", keys.COST, keys.COST_SUBSTEP, "spin_outs", "collisions")
+_RUNNING_SOURCES: Final = (
+    keys.CBF_INTERVENED,
+    keys.CBF_CORRECTION,
+    keys.CBF_INFEASIBLE,
+    keys.CBF_FALLBACK,
+    keys.CBF_MARGIN,
+    keys.COST,
+    keys.COST_SUBSTEP,
+)
+"""Of each key of `interventions.RUNNING`, what it is made from."""
 
 
 class RecordInterventions(
@@ -62,9 +75,12 @@ class RecordInterventions(
     """Counts interventions, corrections and costs; changes neither actions, rewards nor observations.
 
     Put it outside the filter, `LeaseExpiry`, `TeleopChannel` and `OcclusionPenalty`, and inside `ChunkHandover` and
-    SB3's `Monitor`; other orders of our own wrappers are refused (`wrappers/stack.py`). Without a filter
-    inside (the unfiltered arm of a comparison) the missing `cbf/*` keys count as zero, and so do `cost` and
-    `cost_substep` of a task that has none.
+    SB3's `Monitor`; other orders of our own wrappers are refused (`wrappers/stack.py`).
+
+    **What nobody reported is not zero.** Without a filter inside (the unfiltered arm of a comparison) there are no
+    `cbf/*` keys, and many tasks report no `cost`. What would be made of them is NaN in the running keys, missing
+    in the episode's summary, and an empty cell in the file. The same holds for a 0 that was not reported at every
+    step; a count above 0 is given, as a lower bound. `CostFunction` gives a cost to a task that has none.
 
     At every step `info` gains the keys of `safe_wrappers.interventions.RUNNING` (float64, the episode so
     far), and at an episode's last step `info["interventions"]`, a dict:
@@ -74,12 +90,12 @@ class RecordInterventions(
     - `intervention_rate`: intervened steps / length;
     - `correction_mean`, `correction_p95`: over all steps of the episode, also those with no correction;
     - `infeasible`, `fallback`, `nonfinite`, `unsafe`: numbers of steps;
-    - `lease_expired`, `lease_refused`, `lease_braking`: numbers of steps, all 0 without `LeaseExpiry`;
-    - `margin_min`: the smallest finite `cbf/margin` (0 when there was none);
+    - `lease_expired`, `lease_refused`, `lease_braking`: numbers of steps, with a `LeaseExpiry` inside;
+    - `margin_min`: the smallest finite `cbf/margin`;
     - `violations`: steps with `cost` or `cost_substep` above 0;
     - `cost`, `cost_substep`: sums;
-    - `spin_outs`: steps with `spin_out` above 0, when the task reports it;
-    - `collisions`: how many began, when the task reports it;
+    - `spin_outs`: steps with `spin_out` above 0;
+    - `collisions`: how many began;
     - `seen`: share of time that a tracked thing was seen, mean over the tracks, and `expiries`: how often the
       permission to rely on one ran out, with an `OcclusionPenalty` inside;
     - `goals_reached` and `success` when the task reports `goals_reached`, and `success` or `is_success`.
@@ -99,8 +115,8 @@ class RecordInterventions(
         >>> _ = env.reset(seed=0)
         >>> for _ in range(3):
         ...     _, _, _, _, info = env.step(env.action_space.low)
-        >>> info["interventions"]["length"], info["interventions"]["intervention_rate"]
-        (3, 0.0)
+        >>> print(list(info["interventions"]), info["interventions/cost"])  # no filter, and a task without a cost
+        ['length', 'return'] nan
 
     Change log:
         * v0.1.0: added.
@@ -135,11 +151,15 @@ class RecordInterventions(
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Starts a new episode's counts, all zero in info; seed and options pass through untouched."""
+        """Starts a new episode's counts: 0 in info of what this reset's info has, NaN of what it lacks.
+
+        Seed and options pass through untouched.
+        """
         self._clear()
         observation, info = self.env.reset(seed=seed, options=options)
         self._expired = info.get(keys.OCCLUSION_EXPIRED)
-        info.update(dict.fromkeys(keys.RUNNING, 0.0))
+        sources = zip(keys.RUNNING, _RUNNING_SOURCES, strict=True)
+        info.update({key: 0.0 if source in info else NOT_JUDGED for key, source in sources})
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -155,87 +175,99 @@ class RecordInterventions(
         return observation, reward, terminated, truncated, info
 
     def _clear(self) -> None:
+        self._steps = 0
         self._return = 0.0
         self._corrections: list[float] = []
-        self._correction_sum = 0.0
-        self._intervened = 0
-        self._counts = dict.fromkeys(_COUNTED, 0)
+        self._totals: dict[str, tuple[int | float, int]] = {}
         self._margin_min = math.inf
-        self._violations = 0
-        self._cost = 0.0
-        self._cost_substep = 0.0
         self._task: dict[str, int | float | bool] = {}
         self._seen = 0.0
         self._expired = None
 
     def _count(self, reward: float, info: dict[str, Any]) -> None:
+        self._steps += 1
         penalties = info.get(keys.OCCLUSION_PENALTY, 0.0) + info.get(keys.ADAPTION_PENALTY, 0.0)
         self._return += reward + float(penalties)
-        correction = float(info.get(keys.CBF_CORRECTION, 0.0))
-        self._corrections.append(correction)
-        self._correction_sum += correction
-        self._intervened += bool(info.get(keys.CBF_INTERVENED, False))
-        for name in self._counts:
-            self._counts[name] += bool(info.get(_COUNTED[name], False))
+        for name, key in _FLAGS.items():
+            if key in info:
+                self._add(name, bool(info[key]))
+        if keys.CBF_CORRECTION in info:
+            self._corrections.append(float(info[keys.CBF_CORRECTION]))
+            self._add("correction", self._corrections[-1])
         margin = float(info.get(keys.CBF_MARGIN, math.inf))
         if math.isfinite(margin):
             self._margin_min = min(self._margin_min, margin)
-        cost = float(info.get(keys.COST, 0.0))
-        cost_substep = float(info.get(keys.COST_SUBSTEP, 0.0))
-        self._violations += cost > 0 or cost_substep > 0
-        self._cost += cost
-        self._cost_substep += cost_substep
+        costs = {name: float(info.get(name, math.nan)) for name in (keys.COST, keys.COST_SUBSTEP)}
+        costs = {name: cost for name, cost in costs.items() if not math.isnan(cost)}
+        for name, cost in costs.items():
+            self._add(name, cost)
+        if costs:
+            self._add("violations", max(costs.values()) > 0.0)
+        if keys.SPIN_OUT in info:
+            self._add("spin_outs", bool(info[keys.SPIN_OUT] > 0.0))
+        if keys.COLLISIONS in info:
+            self._add("collisions", int(info[keys.COLLISIONS]))
         if "goals_reached" in info:
             self._task["goals_reached"] = int(info["goals_reached"])
-        if keys.SPIN_OUT in info:
-            self._task["spin_outs"] = self._task.get("spin_outs", 0) + bool(info[keys.SPIN_OUT] > 0.0)
-        if keys.COLLISIONS in info:
-            self._task["collisions"] = self._task.get("collisions", 0) + int(info[keys.COLLISIONS])
         if keys.OCCLUSION_VISIBLE in info:
             self._count_sight(info)
         success = info.get("success", info.get("is_success"))
         if success is not None:
             self._task["success"] = self._task.get("success", False) or bool(success)
 
+    def _add(self, name: str, value: int | float) -> None:
+        total, reports = self._totals.get(name, (0, 0))
+        self._totals[name] = total + value, reports + 1
+
+    def _total(self, name: str) -> int | float | None:
+        """The episode's sum so far; None if it would be a 0 that was not reported at every step."""
+        total, reports = self._totals.get(name, (0, 0))
+        return total if total or reports == self._steps else None
+
+    def _mean(self, name: str) -> float | None:
+        total = self._total(name)
+        return None if total is None else total / self._steps
+
     def _count_sight(self, info: dict[str, Any]) -> None:
         self._seen += float(np.mean(info[keys.OCCLUSION_VISIBLE]))
-        self._task["seen"] = self._seen / len(self._corrections)
+        self._task["seen"] = self._seen / self._steps
         expired = np.asarray(info[keys.OCCLUSION_EXPIRED])
         before: Any = expired if self._expired is None else self._expired
         self._task["expiries"] = self._task.get("expiries", 0) + int((expired & ~before).sum())
         self._expired = expired
 
     def _running(self) -> dict[str, float]:
-        steps = len(self._corrections)
         values = (
-            self._intervened / steps,
-            self._correction_sum / steps,
-            float(self._counts["infeasible"]),
-            float(self._counts["fallback"]),
+            self._mean("intervened"),
+            self._mean("correction"),
+            self._total("infeasible"),
+            self._total("fallback"),
             self._finite_margin(),
-            self._cost,
-            self._cost_substep,
+            self._total(keys.COST),
+            self._total(keys.COST_SUBSTEP),
         )
-        return dict(zip(keys.RUNNING, values, strict=True))
-
-    def _summary(self) -> dict[str, int | float | bool]:
-        steps = len(self._corrections)
         return {
-            "length": steps,
-            "return": self._return,
-            "intervention_rate": self._intervened / steps,
-            "correction_mean": self._correction_sum / steps,
-            "correction_p95": float(np.percentile(self._corrections, 95)),
-            **self._counts,
-            "margin_min": self._finite_margin(),
-            "violations": self._violations,
-            "cost": self._cost,
-            "cost_substep": self._cost_substep,
-            **self._task,
+            key: NOT_JUDGED if value is None else float(value)
+            for key, value in zip(keys.RUNNING, values, strict=True)
         }
 
-    def _finite_margin(self) -> float:
-        return self._margin_min if math.isfinite(self._margin_min) else 0.0
+    def _summary(self) -> dict[str, int | float | bool]:
+        all_corrections = len(self._corrections) == self._steps
+        values = {
+            "length": self._steps,
+            "return": self._return,
+            "intervention_rate": self._mean("intervened"),
+            "correction_mean": self._mean("correction"),
+            "correction_p95": float(np.percentile(self._corrections, 95)) if all_corrections else None,
+            **{name: self._total(name) for name in _FLAGS if name != "intervened"},
+            "margin_min": self._finite_margin(),
+            **{name: self._total(name) for name in _OF_THE_TASK},
+            **self._task,
+        }
+        return {name: value for name, value in values.items() if value is not None}
+
+    def _finite_margin(self) -> float | None:
+        return self._margin_min if math.isfinite(self._margin_min) else None
 
 
 def read_episodes(path: str | os.PathLike[str]) -> list[dict[str, float]]:
@@ -245,7 +277,7 @@ def read_episodes(path: str | os.PathLike[str]) -> list[dict[str, float]]:
         path: The file.
 
     Returns:
-        One dict per episode; empty cells (a task without goals) are left out of it.
+        One dict per episode; empty cells (what was not reported) are left out of it.
     """
     rows = csv.DictReader(io.StringIO(_whole_lines(Path(path).read_bytes()).decode()))
     return [{key: float(value) for key, value in row.items() if value != ""} for row in rows]

@@ -12,6 +12,7 @@ from safe_wrappers.plants.plant import wrappers_of
 class Layer(Enum):
     """What a wrapper of this library does in a stack; each names its own in the class attribute `layer`."""
 
+    COST = auto()
     OCCLUSION = auto()
     FILTER = auto()
     LEASE = auto()
@@ -29,6 +30,7 @@ _AGE: Final = "it hands commands over, and the lease must hear how old each one 
 _NETWORK: Final = "it hands commands over, which the channel must do at every control step"
 
 _WRONG_WAY_ROUND: Final = {
+    Layer.COST: {Layer.RECORDER: "it would count no cost", **_PER_CHUNK},
     Layer.OCCLUSION: {
         Layer.FILTER: "the filter reads the estimates, so they must be there before it decides",
         Layer.CHANNEL: "estimates of now would stand beside an image that is delayed",
@@ -53,6 +55,7 @@ _WRONG_WAY_ROUND: Final = {
 
 _BOTH_END_AUTHORITY: Final = "both decide when a command's authority ends; use one of them"
 _NOT_TOGETHER: Final = {
+    (Layer.COST, Layer.COST): "this env has a CostFunction already; add up the costs in one function",
     (
         Layer.OCCLUSION,
         Layer.OCCLUSION,

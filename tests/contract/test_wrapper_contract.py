@@ -28,6 +28,10 @@ def _clearance():
     return sw.HeadingDriveClearance([sw.Discs("hazard_positions", radius=0.2)], margin=0.004)
 
 
+def _joint_speed(env):
+    return abs(env.data.qvel[0])
+
+
 EXAMPLES = {
     "AdaptionPenalty": {
         "a constant and a part that grows": (TASK, lambda: {"penalty": 0.5, "per_correction": 0.25})
@@ -85,6 +89,10 @@ EXAMPLES = {
             "HalfCheetah-v5",
             lambda: {"bodies": ["bfoot", "ffoot"], "against": ["world"]},
         ),
+    },
+    "CostFunction": {
+        "a function": ("Reacher-v5", lambda: {"fn": _joint_speed}),
+        "its name": ("Reacher-v5", lambda: {"fn": f"{__name__}:_joint_speed"}),
     },
     "LeaseExpiry": {
         "a Clearance": (
@@ -230,7 +238,7 @@ CHUNKED = ("ChunkHandover",)
 FILTERS = ("CBFActionFilter", "SlipLimiter", "WholeBodyFilter")
 """Wrappers that let no action through that is not finite or outside the action space."""
 
-ONLY_LOOKING = ("BalanceMonitor", "ContactMonitor", "OcclusionPenalty", "RecordInterventions")
+ONLY_LOOKING = ("BalanceMonitor", "ContactMonitor", "CostFunction", "OcclusionPenalty", "RecordInterventions")
 """Wrappers that look on and pass every action as it is."""
 
 EXPORTED = sorted(
@@ -456,7 +464,7 @@ def test_info_has_the_same_keys_and_types_at_every_step(name, case):
     assert all(s == seen[0] for s in seen)
     added = seen[0].keys() - env.unwrapped.step(env.unwrapped.action_space.low)[4].keys()
     assert added, "a wrapper of ours reports something"
-    assert all("/" in key or key.endswith("_action") for key in added)
+    assert all("/" in key or key.endswith("_action") or key == "cost" for key in added)
 
 
 @every_wrapper

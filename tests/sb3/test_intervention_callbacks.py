@@ -58,6 +58,21 @@ EXPECTED = {
 }
 
 
+@pytest.mark.parametrize("leased", [False, True])
+def test_layers_and_judges_that_are_not_there_log_no_zeros(tmp_path, leased):
+    env = gym.make("InvertedPendulum-v5", max_episode_steps=16)  # reports no cost
+    if leased:
+        rail = [sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])]
+        env = sw.LeaseExpiry(env, sw.Clearance(rail, bodies=["cart"], braking=8.0), acceleration=1.0)
+    model = PPO("MlpPolicy", RecordInterventions(env), n_steps=32, n_epochs=1, batch_size=32, device="cpu")
+    model.set_logger(configure(str(tmp_path), ["tensorboard"]))
+    model.learn(32, callback=InterventionCallback())
+    logged = {tag for tag in scalars(tmp_path) if tag.startswith("interventions/")}
+    names = ("expired", "refused", "braking") if leased else ()
+    expected = {f"interventions/{prefix}lease_{name}" for name in names for prefix in ("", "step_")}
+    assert logged == expected
+
+
 def lost_now_and_then():
     """The whole stack, whose policy is never heard at all."""
     cart = gym.make("InvertedPendulum-v5", max_episode_steps=16)

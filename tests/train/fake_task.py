@@ -51,6 +51,19 @@ class FakeGoal(gym.Env):
         return self._at.copy(), before - after, False, self._steps >= 20, info
 
 
+class SilentGoal(FakeGoal):
+    """The same task, which does not say what it costs."""
+
+    def step(self, action):
+        *result, info = super().step(action)
+        return *result, {"goals_reached": info["goals_reached"]}
+
+
+def in_hazard(env):
+    """The cost that `SilentGoal` does not report."""
+    return np.linalg.norm(env.agent_position - HAZARD) < env.hazard_radius
+
+
 class FakeFilter(gym.Wrapper, gym.utils.RecordConstructorArgs):
     """Refuses an action that ends inside the hazard, and stands still instead."""
 
@@ -81,6 +94,7 @@ def shield(env, margin=0.0):
 
 
 gym.register("FakeGoal-v0", "fake_task:FakeGoal")
+gym.register("SilentGoal-v0", "fake_task:SilentGoal")
 
 
 def count(steps, progress):

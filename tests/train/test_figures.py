@@ -180,7 +180,7 @@ def test_what_came_out(summary):
         "f", "Return", "return per episode", "return", numbers, ["unfiltered", "filtered"]
     )
     assert picture.reading == (
-        "From 10 (unfiltered, filter on) to 20 (unfiltered, filter off). 2 seeds; the bar is the 95 % interval."
+        "From 10 (unfiltered, filter on) to 20 (unfiltered, filter off). 2 seeds; the bar is their range."
     )
     root = check(picture)
     assert {"unfiltered, off", "filtered, on", "return per episode"} <= set(texts(root))

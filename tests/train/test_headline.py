@@ -12,7 +12,7 @@ from safe_wrappers.train.summary import summarize
 
 def told(experiment, **more):
     fill(experiment, **more)
-    return verdict(experiment, summarize(experiment))
+    return " ".join(verdict(experiment, summarize(experiment)))
 
 
 @pytest.mark.parametrize(
@@ -22,65 +22,143 @@ def told(experiment, **more):
             {"violations": 5, "return": 20},
             {"return": 10},
             "With the filter none of 2,400 steps was in violation; without it 120 of 2,400 steps (5 %) were."
-            " The return per episode was 50 % lower (from 20 to 10; the intervals over 2 seeds lie apart).",
+            " Trained without the filter, the policy returned",
         ),
         (
             {"violations": 5, "return": -20},
             {"violations": 1, "return": -10},
             "The filter lowered violations without removing them: 24 of 2,400 steps (1 %) with it,"
-            " 120 of 2,400 steps (5 %) without. The return per episode went from -20 to -10"
-            " (the intervals over 2 seeds lie apart).",
+            " 120 of 2,400 steps (5 %) without. Trained without the filter, the policy returned per evaluation"
+            " episode -20 [-20, -20] without",
         ),
         (
             {"violations": 1, "return": 10},
             {"violations": 1, "return": 10},
             "The filter did not lower violations: 24 of 2,400 steps (1 %) with it, 24 of 2,400 steps (1 %)"
-            " without. The return per episode stayed the same (from 10 to 10; the intervals over 2 seeds overlap).",
+            " without. Trained without the filter, the policy returned per evaluation"
+            " episode 10",
         ),
         (
             {"return": 10},
             {"return": 12},
             "No violation with the filter, and none without it: the task did not put it to the test."
-            " The return per episode was 20 % higher",
+            " Trained without the filter, the policy returned per evaluation episode 10 [10, 10] without it (no",
         ),
         (
             {"violations": 1},
             {"intervention_rate": 0.25, "infeasible": 2, "fallback": 3},
-            "It changed 25 % of the evaluation steps; 48 steps were infeasible and 72 ran the fallback.",
+            "The filter changed 25 % of the evaluation steps; 48 steps were infeasible and 72 ran the fallback.",
         ),
         (
             {"violations": 1},
             {"intervention_rate": 0.00001},
-            "It changed less than 0.01 % of the evaluation steps; no step was infeasible and none ran the"
+            "The filter changed less than 0.01 % of the evaluation steps; no step was infeasible and none ran the"
             " fallback.",
         ),
         (
             {"violations": 5, "collisions": 2, "return": 10},
             {"return": 10},
-            "without it 120 of 2,400 steps (5 %) were. Collisions begun: 0 with it, 48 without. The return",
+            "without it 120 of 2,400 steps (5 %) were. Collisions begun: 0 with it, 48 without. Trained",
         ),
-        ({"violations": 1}, {}, "It changed none of the evaluation steps; no step was infeasible"),
+        ({"violations": 1}, {}, "The filter changed none of the evaluation steps; no step was infeasible"),
     ],
 )
 def test_verdicts(fake_experiment, off, on, sentence):
     assert sentence in told(fake_experiment(), off=off, on=on)
 
 
-def test_one_seed_says_little(fake_experiment):
-    said = told(fake_experiment("seeds=[0]"), off={"return": 20}, on={"return": 10})
-    assert "50 % lower (from 20 to 10; one seed says little)" in said
+def four_ways(experiment, spread=0.0):
+    """Either policy in evaluation without and with the filter: 21.1, 12.7; 9.4, 5.03 in the mean of the seeds."""
+    for seed in experiment.seeds:
+        off = spread * (seed - (len(experiment.seeds) - 1) / 2)
+        for arm, condition, returns, violations in (
+            (0, "filter_off", 21.1, 5),
+            (0, "filter_on", 12.7, 0),
+            (1, "filter_off", 9.4, 3),
+            (1, "filter_on", 5.03, 0),
+        ):
+            row = episode(**{"return": returns + off, "violations": violations})
+            write_evaluation(experiment, arm, seed, condition, [row])
+    return summarize(experiment)
+
+
+def test_the_verdict_names_what_either_policy_returns_without_and_with_the_filter(fake_experiment):
+    experiment = fake_experiment()
+    numbers = four_ways(experiment, spread=1.0)
+    assert verdict(experiment, numbers)[:4] == [
+        "With the filter none of 200 steps was in violation; without it 10 of 200 steps (5 %) were.",
+        "Trained without the filter, the policy returned per evaluation episode 21.1 [20.6, 21.6] without it (10 of"
+        " 200 steps in violation, 5 %) and 12.7 [12.2, 13.2] with it added afterwards (no step in violation).",
+        "Trained through the filter, the policy returned per evaluation episode 9.4 [8.9, 9.9] with it taken off"
+        " (6 of 200 steps in violation, 3 %) and 5.03 [4.53, 5.53] with it (no step in violation).",
+        "With the filter on, the policy trained without it returned more (2 seeds say little)."
+        " In brackets the range over 2 seeds, which is not an interval.",
+    ]
+    page = cards(experiment, numbers)
+    for title, value, what, hurt in (
+        ("Trained without the filter, filter off", "21.1", "20.6 to 21.6", "10 of 200 steps in violation"),
+        ("Trained without the filter, filter on", "12.7", "12.2 to 13.2", "no step in violation"),
+        ("Trained through the filter, filter off", "9.4", "8.9 to 9.9", "6 of 200 steps in violation"),
+        ("Trained through the filter, filter on", "5.03", "4.53 to 5.53", "no step in violation"),
+    ):
+        assert (
+            f'<h3>{title}</h3><p class="value ">{value}</p><p>return per episode</p>'
+            f'<p class="other">range {what}</p><p class="other">{hurt}</p>'
+        ) in page
+
+
+@pytest.mark.parametrize(
+    ("seeds", "spread", "surely", "brackets"),
+    [
+        ("[0]", 0.0, "one seed says little", "One seed: no interval."),
+        (
+            "[0, 1]",
+            0.1,
+            "2 seeds say little",
+            "In brackets the range over 2 seeds, which is not an interval.",
+        ),
+        (
+            "[0, 1, 2]",
+            0.1,
+            "the intervals over 3 seeds lie apart",
+            "In brackets bootstrap 95 % intervals over seeds.",
+        ),
+        (
+            "[0, 1, 2]",
+            9.0,
+            "the intervals over 3 seeds overlap",
+            "In brackets bootstrap 95 % intervals over seeds.",
+        ),
+    ],
+)
+def test_fewer_than_three_seeds_have_no_interval(fake_experiment, seeds, spread, surely, brackets):
+    experiment = fake_experiment(f"seeds={seeds}")
+    said = " ".join(verdict(experiment, four_ways(experiment, spread)))
+    assert f"trained without it returned more ({surely}). {brackets}" in said
+    if len(experiment.seeds) < 3:
+        assert "lie apart" not in said and "overlap" not in said and "95 %" not in said
+
+
+def test_more_return_through_training_with_the_filter_is_said_too(fake_experiment):
+    experiment = fake_experiment("seeds=[0]")
+    write_evaluation(experiment, 0, 0, "filter_on", [episode(**{"return": 1})])
+    write_evaluation(experiment, 0, 0, "filter_off", [episode(**{"return": 3})])
+    write_evaluation(experiment, 1, 0, "filter_on", [episode(**{"return": 2})])
+    said = " ".join(verdict(experiment, summarize(experiment)))
+    assert "the policy trained through it returned more" in said
+    # What has not been evaluated is not told.
+    assert "Trained through the filter, the policy returned per evaluation episode 2 with it (no step" in said
 
 
 def test_a_task_without_a_cost_has_no_violations_to_count(fake_experiment):
     experiment = fake_experiment()
     silent = steps(cost=steps().cost * float("nan"))
     said = told(experiment, off={}, on={"unsafe": 3}, log_off=silent, log_on=silent)
-    assert said.startswith(
-        "The task reports no cost, so violations cannot be counted; by the filter's own measure 72 of 2,400 steps"
-        " with it began outside the safe set."
-    )
+    assert said.startswith("Violations are not judged: the task reports no cost.")
+    assert "By the filter's own measure 72 of 2,400 steps with it began outside the safe set." in said
     assert "in violation" not in said
-    assert "Steps in violation" not in cards(experiment, summarize(experiment))
+    page = cards(experiment, summarize(experiment))
+    assert "in violation" not in page and page.count("violations not judged") == 4
 
 
 def test_without_an_arm_that_has_none_the_filter_is_switched_off(fake_experiment):
@@ -100,7 +178,7 @@ def test_an_arm_of_another_env_is_not_compared_with(fake_experiment):
     )
     fill(experiment, off={"violations": 5}, on={})
     assert "Without: “third”" not in cards(experiment, summarize(experiment))  # nothing of it is there yet
-    assert verdict(experiment, summarize(experiment)).startswith("There is no filter to compare with yet.")
+    assert verdict(experiment, summarize(experiment))[0].startswith("There is no filter to compare with yet.")
 
 
 def test_policies_of_several_tasks_driven_through_the_evaluations_filter(fake_experiment):
@@ -115,14 +193,14 @@ def test_policies_of_several_tasks_driven_through_the_evaluations_filter(fake_ex
         log_on=steps(),
     )
     # The evaluation of both arms: 2 episodes of 100 steps for 2 seeds each.
-    assert verdict(experiment, summarize(experiment)) == (
+    assert " ".join(verdict(experiment, summarize(experiment))) == (
         "With the filter none of 800 steps was in violation; without it 40 of 800 steps (5 %) were."
         " The return per episode went: one 20 to 10, two 20 to 10."
-        " It changed 50 % of the evaluation steps; no step was infeasible and none ran the fallback."
+        " The filter changed 50 % of the evaluation steps; no step was infeasible and none ran the fallback."
     )
     page = cards(experiment, summarize(experiment))
     assert "The same policies, “one”, “two”, with the filter on and off." in page
-    assert "Return per episode" not in page  # of two tasks there is no common one
+    assert "return per episode" not in page  # of two tasks there is no common one
     assert "50 µs" in page
 
 
@@ -155,8 +233,8 @@ def test_the_cards(fake_experiment):
         '<h3>Steps in violation</h3><p class="value good">0</p>',
         "with the filter, of 2,400 of training and evaluation",
         "without: 120 of 2,400",
-        '<h3>Return per episode</h3><p class="value ">10</p>',
-        "without: 20",
+        '<h3>Trained without the filter, filter off</h3><p class="value ">20</p>',
+        '<h3>Trained through the filter, filter on</h3><p class="value ">10</p>',
         '<h3>Steps changed</h3><p class="value ">12 %</p>',
         '<h3>Infeasible steps</h3><p class="value ">24</p>',
         "fallback: 48 steps",

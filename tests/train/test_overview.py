@@ -37,9 +37,9 @@ def test_the_page_has_every_verdict_and_leads_to_every_page(entries, tmp_path):
     for expected in (
         "3 experiments",
         "short, long, silent",
-        "The return per episode was 50 % lower",
-        "The return per episode was 99 % lower",
-        "The task reports no cost",
+        "the policy returned per evaluation episode 20 [20, 20] without it",
+        "the policy returned per evaluation episode 900 [900, 900] without it",
+        "Violations are not judged: the task reports no cost.",
         "safe-wrappers report a b c",
         "trained through the filter",
     ):

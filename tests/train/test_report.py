@@ -125,7 +125,9 @@ def test_what_the_page_says(report):
         "PPO on fake_task:FilmedGoal-v0, 512 steps, 2 seeds; evaluation on 3 episodes",
         "Steps in violation",
         "with the filter, of 1,080 of training and evaluation",
-        "Return per episode",
+        "Trained without the filter, filter on",
+        "return per episode range",
+        "mean over 2 seeds [their range, not an interval]",
         "Steps changed",
         "trained through the filter",
         "The same episode, filter off and on",
@@ -139,7 +141,7 @@ def test_what_the_page_says(report):
         "This filter does not say which of its constraints refused an action.",
         "When in an episode it stepped in",
         "Infeasible and fallback steps while training None: in 960 training steps",
-        "Faint lines are seeds, the band is the bootstrap 95 % interval over them.",
+        "Faint lines are seeds, the band is the range over them.",
         "not from the executed one (“naive”, by the names of Krasowski et al., TMLR 2023)",
         "safe-wrappers compare a&b.yaml",
         "stable-baselines3",
@@ -166,7 +168,7 @@ def test_training_alone_and_a_task_without_a_filter(fake_experiment):
     experiment = fake_experiment("seeds=[0]", "env=InvertedPendulum-v5", "arms={unfiltered: {filter: none}}")
     said = words(Page(run_all(experiment, evaluate=False).read_text()))
     assert "There is no filter to compare with yet. unfiltered: return" in said
-    assert "Steps in violation while" not in said
+    assert "Violations are not judged: the task reports no cost." in said and "0 of" not in said
     assert "Training, all episodes" in said
     assert "No recorded steps with a filter on." in said
     assert "No videos. Nothing has been filmed yet" in said
@@ -220,7 +222,12 @@ def test_a_task_without_a_cost_shows_none(fake_experiment):
     silent = steps(cost=steps().cost * float("nan"))
     fill(experiment, {"return": 20}, {"return": 10}, silent, silent)
     said = words(Page(write_report(experiment, summarize(experiment)).read_text()))
-    assert "The task reports no cost, so nothing can be counted as a violation." in said
+    assert "Violations are not judged: the task reports no cost." in said
+    table = said.partition("In numbers")[2].partition("The same episode")[0]
+    assert (
+        table.count("not judged") == 1 + 2 * 6
+    )  # the note; cost and violations of two arms in three conditions
+    assert "Steps in violation, total not judged not judged" in said.partition("How it was made")[2]
     for absent in ("Return against cost", "Cost of the trained policies", "cost per episode", "0 of 1,000"):
         assert absent not in said.partition("How to read this")[0], absent
 

@@ -108,10 +108,18 @@ def test_summary_of_rows(fake_experiment):
     ]
     assert (per_seed[1]["cost"], per_seed[1]["steps"], per_seed[1]["episodes"]) == ("2.0", "20", "2")
     saved = json.loads((experiment.folder / "summary.json").read_text())
-    assert saved["unfiltered"]["training"]["cost"] == {"iqm": 1.5, "low": 1.0, "high": 2.0, "seeds": 2}
+    assert saved["unfiltered"]["training"]["cost"] == {
+        "iqm": 1.5,
+        "low": 1.0,
+        "high": 2.0,
+        "seeds": 2,
+        "spread": "range",
+    }
     with (experiment.folder / "summary.csv").open() as file:
         rows = {(row["arm"], row["condition"], row["metric"]): row for row in csv.DictReader(file)}
     assert rows["unfiltered", "filter_on", "return"]["low"] == ""
+    assert rows["unfiltered", "filter_on", "return"]["spread"] == ""
+    assert rows["unfiltered", "training", "cost"]["spread"] == "range"
 
 
 def test_spin_outs_are_a_total_and_a_rate_over_all_steps(fake_experiment):

@@ -72,7 +72,7 @@ def test_every_arm_is_filmed_in_the_same_episode_with_the_filter_off_and_on(eval
             (row,) = [row for row in rows if row["episode_seed"] == shown.episode_seed]
             # The film is of the very episode that was evaluated.
             assert (video.steps, video.violations) == (row["length"], row["violations"])
-            assert video.changed == pytest.approx(row["intervention_rate"] * row["length"])
+            assert video.changed == pytest.approx(row.get("intervention_rate", 0) * row["length"])
             changed += video.changed
             frames = Image.open(io.BytesIO(video.animation))
             assert frames.n_frames == 20

@@ -1,3 +1,4 @@
+import copy
 import pickle
 from pathlib import Path
 
@@ -6,8 +7,10 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+import safe_wrappers as sw
 from safe_wrappers import interventions as keys
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.not_judged import NOT_JUDGED
 from safe_wrappers.wrappers.record_interventions import COLUMNS, RecordInterventions, read_episodes
 
 
@@ -78,7 +81,7 @@ def play(env, seed=0):
     env.reset(seed=seed)
     infos, total, done = [], 0.0, False
     while not done:
-        _, reward, terminated, truncated, info = env.step(np.zeros(1, np.float32))
+        _, reward, terminated, truncated, info = env.step(np.zeros(env.action_space.shape, np.float32))
         infos.append(info)
         total += reward
         done = terminated or truncated
@@ -129,23 +132,78 @@ def test_a_new_episode_starts_from_nothing():
         assert [info[key] for info in first] == [info[key] for info in second]
 
 
-def test_without_a_filter_everything_counts_as_zero():
-    env = RecordInterventions(gym.make("Pendulum-v1", max_episode_steps=3))
+def test_what_neither_the_stack_nor_the_task_reports_is_never_zero(tmp_path):
+    env = RecordInterventions(gym.make("Pendulum-v1", max_episode_steps=3), tmp_path / "episodes.csv")
+    reset = env.reset(seed=0)[1]
     infos, _ = play(env)
-    assert all(info[key] == 0.0 for info in infos for key in keys.RUNNING)
-    summary = infos[-1][keys.EPISODE_SUMMARY]
-    assert summary["length"] == 3
-    assert {key for key, value in summary.items() if value == 0} == set(COLUMNS) - {
-        "length",
-        "return",
-        "goals_reached",
-        "spin_outs",
-        "success",
-        "collisions",
-        "seen",
-        "expiries",
-    }
+    for info in (reset, *infos):
+        assert all(np.isnan(info[key]) and isinstance(info[key], float) for key in keys.RUNNING)
+    assert infos[-1][keys.EPISODE_SUMMARY].keys() == {"length", "return"}
+    assert read_episodes(tmp_path / "episodes.csv")[0].keys() == {"length", "return"}
     assert env.filter_time_us is None
+
+
+def test_a_layer_s_zeros_appear_only_with_the_layer():
+    filtered = RecordInterventions(sw.protect(gym.make("SafePointGoal1-v0", max_episode_steps=3)))
+    reset = filtered.reset(seed=0)[1]
+    assert reset["interventions/infeasible"] == 0.0 and reset["interventions/rate"] == 0.0
+    summary = play(filtered)[0][-1][keys.EPISODE_SUMMARY]
+    assert {"infeasible", "fallback", "unsafe", "cost", "violations"} <= summary.keys()
+    assert not any(name.startswith("lease") for name in summary)
+    judged = play(RecordInterventions(gym.make("SafePointGoal1-v0", max_episode_steps=3)))[0][-1]
+    assert judged[keys.EPISODE_SUMMARY]["violations"] == judged["interventions/cost"] == 0
+    assert "infeasible" not in judged[keys.EPISODE_SUMMARY] and np.isnan(judged["interventions/rate"])
+
+
+@pytest.mark.parametrize(
+    ("costs", "violations", "cost"),
+    [
+        ((0.0, 0.0), 0, 0.0),
+        ((0.0, None), None, None),  # the step without a cost may have been a violation
+        ((None, 2.0), 1, 2.0),  # there was one at least
+        ((float("nan"), 0.0), None, None),
+        ((0.0, float("nan")), None, None),
+    ],
+)
+def test_a_zero_needs_a_judgement_of_every_step(costs, violations, cost):
+    infos, _ = play(scripted_env(infos=[{} if c is None else {"cost": c} for c in costs]))
+    summary = infos[-1][keys.EPISODE_SUMMARY]
+    assert (summary.get("violations"), summary.get("cost")) == (violations, cost)
+    np.testing.assert_equal(infos[-1]["interventions/cost"], np.nan if cost is None else cost)
+
+
+@pytest.mark.parametrize("mode", list(gym.vector.AutoresetMode))
+def test_in_a_vector_env_what_is_not_judged_is_nan_and_float(mode):
+    def make():
+        return RecordInterventions(gym.make("Pendulum-v1", max_episode_steps=2))
+
+    envs = gym.vector.AsyncVectorEnv([make] * 2, autoreset_mode=mode)
+    try:
+        envs.reset(seed=0)
+        for _ in range(2):
+            truncated, info = envs.step(np.zeros((2, 1), np.float32))[3:]
+            info = info.get("final_info", info)
+            for key in keys.RUNNING:
+                assert info[key].dtype == np.float64 and np.isnan(info[key]).all()
+        assert truncated.all() and "cost" not in info[keys.EPISODE_SUMMARY]
+    finally:
+        envs.close()
+
+
+def test_monitor_s_file_says_nan_for_what_is_not_judged(tmp_path):
+    monitor = pytest.importorskip("stable_baselines3.common.monitor")
+    env = RecordInterventions(gym.make("Pendulum-v1", max_episode_steps=2))
+    play(monitor.Monitor(env, str(tmp_path / "log"), info_keywords=keys.RUNNING))
+    row = (tmp_path / "log.monitor.csv").read_text().splitlines()[-1]
+    assert row.split(",")[3:] == ["nan"] * len(keys.RUNNING)
+
+
+def test_what_is_not_judged_equals_itself_also_in_another_process():
+    # check_env compares the infos of two equal runs by ==.
+    again = pickle.loads(pickle.dumps(copy.deepcopy(NOT_JUDGED)))
+    assert again is NOT_JUDGED and again == NOT_JUDGED and float("nan") == NOT_JUDGED
+    assert NOT_JUDGED != 0.0 and NOT_JUDGED != "nan" and np.isnan(NOT_JUDGED)
+    assert len({NOT_JUDGED, again}) == 1
 
 
 def test_filter_time_is_an_attribute_and_never_in_info():
@@ -197,11 +255,8 @@ def test_file_gains_one_row_per_episode(tmp_path: Path):
     first, second = read_episodes(path)
     assert first["correction_mean"] == second["correction_mean"] == 0.5
     assert first["success"] == 1.0
-    # A task without goals, wheels, cars and tracks: empty cells, which do not come back.
-    bare = tmp_path / "bare.csv"
-    play(RecordInterventions(gym.make("Pendulum-v1", max_episode_steps=2), bare))
-    absent = {"goals_reached", "spin_outs", "success", "collisions", "seen", "expiries"}
-    assert set(read_episodes(bare)[0]) == set(COLUMNS) - absent
+    # A task without wheels, cars and tracks: empty cells, which do not come back.
+    assert set(first) == set(COLUMNS) - {"spin_outs", "collisions", "seen", "expiries"}
 
 
 def test_spin_outs_are_counted_where_the_task_reports_them(tmp_path: Path):

@@ -39,8 +39,8 @@ def finals_picture(
         if best[2].iqm > worst[2].iqm
         else f"{number(best[2].iqm)} everywhere."
     )
-    seeds = rows[0][2].seeds
-    reading += f" {seeds} seeds; the bar is the 95 % interval." if seeds > 1 else " One seed: no interval."
+    seeds, bar = rows[0][2].seeds, rows[0][2].spread
+    reading += f" {seeds} seeds; the bar is their {bar}." if bar else " One seed: no interval."
 
     def paint(axes: Axes) -> None:
         axes.grid(False, axis="y")

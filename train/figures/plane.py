@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 from matplotlib.axes import Axes
 
@@ -18,7 +18,7 @@ CONDITIONS: Final = {"filter_off": "off", "filter_on": "on"}
 
 def plane_limits(summaries: Sequence[Summary]) -> Limits:
     """A frame that holds every seed's evaluation of several experiments, with some air."""
-    rows = [row for summary in summaries for row in summary.per_seed if row["condition"] in CONDITIONS]
+    rows = [row for summary in summaries for row in judged_rows(summary)]
     spans = []
     for metric in ("return", "cost"):
         values = [float(row[metric]) for row in rows]
@@ -28,6 +28,11 @@ def plane_limits(summaries: Sequence[Summary]) -> Limits:
         air = 0.06 * (high - low)
         spans.append((low - air, high + air))
     return spans[0], spans[1]
+
+
+def judged_rows(summary: Summary) -> list[dict[str, Any]]:
+    """The seeds' evaluations of which somebody judged the cost."""
+    return [row for row in summary.per_seed if row["condition"] in CONDITIONS and "cost" in row]
 
 
 def plane_picture(
@@ -98,7 +103,7 @@ def _paint_arm(
         axes.annotate("", xy=on, xytext=off, arrowprops=arrow)
     for condition, (x, y) in ends.items():
         fill = "none" if condition == "filter_off" else color
-        rows = [row for row in summary.per_seed if (row["arm"], row["condition"]) == (arm, condition)]
+        rows = [row for row in judged_rows(summary) if (row["arm"], row["condition"]) == (arm, condition)]
         if len(rows) > 1:
             seeds = [row["return"] for row in rows], [row["cost"] for row in rows]
             axes.scatter(

@@ -14,7 +14,18 @@ from ..evaluate import evaluated_steps
 from ..run import FINISHED_FILE
 from ..shown import Pair, compared_pairs
 from ..summary import Estimate, Summary
-from ..truth import reports_cost
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What an arm's policies did in evaluation with the filter off or on, all seeds together."""
+
+    arm: ArmConfig
+    filter_on: bool
+    returns: Estimate
+    steps: int
+    violations: int | None
+    """None: not judged."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +33,8 @@ class Side:
     """One side: training where the arms differ there, and evaluation; totals over all seeds."""
 
     steps: int
-    violations: int
+    violations: int | None
+    """None: not judged."""
     infeasible: int
     fallback: int
     unsafe: int
@@ -36,7 +48,7 @@ class Side:
     @property
     def share(self) -> float:
         """Of steps in violation."""
-        return self.violations / self.steps if self.steps else 0.0
+        return (self.violations or 0) / self.steps if self.steps else 0.0
 
 
 @dataclass(frozen=True)
@@ -46,8 +58,13 @@ class Comparison:
     pairs: tuple[Pair, ...]
     off: Side
     on: Side
-    judged: bool
-    """The task reports a cost, so that violations mean something."""
+    outcomes: tuple[Outcome, ...]
+    """In evaluation, of each arm of the pairs with the filter off and on, as far as it is there."""
+
+    @property
+    def judged(self) -> bool:
+        """Violations were judged on both sides."""
+        return self.off.violations is not None and self.on.violations is not None
 
     @property
     def same_policies(self) -> bool:
@@ -67,7 +84,23 @@ def compare(experiment: ExperimentConfig, summary: Summary) -> Comparison | None
     training = not pairs[0].same_policy
     off = side(summary, [pair.bare for pair in pairs], "filter_off", training)
     on = side(summary, [pair.filtered for pair in pairs], "filter_on", training)
-    return Comparison(pairs, off, on, reports_cost(experiment)) if off.steps and on.steps else None
+    arms = dict.fromkeys(arm.name for pair in pairs for arm in (pair.bare, pair.filtered))
+    of_name = {arm.name: arm for arm in experiment.arms}
+    outcomes = tuple(
+        found
+        for name in arms
+        for filter_on in (False, True)
+        if (found := _outcome(summary, of_name[name], filter_on)) is not None
+    )
+    return Comparison(pairs, off, on, outcomes) if off.steps and on.steps else None
+
+
+def _outcome(summary: Summary, arm: ArmConfig, filter_on: bool) -> Outcome | None:
+    condition = "filter_on" if filter_on else "filter_off"
+    evaluated = side(summary, [arm], condition, training=False)
+    if not evaluated.steps or not evaluated.returns:
+        return None
+    return Outcome(arm, filter_on, evaluated.returns[0], evaluated.steps, evaluated.violations)
 
 
 def side(summary: Summary, arms: Sequence[ArmConfig], condition: str, training: bool) -> Side:
@@ -77,12 +110,14 @@ def side(summary: Summary, arms: Sequence[ArmConfig], condition: str, training: 
     rows = [row for row in summary.per_seed if row["arm"] in names and row["condition"] in wanted]
     totals = {
         key: int(sum(row.get(key, 0) for row in rows))
-        for key in ("steps", "violations", "infeasible", "fallback", "unsafe", "collisions")
+        for key in ("steps", "infeasible", "fallback", "unsafe", "collisions")
     }
+    judged = all("violations" in row for row in rows)
     cells = [summary.table[name][condition] for name in names]
     rates = [cell["intervention_rate"].iqm for cell in cells if "intervention_rate" in cell]
     return Side(
         **totals,
+        violations=int(sum(row["violations"] for row in rows)) if judged else None,
         returns=tuple(cell["return"] for cell in cells) if all("return" in cell for cell in cells) else (),
         changed=float(np.mean(rates)) if rates else None,
     )

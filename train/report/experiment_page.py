@@ -67,9 +67,13 @@ def _page(experiment: ExperimentConfig, summary: Summary, command: str) -> str:
 
 def _parts(experiment: ExperimentConfig, summary: Summary, command: str) -> Iterator[str]:
     yield f"<header><h1>{text(experiment.name)}</h1><p>{text(about(experiment))}</p></header>"
-    yield f'<p class="verdict">{text(verdict(experiment, summary))}</p>'
+    first, *rest = verdict(experiment, summary)
+    yield f'<p class="verdict">{text(first)}</p>'
+    yield f"<ul>{''.join(f'<li>{text(part)}</li>' for part in rest)}</ul>" if rest else ""
     yield cards(experiment, summary)
-    yield section("In numbers", short_table([("", experiment, summary)]), sections.table_note(experiment))
+    yield section(
+        "In numbers", short_table([("", experiment, summary)]), sections.table_note(experiment, summary)
+    )
     yield section(
         "The same episode, filter off and on",
         sections.which_episode(experiment),
@@ -79,7 +83,7 @@ def _parts(experiment: ExperimentConfig, summary: Summary, command: str) -> Iter
     yield section("What it bought and what it cost", sections.outcome(experiment, summary))
     yield section("When, where and how much the filter stepped in", sections.interventions(experiment))
     yield section("While training", sections.training(experiment, summary))
-    yield section("How to read this", sections.notes(experiment))
+    yield section("How to read this", sections.notes(experiment, summary))
     yield section(
         "How it was made",
         how_it_was_made(command),

@@ -44,11 +44,12 @@ def section(title: str, *parts: str) -> str:
     return f"<section><h2>{text(title)}</h2>\n{inside}\n</section>" if inside else ""
 
 
-def card(title: str, value: str, what: str, other: str = "", mood: str = "") -> str:
+def card(title: str, value: str, what: str, *others: str, mood: str = "") -> str:
     """A big number with what it counts, and what it is to be compared with; its mood is "", "good" or "bad"."""
+    more = "".join(f'<p class="other">{text(other)}</p>' for other in others)
     return (
         f'<div class="card"><h3>{text(title)}</h3><p class="value {mood}">{text(value)}</p>'
-        f'<p>{text(what)}</p><p class="other">{text(other)}</p></div>'
+        f"<p>{text(what)}</p>{more}</div>"
     )
 
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from ..config import ArmConfig, ExperimentConfig
 from ..run import FINISHED_FILE
-from ..summary import CONDITIONS, METRICS, Estimate, Summary, number
-from ..truth import reports_cost
+from ..summary import CONDITIONS, METRICS, NOT_JUDGED, OF_THE_JUDGE, Estimate, Summary, number
 from .markup import table, text
 
 _SHORT = (
@@ -47,8 +46,8 @@ def full_table(experiment: ExperimentConfig, summary: Summary) -> str:
             f'<tr class="condition"><th scope="rowgroup" colspan="{len(cells) + 1}">{text(title)}</th></tr>'
         )
         for metric in METRICS:
-            if any(metric in cell for cell in cells):
-                values = "".join(f"<td>{_cell(cell.get(metric))}</td>" for cell in cells)
+            if metric in ("cost", "violations") or any(metric in cell for cell in cells):
+                values = "".join(f"<td>{_cell(cell, metric)}</td>" for cell in cells)
                 body.append(f'<tr><th scope="row">{text(METRICS[metric])}</th>{values}</tr>')
     return (
         f'<div class="wide"><table><thead><tr><th></th>{heads}</tr></thead>'
@@ -79,7 +78,6 @@ def _short_rows(heading: str, experiment: ExperimentConfig, summary: Summary) ->
     rows = [
         f'<tr class="experiment"><th scope="rowgroup" colspan="{len(_SHORT) + 1}">{heading}</th></tr>'
     ] * bool(heading)
-    judged = reports_cost(experiment)
     for arm in experiment.arms:
         if not any(summary.table[arm.name].values()):
             continue
@@ -88,7 +86,7 @@ def _short_rows(heading: str, experiment: ExperimentConfig, summary: Summary) ->
             f" <small>{text(_trained(arm))}</small></th></tr>"
         )
         rows += [
-            _short_row(title, summary, arm, condition, judged)
+            _short_row(title, summary, arm, condition)
             for condition, title in CONDITIONS.items()
             if summary.table[arm.name][condition]
         ]
@@ -102,7 +100,7 @@ def _trained(arm: ArmConfig) -> str:
     return f"trained through the filter{learner}"
 
 
-def _short_row(title: str, summary: Summary, arm: ArmConfig, condition: str, judged: bool) -> str:
+def _short_row(title: str, summary: Summary, arm: ArmConfig, condition: str) -> str:
     cell = summary.table[arm.name][condition]
     rows = [row for row in summary.per_seed if (row["arm"], row["condition"]) == (arm.name, condition)]
     steps = sum(row["steps"] for row in rows)
@@ -113,9 +111,11 @@ def _short_row(title: str, summary: Summary, arm: ArmConfig, condition: str, jud
     changed = cell.get("intervention_rate")
     mood = "good" if total("violations") == "0" else "bad"
     values = [
-        _cell(cell.get("return")),
-        _cell(cell.get("cost")) if judged else "-",
-        f'<b class="{mood}">{total("violations")}</b> <small>of {steps:,}</small>' if judged else "-",
+        _cell(cell, "return"),
+        _cell(cell, "cost"),
+        f'<b class="{mood}">{total("violations")}</b> <small>of {steps:,}</small>'
+        if "violations" in cell
+        else NOT_JUDGED,
         "-" if changed is None else f"<b>{100 * changed.iqm:.3g} %</b>",
         *("-" if changed is None else f"<b>{total(key)}</b>" for key in ("infeasible", "fallback")),
     ]
@@ -124,9 +124,10 @@ def _short_row(title: str, summary: Summary, arm: ArmConfig, condition: str, jud
     )
 
 
-def _cell(value: Estimate | None) -> str:
+def _cell(cell: Mapping[str, Estimate], metric: str) -> str:
+    value = cell.get(metric)
     if value is None:
-        return "-"
+        return NOT_JUDGED if cell and metric in OF_THE_JUDGE else "-"
     if value.low is None or value.high is None:
         return f"<b>{text(number(value.iqm))}</b> <small>[n/a]</small>"
     return f"<b>{text(number(value.iqm))}</b> <small>[{text(number(value.low))}, {text(number(value.high))}]</small>"

@@ -10,9 +10,8 @@ from urllib.parse import quote
 from ..atomic import write_text
 from ..config import ExperimentConfig
 from ..figures.picture import Picture
-from ..figures.plane import CONDITIONS, plane_limits, plane_picture
+from ..figures.plane import judged_rows, plane_limits, plane_picture
 from ..summary import Summary
-from ..truth import reports_cost
 from .experiment_page import check_reportable, report_path
 from .markup import document, pictures, section, text
 from .numbers import short_table
@@ -59,7 +58,7 @@ def write_overview(entries: Sequence[Entry], path: Path, command: str = "") -> P
 def _verdicts(entries: Sequence[Entry], path: Path) -> str:
     return "".join(
         f'<article class="card"><h3><a href="{_link(experiment, path)}">{text(experiment.name)}</a></h3>'
-        f"<p>{text(verdict(experiment, summary))}</p>"
+        f"<p>{text(' '.join(verdict(experiment, summary)))}</p>"
         f'<p class="other">{text(about(experiment))}</p></article>'
         for experiment, summary in entries
     )
@@ -69,13 +68,11 @@ def _planes(entries: Sequence[Entry]) -> str:
     arms = list(dict.fromkeys(arm.name for experiment, _ in entries for arm in experiment.arms))
     drawn = []
     for at, (experiment, summary) in enumerate(entries):
-        if not reports_cost(experiment):
-            drawn.append(Picture(experiment.name, "The task reports no cost."))
+        if not summary.judged:
+            drawn.append(Picture(experiment.name, "Violations are not judged: the task reports no cost."))
             continue
         alike = [other for candidate, other in entries if _tasks(candidate) == _tasks(experiment)]
-        evaluated = [
-            other for other in alike if any(row["condition"] in CONDITIONS for row in other.per_seed)
-        ]
+        evaluated = [other for other in alike if judged_rows(other)]
         limits = plane_limits(evaluated) if evaluated else None
         drawn.append(plane_picture(summary, arms, f"plane-{at}", experiment.name, limits))
     return (

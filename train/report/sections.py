@@ -20,8 +20,8 @@ from ..figures.where import choose_view, where_picture
 from ..scene import Scene, load_scenes
 from ..shown import Pair, compared_pairs, shown_episode
 from ..step_log import MOST_STEPS, StepLog, pool
-from ..summary import OF_THE_FILTER, Summary
-from ..truth import reports_cost
+from ..summary import OF_THE_FILTER, SEEDS_FOR_AN_INTERVAL, Summary, over_seeds
+from ..truth import judged_by
 from .markup import pictures, text
 
 _CURVES = {
@@ -36,18 +36,13 @@ _FINALS = {
 }
 
 
-def table_note(experiment: ExperimentConfig) -> str:
-    """What the short table's numbers are."""
-    seeds = len(experiment.seeds)
-    over = "interquartile means over seeds with bootstrap 95 % intervals" if seeds > 1 else "of one seed"
-    own = (
-        ""
-        if reports_cost(experiment)
-        else " The task reports no cost, so nothing can be counted as a violation."
-    )
+def table_note(experiment: ExperimentConfig, summary: Summary) -> str:
+    """What the short table's numbers are, and who judged."""
+    over = over_seeds(*summary.seeds)
+    own = judged_by(experiment, summary.judged)
     return (
-        f"<p>Return, cost and steps changed: {over}."
-        f" Violations, infeasible and fallback: steps of all seeds.{own}</p>"
+        f"<p>Return, cost and steps changed: {text(over)}."
+        f" Violations, infeasible and fallback: steps of all seeds. {text(own)}</p>"
     )
 
 
@@ -94,14 +89,15 @@ def which_episode(experiment: ExperimentConfig) -> str:
 def outcome(experiment: ExperimentConfig, summary: Summary) -> str:
     """Return against cost, and each with its seeds as dots."""
     names = _names(experiment)
-    judged = reports_cost(experiment)
+    judged = summary.judged
     finals = [
         finals_picture(f"final-{metric}", title, unit, metric, summary, names)
         for metric, (title, unit) in _FINALS.items()
         if judged or metric != "cost"
     ]
     drawn = [item for item in finals if item.svg]
-    return pictures([*([plane_picture(summary, names)] if judged else []), *drawn])
+    plane = [plane_picture(summary, names)] if judged else []
+    return pictures([*plane, *drawn] or finals[:1])  # of nothing, that nothing has been evaluated
 
 
 def interventions(experiment: ExperimentConfig) -> str:
@@ -139,7 +135,7 @@ def training(experiment: ExperimentConfig, summary: Summary) -> str:
     """Learning curves with every seed, and when the filter was at a loss."""
     names = _names(experiment)
     filtered = [arm for arm in experiment.arms if arm.filter.kind != "none"]
-    judged = reports_cost(experiment)
+    judged = summary.judged
     items = [
         curve_picture(
             f"curve-{metric}",
@@ -167,17 +163,20 @@ def training(experiment: ExperimentConfig, summary: Summary) -> str:
             if row["condition"] == "training" and row["arm"] in rates["infeasible"]
         )
         items.append(training_timeline_picture(rates, steps, names))
-    band = "<p>Faint lines are seeds, the band is the bootstrap 95 % interval over them.</p>"
-    return pictures(items) + (band if len(experiment.seeds) > 1 else "")
+    seeds = len(experiment.seeds)
+    band = "range" if seeds < SEEDS_FOR_AN_INTERVAL else "bootstrap 95 % interval"
+    told = f"<p>Faint lines are seeds, the band is the {band} over them.</p>" if seeds > 1 else ""
+    return pictures(items) + told
 
 
-def notes(experiment: ExperimentConfig) -> str:
+def notes(experiment: ExperimentConfig, summary: Summary) -> str:
     """What the numbers mean and what they do not."""
     items = [
         "Numbers are interquartile means over seeds (the middle half; with fewer than four the plain mean),"
         " brackets are percentile-bootstrap 95 % intervals over seeds. With a handful of seeds they are too"
-        " narrow; with one there is none.",
-        "A violation is a control step in which the task's own truth reports a cost, at its end or at any"
+        " narrow; of two seeds the range is given instead, which says nothing about a third; of one nothing.",
+        judged_by(experiment, summary.judged)
+        or "A violation is a control step in which the task's own truth reports a cost, at its end or at any"
         " physics substep. The filter's own opinion does not count.",
         "Evaluation is deterministic and paired: episode i starts from the same env seed in every row.",
         "Infeasible: the filter found that no action satisfies every constraint. Fallback: the filter's own"

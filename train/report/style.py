@@ -36,6 +36,7 @@ header p { margin: 4px 0 0; }
 .verdict { font-size: 20px; line-height: 1.45; margin: 22px 0; max-width: 52em; text-wrap: pretty; }
 p.line { color: var(--soft); font-size: 14px; }
 .cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(180px, 1fr)); gap: 14px; }
+.cards.returns { grid-template-columns: repeat(auto-fit, minmax(220px, 1fr)); margin-bottom: 14px; }
 .card, figure, pre {
   margin: 0; padding: 14px 16px;
   background: var(--card); border: 1px solid var(--line); border-radius: 10px;

@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from ..config import ExperimentConfig
-from ..summary import Estimate, Summary, number
-from .comparison import Comparison, Side, compare, side
+from ..summary import SEEDS_FOR_AN_INTERVAL, Estimate, Summary, number, spread
+from ..truth import judged_by
+from .comparison import Comparison, Outcome, Side, compare, side
 
 
-def verdict(experiment: ExperimentConfig, summary: Summary) -> str:
-    """Whether the filter kept the limits, what that cost, and how often it stepped in."""
+def verdict(experiment: ExperimentConfig, summary: Summary) -> list[str]:
+    """Whether the filter kept the limits, what that cost, and how often it stepped in; the main point first.
+
+    Where an arm was trained without the filter and one through it, all four returns are told: of either policy
+    without and with the filter.
+    """
     found = compare(experiment, summary)
     if found is None:
         return _without_comparison(experiment, summary)
-    safety = _safety(found.off, found.on) if found.judged else _own_measure(found.on)
-    return " ".join(filter(None, (safety, _collisions(found.off, found.on), _price(found), _work(found.on))))
+    judge = judged_by(experiment, found.judged)
+    parts = (
+        *((_safety(found.off, found.on), judge) if found.judged else (judge, _own_measure(found.on))),
+        _collisions(found.off, found.on),
+        *_price(found),
+        _work(found.on),
+    )
+    return [part for part in parts if part]
 
 
 def percent(share: float) -> str:
@@ -46,40 +59,83 @@ def _collisions(off: Side, on: Side) -> str:
 
 def _own_measure(on: Side) -> str:
     outside = f"{on.unsafe:,} of {on.steps:,} steps" if on.unsafe else f"none of {on.steps:,} steps"
-    return (
-        "The task reports no cost, so violations cannot be counted; by the filter's own measure"
-        f" {outside} with it began outside the safe set."
-    )
+    return f"By the filter's own measure {outside} with it began outside the safe set."
 
 
-def _price(found: Comparison) -> str:
-    if not found.off.returns or not found.on.returns:
-        return ""
+def _price(found: Comparison) -> list[str]:
     if len(found.pairs) > 1:
+        if not found.off.returns or not found.on.returns:
+            return []
         # Returns of different tasks have no common mean.
-        told = (
+        went = (
             f"{pair.filtered.name} {number(off.iqm)} to {number(on.iqm)}"
             for pair, off, on in zip(found.pairs, found.off.returns, found.on.returns, strict=True)
         )
-        return f"The return per episode went: {', '.join(told)}."
-    (off,), (on,) = found.off.returns, found.on.returns
-    numbers = f"from {number(off.iqm)} to {number(on.iqm)}"
-    intervals = _overlap(off, on)
-    if off.iqm <= 0:
-        return f"The return per episode went {numbers} ({intervals})."
-    change = 100 * (on.iqm / off.iqm - 1)
-    if abs(change) < 0.5:
-        return f"The return per episode stayed the same ({numbers}; {intervals})."
-    direction = "lower" if change < 0 else "higher"
-    return f"The return per episode was {abs(change):.0f} % {direction} ({numbers}; {intervals})."
+        return [f"The return per episode went: {', '.join(went)}."]
+    if not found.outcomes:
+        return []
+    told = [_policy(found, arm) for arm in dict.fromkeys(outcome.arm.name for outcome in found.outcomes)]
+    return [*told, " ".join(filter(None, (_choice(found), _brackets(found.outcomes))))]
 
 
-def _overlap(off: Estimate, on: Estimate) -> str:
-    if off.low is None or off.high is None or on.low is None or on.high is None:
-        return "one seed says little"
-    apart = off.low > on.high or on.low > off.high
-    seeds = min(off.seeds, on.seeds)
+def _policy(found: Comparison, name: str) -> str:
+    """What one arm's policies returned in evaluation, without and with the filter."""
+    if found.same_policies:
+        who, phrases = "The policy", ("without the filter", "with it")
+    elif name == found.pairs[0].filtered.name:
+        who, phrases = "Trained through the filter, the policy", ("with it taken off", "with it")
+    else:
+        who, phrases = "Trained without the filter, the policy", ("without it", "with it added afterwards")
+    parts = [
+        f"{_with_spread(outcome.returns)} {phrases[outcome.filter_on]}{_violations(outcome)}"
+        for outcome in found.outcomes
+        if outcome.arm.name == name
+    ]
+    return f"{who} returned per evaluation episode {' and '.join(parts)}."
+
+
+def _with_spread(returns: Estimate) -> str:
+    return number(returns.iqm) if returns.low is None else str(returns)
+
+
+def _violations(outcome: Outcome) -> str:
+    if outcome.violations is None:
+        return ""
+    if not outcome.violations:
+        return " (no step in violation)"
+    share = percent(outcome.violations / outcome.steps)
+    return f" ({outcome.violations:,} of {outcome.steps:,} steps in violation, {share})"
+
+
+def _choice(found: Comparison) -> str:
+    """Whether it paid to train through the filter that is on afterwards; nothing where that was not tried."""
+    acting = [outcome for outcome in found.outcomes if outcome.filter_on]
+    if len(acting) < 2:
+        return ""
+    added, through = (outcome.returns for outcome in acting)
+    if added.iqm == through.iqm:
+        return "With the filter on, both returned the same."
+    better = "trained without it" if added.iqm > through.iqm else "trained through it"
+    return f"With the filter on, the policy {better} returned more ({_how_surely(added, through)})."
+
+
+def _how_surely(one: Estimate, other: Estimate) -> str:
+    seeds = min(one.seeds, other.seeds)
+    if spread(seeds) != "95 % interval":
+        return "one seed says little" if seeds < 2 else f"{seeds} seeds say little"
+    assert one.low is not None and one.high is not None and other.low is not None and other.high is not None
+    apart = one.low > other.high or other.low > one.high
     return f"the intervals over {seeds} seeds {'lie apart' if apart else 'overlap'}"
+
+
+def _brackets(outcomes: Sequence[Outcome]) -> str:
+    counts = [outcome.returns.seeds for outcome in outcomes]
+    if max(counts) < 2:
+        return "One seed: no interval."
+    if max(counts) < SEEDS_FOR_AN_INTERVAL:
+        return f"In brackets the range over {max(counts)} seeds, which is not an interval."
+    rest = "" if min(counts) >= SEEDS_FOR_AN_INTERVAL else ", of two seeds their range"
+    return f"In brackets bootstrap 95 % intervals over seeds{rest}."
 
 
 def _work(on: Side) -> str:
@@ -89,18 +145,22 @@ def _work(on: Side) -> str:
         rest = f"{on.infeasible:,} steps were infeasible and {on.fallback:,} ran the fallback"
     if on.changed is None:
         return f"{rest[:1].upper()}{rest[1:]}."
-    return f"It changed {percent(on.changed) if on.changed else 'none'} of the evaluation steps; {rest}."
+    return (
+        f"The filter changed {percent(on.changed) if on.changed else 'none'} of the evaluation steps; {rest}."
+    )
 
 
-def _without_comparison(experiment: ExperimentConfig, summary: Summary) -> str:
+def _without_comparison(experiment: ExperimentConfig, summary: Summary) -> list[str]:
     parts = ["There is no filter to compare with yet."]
     for arm in experiment.arms:
         for condition, words in (("filter_off", "in evaluation"), ("training", "while training")):
             alone = side(summary, [arm], condition, training=False)
             if alone.steps and alone.returns:
-                parts.append(
-                    f"{arm.name}: return {number(alone.returns[0].iqm)} {words}, {alone.violations:,} of"
-                    f" {alone.steps:,} steps in violation."
+                judged = (
+                    ""
+                    if alone.violations is None
+                    else f", {alone.violations:,} of {alone.steps:,} steps in violation"
                 )
+                parts.append(f"{arm.name}: return {number(alone.returns[0].iqm)} {words}{judged}.")
                 break
-    return " ".join(parts)
+    return [part for part in (*parts, judged_by(experiment, summary.judged)) if part]

@@ -1,0 +1,117 @@
+"""CostFunction: a cost for a task that has none of its own, judged on the env's true state after each step."""
+
+import pkgutil
+from collections.abc import Callable
+from typing import Any, ClassVar, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+
+from safe_wrappers import interventions as keys
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.stack import Layer, refuse_order
+
+Judge = Callable[[Any], float]
+"""Takes the unwrapped env, returns the cost of the step that it has just made."""
+
+
+class CostFunction(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
+    """Writes ``info["cost"]`` for a task that does not judge itself; changes nothing else.
+
+    After every step, and after a reset, `fn` is asked about the state in which the env now is: any number above 0
+    is a violation. It judges control steps at their ends: what happens between two of them it does not see, so
+    `cost_substep` is not judged. It gets the env, not a filter's plant, so a filter with a wrong model is caught.
+
+    Put it next to the task, so that everything outside sees the cost. A filter does not read it.
+
+    Args:
+        env: Whose task reports no cost.
+        fn: Takes `env.unwrapped`, returns a finite number (or a bool); or its name, "module:function". It must
+            not change the env. A function that can be imported is recorded in the env's spec by its name, any
+            other one as it is, so that `gymnasium.make(env.spec)` works but `env.spec.to_json()` does not.
+
+    Info, at every step and after a reset: ``cost`` (float).
+
+    Raises:
+        ConfigurationError: `fn` is no function, cannot be imported, or returned something else than a finite
+            number; the env has a cost of its own; or a wrapper is inside that must be outside (`wrappers/stack.py`).
+
+    Example:
+        >>> import gymnasium as gym, safe_wrappers as sw
+        >>> def too_fast(env):
+        ...     return abs(env.data.qvel[0]) > 0.5
+        >>> env = sw.CostFunction(gym.make("HalfCheetah-v5"), too_fast)
+        >>> _ = env.reset(seed=0)
+        >>> costs = [env.step(env.action_space.high)[4]["cost"] for _ in range(20)]
+        >>> sorted(set(costs))
+        [0.0, 1.0]
+
+    Change log:
+        * v0.1.0: added.
+    """
+
+    layer: ClassVar = Layer.COST
+
+    def __init__(self, env: gym.Env[Any, Any], fn: Judge | str) -> None:
+        refuse_order(env, self.layer, type(self).__name__)
+        function = _imported(fn) if isinstance(fn, str) else fn
+        if not callable(function):
+            raise ConfigurationError(
+                f"fn is a function of the env, or its name 'module:function'; got {fn!r}"
+            )
+        gym.utils.RecordConstructorArgs.__init__(self, fn=_reference(function))
+        gym.Wrapper.__init__(self, env)
+        self.fn: Judge = function
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Resets the env; info has the cost of the state in which the episode starts."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._judge(info)
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Steps the env and judges where it is now."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._judge(info)
+        return observation, reward, terminated, truncated, info
+
+    def _judge(self, info: dict[str, Any]) -> None:
+        refuse_own_cost(self.unwrapped, info)
+        given = self.fn(self.unwrapped)
+        cost = np.asarray(given)
+        if cost.shape != () or cost.dtype.kind not in "biuf" or not np.isfinite(cost):
+            name = getattr(self.fn, "__name__", repr(self.fn))
+            raise ConfigurationError(f"the cost function {name} must return one finite number, got {given!r}")
+        info[keys.COST] = float(cost)
+
+
+def refuse_own_cost(task: Any, info: dict[str, Any]) -> None:
+    """A task that judges itself needs no other judge, and two would contradict each other."""
+    for key in (keys.COST, keys.COST_SUBSTEP):
+        if key in info:
+            raise ConfigurationError(
+                f"{task} reports a cost of its own (info[{key!r}]), which another judge would hide; leave the other "
+                "one out"
+            )
+
+
+def _imported(name: str) -> Any:
+    try:
+        # Without a colon a name could also be a module's, which is no function.
+        return pkgutil.resolve_name(name) if ":" in name else None
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigurationError(f"fn: {name!r} ('module:function') cannot be imported: {error}") from None
+
+
+def _reference(function: Any) -> Any:
+    """The name by which another process can import the function; the function itself where there is none."""
+    module, name = getattr(function, "__module__", None), getattr(function, "__qualname__", None)
+    if module in (None, "__main__") or name is None:
+        return function
+    reference = f"{module}:{name}"
+    try:
+        return reference if pkgutil.resolve_name(reference) is function else function
+    except (ImportError, AttributeError, ValueError):
+        return function

@@ -1,0 +1,288 @@
+"""Who judges a task that reports no cost: nobody, a function, or the filter's own limits."""
+
+import csv
+import io
+import json
+
+import numpy as np
+import pytest
+from rich.console import Console
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import safe_wrappers as sw
+from safe_wrappers import interventions as keys
+from safe_wrappers.train.config import EnvConfig, FilterConfig, parse_experiment
+from safe_wrappers.train.evaluate import evaluate_run
+from safe_wrappers.train.report import verdict, write_report
+from safe_wrappers.train.run import Progress, train_run
+from safe_wrappers.train.stack import make_stack
+from safe_wrappers.train.summary import summarize, write_summary
+from safe_wrappers.train.table import comparison_table
+from safe_wrappers.train.tables import read_rows
+
+SILENT = Progress(lambda steps: None, pytest.fail)
+HERE = __name__
+SHORT = ("seeds=[0]", "total_steps=128", "evaluation.episodes=2")
+
+
+# Filters that a config can name -----------------------------------------------------------------------------------
+
+
+def slow_joints(env, limit=4.0, mass=1.0, delay_s=0.0):
+    plant = sw.MujocoPlant(delay_s=delay_s)
+    plant.perturb(mass=mass)
+    return sw.CBFActionFilter(env, [sw.JointSpeedLimit(limit)], plant=plant, margin=0.5)
+
+
+def slow_pendulum(env, delay_s=0.0):
+    plant = sw.AnalyticPlant(
+        f=lambda x: np.array([x[1], 15 * np.sin(x[0])]),
+        g=lambda x: np.array([[0.0], [3.0]]),
+        state=lambda env: env.state,
+        hold_s=0.05,
+        delay_s=delay_s,
+    )
+    return sw.CBFActionFilter(env, [sw.Barrier(lambda x: 4.0 - x[1] ** 2, alpha=2.0)], plant=plant)
+
+
+class RowsOnly:
+    """A constraint without an h."""
+
+    def rows(self, plant):
+        return sw.HalfSpaces.none(2)
+
+
+def without_h(env):
+    return sw.CBFActionFilter(env, [sw.JointSpeedLimit(4.0), RowsOnly()])
+
+
+# ------------------------------------------------------------------------------------------------------------------
+
+
+def judged(env_id, factory, action_filter=None, **kwargs):
+    judge = FilterConfig("factory", kwargs, f"{HERE}:{factory}")
+    return make_stack(EnvConfig(env_id, judge=judge), action_filter or FilterConfig())
+
+
+def drive(env, speeds, steps=50):
+    """Bang-bang; the costs, and the true speeds after the steps."""
+    env.reset(seed=0)
+    costs, seen = [], []
+    rng = np.random.default_rng(0)
+    for _ in range(steps):
+        info = env.step(rng.choice([env.action_space.low, env.action_space.high]))[4]
+        assert type(info[keys.COST]) is float
+        costs.append(info[keys.COST])
+        seen.append(speeds(env.unwrapped).copy())
+    return np.array(costs), np.array(seen)
+
+
+def reacher_speeds(env):
+    return env.data.qvel[:2]
+
+
+def test_the_filters_limits_judge_the_true_state_in_the_unfiltered_arm():
+    costs, speeds = drive(judged("Reacher-v5", "slow_joints"), reacher_speeds)
+    # To the limit itself: the filter's margin is not taken off.
+    over = (np.abs(speeds) > 4.0 + 1e-6).any(axis=1)
+    np.testing.assert_array_equal(costs, over)
+    assert over.any() and not over.all()
+
+
+def test_they_judge_the_same_whatever_model_and_delay_the_filter_has():
+    wrong = judged("Reacher-v5", "slow_joints", mass=2.0, delay_s=0.02)
+    costs, speeds = drive(wrong, reacher_speeds)
+    np.testing.assert_array_equal(costs, (np.abs(speeds) > 4.0 + 1e-6).any(axis=1))
+
+
+def test_they_judge_in_the_filtered_arm_too_with_the_experiments_own_limit():
+    # This arm's filter keeps another limit than the one that judges.
+    own = FilterConfig("factory", {"limit": 6.0}, f"{HERE}:slow_joints")
+    env = judged("Reacher-v5", "slow_joints", own)
+    costs, speeds = drive(env, reacher_speeds)
+    np.testing.assert_array_equal(costs, (np.abs(speeds) > 4.0 + 1e-6).any(axis=1))
+    assert costs.any() and np.abs(speeds).max() <= 6.0
+
+
+def test_a_task_without_a_simulator_is_judged_through_the_plant_of_the_user():
+    costs, speeds = drive(judged("Pendulum-v1", "slow_pendulum"), lambda env: env.state[1:])
+    over = speeds[:, 0] ** 2 > 4.0 + 1e-6
+    np.testing.assert_array_equal(costs, over)
+    assert over.any() and not over.all()
+
+
+@pytest.mark.parametrize(
+    ("env_id", "factory", "kwargs", "message"),
+    [
+        (
+            "Reacher-v5",
+            "without_h",
+            {},
+            r"env.judge: RowsOnly has no h \(`value`\) and cannot judge; use env.cost",
+        ),
+        (
+            "Pendulum-v1",
+            "slow_pendulum",
+            {"delay_s": 0.05},
+            "env.judge: the filter's plant looks 0.05 s ahead",
+        ),
+        ("Pendulum-v1", "gymnasium:Wrapper", {}, "env.judge: the filter has no constraints and plant"),
+    ],
+)
+def test_what_cannot_judge_is_refused(env_id, factory, kwargs, message):
+    judge = FilterConfig("factory", kwargs, factory if ":" in factory else f"{HERE}:{factory}")
+    with pytest.raises(sw.SafeWrappersError, match=message):
+        make_stack(EnvConfig(env_id, judge=judge), FilterConfig())
+
+
+@pytest.mark.parametrize("more", [{"cost": "fake_task:in_hazard"}, {"judge": FilterConfig("protect")}])
+def test_a_tasks_own_cost_is_not_hidden(more):
+    env = make_stack(EnvConfig("SafePointGoal1-v0", **more), FilterConfig())
+    with pytest.raises(sw.SafeWrappersError, match="reports a cost of its own"):
+        env.reset(seed=0)
+        env.step(env.action_space.low)
+
+
+SETTINGS = {
+    "name": "x",
+    "env": "Reacher-v5",
+    "algorithm": "PPO",
+    "total_steps": 64,
+    "seeds": [0],
+    "arms": {"bare": {}, "safe": {"filter": {"factory": f"{HERE}:slow_joints", "lease": {}}}},
+}
+
+
+def test_all_arms_have_the_judge_of_the_config():
+    of_cost = parse_experiment(SETTINGS | {"env": {"id": "Reacher-v5", "cost": "a:b"}})
+    assert [arm.env.cost for arm in of_cost.arms] == ["a:b", "a:b"]
+    of_limits = parse_experiment(SETTINGS | {"env": {"id": "Reacher-v5", "judge": "constraints"}})
+    own = FilterConfig("factory", {}, f"{HERE}:slow_joints")  # a lease keeps no limit
+    assert [arm.env.judge for arm in of_limits.arms] == [own, own]
+    prints = [arm.fingerprint()["env"] for arm in (*of_cost.arms, *of_limits.arms)]
+    assert [sorted(print_) for print_ in prints] == [["cost", "id", "kwargs"]] * 2 + [
+        ["id", "judge", "kwargs"]
+    ] * 2
+    assert sorted(parse_experiment(SETTINGS).arms[0].fingerprint()["env"]) == ["id", "kwargs"]
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        ({"cost": "no_colon"}, "env.cost: expected 'module:function', got 'no_colon'"),
+        ({"judge": "constraint"}, "env.judge: unknown name 'constraint'. Did you mean 'constraints'"),
+        ({"cost": "a:b", "judge": "constraints"}, "env: cost and judge both say who judges"),
+        ({"coat": "a:b"}, "env: unknown name 'coat'. Did you mean 'cost'"),
+    ],
+)
+def test_wrong_judges_are_refused(env, message):
+    with pytest.raises(sw.SafeWrappersError, match=message):
+        parse_experiment(SETTINGS | {"env": {"id": "Reacher-v5"} | env})
+
+
+def test_limits_cannot_judge_where_there_is_no_filter():
+    settings = SETTINGS | {"env": {"id": "Reacher-v5", "judge": "constraints"}, "arms": {"bare": {}}}
+    with pytest.raises(
+        sw.SafeWrappersError, match=r"env\.judge: there is no filter whose constraints could judge"
+    ):
+        parse_experiment(settings)
+    given = parse_experiment(settings | {"evaluation": {"filter": "protect"}})
+    assert given.arms[0].env.judge == FilterConfig("protect")
+
+
+@pytest.mark.parametrize("name", ["no_such_module:cost", "fake_task:no_such"])
+def test_a_function_that_is_not_there_is_refused_before_anything_starts(fake_experiment, name):
+    (arm, _) = fake_experiment(f"env={{id: Reacher-v5, cost: '{name}'}}").arms
+    with pytest.raises(sw.SafeWrappersError, match="no_such"):
+        make_stack(arm.env, arm.filter)
+
+
+# ------------------------------------------------------------------------------------------------------------------
+
+
+def run(experiment):
+    for arm in experiment.arms:
+        for seed in experiment.seeds:
+            folder = experiment.run_folder(arm, seed)
+            train_run(arm, seed, folder, SILENT)
+            evaluate_run(arm, seed, folder, experiment.evaluation, experiment.evaluation_filter, SILENT)
+    summary = summarize(experiment)
+    write_summary(summary, experiment.folder)
+    console = Console(file=io.StringIO(), width=200)
+    console.print(comparison_table(experiment, summary))
+    page = write_report(experiment, summary).read_text()
+    return summary, " ".join(console.file.getvalue().split()), page
+
+
+def tags(folder):
+    events = EventAccumulator(str(folder / "tensorboard"))
+    events.Reload()
+    return {tag for tag in events.Tags()["scalars"] if tag.startswith(("interventions/", "evaluation"))}
+
+
+def test_what_nobody_judged_is_nowhere_zero(fake_experiment):
+    experiment = fake_experiment("env=fake_task:SilentGoal-v0", *SHORT)
+    summary, table, page = run(experiment)
+    for arm in experiment.arms:
+        folder = experiment.run_folder(arm, 0)
+        for path in (folder / "episodes.csv", folder / "evaluation" / "filter_off.csv"):
+            for row in read_rows(path):
+                assert not {"cost", "cost_substep", "violations", "collisions", "spin_outs"} & row.keys()
+                assert not {"lease_expired", "lease_refused", "lease_braking"} & row.keys()
+                assert row["length"] == 20
+        written = tags(folder)
+        assert {"interventions/goals_reached", "evaluation_filter_off/return"} <= written
+        assert not [tag for tag in written if "cost" in tag or "violations" in tag or "lease" in tag]
+        filtered = {
+            tag for tag in written if tag.endswith(("infeasible", "fallback", "unsafe", "correction_mean"))
+        }
+        assert ("interventions/infeasible" in filtered) == (arm.name == "filtered")
+        assert "evaluation_filter_on/infeasible" in filtered
+        assert not [tag for tag in filtered if tag.startswith("evaluation_filter_off")]
+    with (experiment.folder / "summary.csv").open() as file:
+        metrics = {row["metric"] for row in csv.DictReader(file)}
+    assert {"return", "infeasible"} <= metrics
+    assert not [metric for metric in metrics if "cost" in metric or "violation" in metric]
+    with (experiment.folder / "per_seed.csv").open() as file:
+        assert all(row["violations"] == row["cost"] == "" for row in csv.DictReader(file))
+    text = (experiment.folder / "summary.json").read_text()
+    assert "cost" not in text and "NaN" not in text and json.loads(text)
+    assert not summary.judged
+    assert "Steps in violation, total │ not judged │ not judged" in table
+    assert "Violations are not judged: the task reports no cost." in table
+    assert "Violations are not judged: the task reports no cost." in " ".join(verdict(experiment, summary))
+    assert "violations not judged" in page and "of 40 steps in violation" not in page
+
+
+def test_a_cost_function_judges_training_and_evaluation_as_the_task_would(fake_experiment):
+    own = fake_experiment("name=own", *SHORT)
+    silent = "{id: 'fake_task:SilentGoal-v0', cost: 'fake_task:in_hazard'}"
+    given = fake_experiment("name=given", f"env={silent}", *SHORT)
+    expected, _, page = run(own)
+    summary, table, own_page = run(given)
+    label = "Violations are judged by fake_task:in_hazard at the end of each step"
+    names = ("violations", "violations_per_1000", "cost", "return")
+    for arm, conditions in expected.table.items():
+        for condition, cell in conditions.items():
+            for name in names:
+                assert summary.table[arm][condition][name] == cell[name]
+    assert sum(row["violations"] for row in summary.per_seed) > 0
+    assert "Cost in substeps" not in table and "not judged" not in table  # it judges the ends of steps
+    assert label in table and label in own_page and label in " ".join(verdict(given, summary))
+    assert label not in page
+
+
+def test_the_label_says_that_the_filters_own_limits_judged(fake_experiment):
+    shield = f"{{factory: '{HERE}:slow_joints'}}"
+    experiment = fake_experiment(
+        "env={id: Reacher-v5, judge: constraints}",
+        f"arms={{bare: {{filter: none}}, safe: {{filter: {shield}}}}}",
+        "seeds=[0]",
+        "total_steps=128",
+        "evaluation.episodes=1",
+    )
+    summary, table, page = run(experiment)
+    for said in (table, page, " ".join(verdict(experiment, summary))):
+        assert "judged by the filter" in said and "own limits" in said
+    assert summary.table["bare"]["filter_off"]["violations"].seeds == 1
+    assert summary.table["safe"]["filter_on"]["violations"].iqm == 0

@@ -1,0 +1,84 @@
+"""ConstraintJudge: the filter's own limits as the judge of a task that reports no cost."""
+
+from __future__ import annotations
+
+from typing import Any, Final, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+
+from safe_wrappers import interventions as keys
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.default import default_plant
+from safe_wrappers.plants.mujoco import MujocoPlant
+from safe_wrappers.wrappers.cost_function import refuse_own_cost
+
+_TOLERANCE: Final = 1e-6
+"""h below zero by less is rounding, in the constraints' own units; the filter's `cbf/unsafe` has the same."""
+
+
+class ConstraintJudge(gym.Wrapper[Any, Any, Any, Any]):
+    """Writes ``info["cost"]``: 1 where some constraint's h is negative at the end of the step, else 0.
+
+    h is read from the env's true state, to the limit itself (a constraint's margin is not taken off): of a MuJoCo
+    env through a plant of its own on the env's own model, whatever model and delay the filter has. So it judges in
+    the same way whether the filter is on or not. It sees what the constraints speak of, and nothing else.
+
+    Args:
+        task: Reports no cost.
+        judging: The filter around the same task, whose constraints are used; it is never stepped.
+
+    Raises:
+        ConfigurationError: The filter has no `constraints` and `plant`, one of them has no h (`value`), or the filter
+            has a plant of the user's own with a delay, which does not see the present state.
+    """
+
+    def __init__(self, task: gym.Env[Any, Any], judging: gym.Env[Any, Any]) -> None:
+        super().__init__(task)
+        if not (judging.has_wrapper_attr("constraints") and judging.has_wrapper_attr("plant")):
+            raise ConfigurationError(
+                "env.judge: the filter has no constraints and plant that could judge (a CBFActionFilter has); use "
+                "env.cost: module:function"
+            )
+        self._constraints = list(judging.get_wrapper_attr("constraints"))
+        for constraint in self._constraints:
+            if not callable(getattr(constraint, "value", None)):
+                raise ConfigurationError(
+                    f"env.judge: {type(constraint).__name__} has no h (`value`) and cannot judge; use env.cost: "
+                    "module:function"
+                )
+        self._plant = judging.get_wrapper_attr("plant")
+        if isinstance(self._plant, MujocoPlant):
+            self._plant = default_plant(task)
+            self._plant.bind(task)
+            for constraint in self._constraints:
+                getattr(constraint, "bind", lambda plant: None)(self._plant)
+        elif self._plant.delay_s:
+            raise ConfigurationError(
+                f"env.judge: the filter's plant looks {self._plant.delay_s} s ahead and does not see the present "
+                "state; use env.cost: module:function"
+            )
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Resets the env; info has the cost of the state in which the episode starts."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._plant.executed(None)
+        for constraint in self._constraints:
+            getattr(constraint, "reset", lambda: None)()
+        self._judge(info)
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Steps the env and judges where it is now."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._judge(info)
+        return observation, reward, terminated, truncated, info
+
+    def _judge(self, info: dict[str, Any]) -> None:
+        refuse_own_cost(self.unwrapped, info)
+        self._plant.observe()
+        barriers = [np.asarray(constraint.value(self._plant)) for constraint in self._constraints]
+        # Not >=, so that an h that is no number is a violation.
+        info[keys.COST] = float(not all((h >= -_TOLERANCE).all() for h in barriers))
