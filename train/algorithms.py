@@ -71,6 +71,7 @@ def check_algorithm(name: object, where: str) -> str:
     """
     if name in _NOT_OFFERED:
         raise ConfigurationError(
-            f"{where}: {name} is not offered: {_NOT_OFFERED[str(name)]}. Valid names: {', '.join(sorted(ALGORITHMS))}."
+            f"{where}: {name} is not offered: {_NOT_OFFERED[str(name)]}. Valid names:"
+            f" {', '.join(sorted(ALGORITHMS))}."
         )
     return check_name(name, ALGORITHMS, where)

@@ -241,8 +241,8 @@ def parse_experiment(settings: Mapping[str, Any]) -> ExperimentConfig:
     for arm in experiment.arms:
         if arm.algorithm in DISCRETE and experiment.evaluation_filter.kind != "none":
             raise ConfigurationError(
-                f"arms.{arm.name}: {arm.algorithm} has discrete actions, and no filter of this library takes those, but"
-                " evaluation would put a filter on (evaluation.filter, or that of another arm). Give the arm an"
+                f"arms.{arm.name}: {arm.algorithm} has discrete actions, and no filter of this library takes those,"
+                " but evaluation would put a filter on (evaluation.filter, or that of another arm). Give the arm an"
                 " experiment of its own, or set evaluation.filter to none."
             )
     return experiment
@@ -397,8 +397,8 @@ def _check_actions(arm: ArmConfig, where: str) -> None:
         raise ConfigurationError(
             f"{where}: the policy of {arm.algorithm} is deterministic and tries nothing out by itself. Give"
             " hyperparameters.action_noise: {normal: 0.1} (a standard deviation of actions scaled to [-1, 1]) or"
-            " {ornstein_uhlenbeck: 0.1}; or none, if the random actions of the first `learning_starts` steps are to be"
-            " all."
+            " {ornstein_uhlenbeck: 0.1}; or none, if the random actions of the first `learning_starts` steps are to"
+            " be all."
         )
 
 

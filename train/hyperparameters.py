@@ -162,7 +162,7 @@ def check_task(arm: ArmConfig, env: gym.Env[Any, Any]) -> None:
     """Refuses an arm whose algorithm cannot learn this task, which only the task itself can tell.
 
     Raises:
-        ConfigurationError: Actions of the wrong kind; or, for HER, no goals, or training before the first episode ends.
+        ConfigurationError: Actions of the wrong kind; or, for HER, no goals, or training before an episode ends.
     """
     where = f"arms.{arm.name}"
     for names, kind, wanted in (

@@ -21,8 +21,8 @@ from .parent import end_with_parent
 from .stack import make_stack
 
 _ENDED: Final = (
-    "The process of an env has ended: killed, out of memory, or with the error that it printed above. The same command"
-    " goes on from the last checkpoint. With vec_env: dummy the envs have no processes of their own."
+    "The process of an env has ended: killed, out of memory, or with the error that it printed above. The same"
+    " command goes on from the last checkpoint. With vec_env: dummy the envs have no processes of their own."
 )
 
 

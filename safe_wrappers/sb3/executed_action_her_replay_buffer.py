@@ -139,8 +139,8 @@ class ExecutedActionHerReplayBuffer(ExecutedActionReplayBuffer, HerReplayBuffer)
         """The task's rewards for having reached `achieved`, (n,)."""
         if self.env is None:
             raise ConfigurationError(
-                "this buffer was loaded and has no env to relabel rewards with: call set_env(vec_env), or load it with"
-                " the model's load_replay_buffer"
+                "this buffer was loaded and has no env to relabel rewards with: call set_env(vec_env), or load it"
+                " with the model's load_replay_buffer"
             )
         infos = copy.deepcopy(self.infos[slots, envs]) if self.copy_info_dict else [{} for _ in slots]
         (rewards,) = self.env.env_method("compute_reward", achieved, goals, infos, indices=[0])

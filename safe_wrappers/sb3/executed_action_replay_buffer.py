@@ -107,8 +107,8 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
             raise ConfigurationError(f"expected a bounded Box of actions, got {action_space}")
         if isinstance(observation_space, spaces.Dict) != isinstance(self, DictReplayBuffer):
             raise ConfigurationError(
-                "use ExecutedActionDictReplayBuffer for Dict observations (with HER: ExecutedActionHerReplayBuffer) and"
-                f" ExecutedActionReplayBuffer for all others; {type(self).__name__} got {observation_space}"
+                "use ExecutedActionDictReplayBuffer for Dict observations (with HER: ExecutedActionHerReplayBuffer)"
+                f" and ExecutedActionReplayBuffer for all others; {type(self).__name__} got {observation_space}"
             )
         if mode == "both" and optimize_memory_usage:
             raise ConfigurationError(

@@ -9,7 +9,7 @@ import torch
 from goal_line import BonusLine, filtered, penalised
 from line_world import HOLD, PENALTY, PER_CORRECTION, WALL
 from scipy import stats
-from stable_baselines3 import HerReplayBuffer, SAC
+from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 import safe_wrappers as sw
