@@ -30,7 +30,7 @@ NORMALIZE: Final = "vecnormalize.pkl"
 REPLAY: Final = "replay_buffer.pkl"
 RANDOM: Final = "random.pkl"
 STATE: Final = "state.json"
-_NO_BUFFER: Final = {
+_NO_BUFFER: Final[dict[str, Any]] = {
     "buffer_size": 1,
     "replay_buffer_class": None,
     "replay_buffer_kwargs": {},

@@ -28,7 +28,8 @@ _ENDED: Final = (
 
 def make_vec_env(arm: ArmConfig) -> VecEnv:
     """Makes `arm.n_envs` envs, as `arm.vec_env` says."""
-    makes = [functools.partial(make_stack, arm.env, arm.filter, arm.learner)] * arm.n_envs
+    make: Callable[[], gym.Env[Any, Any]] = functools.partial(make_stack, arm.env, arm.filter, arm.learner)
+    makes = [make] * arm.n_envs
     return DummyVecEnv(makes) if arm.vec_env == "dummy" else ProcessVecEnv(makes)
 
 

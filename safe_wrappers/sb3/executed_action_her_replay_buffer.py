@@ -142,6 +142,6 @@ class ExecutedActionHerReplayBuffer(ExecutedActionReplayBuffer, HerReplayBuffer)
                 "this buffer was loaded and has no env to relabel rewards with: call set_env(vec_env), or load it"
                 " with the model's load_replay_buffer"
             )
-        infos = copy.deepcopy(self.infos[slots, envs]) if self.copy_info_dict else [{} for _ in slots]
+        infos: Any = copy.deepcopy(self.infos[slots, envs]) if self.copy_info_dict else [{} for _ in slots]
         (rewards,) = self.env.env_method("compute_reward", achieved, goals, infos, indices=[0])
         return np.asarray(rewards, dtype=np.float64)

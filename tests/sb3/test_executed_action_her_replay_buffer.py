@@ -118,8 +118,8 @@ def test_every_transition_is_what_the_mode_says(mode, strategy):
 @pytest.mark.parametrize("n_envs", [1, 2])
 def test_without_a_changed_step_it_is_sb3s_buffer_bit_for_bit(mode, n_envs):
     far = functools.partial(ENVS[mode], wall=100.0)
-    ours = learn(mode, far, n_envs, learning_starts=80)
-    theirs = learn(mode, far, n_envs, learning_starts=80, buffer=HerReplayBuffer)
+    ours = learn(mode, far, n_envs, learning_starts=100)
+    theirs = learn(mode, far, n_envs, learning_starts=100, buffer=HerReplayBuffer)
     assert type(theirs.replay_buffer) is HerReplayBuffer
     for mine, other in zip(ours.policy.parameters(), theirs.policy.parameters(), strict=True):
         assert torch.equal(mine, other)

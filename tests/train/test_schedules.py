@@ -12,11 +12,11 @@ from safe_wrappers.train.run import train_run
 
 PPO = (
     "algorithm=PPO",
-    "hyperparameters={n_steps: 64, batch_size: 64, n_epochs: 1, learning_rate: linear_1e-3, clip_range: linear_0.2}",
+    "hyperparameters={n_steps: 32, batch_size: 32, n_epochs: 1, learning_rate: linear_1e-3, clip_range: linear_0.2}",
 )
 SAC = (
     "algorithm=SAC",
-    "hyperparameters={learning_starts: 63, batch_size: 8, train_freq: 64, gradient_steps: 1,"
+    "hyperparameters={learning_starts: 31, batch_size: 8, train_freq: 32, gradient_steps: 1,"
     " learning_rate: linear_1e-3}",
 )
 
@@ -44,24 +44,24 @@ class Rates(BaseCallback):
 def test_a_continued_run_goes_on_with_the_schedule(fake_experiment, monkeypatch, settings):
     seen = {}
     monkeypatch.setattr(run_module, "InterventionCallback", lambda: Rates(seen))
-    common = (*settings, "total_steps=512", "n_envs=1", "normalize={}", "checkpoint_every=128")
+    common = (*settings, "total_steps=256", "n_envs=1", "normalize={}", "checkpoint_every=64")
     whole = fake_experiment("name=whole", *common)
     train_run(whole.arms[1], 0, whole.run_folder(whole.arms[1], 0), Reports().progress)
     straight = dict(seen)
     seen.clear()
     killed = fake_experiment("name=killed", *common)
     folder = run_killed_after(killed, 1, monkeypatch)
-    assert latest_checkpoint(folder / "checkpoints", pytest.fail).timesteps == 128
+    assert latest_checkpoint(folder / "checkpoints", pytest.fail).timesteps == 64
     before = dict(seen)
     seen.clear()
     train_run(killed.arms[1], 0, folder, Reports().progress)
     assert (
-        min(seen) == 128 and max(before) <= 256
+        min(seen) == 64 and max(before) <= 128
     )  # the rollout after the kill is the one behind the checkpoint
-    assert straight.keys() == {64, 128, 192, 256, 320, 384, 448}
+    assert straight.keys() == set(range(32, 256, 32))
     for rates in (straight, before, seen):
         for steps, (rate, clip) in rates.items():
-            left = 1.0 - steps / 512
+            left = 1.0 - steps / 256
             assert rate == pytest.approx(1e-3 * left, rel=1e-12)
             assert clip is None or clip == pytest.approx(0.2 * left, rel=1e-12)
 

@@ -162,7 +162,9 @@ def until(condition):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="counts processes as Linux lists them")
-@pytest.mark.parametrize("by", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT, None], ids=str)
+@pytest.mark.parametrize(
+    "by", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT, None], ids=lambda by: by.name if by else "itself"
+)
 def test_no_process_outlives_the_command(tmp_path, by):
     """Command -> run -> env, three generations: all gone when the first is, however it ended."""
     config = tmp_path / "three.yaml"
