@@ -8,6 +8,7 @@ import os
 import pickle
 import random
 import shutil
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,14 +22,21 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from safe_wrappers.errors import RunStateError
 
+from .algorithms import ALGORITHMS
 from .atomic import write_json
-from .config import ALGORITHMS
 
 MODEL: Final = "model.zip"
 NORMALIZE: Final = "vecnormalize.pkl"
 REPLAY: Final = "replay_buffer.pkl"
 RANDOM: Final = "random.pkl"
 STATE: Final = "state.json"
+_NO_BUFFER: Final[dict[str, Any]] = {
+    "buffer_size": 1,
+    "replay_buffer_class": None,
+    "replay_buffer_kwargs": {},
+    "optimize_memory_usage": False,
+}
+"""A policy that only acts needs no replay buffer; SB3 would make one of full size, and HER's needs an env."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +49,16 @@ class Checkpoint:
 
     def load_model(self, algorithm: str, env: VecEnv | None, device: str) -> BaseAlgorithm:
         """Loads the model; with an env also what training needs: replay buffer and random states."""
-        model: BaseAlgorithm = ALGORITHMS[algorithm].load(self.folder / MODEL, env=env, device=device)
+        model: BaseAlgorithm = ALGORITHMS[algorithm].load(
+            self.folder / MODEL, env=env, device=device, custom_objects=_NO_BUFFER if env is None else None
+        )
         if env is not None:
             # A finished run's last checkpoint has none: there is nothing left to train on.
             if isinstance(model, OffPolicyAlgorithm) and (self.folder / REPLAY).exists():
-                model.load_replay_buffer(self.folder / REPLAY)
+                with warnings.catch_warnings():
+                    # HER ends the episodes that were cut: a continued run starts new ones, as it should.
+                    warnings.filterwarnings("ignore", "The last trajectory in the replay buffer")
+                    model.load_replay_buffer(self.folder / REPLAY)
             _set_random_states(pickle.loads((self.folder / RANDOM).read_bytes()))
         return model
 

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import gymnasium as gym
-from stable_baselines3 import PPO, SAC
 
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.protect import protect_options
@@ -19,9 +18,10 @@ from safe_wrappers.wrappers.faults import FAULTS
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 
+from .algorithms import ALGORITHMS, DETERMINISTIC, DISCRETE, OFF_POLICY, ON_POLICY, check_algorithm
+from .hyperparameters import HER, SCHEDULED, check_action_noise, check_her, linear_start
 from .names import check_name
 
-ALGORITHMS: Final[dict[str, type[PPO] | type[SAC]]] = {"PPO": PPO, "SAC": SAC}
 # What the run itself decides; the rest of the constructor's arguments are hyperparameters.
 _NOT_HYPERPARAMETERS: Final = {"self", "env", "seed", "device", "verbose", "tensorboard_log"} | {
     "_init_setup_model",
@@ -44,11 +44,13 @@ _ARM_KEYS: Final = (
     "normalize",
     "total_steps",
     "n_envs",
+    "vec_env",
     "checkpoint_every",
     "device",
 )
 _COMMON_KEYS: Final = tuple(key for key in _ARM_KEYS if key not in ("filter", "learner"))
 LEARNERS: Final = ("naive", "adaption_penalty", "safe_action", "both")
+_KWARGS: Final = "hyperparameters.replay_buffer_kwargs"
 _PENALISED: Final = ("adaption_penalty", "both")
 _EXECUTED: Final = ("safe_action", "both")
 
@@ -98,8 +100,10 @@ class LearnerConfig:
 
     - `naive`: its own action and the task's reward;
     - `adaption_penalty`: its own action and the reward less a penalty (`AdaptionPenalty`);
-    - `safe_action`: the executed action and the task's reward (`ExecutedActionReplayBuffer`); not PPO;
-    - `both`: the transitions of the two before; not PPO.
+    - `safe_action`: the executed action and the task's reward (`ExecutedActionReplayBuffer`);
+    - `both`: the transitions of the two before.
+
+    The last two need a replay buffer, so that the on-policy algorithms (PPO, A2C, TRPO) cannot have them.
 
     In a config `learner: safe_action`, or `learner: {kind: both, penalty: 0.1, per_correction: 0.0}`. Only training
     has the penalty; evaluation, and every return that is reported, is the task's own.
@@ -155,11 +159,17 @@ class ArmConfig:
     checkpoint_every: int
     device: str
     learner: LearnerConfig = NAIVE
+    vec_env: str = "dummy"
+
+    @property
+    def replays_goals(self) -> bool:
+        """Whether the replay buffer is HER's, which gives transitions new goals."""
+        return self.hyperparameters.get("replay_buffer_class") == HER
 
     def fingerprint(self) -> dict[str, Any]:
         """What a run folder must agree on to be continued: all that changes what is learned."""
         values = asdict(self)
-        for harmless in ("name", "checkpoint_every", "device"):
+        for harmless in ("name", "checkpoint_every", "device", "vec_env"):
             del values[harmless]
         # As in the folders of runs that were made before there was a choice.
         if self.learner == NAIVE:
@@ -237,6 +247,13 @@ def parse_experiment(settings: Mapping[str, Any]) -> ExperimentConfig:
         workers=None if workers is None else _integer(workers, "workers", 1),
         given_evaluation_filter=None if filter_given is None else _filter(filter_given, "evaluation.filter"),
     )
+    for arm in experiment.arms:
+        if arm.algorithm in DISCRETE and experiment.evaluation_filter.kind != "none":
+            raise ConfigurationError(
+                f"arms.{arm.name}: {arm.algorithm} has discrete actions, and no filter of this library takes those,"
+                " but evaluation would put a filter on (evaluation.filter, or that of another arm). Give the arm an"
+                " experiment of its own, or set evaluation.filter to none."
+            )
     return replace(experiment, arms=tuple(_judged(arm, experiment) for arm in experiment.arms))
 
 
@@ -258,7 +275,7 @@ def _arm(name: object, own: Mapping[str, Any], common: Mapping[str, Any]) -> Arm
     for key in own:
         check_name(key, _ARM_KEYS, where)
     merged = {**common, **own}
-    algorithm = check_name(merged["algorithm"], ALGORITHMS, f"{where}.algorithm")
+    algorithm = check_algorithm(merged["algorithm"], f"{where}.algorithm")
     hyperparameters = dict(_mapping(own.get("hyperparameters"), f"{where}.hyperparameters"))
     if algorithm == common["algorithm"]:  # another algorithm's hyperparameters would not fit
         inherited = _mapping(common.get("hyperparameters"), "hyperparameters")
@@ -276,9 +293,12 @@ def _arm(name: object, own: Mapping[str, Any], common: Mapping[str, Any]) -> Arm
         checkpoint_every=_integer(merged.get("checkpoint_every", 50_000), "checkpoint_every", 1),
         device=check_name(merged.get("device", "cpu"), ("cpu", "cuda", "auto"), "device"),
         learner=_learner(own.get("learner"), f"{where}.learner"),
+        vec_env=check_name(merged.get("vec_env", "dummy"), ("dummy", "subproc"), "vec_env"),
     )
+    _check_actions(arm, where)
     _check_learner(arm, f"{where}.learner")
-    if arm.algorithm == "SAC":
+    _check_replay(arm)
+    if arm.algorithm not in ON_POLICY:
         # SB3's default of a million transitions would be saved with every checkpoint, mostly empty.
         arm.hyperparameters.setdefault("buffer_size", min(1_000_000, total_steps))
     return arm
@@ -291,8 +311,14 @@ def _hyperparameters(algorithm: str, given: Mapping[str, Any]) -> dict[str, Any]
         check_name(key, parameters, f"hyperparameters of {algorithm}")
         default = parameters[key].default
         where = f"hyperparameters.{key}"
-        if key == "learning_rate":
+        if key in SCHEDULED and isinstance(value, str):
+            linear_start(value, where)
+        elif key == "learning_rate":
             _number(value, where, above=0.0)
+        elif key == "action_noise":
+            check_action_noise(value, where)
+        elif key == "replay_buffer_class":
+            check_name(value, (HER,), where)
         elif isinstance(default, bool):
             _flag(value, where)
         elif isinstance(default, int) and key != "train_freq":  # train_freq may be [4, "episode"]
@@ -363,19 +389,51 @@ def _check_learner(arm: ArmConfig, where: str) -> None:
         )
     if not arm.learner.stores_executed:
         return
-    if arm.algorithm == "PPO":
+    if arm.algorithm in ON_POLICY:
         raise ConfigurationError(
-            f"{where}: PPO cannot learn from the executed action: it weighs an action by the probability with which"
-            f" its policy drew it, and the policy did not draw this one. Use naive or adaption_penalty, or {kind}"
-            " with SAC."
+            f"{where}: {arm.algorithm} cannot learn from the executed action: it weighs an action by the probability"
+            " with which its policy drew it, and the policy did not draw this one. Use naive or adaption_penalty, or"
+            f" {kind} with {', '.join(OFF_POLICY[:-1])} or {OFF_POLICY[-1]}."
         )
-    for key in ("replay_buffer_class", "replay_buffer_kwargs"):
-        if key in arm.hyperparameters:
-            raise ConfigurationError(f"{where}: {kind} sets hyperparameters.{key} itself; leave it out.")
+    if not arm.replays_goals and "replay_buffer_kwargs" in arm.hyperparameters:
+        raise ConfigurationError(
+            f"{where}: {kind} sets hyperparameters.replay_buffer_kwargs itself; leave it out, or give"
+            f" hyperparameters.replay_buffer_class: {HER} with it."
+        )
     if arm.hyperparameters.get("n_steps", 1) > 1:
         raise ConfigurationError(
             f"{where}: {kind} has one-step returns, hyperparameters.n_steps is {arm.hyperparameters['n_steps']}: SB3"
             " makes n-step returns with a buffer of its own. Leave n_steps out, or use naive or adaption_penalty."
+        )
+
+
+def _check_actions(arm: ArmConfig, where: str) -> None:
+    if arm.algorithm in DISCRETE and arm.filter.kind != "none":
+        raise ConfigurationError(
+            f"{where}.filter: {arm.algorithm} has discrete actions, and no filter of this library takes those: leave"
+            f" `filter` out. Algorithms that train through a filter: {', '.join(ON_POLICY + OFF_POLICY)}."
+        )
+    if arm.algorithm in DETERMINISTIC and "action_noise" not in arm.hyperparameters:
+        raise ConfigurationError(
+            f"{where}: the policy of {arm.algorithm} is deterministic and tries nothing out by itself. Give"
+            " hyperparameters.action_noise: {normal: 0.1} (a standard deviation of actions scaled to [-1, 1]) or"
+            " {ornstein_uhlenbeck: 0.1}; or none, if the random actions of the first `learning_starts` steps are to"
+            " be all."
+        )
+
+
+def _check_replay(arm: ArmConfig) -> None:
+    if not arm.replays_goals:
+        return
+    check_her(_mapping(arm.hyperparameters.get("replay_buffer_kwargs"), _KWARGS), _KWARGS)
+    if arm.hyperparameters.get("n_steps", 1) > 1:
+        raise ConfigurationError(
+            f"hyperparameters.n_steps: {HER} has one-step returns, whatever n_steps says; leave it out."
+        )
+    if arm.env.occlusion is not None:
+        raise ConfigurationError(
+            f"env.occlusion: {HER} asks the task for the rewards of other goals, and the task does not know of this"
+            " penalty: most transitions would go without. Leave one of the two out."
         )
 
 

@@ -9,6 +9,7 @@ from rich.console import Console
 
 from .config import ArmConfig, ExperimentConfig
 from .evaluate import evaluate_run
+from .hyperparameters import check_task
 from .parallel import Job, run_jobs
 from .run import check_finished, claim_folder, train_run
 from .stack import make_stack
@@ -20,13 +21,15 @@ def train_experiment(experiment: ExperimentConfig, console: Console) -> None:
     """Trains what is not trained yet, arms times seeds in parallel.
 
     Raises:
-        ConfigurationError: A task or a filter refuses its settings; nothing has been started.
+        ConfigurationError: A task, a filter or an algorithm refuses its settings; nothing has been started.
         RunStateError: A run folder belongs to another config; nothing has been started.
         RunsFailedError: Some runs failed.
     """
     # All arms and folders before the first step: nobody should learn after an hour that the last one is wrong.
     for arm in experiment.arms:
-        make_stack(arm.env, arm.filter, arm.learner).close()
+        env = make_stack(arm.env, arm.filter, arm.learner)
+        check_task(arm, env)
+        env.close()
         for seed in experiment.seeds:
             claim_folder(arm, seed, experiment.run_folder(arm, seed))
     _run(experiment, console, "Training", lambda arm: arm.total_steps, "steps", train_run, ())

@@ -6,7 +6,6 @@ import multiprocessing
 import os
 import signal
 import sys
-import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,6 +20,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 
 from safe_wrappers.errors import SafeWrappersError
 
+from .parent import end_with_parent
 from .run import Progress as RunProgress
 
 Message = tuple[str, Any]
@@ -101,7 +101,8 @@ def _cores() -> int:
 def _start(job: Job) -> tuple[Connection, SpawnProcess]:
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(job, sender), daemon=True)
+    # Not a daemon: those may not have processes, and a run's envs may (`vec_env: subproc`). It ends with this one.
+    process = context.Process(target=_work, args=(job, sender))
     process.start()
     sender.close()  # so that the process's end is the pipe's end
     return receiver, process
@@ -128,7 +129,7 @@ def _work(job: Job, sender: Connection) -> None:
     torch.set_num_threads(1)
     # Ctrl-C goes to every process of the terminal; the parent's answer is enough.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
     progress = RunProgress(
         steps=lambda steps: sender.send(("steps", steps)), say=lambda text: sender.send(("say", text))
     )
@@ -138,13 +139,6 @@ def _work(job: Job, sender: Connection) -> None:
         sender.send(("failed", str(error)))
     except Exception:  # whatever a task or a hyperparameter can do wrong: shown, and the other runs go on
         sender.send(("failed", traceback.format_exc()))
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
 
 
 @contextmanager

@@ -5,31 +5,27 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Mapping
-from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from safe_wrappers.errors import RunStateError
-from safe_wrappers.sb3 import (
-    ExecutedActionDictReplayBuffer,
-    ExecutedActionReplayBuffer,
-    InterventionCallback,
-)
+from safe_wrappers.sb3 import InterventionCallback
 
+from .algorithms import ALGORITHMS
 from .atomic import write_json
 from .checkpoint import Checkpoint, latest_checkpoint, save_checkpoint
-from .config import ALGORITHMS, ArmConfig
+from .config import ArmConfig
+from .hyperparameters import constructor_arguments
 from .lock import only_writer
 from .run_callbacks import CheckpointCallback, EpisodeRows, ProgressCallback
-from .stack import make_stack
+from .vec_envs import make_vec_env
 
 RUN_FILE: Final = "run.json"
 FINISHED_FILE: Final = "finished.json"
@@ -66,7 +62,7 @@ def train_run(arm: ArmConfig, seed: int, folder: Path, progress: Progress) -> No
             progress.steps(arm.total_steps)
             return
         checkpoint = latest_checkpoint(folder / CHECKPOINTS, progress.say)
-        envs: VecEnv = DummyVecEnv([lambda: make_stack(arm.env, arm.filter, arm.learner)] * arm.n_envs)
+        envs = make_vec_env(arm)
         try:
             _train(arm, seed, folder, envs, checkpoint, progress)
         finally:
@@ -193,14 +189,7 @@ def _new_model(arm: ArmConfig, seed: int, envs: VecEnv) -> BaseAlgorithm:
             norm_reward=arm.normalize.reward,
             gamma=arm.hyperparameters.get("gamma", 0.99),
         )
-    # A copy: SB3 writes into policy_kwargs, and a run folder is known again by its settings.
-    settings = {"policy": "MlpPolicy", **deepcopy(arm.hyperparameters)}
-    if arm.learner.stores_executed:
-        has_dict = isinstance(envs.observation_space, gym.spaces.Dict)
-        settings["replay_buffer_class"] = (
-            ExecutedActionDictReplayBuffer if has_dict else ExecutedActionReplayBuffer
-        )
-        settings["replay_buffer_kwargs"] = {"mode": arm.learner.kind}
+    settings = {"policy": "MlpPolicy", **constructor_arguments(arm, envs)}
     model: BaseAlgorithm = ALGORITHMS[arm.algorithm](env=envs, seed=seed, device=arm.device, **settings)
     return model
 

@@ -7,6 +7,7 @@ except ImportError as missing:
         "safe_wrappers.sb3 needs stable_baselines3 and torch: pip install 'safe-wrappers[train]'"
     ) from missing
 
+from safe_wrappers.sb3.executed_action_her_replay_buffer import ExecutedActionHerReplayBuffer
 from safe_wrappers.sb3.executed_action_replay_buffer import (
     ExecutedActionDictReplayBuffer,
     ExecutedActionReplayBuffer,
@@ -16,6 +17,7 @@ from safe_wrappers.sb3.intervention_eval_callback import InterventionEvalCallbac
 
 __all__ = [
     "ExecutedActionDictReplayBuffer",
+    "ExecutedActionHerReplayBuffer",
     "ExecutedActionReplayBuffer",
     "InterventionCallback",
     "InterventionEvalCallback",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 import torch as th
@@ -67,6 +67,7 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         optimize_memory_usage: As in SB3, mode "safe_action" only.
         handle_timeout_termination: As in SB3.
         mode: "safe_action" or "both".
+        more: What the SB3 buffer beneath takes besides; none here, HER's in `ExecutedActionHerReplayBuffer`.
 
     Attributes:
         actions, rewards: What SB3 expects there: in mode "both" the policy's actions and penalised rewards.
@@ -81,6 +82,11 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         ActionError: An executed action that is not finite.
     """
 
+    modes: ClassVar[Sequence[str]] = MODES
+    others: ClassVar[str] = (
+        "the naive learner and the one with the adaption penalty alone use SB3's own ReplayBuffer"
+    )
+
     def __init__(
         self,
         buffer_size: int,
@@ -91,18 +97,18 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         optimize_memory_usage: bool = False,
         handle_timeout_termination: bool = True,
         mode: str = "safe_action",
+        **more: Any,
     ) -> None:
-        if mode not in MODES:
+        if mode not in self.modes:
             raise ConfigurationError(
-                f"mode: expected 'safe_action' or 'both', got {mode!r}; the naive learner and the one with the"
-                " adaption penalty alone use SB3's own ReplayBuffer"
+                f"mode: expected {' or '.join(map(repr, self.modes))}, got {mode!r}; {self.others}"
             )
         if not (isinstance(action_space, spaces.Box) and action_space.is_bounded()):
             raise ConfigurationError(f"expected a bounded Box of actions, got {action_space}")
         if isinstance(observation_space, spaces.Dict) != isinstance(self, DictReplayBuffer):
             raise ConfigurationError(
-                "use ExecutedActionDictReplayBuffer for Dict observations and ExecutedActionReplayBuffer for all"
-                f" others; {type(self).__name__} got {observation_space}"
+                "use ExecutedActionDictReplayBuffer for Dict observations (with HER: ExecutedActionHerReplayBuffer)"
+                f" and ExecutedActionReplayBuffer for all others; {type(self).__name__} got {observation_space}"
             )
         if mode == "both" and optimize_memory_usage:
             raise ConfigurationError(
@@ -112,10 +118,11 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
             buffer_size,
             observation_space,
             action_space,
-            device,
+            device=device,
             n_envs=n_envs,
             optimize_memory_usage=optimize_memory_usage,
             handle_timeout_termination=handle_timeout_termination,
+            **more,
         )
         self.mode = mode
         self._low, self._high = action_space.low, action_space.high
@@ -147,10 +154,10 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         if self.mode == "safe_action":
             super().add(obs, next_obs, executed, reward, done, infos)
             return
-        at = self.pos
         task = np.array([info[keys.ADAPTION_TASK_REWARD] for info in infos], dtype=np.float64)
-        self.executed_actions[at], self.task_rewards[at] = executed, task
-        self.changed[at] = changed & finite
+        if self.mode == "both":
+            self.executed_actions[self.pos], self.task_rewards[self.pos] = executed, task
+            self.changed[self.pos] = changed & finite
         super().add(
             obs,
             next_obs,
@@ -215,11 +222,10 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
                         f"env {at} has no info[{key!r}]: ExecutedActionReplayBuffer needs a CBFActionFilter inside"
                         " the env; without a filter use SB3's own ReplayBuffer"
                     )
-            if self.mode == "both" and keys.ADAPTION_PENALTY not in info:
+            if self.mode != "safe_action" and keys.ADAPTION_PENALTY not in info:
                 raise ConfigurationError(
-                    f"env {at} has no info[{keys.ADAPTION_PENALTY!r}]: mode 'both' stores the penalised transition"
-                    " beside the executed one; wrap the env in AdaptionPenalty(env, penalty=...), or use mode"
-                    " 'safe_action'"
+                    f"env {at} has no info[{keys.ADAPTION_PENALTY!r}]: mode {self.mode!r} stores a penalised"
+                    " transition; wrap the env in AdaptionPenalty(env, penalty=...), or use mode 'safe_action'"
                 )
             if self.mode == "safe_action" and keys.ADAPTION_PENALTY in info:
                 raise ConfigurationError(

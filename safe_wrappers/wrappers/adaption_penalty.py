@@ -24,6 +24,9 @@ class AdaptionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
     give for action projection. Any algorithm can learn from it, PPO too: the action is still the policy's own.
     What a penalty is worth depends on the task's reward; look at both before choosing it.
 
+    `compute_reward` of a task with goals stays the task's own and knows of no penalty. With hindsight replay (HER)
+    use `safe_wrappers.sb3.ExecutedActionHerReplayBuffer`, which takes the penalty off relabelled rewards too.
+
     **Order.** filter -> `RecordInterventions` -> SB3's `Monitor` -> `AdaptionPenalty`. What lies inside sees the
     task's own reward, so that the episodes' returns, in `info["interventions"]`, in Monitor's files and in
     `rollout/ep_rew_mean`, can be compared with a run that has no penalty; only the learner sees the penalised one.

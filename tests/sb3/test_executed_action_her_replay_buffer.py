@@ -1,0 +1,292 @@
+"""Every drawn transition against the closed form of task, filter and penalty, and against SB3's own HER buffer."""
+
+import functools
+
+import goal_line
+import numpy as np
+import pytest
+import torch
+from goal_line import BonusLine, filtered, penalised
+from line_world import HOLD, PENALTY, PER_CORRECTION, WALL
+from scipy import stats
+from stable_baselines3 import SAC, HerReplayBuffer
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+
+import safe_wrappers as sw
+from safe_wrappers import interventions as keys
+from safe_wrappers.sb3 import ExecutedActionHerReplayBuffer
+
+torch.set_num_threads(1)
+ENVS = {"safe_action": filtered, "both": penalised, "adaption_penalty": penalised}
+all_modes = pytest.mark.parametrize("mode", ENVS)
+
+
+def learn(mode, make=None, n_envs=2, vec_env=DummyVecEnv, buffer=None, normalize=False, **more):
+    """A model with the buffer under test and 120 steps in it; it has learnt from half of them if asked to."""
+    envs = vec_env([make or ENVS[mode]] * n_envs)
+    buffer_size, learning_starts = more.pop("buffer_size", 400), more.pop("learning_starts", 1000)
+    model = SAC(
+        "MultiInputPolicy",
+        VecNormalize(envs) if normalize else envs,
+        buffer_size=buffer_size,
+        learning_starts=learning_starts,
+        batch_size=16,
+        replay_buffer_class=buffer or ExecutedActionHerReplayBuffer,
+        replay_buffer_kwargs=({} if buffer else {"mode": mode}) | more,
+        policy_kwargs={"net_arch": [8]},
+        seed=0,
+        device="cpu",
+    )
+    return model.learn(120)
+
+
+class Drawn:
+    """A batch as the task's own numbers."""
+
+    def __init__(self, samples):
+        before, after = (
+            {k: v.numpy() for k, v in part.items()}
+            for part in (samples.observations, samples.next_observations)
+        )
+        self.x, _, self.number = before["observation"].T
+        self.x_after, self.steps_after, _ = after["observation"].T
+        self.goal, self.goal_after = before["desired_goal"].ravel(), after["desired_goal"].ravel()
+        self.achieved = after["achieved_goal"].ravel()
+        self.action, self.reward = samples.actions.numpy().ravel(), samples.rewards.numpy().ravel()
+        self.done = samples.dones.numpy().ravel()
+        self.sent = -2.0 + (self.action + 1.0) * 2.5  # unscaled
+        self.moved = (self.x_after - self.x) / HOLD
+        # The filter lets through what it can: a transition of which the wall stopped a part has the policy's action.
+        self.refused = self.sent - self.moved > 1e-4
+        correction = np.where(self.refused, self.sent - self.moved, 0.0)
+        self.charged = self.refused * PENALTY + PER_CORRECTION * correction
+
+    def rows(self):
+        return np.stack([getattr(self, name) for name in sorted(vars(self))])
+
+
+def draw(buffer, count, seed=1):
+    np.random.seed(seed)
+    return Drawn(buffer.sample(count))
+
+
+def episodes(buffer):
+    """The whole episodes of a buffer that is not full: (env, slots in order)."""
+    cut = [np.flatnonzero(buffer.dones[: buffer.pos, env]) + 1 for env in range(buffer.n_envs)]
+    return [
+        (env, np.arange(start, end))
+        for env, ends in enumerate(cut)
+        for start, end in zip(np.r_[0, ends[:-1]], ends, strict=True)
+    ]
+
+
+@all_modes
+@pytest.mark.parametrize("strategy", ["future", "final", "episode"])
+def test_every_transition_is_what_the_mode_says(mode, strategy):
+    buffer = learn(mode, goal_selection_strategy=strategy).replay_buffer
+    drawn = draw(buffer, 1000)
+    np.testing.assert_array_equal(drawn.goal, drawn.goal_after)
+    np.testing.assert_array_equal(drawn.x_after, drawn.achieved)
+    # Where the point went tells which action was executed, and the wall what it is if that was not the policy's.
+    executed = np.abs(drawn.sent - drawn.moved) < 1e-4
+    assert (executed ^ drawn.refused).all()
+    largest = (WALL - drawn.x) / HOLD
+    np.testing.assert_allclose(drawn.moved[drawn.refused], largest[drawn.refused], atol=1e-4)
+    stopped = np.abs(drawn.moved - largest) < 1e-4
+    assert 50 < stopped.sum() < 950
+    share = drawn.refused[stopped].mean()
+    assert {"safe_action": share == 0, "adaption_penalty": share == 1, "both": 0.4 < share < 0.6}[mode]
+    np.testing.assert_allclose(drawn.reward, -np.abs(drawn.x_after - drawn.goal) - drawn.charged, atol=1e-4)
+
+    # Goals: of the first fifth the episode's own; of the others where the episode was, then or later.
+    where = {}
+    for env, slots in episodes(buffer):
+        reached = buffer.next_observations["achieved_goal"][slots, env, 0]
+        seen = buffer.observations["observation"][slots, env]
+        for at, (_, _, number) in enumerate(seen):
+            own = buffer.observations["desired_goal"][slots[at], env, 0]
+            later = {"future": reached[at:], "final": reached[-1:], "episode": reached}[strategy]
+            last = slots[at] == slots[-1] and reached[-1] < -1.0  # the others are cut off by their length
+            where[number] = (own, set(later), last)
+    for at, number in enumerate(drawn.number):
+        own, later, last = where[number]
+        assert drawn.goal[at] == own if at < 200 else drawn.goal[at] in later
+        assert drawn.done[at] == last
+
+
+@all_modes
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_without_a_changed_step_it_is_sb3s_buffer_bit_for_bit(mode, n_envs):
+    far = functools.partial(ENVS[mode], wall=100.0)
+    ours = learn(mode, far, n_envs, learning_starts=100)
+    theirs = learn(mode, far, n_envs, learning_starts=100, buffer=HerReplayBuffer)
+    assert type(theirs.replay_buffer) is HerReplayBuffer
+    for mine, other in zip(ours.policy.parameters(), theirs.policy.parameters(), strict=True):
+        assert torch.equal(mine, other)
+    for count in (1, 7, 64):
+        mine, other = (draw(model.replay_buffer, count).rows() for model in (ours, theirs))
+        np.testing.assert_array_equal(mine, other)
+
+
+def test_the_penalty_is_all_that_sb3s_buffer_lacks():
+    ours = draw(learn("adaption_penalty").replay_buffer, 500)
+    theirs = draw(learn("adaption_penalty", buffer=HerReplayBuffer).replay_buffer, 500)
+    for name in sorted(vars(ours).keys() - {"reward"}):
+        np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), err_msg=name)
+    np.testing.assert_array_equal(ours.reward[:100], theirs.reward[:100])
+    np.testing.assert_allclose(ours.reward[100:], (theirs.reward - ours.charged)[100:], atol=1e-4)
+    assert ours.refused[100:].any()
+
+
+def test_both_draws_uniformly_from_all_transitions():
+    buffer = learn("both").replay_buffer
+    whole = sum(len(slots) for _, slots in episodes(buffer))
+    twice = sum(buffer.changed[slots, env].sum() for env, slots in episodes(buffer))
+    assert 0.05 * whole < twice < 0.95 * whole
+    drawn = draw(buffer, 100 * (whole + twice))
+    _, counts = np.unique(np.stack([drawn.number, drawn.refused]), axis=1, return_counts=True)
+    assert len(counts) == whole + twice
+    assert stats.chisquare(counts).pvalue > 1e-3
+
+
+def test_a_full_buffer_forgets_whole_episodes():
+    drawn = draw(learn("both", n_envs=1, buffer_size=40).replay_buffer, 400)
+    np.testing.assert_allclose(drawn.reward, -np.abs(drawn.x_after - drawn.goal) - drawn.charged, atol=1e-4)
+    assert len(np.unique(drawn.number)) <= 40
+    assert drawn.refused.any() and not drawn.refused.all()
+
+
+@all_modes
+def test_saved_loaded_and_gone_on_with(mode, tmp_path):
+    model = learn(mode)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    again = SAC.load(tmp_path / "model", env=DummyVecEnv([ENVS[mode]] * 2), device="cpu")
+    assert type(again.replay_buffer) is ExecutedActionHerReplayBuffer and again.replay_buffer.size() == 0
+    again.load_replay_buffer(tmp_path / "buffer", truncate_last_traj=False)
+    first = draw(model.replay_buffer, 64).rows()
+    np.testing.assert_array_equal(draw(again.replay_buffer, 64).rows(), first)
+    with pytest.warns(UserWarning, match="last trajectory"):
+        again.load_replay_buffer(tmp_path / "buffer")
+    again.learn(20, reset_num_timesteps=False)
+    assert again.replay_buffer.size() == 60 + 10
+    # The episode that the kill cut is whole now, and no one else's.
+    drawn = draw(again.replay_buffer, 2000)
+    np.testing.assert_allclose(drawn.reward, -np.abs(drawn.x_after - drawn.goal) - drawn.charged, atol=1e-4)
+    last = again.replay_buffer.observations["observation"][59, :, 2]
+    assert np.isin(last, drawn.number).all()
+
+
+@all_modes
+def test_what_is_drawn_is_normalised_after_the_penalty(mode):
+    model = learn(mode, normalize=True)
+    envs = model.get_vec_normalize_env()
+    raw = draw(model.replay_buffer, 200)
+    np.random.seed(1)
+    drawn = model.replay_buffer.sample(200, env=envs)
+    scale = np.sqrt(envs.ret_rms.var + envs.epsilon)
+    np.testing.assert_allclose(drawn.rewards.ravel(), np.clip(raw.reward / scale, -10, 10), rtol=1e-4)
+    rms = envs.obs_rms["desired_goal"]
+    centred = np.clip((raw.goal - rms.mean) / np.sqrt(rms.var + envs.epsilon), -10, 10)
+    np.testing.assert_allclose(drawn.observations["desired_goal"].ravel(), centred, rtol=1e-4, atol=1e-5)
+
+
+@all_modes
+def test_a_reward_that_needs_the_infos_gets_those_of_its_step(mode):
+    make = functools.partial(ENVS[mode], task=BonusLine)
+    drawn = draw(learn(mode, make, copy_info_dict=True).replay_buffer, 300)
+    expected = 100.0 * drawn.steps_after - np.abs(drawn.x_after - drawn.goal) - drawn.charged
+    np.testing.assert_allclose(drawn.reward, expected, atol=2e-4)
+
+
+def test_compute_reward_is_the_tasks_through_all_wrappers_and_processes():
+    for vec_env in (DummyVecEnv, functools.partial(SubprocVecEnv, start_method="fork")):
+        envs = vec_env([penalised] * 2)
+        achieved, goals = np.array([[0.0], [0.25], [-1.0]]), np.array([[1.0], [0.0], [-1.0]])
+        (rewards,) = envs.env_method("compute_reward", achieved, goals, [{}] * 3, indices=[0])
+        np.testing.assert_array_equal(rewards, [-1.0, -0.25, 0.0])
+        envs.close()
+
+
+def test_it_works_with_envs_in_other_processes():
+    fork = functools.partial(SubprocVecEnv, start_method="fork")
+    there, here = learn("both", vec_env=fork), learn("both")
+    np.testing.assert_array_equal(there.replay_buffer.penalties, here.replay_buffer.penalties)
+    there.env.close()
+
+
+# One step, by hand ---------------------------------------------------------------------------------------------
+
+
+class Pays:
+    """Stands for the vectorised env: HER asks it for nothing but rewards."""
+
+    def env_method(self, name, achieved, goals, infos, indices):
+        assert (name, indices, len(infos)) == ("compute_reward", [0], len(goals))
+        return [goal_line.GoalLine.compute_reward(None, achieved, goals, infos)]
+
+
+def by_hand(mode):
+    space = goal_line.GoalLine()
+    return ExecutedActionHerReplayBuffer(
+        8, space.observation_space, space.action_space, env=Pays(), device="cpu", mode=mode
+    )
+
+
+def info(proposed, executed, **more):
+    wrote = {keys.PROPOSED_ACTION: [proposed], keys.EXECUTED_ACTION: [executed]}
+    return wrote | {keys.CBF_INTERVENED: proposed != executed} | more
+
+
+def add(buffer, action, reward, done, wrote):
+    seen = {
+        "observation": np.zeros((1, 3)),
+        "achieved_goal": np.full((1, 1), 2.0),
+        "desired_goal": np.zeros((1, 1)),
+    }
+    buffer.add(seen, seen, np.array([[action]], np.float32), np.array([reward]), np.array([done]), [wrote])
+
+
+@pytest.mark.parametrize("mode", ["both", "adaption_penalty"])
+def test_an_action_that_is_not_finite_is_neither_stored_nor_charged(mode):
+    buffer = by_hand(mode)
+    charged = {keys.ADAPTION_PENALTY: 7.0, keys.ADAPTION_TASK_REWARD: -2.0}
+    add(buffer, np.nan, -9.0, True, info(0.5, 0.0, **charged))
+    drawn = draw(buffer, 50)
+    np.testing.assert_allclose(drawn.action, -0.2, atol=1e-6)  # 0 of [-2, 3]
+    np.testing.assert_allclose(drawn.reward[:10], -2.0)
+    np.testing.assert_allclose(drawn.reward[10:], 0.0)  # the new goal is where it was
+
+
+@pytest.mark.parametrize(
+    ("mode", "wrote", "message"),
+    [
+        ("adaption_penalty", {}, "mode 'adaption_penalty' stores a penalised transition; wrap the env in"),
+        ("safe_action", {keys.ADAPTION_PENALTY: 0.0}, "has an AdaptionPenalty"),
+    ],
+)
+def test_infos_that_do_not_fit_are_refused(mode, wrote, message):
+    with pytest.raises(sw.SafeWrappersError, match=message):
+        add(by_hand(mode), 0.2, 0.0, True, info(1.0, 1.0, **wrote))
+
+
+def test_no_whole_episode_is_sb3s_error_and_an_unknown_mode_ours():
+    buffer = by_hand("both")
+    add(
+        buffer,
+        0.2,
+        0.0,
+        False,
+        info(1.0, 1.0, **{keys.ADAPTION_PENALTY: 0.0, keys.ADAPTION_TASK_REWARD: 0.0}),
+    )
+    with pytest.raises(RuntimeError, match="learning_starts"):
+        buffer.sample(4)
+    buffer.truncate_last_trajectory()
+    assert draw(buffer, 4).reward.shape == (4,)
+    buffer.env = None
+    with pytest.raises(sw.SafeWrappersError, match=r"call set_env\(vec_env\)"):
+        buffer.sample(4)
+    with pytest.raises(
+        sw.SafeWrappersError, match="or 'adaption_penalty', got 'naive'; the naive learner uses"
+    ):
+        by_hand("naive")

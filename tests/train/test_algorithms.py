@@ -1,0 +1,224 @@
+"""Every algorithm that a config can name: trained through the filter, killed, continued, evaluated."""
+
+import inspect
+import json
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.spaces import Discrete
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from test_run import Reports, run_killed_after
+
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.sb3 import ExecutedActionReplayBuffer
+from safe_wrappers.train.algorithms import ALGORITHMS, DISCRETE, OFF_POLICY, ON_POLICY
+from safe_wrappers.train.checkpoint import latest_checkpoint
+from safe_wrappers.train.config import EvaluationConfig
+from safe_wrappers.train.evaluate import evaluate_run, evaluation_folder
+from safe_wrappers.train.hyperparameters import check_task, constructor_arguments
+from safe_wrappers.train.run import train_run
+from safe_wrappers.train.stack import make_stack
+from safe_wrappers.train.tables import read_rows
+from safe_wrappers.train.vec_envs import make_vec_env
+
+SMALL = "policy_kwargs: {net_arch: [8]}"
+REPLAY = f"learning_starts: 32, batch_size: 8, train_freq: 8, {SMALL}"
+SETTINGS = {
+    "PPO": f"n_steps: 32, batch_size: 32, n_epochs: 1, {SMALL}",
+    "A2C": f"n_steps: 8, {SMALL}",
+    "TRPO": f"n_steps: 32, batch_size: 32, n_critic_updates: 1, {SMALL}",
+    "TD3": f"{REPLAY}, action_noise: {{normal: 0.1}}",
+    "DDPG": f"{REPLAY}, action_noise: {{ornstein_uhlenbeck: 0.1}}",
+} | dict.fromkeys(("SAC", "TQC", "CrossQ", "DQN", "QRDQN"), REPLAY)
+FILTERED = "filter: {factory: 'test_learner:shield'}"
+TWO = "learner: {kind: both, penalty: 10.0}"
+
+
+class Left(gym.Wrapper):
+    """The fake task with three discrete actions."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.action_space = Discrete(3)
+
+    def step(self, action):
+        assert isinstance(action, int | np.integer) or np.ndim(action) == 0
+        return self.env.step(np.array([float(action) - 1.0, 0.0]))
+
+
+def discrete():
+    return Left(gym.make("fake_task:FakeGoal-v0"))
+
+
+gym.register("DiscreteGoal-v0", discrete)
+
+
+def one_arm(fake_experiment, algorithm, arm, *overrides):
+    discrete = ["env=test_algorithms:DiscreteGoal-v0"] if algorithm in DISCRETE else []
+    return fake_experiment(
+        f"algorithm={algorithm}",
+        f"hyperparameters={{{SETTINGS[algorithm]}}}",
+        f"arms={{a: {{{arm}}}}}",
+        "total_steps=192",
+        "checkpoint_every=64",
+        "n_envs=1",
+        "normalize={}",
+        *discrete,
+        *overrides,
+    )
+
+
+def installed(algorithm):
+    if algorithm in ("TQC", "CrossQ", "TRPO", "QRDQN"):
+        pytest.importorskip("sb3_contrib")
+    return algorithm
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_trained_killed_continued_and_evaluated(fake_experiment, monkeypatch, algorithm):
+    installed(algorithm)
+    arm = FILTERED if algorithm not in DISCRETE else "filter: none"
+    arm += f", {TWO}" if algorithm in OFF_POLICY else ""
+    experiment = one_arm(fake_experiment, algorithm, arm)
+    (arm,) = experiment.arms
+    folder = run_killed_after(experiment, 1, monkeypatch, arm=0)
+    checkpoint = latest_checkpoint(folder / "checkpoints", pytest.fail)
+    assert checkpoint.timesteps == 64
+    model = checkpoint.load_model(algorithm, make_vec_env(arm), "cpu")
+    assert type(model) is ALGORITHMS[algorithm]
+    if algorithm in OFF_POLICY:
+        assert type(model.replay_buffer) is ExecutedActionReplayBuffer
+        assert model.replay_buffer.size() == 64 and model.replay_buffer.changed.any()
+    train_run(arm, 0, folder, Reports().progress)
+    assert json.loads((folder / "finished.json").read_text())["timesteps"] == 192
+    rows = read_rows(folder / "episodes.csv")
+    assert len(rows) == 64 // 20 + 128 // 20
+    assert (sum(row["intervention_rate"] for row in rows) > 0) == (algorithm not in DISCRETE)
+    evaluate_run(arm, 0, folder, EvaluationConfig(2, 7), experiment.evaluation_filter, Reports().progress)
+    for condition in ("filter_off", *(("filter_on",) if algorithm not in DISCRETE else ())):
+        assert len(read_rows(evaluation_folder(folder) / f"{condition}.csv")) == 2
+
+
+@pytest.mark.parametrize("algorithm", [*ON_POLICY, *OFF_POLICY])
+@pytest.mark.parametrize("kind", ["naive", "adaption_penalty", "safe_action", "both"])
+def test_which_algorithm_can_have_which_learner(fake_experiment, algorithm, kind):
+    installed(algorithm)
+    penalty = ", penalty: 0.1" if kind in ("adaption_penalty", "both") else ""
+    arm = f"{FILTERED}, learner: {{kind: {kind}{penalty}}}"
+    if algorithm in ON_POLICY and kind in ("safe_action", "both"):
+        reason = rf"{algorithm} cannot learn from the executed action.* or {kind} with SAC, TD3, DDPG, TQC or CrossQ"
+        with pytest.raises(ConfigurationError, match=reason):
+            one_arm(fake_experiment, algorithm, arm)
+    else:
+        assert one_arm(fake_experiment, algorithm, arm).arms[0].learner.kind == kind
+
+
+@pytest.mark.parametrize("algorithm", [*OFF_POLICY, *DISCRETE])
+def test_no_replay_buffer_is_larger_than_the_run(fake_experiment, algorithm):
+    installed(algorithm)
+    (arm,) = one_arm(fake_experiment, algorithm, "filter: none").arms
+    assert arm.hyperparameters["buffer_size"] == 192
+
+
+def test_names_are_classes_of_the_two_packages():
+    for name in ("PPO", "DQN"):
+        assert (
+            ALGORITHMS[name].__name__ == name and "policy" in inspect.signature(ALGORITHMS[name]).parameters
+        )
+    assert set(ALGORITHMS) == {*ON_POLICY, *OFF_POLICY, *DISCRETE} == set(SETTINGS) and len(ALGORITHMS) == 10
+
+
+def test_a_missing_package_is_named_with_the_line_that_installs_it(fake_experiment, monkeypatch):
+    monkeypatch.setitem(sys.modules, "sb3_contrib", None)
+    with pytest.raises(
+        ConfigurationError, match=r"TQC is one of sb3-contrib's.*pip install 'sb3-contrib>=2\.6,<3'"
+    ):
+        one_arm(fake_experiment, "TQC", FILTERED)
+
+
+@pytest.mark.parametrize("name", ["ARS", "RecurrentPPO", "MaskablePPO"])
+def test_what_does_not_work_with_a_run_is_refused_with_the_reason(fake_experiment, name):
+    with pytest.raises(
+        ConfigurationError, match=rf"arms.a.algorithm: {name} is not offered: .*Valid names: A2C"
+    ):
+        fake_experiment("arms={a: {filter: none}}", f"arms.a.algorithm={name}")
+    with pytest.raises(UnknownNameError, match="Did you mean 'TD3'"):
+        fake_experiment("arms={a: {filter: none}}", "arms.a.algorithm=TD33")
+
+
+def test_discrete_actions_have_no_filter(fake_experiment):
+    with pytest.raises(
+        ConfigurationError, match=r"arms.a.filter: DQN has discrete actions.*leave `filter` out"
+    ):
+        one_arm(fake_experiment, "DQN", FILTERED)
+    with pytest.raises(
+        ConfigurationError, match=r"evaluation would put a filter on.*evaluation.filter to none"
+    ):
+        one_arm(fake_experiment, "DQN", "filter: none", "evaluation.filter=protect")
+    with pytest.raises(ConfigurationError, match="without a filter no action is ever changed"):
+        one_arm(fake_experiment, "DQN", "learner: safe_action")
+    arms = [f"arms.b={{{FILTERED}, algorithm: PPO}}", "evaluation.filter=none"]
+    assert len(one_arm(fake_experiment, "DQN", "filter: none", *arms).arms) == 2
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "env", "message"),
+    [
+        (
+            "SAC",
+            "test_algorithms:DiscreteGoal-v0",
+            r"SAC needs continuous actions \(a Box\).*Discrete\(3\).*PPO",
+        ),
+        ("DQN", "fake_task:FakeGoal-v0", r"DQN needs discrete actions \(a Discrete\), and fake_task.*PPO"),
+    ],
+)
+def test_actions_of_the_wrong_kind_are_refused_before_the_first_step(
+    fake_experiment, algorithm, env, message
+):
+    (arm,) = one_arm(fake_experiment, algorithm, "filter: none", f"env={env}").arms
+    with pytest.raises(ConfigurationError, match=f"arms.a: {message}"):
+        check_task(arm, make_stack(arm.env, arm.filter))
+
+
+# Action noise --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("algorithm", ["TD3", "DDPG"])
+def test_a_deterministic_policy_needs_a_word_on_noise(fake_experiment, algorithm):
+    with pytest.raises(ConfigurationError, match=f"policy of {algorithm} is deterministic") as refusal:
+        fake_experiment("hyperparameters={}", f"algorithm={algorithm}", "arms={a: {filter: none}}")
+    for offered in ("{normal: 0.1}", "{ornstein_uhlenbeck: 0.1}", "none"):
+        assert offered in str(refusal.value)
+        noise = f"hyperparameters={{action_noise: {offered}}}"
+        (arm,) = fake_experiment(noise, f"algorithm={algorithm}", "arms={a: {filter: none}}").arms
+        made = constructor_arguments(arm, make_vec_env(arm))["action_noise"]
+        if offered == "none":
+            assert made is None
+            continue
+        assert type(made) is {"n": NormalActionNoise, "o": OrnsteinUhlenbeckActionNoise}[offered[1]]
+        np.random.seed(0)
+        drawn = np.array([NormalActionNoise.__call__(made) for _ in range(2000)])
+        assert drawn.shape == (2000, 2)
+        np.testing.assert_allclose(drawn.std(axis=0), 0.1, rtol=0.1)
+
+
+@pytest.mark.parametrize(
+    "noise", ["0.1", "{normal: 0}", "{normal: -1}", "{normal: .nan}", "{normal: [1, 2]}", "{}"]
+)
+def test_noise_that_is_none_is_refused(fake_experiment, noise):
+    with pytest.raises(
+        ConfigurationError, match=r"hyperparameters.action_noise: expected none, \{normal: 0.1\} or"
+    ):
+        one_arm(fake_experiment, "TD3", FILTERED, f"hyperparameters.action_noise={noise}")
+
+
+def test_unknown_noise_is_refused_with_the_nearest(fake_experiment):
+    with pytest.raises(UnknownNameError, match="Did you mean 'normal'"):
+        one_arm(fake_experiment, "SAC", FILTERED, "hyperparameters.action_noise={nromal: 0.1}")
+
+
+def test_training_in_episodes_as_yaml_writes_it(fake_experiment):
+    (arm,) = one_arm(fake_experiment, "TD3", FILTERED, "hyperparameters.train_freq=[1, episode]").arms
+    assert constructor_arguments(arm, make_vec_env(arm))["train_freq"] == (1, "episode")
