@@ -16,7 +16,9 @@ from typing import Any, Final
 
 import numpy as np
 import torch
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
@@ -47,18 +49,34 @@ class Checkpoint:
     timesteps: int
     elapsed_s: float
 
-    def load_model(self, algorithm: str, env: VecEnv | None, device: str) -> BaseAlgorithm:
-        """Loads the model; with an env also what training needs: replay buffer and random states."""
+    def load_model(
+        self, algorithm: str, env: VecEnv | None, device: str, buffer_size: int | None = None
+    ) -> BaseAlgorithm:
+        """Loads the model; with an env also what training needs: replay buffer and random states.
+
+        Args:
+            algorithm: Its name in a config.
+            env: To train in; None to act only.
+            device: Torch's.
+            buffer_size: Of the replay buffer, in transitions, if it should be larger than when the run began.
+        """
+        sizes = {} if buffer_size is None else {"buffer_size": buffer_size}
+        changed = _NO_BUFFER if env is None else sizes
         model: BaseAlgorithm = ALGORITHMS[algorithm].load(
-            self.folder / MODEL, env=env, device=device, custom_objects=_NO_BUFFER if env is None else None
+            self.folder / MODEL, env=env, device=device, custom_objects=changed
         )
         if env is not None:
-            # A finished run's last checkpoint has none: there is nothing left to train on.
+            # A finished run's last checkpoint has no replay buffer.
             if isinstance(model, OffPolicyAlgorithm) and (self.folder / REPLAY).exists():
+                empty = model.replay_buffer
                 with warnings.catch_warnings():
                     # HER ends the episodes that were cut: a continued run starts new ones, as it should.
                     warnings.filterwarnings("ignore", "The last trajectory in the replay buffer")
                     model.load_replay_buffer(self.folder / REPLAY)
+                assert empty is not None and model.replay_buffer is not None
+                if empty.buffer_size > model.replay_buffer.buffer_size:
+                    _move(model.replay_buffer, empty)
+                    model.replay_buffer = empty
             _set_random_states(pickle.loads((self.folder / RANDOM).read_bytes()))
         return model
 
@@ -131,6 +149,24 @@ def latest_checkpoint(root: Path, warn: Callable[[str], None]) -> Checkpoint | N
             " train this run again from the start."
         )
     return None
+
+
+def _move(old: ReplayBuffer, new: ReplayBuffer) -> None:
+    """Moves transitions, oldest first, into an empty buffer that is larger."""
+    # One row more: with `optimize_memory_usage` the newest transition's next observation is there.
+    rows = np.arange(old.pos - old.size(), old.pos + 1) % old.buffer_size
+    for name, value in vars(old).items():
+        if isinstance(value, np.ndarray) and value.shape[:2] == (old.buffer_size, old.n_envs):
+            getattr(new, name)[: len(rows)] = value[rows]
+        elif name in ("observations", "next_observations"):  # a dict of arrays
+            for key, array in value.items():
+                getattr(new, name)[key][: len(rows)] = array[rows]
+    new.pos = old.size()
+    if isinstance(old, HerReplayBuffer) and isinstance(
+        new, HerReplayBuffer
+    ):  # rows in which episodes begin, and the next one will
+        new.ep_start[: len(rows)] = (new.ep_start[: len(rows)] - rows[0]) % old.buffer_size
+        new._current_ep_start[:] = new.pos
 
 
 def _folders(root: Path) -> list[Path]:

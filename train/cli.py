@@ -1,4 +1,8 @@
-"""The `safe-wrappers` command."""
+"""The `safe-wrappers` command.
+
+What takes long to import (torch, Stable-Baselines3, Matplotlib) is imported where it is needed: not for `--help`,
+and not before the config file could be read.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +12,17 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-
-from rich.console import Console
+from typing import TYPE_CHECKING
 
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError
 
-from .config import parse_experiment
 from .config_file import read_config
-from .experiment import evaluate_experiment, summarize_experiment, train_experiment
-from .report import verdict, write_overview, write_report
-from .table import comparison_table
+from .local_imports import importable
+from .output import lasting_output
+from .stopping import Interrupted
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 _COMMANDS = {
     "train": "train every arm with every seed; a killed run goes on where it was, a finished one is left",
@@ -30,7 +35,12 @@ _OPTIONS = {"compare": " [--report]", "report": " [CONFIG.yaml ...] [--output PA
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit status."""
+    """Runs the command; returns its exit status. Output that nobody reads any more does not stop it."""
+    with lasting_output():
+        return _main(arguments)
+
+
+def _main(arguments: Sequence[str] | None) -> int:
     parser = _parser()
     # argparse takes words only right behind the first ones; behind an option they arrive as unknown.
     options, rest = parser.parse_known_args(arguments)
@@ -44,14 +54,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     if not options.configs:
         parser.error("the following arguments are required: CONFIG.yaml")
-    console = Console()
+    from rich.console import Console
+
     try:
-        _run(options, console)
+        with importable([*(config.parent for config in options.configs), Path.cwd()]):
+            _run(options, Console())
     except SafeWrappersError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+    except Interrupted as stop:
+        lines = [f"  {line}" for line in stop.standing]
+        print("\n".join(["Stopped. The same command goes on" + ":" * bool(lines), *lines]), file=sys.stderr)
+        return 128 + stop.signum
     except KeyboardInterrupt:
-        print("Stopped. The same command goes on from the last checkpoints.", file=sys.stderr)
+        print("Stopped.", file=sys.stderr)
         return 130
     return 0
 
@@ -61,7 +77,14 @@ def _run(options: argparse.Namespace, console: Console) -> None:
         _report(options.configs, options.overrides, options.output, console)
         return
     (config,) = options.configs
-    experiment = parse_experiment(read_config(config, options.overrides))
+    settings = read_config(config, options.overrides)
+
+    from .config import parse_experiment
+    from .experiment import evaluate_experiment, summarize_experiment, train_experiment
+    from .report import verdict, write_report
+    from .table import comparison_table
+
+    experiment = parse_experiment(settings)
     if options.command in ("train", "compare"):
         train_experiment(experiment, console)
     if options.command in ("evaluate", "compare"):
@@ -78,7 +101,13 @@ def _run(options: argparse.Namespace, console: Console) -> None:
 
 def _report(configs: Sequence[Path], overrides: Sequence[str], output: Path | None, console: Console) -> None:
     """Of one config its page; of several a page each, and one that puts them side by side."""
-    experiments = [parse_experiment(read_config(config, overrides)) for config in configs]
+    settings = [read_config(config, overrides) for config in configs]
+
+    from .config import parse_experiment
+    from .experiment import summarize_experiment
+    from .report import write_overview, write_report
+
+    experiments = [parse_experiment(each) for each in settings]
     folders = [experiment.folder for experiment in experiments]
     for folder in folders:
         if folders.count(folder) > 1:

@@ -10,8 +10,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-import gymnasium as gym
-
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.protect import protect_options
 from safe_wrappers.wrappers.faults import FAULTS
@@ -19,6 +17,7 @@ from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 
 from .algorithms import ALGORITHMS, DETERMINISTIC, DISCRETE, OFF_POLICY, ON_POLICY, check_algorithm
+from .env_ids import check_env_id
 from .hyperparameters import HER, SCHEDULED, check_action_noise, check_her, linear_start
 from .names import check_name
 
@@ -171,6 +170,7 @@ class ArmConfig:
         values = asdict(self)
         for harmless in ("name", "checkpoint_every", "device", "vec_env"):
             del values[harmless]
+        without_default_buffer_size(values)
         # As in the folders of runs that were made before there was a choice.
         if self.learner == NAIVE:
             del values["learner"]
@@ -300,8 +300,19 @@ def _arm(name: object, own: Mapping[str, Any], common: Mapping[str, Any]) -> Arm
     _check_replay(arm)
     if arm.algorithm not in ON_POLICY:
         # SB3's default of a million transitions would be saved with every checkpoint, mostly empty.
-        arm.hyperparameters.setdefault("buffer_size", min(1_000_000, total_steps))
+        arm.hyperparameters.setdefault("buffer_size", _default_buffer_size(total_steps))
     return arm
+
+
+def without_default_buffer_size(fingerprint: dict[str, Any]) -> None:
+    """Takes the default size of the replay buffer out of a fingerprint: it grows with `total_steps`."""
+    hyperparameters = fingerprint.get("hyperparameters", {})
+    if hyperparameters.get("buffer_size") == _default_buffer_size(fingerprint.get("total_steps", 0)):
+        del hyperparameters["buffer_size"]
+
+
+def _default_buffer_size(total_steps: int) -> int:
+    return min(1_000_000, total_steps)
 
 
 def _hyperparameters(algorithm: str, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -444,11 +455,7 @@ def _env(value: Any) -> EnvConfig:
     for key in value:
         check_name(key, ("id", "kwargs", "faults", "occlusion", "cost", "judge"), "env")
     env_id = _text(value.get("id"), "env.id")
-    if ":" not in env_id:  # `module:Id-v0` is registered by importing the module, when the env is made
-        try:
-            gym.spec(env_id)
-        except gym.error.Error:
-            check_name(env_id, gym.registry, "env.id")
+    check_env_id(env_id)
     occlusion = None
     if value.get("occlusion") is not None:
         occlusion = dict(_mapping(value["occlusion"], "env.occlusion"))

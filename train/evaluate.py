@@ -16,7 +16,7 @@ from safe_wrappers.wrappers.record_interventions import COLUMNS
 from .atomic import write_json
 from .config import ArmConfig, EvaluationConfig, FilterConfig
 from .policy import TrainedPolicy
-from .run import Progress, finished_checkpoint
+from .run import EVALUATION, Progress, finished_checkpoint
 from .scene import Scene, SceneRecorder, save_scenes
 from .stack import make_stack
 from .step_log import StepLog, StepRecorder, load_steps, save_steps
@@ -34,7 +34,7 @@ def evaluation_folder(run_folder: Path) -> Path:
     Per condition (`filter_off`, `filter_on`) a table of episodes `.csv`, the steps `_steps.npz`
     (`safe_wrappers.train.step_log`), and for tasks seen from above the scenes `.npz`.
     """
-    return run_folder / "evaluation"
+    return run_folder / EVALUATION
 
 
 def evaluated_steps(run_folder: Path, condition: str) -> StepLog | None:

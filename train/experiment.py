@@ -11,10 +11,11 @@ from .config import ArmConfig, ExperimentConfig
 from .evaluate import evaluate_run
 from .hyperparameters import check_task
 from .parallel import Job, run_jobs
-from .run import check_finished, claim_folder, train_run
+from .run import check_finished, check_folder, is_outgrown, standing, train_run
 from .stack import make_stack
+from .stopping import Interrupted
 from .summary import Summary, summarize, write_summary
-from .videos import record_videos
+from .videos import delete_videos, record_videos
 
 
 def train_experiment(experiment: ExperimentConfig, console: Console) -> None:
@@ -24,6 +25,7 @@ def train_experiment(experiment: ExperimentConfig, console: Console) -> None:
         ConfigurationError: A task, a filter or an algorithm refuses its settings; nothing has been started.
         RunStateError: A run folder belongs to another config; nothing has been started.
         RunsFailedError: Some runs failed.
+        Interrupted: A signal came; says where each run will go on.
     """
     # All arms and folders before the first step: nobody should learn after an hour that the last one is wrong.
     for arm in experiment.arms:
@@ -31,8 +33,19 @@ def train_experiment(experiment: ExperimentConfig, console: Console) -> None:
         check_task(arm, env)
         env.close()
         for seed in experiment.seeds:
-            claim_folder(arm, seed, experiment.run_folder(arm, seed))
-    _run(experiment, console, "Training", lambda arm: arm.total_steps, "steps", train_run, ())
+            check_folder(arm, seed, experiment.run_folder(arm, seed))
+    for arm in experiment.arms:
+        if any(is_outgrown(arm, experiment.run_folder(arm, seed)) for seed in experiment.seeds):
+            delete_videos(experiment, arm)
+    try:
+        _run(experiment, console, "Training", lambda arm: arm.total_steps, "steps", train_run, ())
+    except Interrupted as stop:
+        stop.standing = [
+            f"{arm.name} seed {seed}: {standing(arm, experiment.run_folder(arm, seed))}"
+            for seed in experiment.seeds
+            for arm in experiment.arms
+        ]
+        raise
 
 
 def evaluate_experiment(experiment: ExperimentConfig, console: Console) -> None:
@@ -44,7 +57,7 @@ def evaluate_experiment(experiment: ExperimentConfig, console: Console) -> None:
     """
     for arm in experiment.arms:
         for seed in experiment.seeds:
-            check_finished(experiment.run_folder(arm, seed))
+            check_finished(arm, experiment.run_folder(arm, seed))
     conditions = 1 if experiment.evaluation_filter.kind == "none" else 2
     episodes = conditions * experiment.evaluation.episodes
     arguments = (experiment.evaluation, experiment.evaluation_filter)

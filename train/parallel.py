@@ -1,29 +1,34 @@
-"""Runs in parallel processes, with a bar for each; none of them outlives this one."""
+"""Runs in parallel processes; none of them outlives this one."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
 import signal
-import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
-from typing import Any
+from typing import Any, Final
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from safe_wrappers.errors import SafeWrappersError
 
+from .output import lasting_output
 from .parent import end_with_parent
+from .progress_display import ProgressDisplay
 from .run import Progress as RunProgress
+from .stopping import Interrupted, RunStoppedError, stop_request
 
 Message = tuple[str, Any]
+_POLL_S: Final = 0.2
+_SAVE_S: Final = 60.0
+"""How long stopped jobs may take: a rollout, its update and a checkpoint with a large replay buffer."""
 
 
 @dataclass(frozen=True)
@@ -45,50 +50,77 @@ def run_jobs(jobs: Sequence[Job], workers: int | None, console: Console, title: 
     """Runs jobs in parallel, spawned processes, one BLAS and torch thread each.
 
     A job that fails does not stop the others. If this process is killed, the jobs' processes end by
-    themselves: nobody goes on writing into the folders.
+    themselves: nobody goes on writing into the folders. SIGINT, SIGTERM and SIGHUP, where they are not ignored, stop
+    the jobs by SIGTERM and wait for at most a minute, in which runs save checkpoints; a second one does not wait.
 
     Args:
         jobs: The work.
         workers: Processes at a time; None for one per core that this process may use.
-        console: Where bars, messages and failures are shown.
-        title: What is going on, for the failure message.
+        console: Where progress, messages and failures are shown.
+        title: What is going on.
 
     Raises:
         RunsFailedError: At least one job failed; holds all their messages.
+        Interrupted: A signal stopped the jobs; none of their processes is left.
     """
     at_once = min(workers or _cores(), len(jobs))
     waiting = list(jobs)
     running: dict[Connection, tuple[Job, SpawnProcess]] = {}
     failures: dict[str, str] = {}
-    with _Bars(console) as bars, _one_thread_each():
+    stopped_at: float | None = None
+    totals = {job.name: job.total for job in jobs}
+    unit = jobs[0].unit if jobs else ""
+    with (
+        stop_request() as request,
+        ProgressDisplay(title, unit, totals, console) as display,
+        _one_thread_each(),
+    ):
         try:
-            while waiting or running:
-                while waiting and len(running) < at_once:
+            while running or (waiting and not request.signum):
+                while waiting and len(running) < at_once and not request.signum:
                     job = waiting.pop(0)
                     connection, process = _start(job)
                     running[connection] = (job, process)
-                    bars.start(job)
-                for ready in wait(list(running)):
+                    display.start(job.name)
+                for ready in wait(list(running), _POLL_S):
                     assert isinstance(ready, Connection)
                     job, process = running[ready]
                     message = _receive(ready)
                     if message is None:
                         del running[ready]
                         process.join()
-                        if process.exitcode != 0 and job.name not in failures:
-                            failures[job.name] = _death(process.exitcode)
-                        bars.end(job, failed=job.name in failures)
+                        how = "failed" if job.name in failures else "done"
+                        if process.exitcode != 0 and how == "done":
+                            how = "stopped" if request.signum else "failed"
+                        if how == "failed":
+                            failures.setdefault(job.name, _death(process.exitcode))
+                        display.end(job.name, how)
                     elif message[0] == "steps":
-                        bars.steps(job, message[1])
+                        display.steps(job.name, message[1])
+                    elif message[0] == "figures":
+                        display.figures(job.name, message[1])
                     elif message[0] == "say":
-                        console.print(f"[yellow]{job.name}:[/yellow] {message[1]}", highlight=False)
+                        display.say(f"{job.name}: {message[1]}")
                     else:
                         failures[job.name] = message[1]
+                display.tick()
+                if request.signum and stopped_at is None:
+                    stopped_at = time.monotonic()
+                    display.say(f"Stopping, for at most {_SAVE_S:.0f} s; another signal stops at once.")
+                    for _, process in running.values():
+                        process.terminate()
+                if stopped_at is not None and (request.at_once or time.monotonic() - stopped_at > _SAVE_S):
+                    break
         finally:
             for _, process in running.values():
-                process.terminate()
+                process.kill()
+                process.join()
+    texts = "\n".join(f"{name}: {text}" for name, text in failures.items())
+    if request.signum:
+        if failures:
+            console.print(texts, highlight=False, markup=False, soft_wrap=True)
+        raise Interrupted(request.signum)
     if failures:
-        texts = "\n".join(f"{name}: {text}" for name, text in failures.items())
         raise RunsFailedError(f"{title}: {len(failures)} of {len(jobs)} failed.\n{texts}")
 
 
@@ -103,7 +135,14 @@ def _start(job: Job) -> tuple[Connection, SpawnProcess]:
     receiver, sender = context.Pipe(duplex=False)
     # Not a daemon: those may not have processes, and a run's envs may (`vec_env: subproc`). It ends with this one.
     process = context.Process(target=_work, args=(job, sender))
-    process.start()
+    # A terminal sends these to every process in it; this one's answer is enough. Blocked, not ignored, from the new
+    # process's first instruction on. The tracker is started before: its own start would unblock them.
+    resource_tracker.ensure_running()
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
+    try:
+        process.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
     sender.close()  # so that the process's end is the pipe's end
     return receiver, process
 
@@ -127,18 +166,22 @@ def _work(job: Job, sender: Connection) -> None:
     import torch
 
     torch.set_num_threads(1)
-    # Ctrl-C goes to every process of the terminal; the parent's answer is enough.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()
     progress = RunProgress(
-        steps=lambda steps: sender.send(("steps", steps)), say=lambda text: sender.send(("say", text))
+        steps=lambda steps: sender.send(("steps", steps)),
+        say=lambda text: sender.send(("say", text)),
+        figures=lambda figures: sender.send(("figures", figures)),
     )
-    try:
-        job.call(*job.arguments, progress)
-    except SafeWrappersError as error:
-        sender.send(("failed", str(error)))
-    except Exception:  # whatever a task or a hyperparameter can do wrong: shown, and the other runs go on
-        sender.send(("failed", traceback.format_exc()))
+    with lasting_output():
+        try:
+            job.call(*job.arguments, progress)
+        except RunStoppedError as stop:
+            progress.say(str(stop))
+            os._exit(128 + signal.SIGTERM)  # all is saved, and taking torch down can take seconds
+        except SafeWrappersError as error:
+            sender.send(("failed", str(error)))
+        except Exception:  # whatever a task or a hyperparameter can do wrong: shown, and the other runs go on
+            sender.send(("failed", traceback.format_exc()))
 
 
 @contextmanager
@@ -155,51 +198,3 @@ def _one_thread_each() -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
-
-
-class _Bars:
-    """A bar per job on a terminal; in a file or a pipe, a line at each start and end."""
-
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=None),
-            TextColumn("{task.completed:.0f}/{task.total:.0f} {task.fields[unit]}"),
-            TextColumn("{task.fields[speed]}"),
-            TimeRemainingColumn(compact=True),
-            console=console,
-            disable=not console.is_terminal,
-        )
-        self._tasks: dict[str, TaskID] = {}
-        self._begun: dict[str, tuple[float, int]] = {}
-        self._speed: dict[str, float] = {}
-
-    def __enter__(self) -> _Bars:
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def start(self, job: Job) -> None:
-        self._tasks[job.name] = self._progress.add_task(job.name, total=job.total, unit=job.unit, speed="")
-        if not self._console.is_terminal:
-            self._console.print(f"{job.name}: started ({job.total} {job.unit})", highlight=False)
-
-    def steps(self, job: Job, steps: int) -> None:
-        now = time.monotonic()
-        since, first = self._begun.setdefault(job.name, (now, steps))
-        if now > since:
-            self._speed[job.name] = (steps - first) / (now - since)
-        speed = f"{self._speed[job.name]:.0f} {job.unit}/s" if job.name in self._speed else ""
-        self._progress.update(self._tasks[job.name], completed=steps, speed=speed)
-
-    def end(self, job: Job, failed: bool) -> None:
-        if self._console.is_terminal:
-            mark = "[red]failed[/red]" if failed else "[green]done[/green]"
-            self._progress.update(self._tasks[job.name], description=f"{job.name} {mark}")
-        else:
-            speed = f", {self._speed[job.name]:.0f} {job.unit}/s" if job.name in self._speed else ""
-            self._console.print(f"{job.name}: {'failed' if failed else 'done'}{speed}", highlight=False)
-        sys.stdout.flush()

@@ -50,7 +50,8 @@ def find_rendering(env: EnvConfig) -> Rendering:
 
 def _probe(env: EnvConfig, variables: dict[str, str]) -> str:
     """What went wrong; empty if a frame was drawn."""
-    command = [sys.executable, "-m", f"{__package__}.render_probe", json.dumps([env.id, env.kwargs])]
+    task = json.dumps([env.id, env.kwargs, sys.path])
+    command = [sys.executable, "-m", f"{__package__}.render_probe", task]
     try:
         done = subprocess.run(
             command,

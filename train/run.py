@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import inspect
 import json
+import shutil
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from safe_wrappers.errors import RunStateError
@@ -21,30 +25,44 @@ from safe_wrappers.sb3 import InterventionCallback
 from .algorithms import ALGORITHMS
 from .atomic import write_json
 from .checkpoint import Checkpoint, latest_checkpoint, save_checkpoint
-from .config import ArmConfig
+from .config import ArmConfig, without_default_buffer_size
 from .hyperparameters import constructor_arguments
 from .lock import only_writer
-from .run_callbacks import CheckpointCallback, EpisodeRows, ProgressCallback
+from .run_callbacks import (
+    CheckpointCallback,
+    EpisodeRows,
+    ProgressCallback,
+    StopCallback,
+    TrainingStopped,
+)
+from .stopping import RunStoppedError, heeding_termination
 from .vec_envs import make_vec_env
 
 RUN_FILE: Final = "run.json"
 FINISHED_FILE: Final = "finished.json"
 CHECKPOINTS: Final = "checkpoints"
+EVALUATION: Final = "evaluation"
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a run reports to: its steps so far, and lines that a person should read."""
+    """Where a run reports to: its steps so far, lines that a person should read, and figures by their names."""
 
     steps: Callable[[int], None]
     say: Callable[[str], None]
+    figures: Callable[[Mapping[str, str]], None] = lambda _: None
 
 
 def train_run(arm: ArmConfig, seed: int, folder: Path, progress: Progress) -> None:
     """Trains one arm with one seed, or goes on where the folder's last checkpoint stands.
 
-    A finished run is left as it is. A continued run starts new episodes (the envs' inner state is not saved),
-    with env seeds of its own, so that no episode is seen twice.
+    A finished run is left as it is, unless the arm's `total_steps` were raised: then it goes on, and its evaluation,
+    which was of another policy, is deleted. A continued run starts new episodes (the envs' inner state is not
+    saved), with env seeds of its own, so that no episode is seen twice.
+
+    The folder becomes this run's (`run.json`) when its envs and its model could be made.
+
+    While it trains, SIGTERM does not end the process: the run saves a checkpoint as soon as it can, and stops.
 
     Args:
         arm: What to train.
@@ -55,10 +73,12 @@ def train_run(arm: ArmConfig, seed: int, folder: Path, progress: Progress) -> No
     Raises:
         RunStateError: The folder belongs to another config, another process is at work in it, or all its
             checkpoints are damaged.
+        RunStoppedError: SIGTERM came; says from which step the run will go on.
     """
     with only_writer(folder):
-        claim_folder(arm, seed, folder)
-        if (folder / FINISHED_FILE).exists():
+        check_folder(arm, seed, folder)
+        if _is_finished(arm, folder):
+            _claim_folder(arm, seed, folder)  # the last rollout may have gone beyond totals that were raised
             progress.steps(arm.total_steps)
             return
         checkpoint = latest_checkpoint(folder / CHECKPOINTS, progress.say)
@@ -77,7 +97,12 @@ def _train(
     checkpoint: Checkpoint | None,
     progress: Progress,
 ) -> None:
-    model = _new_model(arm, seed, envs) if checkpoint is None else _continued(arm, envs, checkpoint)
+    say = progress.say
+    model = _new_model(arm, seed, envs) if checkpoint is None else _continued(arm, envs, checkpoint, say)
+    _claim_folder(arm, seed, folder)
+    if is_outgrown(arm, folder):
+        shutil.rmtree(folder / EVALUATION, ignore_errors=True)
+        (folder / FINISHED_FILE).unlink()
     before_s = 0.0 if checkpoint is None else checkpoint.elapsed_s
     # SB3 seeds env i with seed + i, so that seeds 0 and 1 would share all but one of their envs' episodes.
     vec_env = model.get_env()
@@ -93,32 +118,65 @@ def _train(
     def save() -> None:
         save_checkpoint(folder / CHECKPOINTS, model, elapsed_s())
 
-    callbacks = CallbackList(
-        [
-            InterventionCallback(),
-            EpisodeRows(folder / "episodes.csv"),
-            ProgressCallback(progress.steps),
-            CheckpointCallback(arm.checkpoint_every, save),
-        ]
-    )
-    model.learn(
-        arm.total_steps - model.num_timesteps, callback=callbacks, reset_num_timesteps=checkpoint is None
-    )
-    model.logger.close()
-    save_checkpoint(folder / CHECKPOINTS, model, elapsed_s(), final=True)
-    write_json(folder / FINISHED_FILE, _facts(model, elapsed_s(), envs))
+    filtered = arm.filter.kind != "none"
+    with heeding_termination() as asked_to_stop:
+        callbacks = CallbackList(
+            [
+                StopCallback(asked_to_stop),
+                InterventionCallback(),
+                EpisodeRows(folder / "episodes.csv"),
+                ProgressCallback(progress.steps, progress.figures, filtered),
+                CheckpointCallback(arm.checkpoint_every, save),
+            ]
+        )
+        try:
+            model.learn(
+                arm.total_steps - model.num_timesteps,
+                callback=callbacks,
+                reset_num_timesteps=checkpoint is None,
+            )
+        except TrainingStopped as stop:
+            if model.num_timesteps > 0:
+                save()
+            lost = stop.reached - model.num_timesteps
+            later = f"; {lost:,} later step{'s' * (lost > 1)} will be made again" if lost else ""
+            raise RunStoppedError(f"stopped; goes on {_from_step(model.num_timesteps)}{later}") from None
+        finally:
+            model.logger.close()
+        save_checkpoint(folder / CHECKPOINTS, model, elapsed_s(), final=True)
+        write_json(folder / FINISHED_FILE, _facts(model, elapsed_s(), envs))
 
 
-def check_finished(folder: Path) -> None:
+def standing(arm: ArmConfig, folder: Path) -> str:
+    """Where a run that nobody is working on stands: `finished`, or `from step 8,192` on."""
+    if _is_finished(arm, folder):
+        return "finished"
+    try:
+        checkpoint = latest_checkpoint(folder / CHECKPOINTS, lambda _: None)
+    except RunStateError as error:
+        return str(error)
+    return _from_step(0 if checkpoint is None else checkpoint.timesteps)
+
+
+def _from_step(step: int) -> str:
+    return f"from step {step:,}" if step else "from the start"
+
+
+def check_finished(arm: ArmConfig, folder: Path) -> None:
     """Refuses a run that is not trained to its end.
 
     Raises:
         RunStateError: It is not.
     """
-    if not (folder / FINISHED_FILE).exists():
+    if not _is_finished(arm, folder):
         raise RunStateError(
             f"The run in {str(folder)!r} is not trained to its end; run `safe-wrappers train` (or `compare`)."
         )
+
+
+def is_outgrown(arm: ArmConfig, folder: Path) -> bool:
+    """Whether the run was finished with fewer steps than it should have now: what shows its policy is out of date."""
+    return (folder / FINISHED_FILE).exists() and not _is_finished(arm, folder)
 
 
 def finished_checkpoint(arm: ArmConfig, seed: int, folder: Path) -> Checkpoint:
@@ -127,8 +185,8 @@ def finished_checkpoint(arm: ArmConfig, seed: int, folder: Path) -> Checkpoint:
     Raises:
         RunStateError: The run is not finished, belongs to another config, or its policy is damaged.
     """
-    check_finished(folder)
-    claim_folder(arm, seed, folder)
+    check_finished(arm, folder)
+    check_folder(arm, seed, folder)
     checkpoint = latest_checkpoint(folder / CHECKPOINTS, lambda _: None)
     if checkpoint is None:
         raise RunStateError(
@@ -137,37 +195,55 @@ def finished_checkpoint(arm: ArmConfig, seed: int, folder: Path) -> Checkpoint:
     return checkpoint
 
 
-def claim_folder(arm: ArmConfig, seed: int, folder: Path) -> None:
-    """Marks a new folder as this run's; refuses one that belongs to another config.
+def check_folder(arm: ArmConfig, seed: int, folder: Path) -> None:
+    """Refuses a folder that belongs to another config; `total_steps` may be more than what it was begun with.
 
     Raises:
         RunStateError: Another config's; shows the settings that differ.
     """
     path = folder / RUN_FILE
-    ours = {"arm": arm.name, "seed": seed, "config": arm.fingerprint()}
     if not path.exists():
         if (folder / CHECKPOINTS).exists():
             raise RunStateError(
                 f"{str(folder)!r} has checkpoints but no {RUN_FILE} that says what they are of; delete it, or"
                 " choose another `name` or `output`."
             )
-        write_json(path, ours)
         return
     try:
         theirs = json.loads(path.read_text())
-        there, here = _flat(theirs), _flat(json.loads(json.dumps(ours)))
+        without_default_buffer_size(theirs.get("config", {}))  # older folders have it
+        there, here = _flat(theirs), _flat(json.loads(json.dumps(_identity(arm, seed))))
     except (ValueError, AttributeError):
         raise RunStateError(f"{str(path)!r} is unreadable; delete {str(folder)!r} to train again.") from None
-    lines = [
-        f"  {key}: {there.get(key, 'unset')!r} in the folder, {here.get(key, 'unset')!r} in the config"
-        for key in sorted(there.keys() | here.keys())
-        if there.get(key, "unset") != here.get(key, "unset")
-    ]
-    if lines:
+    differ = {key for key in there.keys() | here.keys() if there.get(key, "unset") != here.get(key, "unset")}
+    if there.get("total_steps", 0) <= arm.total_steps:
+        differ.discard("total_steps")
+    if differ:
+        lines = [
+            f"  {key}: {there.get(key, 'unset')!r} in the folder, {here.get(key, 'unset')!r} in the config"
+            + " (it can be raised, not lowered)" * (key == "total_steps")
+            for key in sorted(differ)
+        ]
         raise RunStateError(
             f"The run folder {str(folder)!r} belongs to another config:\n" + "\n".join(lines) + "\n"
             "Choose another `name` or `output`, go back to its settings, or delete the folder."
         )
+
+
+def _claim_folder(arm: ArmConfig, seed: int, folder: Path) -> None:
+    """Marks a folder that `check_folder` let through as this run's, or as one whose total was raised."""
+    path = folder / RUN_FILE
+    if not path.exists() or json.loads(path.read_text())["config"].get("total_steps") != arm.total_steps:
+        write_json(path, _identity(arm, seed))
+
+
+def _identity(arm: ArmConfig, seed: int) -> dict[str, Any]:
+    return {"arm": arm.name, "seed": seed, "config": arm.fingerprint()}
+
+
+def _is_finished(arm: ArmConfig, folder: Path) -> bool:
+    path = folder / FINISHED_FILE
+    return path.exists() and int(json.loads(path.read_text())["timesteps"]) >= arm.total_steps
 
 
 def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -189,13 +265,29 @@ def _new_model(arm: ArmConfig, seed: int, envs: VecEnv) -> BaseAlgorithm:
             norm_reward=arm.normalize.reward,
             gamma=arm.hyperparameters.get("gamma", 0.99),
         )
-    settings = {"policy": "MlpPolicy", **constructor_arguments(arm, envs)}
+    has_dict = isinstance(envs.observation_space, gym.spaces.Dict)
+    policy = "MultiInputPolicy" if has_dict else "MlpPolicy"
+    settings = {"policy": policy, **constructor_arguments(arm, envs)}
     model: BaseAlgorithm = ALGORITHMS[arm.algorithm](env=envs, seed=seed, device=arm.device, **settings)
     return model
 
 
-def _continued(arm: ArmConfig, envs: VecEnv, checkpoint: Checkpoint) -> BaseAlgorithm:
-    return checkpoint.load_model(arm.algorithm, checkpoint.load_normalize(envs), arm.device)
+def _continued(
+    arm: ArmConfig, envs: VecEnv, checkpoint: Checkpoint, say: Callable[[str], None]
+) -> BaseAlgorithm:
+    buffer_size = arm.hyperparameters.get("buffer_size")
+    model = checkpoint.load_model(arm.algorithm, checkpoint.load_normalize(envs), arm.device, buffer_size)
+    if isinstance(model, OffPolicyAlgorithm) and model.num_timesteps < arm.total_steps:
+        assert model.replay_buffer is not None
+        if model.replay_buffer.size() == 0:  # it went on from a final checkpoint, which has none
+            default = inspect.signature(ALGORITHMS[arm.algorithm]).parameters["learning_starts"].default
+            first = int(arm.hyperparameters.get("learning_starts", default))
+            model.learning_starts = model.num_timesteps + first
+            say(
+                f"goes on from step {model.num_timesteps} with an empty replay buffer (a finished run keeps none):"
+                f" {first} steps of random actions (learning_starts) before it learns again"
+            )
+    return model
 
 
 def _facts(model: BaseAlgorithm, elapsed_s: float, envs: VecEnv) -> dict[str, Any]:

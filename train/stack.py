@@ -21,7 +21,9 @@ from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
 
 from .config import NAIVE, EnvConfig, FilterConfig, LearnerConfig
+from .env_ids import check_env_id
 from .judge import ConstraintJudge
+from .local_imports import own_folders
 from .names import check_name
 
 
@@ -41,6 +43,7 @@ def make_stack(
     Raises:
         ConfigurationError: The task or the filter refuses its settings.
     """
+    check_env_id(env.id)  # a spawned process has not yet registered what the first one did
     try:
         task: gym.Env[Any, Any] = gym.make(env.id, **env.kwargs)
     except (TypeError, gym.error.Error, ImportError) as error:
@@ -104,6 +107,10 @@ def _function(name: str, where: str) -> Any:
     try:
         module = importlib.import_module(module_name)
     except ImportError as error:
-        raise ConfigurationError(f"{where}: cannot import {module_name!r}: {error}") from None
-    check_name(function, [name for name in dir(module) if not name.startswith("_")], f"{module_name}")
+        raise ConfigurationError(
+            f"{where}: cannot import {module_name!r}: {error}. Looked among the installed packages and in"
+            f" {', '.join(own_folders())}."
+        ) from None
+    of = f"{module_name} ({getattr(module, '__file__', 'built in')})"
+    check_name(function, [name for name in dir(module) if not name.startswith("_")], of)
     return getattr(module, function)

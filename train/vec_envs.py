@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import signal
+import os
 from collections.abc import Callable, Iterator
 from typing import Any, Final
 
@@ -93,6 +93,6 @@ def _alive() -> Iterator[None]:
 
 def _in_process(make: Callable[[], gym.Env[Any, Any]]) -> gym.Env[Any, Any]:
     end_with_parent()
-    # Ctrl-C goes to every process of the terminal; the run decides what becomes of its envs.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Signals to the whole command (Ctrl-C, `timeout`) are for the run, which decides what becomes of its envs.
+    os.setpgrp()
     return make()

@@ -56,6 +56,14 @@ def load_video(path: Path) -> Video | None:
     )
 
 
+def delete_videos(experiment: ExperimentConfig, arm: ArmConfig) -> None:
+    """Deletes an arm's videos: its policy is no longer the one that they show."""
+    for condition in ("filter_off", "filter_on"):
+        path = video_path(experiment, arm, condition)
+        path.unlink(missing_ok=True)
+        path.with_suffix(".json").unlink(missing_ok=True)
+
+
 def video_problem(experiment: ExperimentConfig) -> str:
     """The one line that says why there are no videos; empty if nothing is known to stand against them."""
     path = experiment.folder / "videos" / _PROBLEM

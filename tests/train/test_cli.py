@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -23,26 +24,38 @@ def heed_interrupts():
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def start(command, *overrides):
-    return subprocess.Popen(
-        [*COMMAND, command, str(FAKE), *overrides],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=heed_interrupts,
-    )
+@pytest.fixture
+def start():
+    """Starts the command; what a failing test leaves running is killed."""
+    started = []
+
+    def run(command, *overrides, before=()):
+        process = subprocess.Popen(
+            [*before, *COMMAND, command, str(FAKE), *overrides],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            preexec_fn=None if before else heed_interrupts,
+        )
+        started.append(process)
+        return process
+
+    yield run
+    for process in started:
+        process.kill()
+        process.wait()
 
 
-def wait_for(condition, seconds=60.0):
+def wait_for(condition, seconds=240.0):
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "waited in vain"
         time.sleep(0.01)
 
 
-def test_compare_from_nothing_to_the_report_in_parallel_processes(tmp_path):
+def test_compare_from_nothing_to_the_report_in_parallel_processes(tmp_path, start):
     process = start("compare", f"output={tmp_path}", "seeds=[0]", "workers=2", "--report")
-    out, err = process.communicate(timeout=300)
+    out, err = process.communicate(timeout=600)
     assert process.returncode == 0, err
     assert "training filtered seed 0: done" in out
     assert "evaluation unfiltered seed 0: done" in out
@@ -61,14 +74,27 @@ def test_compare_from_nothing_to_the_report_in_parallel_processes(tmp_path):
     assert (tmp_path / "fake" / "per_seed.csv").read_text().count("\n") == 1 + 2 * 3
 
 
-def test_a_killed_comparison_leaves_no_process_behind_and_goes_on(tmp_path):
-    overrides = (f"output={tmp_path}", "total_steps=24000", "checkpoint_every=1000", "seeds=[0]", FILTERED)
+def stopped_step(err):
+    """The step that the message promises to go on from."""
+    first, second = err.splitlines()
+    assert first == "Stopped. The same command goes on:"
+    assert second.startswith("  filtered seed 0: from step ")
+    return int(second.rpartition(" ")[2].replace(",", ""))
+
+
+def test_a_stopped_or_killed_comparison_leaves_no_process_behind_and_goes_on(tmp_path, start):
+    overrides = [f"output={tmp_path}", "total_steps=24000", "seeds=[0]", FILTERED]
     folder = tmp_path / "fake" / "filtered" / "seed_0"
-    process = start("train", *overrides)
-    wait_for(lambda: list(folder.glob("checkpoints/step_*/state.json")))
+    process = start("train", *overrides, "checkpoint_every=1000000")
+    wait_for(lambda: len(read_rows(folder / "episodes.csv")) > 20)
     process.send_signal(signal.SIGINT)
-    assert process.communicate()[1] == "Stopped. The same command goes on from the last checkpoints.\n"
+    out, err = process.communicate()
     assert process.returncode == 130
+    at = stopped_step(err)
+    assert [path.name for path in (folder / "checkpoints").iterdir()] == [f"step_{at:012d}"]
+    assert f"training filtered seed 0: stopped; goes on from step {at:,}" in out
+    assert not _held(folder / ".lock")
+    overrides.append("checkpoint_every=1000")
     process = start("train", *overrides)
     wait_for(lambda: len(list(folder.glob("checkpoints/step_*/state.json"))) >= 2)
     process.send_signal(signal.SIGKILL)
@@ -79,7 +105,7 @@ def test_a_killed_comparison_leaves_no_process_behind_and_goes_on(tmp_path):
     assert 1000 <= at < 24000
     early = [row for row in read_rows(folder / "episodes.csv") if row["timesteps"] <= at]
     assert not (folder / "finished.json").exists()
-    out, err = start("train", *overrides).communicate(timeout=120)
+    out, err = start("train", *overrides).communicate(timeout=600)
     assert "training filtered seed 0: done" in out, err
     rows = read_rows(folder / "episodes.csv")
     assert rows[: len(early)] == early
@@ -89,13 +115,100 @@ def test_a_killed_comparison_leaves_no_process_behind_and_goes_on(tmp_path):
     assert json.loads((folder / "finished.json").read_text())["timesteps"] == 24_064
 
 
-def test_a_killed_worker_is_reported_and_the_others_go_on(tmp_path):
+def test_sigterm_saves_also_where_a_shell_has_other_signals_ignored(tmp_path, start):
+    """`nohup safe-wrappers ... &` in a script: SIGHUP and SIGINT are ignored there."""
+    overrides = [
+        f"output={tmp_path}",
+        "total_steps=200000",
+        "seeds=[0]",
+        "checkpoint_every=1000000",
+        FILTERED,
+    ]
+    ignoring = ["nohup", "sh", "-c", 'trap \'\' INT; exec "$0" "$@"']
+    process = start("train", *overrides, before=ignoring)
+    folder = tmp_path / "fake" / "filtered" / "seed_0"
+    wait_for(lambda: len(read_rows(folder / "episodes.csv")) > 20)
+    for ignored in (signal.SIGHUP, signal.SIGINT):
+        process.send_signal(ignored)
+    rows = len(read_rows(folder / "episodes.csv"))
+    wait_for(lambda: len(read_rows(folder / "episodes.csv")) > rows + 20)
+    process.send_signal(signal.SIGTERM)
+    _, err = process.communicate()
+    assert process.returncode == 128 + signal.SIGTERM
+    at = stopped_step(err)
+    assert [path.name for path in (folder / "checkpoints").iterdir()] == [f"step_{at:012d}"]
+
+
+@pytest.mark.slow
+def test_a_second_interrupt_stops_at_once(tmp_path, start):
+    folder = tmp_path / "fake" / "filtered" / "seed_0"
+    # A rollout that does not end: the run would wait for it for five seconds.
+    long = ("total_steps=20000000", "hyperparameters.n_steps=1000000")
+    process = start("train", f"output={tmp_path}", "seeds=[0]", *long, FILTERED)
+    wait_for(lambda: len(read_rows(folder / "episodes.csv")) > 20)
+    process.send_signal(signal.SIGINT)
+    time.sleep(0.8)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate()
+    assert process.returncode == 130
+    assert "another signal stops at once" in out
+    assert "stopped; goes on" not in out  # the run was not waited for
+    assert err == "Stopped. The same command goes on:\n  filtered seed 0: from the start\n"
+    assert not _held(folder / ".lock")
+
+
+def test_a_reader_that_leaves_stops_nothing(tmp_path):
+    command = shlex.join([*COMMAND, "train", str(FAKE), f"output={tmp_path}", "seeds=[0]", FILTERED])
+    done = subprocess.run(
+        ["bash", "-c", f"set -o pipefail; {command} 2>&1 | head -n 1"], capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.count("\n") == 1
+    assert json.loads((tmp_path / "fake" / "filtered" / "seed_0" / "finished.json").read_text())
+    assert (tmp_path / "fake" / "summary.json").exists()
+
+
+def test_help_and_mistakes_in_the_command_do_not_wait_for_torch():
+    code = """
+import sys
+from safe_wrappers.train.cli import main
+for arguments in (["--help"], ["--version"], ["trian"], ["train"], ["train", "a.yaml", "--no"], ["train", "a.yaml"]):
+    try:
+        main(arguments)
+    except SystemExit:
+        pass
+    late = {"torch", "stable_baselines3", "matplotlib", "tensorboard"} & set(sys.modules)
+    assert not late, (arguments, late)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd="/")
+    assert done.returncode == 0, done.stderr
+    assert "There is no config file 'a.yaml'" in done.stderr
+
+
+def test_a_factory_is_found_beside_the_config_and_sys_path_is_left_as_it_was(tmp_path, capsys):
+    folder = tmp_path / "project"
+    folder.mkdir()
+    (folder / "own_filters.py").write_text("from fake_task import shield\n")
+    (folder / "config.yaml").write_text(FAKE.read_text())
+    before = list(sys.path)
+    arms = "arms={filtered: {filter: {factory: 'own_filters:shield'}}}"
+    assert main(["train", str(folder / "config.yaml"), f"output={tmp_path}", "seeds=[0]", arms]) == 0
+    assert sys.path == before
+    assert json.loads((tmp_path / "fake" / "filtered" / "seed_0" / "finished.json").read_text())
+    arms = "arms={other: {filter: {factory: 'nowhere:shield'}}}"
+    assert main(["train", str(folder / "config.yaml"), f"output={tmp_path}", "seeds=[0]", arms]) == 1
+    err = capsys.readouterr().err
+    assert "filter.factory: cannot import 'nowhere'" in err
+    assert str(folder) in err and str(Path.cwd()) in err
+
+
+def test_a_killed_worker_is_reported_and_the_others_go_on(tmp_path, start):
     overrides = (f"output={tmp_path}", "total_steps=8000", "checkpoint_every=1000", "seeds=[0]", "workers=2")
     process = start("train", *overrides)
     folder = tmp_path / "fake" / "filtered" / "seed_0"
     wait_for(lambda: list(folder.glob("checkpoints/step_*/state.json")))
     os.kill(_holder(folder / ".lock", process.pid), signal.SIGKILL)
-    out, err = process.communicate(timeout=120)
+    out, err = process.communicate(timeout=600)
     assert process.returncode == 1
     assert "training unfiltered seed 0: done" in out
     assert "training filtered seed 0: failed" in out

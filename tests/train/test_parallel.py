@@ -4,6 +4,7 @@ import fake_task
 import pytest
 from rich.console import Console
 
+from safe_wrappers.train import progress_display
 from safe_wrappers.train.parallel import Job, RunsFailedError, run_jobs
 
 
@@ -21,15 +22,18 @@ def job(name, call, *arguments):
     return Job(name, 100, "steps", call, arguments)
 
 
-def test_bars_on_a_terminal_with_speed_and_messages():
+def test_a_terminal_shows_a_table_with_speed_and_messages():
     shown = run([job("first", fake_task.count, 100)], terminal=True)
-    assert "first done" in shown
-    assert "100/100 steps" in shown
+    assert "first: done, " in shown
+    assert "100 %" in shown
     assert "steps/s" in shown
     assert "first: a line to read" in shown
 
 
-def test_lines_in_a_file_and_one_failure_among_others():
+def test_lines_in_a_file_and_one_failure_among_others(monkeypatch):
+    monkeypatch.setattr(
+        progress_display, "_EVERY_S", float("inf")
+    )  # only what happens, on a slow machine too
     jobs = [job("good", fake_task.count, 10), job("bad", fake_task.fail), job("worse", fake_task.crash)]
     text = io.StringIO()
     with pytest.raises(RunsFailedError) as failure:

@@ -2,22 +2,34 @@
 
 import json
 import shutil
+from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
+import stable_baselines3
+from rich.console import Console
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from safe_wrappers import CBFActionFilter, RecordInterventions
 from safe_wrappers.errors import RunStateError, UnknownNameError
+from safe_wrappers.sb3 import ExecutedActionDictReplayBuffer
+from safe_wrappers.train import checkpoint as checkpoint_module
+from safe_wrappers.train import experiment as experiment_module
 from safe_wrappers.train.checkpoint import latest_checkpoint
 from safe_wrappers.train.config import EnvConfig, FilterConfig
+from safe_wrappers.train.evaluate import evaluate_run
+from safe_wrappers.train.experiment import train_experiment
 from safe_wrappers.train.lock import only_writer
 from safe_wrappers.train.run import Progress, finished_checkpoint, train_run
 from safe_wrappers.train.run_callbacks import CheckpointCallback
 from safe_wrappers.train.stack import make_stack
 from safe_wrappers.train.tables import read_rows
+from safe_wrappers.train.videos import video_path
+
+OFF = FilterConfig()
 
 
 class Killed(BaseException):
@@ -165,16 +177,122 @@ def test_the_normaliser_goes_on_too(fake_experiment, monkeypatch):
 def test_another_configs_folder_is_refused_and_the_difference_shown(fake_experiment):
     folder = run(fake_experiment())
     with pytest.raises(RunStateError) as refusal:
-        run(fake_experiment("hyperparameters.n_steps=32", "total_steps=640", "hyperparameters.gamma=0.9"))
+        run(fake_experiment("hyperparameters.n_steps=32", "total_steps=400", "hyperparameters.gamma=0.9"))
     assert str(refusal.value).splitlines() == [
         f"The run folder {str(folder)!r} belongs to another config:",
         "  hyperparameters.gamma: 'unset' in the folder, 0.9 in the config",
         "  hyperparameters.n_steps: 64 in the folder, 32 in the config",
-        "  total_steps: 512 in the folder, 640 in the config",
+        "  total_steps: 512 in the folder, 400 in the config (it can be raised, not lowered)",
         "Choose another `name` or `output`, go back to its settings, or delete the folder.",
     ]
     # What does not change the learning may change.
     run(fake_experiment("checkpoint_every=64", "workers=1", "evaluation.episodes=7", "seeds=[0]"))
+
+
+def test_the_total_of_a_finished_run_can_be_raised(fake_experiment):
+    short = fake_experiment("evaluation.episodes=1")
+    arm = short.arms[1]
+    folder = run(short)
+    evaluate_run(arm, 0, folder, short.evaluation, arm.filter, Reports().progress)
+    long = fake_experiment("evaluation.episodes=1", "total_steps=768").arms[1]
+    with pytest.raises(RunStateError, match="is not trained to its end"):
+        finished_checkpoint(long, 0, folder)
+    run(fake_experiment("total_steps=768"))
+    assert finished_checkpoint(long, 0, folder).timesteps == 768
+    rows = read_rows(folder / "episodes.csv")
+    assert [row["timesteps"] for row in rows] == sorted(row["timesteps"] for row in rows)
+    assert len(rows) == 2 * (256 // 20) + 2 * (128 // 20)
+    # The older policy's evaluation is gone, also for who asks for a report and not for an evaluation.
+    assert not (folder / "evaluation").exists()
+    evaluate_run(long, 0, folder, short.evaluation, arm.filter, Reports().progress)
+    assert json.loads((folder / "evaluation" / "evaluation.json").read_text())["timesteps"] == 768
+    with pytest.raises(RunStateError, match=r"total_steps: 768 in the folder, 512 in the config"):
+        run(short)
+
+
+def test_films_of_a_finished_run_that_goes_on_are_deleted(fake_experiment, monkeypatch):
+    monkeypatch.setattr(experiment_module, "_run", lambda *_: None)
+    short = fake_experiment("seeds=[0]")
+    run(short)
+    films = {arm.name: video_path(short, arm, "filter_on") for arm in short.arms}
+    films["filtered"].parent.mkdir()
+    for path in films.values():
+        path.write_bytes(b"")
+        path.with_suffix(".json").write_text("{}")
+    train_experiment(short, Console())
+    assert all(path.exists() for path in films.values())
+    train_experiment(fake_experiment("seeds=[0]", "total_steps=768"), Console())
+    left = sorted(path.name for path in films["filtered"].parent.iterdir())
+    assert left == ["unfiltered_filter_on.json", "unfiltered_filter_on.webp"]  # it was not trained at all
+
+
+def test_a_raised_total_that_the_last_rollout_had_reached_anyway_changes_nothing(fake_experiment):
+    folder = run(fake_experiment("total_steps=500"))
+    finished = (folder / "finished.json").read_text()
+    run(fake_experiment("total_steps=510"))
+    assert (folder / "finished.json").read_text() == finished
+    assert json.loads((folder / "run.json").read_text())["config"]["total_steps"] == 510
+
+
+SAC = ("algorithm=SAC", "hyperparameters={learning_starts: 50, batch_size: 16, train_freq: 8}", "n_envs=1")
+
+
+def test_a_raised_total_of_a_finished_sac_run_fills_a_new_buffer_first(fake_experiment, monkeypatch):
+    run(fake_experiment(*SAC, "total_steps=200"))
+    trained_at = []
+    train = stable_baselines3.SAC.train
+    monkeypatch.setattr(
+        stable_baselines3.SAC,
+        "train",
+        lambda self, **given: (trained_at.append(self.num_timesteps), train(self, **given)),
+    )
+    reports = Reports()
+    longer = fake_experiment(*SAC, "total_steps=400")
+    folder = run(longer, reports=reports)
+    (line,) = reports.lines
+    assert line.startswith("goes on from step 200 with an empty replay buffer")
+    assert "50 steps of random actions (learning_starts)" in line
+    assert 250 < trained_at[0] <= 264
+    assert json.loads((folder / "finished.json").read_text())["timesteps"] == 400
+    run(longer)  # the buffer's default size has grown with the total: no other config
+
+
+def test_a_raised_total_of_an_unfinished_sac_run_moves_its_buffer_into_a_larger_one(
+    fake_experiment, monkeypatch
+):
+    folder = run_killed_after(fake_experiment(*SAC, "total_steps=330"), 2, monkeypatch)
+    checkpoint = latest_checkpoint(folder / "checkpoints", pytest.fail)
+    envs = checkpoint.load_normalize(DummyVecEnv([lambda: make_stack(fake_experiment().arms[0].env, OFF)]))
+    kept = checkpoint.load_model("SAC", envs, "cpu").replay_buffer
+    moved = checkpoint.load_model("SAC", envs, "cpu", buffer_size=400).replay_buffer
+    assert (kept.buffer_size, moved.buffer_size) == (330, 400)
+    assert kept.size() == moved.size() == checkpoint.timesteps == 256
+    for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts"):
+        assert np.array_equal(getattr(moved, name)[:256], getattr(kept, name)[:256]), name
+    reports = Reports()
+    run(fake_experiment(*SAC, "total_steps=400"), reports=reports)
+    assert reports.lines == []
+
+
+def test_a_full_buffer_is_moved_oldest_first_with_all_that_is_in_it():
+    box = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+    space = gym.spaces.Dict({"a": box, "b": box})
+    old, new = (ExecutedActionDictReplayBuffer(size, space, box, "cpu", mode="both") for size in (4, 6))
+    stored = np.array([4, 5, 2, 3])
+    old.rewards[:, 0] = old.executed_actions[:, 0, 0] = old.next_observations["b"][:, 0, 1] = stored
+    old.pos, old.full = 2, True
+    checkpoint_module._move(old, new)
+    assert (new.pos, new.full) == (4, False)
+    for array in (new.rewards[:4, 0], new.executed_actions[:4, 0, 0], new.next_observations["b"][:4, 0, 1]):
+        assert array.tolist() == [2.0, 3.0, 4.0, 5.0]
+
+
+def test_a_start_that_fails_leaves_the_folder_to_the_corrected_command(fake_experiment):
+    wrong = fake_experiment("hyperparameters.policy=CnnPolicy")
+    with pytest.raises(Exception, match="NatureCNN"):
+        run(wrong)
+    assert not (wrong.run_folder(wrong.arms[1], 0) / "run.json").exists()
+    run(fake_experiment())
 
 
 def test_a_folder_without_its_run_file_is_refused(fake_experiment):
@@ -262,10 +380,15 @@ def test_an_unfinished_or_damaged_policy_is_not_evaluated(fake_experiment):
 
 def test_unknown_factories(fake_experiment):
     env = fake_experiment().arms[0].env
-    with pytest.raises(UnknownNameError, match=r"fake_task: unknown name 'sheild'. Did you mean 'shield'"):
+    with pytest.raises(
+        UnknownNameError, match=r"fake_task.py\): unknown name 'sheild'. Did you mean 'shield'"
+    ):
         make_stack(env, FilterConfig("factory", {}, "fake_task:sheild"))
-    with pytest.raises(ValueError, match=r"filter.factory: cannot import 'no_such_module'"):
+    with pytest.raises(ValueError, match=r"filter.factory: cannot import 'no_such_module'") as refusal:
         make_stack(env, FilterConfig("factory", {}, "no_such_module:f"))
+    looked = str(refusal.value).split(" and in ")[1]
+    assert str(Path(__file__).parent) in looked
+    assert "site-packages" not in looked
 
 
 def test_protect_is_the_filter_and_gets_its_settings():

@@ -1,0 +1,50 @@
+"""Env ids, also those of gymnasium-robotics, which registers its own only when it is imported."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import re
+from typing import Final
+
+import gymnasium as gym
+
+from safe_wrappers.errors import ConfigurationError
+
+from .names import check_name
+
+_ROBOTICS: Final = re.compile(
+    r"(Fetch|Hand(Reach|Manipulate)|Adroit|AntMaze|PointMaze|FrankaKitchen)\w*(-v\d+)?"
+)
+"""The families of gymnasium-robotics: without the package there is no other way to know that an id is its own."""
+
+
+def check_env_id(env_id: str) -> None:
+    """Refuses an id that no installed package registers; imports gymnasium-robotics if it may be one of its ids.
+
+    An id of the form `module:Id-v0` is left to `gymnasium.make`, which imports the module.
+
+    Raises:
+        ConfigurationError: An id of gymnasium-robotics, which is not installed.
+        UnknownNameError: An id that nobody registers; holds the nearest one.
+    """
+    if ":" in env_id or _registered(env_id):
+        return
+    if importlib.util.find_spec("gymnasium_robotics") is not None:
+        gym.register_envs(importlib.import_module("gymnasium_robotics"))  # its import registers them
+        if _registered(env_id):
+            return
+    elif _ROBOTICS.fullmatch(env_id):
+        raise ConfigurationError(
+            f"env.id: {env_id} is an env of gymnasium-robotics, which is not installed:"
+            " pip install 'safe-wrappers[robotics]'"
+        )
+    check_name(env_id, gym.registry, "env.id")
+
+
+def _registered(env_id: str) -> bool:
+    try:
+        gym.spec(env_id)
+    except gym.error.Error:
+        return False
+    return True
