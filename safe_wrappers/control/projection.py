@@ -98,9 +98,9 @@ def project(
         upper: Box, shape (m,); +inf is no bound.
         solver: "daqp" (called directly) or any installed qpsolvers backend by name.
 
-    A nominal that misses a row by up to 1e-9 of what the box can change of it counts as admissible; an answer may miss
-    it by ten times as much. Where the box is wide (more than 16 control units) or open, the numbers that the row
-    compares take its place.
+    A nominal that misses a row by up to 1e-9 of what half of the box changes of it counts as admissible; an answer
+    may miss it by ten times as much. Where the box is wide (more than 16 control units) or open, the numbers that the
+    row compares take its place.
 
     Returns:
         A `Projection`. Infeasible problems give the least-violation control: the smallest sum of squared,
