@@ -206,7 +206,8 @@ def keeps_rows(control: Array, normals: Array, offsets: Array, lower: Array, upp
     """Whether a control satisfies every row as closely as `project` asks of its answers."""
     length = np.sqrt(np.einsum("ij,ij->i", normals, normals))
     size = _sizes(control, normals, offsets, length, _box(lower.tobytes(), upper.tobytes()))
-    return bool((normals @ control - offsets <= 10.0 * _FEASIBILITY_TOLERANCE * size).all())
+    kept = normals @ control - offsets <= 10.0 * _FEASIBILITY_TOLERANCE * size
+    return bool((kept & np.isfinite(length)).all())  # what overflows would be allowed anything
 
 
 class _Box(NamedTuple):

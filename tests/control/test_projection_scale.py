@@ -112,6 +112,12 @@ def test_components_in_units_of_their_own(seed, exponents):
         assert (normals @ (answer.control / unit) <= offsets + 1e-7).all()
 
 
+@pytest.mark.parametrize("size", [1e200, math.nan])
+def test_a_row_that_cannot_be_checked_is_not_kept(size):
+    one = np.ones(1)
+    assert not keeps_rows(one, np.array([[size]]), one, -one, one)
+
+
 def test_entries_of_very_different_size_in_one_row():
     # Two components end at a bound; the third carries the rest with a hundred-thousandth of the first's slope.
     u, slope = np.array([0.2, 0.0, -1000.0]), np.array([[640.0, -11000.0, -0.0855]])
