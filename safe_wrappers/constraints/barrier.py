@@ -10,19 +10,24 @@ from numpy.typing import ArrayLike, NDArray
 from safe_wrappers.constraints.constraint import HalfSpaces, Promise, non_negative, positive
 from safe_wrappers.constraints.cut import cut
 from safe_wrappers.control.cbf import (
+    acts,
     cbf_rows,
     lie_derivatives,
     linear_decay,
     numerical_gradient,
     relative_degree,
 )
+from safe_wrappers.control.projection import keeps_rows
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
 
 _ROUNDING = 1e-9
-"""Less is round-off, in units of h."""
+"""Less is round-off, as a share of h's size: of its value and its gradient together."""
+_NO_EFFECT = 1e-7
+"""A control that acts on h' by less, as a share of h's size and of the control's effect on the state, is looked at
+more closely: differences leave as much."""
 
 
 @dataclass
@@ -111,7 +116,9 @@ class Barrier:
     def _condition(self, plant: Plant) -> HalfSpaces:
         x = plant.state
         self._now = self._height(x)
-        drift, effect = lie_derivatives(self._gradient(x), plant.f, plant.g)
+        gradient = self._gradient(x)
+        self._rounding = _ROUNDING * (abs(self._now) + float(np.abs(gradient).max(initial=0.0)))
+        drift, effect = lie_derivatives(gradient, plant.f, plant.g)
         room = self._now - self.margin
         decay = self.alpha(room) if callable(self.alpha) else linear_decay(room, self.alpha)
         normal, offset = cbf_rows(drift, effect, decay - 0.5 * self.curvature * plant.hold_s)
@@ -121,12 +128,12 @@ class Barrier:
         """Whether the row holds and prediction keeps h through the hold (from outside: does not lose more)."""
         row = self.rows(plant)
         excess = float(row.normals[0] @ control - row.offsets[0])
-        if not excess <= _ROUNDING * (1.0 + float(np.abs(row.normals[0]).sum())):
+        if not excess <= 0.0 and not keeps_rows(control, row.normals, row.offsets, plant.lower, plant.upper):
             return False
         path = getattr(plant, "path", None)
         if path is None:
             return True
-        floor = min(self._now, 0.0) - _ROUNDING
+        floor = min(self._now, 0.0) - self._rounding
         return all(self._height(x) >= floor for x in path(control))
 
     def cut(self, plant: Plant, control: Array) -> HalfSpaces:
@@ -163,11 +170,12 @@ class Barrier:
             )
         if self.gradient is not None:
             given, differences = self._gradient(x), numerical_gradient(self._height, x)
-            if np.abs(given - differences).max() > 1e-2 * (1.0 + np.abs(differences).max()):
+            size = abs(self._height(x)) + np.abs(differences).max()
+            if np.abs(given - differences).max() > 1e-2 * size:
                 raise ConfigurationError(
                     f"gradient does not fit h: at the first state it gives {given}, differences give {differences}"
                 )
-        if np.abs(self._gradient(x) @ plant.g).max(initial=0.0) > 1e-9:
+        if acts(self._gradient(x), plant.g, self._height(x), _NO_EFFECT):
             return
         drift = getattr(plant, "drift", lambda _: plant.f)
         matrix = getattr(plant, "effect", lambda _: plant.g)

@@ -27,7 +27,7 @@ _KEPT = 10
 _SAME_RESPONSE = 1
 """Cuts of one step that take the kept response for theirs."""
 _RESOLUTION = 1e-6
-"""Of controls, in their units: aimed farther inward by what rounding them may change."""
+"""Of controls, as a share of half their range: aimed farther inward by what rounding them may change."""
 RECOVERY_S = 0.1
 """Time constant, s, in which a state outside has to come back."""
 
@@ -196,5 +196,5 @@ class Predicted(ABC):
         away = np.where(response > 0.0, plant.lower - control, plant.upper - control)
         least = left + (response * away).sum(axis=-1)
         near = ~(least > 0.0)
-        left -= _RESOLUTION * np.abs(response).sum(axis=-1)
+        left -= _RESOLUTION * (np.abs(response) * (0.5 * (plant.upper - plant.lower))).sum(axis=-1)
         return through(left[near], control, response[near])

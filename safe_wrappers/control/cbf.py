@@ -103,6 +103,19 @@ def numerical_gradient(h: Callable[[Array], float], x: ArrayLike, step: float = 
     return gradient
 
 
+def acts(gradient: Array, effect: Array, height: float, share: float) -> bool:
+    """Whether some control changes a function at first order by more than a share of what it could.
+
+    Args:
+        gradient: Of the function, shape (n,).
+        effect: Control matrix g, shape (n, m).
+        height: The function's value. A gradient below a hundredth of it may be the round-off of differences.
+        share: What counts as none.
+    """
+    size = max(float(np.abs(gradient).max(initial=0.0)), 1e-2 * abs(height))
+    return bool((np.abs(gradient @ effect) > share * size * np.abs(effect).max(axis=0, initial=0.0)).any())
+
+
 def relative_degree(
     h: Callable[[Array], float],
     f: Callable[[Array], Array],
@@ -114,19 +127,21 @@ def relative_degree(
     """The number of time derivatives of h until the control appears, at one state.
 
     Lie derivatives are nested central differences, so the test is numerical: `tolerance` is relative to the
-    size of g, and each level widens the step to keep round-off below it.
+    sizes of h (its gradient, or a hundredth of its value, whichever is larger) and of each control's column of g, and
+    each level widens the step to keep round-off below it. Neither the unit of h nor that of a control matters; states
+    should be of order one.
 
     Returns:
         1, 2, ... up to `max_degree`, or None if the control appears in none of them.
     """
     point = np.asarray(x, dtype=np.float64)
-    scale = max(1e-12, float(np.abs(g(point)).max(initial=0.0)))
+    effect = np.asarray(g(point), dtype=np.float64)
+    height = float(h(point))
     current = h
     for degree in range(1, max_degree + 1):
         step = 10.0 ** (-6 + 1.5 * (degree - 1))
         gradient = numerical_gradient(current, point, step)
-        effect = gradient @ g(point)
-        if np.abs(effect).max(initial=0.0) > tolerance * scale * 10.0 ** (2 * (degree - 1)):
+        if acts(gradient, effect, height, tolerance * 10.0 ** (2 * (degree - 1))):
             return degree
         current = _lie_along(current, f, step)
     return None

@@ -345,7 +345,7 @@ def blind_time(
         if not (math.isfinite(value) and value > 0.0):
             raise ConfigurationError(f"{name} must be finite and above 0, got {value!r}")
     horizon = float(_times(horizon_s, "horizon_s"))
-    goal = min(tolerance / sigmas, _LARGEST) ** 2 * (1.0 - _GOAL)
+    goal = min(float(tolerance) / float(sigmas), _LARGEST) ** 2 * (1.0 - _GOAL)
     return first_crossing(start, a, q, rows, goal, horizon)
 
 

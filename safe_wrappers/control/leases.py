@@ -260,6 +260,10 @@ def longest_lease_of_room(room: ArrayLike, closing_speed: ArrayLike, delays_s: A
 def _not_negative(**values: ArrayLike) -> None:
     for name, value in values.items():
         # Of nothing, too: no surface near.
-        least = value if isinstance(value, float) else float(np.min(np.asarray(value), initial=np.inf))
+        least = (
+            value
+            if isinstance(value, float)
+            else float(np.min(np.asarray(value, np.float64), initial=np.inf))
+        )
         if least < 0.0:
             raise ConfigurationError(f"{name} must not be negative, got {least:g}")

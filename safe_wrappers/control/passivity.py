@@ -211,7 +211,9 @@ class EnergyLedger:
         dissipated = energy_j("dissipated_j", dissipated_j)
         self._absorbed.add(port_energy(f, v, time))
         self._dissipated.add(dissipated)
-        self._rounding += (f.size + 4) * _EPS * (float(np.abs(f) @ np.abs(v)) * time + dissipated)
+        # Storage is worked out from a state that is itself rounded at every step, so it counts anew each time.
+        exchanged = float(np.abs(f) @ np.abs(v)) * time + dissipated
+        self._rounding += (f.size + 4) * _EPS * (exchanged + stored)
         self._lowest = min(self._lowest, self._absorbed.value)
         missing = stored + self._dissipated.value - self._absorbed.value - self._initial
         self._created = max(self._created, missing)
@@ -251,7 +253,7 @@ class EnergyLedger:
 
     @property
     def rounding_j(self) -> float:
-        """Bound on what rounding has done to these sums, J."""
+        """Bound on what rounding has done to these sums and to the storage that `add` was told of, J."""
         return self._rounding + 4.0 * _EPS * self._initial
 
     @property

@@ -70,13 +70,20 @@ def port_energy(effort: Array, flow: Array, time_s: float) -> float:
     return energy
 
 
+def _is_number(value: object) -> bool:
+    """A scalar of Python or NumPy, or an array without axes."""
+    return isinstance(value, (int, float, np.number)) or (
+        isinstance(value, np.ndarray) and value.ndim == 0 and value.dtype.kind in "iuf"
+    )
+
+
 def positive(name: str, value: float) -> float:
     """A finite number above 0.
 
     Raises:
         ConfigurationError: For any other.
     """
-    if not (isinstance(value, (int, float, np.number)) and math.isfinite(value) and value > 0.0):
+    if not (_is_number(value) and math.isfinite(value) and value > 0.0):
         raise ConfigurationError(f"{name} must be a finite number above 0, got {value!r}")
     return float(value)
 
@@ -87,6 +94,6 @@ def energy_j(name: str, value: float) -> float:
     Raises:
         ConfigurationError: For any other.
     """
-    if not (isinstance(value, (int, float, np.number)) and math.isfinite(value) and value >= 0.0):
+    if not (_is_number(value) and math.isfinite(value) and value >= 0.0):
         raise ConfigurationError(f"{name} must be a finite energy of at least 0 J, got {value!r}")
     return float(value)

@@ -131,9 +131,10 @@ class MujocoPlant:
         space = env.action_space
         assert isinstance(space, gym.spaces.Box)  # the filter has refused every other space
         limited = self.model.actuator_ctrllimited.astype(bool)
+        rounding = 0.5e-6 * (self._upper - self._lower)[limited]
         fits = space.shape == (self.model.nu,) and (
-            np.allclose(space.low[limited], self._lower[limited], atol=1e-6)
-            and np.allclose(space.high[limited], self._upper[limited], atol=1e-6)
+            np.allclose(space.low[limited], self._lower[limited], atol=rounding)
+            and np.allclose(space.high[limited], self._upper[limited], atol=rounding)
         )
         if fits:
             return

@@ -39,7 +39,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
     and, where a constraint can, by prediction; if nothing admissible is found, run the fallback and say so.
 
     **What it guarantees.** No non-finite action, and none outside the action space, reaches the env. The executed
-    action satisfies every constraint's rows (to 1e-9 of a control unit) or, where a constraint predicts the held
+    action satisfies every constraint's rows (to 1e-8 of half the box) or, where a constraint predicts the held
     step, its prediction; else `cbf/infeasible` or `cbf/fallback` is True. If every constraint's `promise` is
     "proved" and the plant is right within the constraints' margins, episodes that start safe stay safe at every
     physics substep, whatever the fallback: a proved stopping control is tried before it.

@@ -7,14 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.constraints.constraint import Constraint
-from safe_wrappers.control.projection import Projection, Status, project_unchecked
+from safe_wrappers.control.projection import Projection, Status, keeps_rows, project_unchecked
 from safe_wrappers.plants.mujoco import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.fallback import Fallback
 
 Array = NDArray[np.float64]
 
-_ROW_TOLERANCE = 1e-9
 _CUTS = 6
 """How often a refused control is answered by linearising anew about it."""
 _OVERSHOOTS = (0.02, 0.1)
@@ -181,7 +180,7 @@ class Decider:
         """Of all that was tried, the control whose forecast fails least; the fallback's own if it is not "brake"."""
         if not (self._fallback.brakes and all(hasattr(c, "shortfall") for c in self._certifying)):
             return target
-        kept = [u for u in self._tried if bool((strict[0] @ u <= strict[1] + _ROW_TOLERANCE).all())]
+        kept = [u for u in self._tried if self._within(u, strict)]
 
         def failing(control: Array) -> float:
             return max(float(c.shortfall(self._plant, control) / c.scale) for c in self._certifying)
@@ -213,8 +212,10 @@ class Decider:
         return admitted
 
     def _keeps(self, control: Array, strict: tuple[Array, Array]) -> bool:
-        within = not strict[1].size or bool((strict[0] @ control <= strict[1] + _ROW_TOLERANCE).all())
-        return within and self._admitted(control)
+        return self._within(control, strict) and self._admitted(control)
+
+    def _within(self, control: Array, strict: tuple[Array, Array]) -> bool:
+        return not strict[1].size or keeps_rows(control, *strict, self._low, self._high)
 
     def _rows(self, asked: list[Any]) -> tuple[Array, Array]:
         parts = [c.rows(self._plant) for c in asked]

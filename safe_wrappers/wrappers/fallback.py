@@ -97,7 +97,7 @@ def brake(plant: MujocoPlant) -> Array:
     weight = np.sqrt(plant.inertia_diagonal())
     a = effect * weight[:, None]
     scale = float(np.sqrt((a * a).sum(axis=0).max(initial=1e-12)))
-    low, high = (np.clip(end, -1e6, 1e6) for end in plant.acting_range)
+    low, high = plant.acting_range
     stacked = np.vstack([a / scale, 1e-4 * np.eye(low.size)])
     aim = np.concatenate([-(plant.qvel / plant.hold_s + drift) * weight / scale, np.zeros(low.size)])
     return box_least_squares(stacked, aim, low, high)

@@ -164,6 +164,50 @@ def test_braking_distance_in_h_is_the_remedy():
     filtered.step(np.array([0.5]))
 
 
+# The unit of h ------------------------------------------------------------------------------------------------
+
+UNITS = [1e-12, 1e-9, 1e-3, 1e3, 1e9, 1e12]
+
+
+def driven(unit, gradient):
+    """What is executed, and h in its unit, under a policy that heads for a speed beyond the limit."""
+    of_h = lambda x: unit * (0.25 - x[1] ** 2)  # noqa: E731
+    dh = (lambda x: unit * np.array([0.0, -2.0 * x[1]])) if gradient else None
+    filtered = cart_filter(sw.Barrier(of_h, gradient=dh, alpha=2.0))
+    filtered.reset(seed=0)
+    seen = []
+    for _ in range(20):
+        info = filtered.step(np.array([0.9], dtype=np.float32))[4]
+        assert not info["cbf/fallback"]
+        seen.append((info["executed_action"][0], info["cbf/margin"] / unit, info["cbf/intervened"]))
+    return np.array(seen, dtype=float)
+
+
+@pytest.mark.parametrize("gradient", [False, True])
+@pytest.mark.parametrize("unit", UNITS)
+def test_the_unit_of_h_does_not_matter(unit, gradient):
+    one = driven(1.0, gradient)
+    assert 0 < one[:, 2].sum() < 20 and one[:, 1].min() > -1e-6
+    np.testing.assert_allclose(driven(unit, gradient), one, atol=1e-5)
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_an_h_that_no_control_acts_on_is_refused_in_every_unit(unit):
+    for barrier, message in (
+        (lambda x: unit, "no control acts on it"),
+        (lambda x: unit * (1.0 - x[0]), "relative degree is 2"),
+    ):
+        with pytest.raises(ConfigurationError, match=message):
+            cart_filter(sw.Barrier(barrier)).reset(seed=0)
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_a_wrong_gradient_is_refused_in_every_unit(unit):
+    wrong = sw.Barrier(lambda x: unit * (1.0 - x[1]), gradient=lambda x: unit * np.array([0.0, 1.0]))
+    with pytest.raises(ConfigurationError, match="gradient does not fit h"):
+        cart_filter(wrong).reset(seed=0)
+
+
 # Refusals -----------------------------------------------------------------------------------------------------
 
 

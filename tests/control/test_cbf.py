@@ -156,6 +156,27 @@ def test_relative_degree_does_not_depend_on_the_size_of_g(size):
     assert relative_degree(lambda x: 1.0 - x[1], drift, scaled, [0.3, 0.2]) == 1
 
 
+@pytest.mark.parametrize("scale", [1e-12, 1e-9, 1e-3, 1e3, 1e9, 1e12])
+@pytest.mark.parametrize("of_control", [1e-9, 1.0, 1e9])
+def test_relative_degree_does_not_depend_on_the_units_of_h_and_of_the_control(scale, of_control):
+    for order in (1, 2, 3):
+        drift, effect = chain(order)
+        # A second control acts on nothing.
+        both = lambda x, effect=effect: np.hstack([effect(x) * of_control, 0.0 * effect(x)])  # noqa: E731
+        barrier = lambda x: scale * (2.0 - x[0] - 0.3 * x[0] ** 2)  # noqa: E731
+        assert relative_degree(barrier, drift, both, np.full(order, 0.4)) == order
+    drift, effect = lambda x: np.array([-x[0], x[1]]), lambda x: np.array([[0.0], [of_control]])
+    assert relative_degree(lambda x: scale * (1.0 - x[0]), drift, effect, [0.3, 0.2]) is None
+    assert relative_degree(lambda x: scale * np.cos(x[0]), drift, effect, [0.3, 0.2]) is None
+    assert relative_degree(lambda x: scale, drift, effect, [0.3, 0.2]) is None
+
+
+def test_a_weak_control_beside_a_strong_one_counts():
+    drift = lambda x: np.zeros(2)  # noqa: E731
+    effect = lambda x: np.diag([1e6, 1e-6])  # noqa: E731
+    assert relative_degree(lambda x: 1.0 - x[1], drift, effect, [0.3, 0.2]) == 1
+
+
 def test_an_uncontrollable_state_has_none():
     drift = lambda x: np.array([-x[0], x[1]])  # noqa: E731
     effect = lambda x: np.array([[0.0], [1.0]])  # noqa: E731

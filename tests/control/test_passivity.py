@@ -335,3 +335,35 @@ def test_a_refused_interval_leaves_the_ledger_as_it_was():
         with pytest.raises(ConfigurationError):
             ledger.add(**{"effort": -3.0, "flow": 1.0, "time_s": 1.0, **bad})
     assert (ledger.absorbed_j, ledger.extracted_j, ledger.created_j) == (0.0, 0.0, 0.0)
+
+
+def oscillator(steps, gain=0.0):
+    """A spring of 4 kN/m and a mass of 1.5 kg, by the implicit midpoint rule: it makes no energy but for rounding.
+
+    `gain` is the share by which every step scales the velocity up: a simulation that does make energy.
+    """
+    mass, k, dt = 1.5, 4e3, 1e-3
+    x, v = 0.05, 30.0
+    ledger = EnergyLedger(0.5 * mass * v * v + 0.5 * k * x * x)
+    for n in range(steps):
+        force = 10.0 * math.sin(3.0 * n * dt)
+        mean = (v + 0.5 * dt / mass * (force - k * x)) / (1.0 + 0.25 * dt * dt * k / mass)
+        x += dt * mean
+        v = (2.0 * mean - v) * (1.0 + gain)
+        ledger.add(force, mean, dt, stored_j=0.5 * mass * v * v + 0.5 * k * x * x)
+    return ledger
+
+
+@pytest.mark.parametrize("steps", [1, 100, 2000])
+def test_storage_that_is_rounded_at_every_step_makes_no_energy(steps):
+    ledger = oscillator(steps)
+    assert ledger.passive
+    # And the bound stays near what rounding does: a share of 1e-15 of the storage per step.
+    assert ledger.rounding_j < 2e-15 * (steps + 2) * 1000.0
+
+
+def test_a_simulation_that_makes_a_hundred_times_the_rounding_is_not_passive():
+    honest = oscillator(2000)
+    active = oscillator(2000, gain=25.0 * honest.rounding_j / honest.initial_storage_j / 1000)
+    assert 20.0 * honest.rounding_j < active.created_j < 200.0 * honest.rounding_j
+    assert not active.passive

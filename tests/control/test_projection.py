@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import qpsolvers
+import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear, minimize
@@ -443,11 +444,19 @@ def test_a_backend_that_raises_is_replaced(monkeypatch, error):
 @pytest.mark.parametrize("flag", [-1, 0, 1])
 @pytest.mark.parametrize("x", [[np.nan, np.nan], [0.0, 0.0]])
 def test_when_every_backend_lies_the_status_says_failed(monkeypatch, flag, x):
-    def solve(h, f, a, bupper, blower, sense):
+    def solve(h, f, a, bupper, blower, sense, primal_tol):
         return np.resize(np.array(x), f.size), 0.0, flag, {"lam": np.zeros(bupper.size), "iterations": 1}
+
+    def give_up(*_):
+        raise RuntimeError("Maximum number of iterations reached.")
 
     with monkeypatch.context() as patch:
         patch.setattr(module.daqp, "solve", solve)
+        if (
+            flag < 1 or np.isnan(x).any()
+        ):  # least squares help where there is no answer to judge feasibility by
+            assert project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0).status == "projected"
+        patch.setattr(scipy.optimize, "nnls", give_up)
         answer = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0)
     assert answer.status in ("failed", "infeasible")
     assert np.isfinite(answer.control).all() and (np.abs(answer.control) <= 1.0).all()

@@ -1,0 +1,172 @@
+"""Integers, float32 and arrays without axes: the same answers as float64, from the public functions of control/."""
+
+import numpy as np
+import pytest
+
+from safe_wrappers.control import (
+    cbf,
+    contact,
+    contact_lcp,
+    covariance,
+    flexible_joint,
+    friction_cone,
+    impact,
+    kalman,
+    leases,
+    lemke,
+    manipulability,
+    observability,
+    passivity,
+    passivity_control,
+    polynomials,
+    predicted_positions,
+    projection,
+    reachability,
+    sampling,
+    slip,
+    smoothstep,
+    splines,
+    stopping,
+    support,
+    tails,
+)
+
+EYE = [[1, 0], [0, 1]]
+EYE3 = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+CHAIN = [[0, 1], [0, 0]]
+UP = [0, 0, 1]
+SQUARE = [[0, 0], [2, 0], [2, 2], [0, 2]]
+CORNERS = [[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]]
+
+CALLS = {
+    "lie_derivatives": (cbf.lie_derivatives, [[1, 2], [3, 4], EYE]),
+    "linear_decay": (cbf.linear_decay, [2, 3]),
+    "power_decay": (cbf.power_decay, [2, 3, 2]),
+    "cbf_rows": (cbf.cbf_rows, [2, [3, 1], 2]),
+    "best_rate": (cbf.best_rate, [2, [3, -1], [-1, -1], [1, 1]]),
+    "nagumo_holds": (cbf.nagumo_holds, [0, 2, [3, -1], [-1, -1], [1, 1]]),
+    "numerical_gradient": (lambda x: cbf.numerical_gradient(lambda y: y @ y, x), [[3, 4]]),
+    "sphere_gap": (contact.sphere_gap, [[0, 0, 0], [3, 4, 0], 1]),
+    "plane_gap": (contact.plane_gap, [[0, 0, 3], UP, 1, 1]),
+    "complementarity_residuals": (contact.complementarity_residuals, [[1, 0], [0, 2]]),
+    "unilateral_force": (contact.unilateral_force, [-1, -2, 100, 3]),
+    "delassus_matrix": (contact_lcp.delassus_matrix, [EYE, [[1, 1]]]),
+    "discretise": (covariance.discretise, [CHAIN, EYE, 2]),
+    "discretise_drift": (covariance.discretise_drift, [CHAIN, [1, 2], 2]),
+    "blind_covariance": (covariance.blind_covariance, [EYE, CHAIN, EYE, 2]),
+    "seen_covariance": (covariance.seen_covariance, [EYE, CHAIN, EYE, [[1, 0]], [[1]], 2]),
+    "double_integrator_covariance": (covariance.double_integrator_covariance, [EYE, 2, 3]),
+    "steady_state": (covariance.steady_state, [CHAIN, EYE, [[1, 0]], [[1]]]),
+    "blind_time": (covariance.blind_time, [EYE, CHAIN, EYE, [1, 0], 9, 1, 60]),
+    "resonances": (flexible_joint.resonances, [[100, 50], [2, 1], EYE]),
+    "damping_ratios": (flexible_joint.damping_ratios, [[100, 50], [2, 1], EYE, 3, 1]),
+    "normal_and_tangential": (friction_cone.normal_and_tangential, [[1, 2, 3], UP]),
+    "friction_ratio": (friction_cone.friction_ratio, [[1, 2, 3], UP, 1]),
+    "in_cone": (friction_cone.in_cone, [[1, 2, 3], UP, 1]),
+    "cone_excess": (friction_cone.cone_excess, [[1, 2, 3], UP, 1]),
+    "tangents": (friction_cone.tangents, [UP]),
+    "restitution_velocity": (impact.restitution_velocity, [-3, 1]),
+    "normal_impulse": (impact.normal_impulse, [2, -3, 1]),
+    "effective_mass": (impact.effective_mass, [EYE, [[1, 1]]]),
+    "reduced_mass": (impact.reduced_mass, [2, 6]),
+    "series_stiffness": (impact.series_stiffness, [2, 6]),
+    "peak_deflection": (impact.peak_deflection, [2, 4, 100]),
+    "peak_force": (impact.peak_force, [2, 4, 100]),
+    "speed_limit": (impact.speed_limit, [2, 4, 100]),
+    "time_to_peak": (impact.time_to_peak, [4, 100]),
+    "braked_deflection": (impact.braked_deflection, [2, 4, 100, 3, 1]),
+    "braked_peak_force": (impact.braked_peak_force, [2, 4, 100, 3, 1]),
+    "predict": (kalman.predict, [[1, 2], EYE, CHAIN, EYE]),
+    "update": (kalman.update, [[1, 2], EYE, [1], [[1, 0]], [[1]]]),
+    "normalised_error_squared": (kalman.normalised_error_squared, [[1, 2], EYE]),
+    "lease_delays": (lambda *late: leases.LeaseDelays(*late).total_s, [1, 0, 2, 3]),
+    "stopping_distance": (leases.stopping_distance, [2, 1]),
+    "longest_lease": (leases.longest_lease, [1, 1, 1, 0]),
+    "longest_lease, all": (leases.longest_lease, [9, 2, 1, 1, 1, 1, 1, 4]),
+    "longest_lease_of_room": (leases.longest_lease_of_room, [9, 2, 1]),
+    "round_trip_ceiling": (leases.round_trip_ceiling, [9, 1, 1, 0, 1, 1]),
+    "solve_lcp": (lambda m, q: lemke.solve_lcp(m, q)[:2], [EYE, [-1, 2]]),
+    "manipulability": (manipulability.manipulability, [[[1, 2], [0, 3]]]),
+    "joint_rates": (manipulability.joint_rates, [[[1, 2], [0, 3]], [1, 1]]),
+    "worst_joint_rates": (manipulability.worst_joint_rates, [[[1, 2], [0, 3]]]),
+    "observability_matrix": (observability.observability_matrix, [CHAIN, [[1, 0]]]),
+    "linear_observability": (lambda a, c: observability.linear_observability(a, c).rank, [CHAIN, [[1, 0]]]),
+    "pbh_test": (lambda a, c: observability.pbh_test(a, c)[1], [CHAIN, [[1, 0]]]),
+    "port_power": (passivity.port_power, [2, 3]),
+    "to_waves": (passivity.to_waves, [2, 3, 4]),
+    "from_waves": (passivity.from_waves, [2, 3, 4]),
+    "effort_and_outgoing": (passivity.effort_and_outgoing, [2, 3, 4]),
+    "flow_and_outgoing": (passivity.flow_and_outgoing, [2, 3, 4]),
+    "wave_power": (passivity.wave_power, [2, 3]),
+    "EnergyLedger": (lambda *a: filled(passivity.EnergyLedger(a[0]), a[1:]), [1, 2, 3, 1, 4, 1]),
+    "ChannelLedger": (lambda *a: filled(passivity.ChannelLedger(a[0]), a[1:]), [1, 2, 3, 1, 4, 1, 2]),
+    "PassivityObserver": (lambda *a: observed(*a), [1, 2, 3, 1]),
+    "differentiate": (polynomials.differentiate, [[1, 2, 3]]),
+    "extrema": (polynomials.extrema, [[0, 3, -1], 2]),
+    "largest_acceleration": (predicted_positions.largest_acceleration, [2, 1, 1]),
+    "project, one row": (lambda *a: projection.project(*a)[0], [[1, 1], [[1, 1]], [1], -1, 1]),
+    "project, rows": (lambda *a: projection.project(*a)[0], [[1, 1], [[2, 1], [1, 2]], [1, 1], -1, 1]),
+    "transit_time": (reachability.transit_time, [9, 2, 3]),
+    "reach": (reachability.reach, [9, 2, 3]),
+    "hold_lag_s": (sampling.hold_lag_s, [2]),
+    "phase_lag": (sampling.phase_lag, [2, 1, 1]),
+    "slip_ratio": (slip.slip_ratio, [3, 2, 1]),
+    "piecewise_slip_ratio": (slip.piecewise_slip_ratio, [3, 2]),
+    "normalized_slip": (slip.normalized_slip, [1]),
+    "spins_out": (slip.spins_out, [3, 1, 2]),
+    "smoothstep": (smoothstep.smoothstep, [1]),
+    "blend": (smoothstep.blend, [[1, 2], [3, 4], 1]),
+    "shortest_latched_blend": (smoothstep.shortest_latched_blend, [2, 3]),
+    "quintic_system": (splines.quintic_system, [2]),
+    "evaluate": (splines.evaluate, [[1, 2, 3, 4, 5, 6], 2]),
+    "hermite_series": (splines.hermite_series, [[0, 1, 3], [0, 2, 1], [1, 0, 1], 2]),
+    "kinetic_inset": (stopping.kinetic_inset, [5, 2, 1]),
+    "kinetic_row": (stopping.kinetic_row, [5, 2, 1, 3]),
+    "predicted_approach": (stopping.predicted_approach, [5, 2, 1, 3]),
+    "held_stopping_distance": (stopping.held_stopping_distance, [5, 2, 1]),
+    "support_polygon": (support.support_polygon, [SQUARE]),
+    "support_margin": (support.support_margin, [[1, 1], SQUARE]),
+    "support_rows": (
+        lambda p, o, n, i: support.support_rows(p, support.plane(o, n), i),
+        [CORNERS, [0, 0, 0], UP, 0],
+    ),
+    "gaussian_tail": (tails.gaussian_tail, [2]),
+    "unimodal_tail": (tails.unimodal_tail, [2]),
+    "chebyshev_tail": (tails.chebyshev_tail, [2]),
+}
+
+
+def filled(ledger, step):
+    ledger.add(*step)
+    return ledger.created_j, ledger.passive
+
+
+def observed(*given):
+    observer = passivity_control.PassivityObserver(given[0])
+    observer.add(*given[1:])
+    return observer.observed_j
+
+
+def as_kind(value, kind):
+    """One argument, a number or nested lists of integers, as the kind of number in question."""
+    if isinstance(value, list):
+        return np.array(value, dtype={"int": np.int64, "0-d": np.float64}.get(kind, kind))
+    if kind == "int":
+        return value
+    return np.array(value, dtype=np.float64) if kind == "0-d" else np.dtype(kind).type(value)
+
+
+def parts(answer):
+    """The numbers in an answer, flat."""
+    several = isinstance(answer, tuple)
+    return [np.asarray(part, dtype=np.float64) for part in (answer if several else (answer,))]
+
+
+@pytest.mark.parametrize("kind", ["int", "float32", "0-d"])
+@pytest.mark.parametrize("name", CALLS)
+def test_the_answer_does_not_depend_on_the_kind_of_number(name, kind):
+    function, arguments = CALLS[name]
+    expected = parts(function(*(as_kind(value, "float64") for value in arguments)))
+    found = parts(function(*(as_kind(value, kind) for value in arguments)))
+    for one, other in zip(expected, found, strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-12, atol=1e-12)

@@ -1,0 +1,162 @@
+"""The unit of the control is the user's choice: in N or in MN the filtered machine does the same."""
+
+import functools
+from types import SimpleNamespace
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+
+import safe_wrappers as sw
+from safe_wrappers.constraints.predicted import Predicted
+from safe_wrappers.errors import UnsupportedEnvError
+from safe_wrappers.wrappers.fallback import brake
+
+SLIDER = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody>
+<body><joint name="x" type="slide" axis="1 0 0"/><geom size=".1" mass="1" contype="0" conaffinity="0"/>
+<body><joint name="y" type="slide" axis="0 1 0"/><geom size=".1" mass="1" contype="0" conaffinity="0"/></body></body>
+</worldbody><actuator><motor joint="x" gear="{gear}" ctrlrange="-{unit} {unit}" ctrllimited="true"/>
+<motor joint="y" gear="{gear}" ctrlrange="-{unit} {unit}" ctrllimited="true"/></actuator></mujoco>"""
+
+
+class Sled(gym.Env):
+    """x'' = u / unit in the plane, exact; the action space is the box of `unit` on both axes."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (4,), np.float64)
+    dt = 0.05
+
+    def __init__(self, unit):
+        self.unit = unit
+        self.action_space = gym.spaces.Box(-unit, unit, (2,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state = np.zeros(4)
+        return self.state.copy(), {}
+
+    def step(self, action):
+        x, v, a = self.state[:2], self.state[2:], np.asarray(action) / self.unit
+        self.state = np.concatenate([x + v * self.dt + 0.5 * a * self.dt**2, v + a * self.dt])
+        return self.state.copy(), 0.0, False, False, {}
+
+
+def sled_plant(unit):
+    return sw.AnalyticPlant(
+        f=lambda x: np.array([x[2], x[3], 0.0, 0.0]),
+        g=lambda x: np.vstack([np.zeros((2, 2)), np.eye(2) / unit]),
+        state=lambda env: env.state,
+        hold_s=Sled.dt,
+    )
+
+
+def corner():
+    """A wedge of two oblique walls, and a third one behind: their rows meet at a corner that the policy heads for."""
+    planes = [
+        sw.Plane([0.6, 0.0], [-1.0, 0.1]),
+        sw.Plane([0.0, 0.4], [-0.2, -1.0]),
+        sw.Plane([-0.5, 0.0], [1.0, 0.0]),
+    ]
+    return sw.Clearance(planes, braking=0.5, position=[0, 1], velocity=[2, 3])
+
+
+def speed():
+    return sw.Barrier(lambda x: 0.09 - x[2] ** 2 - x[3] ** 2, alpha=5.0)
+
+
+@functools.cache
+def drive(unit, *constraints):
+    """Positions, what was executed in shares of the box, and what the filter said, at every step."""
+    env = sw.CBFActionFilter(Sled(unit), [build() for build in constraints], plant=sled_plant(unit))
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    seen = []
+    wanted = np.ones(2)
+    for step in range(100):
+        if step % 25 == 0:
+            wanted = rng.uniform(-0.5, 1.5, 2)
+        observation, _, _, _, info = env.step(np.clip(wanted, -1.0, 1.0) * unit)
+        said = [info["cbf/margin"], info["cbf/intervened"], info["cbf/fallback"], info["cbf/infeasible"]]
+        seen.append(np.concatenate([observation, info["executed_action"] / unit, said]))
+    return np.array(seen)
+
+
+@pytest.mark.parametrize("unit", [1e-7, 1e-4, 1e7])
+@pytest.mark.parametrize("constraints", [(corner,), (corner, speed)], ids=["rows", "rows and a barrier"])
+def test_the_unit_of_the_control_does_not_matter(unit, constraints):
+    one, other = drive(1.0, *constraints), drive(unit, *constraints)
+    margin, intervened, fallback = one[:, 6], one[:, 7], one[:, 8]
+    assert intervened.mean() > 0.2 and not fallback.any() and margin.min() > -1e-9
+    assert margin.min() < 0.01  # it did come to the walls
+    np.testing.assert_allclose(other, one, atol=1e-6)
+
+
+class Slider(gym.Env):
+    """Two axes of 1 kg (y) and 2 kg (x), each with a motor of 10 N whose control is counted in `unit`."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    dt = 0.05
+    frame_skip = 5
+
+    def __init__(self, unit, space=1.0):
+        self.model = mujoco.MjModel.from_xml_string(SLIDER.format(unit=unit, gear=10.0 / unit))
+        self.data = mujoco.MjData(self.model)
+        self.action_space = gym.spaces.Box(-unit * space, unit * space, (2,), np.float64)
+
+
+def test_braking_uses_the_whole_box_however_large_its_numbers_are():
+    def braked(unit):
+        env = Slider(unit)
+        plant = sw.MujocoPlant()
+        plant.bind(env)
+        env.data.qvel[:] = [0.1, -5.0]
+        plant.observe()
+        return brake(plant) / unit
+
+    expected = braked(1.0)
+    assert (
+        abs(expected[0]) < 0.99 and expected[1] == 1.0
+    )  # one can be stopped within the hold, the other cannot
+    for unit in (1e-7, 1e7):
+        np.testing.assert_allclose(braked(unit), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("unit", [1e-7, 1.0, 1e7])
+def test_an_action_space_of_another_size_is_refused_in_every_unit(unit):
+    sw.MujocoPlant().bind(Slider(unit))
+    with pytest.raises(UnsupportedEnvError, match="is not the model's control range"):
+        sw.MujocoPlant().bind(Slider(unit, space=0.5))
+
+
+class Forecasting(Predicted):
+    """What is left is linear in the control, in shares of its box."""
+
+    def __init__(self, unit):
+        self.margin, self.holds, self.reach, self.unit_of_control = 0.0, 1, None, unit
+
+    def _now(self, plant):
+        return np.array([1.0])
+
+    def _room(self, plant, forecast):
+        return np.array([[0.3 - forecast @ np.array([1.0, 0.5]) / self.unit_of_control]])
+
+
+@pytest.mark.parametrize("unit", [1e-7, 1e7])
+def test_rows_of_a_forecast_keep_a_share_of_the_box_for_rounding(unit):
+    def row(unit):
+        plant = SimpleNamespace(
+            has_acceleration=False,
+            lower=-unit * np.ones(2),
+            upper=unit * np.ones(2),
+            hold_s=0.1,
+            stamp=0,
+            braking=lambda: np.zeros(2),
+            forecast=lambda control, holds: control,
+        )
+        constraint = Forecasting(unit)
+        constraint._stamp, constraint._response, constraint._reach = None, None, None
+        rows = constraint.rows(plant)
+        return np.append(rows.normals[0] * unit, rows.offsets[0])
+
+    np.testing.assert_allclose(row(unit), row(1.0), rtol=0.0, atol=1e-10)
+    assert row(1.0)[2] < 0.3 - 1e-6
