@@ -64,8 +64,8 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
     **What it does not.** |du/dt| here is that difference of neighbouring commands over the control interval, and no
     derivative: each command is held for its interval, so the signal itself jumps from one to the next. The first
     command of an episode has no neighbour before it. A filter inside may have to break the limit, and then
-    `handover/peak_jerk`, measured on neighbouring executed commands, shows it. Measured jerk, tracking and stopping are
-    the plant's. It does not check that a chunk is safe: `LeaseExpiry` and `CBFActionFilter` belong inside.
+    `handover/peak_jerk`, measured on neighbouring executed commands, shows it. Measured jerk, tracking and stopping
+    are the plant's. It does not check that a chunk is safe: `LeaseExpiry` and `CBFActionFilter` belong inside.
 
     **Chunks of one** (`chunk_size=1, execution_horizon=1`) are for ordinary policies: commands pass as they are,
     held back by `jerk_limit` alone, and only a change of who gives them is blended: call `switch("human")`, give
