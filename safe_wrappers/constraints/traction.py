@@ -68,7 +68,7 @@ class Traction:
     the step before, which it does not where the other wheels' commands have changed: that overshoots on any ground.
     So twice the largest recent error of this prediction (faded by a tenth at every step, less a twentieth of the
     window) is kept free on the side on which it was wrong, up to nine tenths of the window. A first change of the
-    other wheels' commands after a calm drive is not foreseen, and overshoots.
+    other wheels' commands after a calm drive is not foreseen, and overshoots for up to three steps.
 
     A wheel that slides sideways has less left to slip along its heading (a friction circle), so that driving and
     braking leave the grip to the turn; but a turn that is too fast for the ground still slides, and a vehicle that
