@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, Final
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,6 +12,7 @@ from safe_wrappers.control.tracks import Motion, Tracks
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.interventions import COST, COST_SUBSTEP
 
+from .markers import MarkingRenderer
 from .traffic import CAR_SPEED_STD, CAR_TIME_CONSTANT_S, Traffic
 
 try:
@@ -38,6 +40,8 @@ START_GAP: Final = 0.3
 """m: no patrol starts closer to the ball than that."""
 
 _CONTACT: Final = BALL_RADIUS + PATROL_RADIUS
+_HEIGHT: Final = 0.1  # m: half of a patrol's, drawn about the ball's own height
+_COLOUR: Final = (1.0, 0.5, 0.0, 1.0)
 _SHORTEST: Final = 2.0  # m: on a shorter way the ball may leave no place to start at
 _TRIES: Final = 1000
 U_MAZE_PATROLS: Final = (((1, 1), (1, 3)), ((3, 1), (3, 3)))
@@ -50,8 +54,9 @@ class PatrolledPointMazeEnv(PointMazeEnv):  # type: ignore[misc]
     Each patrol (radius 0.15 m) goes up and down between the centres of two cells of one row or column, always on the
     straight line between them. Its speed wanders about 0.5 m/s by the law of the crossing's cars (standard deviation
     0.15 m/s, time constant 2 s; `safe_wrappers.envs.traffic`), drawn without a discretisation error; at an end it
-    turns about, as a ball off a wall. Patrols are no bodies of the model: they pass through the ball, nothing shows
-    them in a rendering, and walls hide them from whoever looks along the floor. The observation has nothing of them.
+    turns about, as a ball off a wall. Patrols are no bodies of the model: they pass through the ball, and walls hide
+    them from whoever looks along the floor. The observation has nothing of them. Frames show them in orange, which
+    the renderer adds (`safe_wrappers.envs.markers`).
 
     **Attributes**: `patrol_positions` and `patrol_velocities`, shape (k, 2), m and m/s; `patrol_tracks` (a
     `control.tracks.Tracks`): the same as tracks that are known exactly now. `agent_position`, `agent_velocity`.
@@ -114,6 +119,16 @@ class PatrolledPointMazeEnv(PointMazeEnv):  # type: ignore[misc]
         ]
         self._tracks = Tracks(motions)
         self._touching = np.zeros(len(ways), dtype=bool)
+        self.point_env.mujoco_renderer = MarkingRenderer(self.point_env.mujoco_renderer, self._markers)
+
+    def _markers(self) -> list[dict[str, Any]]:
+        """The patrols, as a renderer draws them."""
+        size = np.array([PATROL_RADIUS, PATROL_RADIUS, _HEIGHT])
+        kind = mujoco.mjtGeom.mjGEOM_CYLINDER
+        return [
+            {"type": kind, "size": size, "pos": np.array([x, y, 0.0]), "rgba": np.array(_COLOUR)}
+            for x, y in self.patrol_positions
+        ]
 
     def _way(self, given: Sequence[Sequence[int]]) -> tuple[Array, Array]:
         """The ends of a way, m."""

@@ -97,7 +97,8 @@ HANDOVER_SEAM_JUMP: Final = "handover/seam_jump"
 """float64, shape (3,): the largest first, second and third difference of the executed commands over this step's
 seams, in action units: a difference counts if its newest command is one of the blend's or of the three after it."""
 HANDOVER_PEAK_JERK: Final = "handover/peak_jerk"
-"""float64: the largest ``|du/dt|`` of any component of what was executed, seam or not, in action units per second."""
+"""float64: the largest difference of neighbouring executed commands over the control interval, of any component, seam
+or not, in action units per second."""
 HANDOVER_BLEND_TIME: Final = "handover/blend_time"
 """float64: s, how long the longest blend takes that began in this step; 0 where none did."""
 HANDOVER_STARVED: Final = "handover/starved"

@@ -28,6 +28,12 @@ _NOISE_PER_SLIP = 1.5
 """And what a slip that changed within the interval adds to it: at which slip the force acted is not known."""
 _LEAST_LIMIT = 0.1
 """Share of `max_slip` that is always allowed: without any slip there is no force."""
+_SPEED_ERROR_FACTOR = 2.0
+"""Times the ground speed's recent error of prediction: what is kept free for the next one."""
+_SPEED_ERROR_IGNORED = 0.05
+"""Share of the room below the limit that such an error may take without being counted."""
+_SPEED_ERROR_FADE = 0.9
+"""Share of such an error that still counts one control step later."""
 _LEAST_SHARE = 0.3
 """Of the slip that must be along the heading: the force across is not measured."""
 _UNBOUNDED = 1e9
@@ -56,18 +62,25 @@ class Traction:
     limit is half a standard deviation below it. Accelerating and braking, forward and in reverse are the same rows.
 
     What it promises: a wheel whose ground stays the same for a control step ends it within the limit, up to what
-    the force changes while the slip does. At the edge of another ground, and where a wheel is unloaded or hits
-    something, the measured force is one control step old: the slip overshoots for one or two steps, and comes back as
-    fast as the drives can bring it. A wheel that slides sideways has less left to slip along its heading (a friction
-    circle), so that driving and braking leave the grip to the turn; but a turn that is too fast for the ground still
-    slides, and a vehicle that spins about its own axis turns its wheels faster than any drive follows. Hence best
-    effort. Overshoots are the ground's and no unsafe state, so there is no `value`; and from outside the limit the
-    rows ask for no more than the drives can give: the way back is not called infeasible.
+    its force and its speed over ground change otherwise than predicted. At the edge of another ground, and where a
+    wheel is unloaded or hits something, the measured force is one control step old: the slip overshoots for one or
+    two steps, and comes back as fast as the drives can bring it. The speed over ground is predicted to change as in
+    the step before, which it does not where the other wheels' commands have changed: that overshoots on any ground.
+    So twice the largest recent error of this prediction (faded by a tenth at every step, less a twentieth of the
+    window) is kept free on the side on which it was wrong, up to nine tenths of the window. A first change of the
+    other wheels' commands after a calm drive is not foreseen, and overshoots for up to three steps.
+
+    A wheel that slides sideways has less left to slip along its heading (a friction circle), so that driving and
+    braking leave the grip to the turn; but a turn that is too fast for the ground still slides, and a vehicle that
+    spins about its own axis turns its wheels faster than any drive follows. Hence best effort. An overshoot is no
+    unsafe state, so there is no `value`, and `slip/ratio` alone shows it. From outside the limit the rows ask for no
+    more than the drives can give: the way back is not called infeasible.
 
     The estimate believes in curves of one shape, the Magic Formula's. On others it may take the peak for a later one:
     on Burckhardt's snow (peak at 0.06, nearly flat behind it) a wheel is held at 0.11, for 2 % less force.
     What else holds an axle (dry friction, a spring) is measured as force of the ground: the limit keeps, the friction
-    estimate is too high. A state that is set from outside within an episode looks like a force, too, for one step.
+    estimate is too high. A state that is set from outside within an episode looks like a force, too, for one step,
+    and like a ground speed that cannot be predicted, for some twenty.
 
     A wheel in the air has no force: its circumferential speed is held within the limit of its ground speed, so
     that it touches down rolling, and its estimate stays as it is. At a standstill slip is counted against
@@ -140,6 +153,7 @@ class Traction:
         self._rate: Array | None = None
         self._time = math.nan
         self._ground, self._slip, self._across = np.zeros(n), np.zeros(n), np.zeros(n)
+        self._faster, self._slower = np.zeros(n), np.zeros(n)
         self._load, self._most_load = np.zeros(n), np.zeros(n)
         self._traction, self._present = np.zeros(n), np.zeros(n)
 
@@ -167,7 +181,11 @@ class Traction:
         if self._rate is None or not (held or again):
             # Nothing before it, or a clock that was set: no held control led from that state to this one.
             self._ahead, self._traction, self._present = (np.zeros_like(rate) for _ in range(3))
+            self._faster, self._slower = np.zeros_like(rate), np.zeros_like(rate)
         elif held:
+            error = ground - self._ground - self._ahead
+            self._faster = np.maximum(error, _SPEED_ERROR_FADE * self._faster)
+            self._slower = np.maximum(-error, _SPEED_ERROR_FADE * self._slower)
             self._ahead = ground - self._ground
             torque = self._wheels.torque(published)
             self._traction = self._constants.traction(self._response, self._rate, rate, torque)
@@ -179,8 +197,20 @@ class Traction:
         # Along and across share one curve: what slides sideways already is not left for driving and braking.
         limit = np.sqrt(np.maximum(limit**2 - across**2, 0.0))
         self._limit = np.maximum(limit, _LEAST_LIMIT * self.max_slip)
-        window = slip_window(ground + self._ahead, self._limit, self.regularization)
-        self._window = window[0] / self._constants.radius, window[1] / self._constants.radius
+        speed, radius = ground + self._ahead, self._constants.radius
+        low, high = slip_window(speed, self._limit, self.regularization)
+        self._window = low / radius, high / radius
+        # A ground speed above the prediction is slip of a braked wheel, one below it of a driven wheel.
+        self._reserve = (
+            self._kept_free(self._faster, speed - low) / radius,
+            self._kept_free(self._slower, high - speed) / radius,
+        )
+
+    @staticmethod
+    def _kept_free(error: Array, room: Array) -> Array:
+        """Of the room that the limit leaves, for an error of the predicted ground speed, both m/s."""
+        counted = _SPEED_ERROR_FACTOR * np.maximum(error - _SPEED_ERROR_IGNORED * room, 0.0)
+        return np.minimum(counted, (1.0 - _LEAST_LIMIT) * room)
 
     def _learn(
         self,
@@ -240,6 +270,10 @@ class Traction:
             np.minimum(effect * low, effect * high).sum(axis=1),
             np.maximum(effect * low, effect * high).sum(axis=1),
         )
+        # What is kept back for an error of the prediction is kept as far as the drive can: it is no limit by itself.
+        gain = self._response.gain
+        most = np.maximum(most - self._reserve[1] / gain, np.minimum(most, ends[0]))
+        least = np.minimum(least + self._reserve[0] / gain, np.maximum(least, ends[1]))
         # From outside the window, as fast back as the drive can: no more can be asked for.
         outside = np.abs(self._slip) > self._limit
         most = np.where(outside, np.maximum(most, ends[0]), most)
@@ -257,7 +291,8 @@ class Traction:
             return np.zeros_like(plant.lower)
         bias, effect = self._wheels.drive(plant)
         speed = self._ground + self._ahead
-        wanted = np.where(speed > 0.0, self._window[0], self._window[1])
+        low, high = self._window[0] + self._reserve[0], self._window[1] - self._reserve[1]
+        wanted = np.where(speed > 0.0, low, high)
         # No farther than to a standstill: past it the wheel would drive the other way.
         wanted = np.where(speed > 0.0, np.maximum(wanted, 0.0), np.minimum(wanted, 0.0))
         torque = self._torques(wanted, self._present) - bias

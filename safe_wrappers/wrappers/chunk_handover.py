@@ -55,15 +55,17 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
     `blend_time`; with neither given, over the left-over. See `control/seams.py`. A chunk whose step at the seam
     keeps the limit anyhow is executed bit for bit (without a `blend_time`).
 
-    **What it guarantees.** With `jerk_limit`, no two commands that this wrapper sends within an episode differ by
-    more than `jerk_limit` times the control interval in any component, whatever the chunks: where no blend can keep
-    the limit the commands are held back, which is counted (`handover/limited`), and are late. No entry of a chunk
-    that is not finite is executed: such a chunk is refused as a whole, the left-over goes on, then the fallback.
-    Entries outside the env's action box are clipped to it.
+    **What it guarantees.** With `jerk_limit`, the commands u[k] and u[k+1] that this wrapper sends in neighbouring
+    control steps of an episode differ by at most `jerk_limit` times the control interval in every component, whatever
+    the chunks: where no blend can keep the limit the commands are held back, which is counted (`handover/limited`),
+    and are late. No entry of a chunk that is not finite is executed: such a chunk is refused as a whole, the
+    left-over goes on, then the fallback. Entries outside the env's action box are clipped to it.
 
-    **What it does not.** The limit is on commands: a filter inside may have to break it, and then
-    `handover/peak_jerk`, measured on what was executed, shows it. Measured jerk, tracking and stopping are the
-    plant's. It does not check that a chunk is safe: `LeaseExpiry` and `CBFActionFilter` belong inside.
+    **What it does not.** |du/dt| here is that difference of neighbouring commands over the control interval, and no
+    derivative: each command is held for its interval, so the signal itself jumps from one to the next. The first
+    command of an episode has no neighbour before it. A filter inside may have to break the limit, and then
+    `handover/peak_jerk`, measured on neighbouring executed commands, shows it. Measured jerk, tracking and stopping
+    are the plant's. It does not check that a chunk is safe: `LeaseExpiry` and `CBFActionFilter` belong inside.
 
     **Chunks of one** (`chunk_size=1, execution_horizon=1`) are for ordinary policies: commands pass as they are,
     held back by `jerk_limit` alone, and only a change of who gives them is blended: call `switch("human")`, give
@@ -80,8 +82,9 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         inference_delay: d, control steps; or [least, most], drawn anew for every chunk.
         blend: "smoothstep", "quintic", "hermite", or a baseline.
         blend_time: s, the least duration of a blend.
-        jerk_limit: Bound on |du/dt| of every action component, or a list with one for each, action units per second
-            (the jerk, where the command is an acceleration or a torque).
+        jerk_limit: Bound on |du/dt| = |u[k+1] - u[k]| / control interval, of neighbouring commands, for every action
+            component, or a list with one for each, action units per second (the mean jerk over a control interval,
+            where the command is an acceleration or a torque).
         fallback: "brake", "hold", "zero", or a function of the plant; "brake" needs MuJoCo or a plant.
         plant: For the fallback; None reads the env's MuJoCo model.
         hold_s: Control interval, s; None reads the env's `dt`.

@@ -2,6 +2,8 @@
 
 import functools
 import pickle
+import subprocess
+import sys
 import warnings
 
 import gymnasium as gym
@@ -210,6 +212,64 @@ def test_no_patrol_starts_at_the_ball():
         assert info["cost"] == 0.0 and info["collisions"] == 0
         gaps.append(np.linalg.norm(env.patrol_positions - env.agent_position, axis=1).min())
     assert CONTACT + 0.3 <= min(gaps) < CONTACT + 0.4
+
+
+# What is drawn -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", ["rgb_array", "human"])
+def test_every_frame_and_the_window_are_given_the_patrols(monkeypatch, mode):
+    """With a viewer that needs no GL."""
+
+    class Viewer:
+        def __init__(self):
+            self.marked, self.drawn = [], []
+
+        def add_marker(self, **marker):
+            self.marked.append(marker)
+
+        def render(self, **_):
+            self.drawn, self.marked = self.marked, []
+
+    env, viewer = gym.make(PATROLLED_MAZE_ID).unwrapped, Viewer()
+    monkeypatch.setattr(env.point_env.mujoco_renderer, "_get_viewer", lambda render_mode: viewer)
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(np.zeros(2, np.float32))
+        env.point_env.mujoco_renderer.render(mode)
+        drawn = np.array([marker["pos"][:2] for marker in viewer.drawn])
+        np.testing.assert_array_equal(drawn, env.patrol_positions)
+        assert all((marker["size"][:2] == env.patrol_radius).all() for marker in viewer.drawn)
+
+
+def gl_works():
+    code = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 32, 32).render()"
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
+
+
+def test_frames_are_point_mazes_but_for_the_patrols():
+    if not gl_works():
+        pytest.skip("no working GL here (libosmesa6 and MUJOCO_GL=osmesa, or MUJOCO_GL=egl, are enough)")
+    options = {"render_mode": "rgb_array", "width": 160, "height": 160}
+    ours, theirs = gym.make(PATROLLED_MAZE_ID, **options), gym.make("PointMaze_UMaze-v3", **options)
+    env, centres = ours.unwrapped, []
+    for each in (ours, theirs):
+        each.reset(seed=0)
+    for along in (0.3, 1.7):
+        # The upper corridor's patrol in the frame, the lower one's behind it at the same x.
+        env._gone[:] = along
+        frame, bare = ours.render().astype(int), theirs.render().astype(int)
+        changed = (frame != bare).any(axis=-1)
+        red, green, blue = np.moveaxis(frame[changed], -1, 0)
+        assert 30 < changed.sum() < 0.02 * changed.size
+        assert np.mean((red > green + 20) & (green > blue + 20)) > 0.8  # orange
+        centres.append(np.argwhere(changed)[:, 1].mean())
+        state = (ours.step(np.ones(2, np.float32)), theirs.step(np.ones(2, np.float32)))
+        np.testing.assert_array_equal(state[0][0]["observation"], state[1][0]["observation"])
+    # 1.4 m of the 5 m of maze, which are more than half of the picture's width.
+    assert 20 < centres[1] - centres[0] < 40
+    for each in (ours, theirs):
+        each.close()
 
 
 # Ways ----------------------------------------------------------------------------------------------------------
