@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from safe_wrappers.control.predicted_positions import largest_acceleration, predicted_position_rows
@@ -12,12 +12,16 @@ from safe_wrappers.errors import ConfigurationError
 
 
 def top(speed, acceleration, horizon):
-    """How far a parabola comes, its top looked for on a fine grid and refined by nothing: an oracle."""
-    t = np.linspace(0.0, horizon, 4001)
+    """How far a parabola comes, its top looked for on a fine grid and refined by nothing: an oracle.
+
+    The sharpest one here reaches 1 mm at 5 m/s; over 0.5 s the grid misses 0.1 % of it.
+    """
+    t = np.linspace(0.0, horizon, 20_001)
     return float((speed * t + 0.5 * acceleration * t * t).max())
 
 
 @given(st.floats(1e-3, 3.0), st.floats(-5.0, 5.0), st.floats(0.005, 0.5))
+@example(0.0010701, 5.0, 0.5)  # a top that is 0.4 ms wide
 def test_the_largest_acceleration_comes_up_to_the_limit_and_no_farther(distance, speed, horizon):
     a = float(largest_acceleration(distance, speed, horizon))
     scale = distance + abs(speed) * horizon
