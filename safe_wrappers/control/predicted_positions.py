@@ -34,7 +34,8 @@ def largest_acceleration(distance: ArrayLike, speed: ArrayLike, horizon_s: float
     at_end = 2.0 * (d - horizon_s * v) / horizon_s**2
     # A parabola whose top is before the end: the top may reach the limit, no more.
     top_is_inside = (d > 0.0) & (2.0 * d < horizon_s * v)
-    at_top = -(v * v) / (2.0 * np.where(d > 0.0, d, 1.0))
+    with np.errstate(over="ignore"):  # a hair from the limit: the strongest that is still a number
+        at_top = np.maximum(-(v * v) / (2.0 * np.where(d > 0.0, d, 1.0)), -np.finfo(np.float64).max)
     return np.asarray(np.where(top_is_inside, at_top, at_end))
 
 

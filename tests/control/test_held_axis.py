@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from safe_wrappers.control.held_axis import HeldAxis
@@ -83,13 +83,13 @@ def test_after_one_hold_of_braking_the_rest_point_is_the_same(axis, x, v):
 
 
 @settings(max_examples=200, deadline=None)
-@given(axes(), PLACES, SPEEDS, st.floats(-2.0, 2.0))
-def test_the_control_to_rest_at_a_target_does(axis, x, v, way):
+@given(axes(), PLACES, SPEEDS, st.floats(0.0, 1.0))
+def test_the_control_to_rest_at_a_target_does(axis, x, v, share):
     v = axis.clipped(v)
-    u = axis.control_to_rest_at(x, v, x + way)
-    assume(axis.low <= u <= axis.high)
-    end, speed = axis.step(x, v, u)
-    assert axis.rest(end, speed) == pytest.approx(x + way, abs=1e-9)
+    target = axis.rest(*axis.step(x, v, axis.low + share * (axis.high - axis.low)))
+    u = axis.control_to_rest_at(x, v, target)
+    assert axis.low - 1e-6 <= u <= axis.high + 1e-6
+    assert axis.rest(*axis.step(x, v, u)) == pytest.approx(target, abs=1e-9)
 
 
 @settings(max_examples=200, deadline=None)

@@ -66,14 +66,16 @@ def used(lease, speed, braking, delays, localisation, margin, acceleration, top=
     None,
 )
 @example(1e-300, 0.0, 1.0, 0.0, 0.0, 0.0, 1e-200, None)
+@example(2.0, 0.0, 1.0, 0.0, 1.999999999999, 0.0, 1e-9, None)  # room of 1e-12 m, known to 1e-14 m
 def test_the_lease_is_the_longest_that_keeps_the_inequality(d, v, b, delays, loc, gap, a, top):
     lease = float(longest_lease(d, v, b, delays, loc, gap, a, np.inf if top is None else top))
     assume(np.isfinite(lease) and lease > 0.0)
     rest = (v, b, delays, loc, gap, a, top)
     assert used(lease, *rest) <= Fraction(d)  # exactly: not one rounding too long
     assume(lease < 1e299)  # a machine that creeps: the longest lease that is still a number
-    longer = lease + 1e-9 * (lease + delays) + 1e-9 * d / max(abs(v), 1e-3)
-    assert used(longer, *rest) > Fraction(d)
+    # Longer by a rounding of the times, it ends no more than one of the distances before the wall.
+    longer, rounding = lease + 1e-9 * (lease + delays), 1e-14 * (d + loc + gap + v * v / (2.0 * b))
+    assert used(longer, *rest) > Fraction(d) - Fraction(rounding)
 
 
 def test_the_appendix_formula():

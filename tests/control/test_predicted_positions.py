@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from safe_wrappers.control.predicted_positions import largest_acceleration, predicted_position_rows
@@ -12,17 +12,29 @@ from safe_wrappers.errors import ConfigurationError
 
 
 def top(speed, acceleration, horizon):
-    """How far a parabola comes, its top looked for on a fine grid and refined by nothing: an oracle."""
-    t = np.linspace(0.0, horizon, 4001)
+    """How far a parabola comes, its top looked for on a fine grid and refined by nothing: an oracle.
+
+    The sharpest one here reaches 1 mm at 5 m/s; over 0.5 s the grid misses 0.1 % of it.
+    """
+    t = np.linspace(0.0, horizon, 20_001)
     return float((speed * t + 0.5 * acceleration * t * t).max())
 
 
 @given(st.floats(1e-3, 3.0), st.floats(-5.0, 5.0), st.floats(0.005, 0.5))
+@example(0.0010701, 5.0, 0.5)  # a top that is 0.4 ms wide
 def test_the_largest_acceleration_comes_up_to_the_limit_and_no_farther(distance, speed, horizon):
     a = float(largest_acceleration(distance, speed, horizon))
     scale = distance + abs(speed) * horizon
     assert top(speed, a, horizon) == pytest.approx(distance, abs=1e-4 * scale)
     assert top(speed, a + 0.02 * (abs(a) + 1.0), horizon) > distance
+
+
+@given(st.floats(0.0, 1e-3, exclude_min=True), st.floats(1.0, 5.0))
+@example(5e-324, 1.0)
+def test_a_hair_from_the_limit_it_is_strong_and_finite(distance, speed):
+    a = float(largest_acceleration(distance, speed, 0.1))
+    assert a < 0.0 and np.isfinite(a)
+    assert speed**2 / -a / 2.0 == pytest.approx(distance, rel=1e-12, abs=1e-300)
 
 
 def test_the_end_alone_would_let_it_through():
