@@ -1,10 +1,15 @@
 """What MuJoCo 2.3.3 did where two boxes touch, put back into the MuJoCo of today.
 
-It reported half of the true penetration wherever the touched face belongs to the second box.
+It reported half of the true penetration wherever the touched face belongs to the second box. So did all versions
+up to 3.3; from 3.4 on MuJoCo reports all of it, and from 3.12 on it finds the contact points in another way.
 """
 
 import mujoco
 import numpy as np
+
+HALVES_ITSELF = mujoco.mj_version() < 340
+OTHER_CORNERS = mujoco.mj_version() >= 3_012_000
+"""Whether two boxes may touch in other points than in 2.3.3 (one corner instead of two, say), at the same depth."""
 
 
 def step_as_2_3_3(model, data):
@@ -28,7 +33,9 @@ def forward_as_2_3_3(model, data):
 
 
 def halve_penetrations(model, data):
-    """Halve the depth of box-box contacts on a face of the second box; whether there were any."""
+    """Halve the depth of box-box contacts on a face of the second box; whether there were any to halve."""
+    if HALVES_ITSELF:
+        return False
     pairs = data.contact.geom
     boxes = (model.geom_type[pairs] == mujoco.mjtGeom.mjGEOM_BOX).all(axis=1)
     normals = data.contact.frame[:, :3]

@@ -25,6 +25,11 @@ What is left, and why:
   and half of the penetration of two boxes (bumper on vase, vase on vase; see `mujoco_2_3_3`). With both put
   back these steps agree as all others do. We keep today's contacts: a pushed vase moves differently, the car hardly
   (a vase has 0.03 % of its mass), the cost not at all.
+* MuJoCo 3.3 still halves penetrations itself; level 2, episode 2, steps 99, 165 and 172 are up to 2e-7 m off there,
+  not by its solver's tolerance (tried by hand), all others agree.
+* From MuJoCo 3.12 on another algorithm finds where two boxes touch. In 84 of the steps that touch a vase it reports
+  other points than 2.3.3, which moves vases by up to 16 mm a step, and the car's accelerometer by 10 m/s^2 in one of
+  them. The cost is the same in every step.
 * Two vases against each other, level 2, episode 2, steps 218 to 236: their edges and faces meet nearly parallel,
   and the rule by which 2.3.3 halved a penetration is not ours to guess there.
 * A singular start, level 2, episode 1, step 0: all three wheels stand on the floor at a distance of exactly 0.
@@ -36,7 +41,7 @@ What is left, and why:
 import mujoco
 import numpy as np
 import pytest
-from mujoco_2_3_3 import forward_as_2_3_3, step_as_2_3_3
+from mujoco_2_3_3 import HALVES_ITSELF, OTHER_CORNERS, forward_as_2_3_3, step_as_2_3_3
 from recordings import EPISODES, Recording, replay
 
 AGREE = {"position": 5e-9, "velocity": 5e-7, "sensors": 2e-9, "lidar": 5e-9, "reward": 1e-12, "cost": 0.0}
@@ -45,10 +50,24 @@ STOPPED = {"position": 1e-5, "velocity": 2e-3, "sensors": 1e-5, "lidar": 3e-6, "
 """Bounds where 2.3.3's solver stopped early."""
 TOUCHED = {"position": 3e-2, "velocity": 5.0, "sensors": 0.2, "lidar": 6e-2, "reward": 6e-5, "cost": 0.0}
 """Bounds on what other contacts change in one step: for a vase, not for the car."""
+CORNERS = {"position": 5e-2, "velocity": 6.0, "sensors": 30.0, "lidar": 4e-2, "reward": 4e-4, "cost": 0.0}
+"""Bounds on what other contact points of two boxes change: some three times the worst measured with 4.0."""
 SINGULAR = (2, 1, 0)
 """Level, episode and step that hangs on the last bit of the start."""
 STOPPED_EARLY = {(1, 2): {117, 200, 210}, (2, 2): {63, 76, 168, 183, 185, 189, 190, 237}}
 NEARLY_PARALLEL = {(2, 2): set(range(218, 237))}
+OTHER = {
+    (1, 2): {97, 98, 100, 101},
+    (2, 2): {
+        99, 101, 114, 115, 120, 123, 139, 142, 145, 147, 148, 149, 150, 151, 153, 155, 157, 158, 159, 160,
+        161, 162, 164, 165, 166, 167, 168, 169, 171, 172, 173, 174, 175, 176, 177, 179, 180, 181, 182, 183,
+        184, 185, 187, 189, 190, 191, 192, 193, 194, 198, 199, 200, 201, 202, 203, 204, 205, 212, 213, 214,
+        215, 216, 217, 246, 247, 248, 249, 250, 252, 253, 254, 260, 261, 266, 267, 268, 269, 274, 293, 294,
+    },
+}  # fmt: skip
+"""Steps in which two boxes touch elsewhere, from MuJoCo 3.12 on."""
+if not OTHER_CORNERS:
+    OTHER.clear()
 
 
 def worst(errors):
@@ -82,26 +101,33 @@ def test_every_recorded_step(make_car, monkeypatch, level, episode):
     assert len(free) == {(1, 1): 300, (1, 2): 220, (2, 1): 299, (2, 2): 100}[level, episode]
     assert_within(free, AGREE)
     assert_within([e for _, e in regular if not e.touched], STOPPED)
-    assert_within([e for _, e in regular], TOUCHED)
+    other = OTHER.get((level, episode), set())
+    assert_within([e for t, e in regular if t not in other], TOUCHED)
+    assert_within([errors[t] for t in other], CORNERS)
 
 
 @pytest.mark.parametrize("level", [1, 2])
 def test_other_contacts_explain_the_steps_that_touch_a_vase(make_car, monkeypatch, level):
     """With 2.3.3's contacts put back, these steps agree as well as all others."""
     env = make_car(level)
-    disable = mujoco.mjtDisableBit
-    env.model.opt.disableflags |= int(disable.mjDSBL_NATIVECCD) | int(disable.mjDSBL_MULTICCD)
+    for name in ("mjDSBL_NATIVECCD", "mjDSBL_MULTICCD"):  # the latter is a flag to enable, up to 3.3
+        if hasattr(mujoco.mjtDisableBit, name):
+            env.model.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, name))
     monkeypatch.setattr(mujoco, "mj_forward", forward_as_2_3_3)
     recording = Recording.load(level, 2, "car")
     errors = replay(env, recording, monkeypatch, vase_touched, step_as_2_3_3)
     touched = {t: e for t, e in enumerate(errors) if e.touched}
     assert len(touched) > 70
     early, parallel = STOPPED_EARLY[level, 2], NEARLY_PARALLEL.get((level, 2), set())
-    assert_within([e for t, e in touched.items() if t not in early | parallel], AGREE)
-    assert_within([e for t, e in touched.items() if t not in parallel], STOPPED)
+    other = OTHER.get((level, 2), set())
+    if HALVES_ITSELF and level == 2:
+        early = early | {99, 165, 172}
+    assert_within([e for t, e in touched.items() if t not in early | parallel | other], AGREE)
+    assert_within([e for t, e in touched.items() if t not in parallel | other], STOPPED)
+    assert_within([touched[t] for t in other], CORNERS)
     for t in parallel & set(touched):
         assert touched[t].velocity < 0.5
-        assert touched[t].sensors < 1e-4  # the car's own
+        assert touched[t].sensors < (4e-3 if OTHER_CORNERS else 1e-4)  # the car's own
 
 
 def test_car_alone_agrees_to_rounding(make_car):

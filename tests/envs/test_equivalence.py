@@ -17,9 +17,11 @@ What is left, and why:
 * Nose touches no vase: vases slower than 1e-7 m/s are asleep here, and creep on there. With sleeping off, the
   velocities agree to 5e-11.
 * Nose (a box) touches a vase (a box): MuJoCo 2.3.3 reported half of the true penetration wherever the touched
-  face belongs to the second box, the vase; later versions report all of it. Putting the half back makes these
+  face belongs to the second box, the vase; versions from 3.4 on report all of it. Putting the half back makes these
   steps agree to 1e-11. We keep the right depth: a pushed vase moves differently, the robot hardly (a vase has
   0.15 % of its mass), the cost not at all.
+* From MuJoCo 3.12 on another algorithm finds where two boxes touch. In 11 of the 54 steps it reports other points:
+  in step 222, say, one corner of the nose on the vase instead of two. The other 43 agree as before.
 * Level 2, episode 2, step 206: the nose meets a vase that stands exactly upright, and 2.3.3 reports a third
   contact at the vase's foot, 5 cm below the nose.
 * Level 2, episode 2, step 252: 2.3.3's solver stopped early in one substep. With a tolerance of 1e-12 instead
@@ -31,13 +33,17 @@ What is left, and why:
 import mujoco
 import numpy as np
 import pytest
-from mujoco_2_3_3 import forward_as_2_3_3, step_as_2_3_3
+from mujoco_2_3_3 import OTHER_CORNERS, forward_as_2_3_3, step_as_2_3_3
 from recordings import EPISODES, Recording, replay
 
 FREE = {"position": 5e-9, "velocity": 5e-7, "sensors": 1e-7, "lidar": 5e-9, "reward": 1e-12, "cost": 0.0}
 """Equivalence: some three times the worst measured."""
 TOUCHING = {"position": 4e-3, "velocity": 2.0, "sensors": 20.0, "lidar": 6e-3, "reward": 4e-5, "cost": 0.0}
 """Bounds on what another penetration depth changes in one step: for a vase, not for the robot."""
+CORNERS = TOUCHING | {"lidar": 2.5e-2}
+"""Bounds on what other contact points change."""
+OTHER = {(2, 2): {207, 208, 215, 216, 217, 218, 219, 221, 222, 226, 227}} if OTHER_CORNERS else {}
+"""Level and episode, and the steps in which this MuJoCo lets two boxes touch elsewhere."""
 SINGULAR = {(2, 2, 206): "2.3.3 adds a contact", (2, 2, 252): "2.3.3's solver stopped early"}
 """Level, episode and step of the two that differ for reasons of their own."""
 
@@ -75,7 +81,9 @@ def test_every_recorded_step(make_env, monkeypatch, level, episode):
     free, touching = split(level, episode, errors)
     assert len(free) >= (300 if level == 1 else 270)
     assert_within(free, FREE)
-    assert_within(errors, TOUCHING)
+    other = OTHER.get((level, episode), set())
+    assert_within([e for t, e in enumerate(errors) if t not in other], TOUCHING)
+    assert_within([errors[t] for t in other], CORNERS)
     assert len(touching) == (0 if level == 1 else len(errors) - len(free) - (2 if episode == 2 else 0))
 
 
@@ -84,9 +92,9 @@ def test_penetration_depth_explains_all_contact_steps(make_env, monkeypatch, epi
     """With 2.3.3's box-box penetration put back, contact steps agree as well as all others."""
     monkeypatch.setattr(mujoco, "mj_forward", forward_as_2_3_3)
     errors = replay(make_env(2), Recording.load(2, episode), monkeypatch, nose_on_vase, step_as_2_3_3)
-    free, touching = split(2, episode, errors)
-    assert len(touching) >= 25
-    assert_within(free + touching, FREE)
+    assert len(split(2, episode, errors)[1]) >= 25
+    left_out = OTHER.get((2, episode), set()) | {t for level, e, t in SINGULAR if (level, e) == (2, episode)}
+    assert_within([e for t, e in enumerate(errors) if t not in left_out], FREE)
 
 
 def test_robot_alone_agrees_to_rounding(make_env):
