@@ -68,14 +68,9 @@ def _by_hand(env: gym.Env[Any, Any]) -> str:
     """The lines that protect an env without a recipe, tried on it, or why there are none."""
     try:
         check_actions(env)
-        if isinstance(getattr(env.unwrapped, "model", None), mujoco.MjModel):
-            CBFActionFilter(env, [JointSpeedLimit(limit=4.0)])
-            return (
-                "By hand it is three lines:\n"
-                "    import safe_wrappers as sw\n"
-                "    limit = sw.JointSpeedLimit(limit=4.0)  # rad/s, m/s; or another constraint\n"
-                "    env = sw.CBFActionFilter(env, [limit])"
-            )
+        model = getattr(env.unwrapped, "model", None)
+        if isinstance(model, mujoco.MjModel):
+            return _limiting_joints(env, model)
     except ConfigurationError as error:
         return f"A filter by hand is refused, too: {error}"
     named = env.has_wrapper_attr("dt")
@@ -85,6 +80,26 @@ def _by_hand(env: gym.Env[Any, Any]) -> str:
         "    import safe_wrappers as sw\n"
         f"    plant = sw.AnalyticPlant(f, g, state{'' if named else ', hold_s=hold_s'})\n"
         "    env = sw.CBFActionFilter(env, [sw.Barrier(h)], plant=plant)"
+    )
+
+
+def _limiting_joints(env: gym.Env[Any, Any], model: mujoco.MjModel) -> str:
+    """A limit on the joints that are driven, or else on all that have a name."""
+    joints = ""
+    try:
+        CBFActionFilter(env, [JointSpeedLimit(limit=4.0)])
+    except ConfigurationError:
+        scalar = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+        names = [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] in scalar]
+        if not names or "" in names:
+            raise
+        CBFActionFilter(env, [JointSpeedLimit(limit=4.0, joints=names)])
+        joints = f", joints={names}"
+    return (
+        "By hand it is three lines:\n"
+        "    import safe_wrappers as sw\n"
+        f"    limit = sw.JointSpeedLimit(limit=4.0{joints})  # rad/s, m/s; or another constraint\n"
+        "    env = sw.CBFActionFilter(env, [limit])"
     )
 
 

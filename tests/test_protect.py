@@ -4,6 +4,7 @@ import contextlib
 import copy
 import textwrap
 import warnings
+from unittest import mock
 
 import gymnasium as gym
 import mujoco
@@ -247,6 +248,18 @@ def test_an_unknown_env_is_refused_with_lines_that_work(lab):
     scope["env"].step(scope["env"].action_space.sample())
 
 
+def test_an_unknown_machine_that_is_pushed_at_a_site_gets_lines_that_name_its_joints():
+    with mock.patch.dict(gym.registry):
+        gym.register("lab/Pushed-v0", entry_point=lambda: gym.make("SafePointGoal0-v0").unwrapped)
+        env = gym.make("lab/Pushed-v0")
+        lines = textwrap.dedent("\n".join(refusal(env).splitlines()[1:]))
+    scope = {"env": env}
+    exec(lines, scope)
+    assert scope["limit"].joints == ["x", "y", "z"]
+    scope["env"].reset(seed=0)
+    scope["env"].step(scope["env"].action_space.sample())
+
+
 def test_an_env_without_a_spec_is_refused_and_not_a_crash():
     class Bare(gym.Env):
         action_space = gym.spaces.Box(-1, 1, (1,))
@@ -284,6 +297,7 @@ MACHINES = {
 }
 
 
+@pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning")  # its motor is too weak for this h
 @pytest.mark.parametrize("env_id", MACHINES)
 def test_an_env_without_mujoco_gets_lines_for_it(env_id):
     env = gym.make(env_id)
