@@ -321,7 +321,7 @@ def test_it_is_what_a_fetch_env_gets_when_no_plant_is_named(env_id):
 def test_other_envs_and_other_plants_are_refused():
     with pytest.raises(UnsupportedEnvError, match=r"not moved by displacements.*take MujocoPlant"):
         bound(gym.make("Reacher-v5"))
-    with pytest.raises(UnsupportedEnvError, match=r"takes DisplacementPlant\(\)"):
+    with pytest.raises(UnsupportedEnvError, match=r"take DisplacementPlant\(\)"):
         sw.MujocoPlant().bind(gym.make("FetchReach-v4"))
 
 

@@ -95,7 +95,7 @@ def test_trained_killed_continued_and_evaluated(fake_experiment, monkeypatch, al
     assert json.loads((folder / "finished.json").read_text())["timesteps"] == 192
     rows = read_rows(folder / "episodes.csv")
     assert len(rows) == 64 // 20 + 128 // 20
-    assert (sum(row["intervention_rate"] for row in rows) > 0) == (algorithm not in DISCRETE)
+    assert (sum(row.get("intervention_rate", 0.0) for row in rows) > 0) == (algorithm not in DISCRETE)
     evaluate_run(arm, 0, folder, EvaluationConfig(2, 7), experiment.evaluation_filter, Reports().progress)
     for condition in ("filter_off", *(("filter_on",) if algorithm not in DISCRETE else ())):
         assert len(read_rows(evaluation_folder(folder) / f"{condition}.csv")) == 2

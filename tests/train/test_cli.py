@@ -261,12 +261,14 @@ def test_arms_that_cannot_be_made_are_refused_before_anything_starts(tmp_path, c
 def test_another_configs_folder_is_refused_before_anything_starts(tmp_path, capsys):
     (tmp_path / "fake" / "filtered" / "seed_1").mkdir(parents=True)
     (tmp_path / "fake" / "filtered" / "seed_1" / "run.json").write_text(
-        '{"arm": "filtered", "seed": 1, "config": {"total_steps": 9}}'
+        '{"arm": "filtered", "seed": 1, "config": {"total_steps": 9000}}'
     )
     assert main(["train", str(FAKE), f"output={tmp_path}"]) == 1
     captured = capsys.readouterr()
     assert "belongs to another config" in captured.err
-    assert "total_steps: 9 in the folder, 512 in the config" in captured.err
+    assert (
+        "total_steps: 9000 in the folder, 512 in the config (it can be raised, not lowered)" in captured.err
+    )
     assert "started" not in captured.out
 
 
