@@ -49,6 +49,7 @@ def test_every_timed_env_is_a_case():
     assert set(env_step.ACTIVE) <= set(PROTECTED)
 
 
+@pytest.mark.slow
 def test_trainings_in_turn():
     pytest.importorskip("stable_baselines3")
     from benchmarks import training_time

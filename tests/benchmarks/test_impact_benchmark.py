@@ -50,6 +50,7 @@ def test_of_an_arm_the_formula_is_nearly_an_upper_bound():
     assert found["all"]["lowest"] < -0.3 and found["all"]["highest"] < 0.03
 
 
+@pytest.mark.slow
 def test_with_the_constraint_nothing_exceeds_the_limit_and_without_most_does():
     off, on = (benchmark.run(benchmark.Job(limited, 0, 20)) for limited in (False, True))
     assert off["exceeded"] >= 8 and off["worst"]["share"] > 3.0
@@ -60,6 +61,7 @@ def test_with_the_constraint_nothing_exceeds_the_limit_and_without_most_does():
     assert "| on | 20 |" in text and "| 0 (0.00%) |" in text and "| off | 20 |" in text
 
 
+@pytest.mark.slow
 def test_a_constraint_that_believes_in_a_softer_wall_is_seen(monkeypatch):
     honest = sw.ImpactSpeedLimit
 

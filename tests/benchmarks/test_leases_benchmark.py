@@ -139,6 +139,7 @@ def test_everything_in_the_formula_counts(forgotten, monkeypatch):
     assert hits >= 3
 
 
+@pytest.mark.slow
 def test_with_leases_there_are_no_contacts_and_without_there_are():
     rows = {mode: benchmark.run(benchmark.Job(mode, 0, 25)) for mode in ("alive", "no lease", "lease")}
     assert rows["alive"]["contacts"] == rows["lease"]["contacts"] == 0
@@ -164,6 +165,7 @@ def counted(rows, judge, group):
     return sum(r["refused"] for r in part), sum(r["chunks"] for r in part)
 
 
+@pytest.mark.slow
 def test_no_clean_chunk_is_refused_and_every_unreachable_one_is(judged):
     assert counted(judged, "admits", "clean") == (0, 300)
     assert counted(judged, "LeaseExpiry", "clean") == (0, 300)

@@ -161,6 +161,7 @@ def test_every_filter_keeps_clear_of_what_it_is_said_to():
     }
 
 
+@pytest.mark.slow
 def test_the_command_keeps_the_other_parts_rows(monkeypatch, capsys, tmp_path):
     def command(*words):
         monkeypatch.setattr(sys, "argv", ["occlusion", "--workers", "1", "--results", str(tmp_path), *words])

@@ -171,6 +171,7 @@ def test_reachers_bounds_come_from_the_action_and_the_time_between_seams():
     assert bounds.blend_time == pytest.approx(0.1)
 
 
+@pytest.mark.slow
 def test_a_tiny_run_trains_once_and_writes_every_row(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(seams, "TASKS", TINY)
     monkeypatch.setattr(seams, "DELAYS", (0, 5))
@@ -213,6 +214,7 @@ def test_a_tiny_run_trains_once_and_writes_every_row(tmp_path, monkeypatch, caps
     assert sorted(again, key=str) == sorted(rows, key=str) and again != rows
 
 
+@pytest.mark.slow
 def test_a_bounded_policy_is_trained_through_its_bounds(monkeypatch):
     given = []
     real = sw.ChunkHandover

@@ -47,6 +47,7 @@ def test_a_late_plain_channel_makes_what_its_ledger_says_and_waves_make_nothing(
     assert wave == run(Job("wave", "outages", 0.1, "careful", False, 0, steps=2500))
 
 
+@pytest.mark.slow
 def test_who_looks_away_breaches_unless_authority_is_revoked():
     off, on = (run(Job("wave", "rough", 0.05, "looks away", revoked, 0)) for revoked in (False, True))
     assert off["breached_steps"] > 0 and off["least_m"] < 0.0 and off["revoked_steps"] == 0

@@ -267,6 +267,7 @@ def ramps_energy(rates, durations, hold, k, j, m):
     return np.array(left)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hold", [0.0, 0.01])
 @pytest.mark.parametrize("weights", [1.0, [3.0, 1.0]])
 def test_ramps_at_the_limit_stay_below_the_energy_and_come_near_it(hold, weights):

@@ -28,7 +28,13 @@ def test_every_picture_is_shown_and_every_shown_picture_exists():
     assert set(DRAW["names"]()) == SHOWN
 
 
-@pytest.mark.parametrize("name", DRAW["names"]())
+LONG = {"whole_body_filter", "teleop_channel", "contact_feasibility"}
+"""They drive a robot for as long as 20 seconds."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in DRAW["names"]()]
+)
 def test_a_picture_takes_its_colours_from_the_page_and_nothing_from_elsewhere(name):
     picture = draw(name)
     colours = set(re.findall(r"(?:fill|stroke): ([^;\"]+)", picture))

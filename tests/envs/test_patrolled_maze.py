@@ -120,6 +120,7 @@ def test_it_is_a_way_without_turns_folded_at_the_ends(gone, speed):
         np.testing.assert_allclose(env.patrol_velocities[:, 0], (moved - expected) / 1e-6, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_speeds_have_the_laws_mean_spread_and_memory():
     """Speeds of 600 patrols, at the start and a second later: every z-score within 4.5."""
     env, first, later = shared(), [], []
@@ -144,6 +145,7 @@ def test_the_seed_alone_decides_the_way_whatever_the_ball_does():
     assert np.array_equal(first, pushed) and not np.array_equal(first, other)
 
 
+@pytest.mark.slow
 def test_the_trackers_model_covers_the_turns():
     """Unseen from an exact fix on: how often the truth is beyond k sigma, over 200 starts anywhere on the way."""
     env, beyond = shared(), np.zeros((3, 3))

@@ -82,6 +82,7 @@ def stopped_step(err):
     return int(second.rpartition(" ")[2].replace(",", ""))
 
 
+@pytest.mark.slow
 def test_a_stopped_or_killed_comparison_leaves_no_process_behind_and_goes_on(tmp_path, start):
     overrides = [f"output={tmp_path}", "total_steps=24000", "seeds=[0]", FILTERED]
     folder = tmp_path / "fake" / "filtered" / "seed_0"
@@ -157,6 +158,7 @@ def test_a_second_interrupt_stops_at_once(tmp_path, start):
     assert not _held(folder / ".lock")
 
 
+@pytest.mark.slow
 def test_a_reader_that_leaves_stops_nothing(tmp_path):
     command = shlex.join([*COMMAND, "train", str(FAKE), f"output={tmp_path}", "seeds=[0]", FILTERED])
     done = subprocess.run(
@@ -202,6 +204,7 @@ def test_a_factory_is_found_beside_the_config_and_sys_path_is_left_as_it_was(tmp
     assert str(folder) in err and str(Path.cwd()) in err
 
 
+@pytest.mark.slow
 def test_a_killed_worker_is_reported_and_the_others_go_on(tmp_path, start):
     overrides = (f"output={tmp_path}", "total_steps=8000", "checkpoint_every=1000", "seeds=[0]", "workers=2")
     process = start("train", *overrides)
@@ -228,6 +231,7 @@ def test_errors_are_lines_and_not_tracebacks(tmp_path, capsys):
     assert "invalid choice: 'trian'" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_train_evaluate_and_report_one_after_the_other(tmp_path, capsys):
     arguments = [str(FAKE), f"output={tmp_path}", "seeds=[0]", "evaluation.episodes=1", FILTERED]
     assert main(["evaluate", *arguments]) == 1

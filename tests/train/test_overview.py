@@ -82,6 +82,7 @@ def configs(entries, tmp_path):
     return made
 
 
+@pytest.mark.slow
 def test_the_command_with_several_configs(configs, tmp_path, capsys):
     page = tmp_path / "pages" / "all.html"
     command = ["report", configs[0], "--output", str(page), configs[1], f"output={tmp_path}"]

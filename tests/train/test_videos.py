@@ -140,6 +140,7 @@ def test_nothing_is_filmed_before_the_evaluation(fake_experiment, inline):
     assert inline == []
 
 
+@pytest.mark.slow
 def test_in_processes_of_its_own_with_the_variables_of_the_rendering(evaluated, monkeypatch):
     experiment = evaluated("arms={unfiltered: {filter: none}}")
     monkeypatch.setattr(videos, "find_rendering", lambda env: Rendering({"FILMED_BLUE": "1"}))

@@ -119,6 +119,7 @@ def test_the_goal_is_still_reached():
     assert kept["reward"] > 0.35 * free["reward"], (kept["reward"], free["reward"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mass", [0.8, 1.2])
 @pytest.mark.parametrize("damping", [0.8, 1.2])
 def test_a_wrong_plant_inside_the_declared_uncertainty(mass, damping):

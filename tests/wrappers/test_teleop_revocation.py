@@ -74,6 +74,7 @@ def test_a_brake_that_is_weaker_than_declared_is_found_out():
     assert drive(env, never_stops, 400, tool=(0.0, 0.0))[0] < 0.5 * MARGIN
 
 
+@pytest.mark.slow
 def test_an_operator_who_looks_away_is_stopped_and_one_who_looks_is_not_disturbed():
     for stops in (True, False):
         env = channel(0.05, 0.05, coding="wave", impedance=40.0, ceiling=ceiling())
