@@ -126,7 +126,7 @@ def test_it_imports_without_torch_and_stable_baselines(python, tmp_path):
 import sys
 import safe_wrappers as sw
 assert "site-packages" in sw.__file__, sw.__file__
-for name in ("torch", "stable_baselines3", "tensorboard", "matplotlib", "envs", "train"):
+for name in ("torch", "stable_baselines3", "tensorboard", "matplotlib", "scipy.linalg", "envs", "train"):
     assert name not in sys.modules, name
 missing = [n for n in sw.__all__ if not hasattr(sw, n)]
 assert not missing, missing

@@ -11,7 +11,6 @@ import clarabel
 import daqp
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 Array = NDArray[np.float64]
 
@@ -132,6 +131,8 @@ def by_daqp(program: Program) -> Candidate:
 
 def by_clarabel(program: Program) -> Candidate:
     """Interior-point solution, with cones or without."""
+    from scipy import sparse  # here: SciPy takes a while to import
+
     p, scale = program.scaled()
     n = p.linear.size
     at_most, at_least = np.flatnonzero(np.isfinite(p.upper)), np.flatnonzero(np.isfinite(p.lower))

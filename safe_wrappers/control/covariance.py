@@ -20,7 +20,6 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import solve_continuous_are
 
 from safe_wrappers.control.block_exponentials import Discrete, integral, norm_or_one, riccati_flow, van_loan
 from safe_wrappers.control.finite import finite_arrays
@@ -290,6 +289,8 @@ def steady_state(A: ArrayLike, Q: ArrayLike, C: ArrayLike, R: ArrayLike) -> Arra
         "no noise of Q reaches it, so the filter stops listening to measurements",
     )
     try:
+        from scipy.linalg import solve_continuous_are  # here: SciPy takes a while to import
+
         steady = solve_continuous_are(a.T, c.T, q, r)
     except np.linalg.LinAlgError as error:
         raise ConfigurationError(f"no steady state was found for these A, Q, C and R: {error}") from None

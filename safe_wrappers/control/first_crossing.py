@@ -17,7 +17,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import matrix_balance
 
 from safe_wrappers.control.block_exponentials import van_loan
 
@@ -46,6 +45,8 @@ def first_crossing(P0: Array, a: Array, q: Array, rows: Array, goal: float, hori
     if largest_variance(rows, P0) >= goal:
         return 0.0
     # The remainder is measured in norms: in balanced coordinates they are the least wasteful.
+    from scipy.linalg import matrix_balance  # here: SciPy takes a while to import
+
     a, scales = matrix_balance(a, permute=False)
     inverse = np.linalg.inv(scales)
     P0, q, rows = inverse @ P0 @ inverse.T, inverse @ q @ inverse.T, rows @ scales

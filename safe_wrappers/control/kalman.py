@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincinv
 
 from safe_wrappers.errors import ConfigurationError
 
@@ -123,5 +122,7 @@ def chi_square_band(n: int, runs: int, confidence: float = 0.95) -> tuple[float,
     if not 0.0 < confidence < 1.0:
         raise ConfigurationError(f"confidence must lie between 0 and 1, both excluded, got {confidence!r}")
     outside = 0.5 * (1.0 - confidence)
+    from scipy.special import gammaincinv  # here: SciPy takes a while to import
+
     low, high = 2.0 * gammaincinv(0.5 * n * runs, [outside, 1.0 - outside]) / runs
     return float(low), float(high)

@@ -10,14 +10,18 @@ the second term of the acceleration is tangential, the third centripetal. Whoeve
 happens at O is wrong by those terms, which the inverses here take off again.
 """
 
-from typing import Final
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from safe_wrappers.control.finite import finite_arrays
 from safe_wrappers.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import RigidTransform, Rotation
 
 Array = NDArray[np.float64]
 
@@ -164,6 +168,8 @@ def rigid_transform(rotation: ArrayLike, position: ArrayLike) -> RigidTransform:
             f"expected a rotation: columns of length 1 at right angles (here off by up to {uneven:.3g}) and "
             f"determinant +1 (here {np.linalg.det(matrix).tolist()}); got {matrix.tolist()}"
         )
+    from scipy.spatial.transform import RigidTransform, Rotation  # here: SciPy takes a while to import
+
     return RigidTransform.from_components(origin, Rotation.from_matrix(matrix))
 
 

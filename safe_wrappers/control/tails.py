@@ -17,7 +17,6 @@ inequality in d dimensions; Pukelsheim, "The Three Sigma Rule" (1994), for the u
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import gammaincc, gammainccinv
 
 from safe_wrappers.control.finite import finite_arrays
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
@@ -41,6 +40,8 @@ def gaussian_tail(sigmas: ArrayLike, dimensions: int = 1) -> Array:
         ConfigurationError: For negative or non-finite sigmas, or fewer than one dimension.
     """
     k, d = _checked(sigmas, dimensions)
+    from scipy.special import gammaincc  # here: SciPy takes a while to import
+
     return np.asarray(gammaincc(0.5 * d, 0.5 * k * k), dtype=np.float64)
 
 
@@ -101,6 +102,8 @@ def sigmas_for(probability: ArrayLike, dimensions: int = 1, assume: str = "gauss
         raise ConfigurationError(f"probability must lie between 0 and 1, both excluded, got {probability!r}")
     d = _dimensions(dimensions)
     if assume == "gaussian":
+        from scipy.special import gammainccinv  # here: SciPy takes a while to import
+
         return np.asarray(np.sqrt(2.0 * gammainccinv(0.5 * d, p)), dtype=np.float64)
     if assume == "distribution-free":
         return np.asarray(np.sqrt(d / p), dtype=np.float64)
