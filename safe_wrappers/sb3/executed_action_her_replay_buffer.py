@@ -21,8 +21,8 @@ class ExecutedActionHerReplayBuffer(ExecutedActionReplayBuffer, HerReplayBuffer)
     """SB3's `HerReplayBuffer`, with the action that the filter executed and with the penalty in relabelled rewards.
 
     HER (Andrychowicz et al., NeurIPS 2017) replays most transitions with another goal g', one that the episode did
-    reach, and the task's reward for it, r' = `compute_reward(achieved, g', info)`. Whether and how far the filter changed
-    an action does not depend on the goal, so that of a changed step
+    reach, and the task's reward for it, r' = `compute_reward(achieved, g', info)`. Whether and how far the filter
+    changed an action does not depend on the goal, so that of a changed step
 
     - mode "safe_action" replays (s, g', a_safe, s', r');
     - mode "both" replays that one and (s, g', a, s', r' - penalty), where the penalty is what this step cost, as
