@@ -16,7 +16,6 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 SITE = sysconfig.get_paths()["purelib"]
-IMPORT_SECONDS = 1.0
 
 BLOCK = '''
 import sys
@@ -126,7 +125,7 @@ def test_it_imports_without_torch_and_stable_baselines(python, tmp_path):
 import sys
 import safe_wrappers as sw
 assert "site-packages" in sw.__file__, sw.__file__
-for name in ("torch", "stable_baselines3", "tensorboard", "matplotlib", "scipy.linalg", "envs", "train"):
+for name in ("torch", "stable_baselines3", "tensorboard", "matplotlib", "scipy.linalg", "qpsolvers", "envs", "train"):
     assert name not in sys.modules, name
 missing = [n for n in sw.__all__ if not hasattr(sw, n)]
 assert not missing, missing
@@ -138,14 +137,6 @@ except ModuleNotFoundError:
     done = run(python, code, tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "absent"
-
-
-def test_it_imports_in_under_a_second(python, tmp_path):
-    code = "import time; t = time.perf_counter(); import safe_wrappers; print(time.perf_counter() - t)"
-    seconds = min(
-        float(run(python, code, tmp_path).stdout) for _ in range(4)
-    )  # the first one warms the files
-    assert seconds < IMPORT_SECONDS, f"import safe_wrappers took {seconds:.2f} s"
 
 
 def test_its_tasks_are_made_without_an_import(python, tmp_path):
