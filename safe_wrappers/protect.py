@@ -89,7 +89,7 @@ def _limiting_joints(env: gym.Env[Any, Any], model: mujoco.MjModel) -> str:
     try:
         CBFActionFilter(env, [JointSpeedLimit(limit=4.0)])
     except ConfigurationError:
-        scalar = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+        scalar = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
         names = [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] in scalar]
         if not names or "" in names:
             raise

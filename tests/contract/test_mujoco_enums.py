@@ -26,8 +26,8 @@ def bare(node):
 
 
 def compared(tree):
-    """The members that are compared as they are, or kept in a module's set or tuple to be searched in."""
-    kept = [node.value for node in tree.body if isinstance(node, ast.Assign)]
+    """The members that are compared as they are, or kept in a set or tuple to be searched in."""
+    kept = [node.value for node in ast.walk(tree) if isinstance(node, ast.Assign)]
     kept = [node for node in kept if isinstance(node, ast.Set | ast.Tuple)]
     for node in [*kept, *(n for n in ast.walk(tree) if isinstance(n, ast.Compare))]:
         yield from bare(node)
@@ -39,6 +39,7 @@ def compared(tree):
         "found = m.jnt_type[j] in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)",
         "assert mujoco.mjtTrn.mjTRN_SITE == m.actuator_trntype[0]",
         "KINDS = {mujoco.mjtTrn.mjTRN_SITE}",
+        "def scalar(m):\n    kinds = (mujoco.mjtJoint.mjJNT_HINGE,)\n    return m.jnt_type[0] in kinds",
     ],
 )
 def test_what_is_looked_for_is_found(code):
