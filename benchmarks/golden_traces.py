@@ -1,0 +1,283 @@
+"""Golden traces: what every protected env did, step by step, before a change, compared bit for bit with today.
+
+    python -m benchmarks.golden_traces                    # compares all runs with tests/data/golden_traces.json
+    python -m benchmarks.golden_traces --envs Reacher     # of the envs whose name has one of these words
+    python -m benchmarks.golden_traces --short            # the three envs of the default tests
+    python -m benchmarks.golden_traces --write            # records what is compared from now on
+
+Each env runs under a random and an attacking driver, two seeds, 500 control steps each. Recorded are observation,
+reward, end of episode, executed action and every number in `info`: not themselves but chained digests of 50 steps
+each, so that a difference is found by field and by place and the file stays small.
+
+Bits depend on the processor's vector instructions and on the versions of the libraries. The command therefore runs
+with those instructions that every x86-64 processor of the last ten years has, and records versions and a probe of
+the arithmetic; where they are others than recorded, nothing is compared, and it says so (exit status 3).
+"""
+
+import argparse
+import hashlib
+import importlib.metadata
+import json
+import math
+import multiprocessing
+import os
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+import safe_wrappers as sw
+from benchmarks import mujoco_drivers as drivers
+from benchmarks.cases import CASES, PROTECTED
+from benchmarks.mujoco_drivers import Maker
+from safe_wrappers.envs.teleop_contact import (
+    CLAMP_Y,
+    TELEOP_ACCELERATION,
+    TELEOP_BRAKING,
+    TELEOP_TOP_SPEED,
+    TOOL_RADIUS,
+)
+from safe_wrappers.wrappers.faults import Jitter, Outages, RepeatedCommands
+
+RECORDED = Path(__file__).parents[1] / "tests" / "data" / "golden_traces.json"
+STEPS, SEEDS, PER_DIGEST = 500, (0, 1), 50
+SHORT = ("SafePointGoal1-v0", "Reacher-v5", "Hopper, all contacts")
+"""What the default tests compare: a closed form, forecasts, and both with monitors around them."""
+SAME_BITS = {
+    "OPENBLAS_CORETYPE": "Haswell",
+    "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",
+    "OMP_NUM_THREADS": "1",
+}
+"""The environment in which the command runs itself."""
+NOT_COMPARABLE = 3
+
+_ATTACKING = {
+    "SafeCarGoal1-v0": "full throttle",
+    "SafeCarGoal2-v0": "vase-seeking",
+}
+"""The drivers that the filter answers most often, where they are not the last ones of their case."""
+
+Make = Callable[[], gym.Env[Any, Any]]
+
+
+def _late_commands(env_id: str, constraint: sw.Constraint, jerk_limit: float, **lease: Any) -> Make:
+    """Faults around a handover around a lease around a filter."""
+
+    def make() -> gym.Env[Any, Any]:
+        env: Any = sw.CBFActionFilter(gym.make(env_id), [constraint])
+        env = sw.RecordInterventions(sw.LeaseExpiry(env, constraint, **lease))
+        env = sw.ChunkHandover(env, 6, 3, [0, 2], jerk_limit=jerk_limit)
+        return RepeatedCommands(Jitter(Outages(env, 0.5, 0.2), 0.05), 0.2)
+
+    return make
+
+
+def _hopper() -> gym.Env[Any, Any]:
+    env = sw.WholeBodyFilter(gym.make("Hopper-v5"), friction_share=0.6, zmp_inset=0.02)
+    return sw.BalanceMonitor(sw.ContactMonitor(env))
+
+
+def _stance() -> gym.Env[Any, Any]:
+    return sw.WholeBodyFilter(gym.make("Hopper-v5"), contacts="cone", zmp_inset=0.02)
+
+
+def _teleop() -> gym.Env[Any, Any]:
+    link = sw.Link(delay_s=0.02, jitter_s=0.004, loss=0.05)
+    clamp = sw.Clearance(
+        [sw.Plane([0.0, CLAMP_Y], [0.0, -1.0])], TELEOP_BRAKING, bodies=["tool"], radius=TOOL_RADIUS
+    )
+    ceiling = sw.RoundTripCeiling(clamp, None, TELEOP_ACCELERATION, TELEOP_TOP_SPEED)
+    env = gym.make("TeleopContact-v0")
+    return sw.TeleopChannel(env, link, link, coding="wave", impedance=40.0, ceiling=ceiling)
+
+
+def _lease_alone() -> gym.Env[Any, Any]:
+    rail = sw.Clearance([sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])], bodies=["cart"], braking=8.0)
+    env = sw.LeaseExpiry(gym.make("InvertedPendulum-v5"), rail, acceleration=20.0, longest_s=0.12)
+    return Outages(sw.RecordInterventions(env), 0.12, 0.3)
+
+
+_POINT = sw.HeadingDriveClearance([sw.Discs("hazard_positions", radius=0.2)], margin=0.004)
+_STACKS: dict[str, Make] = {
+    "SafePointGoal1, late commands": _late_commands(
+        "SafePointGoal1-v0", _POINT, 40.0, closing_speed=4.0, longest_s=0.15
+    ),
+    "Reacher, late commands": _late_commands(
+        "Reacher-v5",
+        sw.JointPositionLimit(-1.5, 1.5, ["joint1"]),
+        40.0,
+        closing_speed=10.0,
+        longest_s=0.15,
+    ),
+    "InvertedPendulum, a lease alone": _lease_alone,
+    "Hopper, all contacts": _hopper,
+    "Hopper, stance": _stance,
+    "TeleopContact, over a network": _teleop,
+}
+
+
+def runs() -> dict[str, tuple[Make, dict[str, Maker]]]:
+    """By name: how to make the env, and its two drivers."""
+    found: dict[str, tuple[Make, dict[str, Maker]]] = {}
+    for name, case in PROTECTED.items():
+        attacking = _ATTACKING.get(name, list(case.drivers)[-1])
+        pair = {"random": case.drivers["random"], attacking: case.drivers[attacking]}
+        found[name] = (lambda case=case: case.protect(case.make()), pair)  # type: ignore[misc]
+    disc = CASES["Reacher-v5, with a disc"]
+    attack = {d: disc.drivers[d] for d in ("random", "disc-seeking")}
+    found[disc.name] = (lambda: disc.protect(disc.make()), attack)
+    for name, make in _STACKS.items():
+        pulse = CASES["SafePointGoal1-v0"].drivers["bang-bang"] if "PointGoal" in name else drivers.pulse
+        found[name] = (make, {"random": drivers.random, "pulse": pulse})
+    return found
+
+
+def trace(make: Make, driver: Maker, seed: int) -> dict[str, Any]:
+    """One run: what the filter did, counted, and the digests by field."""
+    env = make()
+    rng = np.random.default_rng(seed)
+    # A chunk is asked of the driver command by command.
+    commands = int(math.prod(env.action_space.shape or ())) // int(
+        math.prod(env.unwrapped.action_space.shape or ())
+    )
+    act = driver(env.unwrapped, rng)
+    digests: dict[str, Any] = {}
+    lines: dict[str, list[str]] = {}
+    counts = dict.fromkeys(("intervened", "fallback", "infeasible"), 0)
+    observation, info = env.reset(seed=seed)
+    episode = seed * 1_000
+    for step in range(STEPS):
+        row = np.concatenate([np.asarray(act()) for _ in range(commands)])
+        action = row.astype(env.action_space.dtype).reshape(env.action_space.shape)
+        observation, reward, terminated, truncated, info = env.step(action)
+        now = {"observation": observation, "reward": reward, "over": [terminated, truncated], "info": info}
+        for field, value in _numbers("", now):
+            digest = digests.setdefault(field, hashlib.blake2b(digest_size=4))
+            digest.update(f"{step} {value.dtype} {value.shape}".encode() + value.tobytes())
+        for name in counts:
+            counts[name] += int(np.any(info.get(f"cbf/{name}", False)))
+        if (step + 1) % PER_DIGEST == 0:
+            for field, digest in digests.items():
+                lines.setdefault(field, []).append(digest.hexdigest())
+        if terminated or truncated:
+            episode += 1
+            env.reset(seed=episode)
+    env.close()
+    return counts | {"digests": {field: " ".join(found) for field, found in sorted(lines.items())}}
+
+
+def _numbers(name: str, value: Any) -> Iterator[tuple[str, np.ndarray]]:
+    """The numbers of a nested value, by field."""
+    if isinstance(value, Mapping):
+        for key, part in value.items():
+            yield from _numbers(f"{name} {key}".strip(), part)
+        return
+    array = np.asarray(value)
+    if array.dtype.kind in "biuf":
+        yield name, np.ascontiguousarray(array)
+
+
+def _job(job: tuple[str, str, int]) -> tuple[str, dict[str, Any]]:
+    warnings.simplefilter("ignore")
+    name, driver, seed = job
+    make, by_name = runs()[name]
+    return f"{name}; {driver}; seed {seed}", trace(make, by_name[driver], seed)
+
+
+def arithmetic() -> dict[str, str]:
+    """What decides about the last bits: the libraries' versions, and a probe of what they compute."""
+    libraries = (
+        "numpy",
+        "scipy",
+        "mujoco",
+        "gymnasium",
+        "gymnasium-robotics",
+        "qpsolvers",
+        "daqp",
+        "clarabel",
+    )
+    rng = np.random.default_rng(0)
+    a, x = rng.normal(size=(24, 24)), rng.normal(size=1001)
+    parts = [a @ a, np.linalg.solve(a, x[:24]), np.linalg.svd(a)[1], np.linalg.eigvalsh(a + a.T), a @ x[:24]]
+    parts += [f(x) for f in (np.sin, np.exp, np.arctan, np.sum, np.tanh)] + [np.hypot(x, 2.0), x @ x]
+    parts += [np.array([f(v) for v in x]) for f in (math.sin, math.cos, math.exp, math.atan)]
+    digest = hashlib.blake2b(b"".join(np.ascontiguousarray(p).tobytes() for p in parts), digest_size=8)
+    versions = {name: importlib.metadata.version(name) for name in libraries}
+    return versions | {"probe": digest.hexdigest()}
+
+
+def differences(recorded: Mapping[str, Any], today: Mapping[str, Any]) -> list[str]:
+    """Where the runs of today are not the recorded ones, in words; runs that were not made are left out."""
+    found = []
+    for run, now in today.items():
+        before = recorded.get(run)
+        if before is None:
+            found.append(f"{run}: was not recorded")
+            continue
+        for field in sorted(before["digests"].keys() | now["digests"].keys()):
+            old, new = (of["digests"].get(field, "").split() for of in (before, now))
+            if old == new:
+                continue
+            if not (old and new):
+                found.append(f"{run}: {field} {'is gone' if old else 'is new'}")
+                continue
+            first = next((i for i, pair in enumerate(zip(old, new, strict=False)) if pair[0] != pair[1]), 0)
+            found.append(
+                f"{run}: {field} differs from steps {first * PER_DIGEST} to {(first + 1) * PER_DIGEST} on"
+            )
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="golden_traces", description=__doc__.splitlines()[0])
+    parser.add_argument("--write", action="store_true", help="record instead of comparing")
+    parser.add_argument("--short", action="store_true", help=f"only {', '.join(SHORT)}")
+    parser.add_argument(
+        "--envs", nargs="+", metavar="WORD", help="only envs whose name has one of these words"
+    )
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--recorded", type=Path, default=RECORDED, help="the file (default: %(default)s)")
+    arguments = parser.parse_args()
+    if any(os.environ.get(name) != value for name, value in SAME_BITS.items()):
+        words = [sys.executable, "-W", "ignore", "-m", "benchmarks.golden_traces", *sys.argv[1:]]
+        sys.exit(subprocess.run(words, env=os.environ | SAME_BITS).returncode)
+    chosen = [
+        name
+        for name in runs()
+        if (not arguments.short or name in SHORT)
+        and (not arguments.envs or any(word in name for word in arguments.envs))
+    ]
+    if not chosen:
+        parser.error(f"no env has one of these words; there are: {'; '.join(runs())}")
+    kept = json.loads(arguments.recorded.read_text()) if arguments.recorded.exists() else {}
+    here = arithmetic()
+    if not arguments.write and kept.get("arithmetic") != here:
+        print(f"not comparable: recorded with {kept.get('arithmetic')}, this is {here}")
+        sys.exit(NOT_COMPARABLE)
+    jobs = [(name, driver, seed) for name in chosen for driver in runs()[name][1] for seed in SEEDS]
+    today: dict[str, Any] = {}
+    with multiprocessing.get_context("spawn").Pool(arguments.workers) as pool:
+        for run, found in pool.imap(_job, jobs):
+            today[run] = found
+            if sys.stderr.isatty():
+                print(f"{len(today)} of {len(jobs)}: {run}", file=sys.stderr)
+    if arguments.write:
+        same = kept.get("arithmetic") == here
+        whole = len(chosen) == len(runs())
+        runs_kept = (kept.get("runs", {}) if same and not whole else {}) | today
+        text = json.dumps({"arithmetic": here, "runs": dict(sorted(runs_kept.items()))}, indent=1)
+        arguments.recorded.write_text(text + "\n")
+        print(f"{len(today)} runs of {STEPS} steps recorded in {arguments.recorded}")
+        return
+    found = differences(kept["runs"], today)
+    print("\n".join(found) if found else f"{len(today)} runs of {STEPS} steps are equal bit for bit")
+    sys.exit(1 if found else 0)
+
+
+if __name__ == "__main__":
+    main()
