@@ -35,7 +35,7 @@ import ruckig
 from numpy.typing import NDArray
 
 import safe_wrappers as sw
-from safe_wrappers.control.reachability import admits
+from safe_wrappers.control.watchdog.reachability import admits
 
 RESULTS = Path(__file__).parent / "results"
 FINE = 2000

@@ -30,7 +30,7 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks.whole_body import learned
-from safe_wrappers.control.whole_body import (
+from safe_wrappers.control.legged.whole_body import (
     WholeBodyProblem,
     WholeBodySolution,
     attainable_contact_acceleration,
@@ -38,7 +38,7 @@ from safe_wrappers.control.whole_body import (
     solve_pyramid,
 )
 from safe_wrappers.errors import SafeWrappersError
-from safe_wrappers.plants.floating_base import floating_base_terms
+from safe_wrappers.plants.queries.floating_base import floating_base_terms
 
 RESULTS = Path(__file__).parent / "results"
 SHARE, SETTLE_S = 0.7, 0.05

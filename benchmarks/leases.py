@@ -9,8 +9,8 @@ the lease. Without one the cart goes on with the last command, as a motor drive 
 
 Worst cases. The policy dies right after a lease was granted, at full throttle or rolling head on, with every reading
 too long by the whole bound, every delay used up and brakes not a bit better than declared. Once under the lease of
-`control/leases.py`, once under one that is 5 % longer. Clearances are drawn so that a lease is a whole number of
-control steps (at least 20: a twentieth is one step), since it only ever runs out between two of them.
+`control/watchdog/leases.py`, once under one that is 5 % longer. Clearances are drawn so that a lease is a whole
+number of control steps (at least 20: a twentieth is one step), since it only ever runs out between two of them.
 """
 
 import argparse
@@ -26,7 +26,7 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks.cart_and_wall import HOLD_S, PHYSICS_S, CartAndWall, Drive
-from safe_wrappers.control.leases import longest_lease
+from safe_wrappers.control.watchdog.leases import longest_lease
 from safe_wrappers.wrappers.faults import Outages
 
 RESULTS = Path(__file__).parent / "results"
@@ -171,7 +171,7 @@ def worst_case(longer: float, seed: tuple[int, ...]) -> dict[str, Any]:
     env.reset(options={"drive": drive})
     steps = 0
     with mock.patch(
-        "safe_wrappers.wrappers.room.longest_lease", lambda *a, **k: longer * longest_lease(*a, **k)
+        "safe_wrappers.wrappers.lease.room.longest_lease", lambda *a, **k: longer * longest_lease(*a, **k)
     ):
         while not (cart.touched or cart.at_rest):
             _, _, _, _, info = env.step(np.array([1.0]))

@@ -22,7 +22,7 @@ import safe_wrappers as sw
 from benchmarks.crossing_drivers import DRIVERS
 from benchmarks.timing import paired_us
 from benchmarks.tracked import CROSSING, crossing
-from safe_wrappers.plants.line_of_sight import LineOfSight
+from safe_wrappers.plants.queries.line_of_sight import LineOfSight
 
 ENV_ID = "OccludedCrossing-v0"
 COUNTS = (1, 4, 16)

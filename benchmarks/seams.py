@@ -42,9 +42,9 @@ from numpy.typing import NDArray
 import safe_wrappers as sw
 from benchmarks.chunk_policy import RUNS, TASKS, Policy, Task, policy
 from benchmarks.seam_bounds import Bounds, bounds_of
-from safe_wrappers.control.flexible_joint import manifold
-from safe_wrappers.control.seams import BLENDS
-from safe_wrappers.control.smoothstep import smoothstep
+from safe_wrappers.appendix.flexible_joint import manifold
+from safe_wrappers.control.handover.seams import BLENDS
+from safe_wrappers.control.handover.smoothstep import smoothstep
 
 RESULTS = Path(__file__).parent / "results"
 Array = NDArray[np.float64]

@@ -36,7 +36,7 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks.arms import ARMS, Arm, Truth, watch
-from safe_wrappers.control.manipulability import manipulability
+from safe_wrappers.control.filtering.manipulability import manipulability
 from safe_wrappers.errors import UnsafeStateWarning
 
 RESULTS = Path(__file__).parent / "results"

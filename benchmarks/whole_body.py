@@ -33,9 +33,9 @@ import mujoco
 import numpy as np
 
 import safe_wrappers as sw
-from safe_wrappers.control.support import common_plane, support_margin, support_polygon, zmp_of_forces
-from safe_wrappers.plants.fixed_bodies import fixed_bodies
-from safe_wrappers.plants.replay import Replay
+from safe_wrappers.control.legged.support import common_plane, support_margin, support_polygon, zmp_of_forces
+from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
+from safe_wrappers.plants.mujoco.replay import Replay
 
 RESULTS = Path(__file__).parent / "results"
 CONFIG = Path(__file__).parents[1] / "configs" / "velocity_experts.yaml"

@@ -12,7 +12,7 @@ from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
 from safe_wrappers.errors import ActionError, ConfigurationError
-from safe_wrappers.interventions import COST, COST_SUBSTEP
+from safe_wrappers.info import COST, COST_SUBSTEP
 
 from .layout import Layout, PartialLayout, parse_layout
 from .levels import (

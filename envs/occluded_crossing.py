@@ -11,9 +11,9 @@ from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
-from safe_wrappers.control.tracks import Motion, Tracks
+from safe_wrappers.control.estimation.tracks import Motion, Tracks
 from safe_wrappers.errors import ActionError, SafeWrappersError
-from safe_wrappers.interventions import COST, COST_SUBSTEP
+from safe_wrappers.info import COST, COST_SUBSTEP
 
 from .crossing_layout import (
     CARS,

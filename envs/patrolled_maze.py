@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.control.tracks import Motion, Tracks
+from safe_wrappers.control.estimation.tracks import Motion, Tracks
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.interventions import COST, COST_SUBSTEP
+from safe_wrappers.info import COST, COST_SUBSTEP
 
 from .markers import MarkingRenderer
 from .traffic import CAR_SPEED_STD, CAR_TIME_CONSTANT_S, Traffic
@@ -59,7 +59,8 @@ class PatrolledPointMazeEnv(PointMazeEnv):  # type: ignore[misc]
     the renderer adds (`safe_wrappers.envs.markers`).
 
     **Attributes**: `patrol_positions` and `patrol_velocities`, shape (k, 2), m and m/s; `patrol_tracks` (a
-    `control.tracks.Tracks`): the same as tracks that are known exactly now. `agent_position`, `agent_velocity`.
+    `control.estimation.tracks.Tracks`): the same as tracks that are known exactly now. `agent_position`,
+    `agent_velocity`.
 
     **Info**, at every step and at reset: ``cost`` and its equal ``cost_substep`` (1.0 if ball and patrol overlapped
     anywhere in the step: closest approach of the straight ways from one physics step to the next), ``collisions``.

@@ -11,9 +11,9 @@ from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
-from safe_wrappers.control.traction_curves import MagicFormula
+from safe_wrappers.control.vehicle.traction_curves import MagicFormula
 from safe_wrappers.errors import ActionError, SafeWrappersError, UnknownNameError
-from safe_wrappers.interventions import COST, COST_SUBSTEP
+from safe_wrappers.info import COST, COST_SUBSTEP
 
 from .goal_env import GOAL_MET, GOALS_REACHED
 from .ground import Ground
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 WHEELS: Final = ("front_left", "front_right", "rear_left", "rear_right")
 """The wheels' joints, bodies and geoms, in the order of every array of four."""
 SLIP: Final = "slip"
-"""float64, shape (4,): longitudinal slip of each wheel at the end of the step (`control.slip.slip_ratio`)."""
+"""float64, shape (4,): longitudinal slip of each wheel at the end of the step (`control.vehicle.slip.slip_ratio`)."""
 SLIP_MAX: Final = "slip_max"
 """float64: largest size of any loaded wheel's longitudinal slip at the ends of this step's physics substeps."""
 SPIN_OUT: Final = "spin_out"
@@ -67,7 +67,7 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
     18 kg, 0.5 m between the axles and 0.4 m between the wheels, centre of mass 0.12 m high. Four wheels of
     0.1 m, each with 0.05 kg m^2 about its axle and a motor of its own; the front ones are steered together. MuJoCo
     gives each wheel its load; the tyre's force comes from its slip along and across, over the traction curve of
-    the ground under it (`control.traction_curves.MAGIC_FORMULA`), anew at every physics substep.
+    the ground under it (`control.vehicle.traction_curves.MAGIC_FORMULA`), anew at every physics substep.
 
     **Action**: ``Box(-1, 1, (5,), float32)``, held for 0.01 s (five physics substeps): the torques on the wheels in
     the order of `WHEELS`, 15 N m at 1, and the steering angle, 0.5 rad at 1 (left), followed by a servo within about

@@ -13,7 +13,7 @@ from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
 from safe_wrappers.errors import ActionError, ConfigurationError, SafeWrappersError, UnknownNameError
-from safe_wrappers.interventions import COST, COST_SUBSTEP
+from safe_wrappers.info import COST, COST_SUBSTEP
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
 from numpy.typing import NDArray
 
 from safe_wrappers.errors import UnknownNameError
-from safe_wrappers.interventions import COST, COST_SUBSTEP
+from safe_wrappers.info import COST, COST_SUBSTEP
 
 from .speed_limits import SPEED_LIMITS
 

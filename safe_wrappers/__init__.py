@@ -35,12 +35,12 @@ from safe_wrappers.constraints import (
     WallClearance,
     Workspace,
 )
-from safe_wrappers.control.projection import Projection, project
 from safe_wrappers.envs import register_envs as _register_envs
 from safe_wrappers.errors import SafeWrappersError, UnsafeStateWarning
+from safe_wrappers.filter.projection import Projection, project
 from safe_wrappers.plants.analytic import AnalyticPlant
 from safe_wrappers.plants.displacement import DisplacementPlant
-from safe_wrappers.plants.mujoco import MujocoPlant
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.protect import protect
 from safe_wrappers.wrappers.adaption_penalty import AdaptionPenalty
@@ -50,15 +50,15 @@ from safe_wrappers.wrappers.chunk_handover import ChunkHandover
 from safe_wrappers.wrappers.contact_monitor import ContactMonitor
 from safe_wrappers.wrappers.cost_function import CostFunction
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
+from safe_wrappers.wrappers.occlusion.sensor import Sensor
+from safe_wrappers.wrappers.occlusion.track import Track
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
-from safe_wrappers.wrappers.round_trip_watch import RoundTripCeiling
-from safe_wrappers.wrappers.sensor import Sensor
 from safe_wrappers.wrappers.slip_limiter import SlipLimiter
+from safe_wrappers.wrappers.teleop.link import Link
+from safe_wrappers.wrappers.teleop.port import TeleopPort
+from safe_wrappers.wrappers.teleop.round_trip import RoundTripCeiling
 from safe_wrappers.wrappers.teleop_channel import TeleopChannel
-from safe_wrappers.wrappers.teleop_link import Link
-from safe_wrappers.wrappers.teleop_port import TeleopPort
-from safe_wrappers.wrappers.track import Track
 from safe_wrappers.wrappers.whole_body_filter import WholeBodyFilter
 
 __all__ = [

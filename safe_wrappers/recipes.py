@@ -22,12 +22,12 @@ from safe_wrappers.constraints import (
     WallClearance,
     Workspace,
 )
-from safe_wrappers.constraints.constraint import Constraint
-from safe_wrappers.control.rectangles import merged
+from safe_wrappers.control.numerics.rectangles import merged
 from safe_wrappers.envs.car import CAR
 from safe_wrappers.envs.speed_limits import SPEED_LIMITS
 from safe_wrappers.envs.teleop_contact import CLAMP_Y, TELEOP_BRAKING, TOOL_RADIUS
 from safe_wrappers.errors import UnknownNameError
+from safe_wrappers.filter.constraint import Constraint
 
 POINT_HULL_RADIUS_M = 0.1585
 """Around the Point robot's turning axis: the far corners of its nose, sqrt(0.15^2 + 0.05^2), rounded up."""

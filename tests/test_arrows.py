@@ -1,4 +1,4 @@
-"""The one-way arrows: control <- plants <- constraints <- wrappers <- sb3, train; envs beside them."""
+"""The one-way arrows: control <- plants <- filter <- constraints <- wrappers <- sb3, train; envs beside them."""
 
 import ast
 import subprocess
@@ -12,27 +12,34 @@ import safe_wrappers
 ROOT = Path(__file__).parents[1]
 ROOMS = {
     "control": ROOT / "safe_wrappers" / "control",
+    "appendix": ROOT / "safe_wrappers" / "appendix",
     "plants": ROOT / "safe_wrappers" / "plants",
+    "filter": ROOT / "safe_wrappers" / "filter",
     "constraints": ROOT / "safe_wrappers" / "constraints",
     "wrappers": ROOT / "safe_wrappers" / "wrappers",
     "sb3": ROOT / "safe_wrappers" / "sb3",
     "envs": ROOT / "envs",
     "train": ROOT / "train",
 }
-COMMON = {"errors", "interventions"}
+COMMON = {"errors", "info"}
 """Single modules at the top that every room may use; `protect` and the package itself are the top."""
+BELOW_WRAPPERS = {"control", "plants", "filter", "constraints", "serialize", "stack", *COMMON}
 MAY_USE = {
     "control": {"control", "errors"},
+    "appendix": {"appendix", "control", "plants", "errors"},
     "plants": {"control", "plants", *COMMON},
-    "constraints": {"control", "plants", "constraints", *COMMON},
-    "wrappers": {"control", "plants", "constraints", "wrappers", *COMMON},
-    "sb3": {"control", "plants", "constraints", "wrappers", "sb3", *COMMON},
+    "filter": {"control", "plants", "filter", *COMMON},
+    "constraints": {"control", "plants", "filter", "constraints", *COMMON},
+    "wrappers": {"wrappers", *BELOW_WRAPPERS},
+    "sb3": {"wrappers", "sb3", *BELOW_WRAPPERS},
     "envs": {"control", "constraints", "envs", *COMMON},
-    "train": {"control", "plants", "constraints", "wrappers", "sb3", "envs", "train", "protect", "", *COMMON},
+    "train": {"wrappers", "sb3", "envs", "train", "protect", "", *BELOW_WRAPPERS},
 }
 LEARNERS = {"torch", "stable_baselines3"}
 FORBIDDEN = {
     "control": LEARNERS | {"gymnasium", "mujoco"},
+    "appendix": LEARNERS | {"gymnasium", "mujoco"},
+    "filter": LEARNERS | {"gymnasium", "mujoco"},
     "plants": LEARNERS,
     "constraints": LEARNERS,
     "wrappers": LEARNERS,
@@ -96,7 +103,7 @@ def test_heavy_libraries_stay_in_their_rooms(room):
         assert not wrong, f"{path.relative_to(ROOT)} imports {sorted(wrong)}"
 
 
-@pytest.mark.parametrize("name", ["__init__", "errors", "interventions", "protect"])
+@pytest.mark.parametrize("name", ["__init__", "errors", "info", "protect", "serialize", "stack"])
 def test_the_top_imports_no_torch_and_no_training(name):
     found = imports(ROOT / "safe_wrappers" / f"{name}.py", "safe_wrappers")
     assert not {n.split(".")[0] for n in found} & {"torch", "stable_baselines3"}
@@ -122,8 +129,8 @@ def test_the_parser_sees_what_it_should(tmp_path):
     path.write_text(source)
     found = imports(path, "safe_wrappers.control")
     assert found == {"torch.nn", "safe_wrappers.wrappers.x", "safe_wrappers.plants.plant.Plant"}
-    assert rooms_used("control", ROOMS["control"] / "projection.py") == {"errors"}
-    assert rooms_used("plants", ROOMS["plants"] / "mujoco.py") == {"errors", "plants"}
+    assert rooms_used("control", ROOMS["control"] / "watchdog" / "leases.py") == {"errors"}
+    assert rooms_used("plants", ROOMS["plants"] / "analytic.py") == {"errors", "plants"}
 
 
 def test_control_runs_without_gymnasium_and_mujoco():
@@ -142,7 +149,9 @@ import importlib
 for name in sys.argv[2:]:
     importlib.import_module("safe_wrappers.control." + name)
 """
-    names = [p.stem for p in modules("control") if p.stem != "__init__"]
+    relative = [p.relative_to(ROOMS["control"]).with_suffix("") for p in modules("control")]
+    names = [".".join(p.parts) for p in relative if p.stem != "__init__"]
+    assert "watchdog.leases" in names
     folder = str(Path(safe_wrappers.__file__).parent)
     done = subprocess.run(
         [sys.executable, "-c", code, folder, *names], capture_output=True, text=True, check=False

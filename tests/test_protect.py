@@ -15,7 +15,7 @@ from gymnasium.utils.env_checker import check_env
 from scipy.linalg import solve_discrete_are
 
 import safe_wrappers as sw
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 from safe_wrappers.envs.speed_limits import SPEED_LIMITS
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsafeStateWarning, UnsupportedEnvError
 
@@ -178,7 +178,7 @@ def test_a_car_keeps_clear_of_vases_with_its_outline_where_they_cost():
 
 
 def test_the_cars_outline_encloses_every_geom():
-    from safe_wrappers.control.outlines import distances_to_outline
+    from safe_wrappers.control.numerics.outlines import distances_to_outline
 
     env = gym.make("SafeCarGoal1-v0").unwrapped
     env.reset(

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from stable_baselines3.common.logger import configure
 
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 from safe_wrappers.wrappers.record_interventions import COLUMNS
 
 from .atomic import write_json

@@ -7,10 +7,10 @@ from typing import Any, Final, SupportsFloat
 import gymnasium as gym
 import numpy as np
 
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.default import default_plant
-from safe_wrappers.plants.mujoco import MujocoPlant
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.wrappers.cost_function import refuse_own_cost
 
 _TOLERANCE: Final = 1e-6

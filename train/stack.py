@@ -11,7 +11,7 @@ import gymnasium as gym
 from stable_baselines3.common.monitor import Monitor
 
 import safe_wrappers
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.adaption_penalty import AdaptionPenalty
 from safe_wrappers.wrappers.cost_function import CostFunction

@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 
 from .atomic import write_bytes
 from .coordinates import CoordinateReader

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from rich.console import Console
 
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 
 from .atomic import write_bytes, write_json

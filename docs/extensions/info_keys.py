@@ -1,4 +1,4 @@
-"""The directive `info-keys`: a table of the info keys, from `safe_wrappers.interventions` and its docstrings."""
+"""The directive `info-keys`: a table of the info keys, from `safe_wrappers.info` and its docstrings."""
 
 import importlib
 
@@ -8,7 +8,7 @@ from sphinx.application import Sphinx
 from sphinx.pycode import ModuleAnalyzer
 from sphinx.util.docutils import SphinxDirective
 
-_MODULE = "safe_wrappers.interventions"
+_MODULE = "safe_wrappers.info"
 
 
 class InfoKeys(SphinxDirective):

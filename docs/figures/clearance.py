@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from _style import FORBIDDEN, INK, OFF, ON, OTHER, panels
-from safe_wrappers.control.stopping import held_stopping_distance
+from safe_wrappers.control.backup.stopping import held_stopping_distance
 
 Array = NDArray[np.float64]
 

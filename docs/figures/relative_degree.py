@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 import safe_wrappers as sw
 from _cart import Cart, run, wall
 from _style import FORBIDDEN, GRID, OFF, ON, SAFE, panels
-from safe_wrappers.control.stopping import held_stopping_distance
+from safe_wrappers.control.backup.stopping import held_stopping_distance
 
 WALL = 2.0
 

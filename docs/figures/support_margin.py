@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 import safe_wrappers as sw
 from _ant import STEP_S, sway
 from _style import FORBIDDEN, OFF, ON
-from safe_wrappers.constraints.support_margin import edge_distances
+from safe_wrappers.constraints.contact.support_margin import edge_distances
 
 STEPS, INSET = 100, 0.1
 

@@ -7,9 +7,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.constraints.constraint import HalfSpaces, Promise, non_negative, positive
-from safe_wrappers.constraints.cut import cut
-from safe_wrappers.control.cbf import (
+from safe_wrappers.control.filtering.cbf import (
     acts,
     cbf_rows,
     lie_derivatives,
@@ -17,8 +15,10 @@ from safe_wrappers.control.cbf import (
     numerical_gradient,
     relative_degree,
 )
-from safe_wrappers.control.projection import keeps_rows
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import HalfSpaces, Promise, non_negative, positive
+from safe_wrappers.filter.linearize import cut
+from safe_wrappers.filter.projection import keeps_rows
 from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]

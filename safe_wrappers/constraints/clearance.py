@@ -7,12 +7,12 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.constraints.constraint import HalfSpaces, Promise, non_negative, positive
-from safe_wrappers.constraints.obstacle_kinds import obstacles_from
-from safe_wrappers.constraints.obstacles import Nearest
-from safe_wrappers.control.stopping import sampled_acceleration_limit, sampled_inset
+from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
+from safe_wrappers.constraints.obstacles.obstacles import Nearest
+from safe_wrappers.control.backup.stopping import sampled_acceleration_limit, sampled_inset
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.mujoco import MujocoPlant
+from safe_wrappers.filter.constraint import HalfSpaces, Promise, non_negative, positive
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
@@ -34,7 +34,7 @@ class Clearance:
     """Keep `distance - (stopping distance) >= 0` from every point to every obstacle, also between samples.
 
     The row bounds the acceleration towards the obstacle that may be held for a control interval, so that full
-    braking afterwards still stops in front of it (`control/stopping.py`). Delay is the plant's: the state is
+    braking afterwards still stops in front of it (`control/backup/stopping.py`). Delay is the plant's: the state is
     predicted over it.
 
     What it promises: in one dimension, and head on, the bound is exact for the declared `braking`. Elsewhere

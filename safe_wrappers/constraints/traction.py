@@ -9,14 +9,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers import interventions as keys
-from safe_wrappers.constraints.constraint import HalfSpaces, Promise, non_negative, positive
-from safe_wrappers.control.friction_estimate import FrictionEstimate
-from safe_wrappers.control.slip import slip_ratio, slip_window
+from safe_wrappers import info as keys
+from safe_wrappers.control.vehicle.friction_estimate import FrictionEstimate
+from safe_wrappers.control.vehicle.slip import slip_ratio, slip_window
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.plants.driven_wheels import DrivenWheels
-from safe_wrappers.plants.mujoco import MujocoPlant
+from safe_wrappers.filter.constraint import HalfSpaces, Promise, non_negative, positive
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
+from safe_wrappers.plants.queries.driven_wheels import DrivenWheels
 
 Array = NDArray[np.float64]
 
@@ -58,8 +58,9 @@ class Traction:
     The wheel's own equation says which torque takes the slip to its limit by the end of the held control step. The
     force of the ground in it is not modelled but measured, from how the wheel answered the last torque; so no
     friction has to be known. From slip and force over load the peak of the traction curve is estimated for each
-    wheel, with its uncertainty (`control/friction_estimate.py`); where it is believed to lie below `max_slip`, the
-    limit is half a standard deviation below it. Accelerating and braking, forward and in reverse are the same rows.
+    wheel, with its uncertainty (`control/vehicle/friction_estimate.py`); where it is believed to lie below
+    `max_slip`, the limit is half a standard deviation below it. Accelerating and braking, forward and in reverse are
+    the same rows.
 
     What it promises: a wheel whose ground stays the same for a control step ends it within the limit, up to what
     its force and its speed over ground change otherwise than predicted. At the edge of another ground, and where a

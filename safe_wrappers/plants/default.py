@@ -5,8 +5,8 @@ from typing import Any
 import gymnasium as gym
 
 from safe_wrappers.plants.displacement import DisplacementPlant
-from safe_wrappers.plants.displacement_step import moves_by_displacement
-from safe_wrappers.plants.mujoco import MujocoPlant
+from safe_wrappers.plants.mujoco.displacement_step import moves_by_displacement
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
 
 def default_plant(env: gym.Env[Any, Any]) -> MujocoPlant:

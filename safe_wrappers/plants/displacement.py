@@ -8,9 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.plants.displacement_step import DisplacementRecorder, gripper_of, moves_by_displacement
-from safe_wrappers.plants.forecast import Forecast, Recorder
-from safe_wrappers.plants.mujoco import MujocoPlant
+from safe_wrappers.plants.mujoco.displacement_step import (
+    DisplacementRecorder,
+    gripper_of,
+    moves_by_displacement,
+)
+from safe_wrappers.plants.mujoco.forecast import Forecast, Recorder
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
 Array = NDArray[np.float64]
 

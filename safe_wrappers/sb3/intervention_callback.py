@@ -9,7 +9,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 
 _STEP_KEYS = {
     keys.CBF_INTERVENED: "step_rate",

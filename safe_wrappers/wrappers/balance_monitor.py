@@ -8,16 +8,16 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers import interventions as keys
-from safe_wrappers.constraints.constraint import non_negative, positive
-from safe_wrappers.control.friction_cone import normal_and_tangential
-from safe_wrappers.control.support_distances import support_distances
+from safe_wrappers import info as keys
+from safe_wrappers.control.contact.friction_cone import normal_and_tangential
+from safe_wrappers.control.legged.support_distances import support_distances
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.plants.contact_forecast import ContactForecast, ContactReader, can_touch_the_world
-from safe_wrappers.plants.fixed_bodies import fixed_bodies
-from safe_wrappers.plants.momentum import MomentumReader
-from safe_wrappers.wrappers.stack import Layer
-from safe_wrappers.wrappers.step_watch import StepWatch
+from safe_wrappers.filter.constraint import non_negative, positive
+from safe_wrappers.plants.mujoco.contact_forecast import ContactForecast, ContactReader, can_touch_the_world
+from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
+from safe_wrappers.plants.queries.momentum import MomentumReader
+from safe_wrappers.stack import Layer
+from safe_wrappers.wrappers.common.step_watch import StepWatch
 
 PRESSING: Final = 0.01
 """Share of the robot's weight from which on a contact counts in `balance/friction_used`. Feet that come down or lift

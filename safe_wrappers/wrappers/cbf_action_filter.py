@@ -12,18 +12,18 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers import interventions as keys
-from safe_wrappers.constraints.constraint import Constraint, non_negative
-from safe_wrappers.constraints.plain_data import constraint_data, constraint_from
-from safe_wrappers.control.projection import check_solver
+from safe_wrappers import info as keys
 from safe_wrappers.errors import ActionError, ConfigurationError, UnsafeStateWarning
+from safe_wrappers.filter.constraint import Constraint, non_negative
+from safe_wrappers.filter.fallback import Fallback, FallbackFunction
+from safe_wrappers.filter.projection import check_solver
+from safe_wrappers.filter.rounding import cast_inside
+from safe_wrappers.filter.search import Decider
 from safe_wrappers.plants.default import default_plant
 from safe_wrappers.plants.plant import Plant, check_actions, wrappers_of
-from safe_wrappers.wrappers.decision import Decider
-from safe_wrappers.wrappers.fallback import Fallback, FallbackFunction
-from safe_wrappers.wrappers.own_plant import PlantOfSpec, own_plant
-from safe_wrappers.wrappers.rounding import cast_inside
-from safe_wrappers.wrappers.stack import Layer, refuse_order
+from safe_wrappers.plants.template import PlantOfSpec, own_plant
+from safe_wrappers.serialize import constraint_data, constraint_from
+from safe_wrappers.stack import Layer, refuse_order
 
 Array = NDArray[np.float64]
 
@@ -57,7 +57,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         solver: "daqp" or any installed qpsolvers backend.
         margin: Added to every constraint's own `margin`, in that constraint's unit (m, rad/s, ...).
 
-    Info, at every step (see `safe_wrappers.interventions`): ``cbf/intervened``, ``cbf/infeasible``,
+    Info, at every step (see `safe_wrappers.info`): ``cbf/intervened``, ``cbf/infeasible``,
     ``cbf/fallback``, ``cbf/nonfinite``, ``cbf/unsafe`` (bool); ``cbf/correction``, ``cbf/clipped``,
     ``cbf/margin`` (float); ``cbf/refused``, ``proposed_action``, ``executed_action`` (arrays).
 

@@ -9,22 +9,22 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers import interventions as keys
-from safe_wrappers.constraints.constraint import non_negative
-from safe_wrappers.control.seams import BLENDS, DIFFERENCES
+from safe_wrappers import info as keys
+from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES
 from safe_wrappers.errors import ActionError, UnknownNameError
+from safe_wrappers.filter.constraint import non_negative
+from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.plant import Plant, check_actions, check_timing
-from safe_wrappers.wrappers.chunk_queue import BASELINES, ChunkQueue, Command
-from safe_wrappers.wrappers.chunk_sizes import ChunkSizes, blend_bounds
-from safe_wrappers.wrappers.fallback import FallbackFunction
+from safe_wrappers.plants.template import PlantOfSpec, own_plant
+from safe_wrappers.stack import Layer, refuse_order
+from safe_wrappers.wrappers.common.fallback_controller import StandIn
+from safe_wrappers.wrappers.common.receiver import CommandReceiver, receiver_inside
+from safe_wrappers.wrappers.common.wrapper_rng import OwnRandom
+from safe_wrappers.wrappers.handover.macro_info import macro_info
+from safe_wrappers.wrappers.handover.queue import BASELINES, ChunkQueue, Command
+from safe_wrappers.wrappers.handover.sizes import ChunkSizes, blend_bounds
+from safe_wrappers.wrappers.handover.upsampling import Upsampling
 from safe_wrappers.wrappers.lease_expiry import lease_inside
-from safe_wrappers.wrappers.macro_info import macro_info
-from safe_wrappers.wrappers.own_plant import PlantOfSpec, own_plant
-from safe_wrappers.wrappers.own_random import OwnRandom
-from safe_wrappers.wrappers.receiver import CommandReceiver, receiver_inside
-from safe_wrappers.wrappers.stack import Layer, refuse_order
-from safe_wrappers.wrappers.stand_in import StandIn
-from safe_wrappers.wrappers.upsampling import Upsampling
 
 Array = NDArray[np.float64]
 
@@ -52,8 +52,8 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
     yet, and whenever the queue runs dry, the fallback acts.
 
     **Seams.** The new chunk is blended in over the shortest time that keeps `jerk_limit`, and at least over
-    `blend_time`; with neither given, over the left-over. See `control/seams.py`. A chunk whose step at the seam
-    keeps the limit anyhow is executed bit for bit (without a `blend_time`).
+    `blend_time`; with neither given, over the left-over. See `control/handover/seams.py`. A chunk whose step at the
+    seam keeps the limit anyhow is executed bit for bit (without a `blend_time`).
 
     **What it guarantees.** With `jerk_limit`, the commands u[k] and u[k+1] that this wrapper sends in neighbouring
     control steps of an episode differ by at most `jerk_limit` times the control interval in every component, whatever
@@ -90,15 +90,15 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         hold_s: Control interval, s; None reads the env's `dt`.
         decay: Of the ensemble's weights.
         steps_per_entry: Control steps from one entry of a chunk to the next, for policies that are slower than the
-            control loop: the commands between are a cubic Hermite spline's (`wrappers/upsampling.py`). H then is
-            `(chunk_size - 1) * steps_per_entry + 1` control steps.
+            control loop: the commands between are a cubic Hermite spline's (`wrappers/handover/upsampling.py`). H
+            then is `(chunk_size - 1) * steps_per_entry + 1` control steps.
         clock_error_s: Bound on how far ahead the clock of who stamps the chunks may be, s: a stamp that is ahead of
             `now_s` by no more counts as now. One that is farther ahead is refused.
 
-    Info, at every step (see `safe_wrappers.interventions`): ``handover/seam_jump``, ``handover/peak_jerk``,
+    Info, at every step (see `safe_wrappers.info`): ``handover/seam_jump``, ``handover/peak_jerk``,
     ``handover/blend_time``, ``handover/starved``, ``handover/limited``, ``handover/refused``,
     ``handover/latency``, ``handover/steps``. The inner layers' costs are summed over the control steps, their flags
-    are True if they were at any of them (`wrappers/macro_info.py`).
+    are True if they were at any of them (`wrappers/handover/macro_info.py`).
 
     Raises:
         ConfigurationError: Sizes that do not fit together, times or limits that are not positive, nothing to blend

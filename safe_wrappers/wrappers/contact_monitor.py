@@ -7,11 +7,11 @@ from typing import Any, ClassVar, SupportsFloat
 import gymnasium as gym
 import numpy as np
 
-from safe_wrappers import interventions as keys
-from safe_wrappers.control.contact import complementarity_residuals
-from safe_wrappers.plants.contacts import Contacts, NormalContact
-from safe_wrappers.wrappers.stack import Layer
-from safe_wrappers.wrappers.step_watch import StepWatch
+from safe_wrappers import info as keys
+from safe_wrappers.control.contact.contact import complementarity_residuals
+from safe_wrappers.plants.mujoco.contacts import Contacts, NormalContact
+from safe_wrappers.stack import Layer
+from safe_wrappers.wrappers.common.step_watch import StepWatch
 
 
 class ContactMonitor(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):

@@ -7,9 +7,9 @@ from typing import Any, ClassVar, SupportsFloat
 import gymnasium as gym
 import numpy as np
 
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.stack import Layer, refuse_order
+from safe_wrappers.stack import Layer, refuse_order
 
 Judge = Callable[[Any], float]
 """Takes the unwrapped env, returns the cost of the step that it has just made."""
@@ -34,7 +34,7 @@ class CostFunction(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
 
     Raises:
         ConfigurationError: `fn` is no function, cannot be imported, or returned something else than a finite
-            number; the env has a cost of its own; or a wrapper is inside that must be outside (`wrappers/stack.py`).
+            number; the env has a cost of its own; or a wrapper is inside that must be outside (`stack.py`).
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw

@@ -9,22 +9,22 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers import interventions as keys
-from safe_wrappers.constraints.constraint import Constraint, non_negative, positive
-from safe_wrappers.constraints.plain_data import constraint_data
-from safe_wrappers.control.leases import LeaseDelays
-from safe_wrappers.control.smoothstep import smoothstep
+from safe_wrappers import info as keys
+from safe_wrappers.control.handover.smoothstep import smoothstep
+from safe_wrappers.control.watchdog.leases import LeaseDelays
 from safe_wrappers.errors import ActionError, ConfigurationError
+from safe_wrappers.filter.constraint import Constraint, non_negative, positive
+from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.default import default_plant
 from safe_wrappers.plants.plant import Plant, check_actions, check_timing, refuse_changed_actions, wrappers_of
-from safe_wrappers.wrappers.admission import Admission, Measured
+from safe_wrappers.plants.template import PlantOfSpec, own_plant
+from safe_wrappers.serialize import constraint_data
+from safe_wrappers.stack import Layer, refuse_order
 from safe_wrappers.wrappers.cbf_action_filter import is_filtered
-from safe_wrappers.wrappers.fallback import FallbackFunction
-from safe_wrappers.wrappers.own_plant import PlantOfSpec, own_plant
-from safe_wrappers.wrappers.receiver import CommandReceiver
-from safe_wrappers.wrappers.room import ClearanceFunction, Room
-from safe_wrappers.wrappers.stack import Layer, refuse_order
-from safe_wrappers.wrappers.stand_in import StandIn
+from safe_wrappers.wrappers.common.fallback_controller import StandIn
+from safe_wrappers.wrappers.common.receiver import CommandReceiver
+from safe_wrappers.wrappers.lease.admission import Admission, Measured
+from safe_wrappers.wrappers.lease.room import ClearanceFunction, Room
 
 Array = NDArray[np.float64]
 
@@ -40,11 +40,11 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
 
         way(lease + detect + confirm + age + act) + v^2 / (2 braking) + localisation + margin <= clearance
 
-    (`control/leases.py`; the way at the approach speed v, growing by `acceleration`). It is granted when a fresh
-    command comes, and counted down on the clock of control steps: no clearance is read in between, as a watchdog
-    could not. While nothing fresh comes, the command in force goes on: repeated if it is a single one, step by step
-    if it is a chunk's (`ChunkHandover` outside). A control step is executed only if the lease covers all of it.
-    When it does not, or where a fresh command would get no lease for a whole step, the fallback brakes at once.
+    (`control/watchdog/leases.py`; the way at the approach speed v, growing by `acceleration`). It is granted when a
+    fresh command comes, and counted down on the clock of control steps: no clearance is read in between, as a
+    watchdog could not. While nothing fresh comes, the command in force goes on: repeated if it is a single one, step
+    by step if it is a chunk's (`ChunkHandover` outside). A control step is executed only if the lease covers all of
+    it. When it does not, or where a fresh command would get no lease for a whole step, the fallback brakes at once.
     Authority comes back with a fresh command alone, over a blend of `blend_time`; a lease that ends on the way back
     brakes at once, too.
 
@@ -90,7 +90,7 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         clock_error_s: Bound on how wrong the stamps of commands may be, s; it counts in the budget.
         reach: Limits on the motion, {"max_acceleration": ..., "max_speed": ..., "max_jerk": ..., "arrival": "moving"
             or "rest"}, for actions that are position setpoints: `ChunkHandover` then has a chunk refused whose end is
-            out of reach in its time (`wrappers/admission.py`).
+            out of reach in its time (`wrappers/lease/admission.py`).
         measured: For `reach`: a function of the env that returns positions, velocities and, for an arrival at rest
             with limited jerk, accelerations; None reads the lengths of the MuJoCo actuators.
         fallback: "brake", "hold", "zero", or a function of the plant.

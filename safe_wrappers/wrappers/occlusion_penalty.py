@@ -10,20 +10,20 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers import interventions as keys
-from safe_wrappers.constraints.constraint import non_negative, positive
-from safe_wrappers.control.covariance import blind_time
-from safe_wrappers.control.observability import linear_observability
-from safe_wrappers.control.spatial import from_sensor, lever_arm_velocity, to_sensor
-from safe_wrappers.control.tracks import Tracks, largest_deviation
+from safe_wrappers import info as keys
+from safe_wrappers.control.estimation.covariance import blind_time
+from safe_wrappers.control.estimation.observability import linear_observability
+from safe_wrappers.control.estimation.tracks import Tracks, largest_deviation
+from safe_wrappers.control.numerics.spatial import from_sensor, lever_arm_velocity, to_sensor
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.plants.line_of_sight import LineOfSight
-from safe_wrappers.plants.mujoco import control_interval
+from safe_wrappers.filter.constraint import non_negative, positive
+from safe_wrappers.plants.mujoco.plant import control_interval
 from safe_wrappers.plants.plant import read_attribute
-from safe_wrappers.wrappers.own_random import OwnRandom
-from safe_wrappers.wrappers.sensor import Sensor, sensor_from
-from safe_wrappers.wrappers.stack import Layer, refuse_order
-from safe_wrappers.wrappers.track import Track, track_from
+from safe_wrappers.plants.queries.line_of_sight import LineOfSight
+from safe_wrappers.stack import Layer, refuse_order
+from safe_wrappers.wrappers.common.wrapper_rng import OwnRandom
+from safe_wrappers.wrappers.occlusion.sensor import Sensor, sensor_from
+from safe_wrappers.wrappers.occlusion.track import Track, track_from
 
 Array = NDArray[np.float64]
 
@@ -70,7 +70,7 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
     ``occlusion/sigma`` (m, array), ``occlusion/penalty``, ``occlusion/task_reward`` (float).
 
     Attributes:
-        tracking: The `control.tracks.Tracks`: positions, velocities, covariances, and those ahead. What
+        tracking: The `control.estimation.tracks.Tracks`: positions, velocities, covariances, and those ahead. What
             `TrackedDiscs` read.
         track_names: One per track: the body's name, or the attribute's with an index.
         last_seen_positions: Where each was measured to be last, shape (n, d), m; before that, the initial fix.

@@ -12,10 +12,10 @@ from typing import Any, ClassVar, Final, SupportsFloat
 import gymnasium as gym
 import numpy as np
 
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.not_judged import NOT_JUDGED
-from safe_wrappers.wrappers.stack import Layer, refuse_order
+from safe_wrappers.stack import Layer, refuse_order
+from safe_wrappers.wrappers.common.not_judged import NOT_JUDGED
 
 COLUMNS: Final = (
     "length",
@@ -75,14 +75,14 @@ class RecordInterventions(
     """Counts interventions, corrections and costs; changes neither actions, rewards nor observations.
 
     Put it outside the filter, `LeaseExpiry`, `TeleopChannel` and `OcclusionPenalty`, and inside `ChunkHandover` and
-    SB3's `Monitor`; other orders of our own wrappers are refused (`wrappers/stack.py`).
+    SB3's `Monitor`; other orders of our own wrappers are refused (`stack.py`).
 
     **What nobody reported is not zero.** Without a filter inside (the unfiltered arm of a comparison) there are no
     `cbf/*` keys, and many tasks report no `cost`. What would be made of them is NaN in the running keys, missing
     in the episode's summary, and an empty cell in the file. The same holds for a 0 that was not reported at every
     step; a count above 0 is given, as a lower bound. `CostFunction` gives a cost to a task that has none.
 
-    At every step `info` gains the keys of `safe_wrappers.interventions.RUNNING` (float64, the episode so
+    At every step `info` gains the keys of `safe_wrappers.info.RUNNING` (float64, the episode so
     far), and at an episode's last step `info["interventions"]`, a dict:
 
     - `length`, `return` (of the task: what an `OcclusionPenalty` or `AdaptionPenalty` inside has taken off is added

@@ -6,10 +6,10 @@ from typing import Any
 import gymnasium as gym
 
 from safe_wrappers.constraints.traction import Traction
+from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.plant import Plant
+from safe_wrappers.plants.template import PlantOfSpec, own_plant
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
-from safe_wrappers.wrappers.fallback import FallbackFunction
-from safe_wrappers.wrappers.own_plant import PlantOfSpec, own_plant
 
 
 class SlipLimiter(CBFActionFilter):

@@ -9,30 +9,30 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers import interventions as keys
-from safe_wrappers.constraints.constraint import non_negative, positive
-from safe_wrappers.control.passivity import ChannelLedger
-from safe_wrappers.control.port_checks import port_energy
-from safe_wrappers.control.running_sum import RunningSum
-from safe_wrappers.control.wave_line import Rule
+from safe_wrappers import info as keys
+from safe_wrappers.control.numerics.running_sum import RunningSum
+from safe_wrappers.control.teleop.passivity import ChannelLedger
+from safe_wrappers.control.teleop.port_checks import port_energy
+from safe_wrappers.control.teleop.wave_line import Rule
 from safe_wrappers.errors import ActionError, ConfigurationError
+from safe_wrappers.filter.constraint import non_negative, positive
+from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.default import default_plant
 from safe_wrappers.plants.plant import Plant, check_actions, check_timing, refuse_changed_actions
+from safe_wrappers.plants.template import PlantOfSpec, own_plant
+from safe_wrappers.stack import Layer, refuse_order
 from safe_wrappers.wrappers.cbf_action_filter import is_filtered
-from safe_wrappers.wrappers.fallback import FallbackFunction
-from safe_wrappers.wrappers.own_plant import PlantOfSpec, own_plant
-from safe_wrappers.wrappers.receiver import CommandReceiver
-from safe_wrappers.wrappers.round_trip_watch import (
+from safe_wrappers.wrappers.common.fallback_controller import StandIn
+from safe_wrappers.wrappers.common.receiver import CommandReceiver
+from safe_wrappers.wrappers.teleop.coding import Coding, Down, PaidCoding, PlainCoding, Up, WaveCoding
+from safe_wrappers.wrappers.teleop.link import Line, Link, Packet, link_data, link_from
+from safe_wrappers.wrappers.teleop.port import PortReading, TeleopPort, port_data, port_from
+from safe_wrappers.wrappers.teleop.round_trip import (
     RoundTripCeiling,
     RoundTripWatch,
     ceiling_data,
     ceiling_from,
 )
-from safe_wrappers.wrappers.stack import Layer, refuse_order
-from safe_wrappers.wrappers.stand_in import StandIn
-from safe_wrappers.wrappers.teleop_coding import Coding, Down, PaidCoding, PlainCoding, Up, WaveCoding
-from safe_wrappers.wrappers.teleop_link import Line, Link, Packet, link_data, link_from
-from safe_wrappers.wrappers.teleop_port import PortReading, TeleopPort, port_data, port_from
 
 Array = NDArray[np.float64]
 
@@ -57,10 +57,10 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
     **Plain coding** works with any Box action. Effort and flow then travel as they are, and the delay can create
     energy: the machine bounces between operator and wall. **Wave coding** needs a *port*: the entries of the action
     that are a flow and those of the observation that are its effort (the env publishes them, or `port` says them).
-    Each direction carries waves that pay for what they do at the other end (`control.wave_line`), whatever the
+    Each direction carries waves that pay for what they do at the other end (`control.teleop.wave_line`), whatever the
     delay, the jitter and the loss, and the operator's observation shows the effort that is decoded at his end in
     place of the machine's. `passivity="controller"` is the other way to keep a channel from creating energy: plain
-    coding, but each end gives out no more than it has heard the other took in (`control.passivity_control`).
+    coding, but each end gives out no more than it has heard the other took in (`control.teleop.passivity_control`).
 
     **The round-trip ceiling.** At every control step the channel measures the round trip: the age of the image that
     the command in force was made from. With a `RoundTripCeiling` it compares it with the longest from which an
@@ -102,10 +102,10 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         ceiling: A `RoundTripCeiling`, the dict of one, or None: authority is never revoked.
         missing: What acts while no command has arrived in a control step: "hold" the last one, "zero", or "fallback".
             Before the first one "hold" is zero. The entries of a wave-coded flow follow `wave_rule`.
-        wave_rule: "queue", "hold" or "zero": what a wave line puts out when packets are late (`control.wave_line`).
-        port: A `TeleopPort` or the dict of one; None: what the env publishes, if it does.
-        damping_limit: Of the passivity controller's damping force at the operator, N; None: none. Damping at a small
-            velocity is a large force for one tick.
+        wave_rule: "queue", "hold" or "zero": what a wave line puts out when packets are late
+        (`control.teleop.wave_line`). port: A `TeleopPort` or the dict of one; None: what the env publishes, if it
+        does. damping_limit: Of the passivity controller's damping force at the operator, N; None: none. Damping at a
+            small velocity is a large force for one tick.
         storage_j: J that each end of a passivity controller may give out unpaid; None: 0.02. It needs some: an
             operator who feels no force puts no energy in, so nothing would ever move.
         fallback: The local brake: "brake", "hold", "zero", or a function of the plant.

@@ -6,17 +6,17 @@ from typing import Any
 import gymnasium as gym
 import mujoco
 
-from safe_wrappers.constraints.constraint import Constraint, non_negative
-from safe_wrappers.constraints.contact_feasibility import ContactFeasibility
-from safe_wrappers.constraints.joint_position_limit import JointPositionLimit
-from safe_wrappers.constraints.joints import refuse_uncovered_stops, stops
-from safe_wrappers.constraints.stance import Stance
-from safe_wrappers.constraints.support_margin import SupportMargin
+from safe_wrappers.constraints.contact.contact_feasibility import ContactFeasibility
+from safe_wrappers.constraints.contact.stance import Stance
+from safe_wrappers.constraints.contact.support_margin import SupportMargin
+from safe_wrappers.constraints.limits.joint_position_limit import JointPositionLimit
+from safe_wrappers.constraints.limits.joints import refuse_uncovered_stops, stops
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.filter.constraint import Constraint, non_negative
+from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.plant import Plant
+from safe_wrappers.plants.template import PlantOfSpec, own_plant
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
-from safe_wrappers.wrappers.fallback import FallbackFunction
-from safe_wrappers.wrappers.own_plant import PlantOfSpec, own_plant
 
 TOLERANCE = 0.01
 """By how much a contact force may miss its cone unless told otherwise, as a share of the robot's weight."""

@@ -11,7 +11,7 @@ import pytest
 import safe_wrappers as sw
 from benchmarks import friction_cones
 from benchmarks.friction_cones import EXACT, SHARE, SOLVERS, at, compare, record, table
-from safe_wrappers.control.whole_body import WholeBodyProblem, rigid_forces
+from safe_wrappers.control.legged.whole_body import WholeBodyProblem, rigid_forces
 
 
 def foot(nominal, wanted=0.0):

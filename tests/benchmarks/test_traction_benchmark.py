@@ -19,7 +19,7 @@ from benchmarks.traction import (
     stopping_distance,
     tables,
 )
-from safe_wrappers.control.traction_curves import MAGIC_FORMULA, peak
+from safe_wrappers.control.vehicle.traction_curves import MAGIC_FORMULA, peak
 
 HARD = ("full throttle", "panic brake", "pulse")
 G = 9.81

@@ -9,7 +9,7 @@ import pytest
 from gymnasium.envs.mujoco import MujocoEnv
 
 import safe_wrappers as sw
-from safe_wrappers.control.stopping import sampled_acceleration_limit, sampled_inset
+from safe_wrappers.control.backup.stopping import sampled_acceleration_limit, sampled_inset
 from safe_wrappers.errors import ConfigurationError
 
 POINT_MASS = """<mujoco><option timestep="{timestep}" gravity="{pull}" integrator="RK4"/>

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.plain_data import constraint_data, constraint_from
 from safe_wrappers.errors import ConfigurationError, UnsafeStateWarning, UnsupportedEnvError
+from safe_wrappers.serialize import constraint_data, constraint_from
 
 FULL = np.array([1.0, 1.0])
 BACK = -FULL

@@ -9,8 +9,8 @@ from contact_judge import DRIVERS, ConeJudge, touches
 from judged_loops import Scene, flagged
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.plain_data import constraint_data, constraint_from
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.serialize import constraint_data, constraint_from
 
 ROUNDING = 1e-6
 """Executed actions are rounded to float32, and a robot in contact makes more of it."""

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.plain_data import constraint_data, constraint_from
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.serialize import constraint_data, constraint_from
 
 HOLD, RADIUS, CAR, PILLAR, MARGIN = 0.04, 0.2, 0.4, 0.35, 0.05
 TRUE_CARS = sw.TrackedDiscs(CAR, 0.0, attribute="car_tracks")

@@ -9,9 +9,9 @@ from judged_loops import Scene
 from scipy.optimize import lsq_linear
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.geom_gaps import GeomGaps
+from safe_wrappers.constraints.contact.geom_gaps import GeomGaps
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.plants.forecast import Poses
+from safe_wrappers.plants.mujoco.forecast import Poses
 
 ARM = """<mujoco><option timestep="0.005" gravity="0 0 0"/><worldbody>
 <geom name="floor" type="plane" pos="0 0 -.4" size="3 3 .1"/>

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from safe_wrappers.constraints import predicted
-from safe_wrappers.plants.forecast import Recorder
+from safe_wrappers.constraints import rollout as predicted
+from safe_wrappers.plants.mujoco.forecast import Recorder
 
 gym.register_envs(pytest.importorskip("gymnasium_robotics"))
 

@@ -11,7 +11,7 @@ from gymnasium.envs.registration import EnvSpec
 from judged_loops import DRIVERS, Judge, Scene, drive, flagged
 
 import safe_wrappers as sw
-from safe_wrappers.control.manipulability import validated_threshold
+from safe_wrappers.control.filtering.manipulability import validated_threshold
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 
 CHAIN = """<mujoco><compiler angle="radian"/><option timestep="0.002"><flag contact="disable"/></option><worldbody>

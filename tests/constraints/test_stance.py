@@ -11,8 +11,8 @@ from qpsolvers import solve_qp
 from scipy.sparse import csc_matrix
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.plain_data import constraint_data, constraint_from
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.serialize import constraint_data, constraint_from
 
 LEGS = [(x, y) for x in (-0.3, 0.3) for y in (-0.2, 0.2)]
 FRICTION = 0.8

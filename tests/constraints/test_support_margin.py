@@ -10,9 +10,9 @@ from judged_loops import Scene, flagged
 from scipy.spatial import ConvexHull
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.plain_data import constraint_data, constraint_from
-from safe_wrappers.constraints.support_margin import edge_distances
+from safe_wrappers.constraints.contact.support_margin import edge_distances
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.serialize import constraint_data, constraint_from
 
 HALF, HEIGHT, MASS = 0.2, 0.5, 5.0
 WEIGHT = MASS * 9.81

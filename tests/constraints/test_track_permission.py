@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.plain_data import constraint_data, constraint_from
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.serialize import constraint_data, constraint_from
 
 NOTHING_SEEN = sw.Sensor("eye", range_m=0.01)
 FAR_CARS = {"layout": {"cars": [[-9.0 - i, 0.0] for i in range(6)], "agent": [0.0, 1.0, 0.0]}}

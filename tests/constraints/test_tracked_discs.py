@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.constraint import Constraint
-from safe_wrappers.constraints.obstacle_kinds import obstacle_data, obstacle_from
-from safe_wrappers.control.tracks import Motion, Tracks
+from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacle_data, obstacle_from
+from safe_wrappers.control.estimation.tracks import Motion, Tracks
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.filter.constraint import Constraint
 
 RADIUS = 0.4
 

@@ -15,7 +15,7 @@ from vehicles import MOTORS, WHEEL, Trolley
 
 import safe_wrappers as sw
 from safe_wrappers.constraints import traction as traction_module
-from safe_wrappers.control.slip import slip_ratio
+from safe_wrappers.control.vehicle.slip import slip_ratio
 from safe_wrappers.errors import ConfigurationError
 
 FULL = np.array([1.0, 1.0, 1.0, 1.0, 0.0], dtype=np.float32)

@@ -8,7 +8,7 @@ import pytest
 from vehicles import Trolley
 
 import safe_wrappers as sw
-from safe_wrappers.control.slip import slip_ratio
+from safe_wrappers.control.vehicle.slip import slip_ratio
 
 FULL = np.array([1.0, 1.0, 1.0, 1.0, 0.0], dtype=np.float32)
 OPEN = {"agent": [0.0, 0.0, 0.0], "goal": [4.0, 4.0], "hazards": [], "patches": []}

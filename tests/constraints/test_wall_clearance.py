@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from point_worlds import BLOCKS, RADIUS, PointWorld
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.plain_data import constraint_data, constraint_from
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.serialize import constraint_data, constraint_from
 
 MARGIN = 0.001
 ROOM = RADIUS + 2 * 0.002 + MARGIN

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safe_wrappers.control.cbf import (
+from safe_wrappers.control.filtering.cbf import (
     best_rate,
     cbf_rows,
     lie_derivatives,

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from safe_wrappers.control.centroidal import (
+from safe_wrappers.control.legged.centroidal import (
     centroidal_bias_rate,
     centroidal_momentum,
     centroidal_momentum_matrix,

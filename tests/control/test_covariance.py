@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from safe_wrappers.control.covariance import (
+from safe_wrappers.control.estimation.covariance import (
     blind_covariance,
     checked_covariance,
     checked_noise,

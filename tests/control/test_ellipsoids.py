@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from safe_wrappers.control.ellipsoids import ellipsoid_gap
+from safe_wrappers.control.estimation.ellipsoids import ellipsoid_gap
 from safe_wrappers.errors import ConfigurationError
 
 LOST_WIDTH = (

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safe_wrappers.control.escapes import Escapes, Manoeuvre
-from safe_wrappers.control.held_axis import HeldAxis
+from safe_wrappers.control.backup.damped_axis import HeldAxis
+from safe_wrappers.control.backup.evasive_maneuvers import Escapes, Manoeuvre
 
 AXES = (
     HeldAxis(0.98, 0.04, 0.01, 4, -1.0, 1.0),

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import safe_wrappers as sw
-from safe_wrappers.control.heading_drive import Motion, StoppingPath
-from safe_wrappers.plants.planar_robot import heading_drive
+from safe_wrappers.control.backup.heading_drive import Motion, StoppingPath
+from safe_wrappers.plants.queries.planar_robot import heading_drive
 
 
 def robot(level=0, uncertainty=0.0):

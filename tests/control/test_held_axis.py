@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safe_wrappers.control.held_axis import HeldAxis
-from safe_wrappers.control.stopping import held_stopping_distance
+from safe_wrappers.control.backup.damped_axis import HeldAxis
+from safe_wrappers.control.backup.stopping import held_stopping_distance
 
 SPEEDS = st.floats(-7.0, 7.0).map(lambda v: round(v, 6))
 PLACES = st.floats(-3.0, 3.0)

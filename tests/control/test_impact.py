@@ -7,7 +7,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from safe_wrappers.control.impact import (
+from safe_wrappers.control.contact.impact import (
     attenuation_after_delay,
     braked_deflection,
     braked_peak_force,

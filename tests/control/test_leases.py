@@ -8,7 +8,7 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from safe_wrappers.control.leases import (
+from safe_wrappers.control.watchdog.leases import (
     LeaseDelays,
     longest_lease,
     longest_lease_of_room,

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from safe_wrappers.control.manipulability import (
+from safe_wrappers.control.filtering.manipulability import (
     chain_derivative,
     joint_rates,
     manipulability,

@@ -3,33 +3,18 @@
 import numpy as np
 import pytest
 
-from safe_wrappers.control import (
-    cbf,
-    contact,
-    contact_lcp,
-    covariance,
-    flexible_joint,
-    friction_cone,
-    impact,
-    kalman,
-    leases,
-    lemke,
-    manipulability,
-    observability,
-    passivity,
-    passivity_control,
-    polynomials,
-    predicted_positions,
-    projection,
-    reachability,
-    sampling,
-    slip,
-    smoothstep,
-    splines,
-    stopping,
-    support,
-    tails,
-)
+from safe_wrappers.appendix import contact_lcp, flexible_joint, lemke, sampling, sigma_coverage
+from safe_wrappers.control.backup import stopping
+from safe_wrappers.control.contact import contact, friction_cone, impact
+from safe_wrappers.control.estimation import covariance, kalman, observability
+from safe_wrappers.control.filtering import cbf, manipulability
+from safe_wrappers.control.handover import smoothstep, splines
+from safe_wrappers.control.legged import predicted_positions, support
+from safe_wrappers.control.numerics import polynomials
+from safe_wrappers.control.teleop import passivity, passivity_control
+from safe_wrappers.control.vehicle import slip
+from safe_wrappers.control.watchdog import leases, reachability
+from safe_wrappers.filter import projection
 
 EYE = [[1, 0], [0, 1]]
 EYE3 = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
@@ -130,9 +115,9 @@ CALLS = {
         lambda p, o, n, i: support.support_rows(p, support.plane(o, n), i),
         [CORNERS, [0, 0, 0], UP, 0],
     ),
-    "gaussian_tail": (tails.gaussian_tail, [2]),
-    "unimodal_tail": (tails.unimodal_tail, [2]),
-    "chebyshev_tail": (tails.chebyshev_tail, [2]),
+    "gaussian_tail": (sigma_coverage.gaussian_tail, [2]),
+    "unimodal_tail": (sigma_coverage.unimodal_tail, [2]),
+    "chebyshev_tail": (sigma_coverage.chebyshev_tail, [2]),
 }
 
 

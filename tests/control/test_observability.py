@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.linalg import subspace_angles
 
-from safe_wrappers.control.observability import (
+from safe_wrappers.control.estimation.observability import (
     described,
     described_subspace,
     linear_observability,

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safe_wrappers.control.passivity import (
+from safe_wrappers.control.numerics.running_sum import RunningSum
+from safe_wrappers.control.teleop.passivity import (
     ChannelLedger,
     EnergyLedger,
     effort_and_outgoing,
@@ -17,7 +18,6 @@ from safe_wrappers.control.passivity import (
     to_waves,
     wave_power,
 )
-from safe_wrappers.control.running_sum import RunningSum
 from safe_wrappers.errors import ConfigurationError
 
 NUMBERS = st.floats(-1e4, 1e4, allow_subnormal=False)

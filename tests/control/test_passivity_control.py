@@ -7,8 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safe_wrappers.control.passivity import ChannelLedger, EnergyLedger
-from safe_wrappers.control.passivity_control import EnergyReference, PassivityController, PassivityObserver
+from safe_wrappers.control.teleop.passivity import ChannelLedger, EnergyLedger
+from safe_wrappers.control.teleop.passivity_control import (
+    EnergyReference,
+    PassivityController,
+    PassivityObserver,
+)
 from safe_wrappers.errors import ConfigurationError
 
 DT = 1e-3

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from safe_wrappers.control.held_axis import HeldAxis
-from safe_wrappers.control.point_among_walls import PointAmongWalls, PointMotion
-from safe_wrappers.control.rectangles import apart
+from safe_wrappers.control.backup.damped_axis import HeldAxis
+from safe_wrappers.control.backup.point_among_walls import PointAmongWalls, PointMotion
+from safe_wrappers.control.numerics.rectangles import apart
 
 WALLS = [(-3.0, 3.0, -3.0, -2.0), (-3.0, 3.0, 2.0, 3.0), (-3.0, -2.0, -2.0, 2.0), (2.0, 3.0, -2.0, 2.0)]
 BLOCK = (-0.5, 0.5, -0.5, 0.4)

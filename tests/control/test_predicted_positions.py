@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from safe_wrappers.control.predicted_positions import largest_acceleration, predicted_position_rows
+from safe_wrappers.control.legged.predicted_positions import largest_acceleration, predicted_position_rows
 from safe_wrappers.errors import ConfigurationError
 
 

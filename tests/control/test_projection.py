@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from scipy.optimize import lsq_linear, minimize
 
 import safe_wrappers as sw
-from safe_wrappers.control import projection as module
-from safe_wrappers.control.projection import Status, project
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.filter import projection as module
+from safe_wrappers.filter.projection import Status, project
 
 pytestmark = pytest.mark.filterwarnings("ignore::qpsolvers.warnings.SparseConversionWarning")
 

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from safe_wrappers.control import reachability
-from safe_wrappers.control.reachability import (
+from safe_wrappers.control.watchdog import reachability
+from safe_wrappers.control.watchdog.reachability import (
     MotionLimits,
     admits,
     furthest,

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from safe_wrappers.control.slip import (
+from safe_wrappers.control.vehicle.slip import (
     normalized_slip,
     piecewise_slip_ratio,
     slip_ratio,
@@ -16,7 +16,7 @@ from safe_wrappers.control.slip import (
     spins_out,
     wheel_acceleration,
 )
-from safe_wrappers.control.traction_curves import MAGIC_FORMULA
+from safe_wrappers.control.vehicle.traction_curves import MAGIC_FORMULA
 from safe_wrappers.errors import ConfigurationError
 
 speeds = st.floats(-30.0, 30.0)

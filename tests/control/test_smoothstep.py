@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BPoly
 
-from safe_wrappers.control.smoothstep import (
+from safe_wrappers.control.handover.smoothstep import (
     SMOOTHSTEP_PEAK_RATE,
     blend,
     blend_rate,

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from safe_wrappers.control.spatial import (
+from safe_wrappers.control.numerics.spatial import (
     centre_acceleration,
     centre_acceleration_from_imu,
     centre_velocity,

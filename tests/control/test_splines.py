@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.interpolate import BPoly, CubicHermiteSpline
 
-from safe_wrappers.control import splines
-from safe_wrappers.control.splines import (
+from safe_wrappers.control.handover import splines
+from safe_wrappers.control.handover.splines import (
     evaluate,
     hermite,
     hermite_series,

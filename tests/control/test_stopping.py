@@ -5,8 +5,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from safe_wrappers.control import stopping
-from safe_wrappers.control.stopping import (
+from safe_wrappers.control.backup import stopping
+from safe_wrappers.control.backup.stopping import (
     kinetic_inset,
     kinetic_row,
     predicted_approach,

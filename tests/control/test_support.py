@@ -8,8 +8,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from safe_wrappers.control.centroidal import momentum_rate
-from safe_wrappers.control.support import (
+from safe_wrappers.control.legged.centroidal import momentum_rate
+from safe_wrappers.control.legged.support import (
     balance,
     common_plane,
     plane,

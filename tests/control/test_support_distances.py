@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safe_wrappers.control import support_distances as module
-from safe_wrappers.control.friction_cone import tangents
-from safe_wrappers.control.support import balance, common_plane, support_polygon
-from safe_wrappers.control.support_distances import support_distances
+from safe_wrappers.control.contact.friction_cone import tangents
+from safe_wrappers.control.legged import support_distances as module
+from safe_wrappers.control.legged.support import balance, common_plane, support_polygon
+from safe_wrappers.control.legged.support_distances import support_distances
 from safe_wrappers.errors import ConfigurationError
 
 UP = np.array([0.0, 0.0, 1.0])

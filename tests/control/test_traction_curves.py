@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
-from safe_wrappers.control.traction_curves import (
+from safe_wrappers.control.vehicle.traction_curves import (
     BURCKHARDT,
     BURCKHARDT_PUBLISHED,
     MAGIC_FORMULA,

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safe_wrappers.control.wave_line import WaveLine
+from safe_wrappers.control.teleop.wave_line import WaveLine
 from safe_wrappers.errors import ConfigurationError
 
 DT = 2.0**-10

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from safe_wrappers.control.wheel import Wheel
+from safe_wrappers.control.vehicle.wheel import Wheel
 from safe_wrappers.errors import ConfigurationError
 
 CART = """

@@ -10,11 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear, minimize
 
-from safe_wrappers.control import whole_body
-from safe_wrappers.control.conic_program import Candidate
-from safe_wrappers.control.friction_cone import friction_pyramid, in_cone
-from safe_wrappers.control.support import plane, support_rows
-from safe_wrappers.control.whole_body import (
+from safe_wrappers.control.contact.friction_cone import friction_pyramid, in_cone
+from safe_wrappers.control.legged import whole_body
+from safe_wrappers.control.legged.support import plane, support_rows
+from safe_wrappers.control.legged.whole_body import (
     Task,
     WholeBodyProblem,
     attainable_contact_acceleration,
@@ -22,6 +21,7 @@ from safe_wrappers.control.whole_body import (
     solve_cone,
     solve_pyramid,
 )
+from safe_wrappers.control.numerics.conic_program import Candidate
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 
 UP = np.array([0.0, 0.0, 1.0])

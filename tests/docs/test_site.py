@@ -10,7 +10,7 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 import safe_wrappers as sw
-from safe_wrappers import interventions
+from safe_wrappers import info as interventions
 
 pytestmark = pytest.mark.slow
 DOCS = Path(__file__).parents[2] / "docs"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-from safe_wrappers.control.slip import slip_ratio
+from safe_wrappers.control.vehicle.slip import slip_ratio
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 RADIUS, SLOWEST, SUBSTEPS = 0.1, 0.5, 5

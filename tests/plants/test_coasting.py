@@ -7,7 +7,7 @@ import pytest
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.plants.coasting import Coasting
+from safe_wrappers.plants.queries.coasting import Coasting
 
 RADIUS = 0.22
 

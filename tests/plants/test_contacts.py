@@ -7,7 +7,7 @@ import pytest
 from dropped_ball import DroppedBall
 
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.plants.contacts import Contacts
+from safe_wrappers.plants.mujoco.contacts import Contacts
 
 
 def by_mujoco(model, data):

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
+from safe_wrappers.appendix.delay_budget import phase_margin_left
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.delay_budget import phase_margin_left
 
 CART = """
 <mujoco><option timestep="0.001" gravity="0 0 0"/>

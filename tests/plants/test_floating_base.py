@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from safe_wrappers.control.centroidal import (
+from safe_wrappers.control.contact.friction_cone import friction_pyramid, friction_ratio, in_cone
+from safe_wrappers.control.legged.centroidal import (
     centroidal_bias_rate,
     centroidal_momentum,
     centroidal_momentum_matrix,
     momentum_rate,
 )
-from safe_wrappers.control.friction_cone import friction_pyramid, friction_ratio, in_cone
-from safe_wrappers.control.support import balance
-from safe_wrappers.control.whole_body import WholeBodyProblem, rigid_forces, solve_cone, solve_pyramid
+from safe_wrappers.control.legged.support import balance
+from safe_wrappers.control.legged.whole_body import WholeBodyProblem, rigid_forces, solve_cone, solve_pyramid
 from safe_wrappers.errors import UnsupportedEnvError
-from safe_wrappers.plants.floating_base import (
+from safe_wrappers.plants.queries.floating_base import (
     contact_points,
     equations_of_motion,
     floating_base_terms,

@@ -7,7 +7,7 @@ import pytest
 
 import safe_wrappers  # noqa: F401 (registers the crossing)
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.plants.line_of_sight import LineOfSight
+from safe_wrappers.plants.queries.line_of_sight import LineOfSight
 
 
 def world(inside, robot="", eye='pos="0 0 0.5"'):

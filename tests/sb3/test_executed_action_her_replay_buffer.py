@@ -13,7 +13,7 @@ from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 import safe_wrappers as sw
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 from safe_wrappers.sb3 import ExecutedActionHerReplayBuffer
 from safe_wrappers.train.checkpoint import _move
 

@@ -18,7 +18,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 import safe_wrappers as sw
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 from safe_wrappers.sb3 import ExecutedActionDictReplayBuffer, ExecutedActionReplayBuffer
 
 torch.set_num_threads(1)

@@ -8,7 +8,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import safe_wrappers as sw
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 from safe_wrappers.sb3 import InterventionCallback, InterventionEvalCallback
 from safe_wrappers.wrappers.faults import DroppedRefreshes
 from safe_wrappers.wrappers.record_interventions import RecordInterventions

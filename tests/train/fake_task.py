@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 
 HAZARD = np.array([0.5, 0.0])

@@ -9,7 +9,7 @@ from gymnasium.spaces import Box, Dict
 from stable_baselines3 import HerReplayBuffer
 from test_run import Reports, run_killed_after
 
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.sb3 import ExecutedActionHerReplayBuffer
 from safe_wrappers.train.checkpoint import latest_checkpoint

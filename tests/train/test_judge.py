@@ -10,7 +10,7 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import safe_wrappers as sw
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 from safe_wrappers.train.config import EnvConfig, FilterConfig, parse_experiment
 from safe_wrappers.train.evaluate import evaluate_run
 from safe_wrappers.train.report import verdict, write_report

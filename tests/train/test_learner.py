@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from test_run import Reports, run_killed_after
 
 import safe_wrappers as sw
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.sb3 import ExecutedActionReplayBuffer
 from safe_wrappers.train import run as run_module

@@ -4,7 +4,7 @@ import pytest
 from made_up import steps
 
 import safe_wrappers as sw
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 from safe_wrappers.train import step_log
 from safe_wrappers.train.step_log import StepRecorder, load_steps, pool, save_steps
 

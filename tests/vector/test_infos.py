@@ -9,7 +9,7 @@ from single_loops import assert_same_info, by_hand, script
 from vector_worlds import TASKS, cart, cart_filter, sub_envs
 
 import safe_wrappers as sw
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 
 SAME = AutoresetMode.SAME_STEP
 pytestmark = pytest.mark.filterwarnings("ignore:the policy's action:UserWarning")

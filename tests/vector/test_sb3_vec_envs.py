@@ -12,7 +12,7 @@ from single_loops import Episode, Step, assert_same_episodes, by_hand, script
 from vector_worlds import AtHazard, cart, cart_filter
 
 import safe_wrappers as sw
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 
 pytest.importorskip("stable_baselines3")
 from stable_baselines3.common.monitor import Monitor

@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 
 import safe_wrappers as sw
-from safe_wrappers.interventions import COST, COST_SUBSTEP
+from safe_wrappers.info import COST, COST_SUBSTEP
 
 WALL = 1.0
 DT = 0.1

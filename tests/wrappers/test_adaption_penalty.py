@@ -4,7 +4,7 @@ import pytest
 from worlds import Cart, SpeedRow, cart_plant
 
 import safe_wrappers as sw
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 
 LIMIT = 0.25
 """The cart may not be faster; from rest at full throttle it gets there in 2.5 steps of 0.1 s."""

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial import ConvexHull
 
 import safe_wrappers as sw
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.wrappers.balance_monitor import PRESSING
 

@@ -16,7 +16,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from worlds import Cart, Raw, SpeedRow, cart_plant, drift, push, read, wall
 
 import safe_wrappers as sw
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError, UnsupportedEnvError
 
 FLOATS = {*keys.CBF_FLOATS}

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from safe_wrappers import interventions as keys
-from safe_wrappers.control.contact import complementarity_residuals
+from safe_wrappers import info as keys
+from safe_wrappers.control.contact.contact import complementarity_residuals
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 
 FLOATS = (

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.common.receiver import CommandReceiver
 from safe_wrappers.wrappers.faults import (
     FAULTS,
     ClockSkew,
@@ -23,7 +24,6 @@ from safe_wrappers.wrappers.faults import (
     Outages,
     RepeatedCommands,
 )
-from safe_wrappers.wrappers.receiver import CommandReceiver
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 FULL = np.array([1.0, 0.0], np.float32)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.wrappers.room import Room
+from safe_wrappers.wrappers.lease.room import Room
 
 pytestmark = pytest.mark.filterwarnings("ignore:the policy's action is not finite")
 FULL = np.array([1.0, 0.0])

@@ -8,9 +8,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import safe_wrappers as sw
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.not_judged import NOT_JUDGED
+from safe_wrappers.wrappers.common.not_judged import NOT_JUDGED
 from safe_wrappers.wrappers.record_interventions import COLUMNS, RecordInterventions, read_episodes
 
 

@@ -145,7 +145,7 @@ def failing(env, control):
 
 def compared(env, steps, monkeypatch):
     """For every infeasible step: how the executed control fails, the proposal, and the brake."""
-    from safe_wrappers.wrappers.fallback import brake
+    from safe_wrappers.filter.fallback import brake
 
     real, seen = env.unwrapped.step, []
 

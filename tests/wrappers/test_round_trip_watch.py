@@ -7,7 +7,7 @@ from teleop_worlds import ceiling, place
 
 import safe_wrappers as sw
 from safe_wrappers.envs.teleop_contact import CLAMP_Y, TOOL_RADIUS
-from safe_wrappers.wrappers.round_trip_watch import RoundTripWatch, ceiling_data, ceiling_from
+from safe_wrappers.wrappers.teleop.round_trip import RoundTripWatch, ceiling_data, ceiling_from
 
 ROOM = CLAMP_Y - TOOL_RADIUS
 HOLD = 0.001

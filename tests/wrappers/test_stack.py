@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 from safe_wrappers.envs.safe_rover import WHEELS
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.plant import wrappers_of

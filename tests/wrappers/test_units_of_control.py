@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.predicted import Predicted
+from safe_wrappers.constraints.rollout import Predicted
 from safe_wrappers.errors import UnsupportedEnvError
-from safe_wrappers.wrappers.fallback import brake
+from safe_wrappers.filter.fallback import brake
 
 SLIDER = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody>
 <body><joint name="x" type="slide" axis="1 0 0"/><geom size=".1" mass="1" contype="0" conaffinity="0"/>

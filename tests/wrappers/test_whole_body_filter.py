@@ -9,7 +9,7 @@ from gymnasium.envs.registration import EnvSpec
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.plants.replay import Replay
+from safe_wrappers.plants.mujoco.replay import Replay
 
 KINDS = ("forecast", "pyramid", "cone")
 KEYS = {"whole_body/contacts", "whole_body/cone_margin"}

@@ -7,12 +7,12 @@ from typing import Any, ClassVar, NamedTuple, SupportsFloat
 import gymnasium as gym
 import numpy as np
 
-from safe_wrappers import interventions as keys
+from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.plant import check_timing, wrappers_of
-from safe_wrappers.wrappers.own_random import OwnRandom
-from safe_wrappers.wrappers.receiver import CommandReceiver, receiver_inside
-from safe_wrappers.wrappers.stack import Layer
+from safe_wrappers.stack import Layer
+from safe_wrappers.wrappers.common.receiver import CommandReceiver, receiver_inside
+from safe_wrappers.wrappers.common.wrapper_rng import OwnRandom
 
 
 class Carried(NamedTuple):

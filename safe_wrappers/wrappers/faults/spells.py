@@ -4,9 +4,9 @@ from typing import Any
 
 import gymnasium as gym
 
-from safe_wrappers.constraints.constraint import positive
+from safe_wrappers.filter.constraint import positive
+from safe_wrappers.wrappers.common.wrapper_rng import OwnRandom
 from safe_wrappers.wrappers.faults.fault import Fault
-from safe_wrappers.wrappers.own_random import OwnRandom
 
 
 class Spells:

@@ -1,0 +1,1 @@
+"""Formulas of the appendix that no wrapper needs: kept and tested, outside the core."""

@@ -1,0 +1,143 @@
+"""One time step with frictionless contacts as a linear complementarity problem.
+
+Source: appendix "Rigid Body Contact Mechanics"; the steps after Stewart and Trinkle (1996), An implicit
+time-stepping scheme for rigid body dynamics with inelastic collisions and Coulomb friction, and Moreau (1988),
+Unilateral contact and dry friction in finite freedom dynamics. With impulses p at the contacts,
+
+    M (v+ - v) = h f + J' p,    0 <= p  complementary to  J v+ - least >= 0,
+
+    least = -e J v      where the contact is closed, or e > 0 and free motion would close it: Newton's restitution;
+    least = -gap / h    elsewhere: it may close by the end of the step, and no more.
+
+**It is linear only because of what is assumed**, and the appendix's caveat holds: no friction; inertia, forces and
+normals frozen over the step; gaps that change by `h J v+`; an impulse per contact at one instant; one restitution law
+for impacts that happen together, where real ones have an order. It shows what rigid contact asks for; it is no
+evidence that a machine does it.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from safe_wrappers.appendix.lemke import LcpStatus, solve_lcp
+from safe_wrappers.control.numerics.finite import finite_arrays
+from safe_wrappers.errors import ConfigurationError
+
+Array = NDArray[np.float64]
+
+
+class ContactStep(NamedTuple):
+    """The end of a step.
+
+    Attributes:
+        velocity: v+, shape (n,); without impulses unless `status` is solved.
+        impulse: p, shape (k,), N s; zeros unless solved. Where normals depend on each other (four feet of a table)
+            it is one of many; the velocity is the same for all.
+        gap: Linearised at the end, `gap + h J v+`, shape (k,), m.
+        status: RAY: no velocity satisfies all contacts, for example one that must bounce off and has no room to.
+    """
+
+    velocity: Array
+    impulse: Array
+    gap: Array
+    status: LcpStatus
+
+
+def delassus_matrix(inertia: ArrayLike, jacobian: ArrayLike) -> Array:
+    """`J M^-1 J'`, shape (k, k), 1/kg: normal velocities that unit impulses at the contacts cause.
+
+    Its diagonal is one over `impact.effective_mass`; the rest is how contacts act on each other.
+
+    Args:
+        inertia: Joint-space inertia M, symmetric and positive definite, shape (n, n).
+        jacobian: Rows J of the contacts' normals, `normal velocity = J @ qvel`, shape (k, n).
+    """
+    m, j = _matrices(inertia, jacobian)
+    return _delassus(_cholesky(m), j)[1]
+
+
+def contact_step(
+    inertia: ArrayLike,
+    jacobian: ArrayLike,
+    gap: ArrayLike,
+    velocity: ArrayLike,
+    force: ArrayLike,
+    step_s: float,
+    restitution: ArrayLike = 0.0,
+) -> ContactStep:
+    """Velocities and impulses at the end of one step.
+
+    A penetration is not pushed out, a ball turns round where it is when the step begins, and with restitution a
+    closed contact that opens may be pressed back at e times its speed: gaps are kept to the order of h. Among
+    contacts that are all closed and have one e, the impulses gain no energy.
+
+    Args:
+        inertia: M, shape (n, n).
+        jacobian: J, shape (k, n); positive velocities open.
+        gap: Signed distances, shape (k,), m.
+        velocity: v, shape (n,).
+        force: Generalised forces f, shape (n,).
+        step_s: h, s.
+        restitution: e, from 0 to 1, one or shape (k,).
+
+    Raises:
+        ConfigurationError: Bad input.
+    """
+    m, j = _matrices(inertia, jacobian)
+    k, n = j.shape
+    phi, v, f, e = (
+        _vector(name, value, size)
+        for name, value, size in (
+            ("gap", gap, k),
+            ("velocity", velocity, n),
+            ("force", force, n),
+            ("restitution", np.broadcast_to(restitution, k) if np.ndim(restitution) == 0 else restitution, k),
+        )
+    )
+    if not ((e >= 0.0) & (e <= 1.0)).all():
+        raise ConfigurationError(f"restitution must be between 0 and 1, got {e}")
+    if not 0.0 < step_s < np.inf:
+        raise ConfigurationError(f"step_s must be positive and finite, got {step_s!r}")
+    lower = _cholesky(m)
+    half, matrix = _delassus(lower, j)
+    free = v + step_s * np.linalg.solve(lower.T, np.linalg.solve(lower, f))
+    impacts = (phi <= 0.0) | ((e > 0.0) & (phi + step_s * (j @ free) <= 0.0))
+    least = np.where(impacts, -e * (j @ v), -phi / step_s)
+    if k == 0:
+        return ContactStep(free, np.zeros(0), np.zeros(0), LcpStatus.SOLVED)
+    found = solve_lcp(matrix, j @ free - least)
+    after = free + np.linalg.solve(lower.T, half @ found.z)
+    return ContactStep(after, found.z, phi + step_s * (j @ after), found.status)
+
+
+def _delassus(lower: Array, j: Array) -> tuple[Array, Array]:
+    """L^-1 J' and its square, which is exactly symmetric."""
+    half: Array = np.asarray(np.linalg.solve(lower, j.T), dtype=np.float64)
+    matrix = half.T @ half
+    return half, np.asarray(0.5 * (matrix + matrix.T))
+
+
+def _cholesky(m: Array) -> Array:
+    try:
+        return np.asarray(np.linalg.cholesky(m))
+    except np.linalg.LinAlgError:
+        raise ConfigurationError("inertia must be positive definite") from None
+
+
+def _matrices(inertia: ArrayLike, jacobian: ArrayLike) -> tuple[Array, Array]:
+    m, j = (finite_arrays(**{name: a})[0] for name, a in (("inertia", inertia), ("jacobian", jacobian)))
+    if m.ndim != 2 or m.shape[0] != m.shape[1] or j.ndim != 2 or j.shape[1] != len(m) or not len(m):
+        raise ConfigurationError(
+            f"expected an inertia of shape (n, n) and a jacobian of shape (k, n), got {m.shape} and {j.shape}"
+        )
+    if np.abs(m - m.T).max() > 1e-9 * np.abs(m).max():
+        raise ConfigurationError("inertia must be symmetric")
+    return m, j
+
+
+def _vector(name: str, value: ArrayLike, size: int) -> Array:
+    (array,) = finite_arrays(**{name: value})
+    if array.shape != (size,):
+        raise ConfigurationError(f"{name} must have shape ({size},), got {array.shape}")
+    return array

@@ -1,0 +1,1 @@
+"""Clearances that are kept by a backup manoeuvre."""

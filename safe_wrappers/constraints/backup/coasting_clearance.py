@@ -1,0 +1,386 @@
+"""CoastingClearance: keep a machine that rolls to rest without drive clear, by forecasting it until it stands."""
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacle_from
+from safe_wrappers.constraints.obstacles.obstacles import Disc, Discs
+from safe_wrappers.control.numerics.outlines import convex_outline, distances_to_outline
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.filter.constraint import HalfSpaces, Promise, non_negative, positive
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.plants.plant import Plant
+from safe_wrappers.plants.queries.coasting import Coasting, Course
+
+Array = NDArray[np.float64]
+
+_SAME_M = 1e-6
+"""What counts as no loss of clearance: rounding of a forecast."""
+_STILL = 1e-9
+"""Two states (m, rad, m/s, rad/s) and two places of a disc that differ by less are the same."""
+_WAY_OUT_M = 1e-3
+"""What a control has to gain by its end where rest alone leaves less than the margin."""
+_RECOVERED = 0.5
+"""The share of the best way out that a control has to take from inside an obstacle."""
+_AROUND = ((1.0, 0.5), (1.0, 0.0), (1.0, -1.0), (-0.5, -1.0))
+"""Shares of the drive for the outer and the inner actuator of a detour, as they are tried."""
+_DETOUR_MEMORY = 25
+"""Control steps for which a detour keeps its side after it was last needed, so that it cannot dither."""
+
+
+@dataclass
+class CoastingClearance:
+    """Keep a free-moving machine out of discs, counting all of its way until it rests without any control.
+
+    For machines that their own friction and damping stop within a few steps, on wheels for instance. Every control
+    is forecast, substep by substep, on the machine's own model: held for one control interval, then no control at
+    all, until it rests. It is admitted if it rests within `holds` control intervals and if along all of that way
+    the body's origin stays out of `keep_out` and the outline out of `untouched`, each by `margin`. The rest of that
+    forecast is what no control does in the next step, so no control is then admissible: it is the stopping control
+    that the filter tries before any fallback.
+
+    What it promises: proved, for obstacles that stand still and as far as the margin covers what the forecast misses
+    of the env's own motion. From a state whose way to rest is clear there is always an admissible control, and every
+    physics substep is clear. It is a proof by forecast, not by formula: as right as the plant's model. With
+    Safety-Gymnasium's car the forecast misses the next step by 0.2 mm at most, rest by 0.8 mm, and a tilted outline
+    reaches out by 1.5 mm (measured): a margin of 5 mm covers them twice.
+
+    From inside an obstacle (an unsafe start) controls are admitted that take at least half of the best way out that
+    full drive offers.
+
+    Args:
+        keep_out: `Disc` and `Discs` for the body's origin.
+        untouched: `Disc` and `Discs` for the outline.
+        outline: Points [x, y] of the body's frame around which the outline goes, m; its convex hull is meant.
+        body: Name of the machine's body, on a free joint.
+        alone: Name of an attribute of the env that holds a model of the machine alone, to forecast with; None takes
+            the plant's own model with all that stands around.
+        margin: Kept free, m: covers what the forecast misses, and the tilt of the outline.
+        holds: Control intervals within which it has to rest.
+        reach: The farthest that the origin or a corner of the outline moves until rest, m, whatever control is held
+            for one interval from rest; a state with more room is not forecast. Checked at every forecast, and
+            dropped with a warning when broken. None forecasts always.
+        reach_s: What the speed of the origin or a corner adds to that, m per m/s.
+        detour: When a driving action of a machine with two actuators is refused, first try to turn while driving, or
+            to back out while turning, to the side that leads around what is in the way. It is no safety measure.
+    """
+
+    keep_out: Sequence[Any] = ()
+    untouched: Sequence[Any] = ()
+    outline: Sequence[Sequence[float]] = ()
+    body: str = "agent"
+    alone: str | None = None
+    margin: float = 0.005
+    holds: int = 12
+    reach: float | None = None
+    reach_s: float = 0.0
+    detour: bool = False
+
+    promise: Promise = field(default="proved", init=False)
+
+    def __post_init__(self) -> None:
+        for name in ("keep_out", "untouched"):
+            given = getattr(self, name)
+            if isinstance(given, dict | str) or not isinstance(given, Sequence):
+                raise ConfigurationError(f"{name} is a list of Disc and Discs, got {given!r}")
+            obstacles = [obstacle_from(o) for o in given]
+            for obstacle in obstacles:
+                if not isinstance(obstacle, Disc | Discs):
+                    raise ConfigurationError(f"{name} holds Disc and Discs, got {type(obstacle).__name__}")
+                if getattr(obstacle, "velocity_attribute", None) is not None:
+                    raise ConfigurationError(
+                        f"{name}: the way to rest is forecast past discs that stand still"
+                    )
+            setattr(self, name, obstacles)
+        if not (self.keep_out or self.untouched):
+            raise ConfigurationError(
+                "give obstacles in keep_out (for the origin) or untouched (for the outline)"
+            )
+        self.outline, self._corners = _outline(self.outline, needed=bool(self.untouched))
+        self.margin = non_negative("margin", self.margin, "m")
+        if isinstance(self.holds, bool) or self.holds != int(self.holds) or self.holds < 2:
+            raise ConfigurationError(f"holds is a whole number of control intervals >= 2, got {self.holds!r}")
+        self.holds = int(self.holds)
+        if self.reach is not None:
+            self.reach = positive("reach", self.reach, "m")
+        self.reach_s = non_negative("reach_s", self.reach_s, "m per m/s")
+        self._radius = float(np.sqrt((self._corners**2).sum(axis=1)).max(initial=0.0))
+
+    def bind(self, plant: Plant) -> None:
+        """Find the machine in the plant's model."""
+        if not isinstance(plant, MujocoPlant):
+            raise UnsupportedEnvError(
+                "CoastingClearance needs a MujocoPlant: it forecasts with the machine's model"
+            )
+        alone = None if self.alone is None else plant.attribute(self.alone)
+        if alone is not None and not isinstance(alone, mujoco.MjModel):
+            raise ConfigurationError(
+                f"alone names an attribute that holds an MjModel; {self.alone!r} is {alone!r}"
+            )
+        self._coasting = Coasting(plant, self.body, alone)
+        self._still = np.zeros(plant.model.nu)
+        self._reach = self.reach
+        self._first_turns_left: bool | None = None
+        self._stamp = -1
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the side on which something is being passed, and what was forecast."""
+        self._side, self._side_steps = 0.0, 0
+        self._seen = np.zeros(0)
+        self._known: dict[bytes, _Outcome] = {}
+
+    # What is around -----------------------------------------------------------------------------------------
+
+    def _look(self, plant: MujocoPlant) -> None:
+        """Take the state, once per observation: what is left now, and which discs may come into play."""
+        if plant.stamp == self._stamp:
+            return
+        self._stamp = plant.stamp
+        self._side_steps -= 1
+        self._low, self._high = plant.acting_range
+        here = self._coasting.start()
+        self._here = here.places[0]
+        reach = math.inf
+        if self._reach is not None:
+            reach = self._reach + self.reach_s * self._coasting.speed(self._radius)
+        self._origin = _Group(self.keep_out, plant, None)
+        self._body = _Group(self.untouched, plant, self._corners)
+        self._least = min(group.keep(here, self.margin + reach) for group in (self._origin, self._body))
+        self._within = reach
+        # Who stands still is asked about the same controls again and again.
+        discs = np.concatenate([self._origin.centers, self._body.centers]).ravel()
+        seen = np.concatenate([[plant.revision], self._coasting.state(), discs])
+        if not (seen.shape == self._seen.shape and (np.abs(seen - self._seen) <= _STILL).all()):
+            self._seen, self._known = seen, {}
+
+    def value(self, plant: MujocoPlant) -> Array:
+        """What is left at the present place to the nearest disc, margin not taken off, m, shape (1,)."""
+        self._look(plant)
+        return np.array([self._least])
+
+    def _after(self, plant: MujocoPlant, control: Array) -> "_Outcome":
+        """The outcome of a control, forecast once per observation."""
+        acting = np.minimum(np.maximum(control, self._low), self._high) + 0.0  # no -0.0: its bytes differ
+        key = acting.tobytes()
+        if key not in self._known:
+            course = self._coasting.run(acting, self.holds, self._radius)
+            outcome, fallen = self._outcome(course)
+            if fallen > self._within + _SAME_M:
+                self._forecast_always(fallen)
+                self.reset()
+                self._stamp = -1
+                self._look(plant)
+                outcome, _ = self._outcome(course)
+            self._known[key] = outcome
+        return self._known[key]
+
+    def _outcome(self, course: Course) -> tuple["_Outcome", float]:
+        """What a course leads to, and by how much a clearance falls on it, m."""
+        left = [group.along(course) for group in (self._origin, self._body)]
+        least, end = min(x.least for x in left), min(x.end for x in left)
+        (ax, ay), (bx, by) = course.ahead[0].tolist(), course.ahead[-1].tolist()
+        way, turn = course.places[-1] - self._here, math.atan2(ax * by - ay * bx, ax * bx + ay * by)
+        outcome = _Outcome(least if course.rests else -math.inf, end, way, turn)
+        return outcome, max(x.fallen for x in left)
+
+    def _forecast_always(self, fallen: float) -> None:
+        self._reach = None
+        warnings.warn(
+            f"CoastingClearance: the clearance fell by {fallen:.3g} m until rest, farther than the declared reach of "
+            f"{self._within:.3g} m; from now on every control is forecast",
+            stacklevel=2,
+        )
+
+    @property
+    def _free(self) -> bool:
+        """Whether no disc can come into play, whatever is done."""
+        return not (self._origin.near or self._body.near)
+
+    # What may be done ---------------------------------------------------------------------------------------
+
+    def rows(self, plant: Any) -> HalfSpaces:
+        """None: what counts is the forecast."""
+        return HalfSpaces.none(plant.lower.size)
+
+    def admits(self, plant: MujocoPlant, control: Array) -> bool:
+        """Whether a control leads to rest with the margin kept (or, where rest alone does not, to a way out)."""
+        self._look(plant)
+        if self._free:
+            return True
+        if self._least < 0.0:
+            return self._leads_out(plant, control)
+        after = self._after(plant, control)
+        if after.least >= self.margin:
+            return True
+        rest = self._after(plant, self._still)
+        if after is rest:
+            return rest.least >= 0.0
+        # Rest alone leaves less than the margin: what the forecasts missed has used it up. No less on the way then,
+        # and more at its end.
+        kept = after.least >= max(rest.least - _SAME_M, 0.0) and after.end >= rest.end + _WAY_OUT_M
+        return rest.least < self.margin and kept
+
+    def _leads_out(self, plant: MujocoPlant, control: Array) -> bool:
+        best = max(self._after(plant, drive).end for drive in self._drives())
+        gain = best - self._least
+        return gain > 0.0 and self._after(plant, control).end - self._least >= _RECOVERED * gain
+
+    def _drives(self) -> list[Array]:
+        """Full control of all actuators together and of each alone, both ways."""
+        low, high, n = self._low, self._high, self._low.size
+        alone = [np.where(np.arange(n) == i, end, 0.0) for i in range(n) for end in (low, high)]
+        return [high, low, *alone]
+
+    def shortfall(self, plant: MujocoPlant, control: Array) -> float:
+        """By how much a control fails: how deep its way (from inside: the end of it) goes into a disc, m."""
+        self._look(plant)
+        after = self._after(plant, control)
+        return -(after.end if self._least < 0.0 else after.least)
+
+    @property
+    def scale(self) -> float:
+        """What a shortfall is compared with, where constraints of several units fail at once."""
+        return 1.0
+
+    def backup(self, plant: MujocoPlant) -> Array:
+        """No control at all: the machine rolls to rest where the last forecast said."""
+        return self._still
+
+    def suggestions(self, plant: MujocoPlant, control: Array) -> list[Array]:
+        """What to try for a refused control, the best first: ways around, less of the same, none."""
+        self._look(plant)
+        if self._least < 0.0:
+            return sorted(self._drives(), key=lambda u: -self._after(plant, u).end)[:1]
+        acting = np.clip(control, self._low, self._high)
+        around = self._around(plant, acting) if self.detour and acting.size == 2 else []
+        return [*around, 0.5 * acting, self._still]
+
+    def _around(self, plant: MujocoPlant, acting: Array) -> list[Array]:
+        """The same drive turning ever more, then backing out while turning, all to the side that leads around."""
+        drive = float(acting[np.abs(acting).argmax()])
+        if float(acting.sum()) * drive <= 0.0:
+            return []  # turning on the spot, or no drive at all
+        if self._side_steps <= 0:
+            way = self._after(plant, acting).way
+            x, y = self._nearest() - self._here
+            # What is to the left of the way is passed on its right.
+            self._side = -1.0 if way[0] * y - way[1] * x > 0.0 else 1.0
+        self._side_steps = _DETOUR_MEMORY
+        if self._first_turns_left is None:
+            first, second = (
+                self._after(plant, u).turn for u in (np.array([drive, 0.0]), np.array([0.0, drive]))
+            )
+            self._first_turns_left = (first - second) * drive > 0.0
+        pairs = np.array(_AROUND) * drive
+        outer_is_first = self._first_turns_left == (self._side * drive > 0.0)
+        return list(pairs if outer_is_first else pairs[:, ::-1])
+
+    def _nearest(self) -> Array:
+        """Centre of the disc with the least room now, shape (2,)."""
+        return min((g for g in (self._origin, self._body) if g.near), key=lambda g: g.now.min()).nearest()
+
+
+class _Outcome(NamedTuple):
+    """What a control leads to.
+
+    Attributes:
+        least: The least clearance until rest, m; minus infinity without rest.
+        end: The clearance at the end, m.
+        way: From here to there, shape (2,), m.
+        turn: How far it turns on the way, rad.
+    """
+
+    least: float
+    end: float
+    way: Array
+    turn: float
+
+
+class _Left(NamedTuple):
+    """Of a group of discs along a course: least clearance, that at its end, and the most that one of them fell; m."""
+
+    least: float
+    end: float
+    fallen: float
+
+
+class _Group:
+    """Discs that one part of the machine keeps clear of.
+
+    Args:
+        obstacles: `Disc` and `Discs`.
+        plant: To read where they are.
+        outline: Corners in the body's frame, shape (c, 2); None means its origin.
+
+    Attributes:
+        centers: Of all discs, shape (n, 2), m.
+        near: Whether one of them may come into play.
+        now: What is left to those that may, shape (close ones,), m.
+    """
+
+    def __init__(self, obstacles: Sequence[Any], plant: MujocoPlant, outline: Array | None) -> None:
+        self._outline = outline
+        where = [
+            (o.centers(plant)[:, :2] if isinstance(o, Discs) else np.array([o.center])) for o in obstacles
+        ]
+        self.centers = self._centers = np.concatenate([np.zeros((0, 2)), *where])
+        self._radii = np.repeat([o.radius for o in obstacles], [len(w) for w in where])
+
+    def keep(self, here: Course, room: float) -> float:
+        """Forget what is farther than `room`, m; the least clearance there was, m."""
+        now = self._left(here)[0] if len(self._centers) else np.zeros(0)
+        close = now < room
+        self._centers, self._radii, self.now = self._centers[close], self._radii[close], now[close]
+        self.near = bool(close.any())
+        return float(now.min(initial=np.inf))
+
+    def along(self, course: Course) -> "_Left":
+        """What a course leaves."""
+        if not self.near:
+            return _Left(math.inf, math.inf, 0.0)
+        left = self._left(course)
+        fallen = float((self.now - left.min(axis=0)).max())
+        return _Left(float(left.min()), float(left[-1].min()), fallen)
+
+    def nearest(self) -> Array:
+        """Centre of the disc with the least room, shape (2,), m."""
+        return np.asarray(self._centers[self.now.argmin()])
+
+    def _left(self, course: Course) -> Array:
+        """Shape (instants, discs), m."""
+        offsets = self._centers - course.places[:, None]
+        if self._outline is None:
+            return np.asarray(np.sqrt((offsets**2).sum(axis=2)) - self._radii)
+        x, y = course.ahead[:, :1], course.ahead[:, 1:]
+        local = np.stack(
+            [offsets[..., 0] * x + offsets[..., 1] * y, offsets[..., 1] * x - offsets[..., 0] * y], axis=-1
+        )
+        return np.asarray(distances_to_outline(self._outline, local) - self._radii)
+
+
+def _outline(given: Any, needed: bool) -> tuple[list[list[float]], Array]:
+    """The outline as plain data, and its corners."""
+    try:
+        points = np.array(given, dtype=np.float64).reshape(-1, 2)
+    except (TypeError, ValueError):
+        points = np.full((1, 2), np.nan)
+    if not np.isfinite(points).all():
+        raise ConfigurationError(f"outline is a list of points [x, y] in m, got {given!r}")
+    if not len(points):
+        if needed:
+            raise ConfigurationError(
+                "untouched needs the machine's outline: [[x, y], ...] in its body's frame, m"
+            )
+        return [], points
+    try:
+        return points.tolist(), convex_outline(points)
+    except ValueError as error:
+        raise ConfigurationError(f"outline: {error}") from None

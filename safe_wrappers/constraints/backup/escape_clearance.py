@@ -1,0 +1,319 @@
+"""EscapeClearance: keep a way out clear of what moves, for a point mass that is pushed along two axes.
+
+A machine in front of something that comes towards it is not safe by standing still. So a control is admitted if, held
+for one control step, it leaves at least one manoeuvre (go off in some direction, brake, stay) whose whole way keeps
+clear of where everything may be by then.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
+from safe_wrappers.constraints.obstacles.obstacles import Discs, distances
+from safe_wrappers.constraints.obstacles.tracked_discs import TrackedDiscs
+from safe_wrappers.control.backup.evasive_maneuvers import Escapes, Manoeuvre
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.filter.constraint import HalfSpaces, Promise, non_negative, positive
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.plants.plant import Plant
+from safe_wrappers.plants.queries.planar_point import planar_point
+
+Array = NDArray[np.float64]
+
+_ROUNDING = 1e-9
+_EVERY = 2
+"""Holds between the instants at which ways are checked."""
+_GOING_S = (0.3, 0.8)
+"""For how long the manoeuvres go before they brake, s."""
+_DIRECTIONS = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
+_RECOVERY_S = 0.4
+"""Time constant, s, with which the way out of a violation must come clear."""
+_BLENDS = (0.2, 0.4, 0.6, 0.8)
+"""Shares of the way from a refused control to one that leaves a way out."""
+_APPROACHED = 2
+"""How many of those are approached."""
+
+
+@dataclass
+class EscapeClearance:
+    """Keep a point mass on two axes out of obstacles, moving ones above all, by keeping an escape open.
+
+    The manoeuvres: brake at once; or go along +x, -x, +y or -y with full force for 0.3 s or 0.8 s, and brake. Each is
+    followed for `horizon_s`, exactly as the plant moves. Moving obstacles are where they are expected to be by then
+    (`Discs` at constant velocity), `TrackedDiscs` anywhere inside the bound of their estimate as it grows if nothing
+    more is seen, boxed in along x and y. So the less is known, the earlier the machine keeps off.
+
+    What it promises: from a state with a way out, the executed control leaves one, or the step is flagged. While
+    everything stays inside its declared bound, following the manoeuvre that was open keeps clear for the rest of the
+    horizon. Best effort: a way out is looked for among nine manoeuvres and the one that was open before; what was
+    clear may not be clear when more is seen (an estimate moves; up to `margin` of that is borne without a flag); ways
+    are checked at every second control step (for a relative speed v and steps of h, `(v h)^2 / 2` over the distance
+    lies between); nothing is seen beyond the horizon.
+
+    Args:
+        body: Name of the body on its two slides along x and y, each with a force actuator of its own. What else the
+            body or the model can do must not act on these.
+        obstacles: `TrackedDiscs`, `Discs`, and what stands still: `Disc`, `Box`, `Plane`.
+        radius: Of the machine around the body's origin, m.
+        margin: Fixed protective distance, m.
+        horizon_s: How far ahead, s: longer than the longest manoeuvre takes to come to rest.
+
+    Raises:
+        ConfigurationError: A number outside its range, or no obstacle.
+        UnsupportedEnvError: At binding: no `MujocoPlant`, or the body is no point mass on two slides.
+
+    Source: appendix "Relative degree and kinetic stopping insets" (room to brake), with the bound of "Continuous
+    Lyapunov and Riccati covariance dynamics".
+    """
+
+    body: str
+    obstacles: Sequence[Any]
+    radius: float = 0.0
+    margin: float = 0.05
+    horizon_s: float = 2.5
+
+    promise: Promise = field(default="best effort", init=False)
+
+    def __post_init__(self) -> None:
+        self.obstacles = obstacles_from(self.obstacles)
+        self.radius = non_negative("radius", self.radius, "m")
+        self.margin = non_negative("margin", self.margin, "m")
+        self.horizon_s = positive("horizon_s", self.horizon_s, "s")
+        if self.horizon_s <= max(_GOING_S):
+            raise ConfigurationError(
+                f"horizon_s must be longer than the manoeuvres, which go for {max(_GOING_S):g} s before they brake; "
+                f"got {self.horizon_s:g}"
+            )
+        for obstacle in self.obstacles:
+            place = getattr(obstacle, "center", getattr(obstacle, "point", ()))
+            if len(place) > 2:
+                raise ConfigurationError(
+                    f"obstacles are seen from above: in {obstacle!r} give two coordinates, x and y"
+                )
+        self._moving: list[Any] = [o for o in self.obstacles if _moves(o)]
+        self._fixed = [o for o in self.obstacles if not _moves(o)]
+
+    def bind(self, plant: Plant) -> None:
+        """Find the point in the plant's model."""
+        if not isinstance(plant, MujocoPlant):
+            raise UnsupportedEnvError(
+                "EscapeClearance needs a MujocoPlant: it reads the point from the model"
+            )
+        for obstacle in self._moving:
+            if isinstance(obstacle, TrackedDiscs):
+                obstacle.tracks(plant)
+        self._read_constants(plant)
+
+    def _read_constants(self, plant: MujocoPlant) -> None:
+        self._stamp, self._revision = -1, plant.revision
+        self._point = point = planar_point(plant, np.inf, self.body)
+        # What one hold makes of a state; x and y.
+        self._hold = np.array([(a.low, a.high, a.drift, a.shift, a.keep, a.add) for a in point.axes]).T
+        holds = int(np.ceil(self.horizon_s / plant.hold_s))
+        longest = max(1, round(max(_GOING_S) / plant.hold_s))
+        if holds <= longest:
+            raise ConfigurationError(
+                f"horizon_s = {self.horizon_s:g} s is too short for control steps of {plant.hold_s:g} s: a manoeuvre "
+                f"takes {longest} of them before it brakes"
+            )
+        bank = [Manoeuvre(0.0, 0.0, 0)]
+        bank += [Manoeuvre(x, y, going) for x, y in _DIRECTIONS for going in range(1, longest + 1)]
+        self._escapes = Escapes(point.axes, bank, np.arange(0, holds + 1, _EVERY))
+        starts = [max(1, round(seconds / plant.hold_s)) for seconds in _GOING_S]
+        self._usual = [0, *(bank.index(Manoeuvre(x, y, n)) for x, y in _DIRECTIONS for n in starts)]
+        self._firsts_of = [0, *(bank.index(Manoeuvre(x, y, 1)) for x, y in _DIRECTIONS)]
+        self._tried: list[tuple[Array, NDArray[np.intp]]] = []
+
+    def reset(self) -> None:
+        """Forget the way out of the episode before."""
+        self._stamp = -1
+        self._tried = []
+
+    def _look(self, plant: MujocoPlant) -> None:
+        """Take the state, and where everything may be later on, once per observation."""
+        if plant.stamp == self._stamp:
+            return
+        if plant.revision != self._revision:
+            self._read_constants(plant)
+        self._stamp = plant.stamp
+        self._open = self._with_going_on(plant.qvel[list(self._point.joints)])
+        joints = list(self._point.joints)
+        self._position = plant.qpos[joints] + np.asarray(self._point.origin)
+        self._velocity = plant.qvel[joints]
+        # A way after a held control begins one hold from now.
+        times = plant.hold_s * np.concatenate([[0.0], 1.0 + self._escapes.instants])
+        parts = [self._expected(o, plant, times) for o in self._moving]
+        none = np.zeros((times.size, 0, 2))
+        centers = np.concatenate([none, *(c for c, _ in parts)], axis=1)
+        halves = np.concatenate([none, *(h for _, h in parts)], axis=1)
+        radii = [np.full(c.shape[1], o.radius) for (c, _), o in zip(parts, self._moving, strict=True)]
+        here = self._position[None]
+        fixed = [distances(o, here, plant)[0] for o in self._fixed]
+        moving = _box_distances(here[:, 0], here[:, 1], centers[:1], halves[:1])[0]
+        self._near_fixed = [float(f.min(initial=np.inf)) for f in fixed]
+        self._sizes = np.concatenate([*radii, np.zeros(0)]) + self.radius
+        self._now = np.concatenate([moving - self._sizes, *(f - self.radius for f in fixed)])
+        self._boxes = centers[1:], halves[1:]
+        self._lowest, self._highest = (centers - halves).min(axis=0), (centers + halves).max(axis=0)
+        # From outside, the violation must shrink along the way.
+        outside = min(float(self._now.min(initial=np.inf)) - self.margin, 0.0)
+        self._wanted = self.margin + outside * np.exp(-times[1:] / _RECOVERY_S)
+        self._best: float | None = None
+
+    def _with_going_on(self, velocity: Array) -> NDArray[np.intp]:
+        """The manoeuvres to look at: the usual ones, and to go on with the one that was open after the last control.
+
+        Which control was executed shows in the velocity that it has led to.
+        """
+        which = list(self._usual)
+        if self._tried:
+            led_to = np.concatenate([v for v, _ in self._tried])
+            chosen = np.concatenate([best for _, best in self._tried])
+            nearest = int(((led_to - velocity) ** 2).sum(axis=1).argmin())
+            # The same way with one hold less to go: the manoeuvres of a direction are in the order of their lengths.
+            going_on = int(chosen[nearest])
+            shorter = going_on - 1 if self._escapes.manoeuvres[going_on].holds > 1 else 0
+            which += [i for i in (going_on, shorter) if i not in which]
+        self._tried = []
+        return np.array(which, dtype=np.intp)
+
+    def _expected(self, obstacle: Any, plant: MujocoPlant, times: Array) -> tuple[Array, Array]:
+        """Centres and half-widths of the boxes that hold them, shapes (k, n, 2)."""
+        # Under a delay the state is predicted: so are the obstacles, to the same moment.
+        late = times + (plant.time - float(plant.attribute("data").time) if plant.delay_s else 0.0)
+        if isinstance(obstacle, TrackedDiscs):
+            centers, halves = obstacle.boxes(plant, late)
+            return centers[..., :2], halves[..., :2]
+        centers = obstacle.centers(plant)[:, :2]
+        velocity = np.asarray(plant.attribute(obstacle.velocity_attribute), dtype=np.float64)[:, :2]
+        moved = centers + late[:, None, None] * velocity
+        return moved, np.zeros_like(moved)
+
+    def _slacks(self, plant: MujocoPlant, controls: Array) -> Array:
+        """What every way out after each of some held controls (c, 2) leaves, wanted >= 0, shape (c, manoeuvres)."""
+        low, high, drift, shift, keep, add = self._hold
+        held = np.minimum(np.maximum(controls, low), high)
+        position = self._position + drift * self._velocity + shift * held
+        velocity = keep * self._velocity + add * held
+        x, y = self._escapes.paths(position, velocity, self._open)
+        left = (self._clearances(plant, x, y) - self._wanted).min(axis=-1)
+        self._tried.append((velocity, self._open[left.argmax(axis=1)]))
+        return np.asarray(left)
+
+    def _clearances(self, plant: MujocoPlant, x: Array, y: Array) -> Array:
+        """Distance of ways from whatever is nearest, margin not taken off; shapes (c, m, k) as the ways'."""
+        (left, low), (right, high) = (float(x.min()), float(y.min())), (float(x.max()), float(y.max()))
+        nearest = np.full(x.shape, np.inf)
+        room = self._sizes[:, None] + self.margin
+        near = ((self._lowest - room <= (right, high)) & (self._highest + room >= (left, low))).all(axis=1)
+        centers, halves = self._boxes
+        for i in np.flatnonzero(near):
+            gap = _box_distances(x, y, centers[:, i], halves[:, i])
+            np.minimum(nearest, gap - self._sizes[i], out=nearest)
+        here_x, here_y = self._position
+        reach = float(np.hypot(max(right - here_x, here_x - left), max(high - here_y, here_y - low)))
+        for obstacle, now in zip(self._fixed, self._near_fixed, strict=True):
+            if now - reach <= self.radius + self.margin:
+                points = np.stack([x.ravel(), y.ravel()], axis=1)
+                gap = distances(obstacle, points, plant).min(axis=1, initial=np.inf).reshape(x.shape)
+                np.minimum(nearest, gap - self.radius, out=nearest)
+        return nearest
+
+    def value(self, plant: MujocoPlant) -> Array:
+        """Distance now from every obstacle, or from the bound of where it may be, m, shape (n,)."""
+        self._look(plant)
+        return self._now
+
+    def _driven(self, control: Array) -> Array:
+        return np.asarray(control)[list(self._point.actuators)]
+
+    def shortfall(self, plant: MujocoPlant, control: Array) -> float:
+        """By how much the best way out after a held control misses what is asked for, m; <= 0: not at all."""
+        self._look(plant)
+        left = float(self._slacks(plant, self._driven(control)[None]).max())
+        if left >= 0.0:
+            return -left
+        return self._needed(plant) - left if left == left else np.inf
+
+    def _needed(self, plant: MujocoPlant) -> float:
+        """What a way out must leave: 0, or the best that there is while that still uses up only the margin.
+
+        What has been seen since the last step moves what was clear by a hair. The way out is then followed, and not
+        given up for it.
+        """
+        if self._best is None:
+            self._best = float(self._slacks(plant, self._firsts()).max())
+        return self._best if -self.margin < self._best < 0.0 else 0.0
+
+    @property
+    def scale(self) -> float:
+        """Metres are compared as they are."""
+        return 1.0
+
+    def admits(self, plant: MujocoPlant, control: Array) -> bool:
+        """Whether a way out is open after a held control."""
+        return self.shortfall(plant, control) <= _ROUNDING
+
+    def backup(self, plant: MujocoPlant) -> Array:
+        """Braking where it leaves a way out, else the first control of the one that keeps farthest away."""
+        self._look(plant)
+        control = np.zeros(plant.model.nu)
+        firsts = self._firsts()
+        left = self._slacks(plant, firsts).max(axis=1)
+        control[list(self._point.actuators)] = firsts[0 if left[0] >= 0.0 else int(left.argmax())]
+        return control
+
+    def _firsts(self) -> Array:
+        """First controls of the manoeuvres: braking, and each direction; shape (5, 2)."""
+        return np.array([self._escapes.first(i, self._velocity) for i in self._firsts_of])
+
+    def suggestions(self, plant: MujocoPlant, control: Array) -> list[Array]:
+        """Admissible controls near a refused one, the nearest first."""
+        self._look(plant)
+        asked, firsts = self._driven(control), self._firsts()
+        left = self._slacks(plant, firsts).max(axis=1)
+        self._best = float(left.max())
+        needed = self._needed(plant)
+        good = _nearest_first(firsts[left >= needed], asked)
+        if needed == 0.0 and len(good):
+            ends = good[:_APPROACHED]
+            tried = [asked + share * (end - asked) for end in ends for share in _BLENDS]
+            tried += [np.array(pair) for x, y in ends for pair in ((asked[0], y), (x, asked[1]))]
+            closer = np.array(tried)
+            closer = closer[self._slacks(plant, closer).max(axis=1) >= 0.0]
+            good = _nearest_first(np.concatenate([good, closer]), asked)
+        found = []
+        for pair in good:
+            whole = np.array(control)
+            whole[list(self._point.actuators)] = pair
+            found.append(whole)
+        return found
+
+    def rows(self, plant: Any) -> HalfSpaces:
+        """None: what counts is whether a way out is open, and that is not convex."""
+        return HalfSpaces.none(plant.lower.size)
+
+
+def _nearest_first(controls: Array, asked: Array) -> Array:
+    return np.asarray(controls[np.argsort(((controls - asked) ** 2).sum(axis=1), kind="stable")])
+
+
+def _moves(obstacle: Any) -> bool:
+    return isinstance(obstacle, TrackedDiscs) or (
+        isinstance(obstacle, Discs) and obstacle.velocity_attribute is not None
+    )
+
+
+def _box_distances(x: Array, y: Array, centers: Array, halves: Array) -> Array:
+    """Distances of points (..., k) from boxes, 0 inside; centres and half-widths (k, 2)."""
+    across = np.abs(x - centers[..., 0])
+    across -= halves[..., 0]
+    along = np.abs(y - centers[..., 1])
+    along -= halves[..., 1]
+    np.maximum(across, 0.0, out=across)
+    np.maximum(along, 0.0, out=along)
+    return np.asarray(np.sqrt(across * across + along * along))

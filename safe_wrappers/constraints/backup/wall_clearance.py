@@ -1,0 +1,277 @@
+"""WallClearance: keep a point mass on two axes out of walls, counting its whole braking path.
+
+Everything is counted from one manoeuvre: brake each axis for itself, fully, and in its last hold just to rest
+(`control/backup/point_among_walls.py`). A state is inside the safe set if the manoeuvre's path keeps its distance
+from every wall; `value` is that distance.
+
+Why an admissible control always exists. A control is admitted if its own hold and the manoeuvre after it are clear,
+so every admitted control leads back inside. From inside, braking is admitted: after one hold of it the manoeuvre
+is the rest of the one that was clear before. At rest the braking control is zero. By induction the point never
+touches a wall, whatever drives it, for any number of walls at once.
+
+Source: appendix "Relative degree and kinetic stopping insets", in two dimensions with box walls.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.control.backup.point_among_walls import PointAmongWalls, PointMotion
+from safe_wrappers.control.numerics.rectangles import Rectangle, gaps, nearest
+from safe_wrappers.errors import UnsupportedEnvError
+from safe_wrappers.filter.constraint import HalfSpaces, Promise, non_negative, positive
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.plants.plant import Plant
+from safe_wrappers.plants.queries.planar_point import planar_point
+from safe_wrappers.plants.queries.walls import walls
+
+Array = NDArray[np.float64]
+
+_Control = tuple[float, float]
+"""Along x and along y, in the actuators' units."""
+
+_HAIR_M = 1e-7
+"""Corrections stay this much farther away than needed, so that rounding them to float32 loses nothing; and only
+what is lost beyond it counts as outside."""
+_NOISE_M = 1e-12
+"""What float64 may lose between a path and the rest of it."""
+_RECOVERY_S = 0.1
+"""Time constant, s, with which a violation must shrink from outside; less where the backup cannot."""
+_TURNS = 4
+"""How many walls, one after another, a correction may have to turn away from."""
+_HALVINGS = 5
+"""How finely a correction is moved back towards the proposal where the path fits and its rectangle does not."""
+
+
+@dataclass
+class WallClearance:
+    """Keep a point mass that is pushed along two axes out of every wall of a maze (PointMaze).
+
+    Walls and point are found in the MuJoCo model: the body on its two slides, and every fixed box, along x and y,
+    that MuJoCo would collide it with. A control is admitted if, held for one control step and followed by
+    braking, it keeps the point clear of them. What is refused is replaced by a control that slides along the wall.
+
+    What it promises: proved. From a safe state the point never touches a wall, at any substep or in between, for
+    any number of walls: braking is always admissible. That takes a plant whose mass, damping and gears are the
+    machine's (they are measured on its model, and one that moves otherwise is refused), walls that stand still, and
+    `velocity_clip` as the env has it. `margin` covers rounding (under a micrometre) and the position error that
+    you expect. Under a plant's `delay_s` the state is predicted without the clip: proved up to that speed.
+
+    Args:
+        margin: Fixed protective distance, beyond that at which MuJoCo reports a contact, m.
+        velocity_clip: Speed along each axis to which the env clips the motion at the start of every control step,
+            m/s (PointMaze: 5). None: not known; every clip is covered, by a more cautious count at corners.
+
+    Raises:
+        ConfigurationError: A number that is not one, or is negative.
+        UnsupportedEnvError: At binding: not a `MujocoPlant`, not a point on two slides with a force of its own
+            on each, or walls that are not boxes along x and y.
+
+    Example:
+        >>> import safe_wrappers as sw
+        >>> walls = sw.WallClearance(margin=0.01, velocity_clip=5.0)
+        >>> walls.promise
+        'proved'
+    """
+
+    margin: float = 0.001
+    velocity_clip: float | None = None
+
+    promise: Promise = field(default="proved", init=False)
+
+    def __post_init__(self) -> None:
+        self.margin = non_negative("margin", self.margin, "m")
+        if self.velocity_clip is not None:
+            self.velocity_clip = positive("velocity_clip", self.velocity_clip, "m/s")
+
+    def bind(self, plant: Plant) -> None:
+        """Find the point and its walls in the plant's model."""
+        if not isinstance(plant, MujocoPlant):
+            raise UnsupportedEnvError(
+                "WallClearance needs a MujocoPlant: it reads point and walls from the model. On an AnalyticPlant "
+                "use Clearance(obstacles=[Box(...)], position=[0, 1], velocity=[2, 3], braking=...)"
+            )
+        self._read_constants(plant)
+        self._stamp = -1
+
+    def _read_constants(self, plant: MujocoPlant) -> None:
+        self._revision = plant.revision
+        clip = self.velocity_clip if self.velocity_clip is not None else math.inf
+        self._point = point = planar_point(plant, clip)
+        around, reach = walls(plant.model, point.body)
+        self._among = PointAmongWalls(*point.axes, around, self.velocity_clip is not None)
+        self._room = reach + self.margin
+
+    def _look(self, plant: MujocoPlant) -> None:
+        """Take the state, once per observation."""
+        if plant.stamp == self._stamp:
+            return
+        self._stamp = plant.stamp
+        if plant.revision != self._revision:
+            self._read_constants(plant)
+        (i, j), (x, y), q, v = self._point.joints, self._point.origin, plant.qpos, plant.qvel
+        motion = PointMotion(float(q[i]) + x, float(q[j]) + y, float(v[i]), float(v[j]))
+        self._motion = self._among.clipped(motion)
+        self._needed: float | None = None
+        if math.isfinite(sum(motion)):
+            self._least = self._among.distance(self._motion) - self._room
+        else:
+            self._least = math.nan
+        self._inside = self._least >= -_HAIR_M
+
+    def value(self, plant: MujocoPlant) -> Array:
+        """Distance of the braking path from touching the nearest wall, margin not taken off, m, shape (1,).
+
+        No walls, no value: shape (0,).
+        """
+        self._look(plant)
+        return np.array([self._least + self.margin] if self._among.walls else [])
+
+    def admits(self, plant: MujocoPlant, control: Array) -> bool:
+        """Whether a held control, and braking after it, keeps its distance from every wall."""
+        self._look(plant)
+        i, j = self._point.actuators
+        return self._admitted((float(control[i]), float(control[j])))
+
+    def _admitted(self, control: _Control, spare: float = 0.0) -> bool:
+        if not self._inside:
+            return self._left_after(control) >= self._recovery() - _NOISE_M
+        # Rounding may have taken a hair of the room: braking, which takes nothing, is admitted all the same.
+        needed = spare if spare > 0.0 else min(0.0, self._least) - _NOISE_M
+        return self._among.clear(self._motion, *control, self._room + needed)
+
+    def _left_after(self, control: _Control) -> float:
+        """What is left after a control step, its own way not counted: it starts outside."""
+        return self._among.distance(self._among.step(self._motion, *control)) - self._room
+
+    def _recovery(self) -> float:
+        """What a control must leave from outside the safe set."""
+        if self._needed is None:
+            axis = self._among.x_axis
+            target = self._least * math.exp(-axis.timestep * axis.substeps / _RECOVERY_S)
+            self._needed = min(target, self._left_after(self._backup()))
+        return self._needed
+
+    def backup(self, plant: MujocoPlant) -> Array:
+        """The control that is always admitted: brake both axes. From outside it leads back inside."""
+        self._look(plant)
+        return self._as_control(np.zeros(plant.model.nu), self._backup())
+
+    def _backup(self) -> _Control:
+        """Braking; from outside the safe set, along the shortest way back to rest just inside it."""
+        stop = self._among.brake(self._motion)
+        if self._inside:
+            return stop
+        around = self._among.stop(self._among.step(self._motion, *stop))
+        wall = nearest(around, self._among.walls, math.inf)[1]
+        if wall is None:  # the state is not a number
+            return stop
+        across, along = gaps(around, wall)
+        if across >= along:
+            return self._stopped_at(0, wall, around[1] - wall[0] <= wall[1] - around[0]), stop[1]
+        return stop[0], self._stopped_at(1, wall, around[3] - wall[2] <= wall[3] - around[2])
+
+    def _stopped_at(self, axis: int, wall: Rectangle, before: bool, gap: float | None = None) -> float:
+        """The control along an axis, within its bounds, whose rest point is this far before or behind a wall."""
+        gap = self._room + _HAIR_M if gap is None else gap
+        constants = self._among.y_axis if axis else self._among.x_axis
+        x, v = self._motion[axis], self._motion[2 + axis]
+        target = wall[2 * axis] - gap if before else wall[2 * axis + 1] + gap
+        return max(constants.low, min(constants.control_to_rest_at(x, v, target), constants.high))
+
+    def _as_control(self, like: Array, control: _Control) -> Array:
+        out = np.array(like)
+        out[list(self._point.actuators)] = control
+        return out
+
+    def suggestions(self, plant: MujocoPlant, control: Array) -> list[Array]:
+        """Admissible controls near a refused one, the nearest first: those that slide along the walls in its way."""
+        self._look(plant)
+        (i, j), x_axis, y_axis = self._point.actuators, self._among.x_axis, self._among.y_axis
+        asked = (
+            max(x_axis.low, min(float(control[i]), x_axis.high)),
+            max(y_axis.low, min(float(control[j]), y_axis.high)),
+        )
+        found = [c for c in self._turned(asked, _TURNS) if self._admitted(c)] if self._inside else []
+        if not found:  # where the path fits and no rectangle does
+            found = [self._approached(self._backup(), asked, axes) for axes in ((0, 1), (1, 0))]
+        elif self.velocity_clip is not None:
+            found = [self._towards(c, asked) for c in found]
+        found.sort(key=lambda c: math.dist(c, asked))
+        return [self._as_control(control, c) for c in found]
+
+    def _turned(self, control: _Control, turns: int) -> list[_Control]:
+        """Controls whose rectangle is clear, by limiting one axis or the other at each wall in the way."""
+        around = self._among.reached(self._motion, *control)
+        wall = nearest(around, self._among.walls, self._room + 0.5 * _HAIR_M)[1]
+        if wall is None:
+            return [control]
+        ways = self._aside(control, gaps(around, wall), wall) if turns else []
+        return [found for way in ways for found in self._turned(way, turns - 1)]
+
+    def _aside(self, control: _Control, gap: tuple[float, float], wall: Rectangle) -> list[_Control]:
+        """The controls nearest to this one that stay clear of a wall: less along x, and less along y."""
+        room, ways = self._room + _HAIR_M, []
+        for axis in (0, 1):
+            before, behind = self._motion[axis] < wall[2 * axis], self._motion[axis] > wall[2 * axis + 1]
+            if not (before or behind):
+                continue
+            # At a corner the gap along the other axis counts too: the distance is Euclidean.
+            other = max(gap[1 - axis], 0.0)
+            limit = self._stopped_at(axis, wall, before, math.sqrt(max(room**2 - other**2, 0.0)))
+            if (limit < control[axis]) if before else (limit > control[axis]):
+                ways.append(_replaced(control, axis, limit))
+        return ways
+
+    def _approached(self, admitted: _Control, asked: _Control, axes: tuple[int, int]) -> _Control:
+        """An admitted control, moved towards the one asked for along one axis and then along the other."""
+        for axis in axes:
+            admitted = self._towards(admitted, _replaced(admitted, axis, asked[axis]))
+        return admitted
+
+    def _towards(self, admitted: _Control, asked: _Control) -> _Control:
+        """An admitted control, moved straight towards the one asked for as far as prediction allows."""
+
+        def at(share: float) -> _Control:
+            x, y = admitted
+            return x + share * (asked[0] - x), y + share * (asked[1] - y)
+
+        if not self._admitted(at(0.5**_HALVINGS), _HAIR_M):
+            return admitted  # mostly: a wall straight ahead, and the rectangle was exact
+        if self._admitted(asked, _HAIR_M):
+            return asked
+        low, high = 0.5**_HALVINGS, 1.0
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if self._admitted(at(middle), _HAIR_M) else (low, middle)
+        return at(low)
+
+    def rows(self, plant: MujocoPlant) -> HalfSpaces:
+        """Bounds on the control along x and y: a convex part of what is admitted, braking included.
+
+        For composing with other constraints' rows: alone, `suggestions` are less conservative.
+        """
+        self._look(plant)
+        normals, offsets = [], []
+        backup, room = self._backup(), self._room + _HAIR_M
+        around = self._among.reached(self._motion, *backup)
+        for wall in self._among.reachable(self._motion, room):
+            gap = gaps(around, wall)
+            corner = 0.0 < gap[0] < room and 0.0 < gap[1] < room
+            # At a corner both axes keep their share of the distance; else the one with more room keeps it all.
+            share = min(1.0, room / math.hypot(*gap)) if corner else 0.0
+            for axis in (0, 1) if corner else (int(gap[1] > gap[0]),):
+                before = wall[2 * axis] - around[2 * axis + 1] >= around[2 * axis] - wall[2 * axis + 1]
+                sign = 1.0 if before else -1.0
+                limit = self._stopped_at(axis, wall, before, share * gap[axis] if corner else room)
+                normals.append(self._as_control(np.zeros(plant.model.nu), _replaced((0.0, 0.0), axis, sign)))
+                offsets.append(max(sign * limit, sign * backup[axis]))
+        if not normals:
+            return HalfSpaces.none(plant.model.nu)
+        return HalfSpaces(np.array(normals), np.array(offsets))
+
+
+def _replaced(control: _Control, axis: int, value: float) -> _Control:
+    return (value, control[1]) if axis == 0 else (control[0], value)

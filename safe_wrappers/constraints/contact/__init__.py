@@ -1,0 +1,1 @@
+"""Constraints on contacts: impact speed, friction cones, support."""

@@ -1,0 +1,134 @@
+"""ContactFeasibility: the ground's forces on the robot stay inside their friction cones."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers import info as keys
+from safe_wrappers.constraints.contact.contact_limit import ContactLimit
+from safe_wrappers.control.contact.friction_cone import normal_and_tangential
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.filter.constraint import Promise, non_negative, positive
+from safe_wrappers.plants.mujoco.contact_forecast import can_touch_the_world
+from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.plants.plant import Plant
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class ContactFeasibility(ContactLimit):
+    """Keep every contact force of the robot with the fixed world inside a narrower friction cone: `|f_t| <= mu f_n`.
+
+    In a simulator forces are inside the model's cone by construction; a foot whose force has reached it slides. So
+    the cone that is asked for is narrower, by `friction_share`: the friction that one is ready to count on. That the
+    ground does not pull is part of it.
+
+    MuJoCo's default cones are pyramids inside the round one: in some directions a foot slides at 0.71 of the
+    friction. A share of 0.7 is below that in every direction; with a larger one a foot may slide within its share.
+
+    What it promises: for a plant that is right, an executed control that is not flagged keeps every contact force
+    of its control step, at every evaluation of the physics, within the cone and the tolerance. That there is such a
+    control cannot be promised: a foot that comes down sideways slides, whatever the torques. Nor does it look beyond
+    the step: the state that the step leads to may have no such control. A robot that stands on feet that do not slide
+    may fall over, and one that slides need not. Hence best effort.
+
+    Args:
+        friction_share: Of the model's friction coefficient, in (0, 1].
+        tolerance: By how much a force may miss its cone, as a share of the robot's weight: light touches scrape.
+        bodies: Names of the bodies whose contacts count; None is every moving body.
+        margin: Kept free inside the cone, as a share of the weight. More than the tolerance refuses light touches.
+
+    Source: appendix "Physical contact feasibility constraints".
+    """
+
+    friction_share: float = 0.7
+    tolerance: float = 0.01
+    bodies: Sequence[str] | None = None
+    margin: float = 0.0
+
+    promise: Promise = field(default="best effort", init=False)
+
+    def __post_init__(self) -> None:
+        self.friction_share = positive(
+            "friction_share", self.friction_share, "shares of the model's friction"
+        )
+        if self.friction_share > 1.0:
+            raise ConfigurationError(
+                f"friction_share is in (0, 1], got {self.friction_share}: no simulated ground holds more than "
+                "its own friction; a model with more is MujocoPlant(model=...)"
+            )
+        self.tolerance = non_negative("tolerance", self.tolerance, "shares of the weight")
+        self.margin = non_negative("margin", self.margin, "shares of the weight")
+        if self.bodies is not None:
+            listed = isinstance(self.bodies, Sequence) and not isinstance(self.bodies, str)
+            if not (listed and self.bodies and all(isinstance(name, str) for name in self.bodies)):
+                raise ConfigurationError(
+                    f"bodies is a list of names, or None for every body; got {self.bodies!r}"
+                )
+            self.bodies = list(self.bodies)
+
+    def bind(self, plant: Plant) -> None:
+        """Resolve the bodies."""
+        super().bind(plant)
+        assert isinstance(plant, MujocoPlant)
+        m = plant.model
+        touching = can_touch_the_world(m)
+        if not touching.any():
+            raise UnsupportedEnvError(
+                "no body of this model can touch the fixed world with friction: there is no cone to stay in"
+            )
+        chosen = np.flatnonzero(touching)
+        if self.bodies is not None:
+            chosen = np.array([self._resting(plant, name, touching) for name in self.bodies])
+        self._index = np.full(m.nbody, -1)
+        self._index[chosen] = np.arange(chosen.size)
+        self._size = chosen.size
+
+    @staticmethod
+    def _resting(plant: MujocoPlant, name: str, touching: NDArray[np.bool_]) -> int:
+        i = plant.named("body", name)
+        if fixed_bodies(plant.model)[i]:
+            raise ConfigurationError(f"the body {name!r} does not move, so the ground is part of it")
+        if not touching[i]:
+            raise UnsupportedEnvError(f"the body {name!r} cannot touch the fixed world with friction")
+        return i
+
+    def insides(self, plant: MujocoPlant, control: Array) -> Array:
+        """By how much each body's contact forces stay inside the cone, at worst, shape (k,), shares of the weight.
+
+        Infinite for a body that touches nothing; not a number where the simulation is none.
+        """
+        found = plant.contact_forecast(control)
+        if not found.finite:
+            return np.full(self._size, np.nan)
+        worst = np.full(self._size, np.inf)
+        which = self._index[found.body]
+        seen = which >= 0
+        normal, tangential = normal_and_tangential(found.force[seen], found.normal[seen])
+        held = self.friction_share * found.friction[seen] * normal
+        inside = held - np.linalg.norm(tangential, axis=1)
+        np.minimum.at(worst, which[seen], np.minimum(inside, normal) / plant.weight_n)
+        return worst
+
+    def slacks(self, plant: MujocoPlant, control: Array) -> Array:
+        """What is left of the cone, tolerance added and margin taken off, per body, shares of the weight."""
+        # What is inside by more than asked for, or in the air, is all the same: differences between a touch and none
+        # would say nothing of the touch.
+        return np.minimum(self.insides(plant, control), self.margin) + self.tolerance - self.margin
+
+    def report(self, proposed: Array, executed: Array) -> dict[str, Any]:
+        """The info keys `whole_body/cone_margin` and `whole_body/contacts`: forecast for the executed control."""
+        contacts, margin = 0, 0.0
+        if self._has_decided:
+            found = self._plant.contact_forecast(executed)
+            contacts = int((found.step == 0).sum())
+            margin = float(self.insides(self._plant, executed).min())
+        return {
+            keys.WHOLE_BODY_CONTACTS: contacts,
+            keys.WHOLE_BODY_CONE_MARGIN: margin if np.isfinite(margin) else 0.0,
+        }

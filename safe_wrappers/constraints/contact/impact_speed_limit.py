@@ -1,0 +1,307 @@
+"""ImpactSpeedLimit: what is declared may be touched only so slowly that the contact's peak force is bearable."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.constraints.contact.geom_gaps import GeomGaps
+from safe_wrappers.constraints.rollout import Predicted
+from safe_wrappers.control.contact.body_regions import body_region
+from safe_wrappers.control.contact.impact import series_stiffness
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import Promise, non_negative, positive
+from safe_wrappers.plants.mujoco.forecast import Forecast
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.plants.plant import Plant
+
+Array = NDArray[np.float64]
+
+_FIXED = 1e-12
+"""1/kg: whose mobility along the normal is less cannot run into anything."""
+
+
+@dataclass
+class ImpactSpeedLimit(Predicted):
+    """Keep the approach speed at every contact so low that its peak force stays below a limit.
+
+    A mass m that meets a spring k at the speed v, and is pushed on by F_p, presses with at most
+    `F_p + sqrt(F_p^2 + k m v^2)`. So the speed allowed at the first touch is `sqrt(F (F - 2 F_p) / (k m))`, with the
+    push F_p towards the obstacle counted (motors, gravity, centrifugal forces) and a pull *not*: braking after
+    contact comes too late (`control.contact.impact.attenuation_after_delay`). m is the machine's effective mass at
+    the very point and along the very normal, by the model's Jacobian and inertia, so it changes with the pose.
+
+    The speed is reduced before contact: the plant's model is stepped through the held action, and then with the
+    actuated joints braking, for `holds` control steps in all. Wherever that touches, it has to touch slowly enough.
+    In contact already, the deflection that the model shows counts as energy stored. Distances are MuJoCo's, between
+    the declared geoms, at every physics substep.
+
+    What it promises: along the held step of an executed control that is not flagged every first touch keeps the
+    limit, for a plant that is right, a contact that is a linear spring of the declared stiffness, and one pair of
+    geoms at a time; friction, and forces through other contacts and joint stops, are not counted. That braking
+    always can keep it afterwards holds as long as it takes no more than `holds` control steps, or `braking` is true.
+    Obstacles are taken where they are; who walks into the robot is not slowed down. The physics step should be short
+    against the contact (a tenth of `control.contact.impact.time_to_peak`, say). Hence best effort.
+
+    `value`, N: the limit less the peak that a contact at the present speed would have. Before contact, without
+    `braking`, it is not below zero, since the machine may still slow down; with it, the speed counts that this
+    deceleration leaves at the contact.
+
+    Args:
+        bodies: Names of the machine's bodies (all their geoms that can collide, or all if none can) or geoms.
+        against: Names of bodies or geoms of the world: walls, people. Moving ones (mocap, free) are taken at their
+            present place; the speed of free ones counts.
+        force_limit: Largest peak force, N, of each pair of geoms. None takes the region's.
+        region: Of a human body (`control.contact.body_regions`, ISO/TS 15066:2016, to be checked against its text):
+            its spring, its effective mass, and its transient force limit.
+        clamped: The region cannot recoil: its quasi-static limit, and no effective mass of its own.
+        stiffness: Of the interface, N/m; with a region that of the robot's side alone (a pad), in series with the
+            region's; None is a rigid robot then.
+        effective_mass: Of the machine, kg; None has it computed at every contact.
+        braking: Deceleration, m/s^2, that the machine can give every declared point towards every obstacle from
+            everywhere: makes up for a look-ahead that ends before the machine stands. None relies on the forecast.
+        margin: Kept free below the limit, N.
+        holds: Control steps to look ahead; cover the time that braking takes, and that of a contact.
+    """
+
+    bodies: Sequence[str]
+    against: Sequence[str]
+    force_limit: float | None = None
+    region: str | None = None
+    clamped: bool = False
+    stiffness: float | None = None
+    effective_mass: float | None = None
+    braking: float | None = None
+    margin: float = 0.0
+    holds: int = 5
+
+    reach: float | None = field(default=None, init=False, repr=False)
+    promise: Promise = field(default="best effort", init=False)
+    needs_acceleration: ClassVar[bool] = True
+    unit: ClassVar[str] = "N"
+
+    def __post_init__(self) -> None:
+        for name in ("bodies", "against"):
+            given = getattr(self, name)
+            if isinstance(given, str) or not isinstance(given, Sequence) or not given:
+                raise ConfigurationError(f"{name} is a list of names of bodies or geoms, got {given!r}")
+            setattr(self, name, list(given))
+        for name, unit in (("force_limit", "N"), ("stiffness", "N/m"), ("effective_mass", "kg")):
+            if getattr(self, name) is not None:
+                setattr(self, name, positive(name, getattr(self, name), unit))
+        if self.braking is not None:
+            self.braking = positive("braking", self.braking, "m/s^2")
+        self.margin = non_negative("margin", self.margin, "N")
+        self._force, self._stiffness, self._other_mass = self._interface()
+        if self.margin >= self._force:
+            raise ConfigurationError(
+                f"the margin {self.margin} N leaves nothing of the limit {self._force} N"
+            )
+        self._check_shared()
+
+    def _interface(self) -> tuple[float, float, float]:
+        """Force limit in N, stiffness in N/m, and mass in kg of what is hit."""
+        if self.region is None:
+            if self.clamped:
+                raise ConfigurationError("clamped says how a region is hit: name the region too")
+            if self.force_limit is None or self.stiffness is None:
+                raise ConfigurationError(
+                    "give a force_limit (N) and the interface's stiffness (N/m), or a region of the human body"
+                )
+            return self.force_limit, self.stiffness, np.inf
+        region = body_region(self.region)
+        limit = region.quasi_static_force if self.clamped else region.transient_force
+        force = self.force_limit if self.force_limit is not None else limit
+        if force is None or (region.transient_force is None and self.force_limit is None):
+            raise ConfigurationError(
+                f"ISO/TS 15066 foresees no contact with {self.region!r}: keep away from it (Workspace), or declare a "
+                "force_limit (N) of your own"
+            )
+        pad = np.inf if self.stiffness is None else self.stiffness
+        return force, float(series_stiffness(pad, region.stiffness)), np.inf if self.clamped else region.mass
+
+    @property
+    def scale(self) -> float:
+        """The limit."""
+        return self._force
+
+    def bind(self, plant: Plant) -> None:
+        """Resolve the geoms."""
+        super().bind(plant)
+        assert isinstance(plant, MujocoPlant)
+        self._gaps = GeomGaps(plant, self.bodies, self.against)
+        self._probe = mujoco.MjData(plant.model)
+        self._integration = np.zeros(
+            mujoco.mj_stateSize(plant.model, int(mujoco.mjtState.mjSTATE_INTEGRATION))
+        )
+        self._control: Array | None = None
+        m = plant.model
+        self._jacobians = [np.zeros((3, m.nv)) for _ in range(4)]
+        self._mobile = np.zeros((1, m.nv))
+
+    # One state ------------------------------------------------------------------------------------------------
+
+    def _at(self, plant: MujocoPlant, qpos: Array, qvel: Array, control: Array | None) -> None:
+        """Everything about a state but its constraint forces; without a control the actuators do not push."""
+        m, d = plant.model, self._probe
+        d.qpos[:], d.qvel[:] = qpos, qvel
+        self._pushing = control is not None
+        if control is not None:
+            d.ctrl[:] = control
+        mujoco.mj_fwdPosition(m, d)
+        mujoco.mj_fwdVelocity(m, d)
+        self._moving = self._forces(plant)
+        self._speeds = qvel
+        self._curving = bool(qvel.any())
+        self._resting: Array | None = None
+
+    def _forces(self, plant: MujocoPlant) -> Array:
+        """Generalised forces without those of constraints, shape (nv,)."""
+        m, d = plant.model, self._probe
+        mujoco.mj_fwdActuation(m, d)
+        mujoco.mj_fwdAcceleration(m, d)
+        return np.asarray(d.qfrc_smooth - (0.0 if self._pushing else d.qfrc_actuator))
+
+    def _contact(self, plant: MujocoPlant, pair: int) -> "_Contact":
+        """What a contact of the pair would be like, at the state of `_at`."""
+        m, d = plant.model, self._probe
+        gap, normal, points = self._gaps.nearest(plant.model, d, pair)
+        robot, other = self._gaps.pairs[pair]
+        first, second, first_dot, second_dot = self._jacobians
+        mujoco.mj_jac(m, d, first, None, points[:3], m.geom_bodyid[robot])
+        mujoco.mj_jac(m, d, second, None, points[3:], m.geom_bodyid[other])
+        closing = first - second
+        row = normal @ closing
+        mujoco.mj_solveM(m, d, self._mobile, row[None])
+        given = self._mobile[0].copy()
+        mobility = float(row @ given)
+        speed = float(row @ self._speeds)
+        if mobility < _FIXED:
+            return _Contact(gap, 0.0, 0.0, 0.0, 0.0)
+        mass = 1.0 / mobility if self.effective_mass is None else self.effective_mass
+        moving = float(given @ self._moving)
+        if self._curving:
+            mujoco.mj_jacDot(m, d, first_dot, None, points[:3], m.geom_bodyid[robot])
+            mujoco.mj_jacDot(m, d, second_dot, None, points[3:], m.geom_bodyid[other])
+            moving += float(normal @ (first_dot - second_dot) @ self._speeds)
+        if not self._gaps.moves[pair]:
+            mass = 1.0 / (1.0 / mass + 1.0 / self._other_mass)
+        push = mass * max(moving, self._at_rest(plant, given), 0.0)
+        return _Contact(gap, max(speed, 0.0), mass * self._stiffness, push, self._stiffness * max(-gap, 0.0))
+
+    def _at_rest(self, plant: MujocoPlant, given: Array) -> float:
+        """Acceleration along the normal once the motion has stopped, when damping no longer holds it back, m/s^2."""
+        if self._resting is None:
+            if self._curving:
+                d = self._probe
+                velocity = d.qvel.copy()
+                d.qvel[:] = 0.0
+                mujoco.mj_fwdVelocity(plant.model, d)
+                self._resting = self._forces(plant)
+                d.qvel[:] = velocity
+                mujoco.mj_fwdVelocity(plant.model, d)
+            else:
+                self._resting = self._moving
+        return float(given @ self._resting)
+
+    def backup(self, plant: MujocoPlant) -> Array:
+        """The braking with which every forecast goes on: what was admitted for its sake stays admissible."""
+        return plant.braking()
+
+    # Now, and along a forecast --------------------------------------------------------------------------------
+
+    def _now(self, plant: MujocoPlant) -> Array:
+        m, d = plant.model, self._probe
+        self._known: dict[tuple[int, bytes], Array] = {}
+        data, what = plant.pose(), int(mujoco.mjtState.mjSTATE_INTEGRATION)
+        mujoco.mj_getState(m, data, self._integration, what)
+        mujoco.mj_setState(m, d, self._integration, what)
+        self._at(plant, plant.qpos, plant.qvel, None)
+        contacts = [self._contact(plant, pair) for pair in range(len(self._gaps.pairs))]
+        touching = [c.gap <= touch for c, touch in zip(contacts, self._gaps.touch, strict=True)]
+        # Only a contact that is there is a fact; before it, how it will be is the forecast's to say.
+        self._lost = np.array(
+            [min(self._left(c), 0.0) if t else 0.0 for c, t in zip(contacts, touching, strict=True)]
+        )
+        value = []
+        for c, there in zip(contacts, touching, strict=True):
+            left = self._force - self._braked(c).peak if not there else self._force - c.peak
+            value.append(left if there or self.braking is not None else max(left, 0.0))
+        return np.array(value)
+
+    def _braked(self, contact: "_Contact") -> "_Contact":
+        """A contact to come, at the speed that the declared braking leaves of it."""
+        if self.braking is None:
+            return contact
+        square = max(contact.speed**2 - 2.0 * self.braking * contact.gap, 0.0)
+        return replace(contact, speed=square**0.5)
+
+    def _left(self, contact: "_Contact") -> float:
+        """What is left of the limit less the margin, N, to first order; in squares, nearly linear in the control."""
+        limit = self._force - self.margin
+        # Beyond the limit the push would change its sign with that of the first factor.
+        push = contact.push if contact.pressed <= limit else -contact.push
+        square = (limit - contact.pressed) * (limit + contact.pressed - 2.0 * push)
+        return (square - contact.inertia * contact.speed**2) / (2.0 * limit)
+
+    def _violation(self, value: Array) -> Array:
+        return self._lost
+
+    def slacks(self, plant: MujocoPlant, control: Array) -> Array:
+        """What is left along the forecast of a control; see `Predicted`."""
+        self._look(plant)
+        key = plant.revision, control.tobytes()
+        if key not in self._known:
+            self._control = control
+            self._known[key] = super().slacks(plant, control)
+        return self._known[key]
+
+    def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
+        k, pairs = len(forecast.qpos), len(self._gaps.pairs)
+        if not np.isfinite(forecast.qpos[-1]).all():
+            return np.full((k, pairs), np.nan)  # MuJoCo gave up: nobody knows
+        touched: dict[int, list[int]] = {}
+        for pair in range(pairs):
+            for instant in self._gaps.touched(plant, forecast, self._probe, pair):
+                touched.setdefault(instant, []).append(pair)
+        soon = plant.substeps - 1
+        if self.braking is not None:
+            touched[soon] = list(range(pairs))
+        # Without contact as much is left as in the gentlest one.
+        room = np.full((k, pairs), 0.5 * (self._force - self.margin))
+        for instant, those in touched.items():
+            # At the end of the held step another control takes over.
+            control = self._control if instant < soon or instant == 0 else None
+            self._at(plant, forecast.qpos[instant], forecast.qvel[instant], control)
+            for pair in those:
+                contact = self._contact(plant, pair)
+                there = contact.gap <= self._gaps.touch[pair]
+                room[instant, pair] = self._left(contact if there else self._braked(contact))
+        return room + self.margin
+
+
+@dataclass(frozen=True, slots=True)
+class _Contact:
+    """A contact, now or at the present speed.
+
+    Attributes:
+        gap: m, negative inside.
+        speed: Of the approach, m/s, >= 0.
+        inertia: Mass times stiffness, N^2 s^2 / m^2.
+        push: What presses on besides the motion, N, >= 0.
+        pressed: Force by the present deflection, N.
+    """
+
+    gap: float
+    speed: float
+    inertia: float
+    push: float
+    pressed: float
+
+    @property
+    def peak(self) -> float:
+        """From `m v^2 / 2 + k x^2 / 2 + F_p (x_max - x) = k x_max^2 / 2`, N."""
+        return self.push + float(np.hypot(self.pressed - self.push, np.sqrt(self.inertia) * self.speed))

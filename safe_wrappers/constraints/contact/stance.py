@@ -1,0 +1,244 @@
+"""Stance: the whole-body program as a constraint: torques that contacts which stay could answer with real forces."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers import info as keys
+from safe_wrappers.constraints.limits.joints import refuse_uncovered_stops, stops
+from safe_wrappers.control.contact.friction_cone import cone_excess
+from safe_wrappers.control.legged.predicted_positions import predicted_position_rows
+from safe_wrappers.control.legged.support import common_plane, support_polygon, support_rows
+from safe_wrappers.control.legged.whole_body import (
+    WholeBodyProblem,
+    WholeBodySolution,
+    WholeBodyStatus,
+    attainable_contact_acceleration,
+    rigid_forces,
+    solve_cone,
+    solve_pyramid,
+)
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.filter.constraint import HalfSpaces, Promise, non_negative, positive
+from safe_wrappers.plants.mujoco.contact_forecast import can_touch_the_world
+from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.plants.plant import Plant
+from safe_wrappers.plants.queries.floating_base import equations_of_motion
+
+Array = NDArray[np.float64]
+
+_SAME = 1e-9
+"""How far a control may be from the program's own answer and still be it, control units."""
+
+
+@dataclass
+class Stance:
+    """Keep to torques under which the feet that stand could stay: the whole-body program at one instant.
+
+    The contacts with the fixed world that carry force under the policy's torques are to come to rest and stay; those
+    that carry none open. A control is admitted if forces inside the narrowed friction cones can hold the former, with
+    the driven joints predicted to stay in range at a constant acceleration until the control step ends. Else the
+    closest such control is the answer of a quadratic program (pyramids) or of a second-order cone program.
+
+    What it promises: at this instant, for rigid contacts and a plant that is right, such forces exist. It does not
+    look at the control step: feet that come down, contacts that give way as a simulator's do, or torques held for
+    longer than the configuration lasts are not in it (`ContactFeasibility` forecasts them). Where no control is
+    admitted the step is infeasible. Hence best effort.
+
+    Args:
+        friction_share: Of the model's friction coefficient, in (0, 1].
+        cone: "pyramid" is conservative and quick, "exact" is the cone itself.
+        edges: Of the pyramid, >= 3.
+        joint_tolerance: How far driven joints may press their stops, rad or m; None leaves them alone.
+        zmp_inset: Distance of the zero moment point from the edge of the support polygon, m, where there is one.
+        settle_s: Time constant in which what still moves at a contact is to come to rest, s.
+
+    Source: appendix "Hierarchical whole-body control quadratic program".
+    """
+
+    friction_share: float = 0.7
+    cone: Literal["pyramid", "exact"] = "pyramid"
+    edges: int = 8
+    joint_tolerance: float | None = 0.1
+    zmp_inset: float | None = None
+    settle_s: float = 0.05
+
+    promise: Promise = field(default="best effort", init=False)
+    scale = 1.0
+
+    def __post_init__(self) -> None:
+        self.friction_share = positive(
+            "friction_share", self.friction_share, "shares of the model's friction"
+        )
+        if self.friction_share > 1.0:
+            raise ConfigurationError(f"friction_share is in (0, 1], got {self.friction_share}")
+        if self.cone not in ("pyramid", "exact"):
+            raise ConfigurationError(f'cone is "pyramid" or "exact", got {self.cone!r}')
+        if not isinstance(self.edges, int | np.integer) or isinstance(self.edges, bool) or self.edges < 3:
+            raise ConfigurationError(f"edges is a whole number of at least 3, got {self.edges!r}")
+        if self.joint_tolerance is not None:
+            self.joint_tolerance = non_negative("joint_tolerance", self.joint_tolerance, "rad or m")
+        if self.zmp_inset is not None:
+            self.zmp_inset = positive("zmp_inset", self.zmp_inset, "m: forces that push do the rest")
+        self.settle_s = positive("settle_s", self.settle_s, "s")
+
+    def bind(self, plant: Plant) -> None:
+        """Resolve the joints."""
+        if not isinstance(plant, MujocoPlant) or not plant.has_acceleration:
+            raise UnsupportedEnvError(
+                "Stance reads inertia and contacts from a MujocoPlant whose controls are forces"
+            )
+        if not can_touch_the_world(plant.model).any():
+            raise UnsupportedEnvError(
+                "no body of this model can touch the fixed world with friction: there is nothing to stand on"
+            )
+        self._plant = plant
+        if self.joint_tolerance is not None:
+            refuse_uncovered_stops(plant.model)
+        self._joints, low, high = stops(plant.model)
+        wider = self.joint_tolerance or 0.0
+        self._low, self._high = low - wider, high + wider
+        self._qpos = plant.model.jnt_qposadr[self._joints]
+        self._dofs = plant.model.jnt_dofadr[self._joints]
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the episode."""
+        self._stamp: int | None = None
+        self._problem: WholeBodyProblem | None = None
+        self._answer: WholeBodySolution | None = None
+        self._asked: Array | None = None
+        self._contacts = 0
+
+    def _look(self, plant: MujocoPlant, control: Array) -> None:
+        """Write the program down, once per observation; the first control asked for says which contacts open."""
+        if self._stamp == plant.stamp:
+            return
+        self._stamp, self._answer, self._asked = plant.stamp, None, None
+        self._problem, self._contacts = None, 0
+        data = plant.under(control)
+        motion = equations_of_motion(plant.model, data, plant.actuators)
+        found = motion.contacts
+        within = bool(
+            (np.abs(plant.state) < mujoco.mjMAXVAL).all()
+        )  # else MuJoCo resets the state in its step
+        if not (within and np.isfinite(motion.bias).all() and np.isfinite(found.forces).all()):
+            return  # nothing can be said
+        ground = fixed_bodies(plant.model)[found.pushed_by]
+        # What the robot's bodies do to each other, and other things to it, stays as it is.
+        bias = motion.bias - np.einsum("kiv,ki->v", found.jacobians[~ground], found.forces[~ground])
+        jacobians, drift, normals = found.jacobians[ground], found.drift[ground], found.normals[ground]
+        pressing = np.einsum("ki,ki->k", found.forces[ground], normals) > 0.0
+        acceleration = -(jacobians @ plant.qvel) / self.settle_s
+        limits: dict[str, Any] = {}
+        if self.joint_tolerance is not None:
+            limits["acceleration_rows"], limits["acceleration_limits"] = predicted_position_rows(
+                self._dofs,
+                plant.qpos[self._qpos],
+                plant.qvel[self._dofs],
+                self._low,
+                self._high,
+                plant.hold_s,
+                plant.model.nv,
+            )
+        if self.zmp_inset is not None:
+            rows = self._balance(found.points[ground], normals, pressing)
+            if rows is not None:
+                limits["force_rows"], limits["force_limits"] = rows, np.zeros(len(rows))
+        problem = WholeBodyProblem(
+            motion.inertia,
+            bias,
+            motion.actuation,
+            jacobians,
+            drift,
+            normals,
+            self.friction_share * found.friction[ground],
+            plant.lower,
+            plant.upper,
+            control,
+            contact_acceleration=acceleration,
+            breaking=~pressing,
+            first_tangents=found.first_tangents[ground],
+            **limits,
+        )
+        # Two points of one rigid foot cannot come to rest each as it likes.
+        self._problem = replace(problem, contact_acceleration=attainable_contact_acceleration(problem))
+        self._contacts = int(ground.sum())
+
+    def _balance(self, points: Array, normals: Array, pressing: NDArray[np.bool_]) -> Array | None:
+        """The inset, as rows on all contact forces; None where there is no polygon."""
+        assert self.zmp_inset is not None
+        if np.count_nonzero(pressing) < 3:
+            return None
+        plane = common_plane(points[pressing], normals[pressing])
+        if plane is None or len(support_polygon(plane.flat(points[pressing]))) < 3:
+            return None
+        some = support_rows(points[pressing], plane, self.zmp_inset)
+        rows = np.zeros((len(some), len(points), 3))
+        rows[:, pressing] = some.reshape(len(some), -1, 3)
+        return np.asarray(rows.reshape(len(some), -1))
+
+    def _solve(self, problem: WholeBodyProblem) -> WholeBodySolution:
+        return solve_cone(problem) if self.cone == "exact" else solve_pyramid(problem, self.edges)
+
+    def admits(self, plant: MujocoPlant, control: Array) -> bool:
+        """Whether the standing contacts could answer this control with forces inside their cones."""
+        # An action space of another precision than the model's range may be a rounding wider.
+        control = np.clip(control, plant.lower, plant.upper)
+        self._look(plant, control)
+        if self._problem is None:
+            return False
+        answer = self._answer
+        if answer is None or self._asked is None:
+            answer = self._ask(self._problem, control)
+        if self._asked is not None and np.array_equal(control, self._asked):
+            return answer.status is WholeBodyStatus.INACTIVE
+        if answer.status is WholeBodyStatus.INFEASIBLE:
+            return False  # whatever the control
+        if float(np.abs(control - answer.control).max()) <= _SAME:
+            return answer.status is not WholeBodyStatus.FAILED
+        return self._solve(replace(self._problem, nominal=control)).status is WholeBodyStatus.INACTIVE
+
+    def _ask(self, problem: WholeBodyProblem, proposed: Array) -> WholeBodySolution:
+        """Solve for a proposal, and keep the answer."""
+        self._asked, self._answer = proposed.copy(), self._solve(replace(problem, nominal=proposed))
+        return self._answer
+
+    def suggestions(self, plant: MujocoPlant, proposed: Array) -> Iterator[Array]:
+        """The program's answer; where there is none, the control that misses least, which is refused."""
+        proposed = np.clip(proposed, plant.lower, plant.upper)
+        self._look(plant, proposed)
+        if self._problem is None:
+            return
+        if self._answer is None:  # another constraint was asked first, and has refused
+            self._ask(self._problem, proposed)
+        assert self._answer is not None
+        yield self._answer.control
+
+    def shortfall(self, plant: MujocoPlant, control: Array) -> float:
+        """By how much the forces that would hold the contacts miss their cones, shares of the weight; <= 0: not."""
+        control = np.clip(control, plant.lower, plant.upper)
+        self._look(plant, control)
+        if self._problem is None:
+            return float("inf")
+        forces, _ = rigid_forces(self._problem, control)
+        if not len(forces):
+            return 0.0
+        missed = cone_excess(forces, self._problem.normals, self._problem.friction)
+        return float(missed.max()) / plant.weight_n
+
+    def rows(self, plant: Any) -> HalfSpaces:
+        """None: forces are unknowns too, so what counts is the program."""
+        return HalfSpaces.none(plant.lower.size)
+
+    def report(self, proposed: Array, executed: Array) -> dict[str, Any]:
+        """The info keys `whole_body/contacts` and `whole_body/cone_margin`: of the forces that would hold them."""
+        contacts, margin = 0, 0.0
+        if self._stamp == self._plant.stamp and self._problem is not None:
+            contacts, margin = self._contacts, 0.0 - self.shortfall(self._plant, executed)
+        return {keys.WHOLE_BODY_CONTACTS: contacts, keys.WHOLE_BODY_CONE_MARGIN: margin}

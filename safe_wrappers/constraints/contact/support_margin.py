@@ -1,0 +1,88 @@
+"""SupportMargin: the zero moment point stays inside the support polygon, by an inset."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers import info as keys
+from safe_wrappers.constraints.contact.contact_limit import ContactLimit
+from safe_wrappers.control.legged.support_distances import support_distances
+from safe_wrappers.filter.constraint import Promise, non_negative, positive
+from safe_wrappers.plants.mujoco.contact_forecast import ContactForecast
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class SupportMargin(ContactLimit):
+    """Keep the zero moment point of the contact forces inside the hull of the contact points, by an inset.
+
+    It speaks only while the model behind it holds: at least three contact points of one plane that are not on a line.
+    Then the robot starts to tip about an edge where the point reaches it. On two point feet, in the air, or on
+    contacts at several heights there is no polygon, and nothing is asked for: it does not keep a robot on its feet.
+
+    What it promises: for a plant that is right, an executed control that is not flagged keeps the inset at every
+    evaluation of the physics of its control step at which there is a polygon. That there is such a control cannot be
+    promised, nor that the next step has one; and crossing an edge predicts no particular fall. Hence best effort.
+
+    Args:
+        inset: m, positive: forces that push keep the point inside the hull by themselves, and on its edge while the
+            robot tips. A foot that leaves the ground between two evaluations takes the polygon along, so an inset of
+            millimetres can be jumped; and how far a control is beyond the edge cannot be seen, so that the answer
+            may be the fallback, checked, where a closer one exists.
+        margin: Kept free inside the inset, m.
+
+    Source: appendix "Physical contact feasibility constraints", third condition and footnote 8.
+    """
+
+    inset: float
+    margin: float = 0.0
+
+    promise: Promise = field(default="best effort", init=False)
+
+    def __post_init__(self) -> None:
+        self.inset = positive("inset", self.inset, "m: forces that push keep the point inside by themselves")
+        self.margin = non_negative("margin", self.margin, "m")
+
+    def reset(self) -> None:
+        """Forget the episode."""
+        super().reset()
+        self._known_at: int | None = None
+        self._known: list[tuple[ContactForecast, list[float]]] = []
+
+    def _distances(self, found: ContactForecast) -> list[float]:
+        """Of a forecast, computed once: a refused control is asked about several times."""
+        for other, distances in self._known:
+            if other is found:
+                return distances
+        if self._known_at != self._plant.stamp:
+            self._known_at, self._known = self._plant.stamp, []
+        distances = edge_distances(found)
+        self._known.append((found, distances))
+        return distances
+
+    def slacks(self, plant: MujocoPlant, control: Array) -> Array:
+        """Distance to the edge minus inset and margin where it is least, shape (1,), m; 0 where there is none."""
+        found = plant.contact_forecast(control)
+        if not found.finite:
+            return np.full(1, np.nan)
+        return np.full(1, min((d - self.inset - self.margin for d in self._distances(found)), default=0.0))
+
+    def report(self, proposed: Array, executed: Array) -> dict[str, Any]:
+        """The info keys `whole_body/zmp_margin` and `whole_body/supported`: forecast for the executed control."""
+        least, share = 0.0, 0.0
+        if self._has_decided:
+            found = self._plant.contact_forecast(executed)
+            distances = self._distances(found) if found.finite else []
+            least = min(distances, default=0.0)
+            share = len(distances) / found.steps
+        return {keys.WHOLE_BODY_ZMP_MARGIN: least, keys.WHOLE_BODY_SUPPORTED: share}
+
+
+def edge_distances(contacts: ContactForecast) -> list[float]:
+    """Distance of the zero moment point from the polygon's edge, at every evaluation at which there is one, m."""
+    found = support_distances(contacts.step, contacts.point, contacts.normal, contacts.force)
+    return [float(distance) for distance in found]

@@ -1,0 +1,126 @@
+"""JointPositionLimit: hinges and slides stay inside a range, with room to brake."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.constraints.limits.joints import scalar_joints
+from safe_wrappers.constraints.rollout import Predicted
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import Promise, non_negative
+from safe_wrappers.plants.mujoco.forecast import Forecast
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.plants.plant import Plant
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class JointPositionLimit(Predicted):
+    """Keep joint positions in a range that may be narrower than the model's own.
+
+    Position under a force has relative degree two: a joint that is inside may be too fast to stay. So the
+    forecast goes on after the held control, braking every actuated joint, for `holds` control steps in all;
+    the range has to hold at every physics substep of it.
+
+    What it promises: an executed control that is not flagged keeps the range at every substep of its step, for
+    a plant that is right, and as long as braking takes no more than `holds` steps leaves one that stops in time.
+    Gravity, coupling, contacts and passive joints can be stronger than the actuators. Hence best effort.
+
+    Args:
+        lower: Smallest position, rad for hinges, m for slides; one number, or one per joint. None is the
+            model's own range.
+        upper: Largest, likewise.
+        joints: Names. None takes every hinge and slide that an actuator drives directly, and is refused where an
+            action moves others as well.
+        margin: Kept free inside the range, in the same units.
+        holds: Control steps to look ahead; cover the time that braking takes.
+        reach: The farthest that a joint can move within `holds` control steps in the declared envelope, rad or m;
+            states with more than that left need no forecast. None forecasts always.
+    """
+
+    lower: float | Sequence[float] | None = None
+    upper: float | Sequence[float] | None = None
+    joints: Sequence[str] | None = None
+    margin: float = 0.0
+    holds: int = 5
+    reach: float | None = None
+
+    promise: Promise = field(default="best effort", init=False)
+    unit: ClassVar[str] = "rad or m"
+
+    def __post_init__(self) -> None:
+        self.margin = non_negative("margin", self.margin, "rad or m")
+        for name in ("lower", "upper"):
+            setattr(self, name, _positions(name, getattr(self, name)))
+        if self.joints is not None:
+            if isinstance(self.joints, str):
+                raise ConfigurationError(f"joints is a list of names, got the string {self.joints!r}")
+            self.joints = list(self.joints)
+            if not self.joints:
+                raise ConfigurationError("joints is a list of names, or None for every driven joint; got []")
+        self._check_shared()
+
+    def bind(self, plant: Plant) -> None:
+        """Resolve the joints and their ranges."""
+        super().bind(plant)
+        assert isinstance(plant, MujocoPlant)
+        ids = scalar_joints(plant, self.joints)
+        model: mujoco.MjModel = plant.model
+        self._qpos = np.array([int(model.jnt_qposadr[j]) for j in ids])
+        limited = model.jnt_limited[ids].astype(bool)
+        own = np.where(limited[:, None], model.jnt_range[ids], [-np.inf, np.inf])
+        self._low = _per_joint("lower", self.lower, own[:, 0])
+        self._high = _per_joint("upper", self.upper, own[:, 1])
+        narrow = ~(self._high - self._low > 2.0 * self.margin)
+        if narrow.any():
+            j = int(np.flatnonzero(narrow)[0])
+            raise ConfigurationError(
+                f"nothing is left of the range of joint {model.joint(ids[j]).name!r}: {self._low[j]:g} to "
+                f"{self._high[j]:g} with a margin of {self.margin:g} at both ends"
+            )
+        self._below, self._above = np.isfinite(self._low), np.isfinite(self._high)
+        if not (self._below.any() or self._above.any()):
+            raise ConfigurationError("none of these joints has a range in the model: pass lower and upper")
+
+    def _now(self, plant: MujocoPlant) -> Array:
+        return self._left(plant.qpos)
+
+    def _left(self, qpos: Array) -> Array:
+        """Room to every bound that there is, the lower ones first, shape (..., n)."""
+        q = qpos[..., self._qpos]
+        return np.concatenate(
+            [(q - self._low)[..., self._below], (self._high - q)[..., self._above]], axis=-1
+        )
+
+    def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
+        return self._left(forecast.qpos)
+
+
+def _positions(name: str, given: float | Sequence[float] | None) -> float | list[float] | None:
+    if given is None:
+        return None
+    per_joint = isinstance(given, Sequence | np.ndarray) and not isinstance(given, str)
+    listed: list[Any] = list(given) if per_joint else [given]  # type: ignore[arg-type]
+    try:
+        many = [float(v) for v in listed]
+    except (TypeError, ValueError):
+        raise ConfigurationError(
+            f"{name} is a position in rad or m, or one per joint; got {given!r}"
+        ) from None
+    if not many or np.isnan(many).any():
+        raise ConfigurationError(f"{name} is a position in rad or m, or one per joint; got {given!r}")
+    return many if per_joint else many[0]
+
+
+def _per_joint(name: str, given: float | Sequence[float] | None, own: Array) -> Array:
+    if given is None:
+        return own
+    try:
+        return np.broadcast_to(np.asarray(given, dtype=np.float64), own.shape)
+    except ValueError:
+        raise ConfigurationError(f"expected one {name} or {own.size}, got {given}") from None

@@ -1,0 +1,126 @@
+"""JointSpeedLimit: a bound on hinge and slide speeds, held at every physics substep."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.constraints.limits.joints import scalar_joints
+from safe_wrappers.constraints.rollout import RECOVERY_S, Predicted
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.filter.constraint import HalfSpaces, Promise, non_negative, positive
+from safe_wrappers.plants.mujoco.forecast import Forecast
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.plants.plant import Plant
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class JointSpeedLimit(Predicted):
+    """Keep `|joint speed| <= limit`.
+
+    Speed under a force has relative degree one, so no stopping inset is needed: the rows bound the speed at
+    the end of the held control step, and a rollout of that step on the plant's model checks every physics
+    substep, contacts and joint limits included.
+
+    What it promises: an executed control that is not flagged infeasible or fallback keeps the limit at every
+    substep of its step, exactly, for a plant that is right. That there always is such a control cannot be
+    promised: gravity, coupling, contacts or joint stops can be stronger than the actuators. Hence best effort;
+    then the step is counted infeasible and the fallback runs.
+
+    Args:
+        limit: In rad/s for hinges, m/s for slides; one number, or one per named joint.
+        joints: Joint names. None takes every hinge and slide that an actuator drives directly, and is refused where
+            an action moves others as well.
+        margin: Kept free below the limit, for model and state error, in the same units.
+        holds: Control steps to look ahead; the actuated joints are braked after the first.
+        reach: The most that a joint's speed can rise within `holds` control steps in the declared envelope, rad/s
+            or m/s; states with more than that left need no forecast. None forecasts always.
+    """
+
+    limit: float | Sequence[float]
+    joints: Sequence[str] | None = None
+    margin: float = 0.0
+    holds: int = 1
+    reach: float | None = None
+
+    promise: Promise = field(default="best effort", init=False)
+    unit: ClassVar[str] = "rad/s or m/s"
+
+    def __post_init__(self) -> None:
+        self.margin = non_negative("margin", self.margin, "rad/s or m/s")
+        many = isinstance(self.limit, Sequence | np.ndarray)
+        limits = list(self.limit) if isinstance(self.limit, Sequence | np.ndarray) else [self.limit]
+        checked = [positive("limit", one, "rad/s or m/s") for one in limits]
+        if self.joints is not None:
+            if isinstance(self.joints, str):
+                raise ConfigurationError(f"joints is a list of names, got the string {self.joints!r}")
+            self.joints = list(self.joints)
+            if not self.joints:
+                raise ConfigurationError("joints is a list of names, or None for every driven joint; got []")
+        if not checked:
+            raise ConfigurationError("limit is one number, or a list with one per joint; got []")
+        self.limit = checked if many else checked[0]
+        if min(checked) <= self.margin:
+            raise ConfigurationError(f"the margin {self.margin} leaves nothing of the limit {self.limit}")
+        self._check_shared()
+
+    @property
+    def scale(self) -> float:
+        """The limit."""
+        return float(np.min(self.limit))
+
+    def bind(self, plant: Plant) -> None:
+        """Resolve the joints."""
+        if not isinstance(plant, MujocoPlant):
+            raise UnsupportedEnvError(
+                "JointSpeedLimit needs a MujocoPlant (named joints); on an AnalyticPlant write "
+                "Barrier(lambda x: limit**2 - x[i]**2)"
+            )
+        super().bind(plant)
+        ids = scalar_joints(plant, self.joints)
+        self._dofs = np.array([int(plant.model.jnt_dofadr[j]) for j in ids])
+        try:
+            limits = np.broadcast_to(np.asarray(self.limit, dtype=np.float64), (len(ids),))
+        except ValueError:
+            raise ConfigurationError(f"expected one limit or {len(ids)}, got {self.limit}") from None
+        self._bound = limits - self.margin
+        self._limits = limits
+
+    def _now(self, plant: MujocoPlant) -> Array:
+        """Speed left below the limit, per joint, rad/s or m/s."""
+        self._speeds = np.abs(plant.qvel[self._dofs])
+        return np.asarray(self._limits - self._speeds)
+
+    def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
+        return np.asarray(self._limits - np.abs(forecast.qvel[:, self._dofs]))
+
+    def slacks(self, plant: MujocoPlant, control: Array) -> Array:
+        """What is left below the bound along the forecast and at its end, per joint, shape (2 k,)."""
+        self._look(plant)
+        left = self._room(plant, plant.forecast(control, self.holds)) - self.margin
+        over = np.maximum(self._speeds - self._bound, 0.0)
+        # From above the bound, joint by joint: never faster on the way, and closer at the end.
+        decay = np.exp(-self.holds * plant.hold_s / RECOVERY_S)
+        return np.concatenate([left.min(axis=0) + over, left[-1] + over * decay])
+
+    def rows(self, plant: MujocoPlant) -> HalfSpaces:
+        """Two rows per joint that could reach its limit within the hold; none where controls are no forces."""
+        if not plant.has_acceleration:
+            return super().rows(plant)
+        drift, effect = plant.acceleration
+        v = plant.qvel[self._dofs]
+        a0, a = drift[self._dofs], effect[self._dofs]
+        strongest = np.maximum(np.abs(plant.lower), np.abs(plant.upper))
+        pushes = np.abs(a) * np.where(
+            a == 0.0, 0.0, strongest
+        )  # no push, however strong the actuator may get
+        reach = np.abs(v) + plant.hold_s * (np.abs(a0) + pushes.sum(axis=1))
+        near = reach > self._bound
+        normals = np.vstack([a[near], -a[near]])
+        room = self._bound[near] / plant.hold_s
+        rate, bias = v[near] / plant.hold_s, a0[near]
+        return HalfSpaces(normals, np.concatenate([room - rate - bias, room + rate + bias]))

@@ -1,0 +1,248 @@
+"""SingularityMargin: the manipulability of a point of an arm stays above a threshold."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.constraints.limits.serial_chain import FrameKind, SerialChain
+from safe_wrappers.constraints.rollout import Predicted
+from safe_wrappers.control.filtering.manipulability import (
+    ValidatedThreshold,
+    chain_derivative,
+    manipulability,
+    manipulability_gradient,
+    task_rows,
+    validated_threshold,
+)
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import HalfSpaces, Promise, non_negative, positive
+from safe_wrappers.plants.mujoco.forecast import Forecast
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.plants.plant import Plant
+
+Array = NDArray[np.float64]
+
+_SAMPLES = 2000
+"""Configurations that say which manipulability can be reached."""
+_STILL = 1e-9
+"""m or rad per rad: a column of less moves nothing."""
+_DECAY_HOLDS = 2.0
+"""Time constant of the rows, control intervals: longer brakes early, shorter is refused by the forecast."""
+_ALONG_S = 1e-5
+"""Of motion, for the difference that gives the curvature of w along it."""
+
+
+@dataclass
+class SingularityMargin(Predicted):
+    """Keep the manipulability `w = sqrt(det(J J'))` of a frame, for declared task directions, above a threshold.
+
+    Near a singular pose a Cartesian command needs joint rates without bound. w says how near it is; but w by itself
+    bounds no joint rate, so a threshold has to be *validated* for the machine. Given `task_speed` and `rate_limit`
+    instead of a threshold, it is the smallest w above which none of 2,000 sampled configurations needs more than the
+    limit at that speed in any direction; `control.filtering.manipulability.validated_threshold` says what that proves
+    and what not, and does the same for other samples.
+
+    A torque changes w through two integrations. So the forecast goes on after the held control, braking every
+    actuated joint, for `holds` control steps in all; w has to stay at every physics substep of it. Rows
+    `w'' + 2 a w' + a^2 (w - threshold) >= 0` are the first guess where controls are forces; what counts is
+    the forecast. With as many joints as directions the determinant's sign is watched too: an arm
+    does not pass through the singular pose between two substeps.
+
+    What it promises: an executed control that is not flagged keeps the threshold at every substep of its step, for a
+    plant that is right, and as long as braking takes no more than `holds` steps leaves one that stops in time. Joints
+    that are pushed by gravity, contacts or each other harder than their actuators can brake go on. Hence best effort.
+    It keeps away from one kind of failure of an inverse: it limits neither joint rates (`JointSpeedLimit`) nor
+    torques, and what a drive does at its own limits is the drive's.
+
+    `value`, and so `cbf/margin`, is w over the threshold, less 1: -1 is singular. w itself has no fixed scale (it is
+    0.01 m^2 at most for Reacher, 0.003 m^6 for Fetch's hand), and tolerances need one.
+
+    A start below the threshold (Reacher's and Pusher's arms begin stretched) counts as `cbf/unsafe`; the filter
+    brings w up again. Whatever task needs the poses below loses them.
+
+    Args:
+        threshold: Smallest w, in m^k for k translations and hinges (times `length` to the number of rotations). None
+            needs `task_speed` and `rate_limit`.
+        site: Name of the site whose motion the task is about; or
+        body: of a body, meaning its frame's origin; or
+        geom: of a geom, meaning its centre.
+        directions: Of translation, some of "xyz".
+        rotations: About these axes, some of "xyz".
+        length: By which a rotation counts as a translation, m; needed if there are both: m and rad do not add up.
+        frame: Whose axes directions and rotations mean: the "world"'s or the frame's "own". Of all three, or none,
+            w is the same in both.
+        joints: Names of the joints that do the task. None takes those that an actuator drives directly, if they move
+            the frame. Where none does (Fetch's arm is pulled by its hand) name them.
+        task_speed: That has to be possible in every direction, m/s (rad/s if the task is of rotations alone).
+        rate_limit: Largest rate of each joint that this may take, rad/s for hinges, m/s for slides.
+        margin: Kept free above the threshold, as a share of it.
+        holds: Control steps to look ahead; cover the time that braking takes.
+        reach: The most that w can fall within `holds` control steps in the declared envelope, in shares of the
+            threshold; states with more than that left need no forecast. None forecasts always.
+
+    Attributes:
+        validated: What the sample said of the threshold; None if it was given, or before the constraint is bound.
+    """
+
+    threshold: float | None = None
+    site: str | None = None
+    body: str | None = None
+    geom: str | None = None
+    directions: str = "xyz"
+    rotations: str = ""
+    length: float | None = None
+    frame: Literal["world", "own"] = "world"
+    joints: Sequence[str] | None = None
+    task_speed: float | None = None
+    rate_limit: float | None = None
+    margin: float = 0.0
+    holds: int = 5
+    reach: float | None = None
+
+    promise: Promise = field(default="best effort", init=False)
+    validated: ValidatedThreshold | None = field(default=None, init=False, repr=False, compare=False)
+    unit: ClassVar[str] = "shares of the threshold"
+
+    def __post_init__(self) -> None:
+        speed, limit = self.task_speed, self.rate_limit
+        given, validated = self.threshold is not None, speed is not None and limit is not None
+        if given is validated or (given and (speed is not None or limit is not None)):
+            raise ConfigurationError(
+                "give a threshold on the manipulability, or a task_speed and a rate_limit to validate one for; got "
+                f"threshold={self.threshold!r}, task_speed={self.task_speed!r}, rate_limit={self.rate_limit!r}"
+            )
+        if self.threshold is not None:
+            self.threshold = positive("threshold", self.threshold, "units of manipulability")
+        if speed is not None and limit is not None:
+            self.task_speed = positive("task_speed", speed, "task units per second")
+            self.rate_limit = positive("rate_limit", limit, "rad/s or m/s")
+        self.margin = non_negative("margin", self.margin, self.unit)
+        kinds: tuple[FrameKind, ...] = ("site", "body", "geom")
+        named = [kind for kind in kinds if getattr(self, kind) is not None]
+        if len(named) != 1 or not isinstance(getattr(self, named[0]), str):
+            raise ConfigurationError(
+                "name the one site, body or geom that the task moves; got "
+                + ", ".join(f"{kind}={getattr(self, kind)!r}" for kind in kinds)
+            )
+        self._kind = named[0]
+        if self.frame not in ("world", "own"):
+            raise ConfigurationError(f'frame is "world" or "own", got {self.frame!r}')
+        if self.joints is not None:
+            if isinstance(self.joints, str):
+                raise ConfigurationError(f"joints is a list of names, got the string {self.joints!r}")
+            self.joints = list(self.joints)
+            if not self.joints:
+                raise ConfigurationError("joints is a list of names, or None for every driven joint; got []")
+        self._rows, self._weights = task_rows(self.directions, self.rotations, self.length)
+        self._check_shared()
+
+    def bind(self, plant: Plant) -> None:
+        """Resolve frame and joints; refuse what no configuration can do."""
+        super().bind(plant)
+        assert isinstance(plant, MujocoPlant)
+        name = getattr(self, self._kind)
+        self._chain = SerialChain(plant, self._kind, name)
+        self._columns = self._chain.columns(self.joints)
+        sampled = self._chain.sample(np.random.default_rng(0), _SAMPLES)
+        idle = np.linalg.norm(self._task(sampled), axis=1).max(axis=0) < _STILL
+        if self.joints is not None and idle.any():
+            still = self._chain.name(self._columns[int(np.argmax(idle))])
+            raise ConfigurationError(
+                f"the joint {still!r} moves the {self._kind} {name!r} in none of the task's directions: leave it out"
+            )
+        self._columns = [c for c, does_nothing in zip(self._columns, idle, strict=True) if not does_nothing]
+        task, count = f"directions={self.directions!r}, rotations={self.rotations!r}", len(self._columns)
+        if count < len(self._rows):
+            raise ConfigurationError(
+                f"{count} joints cannot move the {self._kind} {name!r} in {len(self._rows)} directions at once "
+                f"({task}); the joints are " + (", ".join(map(self._chain.name, self._columns)) or "none")
+            )
+        # With as many joints as directions w is the determinant but for its sign, which turns at a singular pose.
+        self._signed, self._side = count == len(self._rows), 1.0
+        found = np.abs(self._measure(sampled))
+        most = float(found.max())
+        if most < _STILL:
+            raise ConfigurationError(
+                f"the {self._kind} {name!r} cannot be moved in all of these directions at once in any configuration: "
+                f"{task}, frame={self.frame!r}"
+            )
+        if self.threshold is None:
+            assert self.task_speed is not None and self.rate_limit is not None
+            self.validated = validated_threshold(self._task(sampled), self.task_speed, self.rate_limit)
+            self._threshold = self.validated.threshold
+        else:
+            self._threshold = self.threshold
+        if self._threshold * (1.0 + self.margin) >= most:
+            raise ConfigurationError(
+                f"no configuration has a manipulability above {self._threshold:g} with a margin of "
+                f"{self.margin:g} of it: the largest of {_SAMPLES} in the joints' ranges is {most:.4g}, half of "
+                f"them are above {float(np.median(found)):.4g}"
+            )
+
+    def _task(self, qpos: Array) -> Array:
+        """Shape (k, m, n)."""
+        jacobians, axes = self._chain.jacobians(qpos)
+        return self._in_frame(jacobians, axes)[:, self._rows][:, :, self._columns] * self._weights[:, None]
+
+    def _in_frame(self, jacobians: Array, axes: Array) -> Array:
+        """Six rows in the declared axes, shape (k, ..., 6, n)."""
+        if self.frame == "world":
+            return jacobians
+        back = np.swapaxes(axes, -1, -2)
+        back = back.reshape(len(back), *(1,) * (jacobians.ndim - 3), 3, 3)
+        return np.concatenate([back @ jacobians[..., :3, :], back @ jacobians[..., 3:, :]], axis=-2)
+
+    def _measure(self, qpos: Array) -> Array:
+        """w, shape (k,), below zero beyond the singular pose; NaN where a position is no number."""
+        w = np.full(len(qpos), np.nan)
+        finite = np.isfinite(qpos).all(axis=1)
+        task = self._task(qpos[finite])
+        w[finite] = self._side * np.linalg.det(task) if self._signed else manipulability(task)
+        return w
+
+    def _now(self, plant: MujocoPlant) -> Array:
+        self._chain.place(plant.pose())
+        self._side = 1.0
+        w = self._measure(plant.qpos[None])
+        if w[0] < 0.0:
+            self._side, w = -1.0, -w
+        return np.asarray(w / self._threshold - 1.0)
+
+    def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
+        return np.asarray(self._measure(forecast.qpos) / self._threshold - 1.0)[:, None]
+
+    def _slope(self, qpos: Array) -> Array:
+        """dw/dq over the chain's joints, shape (k, n)."""
+        jacobians, axes = self._chain.jacobians(qpos)
+        change = chain_derivative(jacobians[:, :3], jacobians[:, 3:])
+        if self.frame == "own":
+            # The axes turn with the joints, too.
+            turning = np.swapaxes(jacobians[:, 3:], 1, 2)[:, :, None, None, :]  # of joint k
+            blocks = np.swapaxes(jacobians.reshape(len(qpos), 2, 3, -1), 2, 3)[:, None]
+            carried = np.swapaxes(np.cross(turning, blocks), 3, 4)
+            change = change - carried.reshape(change.shape)
+        task = self._in_frame(jacobians, axes)[:, self._rows][:, :, self._columns]
+        moved = self._in_frame(change, axes)[:, :, self._rows][..., self._columns]
+        return manipulability_gradient(task * self._weights[:, None], moved * self._weights[:, None])
+
+    def rows(self, plant: MujocoPlant) -> HalfSpaces:
+        """One row, a first guess for the forecast.
+
+        Where a ball or free joint carries the frame as well, or controls are no forces, it is that of every forecast.
+        """
+        if not (self._chain.scalar and plant.has_acceleration):
+            return super().rows(plant)
+        self._look(plant)
+        drift, effect = plant.acceleration
+        speeds = plant.qvel[self._chain.dofs]
+        along = np.tile(plant.qpos, (3, 1))
+        along[1:, self._chain.qpos] += np.outer([_ALONG_S, -_ALONG_S], speeds)
+        slope, ahead, behind = self._slope(along) / self._threshold
+        curvature = (ahead - behind) @ speeds / (2.0 * _ALONG_S)
+        a = 1.0 / (_DECAY_HOLDS * plant.hold_s)
+        left = 2.0 * a * (slope @ speeds) + a * a * (self._least - self.margin)
+        drift, effect = drift[self._chain.dofs], effect[self._chain.dofs]
+        return HalfSpaces(-(slope @ effect)[None], np.array([slope @ drift + curvature + left]))

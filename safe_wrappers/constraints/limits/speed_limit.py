@@ -1,0 +1,140 @@
+"""SpeedLimit: how fast a body, or the machine's centre of mass, may move."""
+
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.constraints.rollout import Predicted
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.filter.constraint import Promise, non_negative, positive
+from safe_wrappers.plants.mujoco.forecast import Forecast
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.plants.plant import Plant
+
+Array = NDArray[np.float64]
+
+DIRECTIONS = ("+x", "-x", "x", "+y", "-y", "y", "+z", "-z", "z", "xy", "xyz")
+
+
+@dataclass
+class SpeedLimit(Predicted):
+    """Keep the speed of a body, or of the centre of mass, below a limit.
+
+    Speed is displacement over time, as Gymnasium's `x_velocity` is: over one control step, or over one physics
+    substep. The action is held through the forecast's first control step, contacts included, and the actuated
+    joints are braked in the others (`holds`): a speed that is kept now only to be exceeded next is refused now.
+
+    What it promises: the first control step of an executed control that is not flagged keeps the limit, exactly,
+    for a plant that is right. That such a control exists cannot be promised: in flight no actuator changes the
+    momentum, and contact forces have one sign. Hence best effort; then the step is counted infeasible and
+    the control that was found to exceed the limit least is executed.
+
+    Over one control step both displacements count that are in use: from state to state, and the one that MuJoCo's
+    `data.xpos` shows, which belongs to the last point that the integrator evaluated (Gymnasium reads Ant's and
+    Humanoid's speed from it).
+
+    Args:
+        limit: m/s.
+        body: Name of the body whose frame origin is meant; None is the whole machine's centre of mass.
+        direction: "+x" and so on limit one sign, "x" both, "xy" and "xyz" the length of the vector.
+        average: "step" over a control step, "substep" over a physics substep (instantaneous).
+        margin: Kept free below the limit, m/s.
+        holds: Control steps to look ahead.
+        reach: The most that the speed can rise within `holds` control steps in the declared envelope, m/s; states
+            with more than that left need no forecast. None forecasts always.
+    """
+
+    limit: float
+    body: str | None = None
+    direction: str = "xy"
+    average: Literal["step", "substep"] = "step"
+    margin: float = 0.0
+    holds: int = 3
+    reach: float | None = None
+
+    promise: Promise = field(default="best effort", init=False)
+    unit: ClassVar[str] = "m/s"
+
+    def __post_init__(self) -> None:
+        self.limit = positive("limit", self.limit, "m/s")
+        self.margin = non_negative("margin", self.margin, "m/s")
+        if self.margin >= self.limit:
+            raise ConfigurationError(f"the margin {self.margin} leaves nothing of the limit {self.limit}")
+        if self.direction not in DIRECTIONS:
+            raise UnknownNameError(f"no direction {self.direction!r}; choose {', '.join(DIRECTIONS)}")
+        if self.average not in ("step", "substep"):
+            raise UnknownNameError(f"no average {self.average!r}; choose step or substep")
+        self._check_shared()
+        self._axes = ["xyz".index(letter) for letter in self.direction.strip("+-")]
+        self._sign = {"+": 1.0, "-": -1.0}.get(self.direction[0])
+
+    @property
+    def scale(self) -> float:
+        """The limit."""
+        return self.limit
+
+    def bind(self, plant: Plant) -> None:
+        """Resolve the body and its share in the machine's mass."""
+        super().bind(plant)
+        assert isinstance(plant, MujocoPlant)
+        self._body = None if self.body is None else plant.named("body", self.body)
+        self._revision = plant.revision
+        self._weigh(plant)
+        self._here: Array | None = None
+        self._time = np.nan
+        self._window = plant.substeps if self.average == "step" else 1
+
+    def _weigh(self, plant: MujocoPlant) -> None:
+        mass = plant.model.body_mass
+        self._shares = mass / mass.sum()
+
+    def reset(self) -> None:
+        """Forget the episode, and with it the last position."""
+        super().reset()
+        self._here = None
+
+    def _point(self, frames: Array, centres: Array) -> Array:
+        if self._body is None:
+            return np.asarray((self._shares @ centres)[..., self._axes])
+        return np.asarray(frames[..., self._body, :][..., self._axes])
+
+    def _now(self, plant: MujocoPlant) -> Array:
+        if self._revision != plant.revision:
+            self._revision = plant.revision
+            self._weigh(plant)
+        pose = plant.pose()
+        data = plant.published()
+        self._shown = None if data is None else self._point(data.xpos, data.xipos)
+        before, self._here = self._here, self._point(pose.xpos, pose.xipos)
+        if before is None or self.average == "substep":
+            # What the last substep shows; at a reset nothing else has moved yet that could be measured.
+            earlier = plant.substep_ago()
+            moved = self._here - self._point(earlier.frames[0], earlier.centres[0])
+            self._last = self._left(moved[None], 1, plant)
+        elif plant.time != self._time:  # the first step looks at the state of the reset again
+            self._last = self._left((self._here - before)[None], plant.substeps, plant)
+        self._time = plant.time
+        return self._last
+
+    def _left(self, displacements: Array, substeps: int, plant: MujocoPlant) -> Array:
+        velocity = displacements / (substeps * plant.hold_s / plant.substeps)
+        if self._sign is not None:
+            return self.limit - self._sign * velocity[:, 0]
+        return np.asarray(self.limit - np.sqrt((velocity * velocity).sum(axis=1)))
+
+    def _violation(self, value: Array) -> Array:
+        return np.zeros(1)  # the next step's displacement starts afresh: there is no way back to allow for
+
+    def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
+        assert self._here is not None
+        poses = forecast.poses(self._window)
+        left = self._along(self._point(poses.frames, poses.centres), self._here, plant)
+        if self.average == "substep" or self._shown is None:
+            return left[:, None]
+        shown = self._point(forecast.published_frames, forecast.published_centres)
+        return np.stack([left, self._along(shown, self._shown, plant)], axis=1)
+
+    def _along(self, points: Array, start: Array, plant: MujocoPlant) -> Array:
+        return self._left(np.diff(points, axis=0, prepend=start[None]), self._window, plant)

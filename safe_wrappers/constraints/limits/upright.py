@@ -1,0 +1,101 @@
+"""Upright: a body stays above a height and within a tilt."""
+
+import math
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.constraints.rollout import Predicted
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import Promise, non_negative, positive
+from safe_wrappers.plants.mujoco.forecast import Forecast
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.plants.plant import Plant
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Upright(Predicted):
+    """Keep a body's height in a range and its own z axis within an angle of the vertical.
+
+    What it promises: an executed control that is not flagged keeps both at every physics substep of its step,
+    for a plant that is right. It looks `holds` control steps ahead, with the actuated joints braked after the
+    first: that refuses controls whose fall is near, and balances nobody. A robot on legs can be past saving
+    long before it falls. Hence best effort.
+
+    Args:
+        body: Its name.
+        lowest: Of the body frame's origin above the world's zero, m; None: no bound.
+        highest: Likewise.
+        tilt: Largest angle between the body's z axis and the world's, rad; None: no bound.
+        margin: Kept free, m for the heights and rad for the tilt.
+        holds: Control steps to look ahead.
+        reach: The most that height (m) and tilt (rad) can change within `holds` control steps in the declared
+            envelope; states with more than that left need no forecast. None forecasts always.
+    """
+
+    body: str = "torso"
+    lowest: float | None = None
+    highest: float | None = None
+    tilt: float | None = None
+    margin: float = 0.0
+    holds: int = 5
+    reach: float | None = None
+
+    promise: Promise = field(default="best effort", init=False)
+    unit: ClassVar[str] = "m or rad"
+
+    def __post_init__(self) -> None:
+        self.margin = non_negative("margin", self.margin, "m and rad")
+        if self.lowest is None and self.highest is None and self.tilt is None:
+            raise ConfigurationError("give at least one of lowest (m), highest (m) and tilt (rad)")
+        for name in ("lowest", "highest"):
+            height = getattr(self, name)
+            if height is not None and not (isinstance(height, int | float) and math.isfinite(height)):
+                raise ConfigurationError(f"{name} is a height in m or None, got {height!r}")
+        if self.tilt is not None:
+            self.tilt = positive("tilt", self.tilt, "rad")
+            if self.tilt > math.pi or self.tilt <= self.margin:
+                raise ConfigurationError(
+                    f"tilt is an angle above the margin ({self.margin}) and at most pi, got {self.tilt}"
+                )
+        low, high = self._heights()
+        if not high - low > 2.0 * self.margin:
+            raise ConfigurationError(
+                f"nothing is left between lowest = {self.lowest} m and highest = {self.highest} m with a margin "
+                f"of {self.margin} m at both ends"
+            )
+        self._check_shared()
+
+    def _heights(self) -> tuple[float, float]:
+        low = -math.inf if self.lowest is None else self.lowest
+        return low, math.inf if self.highest is None else self.highest
+
+    def bind(self, plant: Plant) -> None:
+        """Resolve the body."""
+        super().bind(plant)
+        assert isinstance(plant, MujocoPlant)
+        self._body = plant.named("body", self.body)
+
+    def _now(self, plant: MujocoPlant) -> Array:
+        pose = plant.pose()
+        return self._left(pose.xpos[self._body, 2], pose.xmat[self._body, 8])
+
+    def _left(self, height: Array, cosine: Array) -> Array:
+        low, high = self._heights()
+        left = []
+        if self.lowest is not None:
+            left.append(height - low)
+        if self.highest is not None:
+            left.append(high - height)
+        if self.tilt is not None:
+            left.append(self.tilt - np.arccos(np.clip(cosine, -1.0, 1.0)))
+        return np.array(left)
+
+    def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
+        poses = forecast.poses()
+        left = self._left(poses.frames[:, self._body, 2], poses.axes[:, self._body, 2, 2])
+        return np.asarray(left.T)

@@ -1,0 +1,146 @@
+"""Workspace: named points stay inside a box, and out of what stands in it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacle_from
+from safe_wrappers.constraints.obstacles.obstacles import distances
+from safe_wrappers.constraints.rollout import Predicted
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import Promise, non_negative
+from safe_wrappers.plants.mujoco.forecast import Forecast
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.plants.plant import Plant
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Workspace(Predicted):
+    """Keep points of the machine inside an axis-aligned box and outside obstacles, in world coordinates.
+
+    Position under a force has relative degree two: a point that is inside may be too fast to stay. So the
+    forecast goes on after the held control, braking every actuated joint, for `holds` control steps in all; the
+    workspace has to hold at every physics substep of it. Moving obstacles are taken where they are.
+
+    What it promises: an executed control that is not flagged keeps the workspace at every substep of its step,
+    for a plant that is right, and as long as braking takes no more than `holds` steps leaves one that stops in
+    time. Near a singular pose, or under loads stronger than the actuators, braking joints can still carry a
+    point on. Hence best effort.
+
+    Args:
+        low: Smallest x, y, z, m; None is no bound, for all or for one: `[None, -0.5, None]`.
+        high: Largest, likewise.
+        keep_out: `Disc`, `Sphere`, `Box`, `Plane`, `Discs`.
+        bodies: Names of bodies whose frame origins are meant.
+        sites: Names of sites, likewise.
+        geoms: Names of geoms: their centres, likewise.
+        radius: Of the machine around each point, m.
+        margin: Kept free, m.
+        holds: Control steps to look ahead; cover the time that braking takes.
+        reach: The farthest that a point can move within `holds` control steps in the declared envelope, m; states
+            with more than that left need no forecast. None forecasts always.
+    """
+
+    low: Sequence[float | None] | None = None
+    high: Sequence[float | None] | None = None
+    keep_out: Sequence[Any] = ()
+    bodies: Sequence[str] = ()
+    sites: Sequence[str] = ()
+    geoms: Sequence[str] = ()
+    radius: float = 0.0
+    margin: float = 0.0
+    holds: int = 5
+    reach: float | None = None
+
+    promise: Promise = field(default="best effort", init=False)
+    unit: ClassVar[str] = "m"
+
+    def __post_init__(self) -> None:
+        self.radius = non_negative("radius", self.radius, "m")
+        self.margin = non_negative("margin", self.margin, "m")
+        self.low, self.high = _corner("low", self.low), _corner("high", self.high)
+        if isinstance(self.keep_out, dict | str) or not isinstance(self.keep_out, Sequence):
+            raise ConfigurationError(f"keep_out is a list of obstacles, got {self.keep_out!r}")
+        self.keep_out = [obstacle_from(o) for o in self.keep_out]
+        for name in ("bodies", "sites", "geoms"):
+            if isinstance(getattr(self, name), str):
+                raise ConfigurationError(f"{name} is a list of names, got the string {getattr(self, name)!r}")
+            setattr(self, name, list(getattr(self, name)))
+        self._low, self._high = _bounds(self.low, -np.inf), _bounds(self.high, np.inf)
+        bounded = bool(np.isfinite(self._low).any() or np.isfinite(self._high).any())
+        if not (bounded or self.keep_out):
+            raise ConfigurationError("give a bound in low or high (m), or something to keep_out of")
+        if (self._high - self._low <= 2.0 * (self.margin + self.radius)).any():
+            raise ConfigurationError(
+                f"nothing is left of the box from {self.low} to {self.high} m with a radius of {self.radius} m "
+                f"and a margin of {self.margin} m on each side"
+            )
+        self._check_shared()
+
+    def bind(self, plant: Plant) -> None:
+        """Resolve the points: a body each, and an offset in its frame."""
+        super().bind(plant)
+        assert isinstance(plant, MujocoPlant)
+        if not (self.bodies or self.sites or self.geoms):
+            raise ConfigurationError(
+                "name the bodies, sites or geoms to keep inside; the model has the bodies "
+                + ", ".join(plant.names("body"))
+            )
+        m = plant.model
+        found = [(plant.named("body", name), np.zeros(3)) for name in self.bodies]
+        for kind, names in (("site", self.sites), ("geom", self.geoms)):
+            for name in names:
+                i = plant.named(kind, name)
+                found.append((int(getattr(m, f"{kind}_bodyid")[i]), np.array(getattr(m, f"{kind}_pos")[i])))
+        self._bodies = np.array([body for body, _ in found])
+        self._offsets = np.array([offset for _, offset in found])
+
+    def _points(self, frames: Array, axes: Array) -> Array:
+        """World positions, shape (k, points, 3)."""
+        rotated = np.einsum("kpij,pj->kpi", axes[:, self._bodies], self._offsets)
+        return np.asarray(frames[:, self._bodies] + rotated)
+
+    def _left(self, points: Array, plant: MujocoPlant) -> Array:
+        """Room of every point to every bound and surface, shape (k, n)."""
+        k = len(points)
+        low, high = np.isfinite(self._low), np.isfinite(self._high)
+        left = [
+            (points - self._low)[:, :, low].reshape(k, -1),
+            (self._high - points)[:, :, high].reshape(k, -1),
+        ]
+        every = points.reshape(-1, 3)
+        for obstacle in self.keep_out:
+            surfaces = distances(obstacle, every, plant)
+            left.append(surfaces.reshape(k, points.shape[1] * surfaces.shape[1]))
+        return np.concatenate(left, axis=1) - self.radius
+
+    def _now(self, plant: MujocoPlant) -> Array:
+        pose = plant.pose()
+        points = self._points(pose.xpos[None], pose.xmat.reshape(1, -1, 3, 3))
+        return np.asarray(self._left(points, plant)[0])
+
+    def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
+        poses = forecast.poses()
+        return self._left(self._points(poses.frames, poses.axes), plant)
+
+
+def _corner(name: str, given: Sequence[float | None] | None) -> list[float | None] | None:
+    if given is None:
+        return None
+    try:
+        corner = [None if v is None else float(v) for v in given]
+    except (TypeError, ValueError):
+        corner = []
+    if len(corner) != 3 or any(v is not None and not np.isfinite(v) for v in corner):
+        raise ConfigurationError(f"{name} is [x, y, z] in m, None where there is no bound; got {given!r}")
+    return corner
+
+
+def _bounds(corner: Sequence[float | None] | None, missing: float) -> Array:
+    values = [None, None, None] if corner is None else corner
+    return np.array([missing if v is None else v for v in values])

@@ -1,0 +1,1 @@
+"""Shapes to keep clear of, at rest, moving, or tracked with uncertainty."""

@@ -1,0 +1,243 @@
+"""Things to keep clear of: discs, spheres, boxes and planes; what moves is published by the env (`Discs`).
+
+Each answers, for a point, how far its surface is and in which direction it lies. Plain data, so that a wrapper
+that is given obstacles can be recorded and rebuilt.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import positive
+from safe_wrappers.plants.plant import Plant
+
+Array = NDArray[np.float64]
+
+
+class Nearest(NamedTuple):
+    """For one point and k surfaces in d dimensions.
+
+    Attributes:
+        distance: Signed, m, negative inside, shape (k,).
+        normal: Unit vectors from the surface towards the point, shape (k, d).
+        velocity: Of the surface, m/s, shape (k, d).
+        curvature: Of the surface of equal distance through the point, along each coordinate, 1/m, shape
+            (k, d): what a sideways motion gains in clearance. Zero along an edge or an upright cylinder.
+    """
+
+    distance: Array
+    normal: Array
+    velocity: Array
+    curvature: Array
+
+
+class Obstacle(Protocol):
+    """Anything with a nearest surface. Ours also have `distances`, for many points at once."""
+
+    def nearest(self, point: Array, plant: Plant) -> Nearest:
+        """The surfaces of this obstacle as seen from a point of shape (d,)."""
+
+
+def distances(obstacle: Obstacle, points: Array, plant: Plant) -> Array:
+    """Signed distances of points of shape (k, d) to an obstacle's n surfaces, shape (k, n), m."""
+    together = getattr(obstacle, "distances", None)
+    if together is not None:
+        return np.asarray(together(points, plant))
+    return np.stack([obstacle.nearest(point, plant).distance for point in points])
+
+
+def _to_centers(points: Array, centers: Array, radius: float) -> Array:
+    d = centers.shape[1]
+    if d > points.shape[1]:
+        raise ConfigurationError(
+            f"{d}-dimensional obstacles cannot meet {points.shape[1]}-dimensional points"
+        )
+    offsets = points[:, None, :d] - centers
+    return np.asarray(np.sqrt(np.einsum("kni,kni->kn", offsets, offsets)) - radius)
+
+
+def _vector(name: str, values: Sequence[float], sizes: tuple[int, ...]) -> list[float]:
+    try:
+        vector = [float(v) for v in values]
+    except (TypeError, ValueError):
+        raise ConfigurationError(f"{name} must be a list of numbers, got {values!r}") from None
+    if len(vector) not in sizes or not np.isfinite(vector).all():
+        raise ConfigurationError(
+            f"{name} must be {' or '.join(map(str, sizes))} finite numbers, got {values!r}"
+        )
+    return vector
+
+
+def _round(point: Array, centers: Array, radius: float, velocity: Array) -> Nearest:
+    """Discs and spheres; a disc seen from three dimensions is an upright cylinder."""
+    d = centers.shape[1]
+    if d > point.size:
+        raise ConfigurationError(f"a {d}-dimensional obstacle cannot meet a {point.size}-dimensional point")
+    offset = point[:d] - centers
+    length = np.sqrt(np.einsum("ij,ij->i", offset, offset))
+    apart = np.where(length > 1e-12, length, 1.0)
+    normal = np.zeros((len(centers), point.size))
+    normal[:, :d] = offset / apart[:, None]
+    normal[length <= 1e-12, 0] = 1.0  # at the very centre every way out is as good
+    moving = np.zeros_like(normal)
+    moving[:, :d] = velocity
+    curvature = np.zeros_like(normal)
+    curvature[:, :d] = 1.0 / np.maximum(length, 1e-9)[:, None]
+    return Nearest(length - radius, normal, moving, curvature)
+
+
+@dataclass
+class Disc:
+    """An upright cylinder: a disc of `radius` (m) in the plane at `center` (x, y). It stands still."""
+
+    center: Sequence[float]
+    radius: float
+
+    def __post_init__(self) -> None:
+        self.center = _vector("center", self.center, (2,))
+        self.radius = positive("radius", self.radius, "m")
+
+    def nearest(self, point: Array, plant: Plant) -> Nearest:
+        """One surface."""
+        return _round(point, np.array([self.center]), self.radius, np.zeros((1, len(self.center))))
+
+    def distances(self, points: Array, plant: Plant) -> Array:
+        """Shape (k, 1), m."""
+        return _to_centers(points, np.array([self.center]), self.radius)
+
+
+@dataclass
+class Sphere:
+    """A ball of `radius` (m) at `center` (x, y, z). It stands still."""
+
+    center: Sequence[float]
+    radius: float
+
+    def __post_init__(self) -> None:
+        self.center = _vector("center", self.center, (3,))
+        self.radius = positive("radius", self.radius, "m")
+
+    def nearest(self, point: Array, plant: Plant) -> Nearest:
+        """One surface."""
+        return _round(point, np.array([self.center]), self.radius, np.zeros((1, len(self.center))))
+
+    def distances(self, points: Array, plant: Plant) -> Array:
+        """Shape (k, 1), m."""
+        return _to_centers(points, np.array([self.center]), self.radius)
+
+
+@dataclass
+class Plane:
+    """A wall: everything behind `point` against the outward `normal` is forbidden; 1, 2 or 3 dimensions."""
+
+    point: Sequence[float]
+    normal: Sequence[float]
+
+    def __post_init__(self) -> None:
+        self.point = _vector("point", self.point, (1, 2, 3))
+        self.normal = _vector("normal", self.normal, (len(self.point),))
+        length = float(np.linalg.norm(self.normal))
+        if length < 1e-12:
+            raise ConfigurationError("normal must not be zero: it points from the wall into free space")
+        self.normal = [n / length for n in self.normal]
+
+    def nearest(self, point: Array, plant: Plant) -> Nearest:
+        """One surface."""
+        d = len(self.point)
+        if d > point.size:
+            raise ConfigurationError(f"a {d}-dimensional plane cannot meet a {point.size}-dimensional point")
+        normal = np.zeros((1, point.size))
+        normal[0, :d] = self.normal
+        distance = normal[0, :d] @ (point[:d] - np.asarray(self.point))
+        return Nearest(np.array([distance]), normal, np.zeros_like(normal), np.zeros_like(normal))
+
+    def distances(self, points: Array, plant: Plant) -> Array:
+        """Shape (k, 1), m."""
+        offsets = points[:, : len(self.point)] - np.asarray(self.point)
+        return np.asarray((offsets @ np.asarray(self.normal))[:, None])
+
+
+@dataclass
+class Box:
+    """An axis-aligned block of `half_size` (m per axis) at `center`; 2 or 3 dimensions. It stands still."""
+
+    center: Sequence[float]
+    half_size: Sequence[float]
+
+    def __post_init__(self) -> None:
+        self.center = _vector("center", self.center, (2, 3))
+        self.half_size = _vector("half_size", self.half_size, (len(self.center),))
+        for half in self.half_size:
+            positive("half_size", half, "m")
+
+    def nearest(self, point: Array, plant: Plant) -> Nearest:
+        """One surface: a face, an edge or a corner."""
+        d = len(self.center)
+        if d > point.size:
+            raise ConfigurationError(f"a {d}-dimensional box cannot meet a {point.size}-dimensional point")
+        offset = point[:d] - np.asarray(self.center)
+        beyond = np.abs(offset) - np.asarray(self.half_size)
+        side = np.where(offset < 0.0, -1.0, 1.0)
+        outside = np.maximum(beyond, 0.0)
+        distance = float(np.linalg.norm(outside))
+        normal = np.zeros((1, point.size))
+        curvature = np.zeros_like(normal)
+        if distance > 0.0:
+            normal[0, :d] = side * outside / distance
+            if int((outside > 0.0).sum()) > 1:
+                curvature[0, :d] = (outside > 0.0) / distance
+        else:
+            axis = int(np.argmax(beyond))
+            distance = float(beyond[axis])
+            normal[0, axis] = side[axis]
+        return Nearest(np.array([distance]), normal, np.zeros_like(normal), curvature)
+
+    def distances(self, points: Array, plant: Plant) -> Array:
+        """Shape (k, 1), m."""
+        offsets = points[:, : len(self.center)] - np.asarray(self.center)
+        beyond = np.abs(offsets) - np.asarray(self.half_size)
+        outside = np.sqrt((np.maximum(beyond, 0.0) ** 2).sum(axis=1))
+        return np.asarray((outside + np.minimum(beyond.max(axis=1), 0.0))[:, None])
+
+
+@dataclass
+class Discs:
+    """Discs (or spheres) whose centres the env publishes, for example `hazard_positions`.
+
+    Args:
+        attribute: Name of the env's attribute, an array of shape (k, 2) or (k, 3) in m.
+        radius: m; the robot's own radius is the constraint's business.
+        velocity_attribute: Name of an array of the same shape in m/s; None says that they stand still.
+    """
+
+    attribute: str
+    radius: float
+    velocity_attribute: str | None = None
+
+    def __post_init__(self) -> None:
+        self.radius = positive("radius", self.radius, "m")
+
+    def centers(self, plant: Plant) -> Array:
+        """Where they are now, shape (k, 2) or (k, 3), m."""
+        where = np.asarray(plant.attribute(self.attribute), dtype=np.float64)
+        if where.ndim != 2 or where.shape[1] not in (2, 3):
+            raise ConfigurationError(
+                f"the env's {self.attribute} must have shape (k, 2) or (k, 3), got {where.shape}"
+            )
+        return where
+
+    def nearest(self, point: Array, plant: Plant) -> Nearest:
+        """One surface per centre."""
+        centers = self.centers(plant)
+        velocity = np.zeros_like(centers)
+        if self.velocity_attribute is not None:
+            velocity = np.asarray(plant.attribute(self.velocity_attribute), dtype=np.float64)
+        return _round(point, centers, self.radius, velocity)
+
+    def distances(self, points: Array, plant: Plant) -> Array:
+        """Shape (k, n), m."""
+        return _to_centers(points, self.centers(plant), self.radius)

@@ -1,0 +1,1 @@
+"""Stopping distances and evasive manoeuvres in closed form."""

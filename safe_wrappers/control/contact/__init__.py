@@ -1,0 +1,1 @@
+"""Contacts: complementarity, impacts, body regions, friction cones."""

@@ -1,0 +1,155 @@
+"""Contact forces that ground can give: it pushes, and holds sideways only in proportion.
+
+Source: appendix "Physical contact feasibility constraints". A force f on the robot, at a contact with unit normal n
+(pointing at the robot) and friction coefficient mu, is one that ground can give where
+
+    f_n = f . n >= 0    and    |f - f_n n| <= mu f_n.
+
+The cone is what Coulomb's law says of a point with one coefficient in every direction. The coefficient is measured
+with an error, changes with the ground, and drops once something slides: inside the cone of an optimistic number is
+not yet safe. Nor does it say that a foothold carries the load.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from safe_wrappers.control.numerics.finite import finite_arrays
+from safe_wrappers.errors import ConfigurationError
+
+Array = NDArray[np.float64]
+
+_UNIT = 1e-6
+"""How far a normal's length may be off 1."""
+
+
+def normal_and_tangential(forces: ArrayLike, normals: ArrayLike) -> tuple[Array, Array]:
+    """The part of each force along its normal, and the rest.
+
+    Args:
+        forces: On the robot, shape (..., 3), N.
+        normals: Unit normals, pointing at the robot, shape (..., 3).
+
+    Returns:
+        Normal force, shape (...), N, negative where the contact pulls; tangential force, shape (..., 3), N.
+    """
+    f, n = _forces_and_normals(forces, normals)
+    along = np.einsum("...i,...i->...", f, n)
+    return along, f - along[..., None] * n
+
+
+def friction_ratio(forces: ArrayLike, normals: ArrayLike, friction: ArrayLike) -> Array:
+    """How much of the friction is used, `|f_t| / (mu f_n)`, shape (...): at most 1 inside the cone.
+
+    Infinite where the ground would have to pull, or to hold sideways without pressure; 0 where there is no force.
+
+    Args:
+        forces: On the robot, shape (..., 3), N.
+        normals: Unit normals, shape (..., 3).
+        friction: Coefficient mu, at least 0, shape (...).
+    """
+    along, rest = normal_and_tangential(forces, normals)
+    sideways = np.linalg.norm(rest, axis=-1)
+    mu = _coefficient(friction)
+    held, sideways = np.broadcast_arrays(mu * along, sideways)
+    pulls = np.broadcast_to(along < 0.0, held.shape)
+    ratio = np.zeros(held.shape)
+    np.divide(sideways, held, out=ratio, where=held > 0.0)
+    ratio[(held <= 0.0) & (sideways > 0.0) | pulls] = np.inf
+    return ratio
+
+
+def in_cone(
+    forces: ArrayLike, normals: ArrayLike, friction: ArrayLike, tolerance: float = 0.0
+) -> NDArray[np.bool_]:
+    """Whether ground can give each force, shape (...).
+
+    Args:
+        forces: On the robot, shape (..., 3), N.
+        normals: Unit normals, shape (..., 3).
+        friction: Coefficient mu, at least 0, shape (...).
+        tolerance: What either condition may be missed by, N.
+    """
+    return np.asarray(cone_excess(forces, normals, friction) <= tolerance)
+
+
+def cone_excess(forces: ArrayLike, normals: ArrayLike, friction: ArrayLike) -> Array:
+    """By how much a force misses the worse of the two conditions, shape (...), N: at most 0 inside the cone."""
+    along, rest = normal_and_tangential(forces, normals)
+    return np.asarray(np.maximum(np.linalg.norm(rest, axis=-1) - _coefficient(friction) * along, -along))
+
+
+def tangents(normals: ArrayLike, first: ArrayLike | None = None) -> Array:
+    """Two unit tangents for each normal, shape (..., 2, 3); with the normal as third they are right-handed.
+
+    Args:
+        normals: Unit normals, shape (..., 3).
+        first: Direction whose tangential part the first tangent follows, shape (..., 3); None takes the axis of the
+            world that is farthest from the normal.
+    """
+    n = _unit(normals)
+    if first is None:
+        wanted = np.zeros(n.shape)
+        np.put_along_axis(wanted, np.abs(n).argmin(axis=-1)[..., None], 1.0, axis=-1)
+    else:
+        wanted, n = finite_arrays(first=first, normals=n)
+    along = wanted - np.einsum("...i,...i->...", wanted, n)[..., None] * n
+    length = np.linalg.norm(along, axis=-1, keepdims=True)
+    if not (length > 1e-9).all():
+        raise ConfigurationError("first must not be parallel to its normal, or zero")
+    along = along / length
+    return np.stack([along, np.cross(n, along)], axis=-2)
+
+
+def friction_pyramid(
+    normals: ArrayLike, friction: ArrayLike, edges: int = 4, first: ArrayLike | None = None
+) -> Array:
+    """Half-spaces inside the friction cone: `rows @ f <= 0` is a pyramid whose edges lie on the cone.
+
+    An inner approximation, for any number of edges: whatever the rows allow, the cone allows. What it gives away:
+    halfway between two edges it allows `cos(pi / edges)` of the friction, and the share of the cone's cross-section
+    that it covers is `sin(2 pi / edges) / (2 pi / edges)`; four edges: 71 % and 64 %, eight: 92 % and 90 %.
+
+    Args:
+        normals: Unit normals, pointing at the robot, shape (..., 3).
+        friction: Coefficient mu, at least 0, shape (...).
+        edges: Of the pyramid, at least 3.
+        first: Direction of the first edge, shape (..., 3); None chooses one (`tangents`). With four edges and the
+            first axis of a contact frame of MuJoCo, the pyramid is MuJoCo's own.
+
+    Returns:
+        Shape (..., edges + 1, 3): one row for each side, then `-normal`, which asks that the ground does not pull.
+        (The sides ask for it too, unless mu is 0.)
+    """
+    if not isinstance(edges, int | np.integer) or edges < 3:
+        raise ConfigurationError(f"edges is a whole number, 3 or more, got {edges!r}")
+    n, mu = _unit(normals), _coefficient(friction)
+    frame = tangents(n, first)
+    middle = (np.arange(edges) + 0.5) * (2.0 * math.pi / edges)
+    facing = np.stack([np.cos(middle), np.sin(middle)], axis=-1)
+    slope = mu[..., None, None] * math.cos(math.pi / edges) * n[..., None, :]
+    sides = facing @ frame - slope
+    return np.concatenate([sides, np.broadcast_to(-n, (*sides.shape[:-2], 3))[..., None, :]], axis=-2)
+
+
+def _forces_and_normals(forces: ArrayLike, normals: ArrayLike) -> tuple[Array, Array]:
+    f, n = finite_arrays(forces=forces, normals=_unit(normals))
+    return f, n
+
+
+def _unit(normals: ArrayLike) -> Array:
+    (n,) = finite_arrays(normals=normals)
+    if n.ndim == 0 or n.shape[-1] != 3:
+        raise ConfigurationError(f"normals must have shape (..., 3), got {n.shape}")
+    length = np.linalg.norm(n, axis=-1)
+    if not (np.abs(length - 1.0) <= _UNIT).all():
+        raise ConfigurationError(f"normals must have length 1, got lengths {length}")
+    return n
+
+
+def _coefficient(friction: ArrayLike) -> Array:
+    (mu,) = finite_arrays(friction=friction)
+    if not (mu >= 0.0).all():
+        raise ConfigurationError(f"friction must be 0 or more, got {mu}")
+    return mu

@@ -1,0 +1,1 @@
+"""Covariance without measurements, Kalman filter, tracks, observability."""

@@ -1,0 +1,128 @@
+"""The sampled Kalman filter for many tracks at once, and the test of whether its covariance tells the truth.
+
+The filter is the fast path, run at every step of an env: it checks nothing. Check the matrices once, beforehand,
+with `safe_wrappers.control.estimation.covariance.checked_covariance` and `checked_noise`; take `transition` and
+`noise` from its `discretise`, so that steps of any length agree with the model in continuous time.
+
+The update has Joseph's form: symmetric and positive semidefinite for any gain, rounding included.
+
+Source: Kalman (1960); Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001),
+sections 5.2 and 5.4, for the consistency test.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.errors import ConfigurationError
+
+Array = NDArray[np.float64]
+
+
+class Updated(NamedTuple):
+    """What a measurement leaves.
+
+    Attributes:
+        mean: Estimate after it, shape (..., n).
+        cov: Its covariance, shape (..., n, n).
+        innovation: Measured minus expected measurement, shape (..., m).
+        innovation_cov: Covariance of the innovation, shape (..., m, m).
+    """
+
+    mean: Array
+    cov: Array
+    innovation: Array
+    innovation_cov: Array
+
+
+def predict(
+    mean: Array, cov: Array, transition: Array, noise: Array, drift: Array | None = None
+) -> tuple[Array, Array]:
+    """One step without a measurement: `x -> F x + d`, `P -> F P F' + Q_d`.
+
+    Args:
+        mean: Estimate, shape (..., n).
+        cov: Its covariance, shape (..., n, n).
+        transition: F, shape (n, n), or one per track.
+        noise: Q_d, shape (n, n), or one per track.
+        drift: d, known displacement in this step, shape (n,) or (..., n); None for none.
+
+    Returns:
+        mean, shape (..., n), and cov, shape (..., n, n).
+    """
+    moved = (transition @ mean[..., None])[..., 0]
+    if drift is not None:
+        moved += drift
+    grown = transition @ cov @ np.swapaxes(transition, -1, -2)
+    grown += noise
+    return moved, 0.5 * (grown + np.swapaxes(grown, -1, -2))
+
+
+def update(mean: Array, cov: Array, measured: Array, C: Array, R: Array) -> Updated:
+    """Take in one measurement `y = C x + v` per track.
+
+    Args:
+        mean: Estimate, shape (..., n).
+        cov: Its covariance, shape (..., n, n).
+        measured: y, shape (..., m).
+        C: Measurement matrix, shape (m, n), or one per track.
+        R: Covariance of v (not its intensity), positive definite, shape (m, m), or one per track.
+    """
+    Ct = np.swapaxes(C, -1, -2)
+    cross = cov @ Ct
+    innovation_cov = C @ cross
+    innovation_cov += R
+    gain = cross @ np.linalg.inv(innovation_cov)
+    innovation = measured - (C @ mean[..., None])[..., 0]
+    left = gain @ C
+    np.negative(left, out=left)
+    np.einsum("...ii->...i", left)[...] += 1.0
+    kept = left @ cov @ np.swapaxes(left, -1, -2)
+    kept += gain @ R @ np.swapaxes(gain, -1, -2)
+    return Updated(
+        mean + (gain @ innovation[..., None])[..., 0],
+        0.5 * (kept + np.swapaxes(kept, -1, -2)),
+        innovation,
+        innovation_cov,
+    )
+
+
+def normalised_error_squared(error: Array, cov: Array) -> Array:
+    """`e' P^-1 e` (NEES): n on average where P is the covariance of e.
+
+    Args:
+        error: True minus estimated state, shape (..., n).
+        cov: Covariance that the filter claims, positive definite, shape (..., n, n).
+
+    Returns:
+        Shape (...), dimensionless.
+    """
+    weighted = np.linalg.solve(cov, error[..., None])[..., 0]
+    return np.asarray((error * weighted).sum(axis=-1))
+
+
+def chi_square_band(n: int, runs: int, confidence: float = 0.95) -> tuple[float, float]:
+    """The band in which the mean of `normalised_error_squared` over independent runs lies, if filter and truth agree.
+
+    Args:
+        n: Dimension of the state.
+        runs: Number of independent runs that the mean is taken over.
+        confidence: Probability of the band, as much left out below as above.
+
+    Returns:
+        Lower and upper end. Below: the filter doubts itself too much; above: it trusts itself too much.
+
+    Raises:
+        ConfigurationError: For n or runs below 1, or a confidence outside (0, 1).
+    """
+    for name, count in (("n", n), ("runs", runs)):
+        if not isinstance(count, int | np.integer) or count < 1:
+            raise ConfigurationError(f"{name} must be a whole number of at least 1, got {count!r}")
+    if not 0.0 < confidence < 1.0:
+        raise ConfigurationError(f"confidence must lie between 0 and 1, both excluded, got {confidence!r}")
+    outside = 0.5 * (1.0 - confidence)
+    from scipy.special import gammaincinv  # here: SciPy takes a while to import
+
+    low, high = 2.0 * gammaincinv(0.5 * n * runs, [outside, 1.0 - outside]) / runs
+    return float(low), float(high)

@@ -1,0 +1,174 @@
+"""Tracks: what is believed of several things that move, seen or not: means, covariances, and where they may be soon.
+
+Each track has the state (position, velocity), of one, two or three coordinates each, with
+
+    p' = v,    v' = (mean_velocity - v) / reversion_s + w,    E[w(t) w(s)'] = q delta(t - s):
+
+a double integrator driven by white acceleration noise (`reversion_s` infinite), or one whose velocity goes back to
+its mean. Between measurements the covariance follows the Lyapunov equation, exactly; a measurement is a Kalman
+update. A covariance bounds nothing by itself: what k standard deviations promise depends on the tail and on the
+model (`appendix.sigma_coverage`).
+
+Source: appendix "Continuous Lyapunov and Riccati covariance dynamics".
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.control.estimation.covariance import discretise, discretise_drift
+from safe_wrappers.control.estimation.kalman import predict, update
+
+Array = NDArray[np.float64]
+
+_KEPT = 256
+"""How many discretisations are remembered."""
+
+
+class Motion(NamedTuple):
+    """How one track moves.
+
+    Attributes:
+        intensity: Of the acceleration noise, q, shape (d, d), m^2/s^3.
+        reversion_s: Time constant with which the velocity goes back to its mean, s; inf: it does not.
+        mean_velocity: What it goes back to, shape (d,), m/s.
+    """
+
+    intensity: Array
+    reversion_s: float
+    mean_velocity: Array
+
+    def matrices(self) -> tuple[Array, Array, Array]:
+        """A (2d, 2d), the constant drift b (2d,) and the noise intensity Q (2d, 2d) of `x' = A x + b + w`."""
+        d, rate = self.mean_velocity.size, 1.0 / self.reversion_s
+        a, q = np.zeros((2 * d, 2 * d)), np.zeros((2 * d, 2 * d))
+        a[:d, d:] = np.eye(d)
+        a[d:, d:] = -rate * np.eye(d)
+        q[d:, d:] = self.intensity
+        return a, np.concatenate([np.zeros(d), rate * self.mean_velocity]), q
+
+
+class _Over(NamedTuple):
+    """Exact discretisation of all tracks over a time."""
+
+    transition: Array
+    drift: Array
+    noise: Array
+
+
+class Tracks:
+    """Means and covariances of n tracks.
+
+    Args:
+        motions: One per track, all of as many coordinates.
+
+    Attributes:
+        mean: Positions and velocities, shape (n, 2d), m and m/s.
+        covariance: Shape (n, 2d, 2d).
+    """
+
+    def __init__(self, motions: Sequence[Motion]) -> None:
+        self.motions = list(motions)
+        self.coordinates = self.motions[0].mean_velocity.size
+        size = 2 * self.coordinates
+        self.mean = np.zeros((len(self.motions), size))
+        self.covariance = np.zeros((len(self.motions), size, size))
+        self._single: dict[float, _Over] = {}
+        self._stacked: dict[tuple[float, ...], _Over] = {}
+
+    @property
+    def positions(self) -> Array:
+        """Estimated positions, shape (n, d), m."""
+        return self.mean[:, : self.coordinates]
+
+    @property
+    def velocities(self) -> Array:
+        """Estimated velocities, shape (n, d), m/s."""
+        return self.mean[:, self.coordinates :]
+
+    @property
+    def position_covariances(self) -> Array:
+        """Shape (n, d, d), m^2."""
+        return self.covariance[:, : self.coordinates, : self.coordinates]
+
+    def start(self, mean: Array, covariance: Array) -> None:
+        """Begin with a prior: shapes (n, 2d) and (n, 2d, 2d)."""
+        self.mean = np.array(mean, dtype=np.float64)
+        self.covariance = np.array(covariance, dtype=np.float64)
+
+    def advance(self, time_s: float) -> None:
+        """Let time pass without a measurement."""
+        over = self._over(time_s)
+        self.mean, self.covariance = predict(
+            self.mean, self.covariance, over.transition, over.noise, over.drift
+        )
+
+    def see(self, which: NDArray[np.intp], measured: Array, matrix: Array, noise: Array) -> None:
+        """Take measurements of some tracks.
+
+        Args:
+            which: Their indices, shape (k,).
+            measured: Shape (k, m).
+            matrix: C of all of them, shape (m, 2d).
+            noise: Covariance R of all of them, shape (m, m).
+        """
+        updated = update(self.mean[which], self.covariance[which], measured, matrix, noise)
+        self.mean[which], self.covariance[which] = updated.mean, updated.cov
+
+    def ahead(self, times_s: Sequence[float]) -> tuple[Array, Array]:
+        """Positions and their covariances some times ahead, if nothing is seen until then.
+
+        Returns:
+            Shapes (k, n, d), m, and (k, n, d, d), m^2.
+        """
+        over = self._ahead(tuple(times_s))
+        positions = (over.transition @ self.mean[:, :, None])[..., 0] + over.drift
+        spread = over.transition @ self.covariance @ over.transition.swapaxes(-1, -2)
+        return positions, spread + over.noise
+
+    def _ahead(self, times_s: tuple[float, ...]) -> _Over:
+        """What concerns positions, over several times at once."""
+        stacked = self._stacked.get(times_s)
+        if stacked is None:
+            d = self.coordinates
+            overs = [self._over(time_s) for time_s in times_s]
+            stacked = _Over(
+                np.stack([over.transition[:, :d] for over in overs]),
+                np.stack([over.drift[:, :d] for over in overs]),
+                np.stack([over.noise[:, :d, :d] for over in overs]),
+            )
+            _keep(self._stacked, times_s, stacked)
+        return stacked
+
+    def _over(self, time_s: float) -> _Over:
+        over = self._single.get(time_s)
+        if over is None:
+            each: dict[int, tuple[Array, Array, Array]] = {}
+            for motion in self.motions:
+                if id(motion) not in each:
+                    a, b, q = motion.matrices()
+                    transition, noise = discretise(a, q, time_s)
+                    each[id(motion)] = transition, discretise_drift(a, b, time_s), noise
+            parts = [each[id(motion)] for motion in self.motions]
+            over = _Over(*(np.stack(part) for part in zip(*parts, strict=True)))
+            _keep(self._single, time_s, over)
+        return over
+
+
+def _keep(kept: dict[Any, _Over], key: Any, over: _Over) -> None:
+    """Remember, but not without end: in an env whose steps all differ in length nothing is asked for twice."""
+    if len(kept) >= _KEPT:
+        kept.clear()
+    kept[key] = over
+
+
+def largest_deviation(covariances: Array) -> Array:
+    """The standard deviation in the direction in which it is largest, shape (...,), of covariances (..., d, d)."""
+    if covariances.shape[-1] == 2:
+        a, b, c = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
+        largest = np.asarray(0.5 * (a + c) + np.hypot(0.5 * (a - c), b))
+    else:
+        largest = np.asarray(np.linalg.eigvalsh(covariances)[..., -1])
+    return np.asarray(np.sqrt(np.maximum(largest, 0.0)))

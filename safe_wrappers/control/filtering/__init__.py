@@ -1,0 +1,1 @@
+"""Control barrier functions and distance from singular poses."""

@@ -1,0 +1,153 @@
+"""Barrier conditions on a control: Lie derivatives, class-K decay, Nagumo's boundary test, relative degree.
+
+Source: appendix "Safety and Control Barrier Functions" (Lie derivatives and forward invariance; Nagumo's
+viability theorem). A barrier `h` is positive inside the safe set. For `x' = f(x) + g(x) u` the condition
+`Lf h + Lg h u >= -alpha(h)` is sufficient, in continuous time, for a barrier of relative degree one, and only
+while some admissible control satisfies it; `control/backup/stopping.py` has the forms that hold between samples.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def lie_derivatives(gradient: ArrayLike, f: ArrayLike, g: ArrayLike) -> tuple[Array, Array]:
+    """Split `h'` into drift and control effectiveness.
+
+    Args:
+        gradient: dh/dx, shape (..., n).
+        f: Drift x' at zero control, shape (..., n), state units per second.
+        g: Control matrix, shape (..., n, m), state units per second per control unit.
+
+    Returns:
+        `Lf h` of shape (...) and `Lg h` of shape (..., m).
+    """
+    dh, drift, effect = (np.asarray(part, dtype=np.float64) for part in (gradient, f, g))
+    if dh.ndim == drift.ndim == 1 and effect.ndim == 2:  # one state: the filter's case, and half the time
+        return np.asarray(dh @ drift), np.asarray(dh @ effect)
+    return np.einsum("...n,...n->...", dh, drift), np.einsum("...n,...nm->...m", dh, effect)
+
+
+def linear_decay(h: ArrayLike, alpha: float) -> Array:
+    """The linear class-K function `alpha * h` (alpha in 1/s)."""
+    return alpha * np.asarray(h, dtype=np.float64)
+
+
+def power_decay(h: ArrayLike, alpha: float, power: float) -> Array:
+    """The extended class-K function `alpha * sign(h) |h|^power`: odd, so an unsafe state is driven back.
+
+    Below 1, `power` lets the state come close quickly and brakes late; above 1 it brakes early.
+    """
+    value = np.asarray(h, dtype=np.float64)
+    return np.asarray(alpha * np.sign(value) * np.abs(value) ** power)
+
+
+def cbf_rows(lf_h: ArrayLike, lg_h: ArrayLike, decay: ArrayLike) -> tuple[Array, Array]:
+    """The barrier condition as half-spaces `normals @ u <= offsets`.
+
+    Args:
+        lf_h: Drift of h, shape (...).
+        lg_h: Control effectiveness on h, shape (..., m).
+        decay: alpha(h), shape (...).
+
+    Returns:
+        Normals `-Lg h` (..., m) and offsets `Lf h + alpha(h)` (...).
+    """
+    return -np.asarray(lg_h, dtype=np.float64), np.asarray(lf_h, dtype=np.float64) + np.asarray(
+        decay, dtype=np.float64
+    )
+
+
+def best_rate(lf_h: ArrayLike, lg_h: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> Array:
+    """The largest `h'` that any control in the box reaches, shape (...)."""
+    effect = np.asarray(lg_h, dtype=np.float64)
+    corner = np.where(effect > 0, np.asarray(upper), np.where(effect < 0, np.asarray(lower), 0.0))
+    return np.asarray(np.asarray(lf_h) + np.einsum("...m,...m->...", effect, corner))
+
+
+def nagumo_holds(
+    h: ArrayLike,
+    lf_h: ArrayLike,
+    lg_h: ArrayLike,
+    lower: ArrayLike,
+    upper: ArrayLike,
+    boundary: float = 1e-9,
+) -> NDArray[np.bool_]:
+    """Nagumo's test at the boundary: on `|h| <= boundary` some control in the box gives `h' >= 0`.
+
+    Away from the boundary the tangent cone is the whole space and the test holds; outside the set
+    (`h < -boundary`) invariance is already lost and it does not.
+
+    Returns:
+        Boolean array of shape (...).
+    """
+    value = np.asarray(h, dtype=np.float64)
+    on_boundary = np.abs(value) <= boundary
+    viable = best_rate(lf_h, lg_h, lower, upper) >= 0.0
+    return np.asarray((value > boundary) | (on_boundary & viable))
+
+
+def numerical_gradient(h: Callable[[Array], float], x: ArrayLike, step: float = 1e-6) -> Array:
+    """Central differences of a scalar function, shape (n,); the step is relative for large entries."""
+    point = np.asarray(x, dtype=np.float64)
+    gradient = np.empty_like(point)
+    for i in range(point.size):
+        width = step * max(1.0, abs(point[i]))
+        ahead, behind = point.copy(), point.copy()
+        ahead[i] += width
+        behind[i] -= width
+        gradient[i] = (float(h(ahead)) - float(h(behind))) / (ahead[i] - behind[i])
+    return gradient
+
+
+def acts(gradient: Array, effect: Array, height: float, share: float) -> bool:
+    """Whether some control changes a function at first order by more than a share of what it could.
+
+    Args:
+        gradient: Of the function, shape (n,).
+        effect: Control matrix g, shape (n, m).
+        height: The function's value. A gradient below a hundredth of it may be the round-off of differences.
+        share: What counts as none.
+    """
+    size = max(float(np.abs(gradient).max(initial=0.0)), 1e-2 * abs(height))
+    return bool((np.abs(gradient @ effect) > share * size * np.abs(effect).max(axis=0, initial=0.0)).any())
+
+
+def relative_degree(
+    h: Callable[[Array], float],
+    f: Callable[[Array], Array],
+    g: Callable[[Array], Array],
+    x: ArrayLike,
+    max_degree: int = 3,
+    tolerance: float = 1e-6,
+) -> int | None:
+    """The number of time derivatives of h until the control appears, at one state.
+
+    Lie derivatives are nested central differences, so the test is numerical: `tolerance` is relative to the
+    sizes of h (its gradient, or a hundredth of its value, whichever is larger) and of each control's column of g, and
+    each level widens the step to keep round-off below it. Neither the unit of h nor that of a control matters; states
+    should be of order one.
+
+    Returns:
+        1, 2, ... up to `max_degree`, or None if the control appears in none of them.
+    """
+    point = np.asarray(x, dtype=np.float64)
+    effect = np.asarray(g(point), dtype=np.float64)
+    height = float(h(point))
+    current = h
+    for degree in range(1, max_degree + 1):
+        step = 10.0 ** (-6 + 1.5 * (degree - 1))
+        gradient = numerical_gradient(current, point, step)
+        if acts(gradient, effect, height, tolerance * 10.0 ** (2 * (degree - 1))):
+            return degree
+        current = _lie_along(current, f, step)
+    return None
+
+
+def _lie_along(
+    h: Callable[[Array], float], f: Callable[[Array], Array], step: float
+) -> Callable[[Array], float]:
+    return lambda x: float(numerical_gradient(h, x, step) @ f(x))

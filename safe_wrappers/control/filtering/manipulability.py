@@ -1,0 +1,330 @@
+"""Manipulability: how far a pose is from losing a direction of its task, and what joint rates that costs.
+
+Source: appendix "Forward kinematics and singularities", and its footnote 3 (Yoshikawa's measure). For a task Jacobian
+J of shape (m, n), twist = J @ joint rates, `w = sqrt(det(J J'))` is the product of J's singular values: the volume of
+the velocity ellipsoid, but for a constant of m. w = 0 marks rank loss. What w does not say:
+
+* **w does not bound the smallest singular value**, and so no joint rate: an ellipsoid of the same volume may be long
+  and thin. A threshold on w means something only once it has been validated for the machine (`validated_threshold`).
+* Near rank loss an inverse-kinematics command can exceed the limits of rate and torque. What the drives do then is
+  theirs: actuators saturate first, and the tool leaves its path.
+* **Units.** Rows of translation (m/rad for a hinge) and of rotation (rad/rad) do not add up. A task that has both
+  needs a length by which its rotations count (`task_jacobian`), and w depends on it by a constant factor,
+  length^rotations, which moves no singularity. Singular values, condition and the ellipsoid's axes change otherwise.
+  A joint that slides beside one that turns mixes units in the columns likewise.
+* **Frames.** The twist's convention has to be declared (`reframed`). w of all six rows is the same in each, because
+  the adjoint has determinant 1. w of some of the rows is not; singular values are not.
+
+Arrays have leading batch axes (...). Jacobians are of shape (..., m, n); what is not finite raises
+`ConfigurationError`.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from safe_wrappers.control.numerics.finite import finite_arrays
+from safe_wrappers.errors import ConfigurationError
+
+Array = NDArray[np.float64]
+
+_EPSILON = float(np.finfo(np.float64).eps)
+
+
+def manipulability(jacobian: ArrayLike) -> Array:
+    """`w = sqrt(det(J J'))`, shape (...), never below zero; exactly zero where rows depend on each other.
+
+    By a QR factorisation of J'. The determinant of `J J'` itself squares the condition: its relative error grows with
+    the square of it, and near rank loss it is negative, whose root is not a number. QR and SVD are both good
+    to the condition times the rounding; QR takes a quarter of the time.
+
+    Args:
+        jacobian: Shape (..., m, n). With fewer joints than task directions w is zero everywhere.
+
+    Returns:
+        In (m/s)^m per (rad/s)^m for m translations and hinges.
+    """
+    j = _jacobian(jacobian)
+    m, n = j.shape[-2:]
+    if n < m:
+        return np.zeros(j.shape[:-2])
+    diagonal = np.abs(np.diagonal(np.linalg.qr(np.swapaxes(j, -1, -2), mode="r"), axis1=-2, axis2=-1))
+    # A row that depends on those before it leaves rounding on the diagonal, in proportion to its own length.
+    noise = n * _EPSILON * np.linalg.norm(j, axis=-1)
+    return np.asarray(np.prod(np.where(diagonal > noise, diagonal, 0.0), axis=-1))
+
+
+@dataclass(frozen=True, slots=True)
+class VelocityEllipsoid:
+    """The twists that joint rates of norm 1 reach: semi-axes of an ellipsoid in task space.
+
+    Attributes:
+        axes: Unit vectors as columns, the longest first, shape (..., m, m).
+        lengths: Of the semi-axes, task speed per joint rate: J's singular values, with zeros where there are fewer
+            joints than directions, shape (..., m).
+    """
+
+    axes: Array
+    lengths: Array
+
+    @property
+    def smallest(self) -> Array:
+        """The smallest singular value, shape (...): the speed in the worst direction per joint rate."""
+        return np.asarray(self.lengths[..., -1])
+
+    @property
+    def condition(self) -> Array:
+        """Longest over shortest, shape (...), >= 1; inf at rank loss, and for a Jacobian of zeros."""
+        longest, shortest = self.lengths[..., 0], self.lengths[..., -1]
+        lost = shortest <= self.lengths.shape[-1] * _EPSILON * longest
+        return np.asarray(np.where(lost, np.inf, longest / np.where(lost, 1.0, shortest)))
+
+
+def velocity_ellipsoid(jacobian: ArrayLike) -> VelocityEllipsoid:
+    """Axes and lengths of the velocity ellipsoid of a Jacobian of shape (..., m, n), by SVD."""
+    j = _jacobian(jacobian)
+    m, n = j.shape[-2:]
+    axes, lengths, _ = np.linalg.svd(j, full_matrices=True)
+    if n < m:
+        lengths = np.concatenate([lengths, np.zeros((*lengths.shape[:-1], m - n))], axis=-1)
+    return VelocityEllipsoid(axes, lengths)
+
+
+def manipulability_gradient(jacobian: ArrayLike, derivative: ArrayLike) -> Array:
+    """dw/dq, shape (..., k): `w tr(J^+ dJ/dq_k)`, without the division by what vanishes at rank loss.
+
+    w has a kink where it is zero: there the answer is the slope on one of the two sides.
+
+    Args:
+        jacobian: Shape (..., m, n), n >= m.
+        derivative: dJ/dq_k, shape (..., k, m, n), as from `chain_derivative`.
+    """
+    j, d = _jacobian(jacobian), _finite("derivative", derivative)
+    m, n = j.shape[-2:]
+    if d.ndim < 3 or d.shape[-2:] != (m, n):
+        raise ConfigurationError(f"derivative has the shape (..., k, {m}, {n}), got {d.shape}")
+    if n < m:
+        raise ConfigurationError(f"with {n} joints and {m} task directions w is zero everywhere")
+    left, lengths, right = np.linalg.svd(j, full_matrices=False)
+    ahead, behind = np.ones_like(lengths), np.ones_like(lengths)
+    np.cumprod(lengths[..., :-1], axis=-1, out=ahead[..., 1:])
+    np.cumprod(lengths[..., :0:-1], axis=-1, out=behind[..., -2::-1] if m > 1 else behind[..., :0])
+    slopes = np.einsum("...ai,...kab,...ib->...ki", left, d, right)
+    return np.asarray(np.einsum("...ki,...i->...k", slopes, ahead * behind))
+
+
+def chain_derivative(linear: ArrayLike, angular: ArrayLike) -> Array:
+    """dJ/dq of a chain of hinges and slides, from its own Jacobian alone: shape (..., n, 6, n).
+
+    `out[..., k, :, j]` is how column j changes with joint k: joint k carries along what comes after it
+    (`w_k x column`), and moves the tip, which is what column j turns about (`w_j x v_k`). Exact.
+
+    Args:
+        linear: Velocity of the tip per joint, shape (..., 3, n), in axes that stand still; joints in their order
+            from the base.
+        angular: Angular velocity of the last link per joint, likewise; zeros for slides.
+    """
+    v, w = finite_arrays(linear=linear, angular=angular)
+    if v.ndim < 2 or v.shape[-2] != 3:
+        raise ConfigurationError(f"linear and angular have the shape (..., 3, n), got {v.shape}")
+    v, w = np.swapaxes(v, -1, -2), np.swapaxes(w, -1, -2)  # (..., n, 3)
+    n = v.shape[-2]
+    carried = _cross(w[..., :, None, :], v[..., None, :, :])  # w_k x v_j
+    turned = _cross(w[..., :, None, :], w[..., None, :, :])  # w_k x w_j
+    before = np.tri(n, dtype=bool).T[..., None]  # joint k not after joint j
+    moves = np.where(before, carried, np.swapaxes(carried, -2, -3))  # else w_j x v_k
+    turns = np.where(before, turned, 0.0)
+    return np.asarray(np.swapaxes(np.concatenate([moves, turns], axis=-1), -1, -2))
+
+
+def joint_rates(jacobian: ArrayLike, twist: ArrayLike) -> Array:
+    """Joint rates of the least norm whose twist comes closest to the wanted one, shape (..., n).
+
+    The ideal inverse model. Near rank loss the rates grow without bound; past the rounding (a singular value below
+    max(m, n) times the machine's precision times the largest) a direction counts as lost and is not asked for.
+
+    Args:
+        jacobian: Shape (..., m, n).
+        twist: Shape (..., m), per second.
+    """
+    j, wanted = _jacobian(jacobian), _finite("twist", twist)
+    if wanted.ndim < 1 or wanted.shape[-1] != j.shape[-2]:
+        raise ConfigurationError(f"twist has the shape (..., {j.shape[-2]}), got {wanted.shape}")
+    return np.asarray(np.einsum("...nm,...m->...n", _inverse(j), wanted))
+
+
+def worst_joint_rates(jacobian: ArrayLike) -> Array:
+    """The largest rate of each joint for any twist of norm 1, shape (..., n); inf at rank loss.
+
+    The norm of the joint's row of the pseudo-inverse. None of them exceeds `1 / smallest singular value`, which is
+    the largest norm of all rates together.
+    """
+    j = _jacobian(jacobian)
+    lost = np.isinf(velocity_ellipsoid(j).condition)
+    return np.asarray(np.where(lost[..., None], np.inf, np.linalg.norm(_inverse(j), axis=-1)))
+
+
+def reframed(jacobian: ArrayLike, rotation: ArrayLike, offset: ArrayLike) -> Array:
+    """A six-row Jacobian in another frame, shape (..., 6, n).
+
+    Twists are (velocity of a point, angular velocity), as MuJoCo has them: of the point itself, in the world's axes.
+    From there, with R the end-effector's axes and p its place in the world,
+
+    * the **body** twist is `reframed(J, R, 0)`: the same point, in its own axes;
+    * the **spatial** twist is `reframed(J, eye(3), -p)`: of the point that passes through the world's origin.
+
+    Args:
+        jacobian: Shape (..., 6, n): three rows of a point's velocity, three of the angular velocity.
+        rotation: The new axes as columns, in the old ones, shape (..., 3, 3); refused if not orthonormal.
+        offset: New point of reference minus the old one, in the old axes, m, shape (..., 3).
+    """
+    j, r, p = _jacobian(jacobian), _finite("rotation", rotation), _finite("offset", offset)
+    if j.shape[-2] != 6:
+        raise ConfigurationError(f"a twist has six rows, got a Jacobian of shape {j.shape}")
+    if r.shape[-2:] != (3, 3) or np.abs(np.swapaxes(r, -1, -2) @ r - np.eye(3)).max(initial=0.0) > 1e-6:
+        raise ConfigurationError(f"rotation is orthonormal, of shape (..., 3, 3); got {rotation!r}")
+    if p.ndim < 1 or p.shape[-1] != 3:
+        raise ConfigurationError(f"offset has the shape (..., 3), got {p.shape}")
+    v, w = j[..., :3, :], j[..., 3:, :]
+    there = v + np.swapaxes(_cross(np.swapaxes(w, -1, -2), p[..., None, :]), -1, -2)
+    back = np.swapaxes(r, -1, -2)
+    return np.concatenate([back @ there, back @ w], axis=-2)
+
+
+def task_jacobian(
+    jacobian: ArrayLike, directions: str = "xyz", rotations: str = "", length: float | None = None
+) -> Array:
+    """The rows of a six-row Jacobian that a task is about, shape (..., m, n).
+
+    Args:
+        jacobian: Shape (..., 6, n), see `reframed`.
+        directions: Of translation: some of "xyz", in the Jacobian's own axes.
+        rotations: Likewise, about which axes.
+        length: By which a rotation counts as a translation, m: of the tool, say. Needed if there are both, which
+            have no unit in common.
+    """
+    j = _jacobian(jacobian)
+    if j.shape[-2] != 6:
+        raise ConfigurationError(f"a twist has six rows, got a Jacobian of shape {j.shape}")
+    rows, scale = task_rows(directions, rotations, length)
+    return np.asarray(j[..., rows, :] * scale[:, None])
+
+
+def task_rows(directions: str, rotations: str, length: float | None) -> tuple[NDArray[np.int64], Array]:
+    """Which of a twist's six rows a task is about, shape (m,), and what they are multiplied by, shape (m,).
+
+    Raises:
+        ConfigurationError: Other letters than x, y, z, one of them twice, none at all; translations and rotations
+            together without a length, or a length without both.
+    """
+    for name, given in (("directions", directions), ("rotations", rotations)):
+        if not (isinstance(given, str) and set(given) <= set("xyz") and len(set(given)) == len(given)):
+            raise ConfigurationError(f'{name} is some of "xyz", each once, or ""; got {given!r}')
+    if not directions + rotations:
+        raise ConfigurationError('a task has directions (some of "xyz"), rotations, or both; got neither')
+    if directions and rotations and length is None:
+        raise ConfigurationError(
+            "translations (m) and rotations (rad) have no unit in common: give the length (m) by which a rotation "
+            "counts, as the tool's own"
+        )
+    if length is not None and not (directions and rotations):
+        raise ConfigurationError(
+            f"length ({length!r}) weighs rotations against translations; this task has one of them only"
+        )
+    factor = 1.0 if length is None else float(length)
+    if not (np.isfinite(factor) and factor > 0.0):
+        raise ConfigurationError(f"length must be a finite number > 0 in m, got {length!r}")
+    rows = ["xyz".index(d) for d in directions] + [3 + "xyz".index(r) for r in rotations]
+    return np.array(rows), np.array([1.0] * len(directions) + [factor] * len(rotations))
+
+
+@dataclass(frozen=True, slots=True)
+class ValidatedThreshold:
+    """What a sample of configurations says about a threshold on w.
+
+    Attributes:
+        threshold: No sampled configuration with w above it needs more than the rate limit. The smallest such number;
+            the smallest w that was sampled if none needs more.
+        samples: How many configurations were looked at.
+        above: How many of them have a w above the threshold.
+        exceeding: How many need more than the limit, all of them at or below the threshold.
+    """
+
+    threshold: float
+    samples: int
+    above: int
+    exceeding: int
+
+    def unseen(self, confidence: float = 0.95) -> float:
+        """The largest share of configurations that may exceed the limit above the threshold all the same.
+
+        Holds with that confidence for independent samples of the distribution that configurations have in use: had
+        the share been larger, all samples would have missed it with a probability of `(1 - share)^samples` at most.
+        Of configurations that an adversary picks it says nothing.
+        """
+        if not 0.0 < confidence < 1.0:
+            raise ConfigurationError(f"confidence is between 0 and 1, got {confidence!r}")
+        return float(-np.expm1(np.log1p(-confidence) / self.samples))
+
+
+def validated_threshold(jacobians: ArrayLike, task_speed: float, rate_limit: ArrayLike) -> ValidatedThreshold:
+    """The smallest threshold on w above which no sampled configuration needs more than the joints' rate limit.
+
+    It proves nothing between the samples, nothing for another task speed, direction weighting, frame or joint
+    selection, and nothing about a controller that does not invert J by least norm; nor does it concern torques. See
+    `ValidatedThreshold.unseen` for what a sample does say.
+
+    Args:
+        jacobians: Task Jacobians of sampled configurations, shape (samples, m, n).
+        task_speed: Norm of the twist that is to be possible in every direction, task units per second.
+        rate_limit: Of the joints, rad/s or m/s; one, or one per joint, shape (n,).
+
+    Raises:
+        ConfigurationError: There is none: the configuration of the largest w needs more than the limit.
+    """
+    j = _jacobian(jacobians)
+    if j.ndim != 3 or not len(j):
+        raise ConfigurationError(f"jacobians has the shape (samples, m, n), samples > 0; got {j.shape}")
+    speed, limit = float(_finite("task_speed", task_speed)), _finite("rate_limit", rate_limit)
+    if speed <= 0.0 or limit.shape not in ((), (j.shape[-1],)) or not (limit > 0.0).all():
+        raise ConfigurationError(
+            f"task_speed and rate_limit are > 0, one limit or {j.shape[-1]} of them; got {task_speed!r} and "
+            f"{rate_limit!r}"
+        )
+    w = manipulability(j)
+    needed = (speed * worst_joint_rates(j) / limit).max(axis=-1)
+    exceeding = needed > 1.0
+    best = int(np.argmax(w))
+    threshold = float(w[exceeding].max()) if exceeding.any() else float(w.min())
+    above = int((w > threshold).sum())
+    if exceeding.any() and not above:
+        raise ConfigurationError(
+            f"no threshold on w keeps the rate limit: of {len(j)} configurations the one of the largest w "
+            f"({w[best]:.4g}) needs {needed[best]:.3g} times the limit at {speed:g} per second; lower the task speed"
+        )
+    return ValidatedThreshold(threshold, len(j), above, int(exceeding.sum()))
+
+
+def _inverse(jacobian: Array) -> Array:
+    """Pseudo-inverse, shape (..., n, m)."""
+    return np.asarray(np.linalg.pinv(jacobian, rcond=max(jacobian.shape[-2:]) * _EPSILON))
+
+
+def _finite(name: str, value: ArrayLike) -> Array:
+    return finite_arrays(**{name: value})[0]
+
+
+def _jacobian(value: ArrayLike) -> Array:
+    j = _finite("jacobian", value)
+    if j.ndim < 2 or 0 in j.shape[-2:]:
+        raise ConfigurationError(f"a Jacobian has the shape (..., directions, joints), got {j.shape}")
+    return j
+
+
+_NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Cross product of vectors along the last axis; np.cross is several times slower for few."""
+    return a[..., _NEXT] * b[..., _AFTER] - a[..., _AFTER] * b[..., _NEXT]

@@ -1,0 +1,1 @@
+"""Blends from one command sequence to the next, and the seams between them."""

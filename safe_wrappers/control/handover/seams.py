@@ -1,0 +1,203 @@
+"""The seam between two streams of held commands: the plan that leads from one into the other, and its measure.
+
+A stream is what a policy asks for at the next control steps, shape (n, m): one command per step, in action units.
+Source: appendix "Smooth Trajectories and Bumpless Transfer". Its bounds are for continuous commands; here the
+commands are held between samples, so that what is bounded is the difference of neighbours: with `rate_limit` in
+action units per second no two neighbours differ by more than `rate_limit * hold_s`. The mean of a rate over a step
+is at most its peak, so a blend that keeps the continuous bound keeps this one too.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.control.handover.smoothstep import smoothstep
+from safe_wrappers.control.handover.splines import evaluate, hermite, quintic_coefficients
+
+Array = NDArray[np.float64]
+
+Blend = Literal["smoothstep", "quintic", "hermite"]
+BLENDS: Final = ("smoothstep", "quintic", "hermite")
+
+DIFFERENCES: Final = 3
+"""A seam is measured by the largest first, second and third difference of the commands around it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Seam:
+    """How one stream leads into the next.
+
+    Attributes:
+        plan: The commands from the seam on, shape (n, m): the blend, then the new stream bit for bit.
+        steps: Control steps of the blend: the first `steps` commands are mixed. 0: the new stream at once.
+        limited: Which commands had to be held back beyond the blend to keep the rate limit, shape (n,): the
+            new stream is too short for a blend that keeps it, or is too fast by itself.
+    """
+
+    plan: Array
+    steps: int
+    limited: NDArray[np.bool_]
+
+
+def join(
+    sent: Array,
+    prior: Array,
+    new: Array,
+    hold_s: float,
+    *,
+    blend: Blend = "smoothstep",
+    fewest: int = 0,
+    rate_limit: Array | float = np.inf,
+    low: Array | float = -np.inf,
+    high: Array | float = np.inf,
+) -> Seam:
+    """The shortest blend from what was sent into a new stream that keeps the rate limit.
+
+    "smoothstep" mixes the two streams with the weight `smoothstep((i + 1) / (n + 1))` at step i of n. The prior
+    stream moves on along its left-over if that lasts for the whole blend; a left-over is never padded, so a longer
+    blend starts from the last command, latched. "quintic" and "hermite" need no prior: they bridge from the last
+    command to the new stream with its first (hermite) and second (quintic) derivatives matched at both ends, taken
+    from differences of the commands; a bridge that leaves the box is clipped to it.
+
+    If no blend that ends inside the new stream keeps the limit, the one that exceeds it least is taken and held
+    back step by step: the limit holds, and the command is late instead.
+
+    Args:
+        sent: The latest commands, oldest first, shape (k, m), k >= 0; with none there is no seam.
+        prior: The left-over of the stream in force for the next steps, shape (p, m), p >= 0.
+        new: The new stream for the next steps, shape (n, m), n >= 1.
+        hold_s: Control interval, s.
+        blend: Which blend.
+        fewest: The blend takes at least so many steps (fewer only if the new stream is shorter).
+        rate_limit: Largest ``|du/dt|``, action units per second: of every component, or of each, shape (m,).
+        low: Action box, for the bridges, shape (m,) or a number.
+        high: Likewise.
+    """
+    step = np.asarray(rate_limit * hold_s)
+    if not len(sent):
+        plan, limited = limit_rate(new, None, step)
+        return Seam(plan, 0, limited)
+    fewest = min(fewest, len(new) - 1)
+    if fewest == 0 and (np.abs(new[0] - sent[-1]) <= step).all():
+        candidates, first = new[None, :], 0
+    else:
+        first = max(fewest, 1) if len(new) > 1 else 0
+        if blend == "smoothstep":
+            candidates = _mixed(sent, prior, new, first)
+        else:
+            candidates = np.clip(_bridged(sent, new, blend, first), low, high)
+    peaks = _peaks(candidates, sent[-1], first, step)
+    kept = np.flatnonzero(peaks <= 1.0)
+    chosen = int(kept[0]) if kept.size else int(np.argmin(peaks))
+    steps = first + chosen
+    plan = np.concatenate([candidates[chosen, :steps], new[steps:]])
+    plan, limited = limit_rate(plan, sent[-1], step)
+    return Seam(plan, steps, limited)
+
+
+def limit_rate(commands: Array, before: Array | None, step: Array | float) -> tuple[Array, NDArray[np.bool_]]:
+    """Hold commands back so that no two neighbours differ by more than `step`; and which of them it had to.
+
+    Commands that keep the limit come back bit for bit.
+
+    Args:
+        commands: Shape (n, m).
+        before: The command before the first, shape (m,), or None.
+        step: Largest difference of neighbours, action units, a number or shape (m,); may be infinite.
+    """
+    limited = np.zeros(len(commands), dtype=bool)
+    whole = commands if before is None else np.concatenate([before[None], commands])
+    if len(whole) < 2 or (np.abs(np.diff(whole, axis=0)) <= step).all():
+        return commands, limited
+    kept = commands.copy()
+    last = kept[0] if before is None else before
+    for i in range(len(kept)):
+        held = np.clip(kept[i], last - step, last + step)
+        limited[i] = (held != kept[i]).any()
+        kept[i] = last = held
+    return kept, limited
+
+
+def _peaks(candidates: Array, before: Array, first: int, step: Array) -> Array:
+    """The largest difference inside each blend, in units of the largest allowed one, shape (c,).
+
+    From the last command to the first one that is not mixed any more.
+    """
+    start = np.broadcast_to(before, (len(candidates), 1, before.size))
+    steps = (np.abs(np.diff(np.concatenate([start, candidates], axis=1), axis=1)) / step).max(axis=2)
+    mixed = np.arange(steps.shape[1]) <= first + np.arange(len(candidates))[:, None]
+    return np.asarray(np.where(mixed, steps, 0.0).max(axis=1))
+
+
+def _phases(steps: int, longest: int) -> Array:
+    """Normalised time of every step of a blend of so many, shape (longest + 1,); 1 from its end on."""
+    return np.asarray(np.minimum((np.arange(longest + 1) + 1.0) / (steps + 1.0), 1.0))
+
+
+@lru_cache(maxsize=256)
+def _weights(first: int, longest: int) -> Array:
+    """The new stream's weight at every step of every candidate blend, shape (c, longest + 1)."""
+    weights = np.array([smoothstep(_phases(n, longest)) for n in range(first, longest + 1)])
+    weights.flags.writeable = False
+    return weights
+
+
+@lru_cache(maxsize=256)
+def _basis(order: int, first: int, longest: int) -> Array:
+    """What each boundary value of a bridge of unit duration adds at every step, shape (c, longest + 1, 2 order).
+
+    Order 2: value and rate at the start, value and rate at the end (hermite). Order 3: with the second derivatives.
+    """
+    unit = np.eye(2 * order)
+    basis = []
+    for n in range(first, longest + 1):
+        s = _phases(n, longest)
+        bridge = (
+            hermite(unit[0], unit[1], unit[2], unit[3], 1.0, s)
+            if order == 2
+            else evaluate(quintic_coefficients(unit[0], unit[1], unit[2], unit[3], unit[4], unit[5], 1.0), s)
+        )
+        basis.append(bridge.T)
+    weights = np.array(basis)
+    weights.flags.writeable = False
+    return weights
+
+
+def _mixed(sent: Array, prior: Array, new: Array, first: int) -> Array:
+    """Every candidate blend of the two streams, shape (c, n, m)."""
+    n = len(new)
+    weight = _weights(first, n - 1)[:, :, None]
+    moving = np.concatenate([prior[:n], np.broadcast_to(sent[-1], (max(n - len(prior), 0), sent.shape[1]))])
+    lengths = np.arange(first, n)[:, None, None]
+    before = np.where(lengths <= len(prior), moving, sent[-1])
+    return np.asarray(np.where(weight < 1.0, before + weight * (new - before), new))
+
+
+def _bridged(sent: Array, new: Array, blend: Blend, first: int) -> Array:
+    """Every candidate bridge, shape (c, n, m); from its end on the new stream.
+
+    Derivatives are per control step: a bridge of n steps lasts n + 1 of them.
+    """
+    n = len(new)
+    ends = np.arange(first, n)
+    order = 2 if blend == "hermite" else 3
+    at_start = _derivatives(sent, order)
+    at_end = [new, np.gradient(new, axis=0) if n > 1 else np.zeros_like(new), np.zeros_like(new)]
+    if n > 2:
+        at_end[2][1:-1] = np.diff(new, n=2, axis=0)
+    lasts = (ends + 1.0)[:, None]
+    given = [np.broadcast_to(d, (len(ends), d.size)) * lasts**k for k, d in enumerate(at_start)]
+    given += [d[ends] * lasts**k for k, d in enumerate(at_end[:order])]
+    bridged = _basis(order, first, n - 1) @ np.stack(given, axis=1)
+    return np.asarray(np.where((np.arange(n) < ends[:, None])[:, :, None], bridged, new))
+
+
+def _derivatives(sent: Array, order: int) -> list[Array]:
+    """The last command and its backward differences, per control step; 0 where too little was sent."""
+    return [
+        np.diff(sent[-k - 1 :], n=k, axis=0)[0] if len(sent) > k else np.zeros_like(sent[-1])
+        for k in range(order)
+    ]

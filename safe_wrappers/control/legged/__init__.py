@@ -1,0 +1,1 @@
+"""Balance: momentum, zero moment point, support, whole-body program."""

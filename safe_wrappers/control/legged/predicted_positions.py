@@ -1,0 +1,88 @@
+"""Joint positions within their range, not only now but until the end of a control step.
+
+Source: appendix "Hierarchical whole-body control quadratic program", its caveat: a bound on the present position is
+none on what happens between samples. With a constant acceleration the position is a parabola, and the largest one
+that keeps it below a limit all the way is known in closed form.
+
+It is a bound for one step ahead. A joint that may still be stopped is another question: choose the horizon no shorter
+than stopping takes, or the next step finds no torque that is strong enough. And the acceleration of a machine is not
+constant over a step; contacts, above all, change it.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from safe_wrappers.control.numerics.finite import finite_arrays
+from safe_wrappers.errors import ConfigurationError
+
+Array = NDArray[np.float64]
+
+
+def largest_acceleration(distance: ArrayLike, speed: ArrayLike, horizon_s: float) -> Array:
+    """The largest constant acceleration that does not pass a limit at any time up to a horizon, shape (...).
+
+    From beyond the limit (a negative distance): the largest that is back at it by the end of the horizon.
+
+    Args:
+        distance: To the limit, shape (...), m or rad.
+        speed: Towards it, shape (...), m/s or rad/s.
+        horizon_s: Positive.
+    """
+    d, v = finite_arrays(distance=distance, speed=speed)
+    if not 0.0 < horizon_s < np.inf:
+        raise ConfigurationError(f"horizon_s must be a positive number of seconds, got {horizon_s}")
+    at_end = 2.0 * (d - horizon_s * v) / horizon_s**2
+    # A parabola whose top is before the end: the top may reach the limit, no more.
+    top_is_inside = (d > 0.0) & (2.0 * d < horizon_s * v)
+    with np.errstate(over="ignore"):  # a hair from the limit: the strongest that is still a number
+        at_top = np.maximum(-(v * v) / (2.0 * np.where(d > 0.0, d, 1.0)), -np.finfo(np.float64).max)
+    return np.asarray(np.where(top_is_inside, at_top, at_end))
+
+
+def predicted_position_rows(
+    dofs: ArrayLike,
+    positions: ArrayLike,
+    velocities: ArrayLike,
+    lower: ArrayLike,
+    upper: ArrayLike,
+    horizon_s: float,
+    nv: int,
+) -> tuple[Array, Array]:
+    """Rows `G qacc <= g` that keep joints within their ranges until the horizon, at a constant acceleration.
+
+    Args:
+        dofs: Indices of the joints' degrees of freedom (slides and hinges), shape (n,).
+        positions: Shape (n,), m or rad.
+        velocities: Shape (n,).
+        lower: Smallest positions, shape (n,); -inf is no limit.
+        upper: Largest positions, shape (n,); inf is no limit.
+        horizon_s: s; a control step, or the time that stopping takes if that is longer.
+        nv: Degrees of freedom of the whole model.
+
+    Returns:
+        G, shape (m, nv), and g, shape (m,): one row for each finite limit, the upper ones first.
+    """
+    q, v = finite_arrays(positions=positions, velocities=velocities)
+    which = np.asarray(dofs)
+    low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
+    if q.ndim != 1 or not (which.shape == low.shape == high.shape == q.shape):
+        raise ConfigurationError(
+            "expected dofs, positions, velocities, lower and upper of one shape (n,), got "
+            f"{which.shape}, {q.shape}, {v.shape}, {low.shape} and {high.shape}"
+        )
+    if not np.issubdtype(which.dtype, np.integer) or not ((which >= 0) & (which < nv)).all():
+        raise ConfigurationError(f"dofs are indices from 0 to {nv - 1}, got {which}")
+    if not (low <= high).all():
+        raise ConfigurationError(f"lower must not exceed upper, got {low} and {high}")
+    above, below = np.isfinite(high), np.isfinite(low)
+    rows = np.zeros((int(above.sum() + below.sum()), nv))
+    rows[np.arange(len(rows)), np.concatenate([which[above], which[below]])] = np.concatenate(
+        [np.ones(int(above.sum())), -np.ones(int(below.sum()))]
+    )
+    limits = np.concatenate(
+        [
+            largest_acceleration(high[above] - q[above], v[above], horizon_s),
+            largest_acceleration(q[below] - low[below], -v[below], horizon_s),
+        ]
+    )
+    return rows, limits

@@ -1,0 +1,1 @@
+"""Passivity over a network: energy ledgers, wave variables, passivity controller."""

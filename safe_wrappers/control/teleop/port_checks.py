@@ -1,0 +1,99 @@
+"""Arguments of energy ports: one step's effort and flow, positive numbers, energies; or an error that names them."""
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from safe_wrappers.control.numerics.finite import finite_arrays
+from safe_wrappers.errors import ConfigurationError
+
+Array = NDArray[np.float64]
+
+
+def same_shape(**values: ArrayLike) -> tuple[Array, Array]:
+    """Two finite arrays of one shape, without broadcasting: a port that does not match is a mistake.
+
+    Raises:
+        ConfigurationError: What is no number, not finite, or of two shapes.
+    """
+    first, second = (finite_arrays(**{name: value})[0] for name, value in values.items())
+    if first.shape != second.shape:
+        a, b = values
+        raise ConfigurationError(f"expected {a} and {b} of one shape, got {first.shape} and {second.shape}")
+    return first, second
+
+
+def port_vector(name: str, value: ArrayLike) -> Array:
+    """One quantity of a port as (m,); a number is (1,). Whether it is finite shows in `port_energy`.
+
+    Raises:
+        ConfigurationError: What is no number, of more than one axis, or empty.
+    """
+    try:
+        vector = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ConfigurationError(f"{name} is a number or an array of numbers, got {value!r}") from None
+    if vector.ndim > 1 or vector.size == 0:
+        raise ConfigurationError(f"expected {name} as a number or of shape (m,), got {vector.shape}")
+    return vector.reshape(-1)
+
+
+def port_vectors(**values: ArrayLike) -> tuple[Array, Array]:
+    """Effort and flow of one port, see `port_vector`, of one size.
+
+    Raises:
+        ConfigurationError: What is no such vector, or of another size.
+    """
+    first, second = (port_vector(name, value) for name, value in values.items())
+    if first.size != second.size:
+        a, b = values
+        raise ConfigurationError(
+            f"expected {a} and {b} of one size, got {first.size} and {second.size} components"
+        )
+    return first, second
+
+
+def port_energy(effort: Array, flow: Array, time_s: float) -> float:
+    """`F.v dt`, J.
+
+    Raises:
+        ConfigurationError: For a product that is not finite: it has a factor that is not, or it overflows.
+    """
+    # One look at the product instead of two at the factors: this runs at every tick.
+    with np.errstate(over="ignore", invalid="ignore"):
+        energy = float(effort @ flow) * time_s
+    if not math.isfinite(energy):
+        raise ConfigurationError(
+            f"effort and flow must be finite, and so their product; got {effort} and {flow}"
+        )
+    return energy
+
+
+def _is_number(value: object) -> bool:
+    """A scalar of Python or NumPy, or an array without axes."""
+    return isinstance(value, (int, float, np.number)) or (
+        isinstance(value, np.ndarray) and value.ndim == 0 and value.dtype.kind in "iuf"
+    )
+
+
+def positive(name: str, value: float) -> float:
+    """A finite number above 0.
+
+    Raises:
+        ConfigurationError: For any other.
+    """
+    if not (_is_number(value) and math.isfinite(value) and value > 0.0):
+        raise ConfigurationError(f"{name} must be a finite number above 0, got {value!r}")
+    return float(value)
+
+
+def energy_j(name: str, value: float) -> float:
+    """A finite energy, at least 0.
+
+    Raises:
+        ConfigurationError: For any other.
+    """
+    if not (_is_number(value) and math.isfinite(value) and value >= 0.0):
+        raise ConfigurationError(f"{name} must be a finite energy of at least 0 J, got {value!r}")
+    return float(value)

@@ -1,0 +1,1 @@
+"""Wheels: slip, traction curves, friction estimate."""

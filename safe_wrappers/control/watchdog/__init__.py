@@ -1,0 +1,1 @@
+"""How long a command may be executed: leases, round-trip ceilings, reachability in time."""

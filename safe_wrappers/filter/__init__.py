@@ -1,0 +1,1 @@
+"""The filter engine without Gymnasium: constraints, one projection, the search for an admissible action."""

@@ -1,0 +1,103 @@
+"""What acts when no admissible action is known: brake, hold, zero, or the user's own."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.filter.projection import box_least_squares
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.plants.plant import Plant
+
+Array = NDArray[np.float64]
+
+FallbackFunction = Callable[[Plant], ArrayLike]
+"""The user's own: takes the plant at its present state, returns a control of shape (m,)."""
+
+NAMES = ("brake", "hold", "zero")
+
+
+class Fallback:
+    """Chooses a finite control inside the box, whatever happens.
+
+    Args:
+        choice: "brake" takes the motion away as fast as the actuators can: by a constraint's own proved
+            stopping control where one has it, else by `brake` on a MujocoPlant; an AnalyticPlant does not say
+            which states are velocities, so there it is the control that violates the rows least. Where all
+            constraints forecast and none admits it, the filter takes, of all that it has tried, the control that
+            fails least. "hold" repeats the last executed action; "zero" is no control; or a function of the plant.
+        backups: Constraints that bring their own stopping control; "brake" uses the first of them.
+
+    Raises:
+        UnknownNameError: No fallback of that name.
+    """
+
+    def __init__(self, choice: str | FallbackFunction, backups: list[Any]) -> None:
+        if not callable(choice) and choice not in NAMES:
+            raise UnknownNameError(
+                f"no fallback {choice!r}; choose {', '.join(NAMES)}, or pass a function of the plant"
+            )
+        self._choice = choice
+        self._backups = backups
+        self.brakes = choice == "brake"
+
+    def __call__(
+        self,
+        plant: Plant | None,
+        last: Array,
+        low: Array,
+        high: Array,
+        least: Array | None,
+        readable: bool = True,
+    ) -> Array:
+        """The control, finite and clipped to the box; one that is not finite is replaced by zero.
+
+        Args:
+            plant: Observed; "hold" and "zero" need none.
+            last: What was executed before, shape (m,).
+            low: Action box, shape (m,).
+            high: Likewise.
+            least: The control that violates the rows least, if one is known.
+            readable: False if the state is not a number: braking is then no control, for want of a motion to brake.
+        """
+        if callable(self._choice):
+            assert plant is not None
+            control = np.asarray(self._choice(plant), dtype=np.float64)
+            if control.shape != low.shape:
+                raise ConfigurationError(
+                    f"the fallback must return a control of shape {low.shape}, got {control.shape}"
+                )
+        elif self._choice == "hold":
+            control = last
+        elif self._choice == "zero" or not readable:
+            control = np.zeros_like(low)
+        elif self._backups:
+            control = np.asarray(self._backups[0].backup(plant), dtype=np.float64)
+        elif isinstance(plant, MujocoPlant):
+            control = brake(plant)
+        else:
+            control = least if least is not None else np.zeros_like(low)
+        if not np.isfinite(control).all():
+            control = np.zeros_like(low)
+        return np.clip(control, low, high)
+
+
+def brake(plant: MujocoPlant) -> Array:
+    """The control that leaves the least kinetic energy at the end of the hold, in the linear model.
+
+    Energies are counted joint by joint (the diagonal of the inertia). A small weight on the control settles
+    actuators that do not matter. Best effort: it opposes motion, it does not balance. A plant whose controls are no
+    forces brakes as its forecasts do.
+    """
+    if not plant.has_acceleration:
+        return plant.braking()
+    drift, effect = plant.acceleration
+    weight = np.sqrt(plant.inertia_diagonal())
+    a = effect * weight[:, None]
+    scale = float(np.sqrt((a * a).sum(axis=0).max(initial=1e-12)))
+    low, high = plant.acting_range
+    stacked = np.vstack([a / scale, 1e-4 * np.eye(low.size)])
+    aim = np.concatenate([-(plant.qvel / plant.hold_s + drift) * weight / scale, np.zeros(low.size)])
+    return box_least_squares(stacked, aim, low, high)

@@ -1,0 +1,1 @@
+"""A MuJoCo model as plant: linear model, rollouts, contacts, replay."""

@@ -1,0 +1,88 @@
+"""What gymnasium-robotics' Fetch envs do to their data with an action, and which envs are of that kind."""
+
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.plants.mujoco.forecast import Recorder
+
+Array = NDArray[np.float64]
+
+_TURN = np.array([1.0, 0.0, 1.0, 0.0])
+"""What the envs add to the gripper's quaternion (w, x, y, z): MuJoCo makes a unit quaternion of the sum."""
+_FINGERS = ("robot0:l_gripper_finger_joint", "robot0:r_gripper_finger_joint")
+"""The joints that an env with a blocked gripper sets to zero after every step."""
+
+
+def moves_by_displacement(raw: Any) -> bool:
+    """Whether an unwrapped env is of the Fetch kind: one mocap body welded to the gripper, four actions."""
+    model, space = getattr(raw, "model", None), getattr(raw, "action_space", None)
+    return (
+        isinstance(model, mujoco.MjModel)
+        and isinstance(space, gym.spaces.Box)
+        and space.shape == (4,)
+        and hasattr(raw, "block_gripper")
+        and hasattr(raw, "n_substeps")
+        and len(_welds(model)) == model.nmocap == 1
+    )
+
+
+def gripper_of(model: mujoco.MjModel) -> int:
+    """The id of the body that the mocap body pulls."""
+    return _welds(model)[0][1]
+
+
+def _welds(model: mujoco.MjModel) -> list[tuple[int, int]]:
+    """Mocap bodies (their mocap ids) and the bodies welded to them."""
+    found = []
+    for i in np.flatnonzero(model.eq_type == int(mujoco.mjtEq.mjEQ_WELD)):
+        first, second = int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
+        for one, other in ((first, second), (second, first)):
+            if model.body_mocapid[one] >= 0 and model.body_mocapid[other] < 0:
+                found.append((int(model.body_mocapid[one]), other))
+    return found
+
+
+class DisplacementRecorder(Recorder):
+    """Forecasts under displacements of the gripper; braking is none.
+
+    Args:
+        model: The plant's own.
+        substeps: Physics substeps per control interval.
+        metres_per_unit: Displacement of an action of 1, m.
+        dtype: Of the env's actions, in whose precision it scales them.
+        blocked: Whether the env keeps the fingers closed.
+    """
+
+    settles: ClassVar[bool] = True
+
+    def __init__(
+        self, model: mujoco.MjModel, substeps: int, metres_per_unit: float, dtype: Any, blocked: bool
+    ) -> None:
+        super().__init__(model, substeps)
+        (self._mocap, self._gripper), *_ = _welds(model)
+        self._scale, self._dtype = metres_per_unit, dtype
+        fingers = [model.joint(name) for name in _FINGERS] if blocked else []
+        self._closed = np.array([int(joint.qposadr[0]) for joint in fingers], dtype=np.intp)
+        self._servoed = model.jnt_qposadr[model.actuator_trnid[:, 0]]
+        self._servo_acts = 0.0 if blocked else 1.0
+
+    def act(self, data: mujoco.MjData, control: Array) -> None:
+        """Move the mocap body off where MuJoCo last evaluated the gripper, and give the fingers' servos a target."""
+        step = control.astype(self._dtype)
+        data.mocap_pos[self._mocap] = data.xpos[self._gripper] + self._scale * step[:3]
+        data.mocap_quat[self._mocap] = data.xquat[self._gripper] + _TURN
+        data.ctrl[:] = data.qpos[self._servoed] + self._servo_acts * step[3]
+
+    def settle(self, data: mujoco.MjData) -> None:
+        """A blocked gripper's fingers are put back to zero, and poses are those of the new positions."""
+        if self._closed.size:
+            data.qpos[self._closed] = 0.0
+            mujoco.mj_kinematics(self._model, data)
+
+    def braking(self, data: mujoco.MjData) -> Array:
+        """No displacement, shape (4,)."""
+        return np.zeros(4)

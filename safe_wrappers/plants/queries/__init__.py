@@ -1,0 +1,1 @@
+"""What constraints and wrappers ask of a model beyond its linear form."""

@@ -1,0 +1,155 @@
+"""What a machine on a free joint does under a held control and then, without any, until it rests."""
+
+import math
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
+
+Array = NDArray[np.float64]
+
+_REST_SPEED = 0.01
+"""m/s, of the body and of its farthest point as it turns: slower counts as at rest. What is left of the way is
+under a millimetre for Safety-Gymnasium's car (measured: 0.8 mm)."""
+_OBJECTS = {
+    "body": mujoco.mjtObj.mjOBJ_BODY,
+    "geom": mujoco.mjtObj.mjOBJ_GEOM,
+    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
+}
+_ADOPTED = {
+    "body": ("body_mass", "body_inertia", "body_ipos", "body_iquat"),
+    "geom": ("geom_friction",),
+    "actuator": ("actuator_gainprm", "actuator_forcerange"),
+}
+"""What a plant's model may have other than the env's, by kind of object."""
+
+
+class Course(NamedTuple):
+    """Where the machine's body is at k instants, one per physics substep.
+
+    Attributes:
+        places: Its origin from above, shape (k, 2), m.
+        ahead: Its x axis from above, unit vectors, shape (k, 2).
+        rests: Whether it has come to rest by the last instant.
+    """
+
+    places: Array
+    ahead: Array
+    rests: bool
+
+
+class Coasting:
+    """Runs the machine's model: a held control first, no control after it.
+
+    Args:
+        plant: Bound; its state is where a run starts, its model gives the masses, damping, friction and motors.
+        body: Name of the machine's body; it has a free joint.
+        alone: A model of the machine without what it must not touch anyway: faster to step. Joints and actuators
+            are found by their names. None runs the plant's own model.
+
+    Raises:
+        UnsupportedEnvError: The body is not on a free joint.
+        ConfigurationError: The model alone has a joint or an actuator that the plant's has not, or another timestep.
+    """
+
+    def __init__(self, plant: MujocoPlant, body: str, alone: mujoco.MjModel | None = None) -> None:
+        self._plant = plant
+        self._model: Any = alone if alone is not None else plant.model
+        m, whole = self._model, plant.model
+        if m.opt.timestep != whole.opt.timestep:
+            raise ConfigurationError(
+                f"the machine's own model must take the env's physics steps of {whole.opt.timestep} s, "
+                f"it has {m.opt.timestep} s"
+            )
+        index = plant.named("body", body)
+        joint = int(whole.body_jntadr[index])
+        if joint < 0 or whole.jnt_type[joint] != int(mujoco.mjtJoint.mjJNT_FREE):
+            raise UnsupportedEnvError(f"body {body!r} must move freely (a free joint)")
+        self._own = alone is not None
+        if [m.actuator(i).name for i in range(m.nu)] != [whole.actuator(i).name for i in range(whole.nu)]:
+            raise ConfigurationError("the machine's own model must have the env's actuators, in their order")
+        joints = range(m.njnt)
+        self._qpos = np.concatenate([_addresses(m, plant, j, "qpos") for j in joints])
+        self._qvel = np.concatenate([_addresses(m, plant, j, "dof") for j in joints])
+        self._at = int(m.jnt_qposadr[m.body(body).jntadr[0]])
+        self._moving = int(m.jnt_dofadr[m.body(body).jntadr[0]])
+        self._pose = self._qpos[self._at : self._at + 7]
+        self._motion = self._qvel[self._moving : self._moving + 6]
+        self._data = mujoco.MjData(m)
+        self._revision = -1
+
+    def _adopt(self) -> None:
+        """Take the numbers that the plant's model may have wrong on purpose."""
+        self._revision = self._plant.revision
+        if not self._own:
+            return
+        m, whole = self._model, self._plant.model
+        for kind, fields in _ADOPTED.items():
+            for i in range(getattr(m, f"n{kind}")):
+                name = mujoco.mj_id2name(m, _OBJECTS[kind], i)
+                j = mujoco.mj_name2id(whole, _OBJECTS[kind], name) if name else -1
+                for field in fields if j >= 0 else ():
+                    getattr(m, field)[i] = getattr(whole, field)[j]
+        m.dof_damping[:] = whole.dof_damping[self._qvel]
+        mujoco.mj_setConst(m, self._data)
+
+    def start(self) -> Course:
+        """Where the machine is now, as a course of one instant."""
+        return _course(self._plant.qpos[self._pose][None], False)
+
+    def state(self) -> Array:
+        """The machine's positions and velocities now: m, rad, quaternions, m/s, rad/s."""
+        return np.concatenate([self._plant.qpos[self._qpos], self._plant.qvel[self._qvel]])
+
+    def speed(self, turning_radius: float) -> float:
+        """The largest speed of its origin and of a point at that distance, as it moves now, m/s."""
+        vx, vy, _, wx, wy, wz = self._plant.qvel[self._motion].tolist()
+        return math.hypot(vx, vy) + math.sqrt(wx * wx + wy * wy + wz * wz) * turning_radius
+
+    def run(self, control: Array, holds: int, turning_radius: float) -> Course:
+        """Hold a control for one control interval, then none until the machine rests.
+
+        Args:
+            control: Shape (nu,).
+            holds: Control intervals at most, >= 1.
+            turning_radius: The farthest point of the machine from its origin, m: turning moves it too.
+        """
+        plant, m, data = self._plant, self._model, self._data
+        if plant.revision != self._revision:
+            self._adopt()
+        now = plant.pose()
+        data.qpos[:], data.qvel[:] = now.qpos[self._qpos], now.qvel[self._qvel]
+        data.qacc_warmstart[:] = now.qacc_warmstart[self._qvel]
+        data.ctrl[:] = control
+        n, at, speeds = plant.substeps, self._at, slice(self._moving, self._moving + 6)
+        poses = np.empty((holds * n, 7))
+        rests = False
+        for hold in range(holds):
+            for i in range(hold * n, hold * n + n):
+                mujoco.mj_step(m, data)
+                poses[i] = data.qpos[at : at + 7]
+            vx, vy, vz, _, _, turn = data.qvel[speeds].tolist()
+            if math.sqrt(vx * vx + vy * vy + vz * vz) + abs(turn) * turning_radius < _REST_SPEED:
+                rests = True
+                break
+            data.ctrl[:] = 0.0
+        return _course(poses[: (hold + 1) * n], rests)
+
+
+def _addresses(m: mujoco.MjModel, plant: MujocoPlant, joint: int, kind: str) -> NDArray[np.intp]:
+    """Where a joint of the machine's own model is in the plant's state ("qpos" or "dof")."""
+    name = m.joint(joint).name
+    there = plant.named("joint", name)
+    sizes = {"qpos": (7, 4, 1, 1), "dof": (6, 3, 1, 1)}[kind]
+    first = int(getattr(plant.model, f"jnt_{kind}adr")[there])
+    return np.arange(first, first + sizes[int(m.jnt_type[joint])])
+
+
+def _course(poses: Array, rests: bool) -> Course:
+    w, x, y, z = poses[:, 3:].T
+    ahead = np.stack([1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)], axis=1)
+    return Course(poses[:, :2], ahead / np.sqrt((ahead**2).sum(axis=1))[:, None], rests)

@@ -1,0 +1,211 @@
+"""Driven wheels in a MuJoCo model: found by their joints' names, with their constants, motion and load."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.control.vehicle.wheel import Wheel
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
+
+Array = NDArray[np.float64]
+
+_ROUND = {
+    int(mujoco.mjtGeom.mjGEOM_SPHERE),
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER),
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE),
+}
+_FIXED_GAIN, _NO_BIAS = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_NONE)
+_AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_AFFINE)
+_FLAT = 1e-6
+"""Level part of an axle's direction below which it has none."""
+_DRIVES = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+
+
+class WheelMotion(NamedTuple):
+    """Of n wheels, along each wheel's heading; shapes (n,).
+
+    Attributes:
+        rate: Of the wheel about its axle in the world, rad/s; positive rolls ahead.
+        ground: Speed of its centre, m/s.
+        sideways: The same to the left of the heading, m/s.
+    """
+
+    rate: Array
+    ground: Array
+    sideways: Array
+
+
+class DrivenWheels:
+    """The wheels of a vehicle on level ground.
+
+    A wheel is a hinge that one or more actuators drive, all of them directly. Its radius is read from a sphere,
+    cylinder or capsule of its body: the one named like the joint, else the first that can touch something. Ahead is
+    where a positive joint rate rolls it: the axle's axis times up.
+
+    Args:
+        plant: Bound.
+        names: Of the hinges.
+
+    Attributes:
+        feedback: Of the speed servos on each wheel, shape (n,), N m s/rad.
+
+    Raises:
+        ConfigurationError: An empty list, a name twice, a joint that is no hinge or that nothing drives, a wheel
+            that a tendon or site drives, too, or one without a round geom of a radius above zero.
+        UnknownNameError: No joint of that name.
+    """
+
+    def __init__(self, plant: MujocoPlant, names: Sequence[str]) -> None:
+        if isinstance(names, str) or not names or len(set(names)) != len(names):
+            raise ConfigurationError(
+                f"wheels is a list of joint names, each once, got {names!r}; the model has the joints "
+                + ", ".join(plant.names("joint"))
+            )
+        self.names = list(names)
+        m = plant.model
+        self._joints = np.array([plant.named("joint", name) for name in names])
+        for joint, name in zip(self._joints, names, strict=True):
+            if m.jnt_type[joint] != int(mujoco.mjtJoint.mjJNT_HINGE):
+                raise ConfigurationError(
+                    f"joint {name!r} is no hinge, so it is no wheel's axle; hinges are {_hinges(plant)}"
+                )
+        direct = np.isin(m.actuator_trntype, _DRIVES)
+        self._drives = direct & (m.actuator_trnid[:, 0] == self._joints[:, None])
+        for drives, name in zip(self._drives, names, strict=True):
+            if not drives.any():
+                raise ConfigurationError(
+                    f"no actuator drives joint {name!r} directly, so its slip cannot be limited; driven are "
+                    + (
+                        ", ".join(sorted({m.joint(int(j)).name for j in m.actuator_trnid[direct, 0]}))
+                        or "none"
+                    )
+                )
+        self.dofs = m.jnt_dofadr[self._joints]
+        self._refuse_other_drives(plant)
+        self._bodies = m.jnt_bodyid[self._joints]
+        self._roots = m.body_rootid[self._bodies]
+        self._geoms = np.array([_round_geom(plant, int(j)) for j in self._joints])
+        # Contacts are the env's, whose geoms need not be those of the plant's model; what is no geom is the last one.
+        truth: mujoco.MjModel = plant.attribute("model")
+        self._wheel_of_geom = np.full(truth.ngeom + 1, -1)
+        for i, body in enumerate(truth.jnt_bodyid[self._joints]):
+            self._wheel_of_geom[:-1][truth.geom_bodyid == body] = i
+        self._force = np.zeros(6)
+        self._fixed_drive: tuple[Array, Array] | None = None
+        self.constants(plant)
+
+    def _refuse_other_drives(self, plant: MujocoPlant) -> None:
+        """A drive through a tendon or a site that turns a wheel would be missing in `drive`."""
+        data = mujoco.MjData(plant.model)
+        mujoco.mj_forward(plant.model, data)
+        turns = plant.actuators.moment(data)[:, self.dofs].T != 0.0
+        for others, name in zip(turns & ~self._drives, self.names, strict=True):
+            if others.any():
+                raise ConfigurationError(
+                    f"joint {name!r} is also driven by {', '.join(_actuators(plant, others))} through a tendon or a "
+                    "site, which its slip limit would not hold back; drive wheels by actuators on their own joints"
+                )
+
+    def constants(self, plant: MujocoPlant) -> Wheel:
+        """Radius, inertia about the axle and damping, as the plant's model has them now; sets `feedback`, too."""
+        m = plant.model
+        self._fixed_drive = None
+        data, column = mujoco.MjData(m), np.empty(m.nv)
+        mujoco.mj_forward(m, data)
+        inertia = []
+        for dof in self.dofs:
+            unit = np.zeros(m.nv)
+            unit[dof] = 1.0
+            mujoco.mj_mulM(m, data, column, unit)
+            inertia.append(column[dof])
+        # A servo that a forcerange can clamp is no feedback while it is: its torque counts as held.
+        servos = (m.actuator_biastype == _AFFINE_BIAS) & ~m.actuator_forcelimited.astype(bool)
+        self._opposing = self._drives * np.where(
+            servos, -m.actuator_gear[:, 0] * m.actuator_biasprm[:, 2], 0.0
+        )
+        self.feedback = np.asarray((self._opposing * m.actuator_gear[:, 0]).sum(axis=1))
+        return Wheel(m.geom_size[self._geoms, 0], np.array(inertia), m.dof_damping[self.dofs])
+
+    def motion(self, plant: MujocoPlant) -> WheelMotion:
+        """Rates and speeds over ground at the plant's present state."""
+        m, d = plant.model, plant.pose()
+        mujoco.mj_comPos(m, d)
+        mujoco.mj_comVel(m, d)
+        axle = d.xaxis[self._joints]
+        level = np.sqrt(axle[:, 0] ** 2 + axle[:, 1] ** 2)
+        level = np.where(level > _FLAT, level, np.inf)  # a wheel that lies flat goes nowhere
+        ahead_x, ahead_y = axle[:, 1] / level, -axle[:, 0] / level
+        velocity = d.cvel[self._bodies]
+        turn, move = velocity[:, :3], velocity[:, 3:]
+        arm = d.geom_xpos[self._geoms] - d.subtree_com[self._roots]
+        vx = move[:, 0] + turn[:, 1] * arm[:, 2] - turn[:, 2] * arm[:, 1]
+        vy = move[:, 1] + turn[:, 2] * arm[:, 0] - turn[:, 0] * arm[:, 2]
+        rate = (turn * axle).sum(axis=1)
+        return WheelMotion(rate, ahead_x * vx + ahead_y * vy, ahead_x * vy - ahead_y * vx)
+
+    def loads(self, model: mujoco.MjModel, data: mujoco.MjData) -> Array:
+        """Force of the ground on each wheel against gravity, shape (n,), N, from an env's model and contacts."""
+        loads = np.zeros(len(self.names))
+        pairs = data.contact.geom
+        for contact, wheel in enumerate(self._wheel_of_geom[pairs].max(axis=1, initial=-1).tolist()):
+            if wheel >= 0:
+                mujoco.mj_contactForce(model, data, contact, self._force)
+                loads[wheel] += self._force[0] * abs(float(data.contact.frame[contact, 2]))
+        return loads
+
+    def torque(self, data: mujoco.MjData) -> Array:
+        """Of the drives on each wheel, shape (n,), N m, without `feedback`: from an env's last physics substep."""
+        return np.asarray(data.qfrc_actuator[self.dofs] + self._opposing @ data.actuator_velocity)
+
+    def driven_by(self, controls: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Whether any of some controls, shape (nu,), drives each wheel, shape (n,)."""
+        return np.asarray((self._drives & controls).any(axis=1))
+
+    def drive(self, plant: MujocoPlant) -> tuple[Array, Array]:
+        """`torque = bias + effect @ u - feedback * rate` inside the actuators' clamps: (n,) in N m and (n, nu)."""
+        if self._fixed_drive is not None:
+            return self._fixed_drive
+        m, driven = plant.model, self._drives
+        gear = m.actuator_gear[:, 0]
+        joint = np.where(driven.any(axis=0), m.actuator_trnid[:, 0], 0)
+        length = gear * plant.qpos[m.jnt_qposadr[joint]]
+        velocity = gear * plant.qvel[m.jnt_dofadr[joint]]
+        gain, bias = plant.actuators.gain_and_bias(length, velocity)
+        at_rest = (driven * (gear * bias)).sum(axis=1) + self._opposing @ velocity
+        drive = np.asarray(at_rest), np.asarray(driven * (gear * gain))
+        motors = (m.actuator_gaintype == _FIXED_GAIN) & (m.actuator_biastype == _NO_BIAS)
+        if motors[driven.any(axis=0)].all():
+            self._fixed_drive = drive
+        return drive
+
+
+def _round_geom(plant: MujocoPlant, joint: int) -> int:
+    m = plant.model
+    name, body = m.joint(joint).name, int(m.jnt_bodyid[joint])
+    round_ones = [g for g in range(m.ngeom) if m.geom_bodyid[g] == body and int(m.geom_type[g]) in _ROUND]
+    touching = [g for g in round_ones if m.geom_contype[g] or m.geom_conaffinity[g]]
+    named = [g for g in touching or round_ones if m.geom(g).name == name]
+    found = (named or touching or round_ones or [-1])[0]
+    radius = float(m.geom_size[found, 0]) if found >= 0 else 0.0
+    if not (math.isfinite(radius) and radius > 0.0):
+        has = f"a radius of {radius} m" if found >= 0 else "no sphere, cylinder or capsule"
+        raise ConfigurationError(
+            f"wheel {name!r} needs a radius above zero, read from a geom of its body {m.body(body).name!r}, which "
+            f"has {has}"
+        )
+    return found
+
+
+def _actuators(plant: MujocoPlant, chosen: NDArray[np.bool_]) -> list[str]:
+    return [plant.model.actuator(int(i)).name or f"actuator #{i}" for i in np.flatnonzero(chosen)]
+
+
+def _hinges(plant: MujocoPlant) -> str:
+    m = plant.model
+    kind = int(mujoco.mjtJoint.mjJNT_HINGE)
+    return ", ".join(m.joint(j).name for j in range(m.njnt) if m.jnt_type[j] == kind and m.joint(j).name)

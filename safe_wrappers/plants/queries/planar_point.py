@@ -1,0 +1,162 @@
+"""A point mass on two slides in a MuJoCo model: where it is, what moves it, how large it is, and its walls."""
+
+import copy
+from dataclasses import dataclass
+from typing import NoReturn
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.control.backup.damped_axis import HeldAxis
+from safe_wrappers.errors import UnsupportedEnvError
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
+
+Array = NDArray[np.float64]
+
+_ALIGNED = 1e-6
+_EXACT = 1e-9
+"""How closely the model's own step must follow the two axes' constants on the states that are tried, m, m/s."""
+_PROBES = 12
+_SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+@dataclass(frozen=True)
+class PlanarPoint:
+    """What `planar_point` finds in a model; x first, then y.
+
+    Attributes:
+        body: Index of the body.
+        axes: Constants of the motion.
+        joints: Indices of the two slides, in qpos and in qvel.
+        actuators: Indices of their actuators.
+        origin: Where the point is at qpos = 0, m.
+    """
+
+    body: int
+    axes: tuple[HeldAxis, HeldAxis]
+    joints: tuple[int, int]
+    actuators: tuple[int, int]
+    origin: tuple[float, float]
+
+
+def planar_point(plant: MujocoPlant, clip: float, body: str | None = None) -> PlanarPoint:
+    """Find the point, or say what does not fit.
+
+    The constants are measured on the model itself, one physics step at a time, and then checked against it: what
+    is not a damped point mass with a force of its own on each axis (springs, gravity, friction, another
+    integrator, coupling) does not pass.
+
+    Args:
+        plant: Bound; its model's constants are read.
+        clip: Speed per axis to which the env clips the motion at each control step's start, m/s.
+        body: Name of the body on the two slides, in a model in which more moves; none of that may act on them. None:
+            the slides are all that moves.
+
+    Raises:
+        UnsupportedEnvError: The model is no such point.
+    """
+    m = plant.model
+    slides = _only_slides(m) if body is None else _slides_of(m, plant.named("body", body), body)
+    data = mujoco.MjData(m)
+    for joint in slides:
+        data.qpos[m.jnt_qposadr[joint]] = 0.0
+    mujoco.mj_kinematics(m, data)
+    joints = _order(slides, data.xaxis)
+    if m.jnt_limited[list(slides)].any():
+        _refuse("its slides must have no limits (walls stop it, not joints)")
+    actuators = _actuators(m, joints, alone=body is None)
+    order = int(m.jnt_qposadr[joints[0]]), int(m.jnt_qposadr[joints[1]])
+    axes = _measured(plant, order, actuators, clip)
+    index = int(m.jnt_bodyid[slides[0]])
+    return PlanarPoint(
+        index, axes, order, actuators, (float(data.xpos[index][0]), float(data.xpos[index][1]))
+    )
+
+
+def _only_slides(m: mujoco.MjModel) -> tuple[int, int]:
+    if m.nv != 2 or m.njnt != 2 or list(m.jnt_type) != [_SLIDE, _SLIDE] or m.jnt_bodyid[0] != m.jnt_bodyid[1]:
+        kinds = [mujoco.mjtJoint(k).name[6:].lower() for k in m.jnt_type]
+        _refuse(f"it needs one body on two slides and nothing else that moves; the model has {kinds}")
+    return 0, 1
+
+
+def _slides_of(m: mujoco.MjModel, body: int, name: str) -> tuple[int, int]:
+    slides = [j for j in range(m.njnt) if m.jnt_bodyid[j] == body and m.jnt_type[j] == _SLIDE]
+    # Where nothing has more coordinates than rates before them, one index serves positions and speeds.
+    if len(slides) != 2 or any(m.jnt_qposadr[j] != m.jnt_dofadr[j] for j in slides):
+        _refuse(
+            f"the body {name!r} must have two slides of its own, before any free or ball joint of the model; it has "
+            f"{len(slides)}"
+        )
+    return slides[0], slides[1]
+
+
+def _order(slides: tuple[int, int], axes: Array) -> tuple[int, int]:
+    """Which slide goes along world x and which along world y."""
+    for first, second in (slides, slides[::-1]):
+        if np.allclose(axes[[first, second]], np.eye(3)[:2], atol=_ALIGNED):
+            return first, second
+    _refuse(
+        f"its slides must go along world x and world y; they go along {axes[list(slides)].round(3).tolist()}"
+    )
+
+
+def _actuators(m: mujoco.MjModel, joints: tuple[int, int], alone: bool) -> tuple[int, int]:
+    joint = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+    driven = [int(m.actuator_trnid[a, 0]) if m.actuator_trntype[a] in joint else -1 for a in range(m.nu)]
+    if alone and sorted(driven) != [0, 1]:
+        _refuse("each of its slides needs a force actuator of its own, and there must be no other actuator")
+    if [driven.count(j) for j in joints] != [1, 1]:
+        _refuse("each of its slides needs a force actuator of its own, and only one")
+    return driven.index(joints[0]), driven.index(joints[1])
+
+
+def _measured(
+    plant: MujocoPlant, order: tuple[int, int], actuators: tuple[int, int], clip: float
+) -> tuple[HeldAxis, HeldAxis]:
+    """The axes' constants from single physics steps of the plant's model without contacts."""
+    m = plant.model
+    least, most = plant.acting_range
+    low, high = least[list(actuators)], most[list(actuators)]
+    if not (np.isfinite([low, high]).all() and (low < 0.0).all() and (high > 0.0).all()):
+        _refuse(f"its controls must be bounded and push both ways; they act from {least} to {most}")
+    free = copy.copy(m)
+    free.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    data = mujoco.MjData(free)
+
+    def step(x: Array, v: Array, u: Array, around: np.random.Generator | None = None) -> tuple[Array, Array]:
+        mujoco.mj_resetData(free, data)
+        if around is not None:  # what else moves must make no difference
+            data.qvel[:] = around.uniform(-1.0, 1.0, m.nv)
+            mujoco.mj_integratePos(free, data.qpos, data.qvel, 1.0)
+            data.ctrl[:] = np.clip(around.uniform(-1.0, 1.0, m.nu), least, most)
+        data.qpos[list(order)], data.qvel[list(order)], data.ctrl[list(actuators)] = x, v, u
+        mujoco.mj_step(free, data)
+        return data.qpos[list(order)].copy(), data.qvel[list(order)].copy()
+
+    zero = np.zeros(2)
+    decay = step(zero, np.ones(2), zero)[1]
+    gain = step(zero, zero, high)[1] / high
+    h, rng = float(m.opt.timestep), np.random.default_rng(0)
+    for _ in range(_PROBES):
+        x, v, u = rng.uniform(-3.0, 3.0, 2), rng.uniform(-5.0, 5.0, 2), rng.uniform(low, high)
+        x_next, v_next = step(x, v, u, rng)
+        expected = decay * v + gain * u
+        wrong = max(np.abs(v_next - expected).max(), np.abs(x_next - x - h * expected).max())
+        if not (wrong <= _EXACT and (gain > 0.0).all() and (decay > 0.0).all() and (decay <= 1.0).all()):
+            _refuse(
+                "its slides must be plain damped masses, each pushed by its own motor with a gear above zero (no "
+                f"springs, gravity or friction along them; Euler integrator); one step is {wrong:.2g} off that"
+            )
+    x_axis, y_axis = (
+        HeldAxis(float(decay[i]), float(gain[i]), h, plant.substeps, float(low[i]), float(high[i]), clip)
+        for i in range(2)
+    )
+    return x_axis, y_axis
+
+
+def _refuse(expectation: str) -> NoReturn:
+    raise UnsupportedEnvError(
+        f"this model is no point mass on two slides: {expectation}. Use Clearance for other machines."
+    )

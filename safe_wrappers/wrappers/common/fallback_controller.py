@@ -1,0 +1,71 @@
+"""StandIn: the fallback of a wrapper that filters nothing: who acts when nobody else may."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.fallback import Fallback, FallbackFunction
+from safe_wrappers.plants.default import default_plant
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.plants.plant import Plant
+
+Array = NDArray[np.float64]
+
+
+class StandIn:
+    """A fallback with the plant that it needs, bound to an env.
+
+    Args:
+        env: What is wrapped.
+        choice: "brake", "hold", "zero", or a function of the plant.
+        plant: None reads the env's MuJoCo model where the choice needs one.
+        backups: Constraints that bring their own stopping control.
+
+    Raises:
+        ConfigurationError: The choice needs a plant that is not there.
+        UnsupportedEnvError: No MuJoCo env, and no plant given.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        choice: str | FallbackFunction,
+        plant: Plant | None,
+        backups: list[Any] | None = None,
+    ) -> None:
+        space: Any = env.action_space
+        self._low, self._high = np.asarray(space.low, np.float64), np.asarray(space.high, np.float64)
+        self._fallback = Fallback(choice, backups or [])
+        needed = callable(choice) or choice == "brake"
+        self.plant: Plant | None = plant if plant is not None else (default_plant(env) if needed else None)
+        if self.plant is not None:
+            self.plant.bind(env)
+            if choice == "brake" and not backups and not isinstance(self.plant, MujocoPlant):
+                raise ConfigurationError(
+                    f'"brake" needs a MujocoPlant, which knows what moves; with a {type(self.plant).__name__} choose '
+                    '"hold", "zero" or a function of the plant'
+                )
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the episode."""
+        self._last = np.clip(np.zeros_like(self._low), self._low, self._high)
+        if self.plant is not None:
+            self.plant.executed(None)
+
+    def executed(self, control: Array) -> None:
+        """Remember what was sent, for "hold" and for the plant's delay."""
+        self._last = control
+        if self.plant is not None:
+            self.plant.executed(control)
+
+    def command(self) -> Array:
+        """What the fallback does now: finite, inside the action box, shape (m,)."""
+        readable = True
+        if self.plant is not None:
+            self.plant.observe()
+            readable = bool(np.isfinite(self.plant.state).all())
+        return self._fallback(self.plant, self._last, self._low, self._high, None, readable)

@@ -1,0 +1,275 @@
+"""ChunkQueue: the commands that a robot executes while chunks arrive, late, broken or not at all."""
+
+import math
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES, join
+from safe_wrappers.control.handover.smoothstep import shortest_latched_blend, smoothstep
+
+Array = NDArray[np.float64]
+
+REPLACE: Final = "replace"
+ENSEMBLE: Final = "ensemble"
+BASELINES: Final = (REPLACE, ENSEMBLE)
+"""What is done without a bound on the seam: the new chunk at once, or the mean of all chunks at hand."""
+
+_WHOLE: Final = 1e-6
+"""Control steps: a time that is longer than whole steps by less is meant to be those."""
+
+
+class Command(NamedTuple):
+    """What to send now.
+
+    Attributes:
+        control: Shape (m,), in the env's dtype and inside its box.
+        observed: Control step whose observation the command was made from; -1 before there was any.
+        starved: The queue is dry: the fallback gave it.
+        limited: It was held back beyond the blend to keep the rate limit.
+        took_over: A chunk took over with it.
+        seam: There is a seam before it: another chunk, another source, or the fallback began.
+        blend_steps: Control steps of the blend that begins with this command; 0 if none does.
+        refused: A chunk was there and could not take over: it came too late, or was not admitted.
+    """
+
+    control: NDArray[Any]
+    observed: int
+    starved: bool
+    limited: bool
+    took_over: bool
+    seam: bool
+    blend_steps: int
+    refused: bool
+
+
+class _Chunk(NamedTuple):
+    commands: Array
+    observed: int
+    due: int
+
+
+class _Fade(NamedTuple):
+    """A mode switch under way: out of a latched command, into whatever comes now."""
+
+    latched: Array
+    steps: int
+    done: int
+
+
+class ChunkQueue:
+    """Which command comes next. It counts control steps; it knows no clock and no env.
+
+    A chunk's entry j is meant for the j-th control step after its observation. A chunk that was observed at step k
+    and is there at step t is consumed from its entry t - k on: latency is what has been consumed, never an
+    estimate. It takes over from the left-over of the chunk before it, over a seam (`control/handover/seams.py`);
+    "replace" takes the new chunk at once, and "ensemble" averages what all chunks at hand ask for at a step. A queue
+    that has run dry asks the fallback.
+
+    A chunk of one has no left-over to blend with: what it asks for is sent as it is, and only a change of its
+    source (`switch`), to and from the fallback too, is faded over.
+
+    Args:
+        controls: m.
+        hold_s: Control interval, s.
+        blend: A blend of `control/handover/seams.py`, "replace" or "ensemble".
+        fewest: A blend takes at least so many control steps.
+        rate_limit: Largest |du/dt| of every component, shape (m,), action units per second; infinite for none.
+        low: Action box, shape (m,); what is outside of it is clipped to it. Where it is infinite it ends at the
+            largest number of the dtype.
+        high: Likewise.
+        dtype: Of the commands.
+        decay: Ensembling weighs the i-th oldest chunk by exp(-decay i).
+    """
+
+    def __init__(
+        self,
+        controls: int,
+        hold_s: float,
+        *,
+        blend: str,
+        fewest: int,
+        rate_limit: Array,
+        low: Array,
+        high: Array,
+        dtype: Any,
+        decay: float,
+    ) -> None:
+        self._hold_s, self._blend, self._fewest, self._decay = hold_s, blend, fewest, decay
+        self._rate_limit = rate_limit
+        step = np.asarray(rate_limit * hold_s)
+        # The difference of two commands, divided by the interval again, must not come out above the limit.
+        self._step = np.where(step / hold_s > rate_limit, np.nextafter(step, 0.0), step)
+        largest = min(float(np.finfo(dtype).max), float(np.finfo(np.float32).max))
+        self._low, self._high = np.maximum(low, -largest), np.minimum(high, largest)
+        self._dtype = np.dtype(dtype)
+        self._none = np.zeros((0, controls))
+        self._source = ""
+        self.reset()
+
+    def reset(self) -> None:
+        """A new episode: nothing sent, nothing planned; the source stays the one that was named last."""
+        self.now = 0
+        self._observed = -1
+        self._sent = self._none
+        self._plan, self._limited = self._none, np.zeros(0, dtype=bool)
+        self._coming: list[_Chunk] = []
+        self._averaged: list[_Chunk] = []
+        self._in_force = self._source
+        self._acting: str | None = None
+        self._fade: _Fade | None = None
+
+    def submit(self, commands: Array, observed: int, due: int) -> bool:
+        """A chunk is on its way; False if it is refused.
+
+        Refused are a chunk with an entry that is not finite, and one whose observation is not newer than the
+        newest one heard of (a repeat), or lies in the future.
+
+        Args:
+            commands: Shape (h, m).
+            observed: Control step of its observation.
+            due: Control step at which it is there.
+        """
+        newest = max([self._observed, *(c.observed for c in self._coming)])
+        if not newest < observed <= self.now or not np.isfinite(commands).all():
+            return False
+        boxed = np.clip(commands, self._low, self._high)
+        self._coming.append(_Chunk(boxed, observed, due))
+        return True
+
+    def switch(self, source: str) -> None:
+        """Chunks that take over from now on are somebody else's; the change is blended, from the last command."""
+        self._source = source
+
+    def next(
+        self, fallback: Callable[[], Array], admit: Callable[[Array, int], bool] | None = None
+    ) -> Command:
+        """The command of this control step.
+
+        Args:
+            fallback: Asked when nothing is planned; returns a finite control of shape (m,).
+            admit: Asked before a chunk takes over: its last command, shape (m,), and the control steps from now to
+                the end of that command; False refuses the chunk.
+        """
+        newest = self._observed
+        seam, blend_steps, refused = self._take_over(admit)
+        control, limited = self._planned()
+        starved = control is None
+        if control is None:
+            control = np.clip(fallback(), self._low, self._high)
+        acting = None if starved else self._in_force
+        if acting != self._acting and len(self._sent):
+            # A longer chunk that takes over blends by itself; everything else starts from the last command.
+            if not seam and self._blend in BLENDS:
+                blend_steps = self._fade_steps(control)
+                self._fade = _Fade(self._sent[-1], blend_steps, 0)
+            seam = True
+        self._acting = acting
+        sent, held = self._sendable(self._faded(control))
+        self._sent = np.concatenate([self._sent[-DIFFERENCES + 1 :], sent[None].astype(np.float64)])
+        self.now += 1
+        return Command(
+            sent,
+            self._observed,
+            starved,
+            limited or held,
+            self._observed > newest,
+            seam,
+            blend_steps,
+            refused,
+        )
+
+    def _take_over(self, admit: Callable[[Array, int], bool] | None) -> tuple[bool, int, bool]:
+        """Let the newest chunk that is there and may take over: is it a seam, its blend's steps, is one refused."""
+        there = [c for c in self._coming if c.due <= self.now]
+        self._coming = [c for c in self._coming if c.due > self.now]
+        refused = False
+        admitted: list[_Chunk] = []
+        for chunk in reversed(there):  # they came in the order of their observations
+            if not self._is_admitted(chunk, admit):
+                refused = True
+                continue
+            admitted.insert(0, chunk)
+            if self._blend != ENSEMBLE:
+                break
+        if not admitted:
+            return False, 0, refused
+        newest = admitted[-1]
+        self._coming = [c for c in self._coming if c.observed > newest.observed]
+        self._observed, self._in_force = newest.observed, self._source
+        if self._blend == ENSEMBLE:
+            self._averaged += admitted
+            return len(self._sent) > 0, 0, refused
+        fresh = newest.commands[self.now - newest.observed :]
+        if self._blend == REPLACE or len(newest.commands) == 1:
+            self._plan, self._limited = fresh, np.zeros(len(fresh), dtype=bool)
+            return self._blend == REPLACE and len(self._sent) > 0, 0, refused
+        joined = join(
+            self._sent,
+            self._plan,
+            fresh,
+            self._hold_s,
+            blend=self._blend,  # type: ignore[arg-type]  # checked by the wrapper
+            fewest=self._fewest,
+            rate_limit=self._rate_limit,
+            low=self._low,
+            high=self._high,
+        )
+        self._plan, self._limited = joined.plan, joined.limited
+        self._fade = None
+        return len(self._sent) > 0, joined.steps, refused
+
+    def _is_admitted(self, chunk: _Chunk, admit: Callable[[Array, int], bool] | None) -> bool:
+        fresh = chunk.commands[self.now - chunk.observed :]
+        return len(fresh) > 0 and (admit is None or admit(fresh[-1], len(fresh)))
+
+    def _planned(self) -> tuple[Array | None, bool]:
+        if self._blend == ENSEMBLE:
+            self._averaged = [c for c in self._averaged if c.observed + len(c.commands) > self.now]
+            if not self._averaged:
+                return None, False
+            votes = np.array([c.commands[self.now - c.observed] for c in self._averaged])
+            weights = np.exp(-self._decay * np.arange(len(votes)))
+            return np.asarray(weights @ votes / weights.sum()), False
+        if not len(self._plan):
+            return None, False
+        control, limited = self._plan[0], bool(self._limited[0])
+        self._plan, self._limited = self._plan[1:], self._limited[1:]
+        return control, limited
+
+    def _fade_steps(self, target: Array) -> int:
+        """Control steps between the latched command and the new one that keep the limit, were both at rest."""
+        steps = self._fewest
+        bounded = np.isfinite(self._rate_limit)
+        if bounded.any():
+            change = np.abs(target - self._sent[-1])[bounded]
+            shortest = float(shortest_latched_blend(change, self._rate_limit[bounded]).max())
+            steps = max(steps, math.ceil(shortest / self._hold_s - _WHOLE) - 1)
+        return steps
+
+    def _faded(self, control: Array) -> Array:
+        if self._fade is None:
+            return control
+        latched, steps, done = self._fade
+        if done >= steps:
+            self._fade = None
+            return control
+        self._fade = _Fade(latched, steps, done + 1)
+        weight = float(smoothstep((done + 1.0) / (steps + 1.0)))
+        return np.asarray(latched + weight * (control - latched))
+
+    def _sendable(self, control: Array) -> tuple[NDArray[Any], bool]:
+        """The command in the env's dtype, within the box and the limit, and whether it had to be held back."""
+        control = np.clip(control, self._low, self._high)
+        if self._blend not in BLENDS or not len(self._sent):
+            return control.astype(self._dtype), False
+        last = self._sent[-1]
+        kept = np.clip(control, last - self._step, last + self._step)
+        sent = kept.astype(self._dtype)
+        # Rounding alone may break the limit by a hair: one number back, which is not called holding back.
+        too_far = np.abs(sent - last) > self._step
+        sent = np.where(too_far, np.nextafter(sent, last.astype(self._dtype)), sent)
+        hair = 2.0 * float(np.finfo(self._dtype).eps) * np.maximum(np.abs(control), np.abs(last))
+        return sent, bool((np.abs(control - kept) > hair).any())

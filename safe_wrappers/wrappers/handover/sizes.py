@@ -1,0 +1,164 @@
+"""The sizes of chunks and the bounds on their blends, checked against each other at construction."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.control.handover.seams import BLENDS
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import positive
+from safe_wrappers.wrappers.handover.queue import BASELINES
+
+_WHOLE: Final = 1e-6
+"""Control steps: a time that is longer than whole steps by less is meant to be those."""
+
+Array = NDArray[np.float64]
+
+
+class ChunkSizes(NamedTuple):
+    """In control steps, by the names of real-time chunking: H, s, and the least and the most of d.
+
+    Attributes:
+        entries: chunk_size.
+        steps_per_entry: Control steps from one entry to the next.
+        chunk: H, the control steps that a chunk has a command for; with one step per entry its entries.
+        horizon: execution_horizon s.
+        delay: The least and the largest inference_delay d; `d <= s <= H - d` holds for the largest.
+    """
+
+    entries: int
+    steps_per_entry: int
+    chunk: int
+    horizon: int
+    delay: tuple[int, int]
+
+    @classmethod
+    def checked(
+        cls, chunk_size: Any, execution_horizon: Any, inference_delay: Any, steps_per_entry: Any
+    ) -> "ChunkSizes":
+        """The sizes as the user gave them, or an error that says what would fit."""
+        entries, horizon = (
+            _count("chunk_size", chunk_size, 1),
+            _count("execution_horizon", execution_horizon, 1),
+        )
+        apart = _count("steps_per_entry", steps_per_entry, 1)
+        if entries == 1 and apart > 1:
+            raise ConfigurationError(
+                f"steps_per_entry = {apart}, but one entry leads to no other: choose a longer chunk_size"
+            )
+        size = (entries - 1) * apart + 1
+        delay = _delay(inference_delay)
+        if horizon > size:
+            raise ConfigurationError(
+                f"execution_horizon = {horizon} is more than a chunk has, {_size(entries, apart, '')}: it would run "
+                f"dry; choose it up to {size}, or longer chunks"
+            )
+        if not delay[1] <= horizon <= size - delay[1]:
+            fits = (
+                f"choose s from {max(delay[1], 1)} to {size - delay[1]}, or longer chunks"
+                if 2 * delay[1] <= size
+                else f"no s fits, choose H >= {2 * delay[1]}"
+            )
+            raise ConfigurationError(
+                f"inference_delay d = {delay[1]}, execution_horizon s = {horizon} and {_size(entries, apart, ' H')} "
+                f"break d <= s <= H - d: a chunk that comes {delay[1]} control steps late has "
+                f"{max(size - delay[1], 0)} commands left, for the {horizon} until the next; {fits}"
+            )
+        return cls(entries, apart, size, horizon, delay)
+
+    @property
+    def leftover(self) -> int:
+        """What is left of a chunk when the next one takes over, at the least."""
+        return self.chunk - self.horizon - self.delay[1]
+
+
+def blend_bounds(
+    sizes: ChunkSizes,
+    space: gym.spaces.Box,
+    hold_s: float,
+    blend: str,
+    blend_time: float | None,
+    jerk_limit: float | Sequence[float] | None,
+) -> tuple[int, Array]:
+    """The fewest steps of a blend, and the rate limit of every component, shape (m,), infinite where there is none.
+
+    Raises:
+        ConfigurationError: Bounds for a baseline, that are not positive, that do not fit into a chunk, or nothing to
+            blend over.
+    """
+    if blend in BASELINES:
+        if blend_time is not None or jerk_limit is not None:
+            raise ConfigurationError(
+                f"blend={blend!r} is a baseline that bounds nothing: leave blend_time and jerk_limit out, or choose "
+                f"{', '.join(BLENDS)}"
+            )
+        return 0, np.full(space.shape, np.inf)
+    fewest, rate_limit = 0, np.full(space.shape, np.inf)
+    if blend_time is not None:
+        fewest = max(math.ceil(positive("blend_time", blend_time, "s") / hold_s - _WHOLE) - 1, 1)
+        available = sizes.chunk - sizes.delay[1]
+        if fewest >= available and sizes.chunk > 1:
+            raise ConfigurationError(
+                f"blend_time = {blend_time} s is longer than what a chunk has left when it takes over, {available} "
+                f"control steps of {hold_s} s: choose a longer chunk_size or a shorter blend_time"
+            )
+    if jerk_limit is not None:
+        rate_limit = _rate_limit(jerk_limit, rate_limit.size)
+        resolution = _rounding(space)
+        if (rate_limit * hold_s <= resolution).any():
+            raise ConfigurationError(
+                f"jerk_limit = {jerk_limit} per second is not above what {space.dtype} resolves in steps of {hold_s} "
+                f"s, {resolution / hold_s:.3g}: choose a larger one"
+            )
+    if blend_time is None and jerk_limit is None:
+        fewest = sizes.leftover
+        if fewest == 0:
+            raise ConfigurationError(
+                f"chunk_size = {sizes.chunk}, execution_horizon = {sizes.horizon} and inference_delay = "
+                f"{sizes.delay[1]} leave no left-over to blend with: pass jerk_limit or blend_time"
+            )
+    return fewest, rate_limit
+
+
+def _size(entries: int, apart: int, letter: str) -> str:
+    if apart == 1:
+        return f"chunk_size{letter} = {entries}"
+    return f"chunk_size {entries} at {apart} control steps per entry, H = {(entries - 1) * apart + 1} control steps"
+
+
+def _count(name: str, value: Any, least: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ConfigurationError(f"{name} is a number of control steps, at least {least}; got {value!r}")
+    return int(value)
+
+
+def _delay(value: Any) -> tuple[int, int]:
+    if not isinstance(value, list | tuple):
+        return (_count("inference_delay", value, 0),) * 2
+    counts = [_count("inference_delay", delay, 0) for delay in value]
+    if len(counts) != 2 or counts[0] > counts[1]:
+        raise ConfigurationError(f"inference_delay is d control steps or [least, most], got {value!r}")
+    return counts[0], counts[1]
+
+
+def _rate_limit(jerk_limit: Any, controls: int) -> Array:
+    unit = "action units per second"
+    if not isinstance(jerk_limit, list | tuple | np.ndarray):
+        return np.full(controls, positive("jerk_limit", jerk_limit, unit))
+    if len(jerk_limit) != controls:
+        raise ConfigurationError(
+            f"jerk_limit is one number, or one for each of the {controls} action components; got {jerk_limit!r}"
+        )
+    return np.array([positive("jerk_limit", each, unit) for each in jerk_limit])
+
+
+def _rounding(space: gym.spaces.Box) -> float:
+    """The most that rounding to the actions' dtype may add to the difference of two commands in the box."""
+    ends = np.abs(np.concatenate([space.low, space.high]).astype(np.float64))
+    largest = float(ends[np.isfinite(ends)].max(initial=1.0))
+    dtype: Any = space.dtype
+    return 2.0 * float(np.finfo(dtype).eps) * largest

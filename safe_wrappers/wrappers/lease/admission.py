@@ -1,0 +1,99 @@
+"""Admission: whether a chunk of position setpoints may be executed at all: is its end within reach, in its time?"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from safe_wrappers.control.watchdog.reachability import MotionLimits, admits, jerk_limited_time
+from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+
+Array = NDArray[np.float64]
+
+Measured = Callable[[gym.Env[Any, Any]], tuple[ArrayLike, ...]]
+"""Takes the env; returns what the actions are setpoints of, its velocity and, if known, its acceleration, shapes
+(m,)."""
+
+ARRIVALS: Final = ("moving", "rest")
+_EXPECTED: Final = (
+    'reach is {"max_acceleration": ..., "max_speed": ..., "max_jerk": ..., "arrival": "moving" or "rest"}, all but '
+    "the first at will, the limits each a number or one for each of the"
+)
+
+
+class Admission:
+    """Refuses chunks that no motion within the limits could follow to their end.
+
+    Necessary only: what is admitted still needs its path and its stopping checked. By "moving" the end may be passed
+    at any speed (`admits`, an idealised bound); by "rest" the machine must be able to stand there in time
+    (`jerk_limited_time`, the constrained profile from the measured state).
+
+    Args:
+        env: What is wrapped.
+        reach: Limits of the motion and the kind of arrival.
+        measured: None reads the lengths and velocities of the MuJoCo actuators.
+        controls: m.
+
+    Raises:
+        ConfigurationError: Limits that are none, or an acceleration that is needed and not measured.
+        UnsupportedEnvError: Nothing says where the machine is.
+    """
+
+    def __init__(
+        self, env: gym.Env[Any, Any], reach: Mapping[str, Any], measured: Measured | None, controls: int
+    ) -> None:
+        if measured is None and not hasattr(env.unwrapped, "data"):
+            raise UnsupportedEnvError(
+                "reach needs to know where the machine is: pass measured, a function of the env that returns the "
+                "positions that the actions are setpoints of, and their velocities"
+            )
+        try:
+            given = dict(reach)
+            arrival = given.pop("arrival", "moving")
+            self._limits = MotionLimits(**given)
+            np.broadcast_to(np.broadcast_arrays(*self._limits.arrays)[0], (controls,))
+        except (TypeError, ValueError) as error:
+            if isinstance(error, ConfigurationError):
+                raise
+            raise ConfigurationError(f"{_EXPECTED} {controls} action components; got {reach!r}") from None
+        if arrival not in ARRIVALS:
+            raise UnknownNameError(f"arrival is {' or '.join(map(repr, ARRIVALS))}, got {arrival!r}")
+        self._rest = arrival == "rest"
+        if self._rest and measured is None and np.isfinite(self._limits.arrays[2]).any():
+            raise ConfigurationError(
+                "arrival at rest with limited jerk starts from the measured acceleration, which MuJoCo's actuators "
+                "do not give: pass measured, a function of the env that returns positions, velocities, accelerations"
+            )
+        self._env, self._measured = env, measured
+
+    def admits(self, end: Array, duration_s: float) -> bool:
+        """Whether a chunk may be executed.
+
+        Args:
+            end: Its last command, shape (m,).
+            duration_s: From now to the end of that command, s.
+        """
+        position, velocity, acceleration = self._state()
+        a_max, v_max, jerk = self._limits.arrays
+        if not self._rest:
+            return bool(admits(end, position, velocity, duration_s, v_max, a_max, jerk, acceleration).all())
+        here = 0.0 if acceleration is None else acceleration
+        return bool(
+            jerk_limited_time((position, velocity, here), (end, 0.0, 0.0), self._limits) <= duration_s
+        )
+
+    def _state(self) -> tuple[ArrayLike, ArrayLike, ArrayLike | None]:
+        if self._measured is None:
+            data: Any = getattr(self._env.unwrapped, "data")  # noqa: B009
+            return data.actuator_length, data.actuator_velocity, None
+        state = self._measured(self._env)
+        if len(state) == 3:
+            return state[0], state[1], state[2]
+        if len(state) != 2 or (self._rest and np.isfinite(self._limits.arrays[2]).any()):
+            raise ConfigurationError(
+                "measured returns positions and velocities, and for an arrival at rest with limited jerk also "
+                f"accelerations; got {len(state)} values"
+            )
+        return state[0], state[1], None

@@ -1,0 +1,136 @@
+"""Sensor: where an `OcclusionPenalty` looks from, how far, and how well it measures."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.control.estimation.covariance import checked_noise
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import non_negative, positive
+from safe_wrappers.wrappers.common.plain_numbers import plain_numbers
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Sensor:
+    """A camera, or any other sensor that needs a line of sight, on a body of the model.
+
+    What it measures is simulated: the tracked point's position relative to the sensor, and if asked for its velocity
+    relative to it, in the sensor's own axes, with Gaussian noise. The pose of the body it sits on is known; where
+    on the body it sits is the model's, or left out (`lever_arm`).
+
+    Args:
+        camera: Name of a camera in the model, which looks along its own -z; or
+        site: name of a site, which looks along its own z.
+        view_deg: Full opening angle of the cone that it sees, degrees, above 0. None: a camera's own `fovy`, and all
+            around for a site. 360 and more is all around.
+        range_m: Farther away it sees nothing, m; None: as far as there is.
+        occluder_groups: Geom groups (0 to 5) that block its sight; None: all of them.
+        position_std: Of a measured position, m: a number for every axis, or a covariance matrix (d x d, m^2) in world
+            axes. None: it does not measure positions.
+        velocity_std: Likewise of a measured velocity, m/s and m^2/s^2. None: it does not measure velocities.
+        dropout: Probability that a measurement of what is in sight is lost, for each track and step, below 1.
+        lever_arm: Whether the estimator knows where on its body the sensor sits. False takes it for the body's
+            origin, which is wrong wherever the body turns; it is there to show by how much.
+
+    Raises:
+        ConfigurationError: Both or neither of camera and site, nothing measured, or a number outside its range.
+    """
+
+    camera: str | None = None
+    site: str | None = None
+    view_deg: float | None = None
+    range_m: float | None = None
+    occluder_groups: Sequence[int] | None = None
+    position_std: Any = 0.05
+    velocity_std: Any = None
+    dropout: float = 0.0
+    lever_arm: bool = True
+
+    def __post_init__(self) -> None:
+        if (self.camera is None) == (self.site is None):
+            raise ConfigurationError(
+                f"a sensor sits at a camera or at a site: name one of the two; got camera={self.camera!r}, "
+                f"site={self.site!r}"
+            )
+        for name in ("camera", "site"):
+            if not isinstance(getattr(self, name), str | None):
+                raise ConfigurationError(f"{name} is a name, got {getattr(self, name)!r}")
+        if self.view_deg is not None:
+            self.view_deg = positive("view_deg", self.view_deg, "degrees")
+        if self.range_m is not None:
+            self.range_m = positive("range_m", self.range_m, "m")
+        self.dropout = non_negative("dropout", self.dropout, "probability per step")
+        if self.dropout >= 1.0:
+            raise ConfigurationError(
+                f"dropout is a probability below 1: nothing would ever be measured at {self.dropout}"
+            )
+        if self.occluder_groups is not None:
+            self.occluder_groups = _groups(self.occluder_groups)
+        if self.position_std is None and self.velocity_std is None:
+            raise ConfigurationError("the sensor measures nothing: give position_std, velocity_std or both")
+        if not isinstance(self.lever_arm, bool | np.bool_):
+            raise ConfigurationError(f"lever_arm is True or False, got {self.lever_arm!r}")
+        self.lever_arm = bool(self.lever_arm)
+        for name in ("position_std", "velocity_std"):
+            setattr(self, name, plain_numbers(getattr(self, name)))
+
+    def matrices(self, coordinates: int) -> tuple[Array, Array]:
+        """C (m, 2d) and the noise covariance R (m, m) for states (position, velocity) of d coordinates.
+
+        Raises:
+            ConfigurationError: A covariance of the wrong shape, not symmetric, or singular.
+        """
+        rows, blocks = [], []
+        state = np.eye(2 * coordinates)
+        parts = {"position_std": state[:coordinates], "velocity_std": state[coordinates:]}
+        for name, part in parts.items():
+            given = getattr(self, name)
+            if given is not None:
+                rows.append(part)
+                blocks.append(_noise(name, given, coordinates))
+        noise = np.zeros((sum(b.shape[0] for b in blocks),) * 2)
+        at = 0
+        for block in blocks:
+            noise[at : at + coordinates, at : at + coordinates] = block
+            at += coordinates
+        return np.concatenate(rows), noise
+
+    def data(self) -> dict[str, Any]:
+        """Plain data, from which it can be made again."""
+        return asdict(self)
+
+
+def _groups(given: Any) -> list[int]:
+    groups = list(given) if isinstance(given, Sequence | np.ndarray) else []
+    if not groups or not all(isinstance(g, int | np.integer) and 0 <= g < mujoco.mjNGROUP for g in groups):
+        raise ConfigurationError(
+            f"occluder_groups is a list of geom groups, 0 to {mujoco.mjNGROUP - 1}, or None for all; got {given!r}"
+        )
+    return [int(g) for g in groups]
+
+
+def _noise(name: str, given: Any, coordinates: int) -> Array:
+    if not isinstance(given, list):
+        return positive(name, given, "m or m/s") ** 2 * np.eye(coordinates)
+    return checked_noise(f"{name} as a covariance", given, coordinates)
+
+
+def sensor_from(given: Any) -> Sensor:
+    """A sensor itself, the name of a camera, or the dict of a recorded one."""
+    if isinstance(given, Sensor):
+        return given
+    if isinstance(given, str):
+        return Sensor(camera=given)
+    if isinstance(given, dict):
+        known = Sensor.__dataclass_fields__
+        for key in given:
+            if key not in known:
+                raise ConfigurationError(f"a sensor has no {key!r}; it has {', '.join(known)}")
+        return Sensor(**given)
+    raise ConfigurationError(f"sensor is a Sensor(...), or the name of a camera of the model; got {given!r}")

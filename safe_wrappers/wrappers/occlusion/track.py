@@ -1,0 +1,136 @@
+"""Track: something that moves, and what is known of how it moves."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.control.estimation.covariance import checked_covariance
+from safe_wrappers.control.estimation.tracks import Motion
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import non_negative, positive
+from safe_wrappers.wrappers.common.plain_numbers import plain_numbers
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Track:
+    """What an `OcclusionPenalty` follows: bodies of the model, or points that the env publishes.
+
+    Its motion is a model, and everything that is promised later rests on it: acceleration is white noise of a known
+    intensity, and the velocity either wanders freely or goes back to a mean.
+
+    At a reset the track starts from an initial fix of the declared accuracy: the true position plus noise of
+    `start_position_std`, and the mean velocity, which is known to `start_velocity_std`.
+
+    Args:
+        bodies: Name of a body, or a pattern ("car*", "car[012]") for every body that fits, in the model's order.
+        published: Instead of bodies: name of an attribute of the env, positions of shape (k, 2) or (k, 3), m.
+        acceleration_noise: Intensity q of the white acceleration noise, m^2/s^3: after t seconds unseen it adds
+            q t^3 / 3 to the variance of a position. A number, one per coordinate (0 along a coordinate that does not
+            wander), or a matrix, d x d. It has no default: a guess would be a promise.
+        reversion_s: Time constant with which the velocity goes back to `mean_velocity`, s; None: it does not.
+        mean_velocity: m/s, one per coordinate; zeros if left out. What the velocity is taken for at a reset, too.
+        start_position_std: m, a number or one per coordinate.
+        start_velocity_std: m/s, a number or one per coordinate.
+
+    Raises:
+        ConfigurationError: Bodies and published points at once, or neither; numbers that are negative or not finite;
+            a matrix that is not symmetric and positive semidefinite.
+    """
+
+    bodies: str | None = None
+    published: str | None = None
+    acceleration_noise: Any = None
+    reversion_s: float | None = None
+    mean_velocity: Sequence[float] | None = None
+    start_position_std: Any = 0.1
+    start_velocity_std: Any = 0.5
+
+    def __post_init__(self) -> None:
+        if (self.bodies is None) == (self.published is None):
+            raise ConfigurationError(
+                "a track follows bodies of the model, by name or pattern, or positions that the env publishes; got "
+                f"bodies={self.bodies!r}, published={self.published!r}"
+            )
+        name = self.published if self.bodies is None else self.bodies
+        if not isinstance(name, str):
+            raise ConfigurationError(f"bodies and published are names, got {name!r}")
+        if self.acceleration_noise is None:
+            raise ConfigurationError(
+                "say how it moves: acceleration_noise, the intensity of its white acceleration noise in m^2/s^3 (0: "
+                "it keeps its velocity exactly)"
+            )
+        if self.reversion_s is not None:
+            self.reversion_s = positive("reversion_s", self.reversion_s, "s")
+        for name in ("acceleration_noise", "mean_velocity", "start_position_std", "start_velocity_std"):
+            setattr(self, name, plain_numbers(getattr(self, name)))
+
+    def motion(self, coordinates: int) -> Motion:
+        """The motion model for d coordinates.
+
+        Raises:
+            ConfigurationError: Numbers of the wrong count or range.
+        """
+        mean = self.mean_velocity
+        return Motion(
+            _intensity(self.acceleration_noise, coordinates),
+            np.inf if self.reversion_s is None else self.reversion_s,
+            np.zeros(coordinates) if mean is None else _each("mean_velocity", mean, coordinates, "m/s"),
+        )
+
+    def start(self, coordinates: int) -> tuple[Array, Array]:
+        """Standard deviations of position and velocity at a reset, shapes (d,)."""
+        deviations = []
+        for name, unit in (("start_position_std", "m"), ("start_velocity_std", "m/s")):
+            values = _each(name, getattr(self, name), coordinates, unit)
+            for value in values:
+                non_negative(name, value, unit)
+            deviations.append(values)
+        return deviations[0], deviations[1]
+
+    def data(self) -> dict[str, Any]:
+        """Plain data, from which it can be made again."""
+        return asdict(self)
+
+
+def _each(name: str, given: Any, coordinates: int, unit: str) -> Array:
+    """One number per coordinate."""
+    try:
+        values = np.asarray(given, dtype=np.float64)
+        values = np.array(np.broadcast_to(values, coordinates))
+    except (TypeError, ValueError):
+        raise ConfigurationError(
+            f"{name} is a number or {coordinates} numbers (one per coordinate) in {unit}, got {given!r}"
+        ) from None
+    if not np.isfinite(values).all():
+        raise ConfigurationError(f"{name} must be finite, in {unit}, got {given!r}")
+    return values
+
+
+def _intensity(given: Any, coordinates: int) -> Array:
+    if isinstance(given, list) and any(isinstance(row, list) for row in given):
+        return checked_covariance("acceleration_noise", given, coordinates)
+    values = _each("acceleration_noise", given, coordinates, "m^2/s^3")
+    for value in values:
+        non_negative("acceleration_noise", value, "m^2/s^3")
+    return np.diag(values)
+
+
+def track_from(given: Any) -> Track:
+    """A track itself, or rebuilt from the dict of a recorded one."""
+    if isinstance(given, Track):
+        return given
+    if isinstance(given, dict):
+        known = Track.__dataclass_fields__
+        for key in given:
+            if key not in known:
+                raise ConfigurationError(f"a track has no {key!r}; it has {', '.join(known)}")
+        return Track(**given)
+    raise ConfigurationError(
+        f"expected a Track, such as sw.Track({given!r}, acceleration_noise=0.1) with the intensity in m^2/s^3: a "
+        f"name alone does not say how it moves; got {given!r}"
+    )

@@ -1,0 +1,157 @@
+"""Link: one direction of a network, with a delay, jitter, loss and outages; and what is on its way in it."""
+
+import heapq
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Final, NamedTuple
+
+import gymnasium as gym
+
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.filter.constraint import non_negative, positive
+from safe_wrappers.wrappers.common.wrapper_rng import OwnRandom
+from safe_wrappers.wrappers.faults.parameters import probability
+from safe_wrappers.wrappers.faults.spells import Spells
+
+LONGEST_DELAY_S: Final = 10.0
+"""What a line remembers, s."""
+
+
+@dataclass(frozen=True)
+class Link:
+    """What a network does to packets in one direction; plain data.
+
+    Every packet takes `delay_s` and a random time between 0 and `jitter_s` more, drawn for each by itself. A packet
+    is lost with the probability `loss`, and surely if it is sent during an outage.
+
+    Args:
+        delay_s: Shortest time that a packet takes, s.
+        jitter_s: How much longer it may take, s, uniform.
+        loss: Probability that a packet is lost, from 0 to 1.
+        in_order: Whether a packet waits for those that were sent before it and are not lost, as in a stream. False:
+            it may overtake them, as datagrams do.
+        outage_between_s: Mean time from the end of an outage to the start of the next, s; None: there are none.
+        outage_length_s: Mean length of an outage, s.
+
+    Raises:
+        ConfigurationError: A negative or too long time, a probability outside of 0 to 1, half of an outage.
+    """
+
+    delay_s: float = 0.0
+    jitter_s: float = 0.0
+    loss: float = 0.0
+    in_order: bool = True
+    outage_between_s: float | None = None
+    outage_length_s: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("delay_s", "jitter_s"):
+            object.__setattr__(self, name, non_negative(name, getattr(self, name), "s"))
+        if self.longest_s > LONGEST_DELAY_S:
+            raise ConfigurationError(
+                f"a line remembers packets for {LONGEST_DELAY_S:g} s; got delays of up to {self.longest_s:g} s"
+            )
+        object.__setattr__(self, "loss", probability("loss", self.loss))
+        if not isinstance(self.in_order, bool):
+            raise ConfigurationError(f"in_order is True or False, got {self.in_order!r}")
+        if (self.outage_between_s is None) != (self.outage_length_s is None):
+            raise ConfigurationError(
+                "an outage needs both outage_between_s and outage_length_s, in s; got "
+                f"{self.outage_between_s!r} and {self.outage_length_s!r}"
+            )
+        for name in ("outage_between_s", "outage_length_s"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, positive(name, getattr(self, name), "s"))
+
+    @property
+    def longest_s(self) -> float:
+        """The longest time that a packet may take by itself, s."""
+        return self.delay_s + self.jitter_s
+
+
+def link_from(name: str, given: Any) -> Link:
+    """A link itself, from the dict of one, or with that number of seconds as its delay.
+
+    Raises:
+        ConfigurationError: None of these.
+        UnknownNameError: A key that no link has.
+    """
+    if isinstance(given, Link):
+        return given
+    if isinstance(given, Mapping):
+        known = [field.name for field in fields(Link)]
+        for key in given:
+            if key not in known:
+                raise UnknownNameError(f"{name} has no {key!r}; it has {', '.join(known)}")
+        return Link(**given)
+    if isinstance(given, int | float) and not isinstance(given, bool):
+        return Link(delay_s=given)
+    raise ConfigurationError(f"{name} is a Link, the dict of one, or a delay in s; got {given!r}")
+
+
+def link_data(link: Link) -> dict[str, Any]:
+    """The plain dict of a link."""
+    return asdict(link)
+
+
+class Packet(NamedTuple):
+    """Something on its way; packets compare by their numbers.
+
+    Attributes:
+        sequence: Counts the packets of a line, from 0.
+        load: What it carries.
+    """
+
+    sequence: int
+    load: Any
+
+
+class Line:
+    """The packets of one direction.
+
+    Args:
+        link: What happens to them.
+        stream: A name, which keeps its random numbers apart from those of other lines.
+        slack_s: Times that are closer are the same.
+    """
+
+    def __init__(self, link: Link, stream: str, slack_s: float) -> None:
+        self._link, self._slack_s = link, slack_s
+        self._random = OwnRandom(stream)
+        outage = link.outage_between_s, link.outage_length_s
+        self._outages = None if outage[0] is None or outage[1] is None else Spells(outage[0], outage[1])
+
+    def reset(self, env: gym.Env[Any, Any], seed: int | None) -> None:
+        """Nothing is on its way; call it after the env's own reset."""
+        self._random.reset(env, seed)
+        if self._outages is not None:
+            self._outages.begin(self._random)
+        self._coming: list[tuple[float, int, Any]] = []
+        self._sent = 0
+        self._latest_s = -math.inf
+
+    def send(self, load: Any, now_s: float) -> tuple[int, bool]:
+        """Send something; its number, and whether it gets lost."""
+        link, sequence = self._link, self._sent
+        self._sent += 1
+        # As many numbers for a lost packet as for one that is not: what follows stays the same.
+        jitter_s = self._random.draw.uniform(0.0, link.jitter_s) if link.jitter_s else 0.0
+        lost = bool(link.loss and self._random.draw.random() < link.loss)
+        if self._outages is not None:
+            lost |= self._outages.bad(now_s, self._random)
+        if lost:
+            return sequence, True
+        due_s = now_s + link.delay_s + jitter_s
+        if link.in_order:
+            due_s = self._latest_s = max(due_s, self._latest_s)
+        heapq.heappush(self._coming, (due_s, sequence, load))
+        return sequence, False
+
+    def arrived(self, now_s: float) -> list[Packet]:
+        """What has arrived since it was last asked, in the order of arrival."""
+        found = []
+        while self._coming and self._coming[0][0] <= now_s + self._slack_s:
+            _, sequence, load = heapq.heappop(self._coming)
+            found.append(Packet(sequence, load))
+        return found

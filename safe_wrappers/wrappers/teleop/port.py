@@ -1,0 +1,159 @@
+"""TeleopPort: where a channel meets the machine: which entries of action and observation are flow and effort."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.filter.constraint import non_negative
+from safe_wrappers.plants.plant import wrappers_of
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TeleopPort:
+    """A pair of effort and flow whose product is power; plain data.
+
+    Args:
+        flow: Entries of the action, in m/s (or rad/s).
+        effort: Entries of the observation, in N (or N m), in the same order: with which the command pushes the
+            machine, at the present state and the last command.
+        feedthrough: By how much the effort changes at once per change of the flow, N s/m: a damper between command
+            and machine.
+
+    Raises:
+        ConfigurationError: No entries, as many of the one as not of the other, or one twice.
+    """
+
+    flow: Sequence[int]
+    effort: Sequence[int]
+    feedthrough: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("flow", "effort"):
+            given = getattr(self, name)
+            whole = isinstance(given, Sequence) and all(
+                isinstance(i, int | np.integer) and not isinstance(i, bool) and i >= 0 for i in given
+            )
+            if not whole or not given or len(set(given)) != len(given):
+                raise ConfigurationError(
+                    f"{name} of a port is a list of indices, each at least 0 and once; got {given!r}"
+                )
+            object.__setattr__(self, name, [int(i) for i in given])
+        if len(self.flow) != len(self.effort):
+            raise ConfigurationError(
+                f"a port has as many efforts as flows; got flow {list(self.flow)} and effort {list(self.effort)}"
+            )
+        object.__setattr__(self, "feedthrough", non_negative("feedthrough", self.feedthrough, "N s/m"))
+
+
+def port_from(given: Any, env: gym.Env[Any, Any]) -> TeleopPort | None:
+    """A port itself, from the dict of one, or what the env publishes; None if it publishes none.
+
+    Raises:
+        ConfigurationError: Neither of these, or indices that the spaces do not have.
+        UnknownNameError: A key that no port has.
+    """
+    if given is None:
+        if not env.has_wrapper_attr("port_flow"):
+            return None
+        port = TeleopPort(
+            list(env.get_wrapper_attr("port_flow")),
+            list(env.get_wrapper_attr("port_effort_observed")),
+            env.get_wrapper_attr("port_feedthrough"),
+        )
+    elif isinstance(given, TeleopPort):
+        port = given
+    elif isinstance(given, Mapping):
+        known = [field.name for field in fields(TeleopPort)]
+        for key in given:
+            if key not in known:
+                raise UnknownNameError(f"a port has no {key!r}; it has {', '.join(known)}")
+        if not {"flow", "effort"} <= given.keys():
+            raise ConfigurationError(f"a port needs flow and effort, lists of indices; got {given!r}")
+        port = TeleopPort(**given)
+    else:
+        raise ConfigurationError(f"port is a TeleopPort or the dict of one; got {given!r}")
+    _check_spaces(port, env)
+    return port
+
+
+def port_data(given: Any) -> Any:
+    """The plain dict of a port."""
+    return asdict(given) if isinstance(given, TeleopPort) else given
+
+
+def _check_spaces(port: TeleopPort, env: gym.Env[Any, Any]) -> None:
+    action, observation = env.action_space, env.observation_space
+    box = isinstance(observation, gym.spaces.Box) and len(observation.shape) == 1
+    if not box or not np.issubdtype(observation.dtype or np.int64, np.floating):
+        raise ConfigurationError(
+            f"a port needs observations of one axis and floating numbers to find its effort in, got {observation}"
+        )
+    for name, indices, space in (("flow", port.flow, action), ("effort", port.effort, observation)):
+        assert space.shape is not None
+        if max(indices) >= space.shape[0]:
+            raise ConfigurationError(
+                f"{name} of the port is entry {max(indices)}, but there are only {space.shape[0]}: {space}"
+            )
+
+
+class PortReading:
+    """What a port's effort was and will be, as far as the env says.
+
+    Args:
+        env: What is wrapped.
+        port: Its port.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], port: TeleopPort) -> None:
+        self._env, self._port = env, port
+        owner = next((e for e in (*wrappers_of(env), env.unwrapped) if hasattr(e, "port_effort_acted")), None)
+        self._publishes = owner is not None
+
+    def reset(self, observation: Array) -> None:
+        """At rest, the effort as observed."""
+        self._last_flow = np.zeros(len(self._port.flow))
+        self.effort = self.of(observation)
+
+    @property
+    def feedthrough(self) -> float:
+        """N s/m."""
+        return self._port.feedthrough
+
+    effort: Array
+    """At the present state and the last command, N."""
+
+    def effort_at(self, flow: Array) -> Array:
+        """What the effort would be in the coming step with another flow, N."""
+        return self.effort + self._port.feedthrough * (flow - self._last_flow)
+
+    @property
+    def base(self) -> Array:
+        """The same without flow, N."""
+        return self.effort - self._port.feedthrough * self._last_flow
+
+    def acted(self, flow: Array, observation: Array) -> Array:
+        """The effort during the step that was made with this flow: as the env publishes it, else as foreseen, N."""
+        if self._publishes:
+            acted = np.array(self._env.get_wrapper_attr("port_effort_acted"), dtype=np.float64)
+        else:
+            acted = self.effort_at(flow)
+        self._last_flow = flow
+        self.effort = self.of(observation)
+        return acted
+
+    def of(self, observation: Array) -> Array:
+        """The effort that an observation shows, N."""
+        return np.asarray(observation[self._port.effort], dtype=np.float64)
+
+    def replaced(self, observation: Array, effort: Array) -> Array:
+        """An observation that shows another effort."""
+        shown = np.array(observation)
+        shown[self._port.effort] = effort
+        return shown
