@@ -89,17 +89,16 @@ def margin_reading(ball: bool) -> Maker:
         constraints: list[Any] = recipe(env, keep_out=obstacles(env) if ball else [])
         plant = sw.DisplacementPlant()
         plant.bind(env)
-        for constraint in constraints:
-            constraint.bind(plant)
+        bound = [constraint.bind(plant) for constraint in constraints]
         state: dict[str, Any] = {"way": rng.normal(size=3)}
 
         def left(action: Action) -> float:
-            return float(min(c.slacks(plant, action).min() for c in constraints))
+            return float(min(c.slacks(action).min() for c in bound))
 
         def act() -> Action:
             plant.observe()
-            for constraint in constraints:
-                constraint.reset()  # nobody says when an episode begins
+            for c in bound:
+                c.observe(c.start())  # nobody says when an episode begins
             if rng.random() < 0.04:
                 state["way"] = rng.normal(size=3)
             fingers = rng.choice([-1.0, 1.0])

@@ -29,6 +29,10 @@ CBF_UNSAFE: Final = "cbf/unsafe"
 CBF_REFUSED: Final = "cbf/refused"
 """bool array, one per constraint in the order of the filter's `constraint_names`: it did not admit the boxed
 proposal. More than one may; all False when nothing was changed, or when the state or the proposal was not finite."""
+CBF_STAGE: Final = "cbf/stage"
+"""int64: which stage of the search found the executed action, a `safe_wrappers.filter.search.Stage`: 0 the proposal
+itself, 1 projection on rows, 2 a constraint's candidate, 3 projection on rows linearised anew, 4 an overshoot, 5 a
+blend, 6 a backup control, 7 the fallback, 8 the least violation."""
 EXECUTED_ACTION: Final = "executed_action"
 """array: what the env was really given."""
 PROPOSED_ACTION: Final = "proposed_action"

@@ -24,8 +24,9 @@ from safe_wrappers.constraints.limits.workspace import Workspace
 from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacle_data
 from safe_wrappers.constraints.track_permission import TrackPermission
 from safe_wrappers.constraints.traction import Traction
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.filter.constraint import Constraint
+from safe_wrappers.filter.duck_typed import duck_typed
 
 KINDS: dict[str, Callable[..., Constraint]] = {
     "Barrier": Barrier,
@@ -52,11 +53,7 @@ KINDS: dict[str, Callable[..., Constraint]] = {
 def constraint_from(data: Any) -> Constraint:
     """A constraint itself, or rebuilt from `constraint_data`."""
     if not isinstance(data, dict):
-        if isinstance(data, type) or not callable(getattr(data, "rows", None)):
-            raise ConfigurationError(
-                f"expected a constraint (an object with rows(plant)) or the dict of one, got {data!r}"
-            )
-        return data  # type: ignore[no-any-return]
+        return data if isinstance(data, Constraint) else duck_typed(data)
     kind = data.get("kind", "")
     if kind not in KINDS:
         raise UnknownNameError(f"unknown constraint kind {kind!r}; the kinds are {', '.join(KINDS)}")

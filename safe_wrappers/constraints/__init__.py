@@ -20,12 +20,11 @@ from safe_wrappers.constraints.obstacles.obstacles import Box, Disc, Discs, Plan
 from safe_wrappers.constraints.obstacles.tracked_discs import TrackedDiscs
 from safe_wrappers.constraints.track_permission import TrackPermission
 from safe_wrappers.constraints.traction import Traction
-from safe_wrappers.filter.constraint import CertifyingConstraint, Constraint, HalfSpaces
+from safe_wrappers.filter.constraint import Constraint, HalfSpaces
 
 __all__ = [
     "Barrier",
     "Box",
-    "CertifyingConstraint",
     "Clearance",
     "CoastingClearance",
     "Constraint",

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,8 +15,16 @@ from safe_wrappers.control.filtering.cbf import (
     relative_degree,
 )
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import HalfSpaces, Promise, non_negative, positive
-from safe_wrappers.filter.linearize import cut
+from safe_wrappers.filter.constraint import (
+    BoundConstraint,
+    Constraint,
+    HalfSpaces,
+    Memory,
+    Promise,
+    non_negative,
+    positive,
+)
+from safe_wrappers.filter.linearize import linearize
 from safe_wrappers.filter.projection import keeps_rows
 from safe_wrappers.plants.plant import Plant
 
@@ -31,7 +38,7 @@ more closely: differences leave as much."""
 
 
 @dataclass
-class Barrier:
+class Barrier(Constraint):
     """Keep `h(x) >= 0` by `Lf h + Lg h u >= -alpha (h - margin) + curvature * hold / 2`.
 
     What it promises: in continuous time the set `h >= margin` is invariant while the row is feasible. A held
@@ -63,7 +70,6 @@ class Barrier:
     curvature: float = 0.0
 
     promise: Promise = field(default="best effort", init=False)
-    needs_acceleration: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if not callable(self.h):
@@ -83,22 +89,37 @@ class Barrier:
         self.margin = non_negative("margin", self.margin, "units of h")
         self.curvature = non_negative("curvature", self.curvature, "units of h per s^2")
 
-    def bind(self, plant: Plant) -> None:
-        """Refuse a decay that outruns the hold interval."""
-        if not callable(self.alpha) and self.alpha * plant.hold_s > 1.0:
+    def bind(self, plant: Plant) -> "BoundBarrier":
+        """On a plant."""
+        return BoundBarrier(self, plant)
+
+
+class BoundBarrier(BoundConstraint):
+    """Barrier on a plant."""
+
+    predicts: bool = True
+    spec: Barrier
+
+    def __init__(self, spec: Barrier, plant: Plant) -> None:
+        plant.require_acceleration("Barrier")
+        super().__init__(spec, plant)
+        if not callable(self.spec.alpha) and self.spec.alpha * self.plant.hold_s > 1.0:
             raise ConfigurationError(
-                f"alpha = {self.alpha}/s lets h cross zero within one hold of {plant.hold_s} s; "
-                f"alpha must be at most 1/hold = {1.0 / plant.hold_s:g}/s"
+                f"alpha = {self.spec.alpha}/s lets h cross zero within one hold of {self.plant.hold_s} s; "
+                f"alpha must be at most 1/hold = {1.0 / self.plant.hold_s:g}/s"
             )
         self._degree_checked = False
-        self._stamp: int | None = None
 
-    def value(self, plant: Plant) -> Array:
+    def observe(self, memory: Memory) -> None:
+        """Nothing is known of this state yet."""
+        self._row: HalfSpaces | None = None
+
+    def value(self) -> Array:
         """H at the plant's state, shape (1,)."""
-        return np.array([self._height(plant.state)])
+        return np.array([self._height(self.plant.state)])
 
     def _height(self, x: Array) -> float:
-        value = self.h(x)
+        value = self.spec.h(x)
         if isinstance(value, float):  # np.float64 is one: the common case
             return float(value)
         h = np.asarray(value, dtype=np.float64)
@@ -106,82 +127,79 @@ class Barrier:
             raise ConfigurationError(f"h must return one number, got an array of shape {h.shape}")
         return float(h.reshape(()))
 
-    def rows(self, plant: Plant) -> HalfSpaces:
+    def rows(self) -> HalfSpaces:
         """The barrier condition as one half-space."""
-        stamp = getattr(plant, "stamp", None)
-        if stamp is None or stamp != self._stamp:
-            self._stamp, self._row = stamp, self._condition(plant)
+        if self._row is None:
+            self._row = self._condition()
         return self._row
 
-    def _condition(self, plant: Plant) -> HalfSpaces:
-        x = plant.state
+    def _condition(self) -> HalfSpaces:
+        x = self.plant.state
         self._now = self._height(x)
         gradient = self._gradient(x)
         self._rounding = _ROUNDING * (abs(self._now) + float(np.abs(gradient).max(initial=0.0)))
-        drift, effect = lie_derivatives(gradient, plant.f, plant.g)
-        room = self._now - self.margin
-        decay = self.alpha(room) if callable(self.alpha) else linear_decay(room, self.alpha)
-        normal, offset = cbf_rows(drift, effect, decay - 0.5 * self.curvature * plant.hold_s)
+        drift, effect = lie_derivatives(gradient, self.plant.f, self.plant.g)
+        room = self._now - self.spec.margin
+        decay = self.spec.alpha(room) if callable(self.spec.alpha) else linear_decay(room, self.spec.alpha)
+        normal, offset = cbf_rows(drift, effect, decay - 0.5 * self.spec.curvature * self.plant.hold_s)
         return HalfSpaces(normal[None, :], offset.reshape(1))
 
-    def admits(self, plant: Plant, control: Array) -> bool:
-        """Whether the row holds and prediction keeps h through the hold (from outside: does not lose more)."""
-        row = self.rows(plant)
-        excess = float(row.normals[0] @ control - row.offsets[0])
-        if not excess <= 0.0 and not keeps_rows(control, row.normals, row.offsets, plant.lower, plant.upper):
-            return False
-        path = getattr(plant, "path", None)
-        if path is None:
-            return True
-        floor = min(self._now, 0.0) - self._rounding
-        return all(self._height(x) >= floor for x in path(control))
+    def slack(self, control: Array) -> float:
+        """Not measured: whether a control is admitted is all that is known."""
+        return 0.0 if self.admits(control) else -np.inf
 
-    def cut(self, plant: Plant, control: Array) -> HalfSpaces:
+    def admits(self, control: Array) -> bool:
+        """Whether the row holds and prediction keeps h through the hold (from outside: does not lose more)."""
+        row = self.rows()
+        excess = float(row.normals[0] @ control - row.offsets[0])
+        if not excess <= 0.0 and not keeps_rows(
+            control, row.normals, row.offsets, self.plant.lower, self.plant.upper
+        ):
+            return False
+        floor = min(self._now, 0.0) - self._rounding
+        return all(self._height(x) >= floor for x in self.plant.path(control))
+
+    def linearize(self, control: Array) -> HalfSpaces:
         """The predicted h, linearised about a refused control."""
-        self.rows(plant)
-        path = getattr(plant, "path", None)
-        if path is None:
-            return HalfSpaces.none(control.size)
+        self.rows()
         floor = min(self._now, 0.0)
 
         def slacks(u: Array) -> Array:
-            heights = [self._height(x) - floor for x in path(u)]
+            heights = [self._height(x) - floor for x in self.plant.path(u)]
             return np.array(heights) if len(heights) <= 3 else np.array([heights[-1], min(heights)])
 
-        return cut(slacks, control, plant.lower, plant.upper)
+        return linearize(slacks, control, self.plant.lower, self.plant.upper)
 
     def _gradient(self, x: Array) -> Array:
-        if self.gradient is None:
+        if self.spec.gradient is None:
             return numerical_gradient(self._height, x)
-        dh = np.asarray(self.gradient(x), dtype=np.float64)
+        dh = np.asarray(self.spec.gradient(x), dtype=np.float64)
         if dh.shape != x.shape:
             raise ConfigurationError(f"gradient must return the shape of the state {x.shape}, got {dh.shape}")
         return dh
 
-    def check(self, plant: Plant) -> None:
+    def check(self) -> None:
         """Refuse an h on which no control acts at first order, at the first state or anywhere near."""
         if self._degree_checked:
             return
-        x = plant.state
+        x = self.plant.state
         self._degree_checked = True
         if not np.isfinite(x).all() or not np.isfinite(self._height(x)):
             raise ConfigurationError(
                 f"the first state must be finite and h of it too; got {x}, h = {self._height(x)}"
             )
-        if self.gradient is not None:
+        if self.spec.gradient is not None:
             given, differences = self._gradient(x), numerical_gradient(self._height, x)
             size = abs(self._height(x)) + np.abs(differences).max()
             if np.abs(given - differences).max() > 1e-2 * size:
                 raise ConfigurationError(
                     f"gradient does not fit h: at the first state it gives {given}, differences give {differences}"
                 )
-        if acts(self._gradient(x), plant.g, self._height(x), _NO_EFFECT):
+        if acts(self._gradient(x), self.plant.g, self._height(x), _NO_EFFECT):
             return
-        drift = getattr(plant, "drift", lambda _: plant.f)
-        matrix = getattr(plant, "effect", lambda _: plant.g)
         # The gradient may vanish at this very state (h = 1 - v^2 at rest): look around it before refusing.
         spread = np.random.default_rng(0).normal(size=(8, x.size)) * 0.1
-        degrees = [relative_degree(self._height, drift, matrix, x + s) for s in spread]
+        degrees = [relative_degree(self._height, self.plant.drift, self.plant.effect, x + s) for s in spread]
         if 1 not in degrees:
             higher = min((d for d in degrees if d is not None), default=None)
             found = f"its relative degree is {higher}" if higher else "no control acts on it"

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +11,17 @@ from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
 from safe_wrappers.constraints.obstacles.obstacles import Nearest
 from safe_wrappers.control.backup.stopping import sampled_acceleration_limit, sampled_inset
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import HalfSpaces, Promise, non_negative, positive
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.filter.constraint import (
+    BoundConstraint,
+    Constraint,
+    HalfSpaces,
+    Memory,
+    Promise,
+    non_negative,
+    positive,
+)
 from safe_wrappers.plants.plant import Plant
+from safe_wrappers.plants.queries.points import Points
 
 Array = NDArray[np.float64]
 
@@ -30,7 +38,7 @@ class _Seen(NamedTuple):
 
 
 @dataclass
-class Clearance:
+class Clearance(Constraint):
     """Keep `distance - (stopping distance) >= 0` from every point to every obstacle, also between samples.
 
     The row bounds the acceleration towards the obstacle that may be held for a control interval, so that full
@@ -71,7 +79,6 @@ class Clearance:
     state_error: float = 0.0
 
     promise: Promise = field(default="best effort", init=False)
-    needs_acceleration: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         self.obstacles = obstacles_from(self.obstacles)
@@ -89,89 +96,74 @@ class Clearance:
                 f"{self.position} and {self.velocity}"
             )
 
-    def bind(self, plant: Plant) -> None:
-        """Resolve the points on the plant."""
-        self._stamp: int | None = None
-        if isinstance(plant, MujocoPlant):
-            if not (self.bodies or self.sites or self.geoms):
-                raise ConfigurationError(
-                    "name the bodies, sites or geoms to keep clear; the model has the bodies "
-                    + ", ".join(plant.names("body"))
-                )
-            for name in self.bodies:
-                plant.named("body", name)
-            for name in self.sites:
-                plant.named("site", name)
-            for name in self.geoms:
-                plant.named("geom", name)
-        elif not self.position:
-            raise ConfigurationError(
-                "on an AnalyticPlant say where the point is in the state: position=[0, 1], velocity=[2, 3]"
-            )
+    def bind(self, plant: Plant) -> "BoundClearance":
+        """On a plant."""
+        return BoundClearance(self, plant)
 
-    def _motions(self, plant: Plant) -> list[tuple[Array, Array]]:
-        """Position and velocity of each point."""
-        if isinstance(plant, MujocoPlant):
-            named = {"body": self.bodies, "site": self.sites, "geom": self.geoms}
-            return [plant.motion(kind, name) for kind, names in named.items() for name in names]
-        return [(plant.state[self.position], plant.state[self.velocity])]
 
-    def _points(self, plant: Plant) -> list[tuple[Array, Array, Array, Array]]:
-        """Position, velocity, acceleration drift and control matrix of each point."""
-        if isinstance(plant, MujocoPlant):
-            named = {"body": self.bodies, "site": self.sites, "geom": self.geoms}
-            return [plant.point(kind, name) for kind, names in named.items() for name in names]
-        x = plant.state
-        p, v = self.position, self.velocity
-        return [(x[p], x[v], plant.f[v], plant.g[v])]
+class BoundClearance(BoundConstraint):
+    """Clearance on a plant."""
 
-    def _gaps(self, plant: Plant, p: Array, v: Array) -> tuple[Nearest, Array, Array, Array]:
+    spec: Clearance
+
+    def __init__(self, spec: Clearance, plant: Plant) -> None:
+        plant.require_acceleration("Clearance")
+        super().__init__(spec, plant)
+        self._points = Points(plant, spec.bodies, spec.sites, spec.geoms, spec.position, spec.velocity)
+
+    def observe(self, memory: Memory) -> None:
+        """Nothing is seen of this state yet."""
+        self._observed: list[_Seen] | None = None
+
+    def _gaps(self, p: Array, v: Array) -> tuple[Nearest, Array, Array, Array]:
         """Surfaces around a point: clearance, approach speed and relative velocity of each."""
-        found = [o.nearest(p, plant) for o in self.obstacles]
+        found = [o.nearest(p, self.plant) for o in self.spec.obstacles]
         near = Nearest(*(np.concatenate(part) for part in zip(*found, strict=True)))
         relative = v - near.velocity
         # The point is predicted over the delay; what comes to meet it is too (a lower bound: distance is convex).
-        met = plant.delay_s * np.einsum("ij,ij->i", near.normal, near.velocity)
-        clearance = near.distance - met - self.radius
+        met = self.plant.delay_s * np.einsum("ij,ij->i", near.normal, near.velocity)
+        clearance = near.distance - met - self.spec.radius
         return near, clearance, -np.einsum("ij,ij->i", near.normal, relative), relative
 
-    def _look(self, plant: Plant) -> list[_Seen]:
+    def _seen(self) -> list[_Seen]:
         """What every point sees, once per observation."""
-        stamp = getattr(plant, "stamp", None)
-        if stamp is None or stamp != self._stamp:
-            self._stamp = stamp
-            self._seen = [
-                _Seen(*self._gaps(plant, p, v), drift, effect) for p, v, drift, effect in self._points(plant)
-            ]
-        return self._seen
+        if self._observed is None:
+            every = self._points.accelerations()
+            self._observed = [_Seen(*self._gaps(p, v), drift, effect) for p, v, drift, effect in every]
+        return self._observed
 
-    def value(self, plant: Plant) -> Array:
+    def value(self) -> Array:
         """Room left after braking, margin and state error not taken off, m, one per point and surface."""
         return np.concatenate(
-            [sampled_inset(s.clearance, s.approach, self.braking, plant.hold_s) for s in self._look(plant)]
+            [
+                sampled_inset(s.clearance, s.approach, self.spec.braking, self.plant.hold_s)
+                for s in self._seen()
+            ]
         )
 
-    def approach(self, plant: Plant) -> tuple[Array, Array]:
+    def approach(self) -> tuple[Array, Array]:
         """Clearances (m) and approach speeds (m/s, towards the obstacle), one per point and surface.
 
         As measured: neither margin, nor state error, nor the way of braking is taken off.
         """
-        # Not through `_look`: the accelerations, which only the rows need, are most of its work.
-        gaps = [self._gaps(plant, p, v) for p, v in self._motions(plant)]
+        # Not through `_seen`: the accelerations, which only the rows need, are most of its work.
+        gaps = [self._gaps(p, v) for p, v in self._points.motions()]
         return np.concatenate([g[1] for g in gaps]), np.concatenate([g[2] for g in gaps])
 
-    def rows(self, plant: Plant) -> HalfSpaces:
+    def rows(self) -> HalfSpaces:
         """One row per point and surface whose limit the actuators could exceed."""
         normals, offsets = [], []
-        strongest = np.maximum(np.abs(plant.lower), np.abs(plant.upper))
-        reserve = {"state_error": self.state_error, "margin": self.margin}
-        for near, clearance, approach, relative, drift, effect in self._look(plant):
-            limit = sampled_acceleration_limit(clearance, approach, self.braking, plant.hold_s, **reserve)
+        strongest = np.maximum(np.abs(self.plant.lower), np.abs(self.plant.upper))
+        reserve = {"state_error": self.spec.state_error, "margin": self.spec.margin}
+        for near, clearance, approach, relative, drift, effect in self._seen():
+            limit = sampled_acceleration_limit(
+                clearance, approach, self.spec.braking, self.plant.hold_s, **reserve
+            )
             # approach acceleration = -n . (drift + effect u) - |sideways speed|^2 * curvature
             bend = (
                 np.einsum("ij,ij->i", near.curvature, relative**2) - near.curvature.max(axis=1) * approach**2
             )
-            bend = np.where(clearance + self.radius > 0.0, np.maximum(bend, 0.0), 0.0)
+            bend = np.where(clearance + self.spec.radius > 0.0, np.maximum(bend, 0.0), 0.0)
             normal = -near.normal @ effect
             offset = limit + near.normal @ drift + bend
             # Negated, so that a row that is not a number is kept, and fails, instead of being left out.

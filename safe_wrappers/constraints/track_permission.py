@@ -2,21 +2,28 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import HalfSpaces, Promise, non_negative, positive
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.filter.constraint import (
+    BoundConstraint,
+    Constraint,
+    HalfSpaces,
+    Promise,
+    non_negative,
+    positive,
+)
+from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
 
 
 @dataclass
-class TrackPermission:
+class TrackPermission(Constraint):
     """While the permission of a track has expired, slow down to `creep` (rest), at least as hard as `braking`.
 
     An `OcclusionPenalty` inside the filter says which tracks may be relied on. The rows bound the speed along an axis
@@ -56,30 +63,40 @@ class TrackPermission:
                 )
             self.tracks = list(self.tracks)
 
-    def bind(self, plant: Plant) -> None:
-        """Resolve names."""
-        if not isinstance(plant, MujocoPlant):
-            raise UnsupportedEnvError("TrackPermission needs a MujocoPlant: it brakes a body of its model")
-        plant.named("body", self.body)
-        names = list(plant.attribute("track_names"))
-        chosen = names if self.tracks is None else list(self.tracks)
+    def bind(self, plant: Plant) -> "BoundTrackPermission":
+        """On a plant."""
+        return BoundTrackPermission(self, plant)
+
+
+class BoundTrackPermission(BoundConstraint):
+    """TrackPermission on a plant."""
+
+    spec: TrackPermission
+    plant: MujocoPlant
+
+    def __init__(self, spec: TrackPermission, plant: Plant) -> None:
+        machine = require_mujoco(plant, "TrackPermission needs a MujocoPlant: it brakes a body of its model")
+        super().__init__(spec, machine)
+        self.plant.named("body", self.spec.body)
+        names = list(self.plant.attribute("track_names"))
+        chosen = names if self.spec.tracks is None else list(self.spec.tracks)
         for name in chosen:
             if name not in names:
                 raise UnknownNameError(f"there is no track {name!r}; there are {', '.join(names)}")
         self._which = [names.index(name) for name in chosen]
 
-    def rows(self, plant: Any) -> HalfSpaces:
+    def rows(self) -> HalfSpaces:
         """Two rows per axis that a control acts on, while a permission has expired; else none."""
-        if bool(np.asarray(plant.attribute("permitted"))[self._which].all()):
-            return HalfSpaces.none(plant.lower.size)
-        _, v, drift, effect = plant.point("body", self.body)
+        if bool(np.asarray(self.plant.attribute("permitted"))[self._which].all()):
+            return HalfSpaces.none(self.plant.lower.size)
+        _, v, drift, effect = self.plant.point("body", self.spec.body)
         acted = np.abs(effect).max(axis=1) > 1e-12
         v, drift, effect = v[acted], drift[acted], effect[acted]
         speed = float(np.sqrt(v @ v))
-        left = max(0.0, 1.0 - self.braking * plant.hold_s / speed) if speed > 0.0 else 0.0
+        left = max(0.0, 1.0 - self.spec.braking * self.plant.hold_s / speed) if speed > 0.0 else 0.0
         # The speed in each axis at the end of the hold: what braking leaves, and a share of the room up to `creep`.
         # All axes together are then no faster than the larger of the two.
-        room = max(0.0, self.creep**2 - (left * speed) ** 2) / max(v.size, 1)
+        room = max(0.0, self.spec.creep**2 - (left * speed) ** 2) / max(v.size, 1)
         allowed = np.sqrt((left * v) ** 2 + room)
-        least, most = (-allowed - v) / plant.hold_s - drift, (allowed - v) / plant.hold_s - drift
+        least, most = (-allowed - v) / self.plant.hold_s - drift, (allowed - v) / self.plant.hold_s - drift
         return HalfSpaces(np.concatenate([effect, -effect]), np.concatenate([most, -least]))

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -12,9 +12,17 @@ from numpy.typing import NDArray
 from safe_wrappers import info as keys
 from safe_wrappers.control.vehicle.friction_estimate import FrictionEstimate
 from safe_wrappers.control.vehicle.slip import slip_ratio, slip_window
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import HalfSpaces, Promise, non_negative, positive
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import (
+    BoundConstraint,
+    Constraint,
+    HalfSpaces,
+    Memory,
+    Promise,
+    non_negative,
+    positive,
+)
+from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.driven_wheels import DrivenWheels
 
@@ -52,7 +60,7 @@ _IMPLICIT = (int(mujoco.mjtIntegrator.mjINT_IMPLICIT), int(mujoco.mjtIntegrator.
 
 
 @dataclass
-class Traction:
+class Traction(Constraint):
     """Keep the slip ratio of every driven wheel within `max_slip`, and below where its ground's curve seems to peak.
 
     The wheel's own equation says which torque takes the slip to its limit by the end of the held control step. The
@@ -121,63 +129,113 @@ class Traction:
         if self.margin >= self.max_slip:
             raise ConfigurationError(f"margin must be below max_slip = {self.max_slip}, got {self.margin}")
 
-    def bind(self, plant: Plant) -> None:
-        """Find the wheels."""
-        if not isinstance(plant, MujocoPlant):
-            raise UnsupportedEnvError("Traction needs a MujocoPlant: it reads the wheels from the model")
-        if plant.delay_s > 0.0:
+    def bind(self, plant: Plant) -> "BoundTraction":
+        """On a plant."""
+        return BoundTraction(self, plant)
+
+
+class TractionMemory(NamedTuple):
+    """What Traction remembers of an episode; arrays of shape (wheels,), before the last control.
+
+    Attributes:
+        estimate: Of the ground's friction.
+        rate: Turning rates, rad/s; None: nothing was measured.
+        time: s.
+        ground: Speeds of the ground below, m/s.
+        slip: Slip ratios along the heading.
+        across: And across it.
+        load: Forces on the ground, N.
+        most_load: The largest so far, N.
+        faster: Recent error of the predicted ground speed, upwards, m/s.
+        slower: Downwards, m/s.
+        ahead: By how much the ground speed is predicted to change, m/s.
+        traction: Force of the ground in the last control step, N.
+        present: Of the ground at its end, N.
+    """
+
+    estimate: FrictionEstimate
+    rate: Array | None
+    time: float
+    ground: Array
+    slip: Array
+    across: Array
+    load: Array
+    most_load: Array
+    faster: Array
+    slower: Array
+    ahead: Array
+    traction: Array
+    present: Array
+
+
+class BoundTraction(BoundConstraint):
+    """Traction on a plant."""
+
+    info_keys: tuple[str, ...] = (
+        keys.SLIP_RATIO,
+        keys.SLIP_LIMITED,
+        keys.SLIP_MU_ESTIMATE,
+        keys.SLIP_MU_STD,
+    )
+    spec: Traction
+    plant: MujocoPlant
+
+    def __init__(self, spec: Traction, plant: Plant) -> None:
+        hint = "Traction needs a MujocoPlant: it reads the wheels from the model"
+        super().__init__(spec, require_mujoco(plant, hint))
+        if self.plant.delay_s > 0.0:
             raise ConfigurationError(
                 f"Traction measures the ground's force from how the wheels answer, which a plant with a delay "
-                f"({plant.delay_s} s) predicts instead; use delay_s=0"
+                f"({self.plant.delay_s} s) predicts instead; use delay_s=0"
             )
-        self._wheels = DrivenWheels(plant, self.wheels)
-        self._read_constants(plant)
-        self.reset()
+        self._wheels = DrivenWheels(self.plant, self.spec.wheels)
+        self._read_constants()
 
-    def _read_constants(self, plant: MujocoPlant) -> None:
-        self._revision = plant.revision
-        self._constants = self._wheels.constants(plant)
-        options = plant.model.opt
+    def _read_constants(self) -> None:
+        self._revision = self.plant.revision
+        self._constants = self._wheels.constants(self.plant)
+        options = self.plant.model.opt
         self._response = self._constants.response(
             float(options.timestep),
-            plant.substeps,
+            self.plant.substeps,
             self._wheels.feedback,
             int(options.integrator) in _IMPLICIT,
         )
 
-    def reset(self) -> None:
-        """Forget the ground and the motion."""
-        n = len(self.wheels)
-        self._estimate = FrictionEstimate(n)
-        self._stamp: int | None = None
-        self._rows: HalfSpaces | None = None
-        self._rate: Array | None = None
-        self._time = math.nan
-        self._ground, self._slip, self._across = np.zeros(n), np.zeros(n), np.zeros(n)
-        self._faster, self._slower = np.zeros(n), np.zeros(n)
-        self._load, self._most_load = np.zeros(n), np.zeros(n)
-        self._traction, self._present = np.zeros(n), np.zeros(n)
+    def start(self) -> Memory:
+        """Nothing is known of the ground, and nothing was measured."""
+        n = len(self.spec.wheels)
+        return TractionMemory(FrictionEstimate(n), None, math.nan, *(np.zeros(n) for _ in range(10)))
 
-    def _look(self, plant: MujocoPlant) -> None:
-        """Take the state and measure what the last control step showed, once per observation."""
-        if self._stamp == plant.stamp:
-            return
-        self._stamp, self._rows = plant.stamp, None
-        if plant.revision != self._revision:
-            self._read_constants(plant)
-        rate, ground, sideways = self._wheels.motion(plant)
-        published = plant.published()
+    def executed(self, control: Array) -> Memory:
+        """What was measured, and the estimate from it."""
+        now = (self._rate, self._time, self._ground, self._slip, self._across, self._load, self._most_load)
+        return TractionMemory(
+            self._estimate, *now, self._faster, self._slower, self._ahead, self._traction, self._present
+        )
+
+    def observe(self, memory: TractionMemory) -> None:
+        """Take the state and measure what the last control step showed."""
+        self._rows: HalfSpaces | None = None
+        self._estimate = memory.estimate.copy()
+        _, self._rate, self._time, self._ground, self._slip, self._across, *rest = memory
+        self._load, self._most_load, self._faster, self._slower, *measured = rest
+        self._ahead, self._traction, self._present = measured
+        if self.plant.revision != self._revision:
+            self._read_constants()
+        rate, ground, sideways = self._wheels.motion(self.plant)
+        published = self.plant.published()
         assert published is not None  # there is no delay
-        load = self._wheels.loads(plant.attribute("model"), published)
+        load = self._wheels.loads(self.plant.attribute("model"), published)
         if not np.isfinite(rate + ground + sideways + load).all():
             self._rate = None
             return
         wheel = self._constants.radius * rate
-        slip = slip_ratio(wheel, ground, self.regularization)
-        faster = np.maximum(np.maximum(np.abs(ground), np.abs(wheel)), self.regularization)
+        slip = slip_ratio(wheel, ground, self.spec.regularization)
+        faster = np.maximum(np.maximum(np.abs(ground), np.abs(wheel)), self.spec.regularization)
         across = np.abs(sideways) / faster
-        elapsed, self._time = plant.time - self._time, plant.time
-        held = math.isclose(elapsed, plant.hold_s, rel_tol=1e-6)
+        elapsed, self._time = self.plant.time - self._time, self.plant.time
+        held = math.isclose(elapsed, self.plant.hold_s, rel_tol=1e-6)
         again = elapsed == 0.0 and bool((rate == self._rate).all())  # keeps what was measured
         if self._rate is None or not (held or again):
             # Nothing before it, or a clock that was set: no held control led from that state to this one.
@@ -191,15 +249,15 @@ class Traction:
             torque = self._wheels.torque(published)
             self._traction = self._constants.traction(self._response, self._rate, rate, torque)
             # Below the regularisation the number is no slip ratio, and says nothing about the curve.
-            self._learn(plant, ground, slip, across, load, rolls=faster > self.regularization)
+            self._learn(ground, slip, across, load, rolls=faster > self.spec.regularization)
         self._rate, self._ground, self._slip, self._across, self._load = rate, ground, slip, across, load
         at, spread = self._estimate.peak_slip
-        limit = np.minimum(self.max_slip, at - _CAUTION * spread) - self.margin
+        limit = np.minimum(self.spec.max_slip, at - _CAUTION * spread) - self.spec.margin
         # Along and across share one curve: what slides sideways already is not left for driving and braking.
         limit = np.sqrt(np.maximum(limit**2 - across**2, 0.0))
-        self._limit = np.maximum(limit, _LEAST_LIMIT * self.max_slip)
+        self._limit = np.maximum(limit, _LEAST_LIMIT * self.spec.max_slip)
         speed, radius = ground + self._ahead, self._constants.radius
-        low, high = slip_window(speed, self._limit, self.regularization)
+        low, high = slip_window(speed, self._limit, self.spec.regularization)
         self._window = low / radius, high / radius
         # A ground speed above the prediction is slip of a braked wheel, one below it of a driven wheel.
         self._reserve = (
@@ -215,7 +273,6 @@ class Traction:
 
     def _learn(
         self,
-        plant: MujocoPlant,
         ground: Array,
         slip: Array,
         across: Array,
@@ -226,7 +283,7 @@ class Traction:
         mean_load, along = 0.5 * (load + self._load), 0.5 * (slip + self._slip)
         total = np.hypot(along, 0.5 * (across + self._across))
         self._most_load = np.maximum(self._most_load, mean_load)
-        self._estimate.travel(np.abs(ground) * plant.hold_s)
+        self._estimate.travel(np.abs(ground) * self.plant.hold_s)
         loaded = np.minimum(load, self._load) > _LEAST_LOAD * self._most_load
         usable = loaded & rolls & (self._traction * along > 0.0) & (np.abs(along) > _LEAST_SHARE * total)
         # The force points against the sliding: its part along the heading is the part of the slip there.
@@ -247,25 +304,20 @@ class Traction:
         coasting = self._response.decay * self._rate
         return np.asarray((rates - coasting) / self._response.gain + self._constants.radius * counted_on)
 
-    def check(self, plant: MujocoPlant) -> None:
-        """Look at the state in which an episode starts: the report of a reset is of it."""
-        self._look(plant)
-
-    def rows(self, plant: MujocoPlant) -> HalfSpaces:
+    def rows(self) -> HalfSpaces:
         """Two per wheel, for driving and braking torque, where the drive could exceed them."""
-        self._look(plant)
         if self._rate is None:  # says nothing, and a row that is not a number fails
-            return HalfSpaces(np.full((1, plant.lower.size), np.nan), np.full(1, np.nan))
+            return HalfSpaces(np.full((1, self.plant.lower.size), np.nan), np.full(1, np.nan))
         if self._rows is None:
-            self._rows = self._bounds(plant)
+            self._rows = self._bounds()
         return self._rows
 
-    def _bounds(self, plant: MujocoPlant) -> HalfSpaces:
-        bias, effect = self._wheels.drive(plant)
-        carried = 0.0 if self.friction is None else self.friction * self._load
+    def _bounds(self) -> HalfSpaces:
+        bias, effect = self._wheels.drive(self.plant)
+        carried = 0.0 if self.spec.friction is None else self.spec.friction * self._load
         most = self._torques(self._window[1], np.maximum(self._present, carried)) - bias
         least = self._torques(self._window[0], np.minimum(self._present, -carried)) - bias
-        low, high = plant.acting_range
+        low, high = self.plant.acting_range
         low, high = np.maximum(low, -_UNBOUNDED), np.minimum(high, _UNBOUNDED)
         ends = (
             np.minimum(effect * low, effect * high).sum(axis=1),
@@ -285,12 +337,11 @@ class Traction:
             np.concatenate([effect[up], -effect[down]]), np.concatenate([most[up], -least[down]])
         )
 
-    def backup(self, plant: MujocoPlant) -> Array:
+    def backup(self) -> Array:
         """The control that brakes the vehicle as the slip limit allows it; other actuators at zero."""
-        self._look(plant)
         if self._rate is None:
-            return np.zeros_like(plant.lower)
-        bias, effect = self._wheels.drive(plant)
+            return np.zeros_like(self.plant.lower)
+        bias, effect = self._wheels.drive(self.plant)
         speed = self._ground + self._ahead
         low, high = self._window[0] + self._reserve[0], self._window[1] - self._reserve[1]
         wanted = np.where(speed > 0.0, low, high)
@@ -299,10 +350,12 @@ class Traction:
         torque = self._torques(wanted, self._present) - bias
         return np.asarray(np.linalg.lstsq(effect, torque, rcond=None)[0])
 
-    def report(self, proposed: Array, executed: Array) -> dict[str, Any]:
+    def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
         """The info keys `slip/...`: of the state before the step, and what its control did to the wheels."""
         mean, std = self._estimate.mean, self._estimate.std
-        changed = np.abs(executed - proposed) > _ROUNDING * np.abs(proposed) + _SOLVERS_NOISE
+        changed = np.zeros(self.plant.lower.size, dtype=bool)
+        if proposed is not None and executed is not None:
+            changed = np.abs(executed - proposed) > _ROUNDING * np.abs(proposed) + _SOLVERS_NOISE
         return {
             keys.SLIP_RATIO: self._slip.copy(),
             keys.SLIP_LIMITED: self._wheels.driven_by(changed),

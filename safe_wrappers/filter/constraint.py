@@ -1,16 +1,22 @@
-"""What a constraint is: half-spaces on the control, from a plant, at one moment."""
+"""What a constraint is: a specification, and what it becomes on a plant."""
 
-from dataclasses import dataclass
-from typing import Any, Literal, Protocol, runtime_checkable
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
 
 Promise = Literal["proved", "best effort"]
+
+Memory = Any
+"""What a bound constraint keeps from one control step to the next; None if nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,32 +37,127 @@ class HalfSpaces:
         return HalfSpaces(np.zeros((0, controls)), np.zeros(0))
 
 
-@runtime_checkable
-class Constraint(Protocol):
-    """One safety requirement.
+class Constraint(ABC):
+    """One safety requirement, as a specification: plain data, bound to no env.
 
-    A class with `rows` alone is enough. `value(plant)` (the barrier h, shape (k,), positive inside) lets the
-    filter report a margin. `bind(plant)` resolves names once, and refuses unknown ones; `check(plant)` refuses
-    at a reset what only a state can show; `reset()` forgets an episode. `promise` says what holds: "proved" or
-    "best effort". `report(proposed, executed)` returns info keys of its own, always the same ones, after every
-    reset (with two equal actions) and step. `admits` belongs to `CertifyingConstraint`. The plant is any `Plant`;
-    a constraint that needs a particular one refuses others in `bind`.
+    A subclass is a dataclass that checks its fields and says in `bind` which `BoundConstraint` it becomes.
+
+    Attributes:
+        promise: What holds for an executed control that is not flagged: "proved" or "best effort".
     """
 
-    def rows(self, plant: Any) -> HalfSpaces:
-        """The half-spaces on the control at the plant's present state."""
+    promise: Promise = "best effort"
+
+    @abstractmethod
+    def bind(self, plant: Plant) -> "BoundConstraint":
+        """The constraint on a plant that is bound to its env.
+
+        Raises:
+            UnsupportedEnvError: The plant cannot answer what the constraint asks of it.
+            ConfigurationError: Names or numbers that do not fit the plant.
+        """
+
+    def widened(self, margin: float) -> Self:
+        """A copy whose margin is wider by this much, in the unit of its margin."""
+        if not (is_dataclass(self) and any(f.name == "margin" for f in fields(self))):
+            raise ConfigurationError(
+                f"{type(self).__name__} has no margin to widen; give it a field `margin`, or margin=0 here"
+            )
+        own: Any = self
+        wider: Self = replace(own, margin=own.margin + margin)
+        return wider
 
 
-@runtime_checkable
-class CertifyingConstraint(Constraint, Protocol):
-    """A constraint that can check a held control exactly, by prediction.
+class BoundConstraint:
+    """A constraint on one plant. Every method has a default; a subclass overrides what it can answer.
 
-    The filter asks it before it computes rows (a check is cheaper and less conservative than a linear bound),
-    and again after every projection, because rows are linear and the machine is not.
+    In every control step the filter calls `observe` once, after the plant has taken the env's state, then asks
+    questions, and closes the step with `executed`. What lasts from step to step is a value: `start` gives that of a
+    new episode, `observe` takes it, `executed` returns the next one. A constraint may keep what it has computed until
+    the next `observe`, and must not change anything else.
+
+    A constraint that says its requirement as rows overrides `rows` alone. One that predicts a held control sets
+    `predicts` and overrides `slack`, or `admits`: the filter asks it about controls, and takes its rows for a guess.
+
+    Args:
+        spec: The specification.
+        plant: Bound to its env.
     """
 
-    def admits(self, plant: Any, control: Array) -> bool:
-        """Whether holding `control` for one control interval keeps the requirement, and keeps it keepable."""
+    predicts: bool = False
+    """Whether `admits` and `slack` predict a held control; else they evaluate the rows."""
+    has_value: bool = False
+    """Whether there is a barrier: set for every subclass that overrides `value`."""
+    has_approach: bool = False
+    """Whether clearance and approach speed are measured: set for every subclass that overrides `approach`."""
+    tolerance: float = 0.0
+    """How far below zero a slack may be and count as rounding."""
+    info_keys: tuple[str, ...] = ()
+    """The keys that `info` writes."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        cls.has_value = cls.value is not BoundConstraint.value
+        cls.has_approach = cls.approach is not BoundConstraint.approach
+
+    def __init__(self, spec: Any, plant: Any) -> None:
+        self.spec, self.plant = spec, plant
+
+    @property
+    def scale(self) -> float:
+        """A typical size of the slack, to compare constraints of different units."""
+        return 1.0
+
+    def start(self) -> Memory:
+        """The memory at the start of an episode."""
+        return None
+
+    def observe(self, memory: Memory) -> None:
+        """Take the plant's present state and the memory."""
+
+    def check(self) -> None:
+        """Refuse at a reset what only a state can show."""
+
+    def value(self) -> Array:
+        """The barriers h, shape (k,), positive inside; the margin is not taken off. k may be 0: nothing is near."""
+        return np.zeros(0)
+
+    def approach(self) -> tuple[Array, Array] | None:
+        """Clearances in m and approach speeds in m/s, shapes (k,), or None: they are not measured."""
+        return None
+
+    def rows(self) -> HalfSpaces:
+        """The half-spaces on the control."""
+        return HalfSpaces.none(self.plant.lower.size)
+
+    def slack(self, control: Array) -> float:
+        """What a control, shape (m,), leaves of the requirement, in its unit; >= 0: kept. NaN counts as lost."""
+        rows = self.rows()
+        return float((rows.offsets - rows.normals @ control).min(initial=np.inf))
+
+    def admits(self, control: Array) -> bool:
+        """Whether a control, held for one control interval, keeps the requirement."""
+        return self.slack(control) >= -self.tolerance
+
+    def linearize(self, control: Array) -> HalfSpaces:
+        """The requirement linearised about a refused control; no rows: it cannot be."""
+        return HalfSpaces.none(self.plant.lower.size)
+
+    def candidates(self, control: Array) -> Iterable[Array]:
+        """Controls to try for a refused one before it is projected, the best first; only admitted ones are taken."""
+        return ()
+
+    def backup(self) -> Array | None:
+        """A control that the constraint knows to keep it, shape (m,), or None."""
+        return None
+
+    def executed(self, control: Array) -> Memory:
+        """The memory after a control was executed in the observed state."""
+        return None
+
+    def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
+        """The info keys of its own, always the same; None: nothing was judged yet, or the state is not a number."""
+        return {}
 
 
 def positive(name: str, value: float, unit: str) -> float:

@@ -1,14 +1,14 @@
 """What acts when no admissible action is known: brake, hold, zero, or the user's own."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.filter.constraint import BoundConstraint
 from safe_wrappers.filter.projection import box_least_squares
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
@@ -28,19 +28,19 @@ class Fallback:
             which states are velocities, so there it is the control that violates the rows least. Where all
             constraints forecast and none admits it, the filter takes, of all that it has tried, the control that
             fails least. "hold" repeats the last executed action; "zero" is no control; or a function of the plant.
-        backups: Constraints that bring their own stopping control; "brake" uses the first of them.
+        constraints: "brake" uses the first one's `backup` that there is.
 
     Raises:
         UnknownNameError: No fallback of that name.
     """
 
-    def __init__(self, choice: str | FallbackFunction, backups: list[Any]) -> None:
+    def __init__(self, choice: str | FallbackFunction, constraints: Sequence[BoundConstraint] = ()) -> None:
         if not callable(choice) and choice not in NAMES:
             raise UnknownNameError(
                 f"no fallback {choice!r}; choose {', '.join(NAMES)}, or pass a function of the plant"
             )
         self._choice = choice
-        self._backups = backups
+        self._constraints = constraints
         self.brakes = choice == "brake"
 
     def __call__(
@@ -73,18 +73,22 @@ class Fallback:
             control = last
         elif self._choice == "zero" or not readable:
             control = np.zeros_like(low)
-        elif self._backups:
-            control = np.asarray(self._backups[0].backup(plant), dtype=np.float64)
-        elif isinstance(plant, MujocoPlant):
-            control = brake(plant)
         else:
-            control = least if least is not None else np.zeros_like(low)
+            control = self._brake(plant, np.zeros_like(low) if least is None else least)
         if not np.isfinite(control).all():
             control = np.zeros_like(low)
         return np.clip(control, low, high)
 
+    def _brake(self, plant: Plant | None, least: Array) -> Array:
+        backup = next((b for c in self._constraints if (b := c.backup()) is not None), None)
+        if backup is not None:
+            return np.asarray(backup, dtype=np.float64)
+        if plant is not None and plant.can_brake:
+            return brake(plant)
+        return least
 
-def brake(plant: MujocoPlant) -> Array:
+
+def brake(plant: Any) -> Array:
     """The control that leaves the least kinetic energy at the end of the hold, in the linear model.
 
     Energies are counted joint by joint (the diagonal of the inertia). A small weight on the control settles
@@ -92,7 +96,7 @@ def brake(plant: MujocoPlant) -> Array:
     forces brakes as its forecasts do.
     """
     if not plant.has_acceleration:
-        return plant.braking()
+        return np.asarray(plant.braking())
     drift, effect = plant.acceleration
     weight = np.sqrt(plant.inertia_diagonal())
     a = effect * weight[:, None]

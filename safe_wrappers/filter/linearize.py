@@ -1,4 +1,4 @@
-"""A half-space through a control that prediction has refused: the constraint linearised where it matters."""
+"""Half-spaces from predicted slacks, linearised about a control that the prediction has refused."""
 
 from collections.abc import Callable
 
@@ -12,10 +12,10 @@ Array = NDArray[np.float64]
 _STEP = 1e-4
 """Width of the differences, as a share of the control's range."""
 _INWARD = 0.01
-"""Aim this share of the violation beyond the boundary, so that repeated cuts end inside it."""
+"""Aim this share of the violation beyond the boundary, so that repeated linearisations end inside it."""
 
 
-def cut(slacks: Callable[[Array], Array], control: Array, low: Array, high: Array) -> HalfSpaces:
+def linearize(slacks: Callable[[Array], Array], control: Array, low: Array, high: Array) -> HalfSpaces:
     """Linearise predicted slacks about a control.
 
     Args:
@@ -35,10 +35,10 @@ def cut(slacks: Callable[[Array], Array], control: Array, low: Array, high: Arra
         moved = control.copy()
         moved[j] += width[j]
         jacobian[:, j] = (slacks(moved) - base) / width[j] if width[j] else 0.0
-    return through(base, control, jacobian)
+    return tangent_rows(base, control, jacobian)
 
 
-def through(base: Array, control: Array, jacobian: Array) -> HalfSpaces:
+def tangent_rows(base: Array, control: Array, jacobian: Array) -> HalfSpaces:
     """Rows of slacks that are `base` at a control and change by a Jacobian, aimed a little inward where violated."""
     wanted = _INWARD * np.maximum(-base, 0.0)
     return HalfSpaces(-jacobian, base - jacobian @ control - wanted)

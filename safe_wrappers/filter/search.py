@@ -1,25 +1,55 @@
-"""From a boxed proposal to the control that is executed: rows, one projection, prediction, fallback."""
+"""From a boxed proposal to an admissible action: a ladder of stages, the cheapest first.
 
+Each stage is a method of `SafeActionSearch` that returns the control it has found, or None; `Decision.stage` names
+the one that answered.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.filter.constraint import Constraint
+from safe_wrappers.filter.constraint import BoundConstraint, HalfSpaces
 from safe_wrappers.filter.fallback import Fallback
 from safe_wrappers.filter.projection import Projection, Status, keeps_rows, project_unchecked
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
+Rows = tuple[Array, Array]
+"""`normals @ u <= offsets`: shapes (k, m) and (k,)."""
+_NO_ROWS: Rows = (np.zeros((0, 0)), np.zeros(0))
 
-_CUTS = 6
+_LINEARIZATIONS = 6
 """How often a refused control is answered by linearising anew about it."""
 _OVERSHOOTS = (0.02, 0.1)
 """Shares by which a refused correction is made larger where no constraint can linearise anew."""
 _BLENDS = (0.1, 0.25, 0.5, 0.75)
-"""How far a refused control is moved towards the stopping control, step by step."""
+"""How far a refused control is moved towards the backup control, step by step."""
+
+
+class Stage(IntEnum):
+    """What found the executed action."""
+
+    PROPOSAL = 0
+    """Every constraint admits the proposal; it is executed bit for bit."""
+    ROWS = 1
+    """Projection on the constraints' rows."""
+    CANDIDATE = 2
+    """A constraint's own candidate."""
+    RELINEARIZED = 3
+    """Projection on rows that were linearised anew about refused controls."""
+    OVERSHOOT = 4
+    """The same correction, a little larger."""
+    BLEND = 5
+    """A refused control moved towards a backup control or the fallback."""
+    BACKUP = 6
+    """A constraint's backup control."""
+    FALLBACK = 7
+    """The fallback, admitted or not (`infeasible` says which)."""
+    LEAST_VIOLATION = 8
+    """Of all that was tried, and the fallback, the control that violates the constraints least."""
 
 
 @dataclass(slots=True)
@@ -28,26 +58,28 @@ class Decision:
 
     Attributes:
         control: Shape (m,), finite, inside the box.
-        fallback: The fallback chose it.
+        stage: What found it.
         infeasible: Nothing that was tried is admitted by every constraint.
         changed: It is not the proposal.
         rows: The half-spaces that it satisfies, for rounding.
         refused: Which constraints did not admit the proposal, shape (number of constraints,); None: none did.
+        fallback: The fallback chose it.
     """
 
     control: Array
-    fallback: bool = False
+    stage: Stage
     infeasible: bool = False
     changed: bool = True
-    rows: tuple[Array, Array] = (np.zeros((0, 0)), np.zeros(0))
+    rows: Rows = _NO_ROWS
     refused: NDArray[np.bool_] | None = None
+    fallback: bool = False
 
 
-class Decider:
-    """Finds the closest admissible control, or falls back.
+class SafeActionSearch:
+    """Finds the closest admissible control that it can, or falls back.
 
     Args:
-        plant: Bound and observed by the caller.
+        plant: Bound; observed by the caller, as the constraints are.
         constraints: All of them.
         fallback: Chooses when nothing admissible is found.
         solver: For the projection.
@@ -58,175 +90,194 @@ class Decider:
     def __init__(
         self,
         plant: Plant,
-        constraints: list[Constraint],
+        constraints: Sequence[BoundConstraint],
         fallback: Fallback,
         solver: str,
         low: Array,
         high: Array,
     ) -> None:
         self._plant, self._fallback, self._solver, self._low, self._high = plant, fallback, solver, low, high
-        self._constraints = constraints
-        self._certifying: list[Any] = [c for c in constraints if hasattr(c, "admits")]
-        self._rows_only: list[Constraint] = [c for c in constraints if not hasattr(c, "admits")]
-        self._suggesting: list[Any] = [c for c in constraints if hasattr(c, "suggestions")]
-        self._cutting: list[Any] = [c for c in self._certifying if hasattr(c, "cut")]
-        self._backups: list[Any] = [c for c in constraints if hasattr(c, "backup")]
-        # A MujocoPlant's bounds are the action space's; others may be narrower, at some states only.
-        self._narrower = not isinstance(plant, MujocoPlant)
+        self._constraints = list(constraints)
+        self._predicting = [c for c in constraints if c.predicts]
+        self._rows_only = [c for c in constraints if not c.predicts]
+        self._narrower = not plant.bounds_are_action_space
 
     def decide(self, boxed: Array, last: Array) -> Decision:
         """The executed control for a proposal inside the box; `last` is what was executed before."""
-        nominal = np.clip(boxed, self._plant.lower, self._plant.upper) if self._narrower else boxed
+        proposal = np.clip(boxed, self._plant.lower, self._plant.upper) if self._narrower else boxed
         self._tried: list[Array] = []
-        decision = self._decide(nominal, last)
+        decision = self._decide(proposal, last)
         if decision.changed:
-            decision.refused = self._refusing(nominal)
+            decision.refused = np.array([not c.admits(proposal) for c in self._constraints], dtype=bool)
         if self._narrower:
-            decision.changed |= bool((nominal != boxed).any())
+            decision.changed |= bool((proposal != boxed).any())
         return decision
 
-    def _refusing(self, boxed: Array) -> NDArray[np.bool_]:
-        """Which constraints do not admit a control: those that predict by their prediction, others by rows."""
-        refused = np.zeros(len(self._constraints), dtype=bool)
-        for i, constraint in enumerate(self._constraints):
-            admits = getattr(constraint, "admits", None)
-            if admits is not None:
-                refused[i] = not admits(self._plant, boxed)
-            else:
-                rows = constraint.rows(self._plant)
-                # Negated, so that a row that is not a number counts as refusing.
-                refused[i] = not bool((rows.normals @ boxed <= rows.offsets).all())
-        return refused
-
-    def _decide(self, boxed: Array, last: Array) -> Decision:
-        refused = bool(self._certifying) and not self._admitted(boxed)
+    def _decide(self, proposal: Array, last: Array) -> Decision:
+        refused = bool(self._predicting) and not self._admitted(proposal)
         strict = self._rows(self._rows_only)
         if not refused:
             if not strict[1].size:
-                return Decision(boxed, changed=False)
-            result, control = self._project(boxed, *strict)
-            if result.status is Status.INACTIVE and control is boxed:
-                return Decision(boxed, changed=False)
+                return Decision(proposal, Stage.PROPOSAL, changed=False)
+            result, control = self._project(proposal, *strict)
+            if result.status is Status.INACTIVE and control is proposal:
+                return Decision(proposal, Stage.PROPOSAL, changed=False)
             if result.status in (Status.INFEASIBLE, Status.FAILED):
                 return self._fall_back(control, last, infeasible=result.status is Status.INFEASIBLE)
-            if not self._certifying or self._admitted(control):
-                return Decision(control, changed=bool((control != boxed).any()), rows=strict)
-        for constraint in self._suggesting if refused else ():
-            for control in constraint.suggestions(self._plant, boxed):
-                if self._keeps(control, strict):
-                    return Decision(control)
-        return self._search(boxed, strict, last)
+            if not self._predicting or self._admitted(control):
+                return self._projected(proposal, control, Stage.ROWS, strict)
+        else:
+            candidate = self.candidate(proposal, strict)
+            if candidate is not None:
+                return Decision(candidate, Stage.CANDIDATE)
+        return self._search(proposal, strict, last)
 
-    def _search(self, boxed: Array, strict: tuple[Array, Array], last: Array) -> Decision:
+    def candidate(self, proposal: Array, strict: Rows) -> Array | None:
+        """The first candidate of a constraint that keeps the rows and every prediction."""
+        every = (control for c in self._constraints for control in c.candidates(proposal))
+        return next((control for control in every if self._keeps(control, strict)), None)
+
+    def _search(self, proposal: Array, strict: Rows, last: Array) -> Decision:
         """Project on the rows of all constraints; where prediction refuses the answer, look closer."""
-        rows = _joined(strict, self._rows(self._certifying))
-        result, control = self._project(boxed, *rows)
-        if result.status is Status.FAILED:
-            return self._fall_back(control, last, infeasible=False)
+        rows = _joined(strict, self._rows(self._predicting))
+        result, control = self._project(proposal, *rows)
         if result.status is Status.INFEASIBLE:
             # Linear rows of constraints that predict are only a guess: what counts is the others' rows.
             rows = strict
-            result, control = self._project(boxed, *rows)
-            if result.status in (Status.INFEASIBLE, Status.FAILED):
-                return self._fall_back(control, last, infeasible=result.status is Status.INFEASIBLE)
-        for _ in range(_CUTS):
-            if self._admitted(control):
-                return Decision(control, changed=bool((control != boxed).any()), rows=rows)
-            cuts = self._cuts(control)
-            if not cuts[1].size:
+            result, control = self._project(proposal, *rows)
+        if result.status in (Status.INFEASIBLE, Status.FAILED):
+            return self._fall_back(control, last, infeasible=result.status is Status.INFEASIBLE)
+        if self._admitted(control):
+            return self._projected(proposal, control, Stage.ROWS, rows)
+        admitted, control, rows = self.relinearize(proposal, control, rows, strict)
+        if admitted:
+            return self._projected(proposal, control, Stage.RELINEARIZED, rows)
+        return self._nearby(proposal, control, rows, strict, last)
+
+    def relinearize(
+        self, proposal: Array, control: Array, rows: Rows, strict: Rows
+    ) -> tuple[bool, Array, Rows]:
+        """Project again with rows linearised about each refused answer.
+
+        Returns:
+            Whether an answer is admitted; the last answer; the rows that it was projected on.
+        """
+        for left in reversed(range(_LINEARIZATIONS)):
+            tangents = self._tangents(control)
+            if not tangents[1].size:
                 break
-            rows = _joined(rows, cuts)
-            result, control = self._project(boxed, *rows)
+            rows = _joined(rows, tangents)
+            result, control = self._project(proposal, *rows)
             if result.status is Status.FAILED:
                 break
-        else:
-            if self._keeps(control, strict):
-                return Decision(control)
-        return self._nearby(boxed, control, rows, strict, last)
+            if not left:
+                return (True, control, _NO_ROWS) if self._keeps(control, strict) else (False, control, rows)
+            # Where guesses and rows contradict each other, the answer violates both least: the rows count.
+            contradictory = result.status is Status.INFEASIBLE
+            if self._admitted(control) and (not contradictory or self._within(control, strict)):
+                return True, control, rows
+        return False, control, rows
 
-    def _nearby(
-        self,
-        boxed: Array,
-        control: Array,
-        rows: tuple[Array, Array],
-        strict: tuple[Array, Array],
-        last: Array,
-    ) -> Decision:
-        """A little more of the same correction, a proved stopping control, or something in between."""
-        excess = np.maximum(rows[0] @ boxed - rows[1], 0.0)
+    def _nearby(self, proposal: Array, control: Array, rows: Rows, strict: Rows, last: Array) -> Decision:
+        """More of the same correction, a backup control, or something in between; else the least violation."""
+        more = self.overshoot(proposal, rows)
+        if more is not None:
+            return Decision(more, Stage.OVERSHOOT, rows=rows)
+        backup = self.backup(strict)
+        target = backup if backup is not None else self._fallback_control(control, last)
+        blended = self.blend(control, target, strict)
+        if blended is not None:
+            return Decision(blended, Stage.BLEND)
+        if backup is not None:
+            return Decision(backup, Stage.BACKUP)
+        if self._keeps(target, strict):
+            return Decision(target, Stage.FALLBACK, fallback=True)
+        least = self.least_violation(target, strict)
+        stage = Stage.FALLBACK if least is target else Stage.LEAST_VIOLATION
+        return Decision(least, stage, fallback=True, infeasible=True)
+
+    def overshoot(self, proposal: Array, rows: Rows) -> Array | None:
+        """A little more of a correction that was refused."""
+        excess = np.maximum(rows[0] @ proposal - rows[1], 0.0)
         for share in _OVERSHOOTS if excess.any() else ():
-            result, more = self._project(boxed, rows[0], rows[1] - share * excess)
+            result, more = self._project(proposal, rows[0], rows[1] - share * excess)
             if result.status is Status.PROJECTED and self._admitted(more):
-                return Decision(more, rows=rows)
-        stops = [np.clip(c.backup(self._plant), self._low, self._high) for c in self._backups]
-        safe = next((stop for stop in stops if self._keeps(stop, strict)), None)
-        target = safe if safe is not None else self._fallback_control(control, last)
+                return more
+        return None
+
+    def backup(self, strict: Rows) -> Array | None:
+        """The first backup control of a constraint that keeps the rows and every prediction."""
+        known = (c.backup() for c in self._constraints)
+        every = [np.clip(control, self._low, self._high) for control in known if control is not None]
+        return next((control for control in every if self._keeps(control, strict)), None)
+
+    def blend(self, control: Array, target: Array, strict: Rows) -> Array | None:
+        """A refused control moved towards a target, along the line and then but for one component."""
         for share in _BLENDS:
-            blend = control + share * (target - control)
-            if self._keeps(blend, strict):
-                return Decision(blend)
+            blended = control + share * (target - control)
+            if self._keeps(blended, strict):
+                return np.asarray(blended)
         for j in range(target.size):
             mixed = target.copy()
             mixed[j] = control[j]
             if self._keeps(mixed, strict):
-                return Decision(mixed)
-        if safe is not None:
-            return Decision(safe)
-        if self._keeps(target, strict):
-            return Decision(target, fallback=True)
-        return Decision(self._least_failing(target, strict), fallback=True, infeasible=True)
+                return mixed
+        return None
 
-    def _least_failing(self, target: Array, strict: tuple[Array, Array]) -> Array:
-        """Of all that was tried, the control whose forecast fails least; the fallback's own if it is not "brake"."""
-        if not (self._fallback.brakes and all(hasattr(c, "shortfall") for c in self._certifying)):
+    def least_violation(self, target: Array, strict: Rows) -> Array:
+        """Of all that was tried and the target, what violates least; the target if the fallback is not "brake"."""
+        if not self._fallback.brakes:
             return target
-        kept = [u for u in self._tried if self._within(u, strict)]
 
-        def failing(control: Array) -> float:
-            return max(float(c.shortfall(self._plant, control) / c.scale) for c in self._certifying)
+        def violation(control: Array) -> float:
+            return max(-c.slack(control) / c.scale for c in self._predicting)
 
-        return min([target, *kept], key=failing)
-
-    def _fall_back(self, least: Array, last: Array, infeasible: bool) -> Decision:
-        return Decision(self._fallback_control(least, last), fallback=True, infeasible=infeasible)
-
-    def _fallback_control(self, least: Array | None, last: Array) -> Array:
-        return self._fallback(self._plant, last, self._low, self._high, least)
+        return min([target, *(u for u in self._tried if self._within(u, strict))], key=violation)
 
     def without_proposal(self, last: Array) -> Decision:
         """The fallback's control, filtered like a policy's: for a proposal that is not finite."""
         decision = self.decide(self._fallback_control(None, last), last)
         decision.fallback = decision.changed = True
+        decision.stage = Stage.FALLBACK
         decision.refused = None  # of the fallback's control; there was no proposal to refuse
         return decision
 
     def unreadable(self, last: Array) -> Decision:
         """The fallback alone: a state or a barrier that is not a number says nothing about any control."""
         control = self._fallback(self._plant, last, self._low, self._high, None, readable=False)
-        return Decision(control, fallback=True)
+        return Decision(control, Stage.FALLBACK, fallback=True)
+
+    def _projected(self, proposal: Array, control: Array, stage: Stage, rows: Rows) -> Decision:
+        return Decision(control, stage, changed=bool((control != proposal).any()), rows=rows)
+
+    def _fall_back(self, least: Array, last: Array, infeasible: bool) -> Decision:
+        control = self._fallback_control(least, last)
+        return Decision(control, Stage.FALLBACK, fallback=True, infeasible=infeasible)
+
+    def _fallback_control(self, least: Array | None, last: Array) -> Array:
+        return self._fallback(self._plant, last, self._low, self._high, least)
 
     def _admitted(self, control: Array) -> bool:
-        admitted = all(c.admits(self._plant, control) for c in self._certifying)
+        admitted = all(c.admits(control) for c in self._predicting)
         if not admitted:
             self._tried.append(control)
         return admitted
 
-    def _keeps(self, control: Array, strict: tuple[Array, Array]) -> bool:
+    def _keeps(self, control: Array, strict: Rows) -> bool:
         return self._within(control, strict) and self._admitted(control)
 
-    def _within(self, control: Array, strict: tuple[Array, Array]) -> bool:
+    def _within(self, control: Array, strict: Rows) -> bool:
         return not strict[1].size or keeps_rows(control, *strict, self._low, self._high)
 
-    def _rows(self, asked: list[Any]) -> tuple[Array, Array]:
-        parts = [c.rows(self._plant) for c in asked]
+    def _rows(self, asked: list[BoundConstraint]) -> Rows:
+        return self._stacked([c.rows() for c in asked])
+
+    def _tangents(self, control: Array) -> Rows:
+        return self._stacked([c.linearize(control) for c in self._predicting if not c.admits(control)])
+
+    def _stacked(self, parts: list[HalfSpaces]) -> Rows:
         if len(parts) == 1:
             return parts[0].normals, parts[0].offsets
-        if not parts:
-            return np.zeros((0, self._low.size)), np.zeros(0)
-        return np.concatenate([p.normals for p in parts]), np.concatenate([p.offsets for p in parts])
-
-    def _cuts(self, control: Array) -> tuple[Array, Array]:
-        parts = [c.cut(self._plant, control) for c in self._cutting if not c.admits(self._plant, control)]
         if not parts:
             return np.zeros((0, self._low.size)), np.zeros(0)
         return np.concatenate([p.normals for p in parts]), np.concatenate([p.offsets for p in parts])
@@ -235,7 +286,7 @@ class Decider:
         lower, upper = self._plant.lower, self._plant.upper
         low, high = np.maximum(self._low, lower), np.minimum(self._high, upper)
         nominal = boxed if bool(((boxed >= low) & (boxed <= high)).all()) else np.clip(boxed, low, high)
-        acting = getattr(self._plant, "acting_range", None)
+        acting = self._plant.acting_range
         if acting is None or acting[0] is lower:
             result = project_unchecked(nominal, normals, offsets, low, high, self._solver)
             return result, result.control
@@ -253,7 +304,7 @@ class Decider:
         return result, np.where(result.control == force / unit, nominal, result.control * unit)
 
 
-def _joined(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[Array, Array]:
+def _joined(first: Rows, second: Rows) -> Rows:
     if not first[1].size:
         return second
     if not second[1].size:

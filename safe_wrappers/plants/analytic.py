@@ -9,12 +9,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.plant import check_delay, check_timing, read_attribute, refuse_second_env, seconds
+from safe_wrappers.plants.plant import (
+    Plant,
+    check_delay,
+    check_timing,
+    read_attribute,
+    refuse_second_env,
+    seconds,
+)
 
 Array = NDArray[np.float64]
 
 
-class AnalyticPlant:
+class AnalyticPlant(Plant):
     """`x' = f(x) + g(x) u` from plain functions.
 
     Args:
@@ -90,9 +97,6 @@ class AnalyticPlant:
         if not (self._lower <= self._upper).all():
             raise ConfigurationError(f"lower must not exceed upper, got {low} and {high}")
         self._env = env
-
-    stamp = 0
-    """Counts observations, so that a constraint can keep what it has computed for one of them."""
 
     def observe(self) -> None:
         """Read the state, predict it over the delay."""

@@ -146,23 +146,23 @@ class DisplacementPlant(MujocoPlant):
     @property
     def f(self) -> Array:
         """Refused: see the class."""
-        self.refuse_acceleration("f")
+        self.require_acceleration("f")
 
     @property
     def g(self) -> Array:
         """Refused: see the class."""
-        self.refuse_acceleration("g")
+        self.require_acceleration("g")
 
     @property
     def acceleration(self) -> tuple[Array, Array]:
         """Refused: see the class."""
-        self.refuse_acceleration("acceleration")
+        self.require_acceleration("acceleration")
 
     def point(self, kind: str, name: str) -> tuple[Array, Array, Array, Array]:
         """Refused: see the class; `motion` has position and velocity."""
-        self.refuse_acceleration("point")
+        self.require_acceleration("point")
 
-    def refuse_acceleration(self, asker: str) -> NoReturn:
+    def require_acceleration(self, asker: str) -> NoReturn:
         """Say to who asks for accelerations that there are none, and what to use instead."""
         raise UnsupportedEnvError(
             f"{asker} needs the acceleration that an action causes; on a {type(self).__name__} an action is a "

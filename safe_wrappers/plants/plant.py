@@ -1,73 +1,106 @@
-"""The Plant protocol: the filter's model of the machine.
+"""Plant: the filter's model of the machine.
 
 A Plant may be wrong on purpose (other masses, other damping): that is how mismatch is tested. What judges a
 violation is always the env, never the Plant.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 
 Array = NDArray[np.float64]
 
 
-@runtime_checkable
-class Plant(Protocol):
+class Plant(ABC):
     """A control-affine machine `x' = f(x) + g(x) u`, read afresh from an env at every step.
 
     Attributes:
         hold_s: Control interval in s: how long one action is held.
         delay_s: Evidence age plus detection plus actuation delay in s; the state that the constraints see is
             predicted over it with the commands in flight.
-        state: x, shape (n,).
-        f: Drift at the state, shape (n,), state units per second.
-        g: Control matrix at the state, shape (n, m).
-        lower: Smallest admissible control at this state, shape (m,).
-        upper: Largest admissible control at this state, shape (m,).
-
-    A plant whose actuators saturate inside the bounds also has `acting_range`, a pair of arrays: beyond it
-    the control has no further effect.
+        stamp: Counts observations.
+        revision: Counts changes of the model, so that a constraint can read its constants anew.
     """
 
     hold_s: float
     delay_s: float
+    stamp: int = 0
+    revision: int = 0
+    has_acceleration: ClassVar[bool] = True
+    """Whether a control acts as a force, so that `f` and `g` are known."""
+    bounds_are_action_space: ClassVar[bool] = False
+    """Whether `lower` and `upper` are the action space's at every state."""
+    can_brake: ClassVar[bool] = False
+    """Whether it knows which states are velocities, so that a fallback can brake."""
 
     @property
+    @abstractmethod
     def state(self) -> Array:
         """The state x, shape (n,)."""
 
     @property
+    @abstractmethod
     def f(self) -> Array:
-        """Drift, shape (n,)."""
+        """Drift at the state, shape (n,), state units per second."""
 
     @property
+    @abstractmethod
     def g(self) -> Array:
-        """Control matrix, shape (n, m)."""
+        """Control matrix at the state, shape (n, m)."""
 
     @property
+    @abstractmethod
     def lower(self) -> Array:
-        """Smallest control, shape (m,)."""
+        """Smallest admissible control at this state, shape (m,)."""
 
     @property
+    @abstractmethod
     def upper(self) -> Array:
-        """Largest control, shape (m,)."""
+        """Largest admissible control at this state, shape (m,)."""
 
+    @abstractmethod
     def bind(self, env: gym.Env[Any, Any]) -> None:
         """Attach to the env that the filter wraps; refuse one that this plant cannot describe."""
 
+    @abstractmethod
     def observe(self) -> None:
         """Take the env's present state."""
 
+    @abstractmethod
     def executed(self, control: Array | None) -> None:
         """Remember what was sent, for the delay; None forgets everything (a new episode)."""
 
+    @abstractmethod
     def attribute(self, name: str) -> Any:
         """Read a published fact of the env by name, for example the positions of its hazards."""
+
+    @property
+    def acting_range(self) -> tuple[Array, Array] | None:
+        """The controls between which the force still changes, shapes (m,); None: all between the bounds."""
+        return None
+
+    def path(self, control: Array) -> list[Array]:
+        """States on the way and at the end of a held control; empty where the plant cannot predict them."""
+        return []
+
+    def drift(self, x: Array) -> Array:
+        """The drift at any state, shape (n,); without a model of other states that of the present one."""
+        return self.f
+
+    def effect(self, x: Array) -> Array:
+        """The control matrix at any state, shape (n, m), likewise."""
+        return self.g
+
+    def require_acceleration(self, asker: str) -> None:
+        """Refuse a constraint whose rows say what a control does to accelerations where none is known."""
+        if not self.has_acceleration:
+            raise UnsupportedEnvError(f"{asker} needs the acceleration that a control causes")
 
 
 def read_attribute(env: gym.Env[Any, Any], name: str) -> Any:

@@ -5,7 +5,6 @@ import math
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import fields, is_dataclass, replace
 from typing import Any, ClassVar, SupportsFloat
 
 import gymnasium as gym
@@ -15,10 +14,11 @@ from numpy.typing import NDArray
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ActionError, ConfigurationError, UnsafeStateWarning
 from safe_wrappers.filter.constraint import Constraint, non_negative
-from safe_wrappers.filter.fallback import Fallback, FallbackFunction
+from safe_wrappers.filter.engine import SafetyFilter
+from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.filter.projection import check_solver
 from safe_wrappers.filter.rounding import cast_inside
-from safe_wrappers.filter.search import Decider
+from safe_wrappers.filter.search import Stage
 from safe_wrappers.plants.default import default_plant
 from safe_wrappers.plants.plant import Plant, check_actions, wrappers_of
 from safe_wrappers.plants.template import PlantOfSpec, own_plant
@@ -105,22 +105,14 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
             margin=margin,
         )
         gym.Wrapper.__init__(self, env)
-        self.constraints: list[Constraint] = [_with_margin(c, margin) for c in own] if margin else own
+        self.constraints: list[Constraint] = [c.widened(margin) for c in own] if margin else own
         self.constraint_names = _unique([type(c).__name__ for c in self.constraints])
         self.plant: Plant = plant if plant is not None else default_plant(env)
         self.plant.bind(env)
-        for constraint in self.constraints:
-            getattr(constraint, "bind", _nothing)(self.plant)
-        _refuse_without_acceleration(self.plant, self.constraints)
-        self._barriers: list[Any] = [c for c in self.constraints if hasattr(c, "value")]
-        self._reporting: list[Any] = [c for c in self.constraints if hasattr(c, "report")]
-        _refuse_same_reports(self._reporting)
         self._low = np.asarray(space.low, dtype=np.float64)
         self._high = np.asarray(space.high, dtype=np.float64)
-        chosen = Fallback(fallback, [c for c in self.constraints if hasattr(c, "backup")])
-        self._decider = Decider(self.plant, self.constraints, chosen, solver, self._low, self._high)
+        self.filter = SafetyFilter(self.plant, self.constraints, fallback, solver, self._low, self._high)
         self._shape, self._dtype = space.shape, space.dtype
-        self._last = np.clip(np.zeros(self._shape), self._low, self._high)
         self._warned: set[str] = set()
         self.filter_seconds = 0.0
         self.filter_calls = 0
@@ -130,18 +122,9 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
     ) -> tuple[Any, dict[str, Any]]:
         """Reset the env and forget the episode: commands in flight, the last action, the warning."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self.plant.executed(None)
-        for constraint in self.constraints:
-            getattr(constraint, "reset", _no_state)()
-        self._last = np.clip(np.zeros(self._shape), self._low, self._high)
         self._warned.discard("unsafe")
-        self.plant.observe()
-        for constraint in self.constraints:
-            getattr(constraint, "check", _nothing)(self.plant)
+        self.filter.start()
         margin, unsafe = self._margin()
-        margin = margin if margin == margin else 0.0
-        if unsafe:
-            self._warn_unsafe(margin)
         info.update(dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0))
         info[keys.CBF_MARGIN] = margin
         info[keys.CBF_UNSAFE] = unsafe
@@ -150,29 +133,25 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         # these keys only if a reset reports them, and a loop reads them at every step.
         info[keys.PROPOSED_ACTION] = np.zeros(self._shape)
         info[keys.EXECUTED_ACTION] = np.zeros(self._shape)
-        for constraint in self._reporting:
-            info |= constraint.report(info[keys.PROPOSED_ACTION], info[keys.EXECUTED_ACTION])
-        return observation, info
+        info[keys.CBF_STAGE] = int(Stage.PROPOSAL)
+        return observation, info | self.filter.info(None, None)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Filter the action and step the env with what may be executed."""
         started = time.perf_counter()
         proposed = self._checked(action)
-        self.plant.observe()
+        self.filter.observe()
         margin, unsafe = self._margin()
-        readable = margin == margin
-        margin = margin if readable else 0.0
-        if unsafe:
-            self._warn_unsafe(margin)
+        readable = self.filter.margin == self.filter.margin
         # False for NaN too, so that one comparison clears the common case.
         inside = bool(((proposed >= self._low) & (proposed <= self._high)).all())
         finite = inside or bool(np.isfinite(proposed).all())
         clipped = 0.0
         if not readable:
             proposed = np.where(np.isfinite(proposed), proposed, 0.0)
-            decision = self._decider.unreadable(self._last)
+            decision = self.filter.filter(None)
         elif inside:
-            decision = self._decider.decide(proposed, self._last)
+            decision = self.filter.filter(proposed)
         elif finite:
             boxed = np.clip(proposed, self._low, self._high)
             clipped = float(np.linalg.norm(boxed - proposed))
@@ -180,11 +159,11 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
                 "clipped",
                 f"the policy's action left the action space by {clipped:.3g}; it is boxed (cbf/clipped)",
             )
-            decision = self._decider.decide(boxed, self._last)
+            decision = self.filter.filter(boxed)
         else:
             self._warn_once("nonfinite", f"the policy's action is not finite ({proposed}); the fallback acts")
             proposed = np.where(np.isfinite(proposed), proposed, 0.0)
-            decision = self._decider.without_proposal(self._last)
+            decision = self.filter.filter(None)
         intervened = decision.changed
         if inside and not decision.changed:
             # Bit for bit the policy's own action wherever the filter has nothing to say.
@@ -196,8 +175,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
             if finite and readable:
                 # What fails least may be the proposal itself, and a change may be lost in rounding.
                 intervened &= bool((executed != np.clip(proposed, self._low, self._high)).any())
-        self._last = executed
-        self.plant.executed(executed)
+        self.filter.executed(executed)
         self.filter_seconds += time.perf_counter() - started
         self.filter_calls += 1
         observation, reward, terminated, truncated, info = self.env.step(sent)
@@ -215,8 +193,8 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         info[keys.CBF_MARGIN] = margin
         info[keys.PROPOSED_ACTION] = proposed
         info[keys.EXECUTED_ACTION] = executed.copy()
-        for constraint in self._reporting:
-            info |= constraint.report(proposed, executed)
+        info[keys.CBF_STAGE] = int(decision.stage)
+        info |= self.filter.info(proposed, executed)
         return observation, reward, terminated, truncated, info
 
     def _checked(self, action: Any) -> Array:
@@ -229,19 +207,13 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         return proposed
 
     def _margin(self) -> tuple[float, bool]:
-        """The smallest h and whether the state is unsafe; NaN, and unsafe, if the state or an h is no number."""
-        reading = float(self.plant.state.sum())
-        if reading - reading != 0.0:
-            return math.nan, True
-        lowest = math.inf
-        for barrier in self._barriers:
-            h = barrier.value(self.plant)
-            if h.size:
-                least = float(h.min())
-                if least != least:
-                    return math.nan, True
-                lowest = min(lowest, least)
-        return (lowest if math.isfinite(lowest) else 0.0), lowest < -_SAFE_TOLERANCE
+        """`cbf/margin` and `cbf/unsafe`: 0 where no h is finite, unsafe where the state or an h is not a number."""
+        lowest = self.filter.margin
+        unsafe = not lowest >= -_SAFE_TOLERANCE
+        margin = lowest if math.isfinite(lowest) else 0.0
+        if unsafe:
+            self._warn_unsafe(margin)
+        return margin, unsafe
 
     def _warn_unsafe(self, margin: float) -> None:
         self._warn_once(
@@ -249,7 +221,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
             f"the state is outside the safe set (cbf/margin = {margin:.3g}); the filter drives it "
             "back where it can, and promises nothing until it is inside",
             UnsafeStateWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
 
     def _warn_once(
@@ -269,42 +241,6 @@ def _unique(kinds: list[str]) -> list[str]:
     ]
 
 
-def _no_state() -> None:
-    """A constraint without `reset` keeps nothing from one episode to the next."""
-
-
-def _nothing(plant: Plant) -> None:
-    """A constraint without `bind` resolves no names, one without `check` needs no state to be refused."""
-
-
-def _refuse_without_acceleration(plant: Any, constraints: Sequence[Constraint]) -> None:
-    """Rows say what a control does to accelerations; a plant may know of none."""
-    for constraint in constraints:
-        if getattr(constraint, "needs_acceleration", False) and not getattr(plant, "has_acceleration", True):
-            plant.refuse_acceleration(type(constraint).__name__)
-
-
-def _refuse_same_reports(reporting: list[Any]) -> None:
-    """Two constraints of a kind would write the same info keys."""
-    kinds = [type(c).__name__ for c in reporting]
-    for kind in kinds:
-        if kinds.count(kind) > 1:
-            raise ConfigurationError(
-                f"{kind} is in the list {kinds.count(kind)} times, and both would write the same info keys; use one "
-                "for everything it watches"
-            )
-
-
 def is_filtered(env: gym.Env[Any, Any]) -> bool:
     """Whether there is a filter among an env's wrappers."""
     return any(isinstance(inner, CBFActionFilter) for inner in wrappers_of(env))
-
-
-def _with_margin(constraint: Constraint, margin: float) -> Constraint:
-    """A copy with a wider margin."""
-    if not (is_dataclass(constraint) and any(f.name == "margin" for f in fields(constraint))):
-        raise ConfigurationError(
-            f"{type(constraint).__name__} has no margin to widen; give it a field `margin`, or margin=0 here"
-        )
-    wider: Constraint = replace(constraint, margin=getattr(constraint, "margin") + margin)  # noqa: B009
-    return wider

@@ -10,12 +10,20 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.constraints.backup.detour import Detour
 from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacle_from
 from safe_wrappers.constraints.obstacles.obstacles import Disc, Discs
 from safe_wrappers.control.numerics.outlines import convex_outline, distances_to_outline
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import HalfSpaces, Promise, non_negative, positive
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import (
+    BoundConstraint,
+    Constraint,
+    Memory,
+    Promise,
+    non_negative,
+    positive,
+)
+from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.coasting import Coasting, Course
 
@@ -36,7 +44,7 @@ _DETOUR_MEMORY = 25
 
 
 @dataclass
-class CoastingClearance:
+class CoastingClearance(Constraint):
     """Keep a free-moving machine out of discs, counting all of its way until it rests without any control.
 
     For machines that their own friction and damping stop within a few steps, on wheels for instance. Every control
@@ -113,71 +121,79 @@ class CoastingClearance:
         self.reach_s = non_negative("reach_s", self.reach_s, "m per m/s")
         self._radius = float(np.sqrt((self._corners**2).sum(axis=1)).max(initial=0.0))
 
-    def bind(self, plant: Plant) -> None:
-        """Find the machine in the plant's model."""
-        if not isinstance(plant, MujocoPlant):
-            raise UnsupportedEnvError(
-                "CoastingClearance needs a MujocoPlant: it forecasts with the machine's model"
-            )
-        alone = None if self.alone is None else plant.attribute(self.alone)
+    def bind(self, plant: Plant) -> "BoundCoastingClearance":
+        """On a plant."""
+        return BoundCoastingClearance(self, plant)
+
+
+class BoundCoastingClearance(BoundConstraint):
+    """CoastingClearance on a plant."""
+
+    predicts: bool = True
+    spec: CoastingClearance
+    plant: MujocoPlant
+
+    def __init__(self, spec: CoastingClearance, plant: Plant) -> None:
+        hint = "CoastingClearance needs a MujocoPlant: it forecasts with the machine's model"
+        super().__init__(spec, require_mujoco(plant, hint))
+        alone = None if self.spec.alone is None else self.plant.attribute(self.spec.alone)
         if alone is not None and not isinstance(alone, mujoco.MjModel):
             raise ConfigurationError(
-                f"alone names an attribute that holds an MjModel; {self.alone!r} is {alone!r}"
+                f"alone names an attribute that holds an MjModel; {self.spec.alone!r} is {alone!r}"
             )
-        self._coasting = Coasting(plant, self.body, alone)
-        self._still = np.zeros(plant.model.nu)
-        self._reach = self.reach
+        self._coasting = Coasting(self.plant, self.spec.body, alone)
+        self._still = np.zeros(self.plant.model.nu)
+        self._reach = self.spec.reach
         self._first_turns_left: bool | None = None
-        self._stamp = -1
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the side on which something is being passed, and what was forecast."""
-        self._side, self._side_steps = 0.0, 0
         self._seen = np.zeros(0)
         self._known: dict[bytes, _Outcome] = {}
 
-    # What is around -----------------------------------------------------------------------------------------
+    def start(self) -> Memory:
+        """No detour is being made."""
+        self._seen = np.zeros(0)
+        return Detour()
 
-    def _look(self, plant: MujocoPlant) -> None:
-        """Take the state, once per observation: what is left now, and which discs may come into play."""
-        if plant.stamp == self._stamp:
-            return
-        self._stamp = plant.stamp
-        self._side_steps -= 1
-        self._low, self._high = plant.acting_range
+    def executed(self, control: Array) -> Memory:
+        """The detour that is being made."""
+        return self._detour
+
+    def observe(self, memory: Detour) -> None:
+        """Take the state: what is left now, and which discs may come into play."""
+        self._detour = Detour(memory.side, memory.steps - 1)
+        self._look()
+
+    def _look(self) -> None:
+        self._low, self._high = self.plant.acting_range
         here = self._coasting.start()
         self._here = here.places[0]
         reach = math.inf
         if self._reach is not None:
-            reach = self._reach + self.reach_s * self._coasting.speed(self._radius)
-        self._origin = _Group(self.keep_out, plant, None)
-        self._body = _Group(self.untouched, plant, self._corners)
-        self._least = min(group.keep(here, self.margin + reach) for group in (self._origin, self._body))
+            reach = self._reach + self.spec.reach_s * self._coasting.speed(self.spec._radius)
+        self._origin = _Group(self.spec.keep_out, self.plant, None)
+        self._body = _Group(self.spec.untouched, self.plant, self.spec._corners)
+        self._least = min(group.keep(here, self.spec.margin + reach) for group in (self._origin, self._body))
         self._within = reach
-        # Who stands still is asked about the same controls again and again.
+        # Rollouts are kept while nothing moves.
         discs = np.concatenate([self._origin.centers, self._body.centers]).ravel()
-        seen = np.concatenate([[plant.revision], self._coasting.state(), discs])
+        seen = np.concatenate([[self.plant.revision], self._coasting.state(), discs])
         if not (seen.shape == self._seen.shape and (np.abs(seen - self._seen) <= _STILL).all()):
             self._seen, self._known = seen, {}
 
-    def value(self, plant: MujocoPlant) -> Array:
+    def value(self) -> Array:
         """What is left at the present place to the nearest disc, margin not taken off, m, shape (1,)."""
-        self._look(plant)
         return np.array([self._least])
 
-    def _after(self, plant: MujocoPlant, control: Array) -> "_Outcome":
+    def _after(self, control: Array) -> "_Outcome":
         """The outcome of a control, forecast once per observation."""
         acting = np.minimum(np.maximum(control, self._low), self._high) + 0.0  # no -0.0: its bytes differ
         key = acting.tobytes()
         if key not in self._known:
-            course = self._coasting.run(acting, self.holds, self._radius)
+            course = self._coasting.run(acting, self.spec.holds, self.spec._radius)
             outcome, fallen = self._outcome(course)
             if fallen > self._within + _SAME_M:
                 self._forecast_always(fallen)
-                self.reset()
-                self._stamp = -1
-                self._look(plant)
+                self._detour, self._seen = Detour(), np.zeros(0)
+                self._look()
                 outcome, _ = self._outcome(course)
             self._known[key] = outcome
         return self._known[key]
@@ -204,34 +220,27 @@ class CoastingClearance:
         """Whether no disc can come into play, whatever is done."""
         return not (self._origin.near or self._body.near)
 
-    # What may be done ---------------------------------------------------------------------------------------
-
-    def rows(self, plant: Any) -> HalfSpaces:
-        """None: what counts is the forecast."""
-        return HalfSpaces.none(plant.lower.size)
-
-    def admits(self, plant: MujocoPlant, control: Array) -> bool:
+    def admits(self, control: Array) -> bool:
         """Whether a control leads to rest with the margin kept (or, where rest alone does not, to a way out)."""
-        self._look(plant)
         if self._free:
             return True
         if self._least < 0.0:
-            return self._leads_out(plant, control)
-        after = self._after(plant, control)
-        if after.least >= self.margin:
+            return self._leads_out(control)
+        after = self._after(control)
+        if after.least >= self.spec.margin:
             return True
-        rest = self._after(plant, self._still)
+        rest = self._after(self._still)
         if after is rest:
             return rest.least >= 0.0
         # Rest alone leaves less than the margin: what the forecasts missed has used it up. No less on the way then,
         # and more at its end.
         kept = after.least >= max(rest.least - _SAME_M, 0.0) and after.end >= rest.end + _WAY_OUT_M
-        return rest.least < self.margin and kept
+        return rest.least < self.spec.margin and kept
 
-    def _leads_out(self, plant: MujocoPlant, control: Array) -> bool:
-        best = max(self._after(plant, drive).end for drive in self._drives())
+    def _leads_out(self, control: Array) -> bool:
+        best = max(self._after(drive).end for drive in self._drives())
         gain = best - self._least
-        return gain > 0.0 and self._after(plant, control).end - self._least >= _RECOVERED * gain
+        return gain > 0.0 and self._after(control).end - self._least >= _RECOVERED * gain
 
     def _drives(self) -> list[Array]:
         """Full control of all actuators together and of each alone, both ways."""
@@ -239,48 +248,40 @@ class CoastingClearance:
         alone = [np.where(np.arange(n) == i, end, 0.0) for i in range(n) for end in (low, high)]
         return [high, low, *alone]
 
-    def shortfall(self, plant: MujocoPlant, control: Array) -> float:
-        """By how much a control fails: how deep its way (from inside: the end of it) goes into a disc, m."""
-        self._look(plant)
-        after = self._after(plant, control)
-        return -(after.end if self._least < 0.0 else after.least)
+    def slack(self, control: Array) -> float:
+        """The least clearance on the way of a control (from inside: at the end of it), m."""
+        after = self._after(control)
+        return after.end if self._least < 0.0 else after.least
 
-    @property
-    def scale(self) -> float:
-        """What a shortfall is compared with, where constraints of several units fail at once."""
-        return 1.0
-
-    def backup(self, plant: MujocoPlant) -> Array:
+    def backup(self) -> Array:
         """No control at all: the machine rolls to rest where the last forecast said."""
         return self._still
 
-    def suggestions(self, plant: MujocoPlant, control: Array) -> list[Array]:
+    def candidates(self, control: Array) -> list[Array]:
         """What to try for a refused control, the best first: ways around, less of the same, none."""
-        self._look(plant)
         if self._least < 0.0:
-            return sorted(self._drives(), key=lambda u: -self._after(plant, u).end)[:1]
+            return sorted(self._drives(), key=lambda u: -self._after(u).end)[:1]
         acting = np.clip(control, self._low, self._high)
-        around = self._around(plant, acting) if self.detour and acting.size == 2 else []
+        around = self._around(acting) if self.spec.detour and acting.size == 2 else []
         return [*around, 0.5 * acting, self._still]
 
-    def _around(self, plant: MujocoPlant, acting: Array) -> list[Array]:
+    def _around(self, acting: Array) -> list[Array]:
         """The same drive turning ever more, then backing out while turning, all to the side that leads around."""
         drive = float(acting[np.abs(acting).argmax()])
         if float(acting.sum()) * drive <= 0.0:
             return []  # turning on the spot, or no drive at all
-        if self._side_steps <= 0:
-            way = self._after(plant, acting).way
+        side = self._detour.side
+        if self._detour.steps <= 0:
+            way = self._after(acting).way
             x, y = self._nearest() - self._here
             # What is to the left of the way is passed on its right.
-            self._side = -1.0 if way[0] * y - way[1] * x > 0.0 else 1.0
-        self._side_steps = _DETOUR_MEMORY
+            side = -1.0 if way[0] * y - way[1] * x > 0.0 else 1.0
+        self._detour = Detour(side, _DETOUR_MEMORY)
         if self._first_turns_left is None:
-            first, second = (
-                self._after(plant, u).turn for u in (np.array([drive, 0.0]), np.array([0.0, drive]))
-            )
+            first, second = (self._after(u).turn for u in (np.array([drive, 0.0]), np.array([0.0, drive])))
             self._first_turns_left = (first - second) * drive > 0.0
         pairs = np.array(_AROUND) * drive
-        outer_is_first = self._first_turns_left == (self._side * drive > 0.0)
+        outer_is_first = self._first_turns_left == (side * drive > 0.0)
         return list(pairs if outer_is_first else pairs[:, ::-1])
 
     def _nearest(self) -> Array:

@@ -16,9 +16,16 @@ from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
 from safe_wrappers.constraints.obstacles.obstacles import Discs, distances
 from safe_wrappers.constraints.obstacles.tracked_discs import TrackedDiscs
 from safe_wrappers.control.backup.evasive_maneuvers import Escapes, Manoeuvre
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import HalfSpaces, Promise, non_negative, positive
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import (
+    BoundConstraint,
+    Constraint,
+    Memory,
+    Promise,
+    non_negative,
+    positive,
+)
+from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.planar_point import planar_point
 
@@ -39,7 +46,7 @@ _APPROACHED = 2
 
 
 @dataclass
-class EscapeClearance:
+class EscapeClearance(Constraint):
     """Keep a point mass on two axes out of obstacles, moving ones above all, by keeping an escape open.
 
     The manoeuvres: brake at once; or go along +x, -x, +y or -y with full force for 0.3 s or 0.8 s, and brake. Each is
@@ -97,118 +104,124 @@ class EscapeClearance:
         self._moving: list[Any] = [o for o in self.obstacles if _moves(o)]
         self._fixed = [o for o in self.obstacles if not _moves(o)]
 
-    def bind(self, plant: Plant) -> None:
-        """Find the point in the plant's model."""
-        if not isinstance(plant, MujocoPlant):
-            raise UnsupportedEnvError(
-                "EscapeClearance needs a MujocoPlant: it reads the point from the model"
-            )
-        for obstacle in self._moving:
-            if isinstance(obstacle, TrackedDiscs):
-                obstacle.tracks(plant)
-        self._read_constants(plant)
+    def bind(self, plant: Plant) -> "BoundEscapeClearance":
+        """On a plant."""
+        return BoundEscapeClearance(self, plant)
 
-    def _read_constants(self, plant: MujocoPlant) -> None:
-        self._stamp, self._revision = -1, plant.revision
-        self._point = point = planar_point(plant, np.inf, self.body)
+
+class BoundEscapeClearance(BoundConstraint):
+    """EscapeClearance on a plant."""
+
+    predicts: bool = True
+    tolerance: float = _ROUNDING
+    spec: EscapeClearance
+    plant: MujocoPlant
+
+    def __init__(self, spec: EscapeClearance, plant: Plant) -> None:
+        hint = "EscapeClearance needs a MujocoPlant: it reads the point from the model"
+        super().__init__(spec, require_mujoco(plant, hint))
+        for obstacle in self.spec._moving:
+            if isinstance(obstacle, TrackedDiscs):
+                obstacle.tracks(self.plant)
+        self._read_constants()
+
+    def _read_constants(self) -> None:
+        self._revision = self.plant.revision
+        self._point = point = planar_point(self.plant, np.inf, self.spec.body)
         # What one hold makes of a state; x and y.
         self._hold = np.array([(a.low, a.high, a.drift, a.shift, a.keep, a.add) for a in point.axes]).T
-        holds = int(np.ceil(self.horizon_s / plant.hold_s))
-        longest = max(1, round(max(_GOING_S) / plant.hold_s))
+        holds = int(np.ceil(self.spec.horizon_s / self.plant.hold_s))
+        longest = max(1, round(max(_GOING_S) / self.plant.hold_s))
         if holds <= longest:
             raise ConfigurationError(
-                f"horizon_s = {self.horizon_s:g} s is too short for control steps of {plant.hold_s:g} s: a manoeuvre "
-                f"takes {longest} of them before it brakes"
+                f"horizon_s = {self.spec.horizon_s:g} s is too short for control steps of {self.plant.hold_s:g} s: "
+                f"a manoeuvre takes {longest} of them before it brakes"
             )
         bank = [Manoeuvre(0.0, 0.0, 0)]
         bank += [Manoeuvre(x, y, going) for x, y in _DIRECTIONS for going in range(1, longest + 1)]
         self._escapes = Escapes(point.axes, bank, np.arange(0, holds + 1, _EVERY))
-        starts = [max(1, round(seconds / plant.hold_s)) for seconds in _GOING_S]
+        starts = [max(1, round(seconds / self.plant.hold_s)) for seconds in _GOING_S]
         self._usual = [0, *(bank.index(Manoeuvre(x, y, n)) for x, y in _DIRECTIONS for n in starts)]
         self._firsts_of = [0, *(bank.index(Manoeuvre(x, y, 1)) for x, y in _DIRECTIONS)]
-        self._tried: list[tuple[Array, NDArray[np.intp]]] = []
 
-    def reset(self) -> None:
-        """Forget the way out of the episode before."""
-        self._stamp = -1
-        self._tried = []
+    def executed(self, control: Array) -> Memory:
+        """The manoeuvre that is open after the control: that of the nearest one that was asked about."""
+        if not self._asked:
+            return None
+        low, high, _, _, keep, add = self._hold
+        velocity = keep * self._velocity + add * np.minimum(np.maximum(self._driven(control), low), high)
+        led_to = np.concatenate([v for v, _ in self._asked])
+        best = np.concatenate([b for _, b in self._asked])
+        return int(best[((led_to - velocity) ** 2).sum(axis=1).argmin()])
 
-    def _look(self, plant: MujocoPlant) -> None:
-        """Take the state, and where everything may be later on, once per observation."""
-        if plant.stamp == self._stamp:
-            return
-        if plant.revision != self._revision:
-            self._read_constants(plant)
-        self._stamp = plant.stamp
-        self._open = self._with_going_on(plant.qvel[list(self._point.joints)])
+    def observe(self, memory: int | None) -> None:
+        """Take the state, and where everything may be later on."""
+        self._asked: list[tuple[Array, NDArray[np.intp]]] = []
+        if self.plant.revision != self._revision:
+            self._read_constants()
+        self._open = self._with_going_on(memory)
         joints = list(self._point.joints)
-        self._position = plant.qpos[joints] + np.asarray(self._point.origin)
-        self._velocity = plant.qvel[joints]
+        self._position = self.plant.qpos[joints] + np.asarray(self._point.origin)
+        self._velocity = self.plant.qvel[joints]
         # A way after a held control begins one hold from now.
-        times = plant.hold_s * np.concatenate([[0.0], 1.0 + self._escapes.instants])
-        parts = [self._expected(o, plant, times) for o in self._moving]
+        times = self.plant.hold_s * np.concatenate([[0.0], 1.0 + self._escapes.instants])
+        parts = [self._expected(o, self.plant, times) for o in self.spec._moving]
         none = np.zeros((times.size, 0, 2))
         centers = np.concatenate([none, *(c for c, _ in parts)], axis=1)
         halves = np.concatenate([none, *(h for _, h in parts)], axis=1)
-        radii = [np.full(c.shape[1], o.radius) for (c, _), o in zip(parts, self._moving, strict=True)]
+        radii = [np.full(c.shape[1], o.radius) for (c, _), o in zip(parts, self.spec._moving, strict=True)]
         here = self._position[None]
-        fixed = [distances(o, here, plant)[0] for o in self._fixed]
+        fixed = [distances(o, here, self.plant)[0] for o in self.spec._fixed]
         moving = _box_distances(here[:, 0], here[:, 1], centers[:1], halves[:1])[0]
         self._near_fixed = [float(f.min(initial=np.inf)) for f in fixed]
-        self._sizes = np.concatenate([*radii, np.zeros(0)]) + self.radius
-        self._now = np.concatenate([moving - self._sizes, *(f - self.radius for f in fixed)])
+        self._sizes = np.concatenate([*radii, np.zeros(0)]) + self.spec.radius
+        self._now = np.concatenate([moving - self._sizes, *(f - self.spec.radius for f in fixed)])
         self._boxes = centers[1:], halves[1:]
         self._lowest, self._highest = (centers - halves).min(axis=0), (centers + halves).max(axis=0)
         # From outside, the violation must shrink along the way.
-        outside = min(float(self._now.min(initial=np.inf)) - self.margin, 0.0)
-        self._wanted = self.margin + outside * np.exp(-times[1:] / _RECOVERY_S)
+        outside = min(float(self._now.min(initial=np.inf)) - self.spec.margin, 0.0)
+        self._wanted = self.spec.margin + outside * np.exp(-times[1:] / _RECOVERY_S)
         self._best: float | None = None
 
-    def _with_going_on(self, velocity: Array) -> NDArray[np.intp]:
-        """The manoeuvres to look at: the usual ones, and to go on with the one that was open after the last control.
-
-        Which control was executed shows in the velocity that it has led to.
-        """
+    def _with_going_on(self, going_on: int | None) -> NDArray[np.intp]:
+        """The manoeuvres to look at: the usual ones, and the one that was open after the last control."""
         which = list(self._usual)
-        if self._tried:
-            led_to = np.concatenate([v for v, _ in self._tried])
-            chosen = np.concatenate([best for _, best in self._tried])
-            nearest = int(((led_to - velocity) ** 2).sum(axis=1).argmin())
+        if going_on is not None:
             # The same way with one hold less to go: the manoeuvres of a direction are in the order of their lengths.
-            going_on = int(chosen[nearest])
             shorter = going_on - 1 if self._escapes.manoeuvres[going_on].holds > 1 else 0
             which += [i for i in (going_on, shorter) if i not in which]
-        self._tried = []
         return np.array(which, dtype=np.intp)
 
     def _expected(self, obstacle: Any, plant: MujocoPlant, times: Array) -> tuple[Array, Array]:
         """Centres and half-widths of the boxes that hold them, shapes (k, n, 2)."""
         # Under a delay the state is predicted: so are the obstacles, to the same moment.
-        late = times + (plant.time - float(plant.attribute("data").time) if plant.delay_s else 0.0)
+        late = times + (
+            self.plant.time - float(self.plant.attribute("data").time) if self.plant.delay_s else 0.0
+        )
         if isinstance(obstacle, TrackedDiscs):
-            centers, halves = obstacle.boxes(plant, late)
+            centers, halves = obstacle.boxes(self.plant, late)
             return centers[..., :2], halves[..., :2]
-        centers = obstacle.centers(plant)[:, :2]
-        velocity = np.asarray(plant.attribute(obstacle.velocity_attribute), dtype=np.float64)[:, :2]
+        centers = obstacle.centers(self.plant)[:, :2]
+        velocity = np.asarray(self.plant.attribute(obstacle.velocity_attribute), dtype=np.float64)[:, :2]
         moved = centers + late[:, None, None] * velocity
         return moved, np.zeros_like(moved)
 
-    def _slacks(self, plant: MujocoPlant, controls: Array) -> Array:
+    def _slacks(self, controls: Array) -> Array:
         """What every way out after each of some held controls (c, 2) leaves, wanted >= 0, shape (c, manoeuvres)."""
         low, high, drift, shift, keep, add = self._hold
         held = np.minimum(np.maximum(controls, low), high)
         position = self._position + drift * self._velocity + shift * held
         velocity = keep * self._velocity + add * held
         x, y = self._escapes.paths(position, velocity, self._open)
-        left = (self._clearances(plant, x, y) - self._wanted).min(axis=-1)
-        self._tried.append((velocity, self._open[left.argmax(axis=1)]))
+        left = (self._clearances(x, y) - self._wanted).min(axis=-1)
+        self._asked.append((velocity, self._open[left.argmax(axis=1)]))
         return np.asarray(left)
 
-    def _clearances(self, plant: MujocoPlant, x: Array, y: Array) -> Array:
+    def _clearances(self, x: Array, y: Array) -> Array:
         """Distance of ways from whatever is nearest, margin not taken off; shapes (c, m, k) as the ways'."""
         (left, low), (right, high) = (float(x.min()), float(y.min())), (float(x.max()), float(y.max()))
         nearest = np.full(x.shape, np.inf)
-        room = self._sizes[:, None] + self.margin
+        room = self._sizes[:, None] + self.spec.margin
         near = ((self._lowest - room <= (right, high)) & (self._highest + room >= (left, low))).all(axis=1)
         centers, halves = self._boxes
         for i in np.flatnonzero(near):
@@ -216,54 +229,42 @@ class EscapeClearance:
             np.minimum(nearest, gap - self._sizes[i], out=nearest)
         here_x, here_y = self._position
         reach = float(np.hypot(max(right - here_x, here_x - left), max(high - here_y, here_y - low)))
-        for obstacle, now in zip(self._fixed, self._near_fixed, strict=True):
-            if now - reach <= self.radius + self.margin:
+        for obstacle, now in zip(self.spec._fixed, self._near_fixed, strict=True):
+            if now - reach <= self.spec.radius + self.spec.margin:
                 points = np.stack([x.ravel(), y.ravel()], axis=1)
-                gap = distances(obstacle, points, plant).min(axis=1, initial=np.inf).reshape(x.shape)
-                np.minimum(nearest, gap - self.radius, out=nearest)
+                gap = distances(obstacle, points, self.plant).min(axis=1, initial=np.inf).reshape(x.shape)
+                np.minimum(nearest, gap - self.spec.radius, out=nearest)
         return nearest
 
-    def value(self, plant: MujocoPlant) -> Array:
+    def value(self) -> Array:
         """Distance now from every obstacle, or from the bound of where it may be, m, shape (n,)."""
-        self._look(plant)
         return self._now
 
     def _driven(self, control: Array) -> Array:
         return np.asarray(control)[list(self._point.actuators)]
 
-    def shortfall(self, plant: MujocoPlant, control: Array) -> float:
-        """By how much the best way out after a held control misses what is asked for, m; <= 0: not at all."""
-        self._look(plant)
-        left = float(self._slacks(plant, self._driven(control)[None]).max())
+    def slack(self, control: Array) -> float:
+        """What the best way out after a held control leaves of what is asked for, m."""
+        left = float(self._slacks(self._driven(control)[None]).max())
         if left >= 0.0:
-            return -left
-        return self._needed(plant) - left if left == left else np.inf
+            return left
+        return left - self._needed() if left == left else -np.inf
 
-    def _needed(self, plant: MujocoPlant) -> float:
+    def _needed(self) -> float:
         """What a way out must leave: 0, or the best that there is while that still uses up only the margin.
 
         What has been seen since the last step moves what was clear by a hair. The way out is then followed, and not
         given up for it.
         """
         if self._best is None:
-            self._best = float(self._slacks(plant, self._firsts()).max())
-        return self._best if -self.margin < self._best < 0.0 else 0.0
+            self._best = float(self._slacks(self._firsts()).max())
+        return self._best if -self.spec.margin < self._best < 0.0 else 0.0
 
-    @property
-    def scale(self) -> float:
-        """Metres are compared as they are."""
-        return 1.0
-
-    def admits(self, plant: MujocoPlant, control: Array) -> bool:
-        """Whether a way out is open after a held control."""
-        return self.shortfall(plant, control) <= _ROUNDING
-
-    def backup(self, plant: MujocoPlant) -> Array:
+    def backup(self) -> Array:
         """Braking where it leaves a way out, else the first control of the one that keeps farthest away."""
-        self._look(plant)
-        control = np.zeros(plant.model.nu)
+        control = np.zeros(self.plant.model.nu)
         firsts = self._firsts()
-        left = self._slacks(plant, firsts).max(axis=1)
+        left = self._slacks(firsts).max(axis=1)
         control[list(self._point.actuators)] = firsts[0 if left[0] >= 0.0 else int(left.argmax())]
         return control
 
@@ -271,20 +272,19 @@ class EscapeClearance:
         """First controls of the manoeuvres: braking, and each direction; shape (5, 2)."""
         return np.array([self._escapes.first(i, self._velocity) for i in self._firsts_of])
 
-    def suggestions(self, plant: MujocoPlant, control: Array) -> list[Array]:
+    def candidates(self, control: Array) -> list[Array]:
         """Admissible controls near a refused one, the nearest first."""
-        self._look(plant)
         asked, firsts = self._driven(control), self._firsts()
-        left = self._slacks(plant, firsts).max(axis=1)
+        left = self._slacks(firsts).max(axis=1)
         self._best = float(left.max())
-        needed = self._needed(plant)
+        needed = self._needed()
         good = _nearest_first(firsts[left >= needed], asked)
         if needed == 0.0 and len(good):
             ends = good[:_APPROACHED]
             tried = [asked + share * (end - asked) for end in ends for share in _BLENDS]
             tried += [np.array(pair) for x, y in ends for pair in ((asked[0], y), (x, asked[1]))]
             closer = np.array(tried)
-            closer = closer[self._slacks(plant, closer).max(axis=1) >= 0.0]
+            closer = closer[self._slacks(closer).max(axis=1) >= 0.0]
             good = _nearest_first(np.concatenate([good, closer]), asked)
         found = []
         for pair in good:
@@ -292,10 +292,6 @@ class EscapeClearance:
             whole[list(self._point.actuators)] = pair
             found.append(whole)
         return found
-
-    def rows(self, plant: Any) -> HalfSpaces:
-        """None: what counts is whether a way out is open, and that is not convex."""
-        return HalfSpaces.none(plant.lower.size)
 
 
 def _nearest_first(controls: Array, asked: Array) -> Array:

@@ -9,12 +9,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.constraints.backup.detour import Detour
 from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
 from safe_wrappers.constraints.obstacles.obstacles import Disc, Discs
 from safe_wrappers.control.backup.heading_drive import StoppingPath
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import HalfSpaces, Promise, non_negative
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import (
+    BoundConstraint,
+    Constraint,
+    HalfSpaces,
+    Memory,
+    Promise,
+    non_negative,
+)
+from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.planar_robot import PlanarFrame, heading_drive
 
@@ -37,7 +45,7 @@ _RESERVE_M = 0.001
 
 
 @dataclass
-class HeadingDriveClearance:
+class HeadingDriveClearance(Constraint):
     """Keep the stopping path of a planar robot out of every disc.
 
     The robot slides on two joints with equal damping, turns on a hinge, and its drive pushes along the heading
@@ -88,18 +96,27 @@ class HeadingDriveClearance:
         if self.uncertainty >= 1.0:
             raise ConfigurationError(f"uncertainty is a fraction in [0, 1), got {self.uncertainty}")
 
-    def bind(self, plant: Plant) -> None:
-        """Read the robot's constants from the plant's model."""
-        if not isinstance(plant, MujocoPlant):
-            raise UnsupportedEnvError("HeadingDriveClearance needs a MujocoPlant: it reads the robot's model")
-        self._frame = PlanarFrame(plant, self.body)
-        self._read_constants(plant)
-        self._stamp = -1
-        self.reset()
+    def bind(self, plant: Plant) -> "BoundHeadingDriveClearance":
+        """On a plant."""
+        return BoundHeadingDriveClearance(self, plant)
 
-    def _read_constants(self, plant: MujocoPlant) -> None:
-        self._revision = plant.revision
-        self.drive = drive = heading_drive(plant, self.body, self.uncertainty)
+
+class BoundHeadingDriveClearance(BoundConstraint):
+    """HeadingDriveClearance on a plant."""
+
+    predicts: bool = True
+    spec: HeadingDriveClearance
+    plant: MujocoPlant
+
+    def __init__(self, spec: HeadingDriveClearance, plant: Plant) -> None:
+        hint = "HeadingDriveClearance needs a MujocoPlant: it reads the robot's model"
+        super().__init__(spec, require_mujoco(plant, hint))
+        self._frame = PlanarFrame(self.plant, self.spec.body)
+        self._read_constants()
+
+    def _read_constants(self) -> None:
+        self._revision = self.plant.revision
+        self.drive = drive = heading_drive(self.plant, self.spec.body, self.spec.uncertainty)
         # Predictions are made for the corners of the uncertainty: each must keep what is needed.
         self._models = drive.corners()
         self._swivel = 2.0 * abs(drive.com_offset)
@@ -109,25 +126,30 @@ class HeadingDriveClearance:
             drive.yaw_limit / max(drive.yaw_damping, 1e-12), math.pi / drive.hold_s
         )
 
-    def _look(self, plant: MujocoPlant) -> None:
-        """Take the state, once per observation."""
-        if plant.stamp == self._stamp:
-            return
-        self._stamp = plant.stamp
-        if plant.revision != self._revision:
-            self._read_constants(plant)
-        self._side_steps -= 1
-        self._motion = motion = self._frame.motion(plant)
-        self._path = path = self.drive.stopping_path(motion, self.brake)
+    def start(self) -> Memory:
+        """No detour is being made."""
+        return Detour()
+
+    def executed(self, control: Array) -> Memory:
+        """The detour that is being made."""
+        return self._detour
+
+    def observe(self, memory: Detour) -> None:
+        """Take the state, and the detour that is being made."""
+        self._detour = Detour(memory.side, memory.steps - 1)
+        if self.plant.revision != self._revision:
+            self._read_constants()
+        self._motion = motion = self._frame.motion(self.plant)
+        self._path = path = self.drive.stopping_path(motion, self.spec.brake)
         self._backup: list[StoppingPath] = []
         speed = math.hypot(motion.vx, motion.vy) + abs(self.drive.com_offset * motion.yaw_rate)
         self._loss = self._push + speed * (self.drive.hold_s + self._turn * self.drive.coast_time)
-        x, y, reserve = motion.x, motion.y, self.margin + self.state_error
+        x, y, reserve = motion.x, motion.y, self.spec.margin + self.spec.state_error
         kept = path.reach + self._swivel
         bounds: list[tuple[float, _Circle]] = []
-        for obstacle in self.obstacles:
+        for obstacle in self.spec.obstacles:
             if isinstance(obstacle, Discs):
-                where, room = obstacle.centers(plant).tolist(), obstacle.radius + reserve
+                where, room = obstacle.centers(self.plant).tolist(), obstacle.radius + reserve
             else:
                 where, room = [obstacle.center], obstacle.radius + reserve
             for center in where:
@@ -151,10 +173,9 @@ class HeadingDriveClearance:
             return path.distance(x, y) - self._swivel - room
         return min(path.distance(x, y), path.end_distance(x, y) - self._swivel) - room
 
-    def value(self, plant: MujocoPlant) -> Array:
+    def value(self) -> Array:
         """Clearance of the stopping path from the nearest disc, margin and state error not taken off, m, (1,)."""
-        self._look(plant)
-        return np.array([self._least + self.margin + self.state_error])
+        return np.array([self._least + self.spec.margin + self.spec.state_error])
 
     def _needed(self, disc: _Circle, backup: StoppingPath) -> float:
         """The clearance that a control must leave of a disc, from inside the safe set: a share of today's."""
@@ -183,12 +204,15 @@ class HeadingDriveClearance:
 
     def _after(self, drive: float, turn: float) -> list[StoppingPath]:
         """The stopping paths at the end of a held control, one per model of the uncertainty."""
-        path, motion, brake = self.drive.stopping_path, self._motion, self.brake
+        path, motion, brake = self.drive.stopping_path, self._motion, self.spec.brake
         return [path(model.predict(motion, drive, turn), brake) for model in self._models]
 
-    def admits(self, plant: MujocoPlant, control: Array) -> bool:
+    def slack(self, control: Array) -> float:
+        """Not measured: whether a control is admitted is all that is known."""
+        return 0.0 if self.admits(control) else -math.inf
+
+    def admits(self, control: Array) -> bool:
         """Predict the held control step; its end must still have a safe stopping path."""
-        self._look(plant)
         if not self._close:
             return True
         paths = self._after(float(control[self._frame.drive_index]), float(control[self._frame.turn_index]))
@@ -203,9 +227,8 @@ class HeadingDriveClearance:
                     return False
         return True
 
-    def rows(self, plant: MujocoPlant) -> HalfSpaces:
+    def rows(self) -> HalfSpaces:
         """Secants of the clearance after one hold, over the acting controls, one row per disc in play."""
-        self._look(plant)
         k, t = self._frame.drive_index, self._frame.turn_index
         normals, offsets = [], []
         if self._close:
@@ -219,12 +242,12 @@ class HeadingDriveClearance:
                     worst = at_brake + min(0.0, by_drive * (pushing - braking)) - abs(by_turn)
                     if worst >= needed:
                         continue
-                    normal = np.zeros(plant.model.nu)
+                    normal = np.zeros(self.plant.model.nu)
                     normal[k], normal[t] = -by_drive, -by_turn
                     normals.append(normal)
                     offsets.append(at_brake - by_drive * braking - needed + _HAIR_M)
         if not normals:
-            return HalfSpaces.none(plant.model.nu)
+            return HalfSpaces.none(self.plant.model.nu)
         return HalfSpaces(np.array(normals), np.array(offsets))
 
     def _asked(self, backup: StoppingPath) -> list[tuple[Callable[[StoppingPath], float], float]]:
@@ -241,18 +264,13 @@ class HeadingDriveClearance:
         m = self._motion
         ahead = m.vx * math.cos(m.heading) + m.vy * math.sin(m.heading)
         full = self.drive.drive_limit / self.drive.drive_gain
-        braking = self.drive.brake_control(ahead) if self.brake else 0.0
+        braking = self.drive.brake_control(ahead) if self.spec.brake else 0.0
         return braking, math.copysign(full, ahead)
 
-    def reset(self) -> None:
-        """Forget the side on which a disc is being passed."""
-        self._side, self._side_steps = 0.0, 0
-
-    def suggestions(self, plant: MujocoPlant, control: Array) -> list[Array]:
+    def candidates(self, control: Array) -> list[Array]:
         """Controls that lead around the disc in the way, to be tried before a refused control is projected."""
-        if not self.detour:
+        if not self.spec.detour:
             return []
-        self._look(plant)
         k, t = self._frame.drive_index, self._frame.turn_index
         drive = float(control[k])
         if not self._close or drive == 0.0:
@@ -264,25 +282,25 @@ class HeadingDriveClearance:
         in_front = [d for d in self._close if (d[0] - m.x) * ahead + (d[1] - m.y) * beside > 0.0]
         if not in_front:
             return []  # driving away from all of them: nothing to go around
-        if self._side_steps <= 0:
+        side = self._detour.side
+        if self._detour.steps <= 0:
             path = self._after(drive, float(control[t]))[0]
             x, y, _ = min(in_front, key=lambda disc: self._clearance(path, disc))
             # A disc to the right of the drive is passed on the left.
-            self._side = 1.0 if ahead * (y - m.y) - beside * (x - m.x) <= 0.0 else -1.0
-        self._side_steps = _DETOUR_MEMORY
+            side = 1.0 if ahead * (y - m.y) - beside * (x - m.x) <= 0.0 else -1.0
+        self._detour = Detour(side, _DETOUR_MEMORY)
         around = np.array(control)
-        around[t] = self._side
+        around[t] = side
         turn_only = np.array(around)
         turn_only[k] = 0.0
         return [around, turn_only]
 
-    def backup(self, plant: MujocoPlant) -> Array:
+    def backup(self) -> Array:
         """The control that never shrinks the clearance: brake along the heading, hold the heading.
 
         From inside a disc it drives out, whichever way is better.
         """
-        self._look(plant)
-        control = np.zeros(plant.model.nu)
+        control = np.zeros(self.plant.model.nu)
         drive = self._ends()[0]
         if self._least < 0.0:
             full = self.drive.drive_limit / self.drive.drive_gain

@@ -20,9 +20,16 @@ from numpy.typing import NDArray
 
 from safe_wrappers.control.backup.point_among_walls import PointAmongWalls, PointMotion
 from safe_wrappers.control.numerics.rectangles import Rectangle, gaps, nearest
-from safe_wrappers.errors import UnsupportedEnvError
-from safe_wrappers.filter.constraint import HalfSpaces, Promise, non_negative, positive
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.filter.constraint import (
+    BoundConstraint,
+    Constraint,
+    HalfSpaces,
+    Memory,
+    Promise,
+    non_negative,
+    positive,
+)
+from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.planar_point import planar_point
 from safe_wrappers.plants.queries.walls import walls
@@ -46,7 +53,7 @@ _HALVINGS = 5
 
 
 @dataclass
-class WallClearance:
+class WallClearance(Constraint):
     """Keep a point mass that is pushed along two axes out of every wall of a maze (PointMaze).
 
     Walls and point are found in the MuJoCo model: the body on its two slides, and every fixed box, along x and y,
@@ -86,32 +93,39 @@ class WallClearance:
         if self.velocity_clip is not None:
             self.velocity_clip = positive("velocity_clip", self.velocity_clip, "m/s")
 
-    def bind(self, plant: Plant) -> None:
-        """Find the point and its walls in the plant's model."""
-        if not isinstance(plant, MujocoPlant):
-            raise UnsupportedEnvError(
-                "WallClearance needs a MujocoPlant: it reads point and walls from the model. On an AnalyticPlant "
-                "use Clearance(obstacles=[Box(...)], position=[0, 1], velocity=[2, 3], braking=...)"
-            )
-        self._read_constants(plant)
-        self._stamp = -1
+    def bind(self, plant: Plant) -> "BoundWallClearance":
+        """On a plant."""
+        return BoundWallClearance(self, plant)
 
-    def _read_constants(self, plant: MujocoPlant) -> None:
-        self._revision = plant.revision
-        clip = self.velocity_clip if self.velocity_clip is not None else math.inf
-        self._point = point = planar_point(plant, clip)
-        around, reach = walls(plant.model, point.body)
-        self._among = PointAmongWalls(*point.axes, around, self.velocity_clip is not None)
-        self._room = reach + self.margin
 
-    def _look(self, plant: MujocoPlant) -> None:
-        """Take the state, once per observation."""
-        if plant.stamp == self._stamp:
-            return
-        self._stamp = plant.stamp
-        if plant.revision != self._revision:
-            self._read_constants(plant)
-        (i, j), (x, y), q, v = self._point.joints, self._point.origin, plant.qpos, plant.qvel
+class BoundWallClearance(BoundConstraint):
+    """WallClearance on a plant."""
+
+    predicts: bool = True
+    spec: WallClearance
+    plant: MujocoPlant
+
+    def __init__(self, spec: WallClearance, plant: Plant) -> None:
+        hint = "use Clearance(obstacles=[Box(...)], position=[0, 1], velocity=[2, 3], braking=...)"
+        needed = (
+            "WallClearance needs a MujocoPlant: it reads point and walls from the model. On an AnalyticPlant"
+        )
+        super().__init__(spec, require_mujoco(plant, f"{needed} {hint}"))
+        self._read_constants()
+
+    def _read_constants(self) -> None:
+        self._revision = self.plant.revision
+        clip = self.spec.velocity_clip if self.spec.velocity_clip is not None else math.inf
+        self._point = point = planar_point(self.plant, clip)
+        around, reach = walls(self.plant.model, point.body)
+        self._among = PointAmongWalls(*point.axes, around, self.spec.velocity_clip is not None)
+        self._room = reach + self.spec.margin
+
+    def observe(self, memory: Memory) -> None:
+        """Take the state."""
+        if self.plant.revision != self._revision:
+            self._read_constants()
+        (i, j), (x, y), q, v = self._point.joints, self._point.origin, self.plant.qpos, self.plant.qvel
         motion = PointMotion(float(q[i]) + x, float(q[j]) + y, float(v[i]), float(v[j]))
         self._motion = self._among.clipped(motion)
         self._needed: float | None = None
@@ -121,17 +135,19 @@ class WallClearance:
             self._least = math.nan
         self._inside = self._least >= -_HAIR_M
 
-    def value(self, plant: MujocoPlant) -> Array:
+    def value(self) -> Array:
         """Distance of the braking path from touching the nearest wall, margin not taken off, m, shape (1,).
 
         No walls, no value: shape (0,).
         """
-        self._look(plant)
-        return np.array([self._least + self.margin] if self._among.walls else [])
+        return np.array([self._least + self.spec.margin] if self._among.walls else [])
 
-    def admits(self, plant: MujocoPlant, control: Array) -> bool:
+    def slack(self, control: Array) -> float:
+        """Not measured: whether a control is admitted is all that is known."""
+        return 0.0 if self.admits(control) else -math.inf
+
+    def admits(self, control: Array) -> bool:
         """Whether a held control, and braking after it, keeps its distance from every wall."""
-        self._look(plant)
         i, j = self._point.actuators
         return self._admitted((float(control[i]), float(control[j])))
 
@@ -154,10 +170,9 @@ class WallClearance:
             self._needed = min(target, self._left_after(self._backup()))
         return self._needed
 
-    def backup(self, plant: MujocoPlant) -> Array:
+    def backup(self) -> Array:
         """The control that is always admitted: brake both axes. From outside it leads back inside."""
-        self._look(plant)
-        return self._as_control(np.zeros(plant.model.nu), self._backup())
+        return self._as_control(np.zeros(self.plant.model.nu), self._backup())
 
     def _backup(self) -> _Control:
         """Braking; from outside the safe set, along the shortest way back to rest just inside it."""
@@ -186,9 +201,8 @@ class WallClearance:
         out[list(self._point.actuators)] = control
         return out
 
-    def suggestions(self, plant: MujocoPlant, control: Array) -> list[Array]:
+    def candidates(self, control: Array) -> list[Array]:
         """Admissible controls near a refused one, the nearest first: those that slide along the walls in its way."""
-        self._look(plant)
         (i, j), x_axis, y_axis = self._point.actuators, self._among.x_axis, self._among.y_axis
         asked = (
             max(x_axis.low, min(float(control[i]), x_axis.high)),
@@ -197,7 +211,7 @@ class WallClearance:
         found = [c for c in self._turned(asked, _TURNS) if self._admitted(c)] if self._inside else []
         if not found:  # where the path fits and no rectangle does
             found = [self._approached(self._backup(), asked, axes) for axes in ((0, 1), (1, 0))]
-        elif self.velocity_clip is not None:
+        elif self.spec.velocity_clip is not None:
             found = [self._towards(c, asked) for c in found]
         found.sort(key=lambda c: math.dist(c, asked))
         return [self._as_control(control, c) for c in found]
@@ -248,12 +262,11 @@ class WallClearance:
             low, high = (middle, high) if self._admitted(at(middle), _HAIR_M) else (low, middle)
         return at(low)
 
-    def rows(self, plant: MujocoPlant) -> HalfSpaces:
+    def rows(self) -> HalfSpaces:
         """Bounds on the control along x and y: a convex part of what is admitted, braking included.
 
         For composing with other constraints' rows: alone, `suggestions` are less conservative.
         """
-        self._look(plant)
         normals, offsets = [], []
         backup, room = self._backup(), self._room + _HAIR_M
         around = self._among.reached(self._motion, *backup)
@@ -266,10 +279,12 @@ class WallClearance:
                 before = wall[2 * axis] - around[2 * axis + 1] >= around[2 * axis] - wall[2 * axis + 1]
                 sign = 1.0 if before else -1.0
                 limit = self._stopped_at(axis, wall, before, share * gap[axis] if corner else room)
-                normals.append(self._as_control(np.zeros(plant.model.nu), _replaced((0.0, 0.0), axis, sign)))
+                normals.append(
+                    self._as_control(np.zeros(self.plant.model.nu), _replaced((0.0, 0.0), axis, sign))
+                )
                 offsets.append(max(sign * limit, sign * backup[axis]))
         if not normals:
-            return HalfSpaces.none(plant.model.nu)
+            return HalfSpaces.none(self.plant.model.nu)
         return HalfSpaces(np.array(normals), np.array(offsets))
 
 

@@ -8,20 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.constraints.contact.contact_limit import ContactLimit
+from safe_wrappers.constraints.rollout import BoundSlacks
 from safe_wrappers.control.contact.friction_cone import normal_and_tangential
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import Promise, non_negative, positive
+from safe_wrappers.filter.constraint import Constraint, Promise, non_negative, positive
 from safe_wrappers.plants.mujoco.contact_forecast import can_touch_the_world
 from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
 
 
 @dataclass
-class ContactFeasibility(ContactLimit):
+class ContactFeasibility(Constraint):
     """Keep every contact force of the robot with the fixed world inside a narrower friction cone: `|f_t| <= mu f_n`.
 
     In a simulator forces are inside the model's cone by construction; a foot whose force has reached it slides. So
@@ -72,63 +72,78 @@ class ContactFeasibility(ContactLimit):
                 )
             self.bodies = list(self.bodies)
 
-    def bind(self, plant: Plant) -> None:
-        """Resolve the bodies."""
-        super().bind(plant)
-        assert isinstance(plant, MujocoPlant)
-        m = plant.model
+    def bind(self, plant: Plant) -> "BoundContactFeasibility":
+        """On a plant."""
+        return BoundContactFeasibility(self, plant)
+
+
+class BoundContactFeasibility(BoundSlacks):
+    """ContactFeasibility on a plant."""
+
+    info_keys: tuple[str, ...] = (keys.WHOLE_BODY_CONTACTS, keys.WHOLE_BODY_CONE_MARGIN)
+    spec: ContactFeasibility
+
+    def __init__(self, spec: ContactFeasibility, plant: Plant) -> None:
+        super().__init__(spec, require_contacts(plant, "ContactFeasibility"))
+        m = self.plant.model
         touching = can_touch_the_world(m)
         if not touching.any():
             raise UnsupportedEnvError(
                 "no body of this model can touch the fixed world with friction: there is no cone to stay in"
             )
         chosen = np.flatnonzero(touching)
-        if self.bodies is not None:
-            chosen = np.array([self._resting(plant, name, touching) for name in self.bodies])
+        if self.spec.bodies is not None:
+            chosen = np.array([self._resting(name, touching) for name in self.spec.bodies])
         self._index = np.full(m.nbody, -1)
         self._index[chosen] = np.arange(chosen.size)
         self._size = chosen.size
 
-    @staticmethod
-    def _resting(plant: MujocoPlant, name: str, touching: NDArray[np.bool_]) -> int:
-        i = plant.named("body", name)
-        if fixed_bodies(plant.model)[i]:
+    def _resting(self, name: str, touching: NDArray[np.bool_]) -> int:
+        i = self.plant.named("body", name)
+        if fixed_bodies(self.plant.model)[i]:
             raise ConfigurationError(f"the body {name!r} does not move, so the ground is part of it")
         if not touching[i]:
             raise UnsupportedEnvError(f"the body {name!r} cannot touch the fixed world with friction")
         return i
 
-    def insides(self, plant: MujocoPlant, control: Array) -> Array:
+    def insides(self, control: Array) -> Array:
         """By how much each body's contact forces stay inside the cone, at worst, shape (k,), shares of the weight.
 
         Infinite for a body that touches nothing; not a number where the simulation is none.
         """
-        found = plant.contact_forecast(control)
+        found = self.plant.contact_forecast(control)
         if not found.finite:
             return np.full(self._size, np.nan)
         worst = np.full(self._size, np.inf)
         which = self._index[found.body]
         seen = which >= 0
         normal, tangential = normal_and_tangential(found.force[seen], found.normal[seen])
-        held = self.friction_share * found.friction[seen] * normal
+        held = self.spec.friction_share * found.friction[seen] * normal
         inside = held - np.linalg.norm(tangential, axis=1)
-        np.minimum.at(worst, which[seen], np.minimum(inside, normal) / plant.weight_n)
+        np.minimum.at(worst, which[seen], np.minimum(inside, normal) / self.plant.weight_n)
         return worst
 
-    def slacks(self, plant: MujocoPlant, control: Array) -> Array:
+    def slacks(self, control: Array) -> Array:
         """What is left of the cone, tolerance added and margin taken off, per body, shares of the weight."""
         # What is inside by more than asked for, or in the air, is all the same: differences between a touch and none
         # would say nothing of the touch.
-        return np.minimum(self.insides(plant, control), self.margin) + self.tolerance - self.margin
+        return np.minimum(self.insides(control), self.spec.margin) + self.spec.tolerance - self.spec.margin
 
-    def report(self, proposed: Array, executed: Array) -> dict[str, Any]:
+    def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
         """The info keys `whole_body/cone_margin` and `whole_body/contacts`: forecast for the executed control."""
         contacts, margin = 0, 0.0
-        if self._has_decided:
-            found = self._plant.contact_forecast(executed)
+        if executed is not None:
+            found = self.plant.contact_forecast(executed)
             contacts = int((found.step == 0).sum())
-            margin = float(self.insides(self._plant, executed).min())
+            margin = float(self.insides(executed).min())
         return {
             keys.WHOLE_BODY_CONTACTS: contacts,
             keys.WHOLE_BODY_CONE_MARGIN: margin if np.isfinite(margin) else 0.0,
         }
+
+
+def require_contacts(plant: Plant, asker: str) -> MujocoPlant:
+    """The plant, if it can forecast contact forces."""
+    return require_mujoco(
+        plant, f"{asker} forecasts contact forces with a MuJoCo model; an AnalyticPlant has none"
+    )

@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.constraints.contact.geom_gaps import GeomGaps
-from safe_wrappers.constraints.rollout import Predicted
+from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.control.contact.body_regions import body_region
 from safe_wrappers.control.contact.impact import series_stiffness
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Promise, non_negative, positive
 from safe_wrappers.plants.mujoco.forecast import Forecast
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
@@ -25,7 +24,7 @@ _FIXED = 1e-12
 
 
 @dataclass
-class ImpactSpeedLimit(Predicted):
+class ImpactSpeedLimit(RolloutConstraint):
     """Keep the approach speed at every contact so low that its peak force stays below a limit.
 
     A mass m that meets a spring k at the speed v, and is pushed on by F_p, presses with at most
@@ -80,7 +79,6 @@ class ImpactSpeedLimit(Predicted):
 
     reach: float | None = field(default=None, init=False, repr=False)
     promise: Promise = field(default="best effort", init=False)
-    needs_acceleration: ClassVar[bool] = True
     unit: ClassVar[str] = "N"
 
     def __post_init__(self) -> None:
@@ -123,52 +121,59 @@ class ImpactSpeedLimit(Predicted):
         pad = np.inf if self.stiffness is None else self.stiffness
         return force, float(series_stiffness(pad, region.stiffness)), np.inf if self.clamped else region.mass
 
+    def bind(self, plant: Plant) -> "BoundImpactSpeedLimit":
+        """On a plant."""
+        return BoundImpactSpeedLimit(self, plant)
+
+
+class BoundImpactSpeedLimit(BoundRollout):
+    """ImpactSpeedLimit on a plant."""
+
+    spec: ImpactSpeedLimit
+
     @property
     def scale(self) -> float:
         """The limit."""
-        return self._force
+        return self.spec._force
 
-    def bind(self, plant: Plant) -> None:
-        """Resolve the geoms."""
-        super().bind(plant)
-        assert isinstance(plant, MujocoPlant)
-        self._gaps = GeomGaps(plant, self.bodies, self.against)
-        self._probe = mujoco.MjData(plant.model)
+    def __init__(self, spec: ImpactSpeedLimit, plant: Plant) -> None:
+        plant.require_acceleration("ImpactSpeedLimit")
+        super().__init__(spec, plant)
+        self._gaps = GeomGaps(self.plant, self.spec.bodies, self.spec.against)
+        self._probe = mujoco.MjData(self.plant.model)
         self._integration = np.zeros(
-            mujoco.mj_stateSize(plant.model, int(mujoco.mjtState.mjSTATE_INTEGRATION))
+            mujoco.mj_stateSize(self.plant.model, int(mujoco.mjtState.mjSTATE_INTEGRATION))
         )
         self._control: Array | None = None
-        m = plant.model
+        m = self.plant.model
         self._jacobians = [np.zeros((3, m.nv)) for _ in range(4)]
         self._mobile = np.zeros((1, m.nv))
 
-    # One state ------------------------------------------------------------------------------------------------
-
-    def _at(self, plant: MujocoPlant, qpos: Array, qvel: Array, control: Array | None) -> None:
+    def _at(self, qpos: Array, qvel: Array, control: Array | None) -> None:
         """Everything about a state but its constraint forces; without a control the actuators do not push."""
-        m, d = plant.model, self._probe
+        m, d = self.plant.model, self._probe
         d.qpos[:], d.qvel[:] = qpos, qvel
         self._pushing = control is not None
         if control is not None:
             d.ctrl[:] = control
         mujoco.mj_fwdPosition(m, d)
         mujoco.mj_fwdVelocity(m, d)
-        self._moving = self._forces(plant)
+        self._moving = self._forces()
         self._speeds = qvel
         self._curving = bool(qvel.any())
         self._resting: Array | None = None
 
-    def _forces(self, plant: MujocoPlant) -> Array:
+    def _forces(self) -> Array:
         """Generalised forces without those of constraints, shape (nv,)."""
-        m, d = plant.model, self._probe
+        m, d = self.plant.model, self._probe
         mujoco.mj_fwdActuation(m, d)
         mujoco.mj_fwdAcceleration(m, d)
         return np.asarray(d.qfrc_smooth - (0.0 if self._pushing else d.qfrc_actuator))
 
-    def _contact(self, plant: MujocoPlant, pair: int) -> "_Contact":
+    def _contact(self, pair: int) -> "_Contact":
         """What a contact of the pair would be like, at the state of `_at`."""
-        m, d = plant.model, self._probe
-        gap, normal, points = self._gaps.nearest(plant.model, d, pair)
+        m, d = self.plant.model, self._probe
+        gap, normal, points = self._gaps.nearest(self.plant.model, d, pair)
         robot, other = self._gaps.pairs[pair]
         first, second, first_dot, second_dot = self._jacobians
         mujoco.mj_jac(m, d, first, None, points[:3], m.geom_bodyid[robot])
@@ -181,46 +186,46 @@ class ImpactSpeedLimit(Predicted):
         speed = float(row @ self._speeds)
         if mobility < _FIXED:
             return _Contact(gap, 0.0, 0.0, 0.0, 0.0)
-        mass = 1.0 / mobility if self.effective_mass is None else self.effective_mass
+        mass = 1.0 / mobility if self.spec.effective_mass is None else self.spec.effective_mass
         moving = float(given @ self._moving)
         if self._curving:
             mujoco.mj_jacDot(m, d, first_dot, None, points[:3], m.geom_bodyid[robot])
             mujoco.mj_jacDot(m, d, second_dot, None, points[3:], m.geom_bodyid[other])
             moving += float(normal @ (first_dot - second_dot) @ self._speeds)
         if not self._gaps.moves[pair]:
-            mass = 1.0 / (1.0 / mass + 1.0 / self._other_mass)
-        push = mass * max(moving, self._at_rest(plant, given), 0.0)
-        return _Contact(gap, max(speed, 0.0), mass * self._stiffness, push, self._stiffness * max(-gap, 0.0))
+            mass = 1.0 / (1.0 / mass + 1.0 / self.spec._other_mass)
+        push = mass * max(moving, self._at_rest(given), 0.0)
+        return _Contact(
+            gap, max(speed, 0.0), mass * self.spec._stiffness, push, self.spec._stiffness * max(-gap, 0.0)
+        )
 
-    def _at_rest(self, plant: MujocoPlant, given: Array) -> float:
+    def _at_rest(self, given: Array) -> float:
         """Acceleration along the normal once the motion has stopped, when damping no longer holds it back, m/s^2."""
         if self._resting is None:
             if self._curving:
                 d = self._probe
                 velocity = d.qvel.copy()
                 d.qvel[:] = 0.0
-                mujoco.mj_fwdVelocity(plant.model, d)
-                self._resting = self._forces(plant)
+                mujoco.mj_fwdVelocity(self.plant.model, d)
+                self._resting = self._forces()
                 d.qvel[:] = velocity
-                mujoco.mj_fwdVelocity(plant.model, d)
+                mujoco.mj_fwdVelocity(self.plant.model, d)
             else:
                 self._resting = self._moving
         return float(given @ self._resting)
 
-    def backup(self, plant: MujocoPlant) -> Array:
+    def backup(self) -> Array:
         """The braking with which every forecast goes on: what was admitted for its sake stays admissible."""
-        return plant.braking()
+        return self.plant.braking()
 
-    # Now, and along a forecast --------------------------------------------------------------------------------
-
-    def _now(self, plant: MujocoPlant) -> Array:
-        m, d = plant.model, self._probe
+    def _now(self) -> Array:
+        m, d = self.plant.model, self._probe
         self._known: dict[tuple[int, bytes], Array] = {}
-        data, what = plant.pose(), int(mujoco.mjtState.mjSTATE_INTEGRATION)
+        data, what = self.plant.pose(), int(mujoco.mjtState.mjSTATE_INTEGRATION)
         mujoco.mj_getState(m, data, self._integration, what)
         mujoco.mj_setState(m, d, self._integration, what)
-        self._at(plant, plant.qpos, plant.qvel, None)
-        contacts = [self._contact(plant, pair) for pair in range(len(self._gaps.pairs))]
+        self._at(self.plant.qpos, self.plant.qvel, None)
+        contacts = [self._contact(pair) for pair in range(len(self._gaps.pairs))]
         touching = [c.gap <= touch for c, touch in zip(contacts, self._gaps.touch, strict=True)]
         # Only a contact that is there is a fact; before it, how it will be is the forecast's to say.
         self._lost = np.array(
@@ -228,20 +233,20 @@ class ImpactSpeedLimit(Predicted):
         )
         value = []
         for c, there in zip(contacts, touching, strict=True):
-            left = self._force - self._braked(c).peak if not there else self._force - c.peak
-            value.append(left if there or self.braking is not None else max(left, 0.0))
+            left = self.spec._force - self._braked(c).peak if not there else self.spec._force - c.peak
+            value.append(left if there or self.spec.braking is not None else max(left, 0.0))
         return np.array(value)
 
     def _braked(self, contact: "_Contact") -> "_Contact":
         """A contact to come, at the speed that the declared braking leaves of it."""
-        if self.braking is None:
+        if self.spec.braking is None:
             return contact
-        square = max(contact.speed**2 - 2.0 * self.braking * contact.gap, 0.0)
+        square = max(contact.speed**2 - 2.0 * self.spec.braking * contact.gap, 0.0)
         return replace(contact, speed=square**0.5)
 
     def _left(self, contact: "_Contact") -> float:
         """What is left of the limit less the margin, N, to first order; in squares, nearly linear in the control."""
-        limit = self._force - self.margin
+        limit = self.spec._force - self.spec.margin
         # Beyond the limit the push would change its sign with that of the first factor.
         push = contact.push if contact.pressed <= limit else -contact.push
         square = (limit - contact.pressed) * (limit + contact.pressed - 2.0 * push)
@@ -250,37 +255,36 @@ class ImpactSpeedLimit(Predicted):
     def _violation(self, value: Array) -> Array:
         return self._lost
 
-    def slacks(self, plant: MujocoPlant, control: Array) -> Array:
-        """What is left along the forecast of a control; see `Predicted`."""
-        self._look(plant)
-        key = plant.revision, control.tobytes()
+    def slacks(self, control: Array) -> Array:
+        """What is left along the forecast of a control; see `BoundRollout`."""
+        key = self.plant.revision, control.tobytes()
         if key not in self._known:
             self._control = control
-            self._known[key] = super().slacks(plant, control)
+            self._known[key] = super().slacks(control)
         return self._known[key]
 
-    def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
+    def _room(self, forecast: Forecast) -> Array:
         k, pairs = len(forecast.qpos), len(self._gaps.pairs)
         if not np.isfinite(forecast.qpos[-1]).all():
             return np.full((k, pairs), np.nan)  # MuJoCo gave up: nobody knows
         touched: dict[int, list[int]] = {}
         for pair in range(pairs):
-            for instant in self._gaps.touched(plant, forecast, self._probe, pair):
+            for instant in self._gaps.touched(self.plant, forecast, self._probe, pair):
                 touched.setdefault(instant, []).append(pair)
-        soon = plant.substeps - 1
-        if self.braking is not None:
+        soon = self.plant.substeps - 1
+        if self.spec.braking is not None:
             touched[soon] = list(range(pairs))
         # Without contact as much is left as in the gentlest one.
-        room = np.full((k, pairs), 0.5 * (self._force - self.margin))
+        room = np.full((k, pairs), 0.5 * (self.spec._force - self.spec.margin))
         for instant, those in touched.items():
             # At the end of the held step another control takes over.
             control = self._control if instant < soon or instant == 0 else None
-            self._at(plant, forecast.qpos[instant], forecast.qvel[instant], control)
+            self._at(forecast.qpos[instant], forecast.qvel[instant], control)
             for pair in those:
-                contact = self._contact(plant, pair)
+                contact = self._contact(pair)
                 there = contact.gap <= self._gaps.touch[pair]
                 room[instant, pair] = self._left(contact if there else self._braked(contact))
-        return room + self.margin
+        return room + self.spec.margin
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,10 +23,17 @@ from safe_wrappers.control.legged.whole_body import (
     solve_pyramid,
 )
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import HalfSpaces, Promise, non_negative, positive
+from safe_wrappers.filter.constraint import (
+    BoundConstraint,
+    Constraint,
+    Memory,
+    Promise,
+    non_negative,
+    positive,
+)
 from safe_wrappers.plants.mujoco.contact_forecast import can_touch_the_world
 from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.floating_base import equations_of_motion
 
@@ -37,7 +44,7 @@ _SAME = 1e-9
 
 
 @dataclass
-class Stance:
+class Stance(Constraint):
     """Keep to torques under which the feet that stand could stay: the whole-body program at one instant.
 
     The contacts with the fixed world that carry force under the policy's torques are to come to rest and stay; those
@@ -69,7 +76,6 @@ class Stance:
     settle_s: float = 0.05
 
     promise: Promise = field(default="best effort", init=False)
-    scale = 1.0
 
     def __post_init__(self) -> None:
         self.friction_share = positive(
@@ -87,66 +93,75 @@ class Stance:
             self.zmp_inset = positive("zmp_inset", self.zmp_inset, "m: forces that push do the rest")
         self.settle_s = positive("settle_s", self.settle_s, "s")
 
-    def bind(self, plant: Plant) -> None:
-        """Resolve the joints."""
-        if not isinstance(plant, MujocoPlant) or not plant.has_acceleration:
-            raise UnsupportedEnvError(
-                "Stance reads inertia and contacts from a MujocoPlant whose controls are forces"
-            )
-        if not can_touch_the_world(plant.model).any():
+    def bind(self, plant: Plant) -> "BoundStance":
+        """On a plant."""
+        return BoundStance(self, plant)
+
+
+class BoundStance(BoundConstraint):
+    """Stance on a plant."""
+
+    predicts: bool = True
+    info_keys: tuple[str, ...] = (keys.WHOLE_BODY_CONTACTS, keys.WHOLE_BODY_CONE_MARGIN)
+    spec: Stance
+    plant: MujocoPlant
+
+    def __init__(self, spec: Stance, plant: Plant) -> None:
+        hint = "Stance reads inertia and contacts from a MujocoPlant whose controls are forces"
+        super().__init__(spec, require_mujoco(plant, hint))
+        if not plant.has_acceleration:
+            raise UnsupportedEnvError(hint)
+        if not can_touch_the_world(self.plant.model).any():
             raise UnsupportedEnvError(
                 "no body of this model can touch the fixed world with friction: there is nothing to stand on"
             )
-        self._plant = plant
-        if self.joint_tolerance is not None:
-            refuse_uncovered_stops(plant.model)
-        self._joints, low, high = stops(plant.model)
-        wider = self.joint_tolerance or 0.0
+        if self.spec.joint_tolerance is not None:
+            refuse_uncovered_stops(self.plant.model)
+        self._joints, low, high = stops(self.plant.model)
+        wider = self.spec.joint_tolerance or 0.0
         self._low, self._high = low - wider, high + wider
-        self._qpos = plant.model.jnt_qposadr[self._joints]
-        self._dofs = plant.model.jnt_dofadr[self._joints]
-        self.reset()
+        self._qpos = self.plant.model.jnt_qposadr[self._joints]
+        self._dofs = self.plant.model.jnt_dofadr[self._joints]
 
-    def reset(self) -> None:
-        """Forget the episode."""
-        self._stamp: int | None = None
+    def observe(self, memory: Memory) -> None:
+        """Nothing is known of this state yet."""
+        self._known = False
         self._problem: WholeBodyProblem | None = None
         self._answer: WholeBodySolution | None = None
         self._asked: Array | None = None
         self._contacts = 0
 
-    def _look(self, plant: MujocoPlant, control: Array) -> None:
-        """Write the program down, once per observation; the first control asked for says which contacts open."""
-        if self._stamp == plant.stamp:
+    def _write_down(self, control: Array) -> None:
+        """The program, once per observation; the first control asked for says which contacts open."""
+        if self._known:
             return
-        self._stamp, self._answer, self._asked = plant.stamp, None, None
-        self._problem, self._contacts = None, 0
-        data = plant.under(control)
-        motion = equations_of_motion(plant.model, data, plant.actuators)
+        self._known = True
+        data = self.plant.under(control)
+        motion = equations_of_motion(self.plant.model, data, self.plant.actuators)
         found = motion.contacts
         within = bool(
-            (np.abs(plant.state) < mujoco.mjMAXVAL).all()
+            (np.abs(self.plant.state) < mujoco.mjMAXVAL).all()
         )  # else MuJoCo resets the state in its step
         if not (within and np.isfinite(motion.bias).all() and np.isfinite(found.forces).all()):
             return  # nothing can be said
-        ground = fixed_bodies(plant.model)[found.pushed_by]
+        ground = fixed_bodies(self.plant.model)[found.pushed_by]
         # What the robot's bodies do to each other, and other things to it, stays as it is.
         bias = motion.bias - np.einsum("kiv,ki->v", found.jacobians[~ground], found.forces[~ground])
         jacobians, drift, normals = found.jacobians[ground], found.drift[ground], found.normals[ground]
         pressing = np.einsum("ki,ki->k", found.forces[ground], normals) > 0.0
-        acceleration = -(jacobians @ plant.qvel) / self.settle_s
+        acceleration = -(jacobians @ self.plant.qvel) / self.spec.settle_s
         limits: dict[str, Any] = {}
-        if self.joint_tolerance is not None:
+        if self.spec.joint_tolerance is not None:
             limits["acceleration_rows"], limits["acceleration_limits"] = predicted_position_rows(
                 self._dofs,
-                plant.qpos[self._qpos],
-                plant.qvel[self._dofs],
+                self.plant.qpos[self._qpos],
+                self.plant.qvel[self._dofs],
                 self._low,
                 self._high,
-                plant.hold_s,
-                plant.model.nv,
+                self.plant.hold_s,
+                self.plant.model.nv,
             )
-        if self.zmp_inset is not None:
+        if self.spec.zmp_inset is not None:
             rows = self._balance(found.points[ground], normals, pressing)
             if rows is not None:
                 limits["force_rows"], limits["force_limits"] = rows, np.zeros(len(rows))
@@ -157,9 +172,9 @@ class Stance:
             jacobians,
             drift,
             normals,
-            self.friction_share * found.friction[ground],
-            plant.lower,
-            plant.upper,
+            self.spec.friction_share * found.friction[ground],
+            self.plant.lower,
+            self.plant.upper,
             control,
             contact_acceleration=acceleration,
             breaking=~pressing,
@@ -172,25 +187,25 @@ class Stance:
 
     def _balance(self, points: Array, normals: Array, pressing: NDArray[np.bool_]) -> Array | None:
         """The inset, as rows on all contact forces; None where there is no polygon."""
-        assert self.zmp_inset is not None
+        assert self.spec.zmp_inset is not None
         if np.count_nonzero(pressing) < 3:
             return None
         plane = common_plane(points[pressing], normals[pressing])
         if plane is None or len(support_polygon(plane.flat(points[pressing]))) < 3:
             return None
-        some = support_rows(points[pressing], plane, self.zmp_inset)
+        some = support_rows(points[pressing], plane, self.spec.zmp_inset)
         rows = np.zeros((len(some), len(points), 3))
         rows[:, pressing] = some.reshape(len(some), -1, 3)
         return np.asarray(rows.reshape(len(some), -1))
 
     def _solve(self, problem: WholeBodyProblem) -> WholeBodySolution:
-        return solve_cone(problem) if self.cone == "exact" else solve_pyramid(problem, self.edges)
+        return solve_cone(problem) if self.spec.cone == "exact" else solve_pyramid(problem, self.spec.edges)
 
-    def admits(self, plant: MujocoPlant, control: Array) -> bool:
+    def admits(self, control: Array) -> bool:
         """Whether the standing contacts could answer this control with forces inside their cones."""
         # An action space of another precision than the model's range may be a rounding wider.
-        control = np.clip(control, plant.lower, plant.upper)
-        self._look(plant, control)
+        control = np.clip(control, self.plant.lower, self.plant.upper)
+        self._write_down(control)
         if self._problem is None:
             return False
         answer = self._answer
@@ -209,10 +224,10 @@ class Stance:
         self._asked, self._answer = proposed.copy(), self._solve(replace(problem, nominal=proposed))
         return self._answer
 
-    def suggestions(self, plant: MujocoPlant, proposed: Array) -> Iterator[Array]:
+    def candidates(self, proposed: Array) -> Iterator[Array]:
         """The program's answer; where there is none, the control that misses least, which is refused."""
-        proposed = np.clip(proposed, plant.lower, plant.upper)
-        self._look(plant, proposed)
+        proposed = np.clip(proposed, self.plant.lower, self.plant.upper)
+        self._write_down(proposed)
         if self._problem is None:
             return
         if self._answer is None:  # another constraint was asked first, and has refused
@@ -220,25 +235,21 @@ class Stance:
         assert self._answer is not None
         yield self._answer.control
 
-    def shortfall(self, plant: MujocoPlant, control: Array) -> float:
-        """By how much the forces that would hold the contacts miss their cones, shares of the weight; <= 0: not."""
-        control = np.clip(control, plant.lower, plant.upper)
-        self._look(plant, control)
+    def slack(self, control: Array) -> float:
+        """What the forces that would hold the contacts leave of their cones, shares of the weight."""
+        control = np.clip(control, self.plant.lower, self.plant.upper)
+        self._write_down(control)
         if self._problem is None:
-            return float("inf")
+            return -np.inf
         forces, _ = rigid_forces(self._problem, control)
         if not len(forces):
             return 0.0
         missed = cone_excess(forces, self._problem.normals, self._problem.friction)
-        return float(missed.max()) / plant.weight_n
+        return -float(missed.max()) / self.plant.weight_n
 
-    def rows(self, plant: Any) -> HalfSpaces:
-        """None: forces are unknowns too, so what counts is the program."""
-        return HalfSpaces.none(plant.lower.size)
-
-    def report(self, proposed: Array, executed: Array) -> dict[str, Any]:
+    def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
         """The info keys `whole_body/contacts` and `whole_body/cone_margin`: of the forces that would hold them."""
         contacts, margin = 0, 0.0
-        if self._stamp == self._plant.stamp and self._problem is not None:
-            contacts, margin = self._contacts, 0.0 - self.shortfall(self._plant, executed)
+        if executed is not None and self._problem is not None:
+            contacts, margin = self._contacts, 0.0 + self.slack(executed)
         return {keys.WHOLE_BODY_CONTACTS: contacts, keys.WHOLE_BODY_CONE_MARGIN: margin}

@@ -7,17 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.constraints.contact.contact_limit import ContactLimit
+from safe_wrappers.constraints.contact.contact_feasibility import require_contacts
+from safe_wrappers.constraints.rollout import BoundSlacks
 from safe_wrappers.control.legged.support_distances import support_distances
-from safe_wrappers.filter.constraint import Promise, non_negative, positive
+from safe_wrappers.filter.constraint import Constraint, Memory, Promise, non_negative, positive
 from safe_wrappers.plants.mujoco.contact_forecast import ContactForecast
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
 
 
 @dataclass
-class SupportMargin(ContactLimit):
+class SupportMargin(Constraint):
     """Keep the zero moment point of the contact forces inside the hull of the contact points, by an inset.
 
     It speaks only while the model behind it holds: at least three contact points of one plane that are not on a line.
@@ -47,10 +48,22 @@ class SupportMargin(ContactLimit):
         self.inset = positive("inset", self.inset, "m: forces that push keep the point inside by themselves")
         self.margin = non_negative("margin", self.margin, "m")
 
-    def reset(self) -> None:
-        """Forget the episode."""
-        super().reset()
-        self._known_at: int | None = None
+    def bind(self, plant: Plant) -> "BoundSupportMargin":
+        """On a plant."""
+        return BoundSupportMargin(self, plant)
+
+
+class BoundSupportMargin(BoundSlacks):
+    """SupportMargin on a plant."""
+
+    info_keys: tuple[str, ...] = (keys.WHOLE_BODY_ZMP_MARGIN, keys.WHOLE_BODY_SUPPORTED)
+    spec: SupportMargin
+
+    def __init__(self, spec: SupportMargin, plant: Plant) -> None:
+        super().__init__(spec, require_contacts(plant, "SupportMargin"))
+
+    def observe(self, memory: Memory) -> None:
+        """Nothing is known of this state yet."""
         self._known: list[tuple[ContactForecast, list[float]]] = []
 
     def _distances(self, found: ContactForecast) -> list[float]:
@@ -58,24 +71,24 @@ class SupportMargin(ContactLimit):
         for other, distances in self._known:
             if other is found:
                 return distances
-        if self._known_at != self._plant.stamp:
-            self._known_at, self._known = self._plant.stamp, []
         distances = edge_distances(found)
         self._known.append((found, distances))
         return distances
 
-    def slacks(self, plant: MujocoPlant, control: Array) -> Array:
+    def slacks(self, control: Array) -> Array:
         """Distance to the edge minus inset and margin where it is least, shape (1,), m; 0 where there is none."""
-        found = plant.contact_forecast(control)
+        found = self.plant.contact_forecast(control)
         if not found.finite:
             return np.full(1, np.nan)
-        return np.full(1, min((d - self.inset - self.margin for d in self._distances(found)), default=0.0))
+        return np.full(
+            1, min((d - self.spec.inset - self.spec.margin for d in self._distances(found)), default=0.0)
+        )
 
-    def report(self, proposed: Array, executed: Array) -> dict[str, Any]:
+    def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
         """The info keys `whole_body/zmp_margin` and `whole_body/supported`: forecast for the executed control."""
         least, share = 0.0, 0.0
-        if self._has_decided:
-            found = self._plant.contact_forecast(executed)
+        if executed is not None:
+            found = self.plant.contact_forecast(executed)
             distances = self._distances(found) if found.finite else []
             least = min(distances, default=0.0)
             share = len(distances) / found.steps

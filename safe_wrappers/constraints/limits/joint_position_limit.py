@@ -9,18 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.constraints.limits.joints import scalar_joints
-from safe_wrappers.constraints.rollout import Predicted
+from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Promise, non_negative
 from safe_wrappers.plants.mujoco.forecast import Forecast
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
 
 
 @dataclass
-class JointPositionLimit(Predicted):
+class JointPositionLimit(RolloutConstraint):
     """Keep joint positions in a range that may be narrower than the model's own.
 
     Position under a force has relative degree two: a joint that is inside may be too fast to stay. So the
@@ -65,30 +64,38 @@ class JointPositionLimit(Predicted):
                 raise ConfigurationError("joints is a list of names, or None for every driven joint; got []")
         self._check_shared()
 
-    def bind(self, plant: Plant) -> None:
-        """Resolve the joints and their ranges."""
-        super().bind(plant)
-        assert isinstance(plant, MujocoPlant)
-        ids = scalar_joints(plant, self.joints)
-        model: mujoco.MjModel = plant.model
+    def bind(self, plant: Plant) -> "BoundJointPositionLimit":
+        """On a plant."""
+        return BoundJointPositionLimit(self, plant)
+
+
+class BoundJointPositionLimit(BoundRollout):
+    """JointPositionLimit on a plant."""
+
+    spec: JointPositionLimit
+
+    def __init__(self, spec: JointPositionLimit, plant: Plant) -> None:
+        super().__init__(spec, plant)
+        ids = scalar_joints(self.plant, self.spec.joints)
+        model: mujoco.MjModel = self.plant.model
         self._qpos = np.array([int(model.jnt_qposadr[j]) for j in ids])
         limited = model.jnt_limited[ids].astype(bool)
         own = np.where(limited[:, None], model.jnt_range[ids], [-np.inf, np.inf])
-        self._low = _per_joint("lower", self.lower, own[:, 0])
-        self._high = _per_joint("upper", self.upper, own[:, 1])
-        narrow = ~(self._high - self._low > 2.0 * self.margin)
+        self._low = _per_joint("lower", self.spec.lower, own[:, 0])
+        self._high = _per_joint("upper", self.spec.upper, own[:, 1])
+        narrow = ~(self._high - self._low > 2.0 * self.spec.margin)
         if narrow.any():
             j = int(np.flatnonzero(narrow)[0])
             raise ConfigurationError(
                 f"nothing is left of the range of joint {model.joint(ids[j]).name!r}: {self._low[j]:g} to "
-                f"{self._high[j]:g} with a margin of {self.margin:g} at both ends"
+                f"{self._high[j]:g} with a margin of {self.spec.margin:g} at both ends"
             )
         self._below, self._above = np.isfinite(self._low), np.isfinite(self._high)
         if not (self._below.any() or self._above.any()):
             raise ConfigurationError("none of these joints has a range in the model: pass lower and upper")
 
-    def _now(self, plant: MujocoPlant) -> Array:
-        return self._left(plant.qpos)
+    def _now(self) -> Array:
+        return self._left(self.plant.qpos)
 
     def _left(self, qpos: Array) -> Array:
         """Room to every bound that there is, the lower ones first, shape (..., n)."""
@@ -97,7 +104,7 @@ class JointPositionLimit(Predicted):
             [(q - self._low)[..., self._below], (self._high - q)[..., self._above]], axis=-1
         )
 
-    def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
+    def _room(self, forecast: Forecast) -> Array:
         return self._left(forecast.qpos)
 
 

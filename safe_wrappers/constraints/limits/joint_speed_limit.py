@@ -8,18 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.constraints.limits.joints import scalar_joints
-from safe_wrappers.constraints.rollout import RECOVERY_S, Predicted
-from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.constraints.rollout import RECOVERY_S, BoundRollout, RolloutConstraint
+from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import HalfSpaces, Promise, non_negative, positive
 from safe_wrappers.plants.mujoco.forecast import Forecast
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.plants.mujoco.plant import require_mujoco
 from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
 
 
 @dataclass
-class JointSpeedLimit(Predicted):
+class JointSpeedLimit(RolloutConstraint):
     """Keep `|joint speed| <= limit`.
 
     Speed under a force has relative degree one, so no stopping inset is needed: the rows bound the speed at
@@ -68,59 +68,64 @@ class JointSpeedLimit(Predicted):
             raise ConfigurationError(f"the margin {self.margin} leaves nothing of the limit {self.limit}")
         self._check_shared()
 
+    def bind(self, plant: Plant) -> "BoundJointSpeedLimit":
+        """On a plant."""
+        return BoundJointSpeedLimit(self, plant)
+
+
+class BoundJointSpeedLimit(BoundRollout):
+    """JointSpeedLimit on a plant."""
+
+    spec: JointSpeedLimit
+
     @property
     def scale(self) -> float:
         """The limit."""
-        return float(np.min(self.limit))
+        return float(np.min(self.spec.limit))
 
-    def bind(self, plant: Plant) -> None:
-        """Resolve the joints."""
-        if not isinstance(plant, MujocoPlant):
-            raise UnsupportedEnvError(
-                "JointSpeedLimit needs a MujocoPlant (named joints); on an AnalyticPlant write "
-                "Barrier(lambda x: limit**2 - x[i]**2)"
-            )
-        super().bind(plant)
-        ids = scalar_joints(plant, self.joints)
-        self._dofs = np.array([int(plant.model.jnt_dofadr[j]) for j in ids])
+    def __init__(self, spec: JointSpeedLimit, plant: Plant) -> None:
+        hint = "on an AnalyticPlant write Barrier(lambda x: limit**2 - x[i]**2)"
+        require_mujoco(plant, f"JointSpeedLimit needs a MujocoPlant (named joints); {hint}")
+        super().__init__(spec, plant)
+        ids = scalar_joints(self.plant, self.spec.joints)
+        self._dofs = np.array([int(self.plant.model.jnt_dofadr[j]) for j in ids])
         try:
-            limits = np.broadcast_to(np.asarray(self.limit, dtype=np.float64), (len(ids),))
+            limits = np.broadcast_to(np.asarray(self.spec.limit, dtype=np.float64), (len(ids),))
         except ValueError:
-            raise ConfigurationError(f"expected one limit or {len(ids)}, got {self.limit}") from None
-        self._bound = limits - self.margin
+            raise ConfigurationError(f"expected one limit or {len(ids)}, got {self.spec.limit}") from None
+        self._bound = limits - self.spec.margin
         self._limits = limits
 
-    def _now(self, plant: MujocoPlant) -> Array:
+    def _now(self) -> Array:
         """Speed left below the limit, per joint, rad/s or m/s."""
-        self._speeds = np.abs(plant.qvel[self._dofs])
+        self._speeds = np.abs(self.plant.qvel[self._dofs])
         return np.asarray(self._limits - self._speeds)
 
-    def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
+    def _room(self, forecast: Forecast) -> Array:
         return np.asarray(self._limits - np.abs(forecast.qvel[:, self._dofs]))
 
-    def slacks(self, plant: MujocoPlant, control: Array) -> Array:
+    def slacks(self, control: Array) -> Array:
         """What is left below the bound along the forecast and at its end, per joint, shape (2 k,)."""
-        self._look(plant)
-        left = self._room(plant, plant.forecast(control, self.holds)) - self.margin
+        left = self._room(self.plant.forecast(control, self.spec.holds)) - self.spec.margin
         over = np.maximum(self._speeds - self._bound, 0.0)
         # From above the bound, joint by joint: never faster on the way, and closer at the end.
-        decay = np.exp(-self.holds * plant.hold_s / RECOVERY_S)
+        decay = np.exp(-self.spec.holds * self.plant.hold_s / RECOVERY_S)
         return np.concatenate([left.min(axis=0) + over, left[-1] + over * decay])
 
-    def rows(self, plant: MujocoPlant) -> HalfSpaces:
+    def rows(self) -> HalfSpaces:
         """Two rows per joint that could reach its limit within the hold; none where controls are no forces."""
-        if not plant.has_acceleration:
-            return super().rows(plant)
-        drift, effect = plant.acceleration
-        v = plant.qvel[self._dofs]
+        if not self.plant.has_acceleration:
+            return super().rows()
+        drift, effect = self.plant.acceleration
+        v = self.plant.qvel[self._dofs]
         a0, a = drift[self._dofs], effect[self._dofs]
-        strongest = np.maximum(np.abs(plant.lower), np.abs(plant.upper))
+        strongest = np.maximum(np.abs(self.plant.lower), np.abs(self.plant.upper))
         pushes = np.abs(a) * np.where(
             a == 0.0, 0.0, strongest
         )  # no push, however strong the actuator may get
-        reach = np.abs(v) + plant.hold_s * (np.abs(a0) + pushes.sum(axis=1))
+        reach = np.abs(v) + self.plant.hold_s * (np.abs(a0) + pushes.sum(axis=1))
         near = reach > self._bound
         normals = np.vstack([a[near], -a[near]])
-        room = self._bound[near] / plant.hold_s
-        rate, bias = v[near] / plant.hold_s, a0[near]
+        room = self._bound[near] / self.plant.hold_s
+        rate, bias = v[near] / self.plant.hold_s, a0[near]
         return HalfSpaces(normals, np.concatenate([room - rate - bias, room + rate + bias]))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.constraints.limits.serial_chain import FrameKind, SerialChain
-from safe_wrappers.constraints.rollout import Predicted
+from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.control.filtering.manipulability import (
     ValidatedThreshold,
     chain_derivative,
@@ -20,7 +20,6 @@ from safe_wrappers.control.filtering.manipulability import (
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import HalfSpaces, Promise, non_negative, positive
 from safe_wrappers.plants.mujoco.forecast import Forecast
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
@@ -36,7 +35,7 @@ _ALONG_S = 1e-5
 
 
 @dataclass
-class SingularityMargin(Predicted):
+class SingularityMargin(RolloutConstraint):
     """Keep the manipulability `w = sqrt(det(J J'))` of a frame, for declared task directions, above a threshold.
 
     Near a singular pose a Cartesian command needs joint rates without bound. w says how near it is; but w by itself
@@ -139,57 +138,75 @@ class SingularityMargin(Predicted):
         self._rows, self._weights = task_rows(self.directions, self.rotations, self.length)
         self._check_shared()
 
-    def bind(self, plant: Plant) -> None:
-        """Resolve frame and joints; refuse what no configuration can do."""
-        super().bind(plant)
-        assert isinstance(plant, MujocoPlant)
-        name = getattr(self, self._kind)
-        self._chain = SerialChain(plant, self._kind, name)
-        self._columns = self._chain.columns(self.joints)
+    def bind(self, plant: Plant) -> "BoundSingularityMargin":
+        """On a plant."""
+        return BoundSingularityMargin(self, plant)
+
+
+class BoundSingularityMargin(BoundRollout):
+    """SingularityMargin on a plant."""
+
+    spec: SingularityMargin
+
+    def __init__(self, spec: SingularityMargin, plant: Plant) -> None:
+        super().__init__(spec, plant)
+        name = getattr(spec, spec._kind)
+        self._chain = SerialChain(self.plant, self.spec._kind, name)
+        self._columns = self._chain.columns(self.spec.joints)
         sampled = self._chain.sample(np.random.default_rng(0), _SAMPLES)
         idle = np.linalg.norm(self._task(sampled), axis=1).max(axis=0) < _STILL
-        if self.joints is not None and idle.any():
+        if self.spec.joints is not None and idle.any():
             still = self._chain.name(self._columns[int(np.argmax(idle))])
             raise ConfigurationError(
-                f"the joint {still!r} moves the {self._kind} {name!r} in none of the task's directions: leave it out"
+                f"the joint {still!r} moves the {self.spec._kind} {name!r} in none of the task's directions: "
+                "leave it out"
             )
         self._columns = [c for c, does_nothing in zip(self._columns, idle, strict=True) if not does_nothing]
-        task, count = f"directions={self.directions!r}, rotations={self.rotations!r}", len(self._columns)
-        if count < len(self._rows):
+        task, count = (
+            f"directions={self.spec.directions!r}, rotations={self.spec.rotations!r}",
+            len(self._columns),
+        )
+        if count < len(self.spec._rows):
             raise ConfigurationError(
-                f"{count} joints cannot move the {self._kind} {name!r} in {len(self._rows)} directions at once "
-                f"({task}); the joints are " + (", ".join(map(self._chain.name, self._columns)) or "none")
+                f"{count} joints cannot move the {self.spec._kind} {name!r} in {len(self.spec._rows)} directions at "
+                f"once ({task}); the joints are "
+                + (", ".join(map(self._chain.name, self._columns)) or "none")
             )
         # With as many joints as directions w is the determinant but for its sign, which turns at a singular pose.
-        self._signed, self._side = count == len(self._rows), 1.0
+        self._signed, self._side = count == len(self.spec._rows), 1.0
         found = np.abs(self._measure(sampled))
         most = float(found.max())
         if most < _STILL:
             raise ConfigurationError(
-                f"the {self._kind} {name!r} cannot be moved in all of these directions at once in any configuration: "
-                f"{task}, frame={self.frame!r}"
+                f"the {self.spec._kind} {name!r} cannot be moved in all of these directions at once in any "
+                f"configuration: {task}, frame={self.spec.frame!r}"
             )
-        if self.threshold is None:
-            assert self.task_speed is not None and self.rate_limit is not None
-            self.validated = validated_threshold(self._task(sampled), self.task_speed, self.rate_limit)
-            self._threshold = self.validated.threshold
+        if self.spec.threshold is None:
+            assert self.spec.task_speed is not None and self.spec.rate_limit is not None
+            self.spec.validated = validated_threshold(
+                self._task(sampled), self.spec.task_speed, self.spec.rate_limit
+            )
+            self._threshold = self.spec.validated.threshold
         else:
-            self._threshold = self.threshold
-        if self._threshold * (1.0 + self.margin) >= most:
+            self._threshold = self.spec.threshold
+        if self._threshold * (1.0 + self.spec.margin) >= most:
             raise ConfigurationError(
                 f"no configuration has a manipulability above {self._threshold:g} with a margin of "
-                f"{self.margin:g} of it: the largest of {_SAMPLES} in the joints' ranges is {most:.4g}, half of "
+                f"{self.spec.margin:g} of it: the largest of {_SAMPLES} in the joints' ranges is {most:.4g}, half of "
                 f"them are above {float(np.median(found)):.4g}"
             )
 
     def _task(self, qpos: Array) -> Array:
         """Shape (k, m, n)."""
         jacobians, axes = self._chain.jacobians(qpos)
-        return self._in_frame(jacobians, axes)[:, self._rows][:, :, self._columns] * self._weights[:, None]
+        return (
+            self._in_frame(jacobians, axes)[:, self.spec._rows][:, :, self._columns]
+            * self.spec._weights[:, None]
+        )
 
     def _in_frame(self, jacobians: Array, axes: Array) -> Array:
         """Six rows in the declared axes, shape (k, ..., 6, n)."""
-        if self.frame == "world":
+        if self.spec.frame == "world":
             return jacobians
         back = np.swapaxes(axes, -1, -2)
         back = back.reshape(len(back), *(1,) * (jacobians.ndim - 3), 3, 3)
@@ -203,46 +220,47 @@ class SingularityMargin(Predicted):
         w[finite] = self._side * np.linalg.det(task) if self._signed else manipulability(task)
         return w
 
-    def _now(self, plant: MujocoPlant) -> Array:
-        self._chain.place(plant.pose())
+    def _now(self) -> Array:
+        self._chain.place(self.plant.pose())
         self._side = 1.0
-        w = self._measure(plant.qpos[None])
+        w = self._measure(self.plant.qpos[None])
         if w[0] < 0.0:
             self._side, w = -1.0, -w
         return np.asarray(w / self._threshold - 1.0)
 
-    def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
+    def _room(self, forecast: Forecast) -> Array:
         return np.asarray(self._measure(forecast.qpos) / self._threshold - 1.0)[:, None]
 
     def _slope(self, qpos: Array) -> Array:
         """dw/dq over the chain's joints, shape (k, n)."""
         jacobians, axes = self._chain.jacobians(qpos)
         change = chain_derivative(jacobians[:, :3], jacobians[:, 3:])
-        if self.frame == "own":
+        if self.spec.frame == "own":
             # The axes turn with the joints, too.
             turning = np.swapaxes(jacobians[:, 3:], 1, 2)[:, :, None, None, :]  # of joint k
             blocks = np.swapaxes(jacobians.reshape(len(qpos), 2, 3, -1), 2, 3)[:, None]
             carried = np.swapaxes(np.cross(turning, blocks), 3, 4)
             change = change - carried.reshape(change.shape)
-        task = self._in_frame(jacobians, axes)[:, self._rows][:, :, self._columns]
-        moved = self._in_frame(change, axes)[:, :, self._rows][..., self._columns]
-        return manipulability_gradient(task * self._weights[:, None], moved * self._weights[:, None])
+        task = self._in_frame(jacobians, axes)[:, self.spec._rows][:, :, self._columns]
+        moved = self._in_frame(change, axes)[:, :, self.spec._rows][..., self._columns]
+        return manipulability_gradient(
+            task * self.spec._weights[:, None], moved * self.spec._weights[:, None]
+        )
 
-    def rows(self, plant: MujocoPlant) -> HalfSpaces:
+    def rows(self) -> HalfSpaces:
         """One row, a first guess for the forecast.
 
         Where a ball or free joint carries the frame as well, or controls are no forces, it is that of every forecast.
         """
-        if not (self._chain.scalar and plant.has_acceleration):
-            return super().rows(plant)
-        self._look(plant)
-        drift, effect = plant.acceleration
-        speeds = plant.qvel[self._chain.dofs]
-        along = np.tile(plant.qpos, (3, 1))
+        if not (self._chain.scalar and self.plant.has_acceleration):
+            return super().rows()
+        drift, effect = self.plant.acceleration
+        speeds = self.plant.qvel[self._chain.dofs]
+        along = np.tile(self.plant.qpos, (3, 1))
         along[1:, self._chain.qpos] += np.outer([_ALONG_S, -_ALONG_S], speeds)
         slope, ahead, behind = self._slope(along) / self._threshold
         curvature = (ahead - behind) @ speeds / (2.0 * _ALONG_S)
-        a = 1.0 / (_DECAY_HOLDS * plant.hold_s)
-        left = 2.0 * a * (slope @ speeds) + a * a * (self._least - self.margin)
+        a = 1.0 / (_DECAY_HOLDS * self.plant.hold_s)
+        left = 2.0 * a * (slope @ speeds) + a * a * (self._least - self.spec.margin)
         drift, effect = drift[self._chain.dofs], effect[self._chain.dofs]
         return HalfSpaces(-(slope @ effect)[None], np.array([slope @ drift + curvature + left]))

@@ -1,16 +1,15 @@
 """SpeedLimit: how fast a body, or the machine's centre of mass, may move."""
 
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.constraints.rollout import Predicted
+from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint, RolloutMemory
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.filter.constraint import Promise, non_negative, positive
+from safe_wrappers.filter.constraint import Memory, Promise, non_negative, positive
 from safe_wrappers.plants.mujoco.forecast import Forecast
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
@@ -19,7 +18,7 @@ DIRECTIONS = ("+x", "-x", "x", "+y", "-y", "y", "+z", "-z", "z", "xy", "xyz")
 
 
 @dataclass
-class SpeedLimit(Predicted):
+class SpeedLimit(RolloutConstraint):
     """Keep the speed of a body, or of the centre of mass, below a limit.
 
     Speed is displacement over time, as Gymnasium's `x_velocity` is: over one control step, or over one physics
@@ -70,71 +69,93 @@ class SpeedLimit(Predicted):
         self._axes = ["xyz".index(letter) for letter in self.direction.strip("+-")]
         self._sign = {"+": 1.0, "-": -1.0}.get(self.direction[0])
 
+    def bind(self, plant: Plant) -> "BoundSpeedLimit":
+        """On a plant."""
+        return BoundSpeedLimit(self, plant)
+
+
+class SpeedMemory(NamedTuple):
+    """What SpeedLimit remembers of an episode.
+
+    Attributes:
+        rollout: As every constraint on rollouts.
+        here: The point at the last control step, m; None: there was none.
+    """
+
+    rollout: RolloutMemory
+    here: Array | None = None
+
+
+class BoundSpeedLimit(BoundRollout):
+    """SpeedLimit on a plant."""
+
+    spec: SpeedLimit
+
     @property
     def scale(self) -> float:
         """The limit."""
-        return self.limit
+        return self.spec.limit
 
-    def bind(self, plant: Plant) -> None:
-        """Resolve the body and its share in the machine's mass."""
-        super().bind(plant)
-        assert isinstance(plant, MujocoPlant)
-        self._body = None if self.body is None else plant.named("body", self.body)
-        self._revision = plant.revision
-        self._weigh(plant)
-        self._here: Array | None = None
-        self._time = np.nan
-        self._window = plant.substeps if self.average == "step" else 1
+    def __init__(self, spec: SpeedLimit, plant: Plant) -> None:
+        super().__init__(spec, plant)
+        self._body = None if self.spec.body is None else self.plant.named("body", self.spec.body)
+        self._revision = self.plant.revision
+        self._weigh()
+        self._window = self.plant.substeps if self.spec.average == "step" else 1
 
-    def _weigh(self, plant: MujocoPlant) -> None:
-        mass = plant.model.body_mass
+    def _weigh(self) -> None:
+        mass = self.plant.model.body_mass
         self._shares = mass / mass.sum()
 
-    def reset(self) -> None:
-        """Forget the episode, and with it the last position."""
-        super().reset()
-        self._here = None
+    def start(self) -> Memory:
+        """No position before the present one."""
+        return SpeedMemory(super().start())
+
+    def observe(self, memory: Memory) -> None:
+        """Measure the speed from the position before this one."""
+        self._before = memory.here
+        super().observe(memory.rollout)
+
+    def executed(self, control: Array) -> Memory:
+        """And the present position."""
+        return SpeedMemory(super().executed(control), self._here)
 
     def _point(self, frames: Array, centres: Array) -> Array:
         if self._body is None:
-            return np.asarray((self._shares @ centres)[..., self._axes])
-        return np.asarray(frames[..., self._body, :][..., self._axes])
+            return np.asarray((self._shares @ centres)[..., self.spec._axes])
+        return np.asarray(frames[..., self._body, :][..., self.spec._axes])
 
-    def _now(self, plant: MujocoPlant) -> Array:
-        if self._revision != plant.revision:
-            self._revision = plant.revision
-            self._weigh(plant)
-        pose = plant.pose()
-        data = plant.published()
+    def _now(self) -> Array:
+        if self._revision != self.plant.revision:
+            self._revision = self.plant.revision
+            self._weigh()
+        pose = self.plant.pose()
+        data = self.plant.published()
         self._shown = None if data is None else self._point(data.xpos, data.xipos)
-        before, self._here = self._here, self._point(pose.xpos, pose.xipos)
-        if before is None or self.average == "substep":
+        before, self._here = self._before, self._point(pose.xpos, pose.xipos)
+        if before is None or self.spec.average == "substep":
             # What the last substep shows; at a reset nothing else has moved yet that could be measured.
-            earlier = plant.substep_ago()
+            earlier = self.plant.substep_ago()
             moved = self._here - self._point(earlier.frames[0], earlier.centres[0])
-            self._last = self._left(moved[None], 1, plant)
-        elif plant.time != self._time:  # the first step looks at the state of the reset again
-            self._last = self._left((self._here - before)[None], plant.substeps, plant)
-        self._time = plant.time
-        return self._last
+            return self._left(moved[None], 1)
+        return self._left((self._here - before)[None], self.plant.substeps)
 
-    def _left(self, displacements: Array, substeps: int, plant: MujocoPlant) -> Array:
-        velocity = displacements / (substeps * plant.hold_s / plant.substeps)
-        if self._sign is not None:
-            return self.limit - self._sign * velocity[:, 0]
-        return np.asarray(self.limit - np.sqrt((velocity * velocity).sum(axis=1)))
+    def _left(self, displacements: Array, substeps: int) -> Array:
+        velocity = displacements / (substeps * self.plant.hold_s / self.plant.substeps)
+        if self.spec._sign is not None:
+            return self.spec.limit - self.spec._sign * velocity[:, 0]
+        return np.asarray(self.spec.limit - np.sqrt((velocity * velocity).sum(axis=1)))
 
     def _violation(self, value: Array) -> Array:
         return np.zeros(1)  # the next step's displacement starts afresh: there is no way back to allow for
 
-    def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
-        assert self._here is not None
+    def _room(self, forecast: Forecast) -> Array:
         poses = forecast.poses(self._window)
-        left = self._along(self._point(poses.frames, poses.centres), self._here, plant)
-        if self.average == "substep" or self._shown is None:
+        left = self._along(self._point(poses.frames, poses.centres), self._here)
+        if self.spec.average == "substep" or self._shown is None:
             return left[:, None]
         shown = self._point(forecast.published_frames, forecast.published_centres)
-        return np.stack([left, self._along(shown, self._shown, plant)], axis=1)
+        return np.stack([left, self._along(shown, self._shown)], axis=1)
 
-    def _along(self, points: Array, start: Array, plant: MujocoPlant) -> Array:
-        return self._left(np.diff(points, axis=0, prepend=start[None]), self._window, plant)
+    def _along(self, points: Array, start: Array) -> Array:
+        return self._left(np.diff(points, axis=0, prepend=start[None]), self._window)

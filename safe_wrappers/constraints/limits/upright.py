@@ -7,18 +7,17 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.constraints.rollout import Predicted
+from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Promise, non_negative, positive
 from safe_wrappers.plants.mujoco.forecast import Forecast
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
 
 
 @dataclass
-class Upright(Predicted):
+class Upright(RolloutConstraint):
     """Keep a body's height in a range and its own z axis within an angle of the vertical.
 
     What it promises: an executed control that is not flagged keeps both at every physics substep of its step,
@@ -74,28 +73,36 @@ class Upright(Predicted):
         low = -math.inf if self.lowest is None else self.lowest
         return low, math.inf if self.highest is None else self.highest
 
-    def bind(self, plant: Plant) -> None:
-        """Resolve the body."""
-        super().bind(plant)
-        assert isinstance(plant, MujocoPlant)
-        self._body = plant.named("body", self.body)
+    def bind(self, plant: Plant) -> "BoundUpright":
+        """On a plant."""
+        return BoundUpright(self, plant)
 
-    def _now(self, plant: MujocoPlant) -> Array:
-        pose = plant.pose()
+
+class BoundUpright(BoundRollout):
+    """Upright on a plant."""
+
+    spec: Upright
+
+    def __init__(self, spec: Upright, plant: Plant) -> None:
+        super().__init__(spec, plant)
+        self._body = self.plant.named("body", self.spec.body)
+
+    def _now(self) -> Array:
+        pose = self.plant.pose()
         return self._left(pose.xpos[self._body, 2], pose.xmat[self._body, 8])
 
     def _left(self, height: Array, cosine: Array) -> Array:
-        low, high = self._heights()
+        low, high = self.spec._heights()
         left = []
-        if self.lowest is not None:
+        if self.spec.lowest is not None:
             left.append(height - low)
-        if self.highest is not None:
+        if self.spec.highest is not None:
             left.append(high - height)
-        if self.tilt is not None:
-            left.append(self.tilt - np.arccos(np.clip(cosine, -1.0, 1.0)))
+        if self.spec.tilt is not None:
+            left.append(self.spec.tilt - np.arccos(np.clip(cosine, -1.0, 1.0)))
         return np.array(left)
 
-    def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
+    def _room(self, forecast: Forecast) -> Array:
         poses = forecast.poses()
         left = self._left(poses.frames[:, self._body, 2], poses.axes[:, self._body, 2, 2])
         return np.asarray(left.T)

@@ -9,18 +9,17 @@ from numpy.typing import NDArray
 
 from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacle_from
 from safe_wrappers.constraints.obstacles.obstacles import distances
-from safe_wrappers.constraints.rollout import Predicted
+from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Promise, non_negative
 from safe_wrappers.plants.mujoco.forecast import Forecast
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
 
 
 @dataclass
-class Workspace(Predicted):
+class Workspace(RolloutConstraint):
     """Keep points of the machine inside an axis-aligned box and outside obstacles, in world coordinates.
 
     Position under a force has relative degree two: a point that is inside may be too fast to stay. So the
@@ -82,20 +81,28 @@ class Workspace(Predicted):
             )
         self._check_shared()
 
-    def bind(self, plant: Plant) -> None:
-        """Resolve the points: a body each, and an offset in its frame."""
-        super().bind(plant)
-        assert isinstance(plant, MujocoPlant)
-        if not (self.bodies or self.sites or self.geoms):
+    def bind(self, plant: Plant) -> "BoundWorkspace":
+        """On a plant."""
+        return BoundWorkspace(self, plant)
+
+
+class BoundWorkspace(BoundRollout):
+    """Workspace on a plant."""
+
+    spec: Workspace
+
+    def __init__(self, spec: Workspace, plant: Plant) -> None:
+        super().__init__(spec, plant)
+        if not (self.spec.bodies or self.spec.sites or self.spec.geoms):
             raise ConfigurationError(
                 "name the bodies, sites or geoms to keep inside; the model has the bodies "
-                + ", ".join(plant.names("body"))
+                + ", ".join(self.plant.names("body"))
             )
-        m = plant.model
-        found = [(plant.named("body", name), np.zeros(3)) for name in self.bodies]
-        for kind, names in (("site", self.sites), ("geom", self.geoms)):
+        m = self.plant.model
+        found = [(self.plant.named("body", name), np.zeros(3)) for name in self.spec.bodies]
+        for kind, names in (("site", self.spec.sites), ("geom", self.spec.geoms)):
             for name in names:
-                i = plant.named(kind, name)
+                i = self.plant.named(kind, name)
                 found.append((int(getattr(m, f"{kind}_bodyid")[i]), np.array(getattr(m, f"{kind}_pos")[i])))
         self._bodies = np.array([body for body, _ in found])
         self._offsets = np.array([offset for _, offset in found])
@@ -105,28 +112,28 @@ class Workspace(Predicted):
         rotated = np.einsum("kpij,pj->kpi", axes[:, self._bodies], self._offsets)
         return np.asarray(frames[:, self._bodies] + rotated)
 
-    def _left(self, points: Array, plant: MujocoPlant) -> Array:
+    def _left(self, points: Array) -> Array:
         """Room of every point to every bound and surface, shape (k, n)."""
         k = len(points)
-        low, high = np.isfinite(self._low), np.isfinite(self._high)
+        low, high = np.isfinite(self.spec._low), np.isfinite(self.spec._high)
         left = [
-            (points - self._low)[:, :, low].reshape(k, -1),
-            (self._high - points)[:, :, high].reshape(k, -1),
+            (points - self.spec._low)[:, :, low].reshape(k, -1),
+            (self.spec._high - points)[:, :, high].reshape(k, -1),
         ]
         every = points.reshape(-1, 3)
-        for obstacle in self.keep_out:
-            surfaces = distances(obstacle, every, plant)
+        for obstacle in self.spec.keep_out:
+            surfaces = distances(obstacle, every, self.plant)
             left.append(surfaces.reshape(k, points.shape[1] * surfaces.shape[1]))
-        return np.concatenate(left, axis=1) - self.radius
+        return np.concatenate(left, axis=1) - self.spec.radius
 
-    def _now(self, plant: MujocoPlant) -> Array:
-        pose = plant.pose()
+    def _now(self) -> Array:
+        pose = self.plant.pose()
         points = self._points(pose.xpos[None], pose.xmat.reshape(1, -1, 3, 3))
-        return np.asarray(self._left(points, plant)[0])
+        return np.asarray(self._left(points)[0])
 
-    def _room(self, plant: MujocoPlant, forecast: Forecast) -> Array:
+    def _room(self, forecast: Forecast) -> Array:
         poses = forecast.poses()
-        return self._left(self._points(poses.frames, poses.axes), plant)
+        return self._left(self._points(poses.frames, poses.axes))
 
 
 def _corner(name: str, given: Sequence[float | None] | None) -> list[float | None] | None:

@@ -11,6 +11,7 @@ Formula's. The bank of hypotheses is textbook multiple-model estimation. The sta
 that is white and curves of this shape; neither is guaranteed, so they are no error bound.
 """
 
+import copy
 import math
 from typing import Final
 
@@ -46,6 +47,12 @@ class FrictionEstimate:
         self._variance = np.full((wheels, peaks.size), _PRIOR_STD**2)
         self._log_weight = np.zeros((wheels, peaks.size))
         self._weights: Array | None = None
+
+    def copy(self) -> "FrictionEstimate":
+        """One that goes on from here by itself."""
+        other = copy.copy(self)
+        other._variance, other._log_weight = self._variance.copy(), self._log_weight.copy()
+        return other
 
     @property
     def weights(self) -> Array:

@@ -22,6 +22,7 @@ from safe_wrappers.plants.mujoco.displacement_step import moves_by_displacement
 from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
 from safe_wrappers.plants.mujoco.forecast import Forecast, Poses, Recorder
 from safe_wrappers.plants.plant import (
+    Plant,
     check_delay,
     check_timing,
     name_of,
@@ -39,7 +40,7 @@ _LAST_INTEGRATOR = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
 _QUADRATIC = int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC)
 
 
-class MujocoPlant:
+class MujocoPlant(Plant):
     """`x = (qpos, qvel)`, `x' = f + g u`, through the actuators and the active constraints.
 
     The drift and the control matrix hold at the present set of active contacts and limits; a contact that
@@ -55,13 +56,8 @@ class MujocoPlant:
             that is not its model's control range.
     """
 
-    hold_s: float
-    has_acceleration: ClassVar[bool] = True
-    """Whether a control acts as a force, so that `f`, `g`, `acceleration` and `point` are known."""
-    stamp: int
-    """Counts observations, so that a constraint can keep what it has computed for one of them."""
-    revision: int
-    """Counts changes of the model, so that a constraint can read its constants anew."""
+    bounds_are_action_space: ClassVar[bool] = True
+    can_brake: ClassVar[bool] = True
 
     def __init__(self, model: mujoco.MjModel | None = None, delay_s: float = 0.0) -> None:
         self._given = model
@@ -505,6 +501,13 @@ class MujocoPlant:
         """Read a published fact of the env."""
         found = getattr(self._raw, name, None)
         return found if found is not None else read_attribute(self._env, name)
+
+
+def require_mujoco(plant: Plant, message: str) -> MujocoPlant:
+    """The plant, if it is a MujocoPlant; else an UnsupportedEnvError with the message."""
+    if not isinstance(plant, MujocoPlant):
+        raise UnsupportedEnvError(message)
+    return plant
 
 
 def control_interval(raw: Any) -> float:

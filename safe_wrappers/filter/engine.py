@@ -1,0 +1,118 @@
+"""SafetyFilter: proposals in, decisions out; no Gymnasium."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint
+from safe_wrappers.filter.fallback import Fallback, FallbackFunction
+from safe_wrappers.filter.search import Decision, SafeActionSearch
+from safe_wrappers.plants.plant import Plant
+
+Array = NDArray[np.float64]
+
+
+class SafetyFilter:
+    """Constraints, bound to one plant, and the search for an admissible action.
+
+    In an episode: `start`; then at every control step `observe`, `filter`, and `executed` with what was really sent.
+
+    Args:
+        plant: Bound to its env.
+        constraints: Specifications; each is bound to the plant.
+        fallback: "brake", "hold", "zero", or a function of the plant.
+        solver: "daqp" or any installed qpsolvers backend.
+        low: Action box, shape (m,).
+        high: Likewise.
+
+    Attributes:
+        bound: The constraints on the plant, in their order.
+        margin: The smallest h of the observed state; inf if there is none, NaN if the state or an h is not a number.
+
+    Raises:
+        ConfigurationError: A constraint that does not fit the plant, or two that write the same info keys.
+        UnknownNameError: No fallback of that name.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        constraints: Sequence[Constraint],
+        fallback: str | FallbackFunction,
+        solver: str,
+        low: Array,
+        high: Array,
+    ) -> None:
+        self.plant = plant
+        self.bound: list[BoundConstraint] = [constraint.bind(plant) for constraint in constraints]
+        _refuse_same_keys(self.bound)
+        self._reporting = [c for c in self.bound if c.info_keys]
+        self._search = SafeActionSearch(plant, self.bound, Fallback(fallback, self.bound), solver, low, high)
+        self._low, self._high = low, high
+
+    def start(self) -> None:
+        """Forget the episode, take the state of the next one, and refuse what only a state can show."""
+        self.plant.executed(None)
+        self._memories = [c.start() for c in self.bound]
+        self._last = np.clip(np.zeros_like(self._low), self._low, self._high)
+        self.observe()
+        for c in self.bound:
+            c.check()
+
+    def observe(self) -> None:
+        """Take the env's present state, and `margin` from it."""
+        plant = self.plant
+        plant.observe()
+        self.margin = math.nan
+        state = float(plant.state.sum())
+        if state - state != 0.0:
+            return
+        lowest = math.inf
+        for c, memory in zip(self.bound, self._memories, strict=True):
+            c.observe(memory)
+            h = c.value()
+            if h.size:
+                least = float(h.min())
+                if least != least:
+                    return
+                lowest = min(lowest, least)
+        self.margin = lowest
+
+    def filter(self, boxed: Array | None) -> Decision:
+        """The decision about a proposal inside the box, shape (m,), or about none: then the fallback proposes."""
+        if self.margin != self.margin:
+            return self._search.unreadable(self._last)
+        if boxed is None:
+            return self._search.without_proposal(self._last)
+        return self._search.decide(boxed, self._last)
+
+    def executed(self, control: Array) -> None:
+        """Remember what was sent, shape (m,), for the plant's delay, the constraints and a fallback that holds it."""
+        self._last = control
+        self.plant.executed(control)
+        if self.margin == self.margin:
+            self._memories = [c.executed(control) for c in self.bound]
+
+    def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
+        """The constraints' own info keys about the observed state; None after a reset."""
+        if self.margin != self.margin:
+            proposed = executed = None
+        found: dict[str, Any] = {}
+        for c in self._reporting:
+            found |= c.info(proposed, executed)
+        return found
+
+
+def _refuse_same_keys(bound: Sequence[BoundConstraint]) -> None:
+    """Two constraints of a kind would write the same info keys."""
+    kinds = [type(c.spec).__name__ for c in bound if c.info_keys]
+    for kind in kinds:
+        if kinds.count(kind) > 1:
+            raise ConfigurationError(
+                f"{kind} is in the list {kinds.count(kind)} times, and both would write the same info keys; use one "
+                "for everything it watches"
+            )

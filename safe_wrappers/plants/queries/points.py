@@ -1,0 +1,69 @@
+"""Named points of a MuJoCo machine, or one point of an analytic state: how they move."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.plants.plant import Plant
+
+Array = NDArray[np.float64]
+
+
+class Points:
+    """Origins of bodies, sites and geoms (MujocoPlant), or state indices of one point (AnalyticPlant).
+
+    Args:
+        plant: Bound.
+        bodies: Names.
+        sites: Names.
+        geoms: Names.
+        position: Indices of the point's coordinates in the state.
+        velocity: Indices of its velocity, in the same order.
+
+    Raises:
+        ConfigurationError: Nothing is named that this plant can find; an unknown name with the list.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        bodies: Sequence[str],
+        sites: Sequence[str],
+        geoms: Sequence[str],
+        position: Sequence[int],
+        velocity: Sequence[int],
+    ) -> None:
+        self._plant, self._position, self._velocity = plant, list(position), list(velocity)
+        self._machine = plant if isinstance(plant, MujocoPlant) else None
+        named = {"body": bodies, "site": sites, "geom": geoms}
+        self._named = [(kind, name) for kind, names in named.items() for name in names]
+        if self._machine is None:
+            if not self._position:
+                raise ConfigurationError(
+                    "on an AnalyticPlant say where the point is in the state: position=[0, 1], velocity=[2, 3]"
+                )
+            return
+        if not self._named:
+            raise ConfigurationError(
+                "name the bodies, sites or geoms to keep clear; the model has the bodies "
+                + ", ".join(self._machine.names("body"))
+            )
+        for kind, name in self._named:
+            self._machine.named(kind, name)
+
+    def motions(self) -> list[tuple[Array, Array]]:
+        """Position, m, and velocity, m/s, of each point."""
+        if self._machine is not None:
+            return [self._machine.motion(kind, name) for kind, name in self._named]
+        x = self._plant.state
+        return [(x[self._position], x[self._velocity])]
+
+    def accelerations(self) -> list[tuple[Array, Array, Array, Array]]:
+        """Position, velocity, acceleration drift and control matrix of each point."""
+        if self._machine is not None:
+            return [self._machine.point(kind, name) for kind, name in self._named]
+        x, p, v = self._plant.state, self._position, self._velocity
+        return [(x[p], x[v], self._plant.f[v], self._plant.g[v])]
