@@ -64,7 +64,7 @@ bench: .venv/bench
 	$(BIN)/python -m benchmarks.occlusion_cost
 	$(BIN)/python -m benchmarks.training_time
 
-# Every long figure of the README and docs/results.md: about six hours on two cores.
+# Every long figure of the README and docs/results: about six hours on two cores.
 figures: .venv/installed
 	$(BIN)/python -m benchmarks.adversarial
 	$(BIN)/python -m benchmarks.adversarial --mismatch

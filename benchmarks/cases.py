@@ -1,4 +1,4 @@
-"""What is measured on which env: the filter, the judge and the drivers of each row of the README's tables."""
+"""The filter, the judge and the drivers of each row in docs/results/standard-envs.md."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

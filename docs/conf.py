@@ -4,8 +4,13 @@ A new page is a Markdown file and a line in its folder's `index.md`; a new pictu
 function `draw`, shown by the directive `drawn`; a new class is three lines in `api/`.
 """
 
+import contextlib
+import io
 import sys
 from pathlib import Path
+
+with contextlib.redirect_stderr(io.StringIO()):  # it greets on stderr
+    import gymnasium_robotics  # noqa: F401
 
 sys.path.insert(0, str(Path(__file__).parent / "extensions"))
 

@@ -1,4 +1,4 @@
-"""The README's adversarial table, shorter: minutes long, so `make test-slow` runs it."""
+"""The adversarial table of docs/results/goal-tasks.md, shorter: minutes long, so `make test-slow` runs it."""
 
 import pytest
 
