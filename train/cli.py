@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError
 
-from .config_file import read_config
+from .config.file import read_config
 from .local_imports import importable
-from .output import lasting_output
-from .stopping import Interrupted
+from .processes.output import lasting_output
+from .processes.stopping import Interrupted
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -82,7 +82,7 @@ def _run(options: argparse.Namespace, console: Console) -> None:
     from .config import parse_experiment
     from .experiment import evaluate_experiment, summarize_experiment, train_experiment
     from .report import verdict, write_report
-    from .table import comparison_table
+    from .report.terminal_table import comparison_table
 
     experiment = parse_experiment(settings)
     if options.command in ("train", "compare"):

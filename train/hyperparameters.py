@@ -16,8 +16,8 @@ from gymnasium import spaces
 
 from safe_wrappers.errors import ConfigurationError
 
-from .algorithms import ALGORITHMS, DISCRETE, OFF_POLICY, ON_POLICY
-from .names import check_name
+from .config.algorithms import ALGORITHMS, DISCRETE, OFF_POLICY, ON_POLICY
+from .config.names import check_name
 
 if TYPE_CHECKING:
     from stable_baselines3.common.noise import ActionNoise

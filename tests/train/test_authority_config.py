@@ -9,8 +9,8 @@ import pytest
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.train.config import EnvConfig, FilterConfig, parse_experiment
-from safe_wrappers.train.stack import make_stack
-from safe_wrappers.train.summary import summarize
+from safe_wrappers.train.evaluation.summary import summarize
+from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.wrappers.faults import DroppedRefreshes, Outages
 
 OUTAGES = {"mean_between_s": 0.2, "mean_length_s": 0.2}

@@ -4,7 +4,7 @@ import pytest
 
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.train.config import parse_experiment
-from safe_wrappers.train.config_file import read_config
+from safe_wrappers.train.config.file import read_config
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 MINIMAL = {

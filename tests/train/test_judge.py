@@ -12,12 +12,12 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import safe_wrappers as sw
 from safe_wrappers import interventions as keys
 from safe_wrappers.train.config import EnvConfig, FilterConfig, parse_experiment
-from safe_wrappers.train.evaluate import evaluate_run
+from safe_wrappers.train.evaluation.evaluate import evaluate_run
+from safe_wrappers.train.evaluation.summary import summarize, write_summary
 from safe_wrappers.train.report import verdict, write_report
+from safe_wrappers.train.report.terminal_table import comparison_table
 from safe_wrappers.train.run import Progress, train_run
-from safe_wrappers.train.stack import make_stack
-from safe_wrappers.train.summary import summarize, write_summary
-from safe_wrappers.train.table import comparison_table
+from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.train.tables import read_rows
 
 SILENT = Progress(lambda steps: None, pytest.fail)

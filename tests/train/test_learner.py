@@ -14,13 +14,13 @@ import safe_wrappers as sw
 from safe_wrappers import interventions as keys
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.sb3 import ExecutedActionReplayBuffer
-from safe_wrappers.train import run as run_module
-from safe_wrappers.train import stack as stack_module
-from safe_wrappers.train.checkpoint import latest_checkpoint
 from safe_wrappers.train.config import NAIVE, EvaluationConfig, FilterConfig, LearnerConfig
-from safe_wrappers.train.evaluate import evaluate_run, evaluation_folder
-from safe_wrappers.train.run import train_run
-from safe_wrappers.train.stack import make_stack
+from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
+from safe_wrappers.train.run import stack as stack_module
+from safe_wrappers.train.run import training as run_module
+from safe_wrappers.train.run.checkpoint import latest_checkpoint
+from safe_wrappers.train.run.stack import make_stack
+from safe_wrappers.train.run.training import train_run
 from safe_wrappers.train.tables import read_rows
 
 WALL = 0.0  # in the middle of where episodes start

@@ -7,7 +7,7 @@ import pytest
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.train.config import EnvConfig, FilterConfig, parse_experiment
-from safe_wrappers.train.stack import make_stack
+from safe_wrappers.train.run.stack import make_stack
 
 pytestmark = pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning")
 OCCLUSION = {

@@ -8,8 +8,8 @@ from test_report import Page, words
 
 from safe_wrappers.errors import RunStateError
 from safe_wrappers.train.cli import main
+from safe_wrappers.train.evaluation.summary import summarize
 from safe_wrappers.train.report import write_overview
-from safe_wrappers.train.summary import summarize
 
 FAKE = Path(__file__).parent / "fake.yaml"
 

@@ -16,18 +16,19 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from safe_wrappers import CBFActionFilter, RecordInterventions
 from safe_wrappers.errors import RunStateError, UnknownNameError
 from safe_wrappers.sb3 import ExecutedActionDictReplayBuffer
-from safe_wrappers.train import checkpoint as checkpoint_module
 from safe_wrappers.train import experiment as experiment_module
-from safe_wrappers.train.checkpoint import latest_checkpoint
 from safe_wrappers.train.config import EnvConfig, FilterConfig
-from safe_wrappers.train.evaluate import evaluate_run
+from safe_wrappers.train.evaluation.evaluate import evaluate_run
 from safe_wrappers.train.experiment import train_experiment
-from safe_wrappers.train.lock import only_writer
-from safe_wrappers.train.run import Progress, finished_checkpoint, train_run
-from safe_wrappers.train.run_callbacks import CheckpointCallback
-from safe_wrappers.train.stack import make_stack
+from safe_wrappers.train.processes.lock import only_writer
+from safe_wrappers.train.run import Progress, train_run
+from safe_wrappers.train.run import checkpoint as checkpoint_module
+from safe_wrappers.train.run.callbacks import CheckpointCallback
+from safe_wrappers.train.run.checkpoint import latest_checkpoint
+from safe_wrappers.train.run.stack import make_stack
+from safe_wrappers.train.run.training import finished_checkpoint
 from safe_wrappers.train.tables import read_rows
-from safe_wrappers.train.videos import video_path
+from safe_wrappers.train.videos.record import video_path
 
 OFF = FilterConfig()
 

@@ -19,7 +19,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from safe_wrappers.train.config import EnvConfig, FilterConfig
-from safe_wrappers.train.stack import make_stack
+from safe_wrappers.train.run.stack import make_stack
 
 pytestmark = pytest.mark.filterwarnings("ignore:the policy's action:UserWarning")
 KINDS = {"dummy": DummyVecEnv, "subproc": functools.partial(SubprocVecEnv, start_method="fork")}

@@ -15,15 +15,15 @@ from rich.console import Console
 from safe_wrappers import interventions as keys
 from safe_wrappers.errors import ConfigurationError
 
-from .atomic import write_bytes, write_json
-from .config import ArmConfig, EnvConfig, ExperimentConfig, FilterConfig
+from ..atomic import write_bytes, write_json
+from ..config import ArmConfig, EnvConfig, ExperimentConfig, FilterConfig
+from ..evaluation.episode_selection import ShownEpisode, shown_episode
+from ..processes.parallel import Job, Progress, RunsFailedError, run_jobs
+from ..run.policy import TrainedPolicy
+from ..run.stack import make_stack
+from ..run.training import finished_checkpoint
 from .film import Film, encode, speed_of, stride_of
-from .parallel import Job, RunsFailedError, run_jobs
-from .policy import TrainedPolicy
 from .rendering import find_rendering
-from .run import Progress, finished_checkpoint
-from .shown import ShownEpisode, shown_episode
-from .stack import make_stack
 
 _PROBLEM: Final = "problem.json"
 

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from .config import ArmConfig, ExperimentConfig
+from ..config import ArmConfig, ExperimentConfig
+from ..tables import read_rows
 from .summary import SEEDS_FOR_AN_INTERVAL, interquartile_mean
-from .tables import read_rows
 
 _MOST_BINS = 40
 

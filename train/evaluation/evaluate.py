@@ -13,14 +13,15 @@ from stable_baselines3.common.logger import configure
 from safe_wrappers import interventions as keys
 from safe_wrappers.wrappers.record_interventions import COLUMNS
 
-from .atomic import write_json
-from .config import ArmConfig, EvaluationConfig, FilterConfig
-from .policy import TrainedPolicy
-from .run import EVALUATION, Progress, finished_checkpoint
+from ..atomic import write_json
+from ..config import ArmConfig, EvaluationConfig, FilterConfig
+from ..processes.parallel import Progress
+from ..run.policy import TrainedPolicy
+from ..run.stack import make_stack
+from ..run.training import EVALUATION, finished_checkpoint
+from ..tables import write_rows
 from .scene import Scene, SceneRecorder, save_scenes
-from .stack import make_stack
 from .step_log import StepLog, StepRecorder, load_steps, save_steps
-from .tables import write_rows
 
 EVALUATION_COLUMNS: Final = ("episode_seed", *COLUMNS)
 STATE_FILE: Final = "evaluation.json"

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from .atomic import write_json
-from .config import ExperimentConfig, FilterConfig
+from ..atomic import write_json
+from ..config import ExperimentConfig, FilterConfig
+from ..tables import read_rows, write_rows
 from .evaluate import evaluation_folder
-from .tables import read_rows, write_rows
-from .truth import evaluated_without_cost
+from .has_cost import evaluated_without_cost
 
 CONDITIONS: Final = {
     "training": "Training, all episodes",

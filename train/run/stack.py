@@ -20,11 +20,11 @@ from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
 
-from .config import NAIVE, EnvConfig, FilterConfig, LearnerConfig
-from .env_ids import check_env_id
+from ..config import NAIVE, EnvConfig, FilterConfig, LearnerConfig
+from ..config.env_ids import check_env_id
+from ..config.names import check_name
+from ..local_imports import own_folders
 from .judge import ConstraintJudge
-from .local_imports import own_folders
-from .names import check_name
 
 
 def make_stack(

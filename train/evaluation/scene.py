@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers import interventions as keys
 
-from .atomic import write_bytes
+from ..atomic import write_bytes
 
 _STATIC = ("hazard_positions", "hazard_radius", "goal_radius", "vase_positions")
 

@@ -22,13 +22,21 @@ from safe_wrappers.errors import SafeWrappersError
 from .output import lasting_output
 from .parent import end_with_parent
 from .progress_display import ProgressDisplay
-from .run import Progress as RunProgress
 from .stopping import Interrupted, RunStoppedError, stop_request
 
 Message = tuple[str, Any]
 _POLL_S: Final = 0.2
 _SAVE_S: Final = 60.0
 """How long stopped jobs may take: a rollout, its update and a checkpoint with a large replay buffer."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a job reports to: its steps so far, lines that a person should read, and figures by their names."""
+
+    steps: Callable[[int], None]
+    say: Callable[[str], None]
+    figures: Callable[[Mapping[str, str]], None] = lambda _: None
 
 
 @dataclass(frozen=True)
@@ -167,7 +175,7 @@ def _work(job: Job, sender: Connection) -> None:
 
     torch.set_num_threads(1)
     end_with_parent()
-    progress = RunProgress(
+    progress = Progress(
         steps=lambda steps: sender.send(("steps", steps)),
         say=lambda text: sender.send(("say", text)),
         figures=lambda figures: sender.send(("figures", figures)),

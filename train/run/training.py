@@ -7,7 +7,6 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,35 +21,27 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from safe_wrappers.errors import RunStateError
 from safe_wrappers.sb3 import InterventionCallback
 
-from .algorithms import ALGORITHMS
-from .atomic import write_json
-from .checkpoint import Checkpoint, latest_checkpoint, save_checkpoint
-from .config import ArmConfig, without_default_buffer_size
-from .hyperparameters import constructor_arguments
-from .lock import only_writer
-from .run_callbacks import (
+from ..atomic import write_json
+from ..config import ArmConfig, without_default_buffer_size
+from ..config.algorithms import ALGORITHMS
+from ..hyperparameters import constructor_arguments
+from ..processes.lock import only_writer
+from ..processes.parallel import Progress
+from ..processes.stopping import RunStoppedError, heeding_termination
+from .callbacks import (
     CheckpointCallback,
     EpisodeRows,
     ProgressCallback,
     StopCallback,
     TrainingStopped,
 )
-from .stopping import RunStoppedError, heeding_termination
+from .checkpoint import Checkpoint, latest_checkpoint, save_checkpoint
 from .vec_envs import make_vec_env
 
 RUN_FILE: Final = "run.json"
 FINISHED_FILE: Final = "finished.json"
 CHECKPOINTS: Final = "checkpoints"
 EVALUATION: Final = "evaluation"
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Where a run reports to: its steps so far, lines that a person should read, and figures by their names."""
-
-    steps: Callable[[int], None]
-    say: Callable[[str], None]
-    figures: Callable[[Mapping[str, str]], None] = lambda _: None
 
 
 def train_run(arm: ArmConfig, seed: int, folder: Path, progress: Progress) -> None:

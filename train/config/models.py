@@ -16,9 +16,9 @@ from safe_wrappers.wrappers.faults import FAULTS
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 
+from ..hyperparameters import HER, SCHEDULED, check_action_noise, check_her, linear_start
 from .algorithms import ALGORITHMS, DETERMINISTIC, DISCRETE, OFF_POLICY, ON_POLICY, check_algorithm
 from .env_ids import check_env_id
-from .hyperparameters import HER, SCHEDULED, check_action_noise, check_her, linear_start
 from .names import check_name
 
 # What the run itself decides; the rest of the constructor's arguments are hyperparameters.

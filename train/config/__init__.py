@@ -1,0 +1,29 @@
+"""An experiment's settings: a YAML file and overrides, checked and turned into frozen dataclasses."""
+
+from .file import read_config
+from .models import (
+    NAIVE,
+    ArmConfig,
+    EnvConfig,
+    EvaluationConfig,
+    ExperimentConfig,
+    FilterConfig,
+    LearnerConfig,
+    NormalizeConfig,
+    parse_experiment,
+    without_default_buffer_size,
+)
+
+__all__ = [
+    "NAIVE",
+    "ArmConfig",
+    "EnvConfig",
+    "EvaluationConfig",
+    "ExperimentConfig",
+    "FilterConfig",
+    "LearnerConfig",
+    "NormalizeConfig",
+    "parse_experiment",
+    "read_config",
+    "without_default_buffer_size",
+]
