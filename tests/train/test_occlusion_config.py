@@ -58,7 +58,7 @@ def test_what_is_missing_is_said_when_the_stack_is_made():
 
 @pytest.mark.slow
 def test_the_stack_has_it_inside_the_filter_and_the_recorder_counts_what_it_tells():
-    stack = make_stack(EnvConfig(TASK, {}, {}, OCCLUSION), FilterConfig("protect", {"cars": "estimated"}))
+    stack = make_stack(EnvConfig(TASK, {}, {}, OCCLUSION), FilterConfig(protect={"cars": "estimated"}))
     kinds, inner = [], stack.env
     while isinstance(inner, gym.Wrapper):
         kinds.append(type(inner))

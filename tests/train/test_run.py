@@ -384,18 +384,16 @@ def test_unknown_factories(fake_experiment):
     with pytest.raises(
         UnknownNameError, match=r"fake_task.py\): unknown name 'sheild'. Did you mean 'shield'"
     ):
-        make_stack(env, FilterConfig("factory", {}, "fake_task:sheild"))
+        make_stack(env, FilterConfig(factory="fake_task:sheild"))
     with pytest.raises(ValueError, match=r"filter.factory: cannot import 'no_such_module'") as refusal:
-        make_stack(env, FilterConfig("factory", {}, "no_such_module:f"))
+        make_stack(env, FilterConfig(factory="no_such_module:f"))
     looked = str(refusal.value).split(" and in ")[1]
     assert str(Path(__file__).parent) in looked
     assert "site-packages" not in looked
 
 
 def test_protect_is_the_filter_and_gets_its_settings():
-    env = make_stack(
-        EnvConfig("SafePointGoal1-v0"), FilterConfig("protect", {"margin": 0.25, "solver": "daqp"})
-    )
+    env = make_stack(EnvConfig("SafePointGoal1-v0"), FilterConfig(protect={"margin": 0.25, "solver": "daqp"}))
     assert isinstance(env, Monitor)
     assert isinstance(env.env, RecordInterventions)
     assert isinstance(env.env.env, CBFActionFilter)

@@ -1,5 +1,7 @@
 """Learning rates that fall: the numbers of every update, in one go and continued after a kill."""
 
+import pickle
+
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback
 from test_run import Reports, run_killed_after
@@ -82,7 +84,7 @@ def test_a_rollout_beyond_the_end_does_not_unlearn(fake_experiment):
 @pytest.mark.parametrize("text", ["lin_3e-4", "linear_", "linear_-1", "linear_0", "linear_1.2.3", "linear_x"])
 def test_other_texts_are_refused(fake_experiment, key, text):
     message = (
-        f"hyperparameters.{key}: expected a number, or linear_<number> .* such as linear_3e-4; got '{text}'"
+        f"hyperparameters.{key}: expected a number, or linear_<number> .* such as linear_3e-4, got '{text}'"
     )
     with pytest.raises(ConfigurationError, match=message):
         fake_experiment("algorithm=PPO", f"hyperparameters={{{key}: {text}}}")
@@ -98,3 +100,7 @@ def test_another_schedule_is_another_run(fake_experiment):
         == "linear_3e-4"
         != constant["hyperparameters"]["learning_rate"]
     )
+
+
+def test_a_checkpoint_s_schedule_is_found_again_where_checkpoints_of_before_say_it_is():
+    assert pickle.loads(b"csafe_wrappers.train.hyperparameters\nLinearFall\n.") is LinearFall

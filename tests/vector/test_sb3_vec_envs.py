@@ -33,11 +33,11 @@ def monitored_cart(index):
 def stack(env_id, name, steps, index):
     """The training's own stack, Monitor outermost."""
     env = EnvConfig(env_id, {"max_episode_steps": steps + 2 * index})
-    return make_stack(env, FilterConfig("factory", {}, f"vector_worlds:{name}"))
+    return make_stack(env, FilterConfig(factory=f"vector_worlds:{name}"))
 
 
 def plain_stack(index):
-    return make_stack(EnvConfig("SafePointGoal1-v0", {"max_episode_steps": 5}), FilterConfig("protect"))
+    return make_stack(EnvConfig("SafePointGoal1-v0", {"max_episode_steps": 5}), FilterConfig(protect={}))
 
 
 TASKS = {

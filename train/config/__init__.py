@@ -1,5 +1,6 @@
 """An experiment's settings: a YAML file and overrides, checked and turned into frozen dataclasses."""
 
+from .experiment import parse_experiment
 from .file import read_config
 from .models import (
     NAIVE,
@@ -10,8 +11,6 @@ from .models import (
     FilterConfig,
     LearnerConfig,
     NormalizeConfig,
-    parse_experiment,
-    without_default_buffer_size,
 )
 
 __all__ = [
@@ -25,5 +24,4 @@ __all__ = [
     "NormalizeConfig",
     "parse_experiment",
     "read_config",
-    "without_default_buffer_size",
 ]

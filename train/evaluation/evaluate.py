@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
@@ -74,8 +73,8 @@ def evaluate_run(
         conditions["filter_on"] = action_filter
     out = evaluation_folder(folder)
     state = {
-        "settings": asdict(settings),
-        "filter": asdict(action_filter),
+        "settings": {"episodes": settings.episodes, "seed": settings.seed},
+        "filter": action_filter.plain(),
         "timesteps": checkpoint.timesteps,
         "recording": _RECORDING,
     }

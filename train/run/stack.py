@@ -74,9 +74,9 @@ def make_stack(
 
 def _filtered(task: gym.Env[Any, Any], action_filter: FilterConfig) -> gym.Env[Any, Any]:
     """The task in its filter; as it is if there is none."""
-    if action_filter.kind == "protect":
-        return safe_wrappers.protect(task, **action_filter.kwargs)
-    if action_filter.kind == "factory":
+    if action_filter.protect is not None:
+        return safe_wrappers.protect(task, **action_filter.protect)
+    if action_filter.factory is not None:
         factory = _function(action_filter.factory, "filter.factory")
         try:
             filtered: gym.Env[Any, Any] = factory(task, **action_filter.kwargs)

@@ -22,8 +22,9 @@ from safe_wrappers.errors import RunStateError
 from safe_wrappers.sb3 import InterventionCallback
 
 from ..atomic import write_json
-from ..config import ArmConfig, without_default_buffer_size
+from ..config import ArmConfig
 from ..config.algorithms import ALGORITHMS
+from ..config.models import without_default_buffer_size
 from ..hyperparameters import constructor_arguments
 from ..processes.lock import only_writer
 from ..processes.parallel import Progress

@@ -6,7 +6,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -190,7 +190,7 @@ def _conditions(experiment: ExperimentConfig, arm: ArmConfig) -> dict[str, Filte
 def _state(arm: ArmConfig, used: FilterConfig, shown: ShownEpisode, timesteps: int) -> dict[str, Any]:
     return {
         "arm": arm.fingerprint(),
-        "filter": asdict(used),
+        "filter": used.plain(),
         "seed": shown.seed,
         "episode_seed": shown.episode_seed,
         "timesteps": timesteps,
