@@ -148,8 +148,7 @@ class EnvConfig(Section):
     """`module:function` that judges a task without a cost of its own: [CostFunction](wrappers/cost-function.md), in
     all arms, in training and evaluation."""
     judge: Annotated[FilterConfig | None, BeforeValidator(_judge)] = None
-    """`constraints`: the evaluation filter's own limits judge such a task, read from its true state, in all
-    arms."""
+    """`constraints`: the evaluation filter's own limits judge such a task, read from its true state, in all arms."""
 
     @model_validator(mode="after")
     def _has_one_judge(self) -> EnvConfig:
