@@ -58,8 +58,7 @@ def evaluate_experiment(experiment: ExperimentConfig, console: Console) -> None:
     for arm in experiment.arms:
         for seed in experiment.seeds:
             check_finished(arm, experiment.run_folder(arm, seed))
-    conditions = 1 if experiment.evaluation_filter.kind == "none" else 2
-    episodes = conditions * experiment.evaluation.episodes
+    episodes = (1 if experiment.evaluation_filter.kind == "none" else 2) * experiment.evaluation.episodes
     arguments = (experiment.evaluation, experiment.evaluation_filter)
     _run(experiment, console, "Evaluation", lambda _: episodes, "episodes", evaluate_run, arguments)
     record_videos(experiment, console)

@@ -88,6 +88,12 @@ def _replay_buffer(arm: ArmConfig, envs: VecEnv) -> tuple[type, dict[str, Any]] 
     return (ExecutedActionDictReplayBuffer if has_dict else ExecutedActionReplayBuffer), mode
 
 
+def learning_starts(arm: ArmConfig) -> int:
+    """Steps of random actions before an off-policy algorithm learns."""
+    default = inspect.signature(ALGORITHMS[arm.algorithm]).parameters["learning_starts"].default
+    return int(arm.hyperparameters.get("learning_starts", default))
+
+
 def check_task(arm: ArmConfig, env: gym.Env[Any, Any]) -> None:
     """Refuses an arm whose algorithm cannot learn this task, which only the task itself can tell.
 
@@ -117,8 +123,7 @@ def check_task(arm: ArmConfig, env: gym.Env[Any, Any]) -> None:
             f" compute_reward; {arm.env.id} has {space}. Leave hyperparameters.replay_buffer_class out."
         )
     steps = env.spec.max_episode_steps if env.spec is not None else None
-    default = inspect.signature(ALGORITHMS[arm.algorithm]).parameters["learning_starts"].default
-    starts = arm.hyperparameters.get("learning_starts", default)
+    starts = learning_starts(arm)
     if steps is not None and starts < steps * arm.n_envs:
         raise ConfigurationError(
             f"{where}: {HER} draws from episodes that have ended. With {arm.n_envs} envs of {steps} steps an episode"

@@ -42,6 +42,12 @@ def evaluated_steps(run_folder: Path, condition: str) -> StepLog | None:
     return load_steps(evaluation_folder(run_folder) / f"{condition}_steps.npz")
 
 
+def conditions(arm: ArmConfig, default_filter: FilterConfig) -> dict[str, FilterConfig]:
+    """The filter that is on in each condition of an arm's evaluation; "filter_on" is left out where there is none."""
+    used = arm.filter if arm.filter.kind != "none" else default_filter
+    return {"filter_off": FilterConfig()} | ({"filter_on": used} if used.kind != "none" else {})
+
+
 def evaluate_run(
     arm: ArmConfig,
     seed: int,
@@ -67,14 +73,11 @@ def evaluate_run(
         RunStateError: The run is not finished, or its folder or policy cannot be used.
     """
     checkpoint = finished_checkpoint(arm, seed, folder)
-    action_filter = arm.filter if arm.filter.kind != "none" else default_filter
-    conditions = {"filter_off": FilterConfig()}
-    if action_filter.kind != "none":
-        conditions["filter_on"] = action_filter
+    filters = conditions(arm, default_filter)
     out = evaluation_folder(folder)
     state = {
         "settings": {"episodes": settings.episodes, "seed": settings.seed},
-        "filter": action_filter.plain(),
+        "filter": filters.get("filter_on", FilterConfig()).plain(),
         "timesteps": checkpoint.timesteps,
         "recording": _RECORDING,
     }
@@ -83,7 +86,7 @@ def evaluate_run(
     (out / STATE_FILE).unlink(missing_ok=True)  # from here on the rows may be of two settings
     policy = TrainedPolicy(arm, checkpoint)
     logger = configure(str(folder / "tensorboard"), ["tensorboard"])
-    for at, (condition, used) in enumerate(conditions.items()):
+    for at, (condition, used) in enumerate(filters.items()):
         evaluation = _Evaluation(arm, used)
         rows: list[dict[str, Any]] = []
         scenes: dict[int, Scene] = {}

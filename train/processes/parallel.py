@@ -81,7 +81,8 @@ def run_jobs(jobs: Sequence[Job], workers: int | None, console: Console, title: 
     with (
         stop_request() as request,
         ProgressDisplay(title, unit, totals, console) as display,
-        _one_thread_each(),
+        # Read by the BLAS libraries when the spawned process loads them; more threads would only fight for cores.
+        environment(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")),
     ):
         try:
             while running or (waiting and not request.signum):
@@ -193,11 +194,10 @@ def _work(job: Job, sender: Connection) -> None:
 
 
 @contextmanager
-def _one_thread_each() -> Iterator[None]:
-    # Read by the BLAS libraries when the spawned process loads them; more threads would only fight for cores.
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    before: Mapping[str, str | None] = {name: os.environ.get(name) for name in names}
-    os.environ.update(dict.fromkeys(names, "1"))
+def environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Environment variables for the processes that are started inside."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
     try:
         yield
     finally:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import shutil
 import time
@@ -25,7 +24,7 @@ from ..atomic import write_json
 from ..config import ArmConfig
 from ..config.algorithms import ALGORITHMS
 from ..config.models import without_default_buffer_size
-from ..hyperparameters import constructor_arguments
+from ..hyperparameters import constructor_arguments, learning_starts
 from ..processes.lock import only_writer
 from ..processes.parallel import Progress
 from ..processes.stopping import RunStoppedError, heeding_termination
@@ -272,8 +271,7 @@ def _continued(
     if isinstance(model, OffPolicyAlgorithm) and model.num_timesteps < arm.total_steps:
         assert model.replay_buffer is not None
         if model.replay_buffer.size() == 0:  # it went on from a final checkpoint, which has none
-            default = inspect.signature(ALGORITHMS[arm.algorithm]).parameters["learning_starts"].default
-            first = int(arm.hyperparameters.get("learning_starts", default))
+            first = learning_starts(arm)
             model.learning_starts = model.num_timesteps + first
             say(
                 f"goes on from step {model.num_timesteps} with an empty replay buffer (a finished run keeps none):"
