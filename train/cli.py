@@ -121,9 +121,9 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     if not options.configs:
         parser.error("the following arguments are required: CONFIG.yaml")
     if options.command != "report" and (options.output or len(options.configs) > 1):
-        parser.error("several configs and --output are for the command report")
+        parser.error(f"{options.command} takes one CONFIG.yaml and no --output; report does")
     if options.command != "compare" and options.report:
-        parser.error("--report is for the command compare")
+        parser.error(f"{options.command} takes no --report; compare does")
     return options
 
 
