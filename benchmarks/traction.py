@@ -102,7 +102,7 @@ def is_learned(config: str) -> bool:
 
 def _run_folder(config: str) -> tuple[Any, Path]:
     from safe_wrappers.train.config import parse_experiment
-    from safe_wrappers.train.config_file import read_config
+    from safe_wrappers.train.config.file import read_config
 
     experiment = parse_experiment(read_config(Path(config)))
     arm = next(a for a in experiment.arms if a.filter.kind == "none")
@@ -110,8 +110,8 @@ def _run_folder(config: str) -> tuple[Any, Path]:
 
 
 def _learned(config: str) -> Callable[[], Driver]:
-    from safe_wrappers.train.policy import TrainedPolicy
-    from safe_wrappers.train.run import finished_checkpoint
+    from safe_wrappers.train.run.policy import TrainedPolicy
+    from safe_wrappers.train.run.training import finished_checkpoint
 
     arm, folder = _run_folder(config)
     policy = TrainedPolicy(arm, finished_checkpoint(arm, 0, folder))

@@ -17,10 +17,10 @@ import torch
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from safe_wrappers.sb3 import InterventionCallback
-from safe_wrappers.train.algorithms import ALGORITHMS
 from safe_wrappers.train.config import ArmConfig, parse_experiment
-from safe_wrappers.train.config_file import read_config
-from safe_wrappers.train.stack import make_stack
+from safe_wrappers.train.config.algorithms import ALGORITHMS
+from safe_wrappers.train.config.file import read_config
+from safe_wrappers.train.run.stack import make_stack
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 EXPERIMENTS = ("pointgoal1_300k", "halfcheetah_velocity_ppo")

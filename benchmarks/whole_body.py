@@ -157,9 +157,9 @@ class Judge:
 def learned(robot: str) -> Callable[[Any], Any]:
     """The trained policy of a robot; says how to train it where there is none."""
     from safe_wrappers.train.config import parse_experiment
-    from safe_wrappers.train.config_file import read_config
-    from safe_wrappers.train.policy import TrainedPolicy
-    from safe_wrappers.train.run import finished_checkpoint
+    from safe_wrappers.train.config.file import read_config
+    from safe_wrappers.train.run.policy import TrainedPolicy
+    from safe_wrappers.train.run.training import finished_checkpoint
 
     experiment = parse_experiment(read_config(CONFIG))
     arm = next(a for a in experiment.arms if a.name == robot)

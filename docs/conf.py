@@ -20,6 +20,7 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
+    "config_keys",
     "docstrings",
     "drawn",
     "info_keys",

@@ -1,9 +1,9 @@
 """Training, paired evaluation and comparison with Stable-Baselines3: the `safe-wrappers` command.
 
 **What is learned from.** SB3 stores the action that the policy proposed, not the one that the filter let
-through: with the names of Krasowski et al. (Provably Safe Reinforcement Learning, TMLR 2023) every filtered
-arm here learns in the *naive* way. The filter is then part of the environment: the policy sees the outcome of
-the executed action under the name of its own. PPO stays on-policy that way, and the return is the one really
-obtained; what it does not learn by itself is to avoid being corrected. The paper's other choices (adaption
-penalty, safe action, both) are not in this release.
+through: with the names of Krasowski et al. (Provably Safe Reinforcement Learning, TMLR 2023) a filtered arm
+learns in the *naive* way unless its `learner` says otherwise. The filter is then part of the environment: the
+policy sees the outcome of the executed action under the name of its own. PPO stays on-policy that way, and the
+return is the one really obtained; what it does not learn by itself is to avoid being corrected. The paper's other
+choices are `learner: adaption_penalty`, `safe_action` and `both`; the last two need a replay buffer.
 """

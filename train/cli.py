@@ -16,22 +16,21 @@ from typing import TYPE_CHECKING
 
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError
 
-from .config_file import read_config
 from .local_imports import importable
-from .output import lasting_output
-from .stopping import Interrupted
+from .processes.output import lasting_output
+from .processes.stopping import Interrupted
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-_COMMANDS = {
+    from .config import ExperimentConfig
+
+COMMANDS = {
     "train": "train every arm with every seed; a killed run goes on where it was, a finished one is left",
     "evaluate": "evaluate the trained policies on the same episodes, with the filter off and on",
     "compare": "train, evaluate, and print the comparison",
     "report": "write the comparison as one HTML page, from what is already there; of several, also an overview",
 }
-
-_OPTIONS = {"compare": " [--report]", "report": " [CONFIG.yaml ...] [--output PAGE.html]"}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -41,19 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(arguments: Sequence[str] | None) -> int:
-    parser = _parser()
-    # argparse takes words only right behind the first ones; behind an option they arrive as unknown.
-    options, rest = parser.parse_known_args(arguments)
-    words = [*options.words, *rest]
-    options.configs = [Path(word) for word in words if "=" not in word and not word.startswith("-")]
-    options.overrides = [word for word in words if "=" in word and not word.startswith("-")]
-    unknown = [word for word in words if word.startswith("-")]
-    if options.command != "report":
-        unknown += map(str, options.configs[1:])
-    if unknown:
-        parser.error(f"unrecognized arguments: {' '.join(unknown)}")
-    if not options.configs:
-        parser.error("the following arguments are required: CONFIG.yaml")
+    options = _options(arguments)
     from rich.console import Console
 
     try:
@@ -73,18 +60,18 @@ def _main(arguments: Sequence[str] | None) -> int:
 
 
 def _run(options: argparse.Namespace, console: Console) -> None:
-    if options.command == "report":
-        _report(options.configs, options.overrides, options.output, console)
-        return
-    (config,) = options.configs
-    settings = read_config(config, options.overrides)
+    from .config import parse_experiment, read_config
 
-    from .config import parse_experiment
+    settings = [read_config(config, options.overrides) for config in options.configs]
+    if options.command == "report":
+        _report(options, [parse_experiment(each) for each in settings], console)
+        return
+
     from .experiment import evaluate_experiment, summarize_experiment, train_experiment
     from .report import verdict, write_report
-    from .table import comparison_table
+    from .report.terminal_table import comparison_table
 
-    experiment = parse_experiment(settings)
+    experiment = parse_experiment(settings[0])
     if options.command in ("train", "compare"):
         train_experiment(experiment, console)
     if options.command in ("evaluate", "compare"):
@@ -93,34 +80,31 @@ def _run(options: argparse.Namespace, console: Console) -> None:
     if options.command in ("evaluate", "compare"):
         console.print(comparison_table(experiment, summary))
         console.print("\n".join(verdict(experiment, summary)), highlight=False, markup=False)
-    if getattr(options, "report", False):
-        path = write_report(experiment, summary, _compare_command(config, options.overrides))
+    if options.report:
+        path = write_report(experiment, summary, _compare_command(options.configs[0], options.overrides))
         console.print(f"Report: {path}", soft_wrap=True, highlight=False)
     console.print(f"Files: {experiment.folder}", soft_wrap=True, highlight=False)
 
 
-def _report(configs: Sequence[Path], overrides: Sequence[str], output: Path | None, console: Console) -> None:
+def _report(options: argparse.Namespace, experiments: list[ExperimentConfig], console: Console) -> None:
     """Of one config its page; of several a page each, and one that puts them side by side."""
-    settings = [read_config(config, overrides) for config in configs]
-
-    from .config import parse_experiment
     from .experiment import summarize_experiment
     from .report import write_overview, write_report
 
-    experiments = [parse_experiment(each) for each in settings]
     folders = [experiment.folder for experiment in experiments]
     for folder in folders:
         if folders.count(folder) > 1:
             raise ConfigurationError(f"report: two configs name the same experiment, {str(folder)!r}.")
     entries = [(experiment, summarize_experiment(experiment)) for experiment in experiments]
-    for config, (experiment, summary) in zip(configs, entries, strict=True):
-        alone = output if len(entries) == 1 else None
-        path = write_report(experiment, summary, _compare_command(config, overrides), alone)
+    for config, (experiment, summary) in zip(options.configs, entries, strict=True):
+        alone = options.output if len(entries) == 1 else None
+        path = write_report(experiment, summary, _compare_command(config, options.overrides), alone)
         console.print(f"Report: {path}", soft_wrap=True, highlight=False)
         console.print(f"Files: {experiment.folder}", soft_wrap=True, highlight=False)
     if len(entries) > 1:
-        path = output or experiments[0].output / "overview.html"
-        write_overview(entries, path, shlex.join(["safe-wrappers", "report", *map(str, configs), *overrides]))
+        path = options.output or experiments[0].output / "overview.html"
+        again = ["safe-wrappers", "report", *map(str, options.configs), *options.overrides]
+        write_overview(entries, path, shlex.join(again))
         console.print(f"Overview: {path}", soft_wrap=True, highlight=False)
 
 
@@ -128,30 +112,45 @@ def _compare_command(config: Path, overrides: Sequence[str]) -> str:
     return shlex.join(["safe-wrappers", "compare", str(config), *overrides, "--report"])
 
 
-def _parser() -> argparse.ArgumentParser:
+def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = make_parser()
+    # Subparsers would take no words behind an option: `compare a.yaml --report seeds=[0]`.
+    options = parser.parse_intermixed_args(arguments)
+    options.configs = [Path(word) for word in options.words if "=" not in word]
+    options.overrides = [word for word in options.words if "=" in word]
+    if not options.configs:
+        parser.error("the following arguments are required: CONFIG.yaml")
+    if options.command != "report" and (options.output or len(options.configs) > 1):
+        parser.error(f"{options.command} takes one CONFIG.yaml and no --output; report does")
+    if options.command != "compare" and options.report:
+        parser.error(f"{options.command} takes no --report; compare does")
+    return options
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The command's words and options."""
     parser = argparse.ArgumentParser(
-        prog="safe-wrappers", description="Train with and without a safety filter, and compare."
+        prog="safe-wrappers",
+        description="Train with and without a safety filter, and compare.",
+        usage="%(prog)s COMMAND CONFIG.yaml [key=value ...] [option ...]",
+        epilog="commands:\n" + "\n".join(f"  {name:10}{text}" for name, text in COMMANDS.items()),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("command", choices=COMMANDS, metavar="COMMAND", help="one of those below")
+    parser.add_argument(
+        "words",
+        nargs="+",
+        metavar="CONFIG.yaml, key=value",
+        help="the experiment, and overrides such as total_steps=1000 or arms.filtered.filter=protect",
+    )
+    parser.add_argument("--report", action="store_true", help="of compare: also write the HTML report")
+    parser.add_argument(
+        "--output",
+        type=Path,
+        metavar="PAGE.html",
+        help="of report: where to (default: report.html beside the runs; of several, overview.html)",
     )
     parser.add_argument("--version", action="version", version=version("safe-wrappers"))
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name, text in _COMMANDS.items():
-        usage = f"safe-wrappers {name} CONFIG.yaml [key=value ...]{_OPTIONS.get(name, '')}"
-        command = commands.add_parser(name, help=text, description=text, usage=usage)
-        command.add_argument(
-            "words",
-            nargs="+",
-            metavar="CONFIG.yaml, key=value",
-            help="the experiment, and overrides such as total_steps=1000 or arms.filtered.filter=protect",
-        )
-        if name == "compare":
-            command.add_argument("--report", action="store_true", help="also write the HTML report")
-        if name == "report":
-            command.add_argument(
-                "--output",
-                type=Path,
-                metavar="PAGE.html",
-                help="where to (default: report.html beside the runs; of several, overview.html)",
-            )
     return parser
 
 

@@ -8,14 +8,14 @@ from typing import Any
 from rich.console import Console
 
 from .config import ArmConfig, ExperimentConfig
-from .evaluate import evaluate_run
+from .evaluation.evaluate import evaluate_run
+from .evaluation.summary import Summary, summarize, write_summary
 from .hyperparameters import check_task
-from .parallel import Job, run_jobs
-from .run import check_finished, check_folder, is_outgrown, standing, train_run
-from .stack import make_stack
-from .stopping import Interrupted
-from .summary import Summary, summarize, write_summary
-from .videos import delete_videos, record_videos
+from .processes.parallel import Job, run_jobs
+from .processes.stopping import Interrupted
+from .run.stack import make_stack
+from .run.training import check_finished, check_folder, is_outgrown, standing, train_run
+from .videos.record import delete_videos, record_videos
 
 
 def train_experiment(experiment: ExperimentConfig, console: Console) -> None:
@@ -58,8 +58,7 @@ def evaluate_experiment(experiment: ExperimentConfig, console: Console) -> None:
     for arm in experiment.arms:
         for seed in experiment.seeds:
             check_finished(arm, experiment.run_folder(arm, seed))
-    conditions = 1 if experiment.evaluation_filter.kind == "none" else 2
-    episodes = conditions * experiment.evaluation.episodes
+    episodes = (1 if experiment.evaluation_filter.kind == "none" else 2) * experiment.evaluation.episodes
     arguments = (experiment.evaluation, experiment.evaluation_filter)
     _run(experiment, console, "Evaluation", lambda _: episodes, "episodes", evaluate_run, arguments)
     record_videos(experiment, console)

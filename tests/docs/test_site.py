@@ -2,6 +2,7 @@
 
 import html.parser
 import os
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -82,6 +83,13 @@ def test_every_info_key_is_explained(site):
     constants = {k: v for k, v in vars(interventions).items() if k.isupper() and isinstance(v, str)}
     keys = {v for k, v in constants.items() if not k.endswith("PREFIX")} | set(interventions.RUNNING)
     assert {key for key in keys if f">{key}<" not in shown} == set()
+
+
+def test_every_key_of_a_config_is_in_a_table(site):
+    shown = (site / "config.html").read_text(encoding="utf-8")
+    keys = runpy.run_path(str(DOCS / "config_keys.py"))["keys"]
+    names = [key.name for key in (*keys("ExperimentConfig"), *keys("ArmConfig"), *keys("EnvConfig", "env."))]
+    assert len(names) > 20 and [name for name in names if f">{name}<" not in shown] == []
 
 
 def test_every_public_name_is_in_the_api(pages):

@@ -348,7 +348,7 @@ def test_vector_envs_report_whole_arrays():
 def test_the_training_stack_counts_the_cost():
     pytest.importorskip("stable_baselines3")
     from safe_wrappers.train.config import EnvConfig, FilterConfig
-    from safe_wrappers.train.stack import make_stack
+    from safe_wrappers.train.run.stack import make_stack
 
     task = EnvConfig(VELOCITY_IDS[0], {"version": "v4", "max_episode_steps": 50})
     stack = make_stack(task, FilterConfig())

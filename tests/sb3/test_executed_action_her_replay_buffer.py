@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.sb3 import ExecutedActionHerReplayBuffer
-from safe_wrappers.train.checkpoint import _move
+from safe_wrappers.train.run.checkpoint import _move
 
 torch.set_num_threads(1)
 ENVS = {"safe_action": filtered, "both": penalised, "adaption_penalty": penalised}

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from safe_wrappers.train.config import parse_experiment
-from safe_wrappers.train.config_file import read_config
+from safe_wrappers.train.config.file import read_config
 
 torch.set_num_threads(1)  # as in the workers; two threads on two busy cores only wait for each other
 

@@ -4,9 +4,9 @@ import json
 
 import numpy as np
 
-from safe_wrappers.train.evaluate import EVALUATION_COLUMNS, evaluation_folder
-from safe_wrappers.train.run_callbacks import EPISODE_COLUMNS
-from safe_wrappers.train.step_log import StepLog, save_steps
+from safe_wrappers.train.evaluation.evaluate import EVALUATION_COLUMNS, evaluation_folder
+from safe_wrappers.train.evaluation.step_log import StepLog, save_steps
+from safe_wrappers.train.run.callbacks import EPISODE_COLUMNS
 from safe_wrappers.train.tables import write_rows
 
 

@@ -13,15 +13,15 @@ from test_run import Reports, run_killed_after
 
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.sb3 import ExecutedActionReplayBuffer
-from safe_wrappers.train.algorithms import ALGORITHMS, DISCRETE, OFF_POLICY, ON_POLICY
-from safe_wrappers.train.checkpoint import latest_checkpoint
 from safe_wrappers.train.config import EvaluationConfig
-from safe_wrappers.train.evaluate import evaluate_run, evaluation_folder
+from safe_wrappers.train.config.algorithms import ALGORITHMS, DISCRETE, OFF_POLICY, ON_POLICY
+from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
 from safe_wrappers.train.hyperparameters import check_task, constructor_arguments
-from safe_wrappers.train.run import train_run
-from safe_wrappers.train.stack import make_stack
+from safe_wrappers.train.run.checkpoint import latest_checkpoint
+from safe_wrappers.train.run.stack import make_stack
+from safe_wrappers.train.run.training import train_run
+from safe_wrappers.train.run.vec_envs import make_vec_env
 from safe_wrappers.train.tables import read_rows
-from safe_wrappers.train.vec_envs import make_vec_env
 
 SMALL = "policy_kwargs: {net_arch: [8]}"
 REPLAY = f"learning_starts: 32, batch_size: 8, train_freq: 8, {SMALL}"

@@ -9,8 +9,8 @@ import pytest
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.train.config import EnvConfig, FilterConfig, parse_experiment
-from safe_wrappers.train.stack import make_stack
-from safe_wrappers.train.summary import summarize
+from safe_wrappers.train.evaluation.summary import summarize
+from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.wrappers.faults import DroppedRefreshes, Outages
 
 OUTAGES = {"mean_between_s": 0.2, "mean_length_s": 0.2}
@@ -27,7 +27,7 @@ def test_they_are_read_and_change_the_runs_fingerprint_only_where_they_are():
     (plain,) = parsed(a={"filter": "protect"}).arms
     (leased,) = parsed(env=env, a={"filter": {"protect": {"margin": 0.01}, "lease": LEASE}}).arms
     assert leased.env.faults == {"Outages": OUTAGES}
-    assert (leased.filter.kind, leased.filter.kwargs, leased.filter.lease) == (
+    assert (leased.filter.kind, leased.filter.protect, leased.filter.lease) == (
         "protect",
         {"margin": 0.01},
         LEASE,
@@ -62,7 +62,7 @@ def test_what_cannot_be_is_refused_by_name(env, filter_, error, words):
 
 def test_the_stack_has_every_layer_in_its_place():
     faults = {"Outages": OUTAGES, "DroppedRefreshes": {"share": 0.1}}
-    stack = make_stack(EnvConfig("SafePointGoal1-v0", {}, faults), FilterConfig("protect", {}, lease=LEASE))
+    stack = make_stack(EnvConfig("SafePointGoal1-v0", {}, faults), FilterConfig(protect={}, lease=LEASE))
     kinds = []
     inner = stack.env
     while isinstance(inner, gym.Wrapper):
@@ -82,11 +82,11 @@ def test_the_stack_has_every_layer_in_its_place():
 
 
 def test_the_leases_room_is_the_filters_unless_it_is_given():
-    two = FilterConfig("protect", {}, lease=LEASE)
+    two = FilterConfig(protect={}, lease=LEASE)
     with pytest.raises(ConfigurationError, match="2 constraints; say which room"):
         make_stack(EnvConfig("Pusher-v5"), two)
     given = {"clearance": {"kind": "JointSpeedLimit", "limit": 6.0}, "closing_speed": 100.0}
-    assert make_stack(EnvConfig("Pusher-v5"), FilterConfig("protect", {}, lease=given))
+    assert make_stack(EnvConfig("Pusher-v5"), FilterConfig(protect={}, lease=given))
 
 
 def test_arguments_that_are_missing_are_named():

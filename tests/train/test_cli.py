@@ -174,17 +174,43 @@ def test_help_and_mistakes_in_the_command_do_not_wait_for_torch():
     code = """
 import sys
 from safe_wrappers.train.cli import main
+late = {"torch", "stable_baselines3", "sb3_contrib", "tensorboard", "matplotlib", "PIL", "gymnasium_robotics"}
 for arguments in (["--help"], ["--version"], ["trian"], ["train"], ["train", "a.yaml", "--no"], ["train", "a.yaml"]):
+    read = {"rich", "pydantic", "yaml"} if arguments != ["train", "a.yaml"] else set()
     try:
         main(arguments)
     except SystemExit:
         pass
-    late = {"torch", "stable_baselines3", "matplotlib", "tensorboard"} & set(sys.modules)
-    assert not late, (arguments, late)
+    loaded = (late | read) & set(sys.modules)
+    assert not loaded, (arguments, loaded)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd="/")
     assert done.returncode == 0, done.stderr
     assert "There is no config file 'a.yaml'" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["train", "a.yaml", "--report"], "train takes no --report; compare does"),
+        (["train", "a.yaml", "--no"], "unrecognized arguments: --no"),
+        (["train", "n_envs=1"], "the following arguments are required: CONFIG.yaml"),
+    ],
+)
+def test_options_of_another_command_are_refused(words, message, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(words)
+    assert end.value.code == 2 and message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words", [["--report", "a.yaml", "nam=1"], ["a.yaml", "--report", "nam=1"], ["a.yaml", "nam=1"]]
+)
+def test_words_and_options_come_in_any_order(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.yaml").write_text("name: x")
+    assert main(["compare", *words]) == 1
+    assert "config: unknown name 'nam'. Did you mean 'name'?" in capsys.readouterr().err
 
 
 def test_a_factory_is_found_beside_the_config_and_sys_path_is_left_as_it_was(tmp_path, capsys):

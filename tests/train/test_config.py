@@ -4,7 +4,7 @@ import pytest
 
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.train.config import parse_experiment
-from safe_wrappers.train.config_file import read_config
+from safe_wrappers.train.config.file import read_config
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 MINIMAL = {
@@ -35,7 +35,7 @@ def test_every_config_of_the_repo_is_valid(path):
         assert all(list(arm.env.faults) == ["Outages"] for arm in experiment.arms)
     elif path.stem == "occluded_crossing_ppo":
         known = {"true_state": "true", "last_seen": "last_seen", "estimated": "estimated"}
-        kept = {arm.name: arm.filter.kwargs.get("cars") for arm in experiment.arms}
+        kept = {arm.name: (arm.filter.protect or {}).get("cars") for arm in experiment.arms}
         without = {name: cars for name, cars in kept.items() if not name.endswith("_penalty")}
         assert without == known | {"unfiltered": None}
         assert kept == without | {f"{name}_penalty": cars for name, cars in without.items()}
@@ -49,7 +49,7 @@ def test_an_evaluation_may_name_its_own_filter():
     arms = {"unfiltered": {"filter": "none"}}
     assert changed(arms=arms).evaluation_filter.kind == "none"
     on = changed(arms=arms, evaluation={"episodes": 1, "filter": {"protect": {"margin": 0.1}}})
-    assert on.evaluation_filter.kwargs == {"margin": 0.1}
+    assert on.evaluation_filter.protect == {"margin": 0.1}
     filtered = changed(evaluation={"filter": "none"})
     assert filtered.evaluation_filter.kind == "none"
     with pytest.raises(UnknownNameError, match="protect"):
@@ -90,7 +90,7 @@ def test_arms_override_the_common_settings():
         },
     )
     a, b, c, d = experiment.arms
-    assert (a.filter.kind, a.filter.kwargs) == ("protect", {"margin": 0.01})
+    assert (a.filter.kind, a.filter.protect) == ("protect", {"margin": 0.01})
     assert (b.hyperparameters, b.total_steps, b.n_envs) == ({"n_steps": 64, "gamma": 0.8}, 5, 3)
     assert b.device == "auto"
     # Another algorithm does not inherit PPO's hyperparameters; its buffer is no larger than the run.
@@ -104,7 +104,7 @@ def test_arms_override_the_common_settings():
     ("settings", "message"),
     [
         ({"totalsteps": 3}, "config: unknown name 'totalsteps'. Did you mean 'total_steps'?"),
-        ({"algorithm": "PP0"}, "arms.unfiltered.algorithm: unknown name 'PP0'. Did you mean 'PPO'?"),
+        ({"algorithm": "PP0"}, "algorithm: unknown name 'PP0'. Did you mean 'PPO'?"),
         ({"env": "InvertedPendulums-v5"}, "Did you mean 'InvertedPendulum-v5'?"),
         ({"env": {"id": "Pendulum-v1", "kwarg": {}}}, "env: unknown name 'kwarg'. Did you mean 'kwargs'?"),
         (
@@ -139,42 +139,77 @@ def test_unknown_names_are_refused_with_the_nearest(settings, message):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"total_steps": 0}, "total_steps: expected an integer of at least 1, got 0."),
-        ({"total_steps": "many"}, "total_steps: expected an integer of at least 1, got 'many'."),
-        ({"total_steps": True}, "total_steps: expected an integer of at least 1, got True."),
-        ({"n_envs": 1.5}, "n_envs: expected an integer of at least 1, got 1.5."),
-        ({"workers": 0}, "workers: expected an integer of at least 1, got 0."),
-        ({"checkpoint_every": -1}, "checkpoint_every: expected an integer of at least 1, got -1."),
-        ({"seeds": 3}, "seeds: expected a list such as [0, 1, 2], got 3."),
-        ({"seeds": []}, "seeds: expected a list such as [0, 1, 2], got []."),
+        ({"total_steps": 0}, "total_steps: input should be greater than or equal to 1, got 0."),
+        ({"total_steps": "many"}, "total_steps: input should be a valid integer, got 'many'."),
+        ({"total_steps": True}, "total_steps: input should be a valid integer, got True."),
+        ({"n_envs": 1.5}, "n_envs: input should be a valid integer, got 1.5."),
+        ({"workers": 0}, "workers: input should be greater than or equal to 1, got 0."),
+        ({"checkpoint_every": -1}, "checkpoint_every: input should be greater than or equal to 1, got -1."),
+        ({"seeds": 3}, "seeds: input should be a valid list, got 3."),
+        ({"seeds": []}, "seeds: list should have at least 1 item"),
         ({"seeds": [1, 1]}, "seeds: each may be given once, got [1, 1]."),
-        ({"seeds": [-1]}, "seeds: expected an integer of at least 0, got -1."),
+        ({"seeds": [-1]}, "seeds.0: input should be greater than or equal to 0, got -1."),
         ({"arms": {}}, "arms: expected at least one"),
-        ({"arms": [1]}, "arms: expected a mapping (`key: value`), got [1]."),
-        ({"arms": {"../x": {}}}, "arms: expected a name that can be a folder's"),
+        ({"arms": [1]}, "arms: input should be a valid dictionary, got [1]."),
+        ({"arms": {"../x": {}}}, "arms.../x.name: expected a name that can be a folder's"),
         ({"name": "a/b"}, "name: expected a name that can be a folder's"),
-        ({"output": 3}, "output: expected a text, got 3."),
-        ({"arms": {"a": {"filter": False}}}, "arms.a.filter: expected none, protect, {protect: {...}}"),
+        ({"output": 3}, "output: input is not a valid path"),
+        (
+            {"arms": {"a": {"filter": False}}},
+            "arms.a.filter: expected a mapping of protect, factory, kwargs, lease; got False.",
+        ),
         (
             {"arms": {"a": {"filter": {"factory": "no_colon"}}}},
             "factory: expected 'module:function', got 'no_colon'.",
         ),
-        ({"arms": {"a": {"filter": {"kwargs": {}}}}}, "arms.a.filter: expected none, protect"),
+        (
+            {"arms": {"a": {"filter": {"kwargs": {"x": 1}}}}},
+            "arms.a.filter: expected none, protect, {protect: {...}}",
+        ),
         (
             {"hyperparameters": {"learning_rate": -1}},
-            "learning_rate: expected a finite number above 0, got -1.",
+            "learning_rate: input should be greater than 0, got -1.",
         ),
-        ({"hyperparameters": {"n_steps": 0}}, "n_steps: expected an integer of at least 1, got 0."),
-        ({"hyperparameters": {"gamma": "high"}}, "gamma: expected a finite number, got 'high'."),
-        ({"hyperparameters": {"use_sde": 1}}, "use_sde: expected true or false, got 1."),
-        ({"normalize": {"reward": "yes"}}, "normalize.reward: expected true or false, got 'yes'."),
-        ({"evaluation": {"seed": -1}}, "evaluation.seed: expected an integer of at least 0, got -1."),
+        ({"hyperparameters": {"n_steps": 0}}, "n_steps: input should be greater than or equal to 1, got 0."),
+        ({"hyperparameters": {"gamma": "high"}}, "gamma: input should be a valid number, got 'high'."),
+        ({"hyperparameters": {"use_sde": 1}}, "use_sde: input should be a valid boolean, got 1."),
+        ({"normalize": {"reward": "yes"}}, "normalize.reward: input should be a valid boolean, got 'yes'."),
+        (
+            {"evaluation": {"seed": -1}},
+            "evaluation.seed: input should be greater than or equal to 0, got -1.",
+        ),
     ],
 )
 def test_bad_values_are_refused(settings, message):
     with pytest.raises(ConfigurationError) as refusal:
         changed(**settings)
     assert message in str(refusal.value)
+
+
+def test_a_key_without_a_value_has_its_default():
+    (arm,) = changed(n_envs=None, normalize=None, workers=None, arms={"a": {"filter": None}}).arms
+    assert (arm.n_envs, arm.normalize.reward, arm.filter.kind) == (1, False, "none")
+    (arm,) = changed(arms={"a": {"filter": {"protect": None}}}).arms
+    assert (arm.filter.kind, arm.filter.protect) == ("protect", {})
+
+
+def test_numbers_have_the_types_that_the_algorithm_takes():
+    (arm,) = changed(total_steps=1e3, hyperparameters={"n_steps": 1e2, "gamma": 1}).arms
+    assert [type(value) for value in (arm.total_steps, *arm.hyperparameters.values())] == [int, int, float]
+
+
+@pytest.mark.parametrize(
+    ("common", "own", "place"),
+    [
+        ({"n_envs": 0}, {}, "n_envs: "),
+        ({}, {"n_envs": 0}, "arms.a.n_envs: "),
+        ({"n_envs": 1}, {"n_envs": 0}, "arms.a.n_envs: "),
+    ],
+)
+def test_a_refusal_says_where_the_setting_stands(common, own, place):
+    with pytest.raises(ConfigurationError) as refusal:
+        changed(**common, arms={"a": own})
+    assert str(refusal.value).startswith(place)
 
 
 @pytest.mark.parametrize("key", sorted(MINIMAL))

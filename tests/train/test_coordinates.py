@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import safe_wrappers  # noqa: F401 (registers its tasks)
-from safe_wrappers.train.coordinates import CoordinateReader
+from safe_wrappers.train.evaluation.coordinates import CoordinateReader
 
 
 def test_joints_by_name_with_the_turns_taken_off():

@@ -5,9 +5,9 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from safe_wrappers.errors import RunStateError
-from safe_wrappers.train.evaluate import evaluate_run, evaluated_steps
+from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluated_steps
+from safe_wrappers.train.evaluation.scene import load_scenes
 from safe_wrappers.train.run import Progress, train_run
-from safe_wrappers.train.scene import load_scenes
 from safe_wrappers.train.tables import read_rows
 
 SILENT = Progress(lambda steps: None, pytest.fail)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from made_up import fill, steps
 
-from safe_wrappers.train.curves import Curve, event_rate
+from safe_wrappers.train.evaluation.curves import Curve, event_rate
+from safe_wrappers.train.evaluation.summary import summarize
 from safe_wrappers.train.figures.canvas import draw
 from safe_wrappers.train.figures.constraints import constraints_picture
 from safe_wrappers.train.figures.corrections import corrections_picture
@@ -17,7 +18,6 @@ from safe_wrappers.train.figures.finals import finals_picture
 from safe_wrappers.train.figures.plane import plane_limits, plane_picture
 from safe_wrappers.train.figures.training_timeline import training_timeline_picture
 from safe_wrappers.train.figures.where import choose_view, where_picture
-from safe_wrappers.train.summary import summarize
 
 ARMS = ["bare", "safe"]
 DRAWN = 'role="img" aria-label="'

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from safe_wrappers.train import film
-from safe_wrappers.train.film import HEIGHT, STRIP, Film, encode, first_frame, speed_of, stride_of
+from safe_wrappers.train.videos import film
+from safe_wrappers.train.videos.film import HEIGHT, STRIP, Film, encode, first_frame, speed_of, stride_of
 
 
 def shot(steps, changed=(), violated=(), stride=1):

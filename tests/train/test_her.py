@@ -12,14 +12,14 @@ from test_run import Reports, run_killed_after
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.sb3 import ExecutedActionHerReplayBuffer
-from safe_wrappers.train.checkpoint import latest_checkpoint
 from safe_wrappers.train.config import EvaluationConfig, FilterConfig
-from safe_wrappers.train.evaluate import evaluate_run, evaluation_folder
+from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
 from safe_wrappers.train.hyperparameters import check_task
-from safe_wrappers.train.run import train_run
-from safe_wrappers.train.stack import make_stack
+from safe_wrappers.train.run.checkpoint import latest_checkpoint
+from safe_wrappers.train.run.stack import make_stack
+from safe_wrappers.train.run.training import train_run
+from safe_wrappers.train.run.vec_envs import make_vec_env
 from safe_wrappers.train.tables import read_rows
-from safe_wrappers.train.vec_envs import make_vec_env
 
 HER = (
     "hyperparameters={policy: MultiInputPolicy, learning_starts: 32, batch_size: 16, train_freq: 8,"
@@ -106,8 +106,8 @@ def test_trained_killed_continued_and_evaluated(fake_experiment, monkeypatch, re
         ("naive", "replay_buffer_class=ReplayBuffer", "class: unknown name 'ReplayBuffer'. Did you mean"),
         ("both", "replay_buffer_kwargs={n_goals: 3}", "kwargs: unknown name 'n_goals'. Did you mean"),
         ("both", "replay_buffer_kwargs={mode: naive}", "replay_buffer_kwargs: unknown name 'mode'"),
-        ("both", "replay_buffer_kwargs={n_sampled_goal: -1}", "n_sampled_goal: expected an integer of at least 0"),
-        ("naive", "replay_buffer_kwargs={copy_info_dict: 1}", "copy_info_dict: expected true or false, got 1"),
+        ("both", "replay_buffer_kwargs={n_sampled_goal: -1}", "goal: input should be greater than or equal to 0"),
+        ("naive", "replay_buffer_kwargs={copy_info_dict: 1}", "copy_info_dict: input should be a valid boolean, got"),
         (
             "naive",
             "replay_buffer_kwargs={goal_selection_strategy: past}",

@@ -12,12 +12,12 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.train.config import EnvConfig, FilterConfig, parse_experiment
-from safe_wrappers.train.evaluate import evaluate_run
+from safe_wrappers.train.evaluation.evaluate import evaluate_run
+from safe_wrappers.train.evaluation.summary import summarize, write_summary
 from safe_wrappers.train.report import verdict, write_report
+from safe_wrappers.train.report.terminal_table import comparison_table
 from safe_wrappers.train.run import Progress, train_run
-from safe_wrappers.train.stack import make_stack
-from safe_wrappers.train.summary import summarize, write_summary
-from safe_wrappers.train.table import comparison_table
+from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.train.tables import read_rows
 
 SILENT = Progress(lambda steps: None, pytest.fail)
@@ -60,7 +60,7 @@ def without_h(env):
 
 
 def judged(env_id, factory, action_filter=None, **kwargs):
-    judge = FilterConfig("factory", kwargs, f"{HERE}:{factory}")
+    judge = FilterConfig(factory=f"{HERE}:{factory}", kwargs=kwargs)
     return make_stack(EnvConfig(env_id, judge=judge), action_filter or FilterConfig())
 
 
@@ -97,7 +97,7 @@ def test_they_judge_the_same_whatever_model_and_delay_the_filter_has():
 
 def test_they_judge_in_the_filtered_arm_too_with_the_experiments_own_limit():
     # This arm's filter keeps another limit than the one that judges.
-    own = FilterConfig("factory", {"limit": 6.0}, f"{HERE}:slow_joints")
+    own = FilterConfig(factory=f"{HERE}:slow_joints", kwargs={"limit": 6.0})
     env = judged("Reacher-v5", "slow_joints", own)
     costs, speeds = drive(env, reacher_speeds)
     np.testing.assert_array_equal(costs, (np.abs(speeds) > 4.0 + 1e-6).any(axis=1))
@@ -130,12 +130,12 @@ def test_a_task_without_a_simulator_is_judged_through_the_plant_of_the_user():
     ],
 )
 def test_what_cannot_judge_is_refused(env_id, factory, kwargs, message):
-    judge = FilterConfig("factory", kwargs, factory if ":" in factory else f"{HERE}:{factory}")
+    judge = FilterConfig(factory=factory if ":" in factory else f"{HERE}:{factory}", kwargs=kwargs)
     with pytest.raises(sw.SafeWrappersError, match=message):
         make_stack(EnvConfig(env_id, judge=judge), FilterConfig())
 
 
-@pytest.mark.parametrize("more", [{"cost": "fake_task:in_hazard"}, {"judge": FilterConfig("protect")}])
+@pytest.mark.parametrize("more", [{"cost": "fake_task:in_hazard"}, {"judge": FilterConfig(protect={})}])
 def test_a_tasks_own_cost_is_not_hidden(more):
     env = make_stack(EnvConfig("SafePointGoal1-v0", **more), FilterConfig())
     with pytest.raises(sw.SafeWrappersError, match="reports a cost of its own"):
@@ -157,7 +157,7 @@ def test_all_arms_have_the_judge_of_the_config():
     of_cost = parse_experiment(SETTINGS | {"env": {"id": "Reacher-v5", "cost": "a:b"}})
     assert [arm.env.cost for arm in of_cost.arms] == ["a:b", "a:b"]
     of_limits = parse_experiment(SETTINGS | {"env": {"id": "Reacher-v5", "judge": "constraints"}})
-    own = FilterConfig("factory", {}, f"{HERE}:slow_joints")  # a lease keeps no limit
+    own = FilterConfig(factory=f"{HERE}:slow_joints")  # a lease keeps no limit
     assert [arm.env.judge for arm in of_limits.arms] == [own, own]
     prints = [arm.fingerprint()["env"] for arm in (*of_cost.arms, *of_limits.arms)]
     assert [sorted(print_) for print_ in prints] == [["cost", "id", "kwargs"]] * 2 + [
@@ -187,7 +187,7 @@ def test_limits_cannot_judge_where_there_is_no_filter():
     ):
         parse_experiment(settings)
     given = parse_experiment(settings | {"evaluation": {"filter": "protect"}})
-    assert given.arms[0].env.judge == FilterConfig("protect")
+    assert given.arms[0].env.judge == FilterConfig(protect={})
 
 
 @pytest.mark.parametrize("name", ["no_such_module:cost", "fake_task:no_such"])

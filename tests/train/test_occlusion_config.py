@@ -7,7 +7,7 @@ import pytest
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.train.config import EnvConfig, FilterConfig, parse_experiment
-from safe_wrappers.train.stack import make_stack
+from safe_wrappers.train.run.stack import make_stack
 
 pytestmark = pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning")
 OCCLUSION = {
@@ -58,7 +58,7 @@ def test_what_is_missing_is_said_when_the_stack_is_made():
 
 @pytest.mark.slow
 def test_the_stack_has_it_inside_the_filter_and_the_recorder_counts_what_it_tells():
-    stack = make_stack(EnvConfig(TASK, {}, {}, OCCLUSION), FilterConfig("protect", {"cars": "estimated"}))
+    stack = make_stack(EnvConfig(TASK, {}, {}, OCCLUSION), FilterConfig(protect={"cars": "estimated"}))
     kinds, inner = [], stack.env
     while isinstance(inner, gym.Wrapper):
         kinds.append(type(inner))

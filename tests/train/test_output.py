@@ -7,7 +7,7 @@ import os
 
 import pytest
 
-from safe_wrappers.train.output import lasting_output
+from safe_wrappers.train.processes.output import lasting_output
 
 
 def test_a_closed_pipe_is_no_exception_then_or_later():

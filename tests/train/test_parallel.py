@@ -4,8 +4,8 @@ import fake_task
 import pytest
 from rich.console import Console
 
-from safe_wrappers.train import progress_display
-from safe_wrappers.train.parallel import Job, RunsFailedError, run_jobs
+from safe_wrappers.train.processes import progress_display
+from safe_wrappers.train.processes.parallel import Job, RunsFailedError, run_jobs
 
 
 def run(jobs, terminal, workers=2):

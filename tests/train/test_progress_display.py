@@ -5,8 +5,8 @@ import io
 import pytest
 from rich.console import Console
 
-from safe_wrappers.train.pace import Pace, left_text, speed_text
-from safe_wrappers.train.progress_display import ProgressDisplay
+from safe_wrappers.train.processes.pace import Pace, left_text, speed_text
+from safe_wrappers.train.processes.progress_display import ProgressDisplay
 
 TOTALS = {"one": 1000, "two": 1000, "three": 2000}
 LIVE = {"return": "12.3", "violations": "not judged", "changed": "4.1 %"}

@@ -1,100 +1,90 @@
 """The pages of the command and of the config have every option and every key, with the defaults that there are."""
 
-import argparse
 import re
+import runpy
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 import pytest
 import yaml
 
-from safe_wrappers.train import cli, config
+from safe_wrappers.train import cli
+from safe_wrappers.train.config import models, parse_experiment
 from safe_wrappers.wrappers.faults import FAULTS
 
 DOCS = Path(__file__).parents[2] / "docs"
-PREFIXES = {
-    "ExperimentConfig": "",
-    "ArmConfig": "",
-    "EnvConfig": "env.",
-    "FilterConfig": "filter.",
-    "LearnerConfig": "learner.",
-    "NormalizeConfig": "normalize.",
-    "EvaluationConfig": "evaluation.",
-}
-"""Where a dataclass of the config stands in a YAML file; a new one needs a place here and on the page."""
-WRITTEN = {
-    "given_evaluation_filter": "evaluation.filter",
-    "filter.kind": "filter",  # `filter: none`, `filter: protect`
-}
-SECTIONS = {"evaluation", "normalize"}
-"""Keys that hold only other keys."""
+KEYS = runpy.run_path(str(DOCS / "config_keys.py"))["keys"]
 
 
 def rows():
-    """Key -> (type, default, meaning) of every table row of the page."""
+    """Every row of the page's tables, by its key."""
     text = (DOCS / "config.md").read_text(encoding="utf-8")
-    found = re.findall(r"^\| `([\w.]+)` \| (.*) \| (.*) \| (.*) \|$", text, re.MULTILINE)
-    assert len({key for key, *_ in found}) == len(found)
-    return {key: tuple(rest) for key, *rest in found}
+    tables = re.findall(r"^```{config-keys} (\w+)\n(?::prefix: (\S+)\n)?```$", text, re.MULTILINE)
+    found = [key for section, prefix in tables for key in KEYS(section, prefix)]
+    assert len({key.name for key in found}) == len(found)
+    return {key.name: key for key in found}
 
 
-def test_every_key_of_a_config_is_on_its_page():
-    classes = [
+def test_every_field_of_the_models_is_on_the_page():
+    sections = [
         value
-        for value in vars(config).values()
-        if isinstance(value, type) and is_dataclass(value) and value.__module__ == config.__name__
+        for value in vars(models).values()
+        if is_dataclass(value) and isinstance(value, type) and value.__module__ == models.__name__
     ]
-    names = {PREFIXES[cls.__name__] + field.name for cls in classes for field in fields(cls)}
-    keys = {WRITTEN.get(name, name) for name in names} - SECTIONS
-    keys |= {*config._COMMON_KEYS, *config._ARM_KEYS} - SECTIONS
-    assert keys - rows().keys() == set()
-    assert rows().keys() - keys == {"filter.protect"}
+    shown = {name.rpartition(".")[2] for name in rows()}
+    names = {(section.__name__, field.name) for section in sections for field in fields(section)}
+    # Those two hold only other keys, and an arm's name is its key in `arms`.
+    left_out = {("ArmConfig", "normalize"), ("ExperimentConfig", "evaluation")}
+    assert {name for _, name in names - left_out} <= shown
+    assert len(rows()) == len(names - left_out - {("ArmConfig", "name")})
+    assert all(key.meaning for key in rows().values())
 
 
 def test_the_page_s_defaults_are_those_of_a_config_that_gives_none():
-    experiment = config.parse_experiment(
-        {
-            "name": "x",
-            "env": "Pendulum-v1",
-            "algorithm": "PPO",
-            "total_steps": 10,
-            "arms": {"a": {}},
-            "seeds": [0],
-        }
-    )
-    (arm,) = experiment.arms
-    parts = {
-        "env.": arm.env,
-        "filter.": arm.filter,
-        "learner.": arm.learner,
-        "normalize.": arm.normalize,
-        "evaluation.": experiment.evaluation,
+    given = {
+        "name": "x",
+        "env": "Pendulum-v1",
+        "algorithm": "PPO",
+        "total_steps": 10,
+        "arms": {"a": {}},
+        "seeds": [0],
     }
-    for key, (_, default, _) in rows().items():
-        if not default.startswith("`") or key == "filter.protect":
-            assert default in ("required", "none", "the first filtered arm's") or key == "filter.protect", key
-            continue
-        prefix = key.partition(".")[0] + "."
-        if prefix in parts and "." in key:
-            there = getattr(parts[prefix], key.removeprefix(prefix))
-        else:
-            there = getattr(experiment, key) if hasattr(experiment, key) else getattr(arm, key)
+    experiment = parse_experiment(given)
+    required = {name for name, key in rows().items() if key.default == "required"}
+    assert required == given.keys() | {"env.id"}
+    for name in rows().keys() - required:
+        there = experiment if hasattr(experiment, name.partition(".")[0]) else experiment.arms[0]
+        for part in name.split("."):
+            there = getattr(there, part)
         there = getattr(there, "kind", there)  # filter and learner
-        written = yaml.safe_load(default.strip("`"))
-        assert written == (str(there) if isinstance(there, Path) else there), key
+        written = yaml.safe_load(rows()[name].default.strip("`"))
+        assert written == (str(there) if isinstance(there, Path) else there), name
+
+
+def test_types_are_told_as_a_yaml_file_has_them():
+    told = {
+        name: rows()[name].type
+        for name in ("arms", "seeds", "env", "env.judge", "device", "workers", "output")
+    }
+    assert told == {
+        "arms": "mapping",
+        "seeds": "list of integers",
+        "env": "text or mapping",
+        "env.judge": "`constraints`",
+        "device": "`cpu`, `cuda`, `auto`",
+        "workers": "integer",
+        "output": "path",
+    }
 
 
 def test_every_command_and_option_is_on_its_page():
     text = (DOCS / "cli.md").read_text(encoding="utf-8")
-    parser = cli._parser()
-    (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
-    assert set(commands.choices) == set(cli._COMMANDS)
-    for name, command in commands.choices.items():
-        assert f"| `{name}` |" in text
-        for action in command._actions:
-            for option in action.option_strings:
-                assert re.search(rf"`{option}[` ]", text), option
-    assert "`--version`" in text
+    options = re.findall(r"(?<!\w)--?[a-z]+\b", cli.make_parser().format_help())
+    assert {"-h", "--report", "--output"} <= set(options)
+    for option in options:
+        assert re.search(rf"`{option}[` ]", text), option
+    for command in cli.COMMANDS:
+        assert f"| `{command}` |" in text
 
 
 @pytest.mark.parametrize("fault", sorted(FAULTS))

@@ -2,9 +2,9 @@
 
 import pytest
 
-from safe_wrappers.train import rendering
 from safe_wrappers.train.config import EnvConfig
-from safe_wrappers.train.rendering import Rendering, find_rendering
+from safe_wrappers.train.videos import rendering
+from safe_wrappers.train.videos.rendering import Rendering, find_rendering
 
 
 def filmed(trouble=""):

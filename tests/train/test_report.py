@@ -11,15 +11,15 @@ from made_up import episode, fill, steps, write_evaluation, write_training
 from PIL import Image
 
 from safe_wrappers.errors import RunStateError
-from safe_wrappers.train import videos
 from safe_wrappers.train.config import parse_experiment
-from safe_wrappers.train.config_file import read_config
-from safe_wrappers.train.evaluate import evaluate_run
-from safe_wrappers.train.rendering import Rendering
+from safe_wrappers.train.config.file import read_config
+from safe_wrappers.train.evaluation.evaluate import evaluate_run
+from safe_wrappers.train.evaluation.summary import summarize
 from safe_wrappers.train.report import write_report
 from safe_wrappers.train.run import Progress, train_run
-from safe_wrappers.train.summary import summarize
-from safe_wrappers.train.videos import record_videos
+from safe_wrappers.train.videos import record as videos
+from safe_wrappers.train.videos.record import record_videos
+from safe_wrappers.train.videos.rendering import Rendering
 
 HERE = Path(__file__).parent
 CHROMIUM = next(

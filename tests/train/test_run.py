@@ -16,18 +16,19 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from safe_wrappers import CBFActionFilter, RecordInterventions
 from safe_wrappers.errors import RunStateError, UnknownNameError
 from safe_wrappers.sb3 import ExecutedActionDictReplayBuffer
-from safe_wrappers.train import checkpoint as checkpoint_module
 from safe_wrappers.train import experiment as experiment_module
-from safe_wrappers.train.checkpoint import latest_checkpoint
 from safe_wrappers.train.config import EnvConfig, FilterConfig
-from safe_wrappers.train.evaluate import evaluate_run
+from safe_wrappers.train.evaluation.evaluate import evaluate_run
 from safe_wrappers.train.experiment import train_experiment
-from safe_wrappers.train.lock import only_writer
-from safe_wrappers.train.run import Progress, finished_checkpoint, train_run
-from safe_wrappers.train.run_callbacks import CheckpointCallback
-from safe_wrappers.train.stack import make_stack
+from safe_wrappers.train.processes.lock import only_writer
+from safe_wrappers.train.run import Progress, train_run
+from safe_wrappers.train.run import checkpoint as checkpoint_module
+from safe_wrappers.train.run.callbacks import CheckpointCallback
+from safe_wrappers.train.run.checkpoint import latest_checkpoint
+from safe_wrappers.train.run.stack import make_stack
+from safe_wrappers.train.run.training import finished_checkpoint
 from safe_wrappers.train.tables import read_rows
-from safe_wrappers.train.videos import video_path
+from safe_wrappers.train.videos.record import video_path
 
 OFF = FilterConfig()
 
@@ -383,18 +384,16 @@ def test_unknown_factories(fake_experiment):
     with pytest.raises(
         UnknownNameError, match=r"fake_task.py\): unknown name 'sheild'. Did you mean 'shield'"
     ):
-        make_stack(env, FilterConfig("factory", {}, "fake_task:sheild"))
+        make_stack(env, FilterConfig(factory="fake_task:sheild"))
     with pytest.raises(ValueError, match=r"filter.factory: cannot import 'no_such_module'") as refusal:
-        make_stack(env, FilterConfig("factory", {}, "no_such_module:f"))
+        make_stack(env, FilterConfig(factory="no_such_module:f"))
     looked = str(refusal.value).split(" and in ")[1]
     assert str(Path(__file__).parent) in looked
     assert "site-packages" not in looked
 
 
 def test_protect_is_the_filter_and_gets_its_settings():
-    env = make_stack(
-        EnvConfig("SafePointGoal1-v0"), FilterConfig("protect", {"margin": 0.25, "solver": "daqp"})
-    )
+    env = make_stack(EnvConfig("SafePointGoal1-v0"), FilterConfig(protect={"margin": 0.25, "solver": "daqp"}))
     assert isinstance(env, Monitor)
     assert isinstance(env.env, RecordInterventions)
     assert isinstance(env.env.env, CBFActionFilter)

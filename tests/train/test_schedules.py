@@ -1,14 +1,16 @@
 """Learning rates that fall: the numbers of every update, in one go and continued after a kill."""
 
+import pickle
+
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback
 from test_run import Reports, run_killed_after
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.train import run as run_module
-from safe_wrappers.train.checkpoint import latest_checkpoint
 from safe_wrappers.train.hyperparameters import LinearFall
-from safe_wrappers.train.run import train_run
+from safe_wrappers.train.run import training as run_module
+from safe_wrappers.train.run.checkpoint import latest_checkpoint
+from safe_wrappers.train.run.training import train_run
 
 PPO = (
     "algorithm=PPO",
@@ -82,7 +84,7 @@ def test_a_rollout_beyond_the_end_does_not_unlearn(fake_experiment):
 @pytest.mark.parametrize("text", ["lin_3e-4", "linear_", "linear_-1", "linear_0", "linear_1.2.3", "linear_x"])
 def test_other_texts_are_refused(fake_experiment, key, text):
     message = (
-        f"hyperparameters.{key}: expected a number, or linear_<number> .* such as linear_3e-4; got '{text}'"
+        f"hyperparameters.{key}: expected a number, or linear_<number> .* such as linear_3e-4, got '{text}'"
     )
     with pytest.raises(ConfigurationError, match=message):
         fake_experiment("algorithm=PPO", f"hyperparameters={{{key}: {text}}}")
@@ -98,3 +100,7 @@ def test_another_schedule_is_another_run(fake_experiment):
         == "linear_3e-4"
         != constant["hyperparameters"]["learning_rate"]
     )
+
+
+def test_a_checkpoint_s_schedule_is_found_again_where_checkpoints_of_before_say_it_is():
+    assert pickle.loads(b"csafe_wrappers.train.hyperparameters\nLinearFall\n.") is LinearFall

@@ -5,8 +5,8 @@ from made_up import steps
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
-from safe_wrappers.train import step_log
-from safe_wrappers.train.step_log import StepRecorder, load_steps, pool, save_steps
+from safe_wrappers.train.evaluation import step_log
+from safe_wrappers.train.evaluation.step_log import StepRecorder, load_steps, pool, save_steps
 
 
 def record(env, actions, seed=0):

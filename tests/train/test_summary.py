@@ -4,10 +4,9 @@ import json
 import numpy as np
 import pytest
 
-from safe_wrappers.train.curves import learning_curve
-from safe_wrappers.train.evaluate import EVALUATION_COLUMNS
-from safe_wrappers.train.run_callbacks import EPISODE_COLUMNS
-from safe_wrappers.train.summary import (
+from safe_wrappers.train.evaluation.curves import learning_curve
+from safe_wrappers.train.evaluation.evaluate import EVALUATION_COLUMNS
+from safe_wrappers.train.evaluation.summary import (
     Estimate,
     estimate,
     interquartile_mean,
@@ -15,6 +14,7 @@ from safe_wrappers.train.summary import (
     summarize,
     write_summary,
 )
+from safe_wrappers.train.run.callbacks import EPISODE_COLUMNS
 from safe_wrappers.train.tables import write_rows
 
 

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safe_wrappers.train.telling import telling_pair
+from safe_wrappers.train.figures.telling import telling_pair
 
 NOISE = np.random.default_rng(1).normal(size=(3000, 6))
 PLANTED = {

@@ -20,12 +20,12 @@ from test_learner import one_arm
 from test_run import Reports
 
 from safe_wrappers.errors import RunStateError, UnknownNameError
-from safe_wrappers.train import run as run_module
-from safe_wrappers.train import vec_envs
-from safe_wrappers.train.checkpoint import latest_checkpoint
-from safe_wrappers.train.run import train_run
-from safe_wrappers.train.stack import make_stack
-from safe_wrappers.train.vec_envs import ProcessVecEnv
+from safe_wrappers.train.run import training as run_module
+from safe_wrappers.train.run import vec_envs
+from safe_wrappers.train.run.checkpoint import latest_checkpoint
+from safe_wrappers.train.run.stack import make_stack
+from safe_wrappers.train.run.training import train_run
+from safe_wrappers.train.run.vec_envs import ProcessVecEnv
 
 WAIT_S = 300.0
 """For three generations of processes to import torch on a busy machine."""

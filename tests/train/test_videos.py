@@ -6,16 +6,16 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from safe_wrappers.train import videos
-from safe_wrappers.train.evaluate import evaluate_run, evaluation_folder
-from safe_wrappers.train.film import HEIGHT
-from safe_wrappers.train.parallel import RunsFailedError
-from safe_wrappers.train.rendering import Rendering
+from safe_wrappers.train.evaluation.episode_selection import shown_episode
+from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
+from safe_wrappers.train.evaluation.scene import load_scenes
+from safe_wrappers.train.processes.parallel import RunsFailedError
 from safe_wrappers.train.run import Progress, train_run
-from safe_wrappers.train.scene import load_scenes
-from safe_wrappers.train.shown import shown_episode
 from safe_wrappers.train.tables import read_rows
-from safe_wrappers.train.videos import load_video, record_videos, video_path, video_problem
+from safe_wrappers.train.videos import record as videos
+from safe_wrappers.train.videos.film import HEIGHT
+from safe_wrappers.train.videos.record import load_video, record_videos, video_path, video_problem
+from safe_wrappers.train.videos.rendering import Rendering
 
 SILENT = Progress(lambda steps: None, pytest.fail)
 ENV = "env=fake_task:FilmedGoal-v0"

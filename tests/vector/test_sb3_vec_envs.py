@@ -19,7 +19,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from safe_wrappers.train.config import EnvConfig, FilterConfig
-from safe_wrappers.train.stack import make_stack
+from safe_wrappers.train.run.stack import make_stack
 
 pytestmark = pytest.mark.filterwarnings("ignore:the policy's action:UserWarning")
 KINDS = {"dummy": DummyVecEnv, "subproc": functools.partial(SubprocVecEnv, start_method="fork")}
@@ -33,11 +33,11 @@ def monitored_cart(index):
 def stack(env_id, name, steps, index):
     """The training's own stack, Monitor outermost."""
     env = EnvConfig(env_id, {"max_episode_steps": steps + 2 * index})
-    return make_stack(env, FilterConfig("factory", {}, f"vector_worlds:{name}"))
+    return make_stack(env, FilterConfig(factory=f"vector_worlds:{name}"))
 
 
 def plain_stack(index):
-    return make_stack(EnvConfig("SafePointGoal1-v0", {"max_episode_steps": 5}), FilterConfig("protect"))
+    return make_stack(EnvConfig("SafePointGoal1-v0", {"max_episode_steps": 5}), FilterConfig(protect={}))
 
 
 TASKS = {

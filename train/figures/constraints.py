@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.axes import Axes
 
-from ..step_log import StepLog
+from ..evaluation.step_log import StepLog
 from .canvas import arm_color, arm_key, draw
 from .picture import Key, Picture, per_arm
 

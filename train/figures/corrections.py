@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter
 
-from ..step_log import StepLog
-from ..summary import number
+from ..evaluation.step_log import StepLog
+from ..evaluation.summary import number
 from .canvas import arm_color, arm_key, draw
 from .picture import Key, Picture, per_arm
 

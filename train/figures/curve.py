@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from ..curves import Curve
-from ..summary import number
+from ..evaluation.curves import Curve
+from ..evaluation.summary import number
 from .canvas import arm_color, arm_key, draw
 from .picture import Key, Picture
 

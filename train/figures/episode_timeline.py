@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from ..step_log import StepLog
+from ..evaluation.step_log import StepLog
 from .canvas import arm_color, arm_key, draw
 from .picture import Key, Look, Picture, per_arm
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 
-from ..summary import Summary, number
+from ..evaluation.summary import Summary, number
 from .canvas import arm_color, draw
 from .picture import Picture
 from .plane import CONDITIONS

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from matplotlib.axes import Axes
 
-from ..summary import Estimate, Summary, number
+from ..evaluation.summary import Estimate, Summary, number
 from .canvas import arm_color, arm_key, draw
 from .picture import Key, Picture
 

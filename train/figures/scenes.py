@@ -5,7 +5,7 @@ from __future__ import annotations
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Rectangle
 
-from ..scene import Scene
+from ..evaluation.scene import Scene
 from .canvas import BAD, GOAL, HAZARD, INK, MARK, VASE, arm_color, arm_key, draw
 from .picture import Key, Picture
 

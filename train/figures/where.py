@@ -10,10 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
-from ..step_log import StepLog
-from ..telling import telling_pair
+from ..evaluation.step_log import StepLog
 from .canvas import BAD, INK, MARK, draw
 from .picture import Picture
+from .telling import telling_pair
 
 _CELLS: Final = 32
 

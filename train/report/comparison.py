@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..config import ArmConfig, ExperimentConfig
-from ..evaluate import evaluated_steps
-from ..run import FINISHED_FILE
-from ..shown import Pair, compared_pairs
-from ..summary import Estimate, Summary
+from ..evaluation.episode_selection import Pair, compared_pairs
+from ..evaluation.evaluate import evaluated_steps
+from ..evaluation.summary import Estimate, Summary
+from ..run.training import FINISHED_FILE
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from safe_wrappers.errors import RunStateError
 
 from ..atomic import write_text
 from ..config import ExperimentConfig
-from ..summary import Summary
+from ..evaluation.summary import Summary
 from . import sections
 from .film_section import films
 from .headline import cards

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from ..config import ArmConfig, ExperimentConfig
-from ..film import HEIGHT, STRIP, first_frame
-from ..videos import Video, load_video, video_path, video_problem
+from ..videos.film import HEIGHT, STRIP, first_frame
+from ..videos.record import Video, load_video, video_path, video_problem
 from .markup import data_uri, keys, text
 
 _CONDITIONS = {"filter_off": "filter off", "filter_on": "filter on"}

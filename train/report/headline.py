@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ..config import ExperimentConfig
-from ..summary import NOT_JUDGED, Summary, number
+from ..evaluation.summary import NOT_JUDGED, Summary, number
 from .comparison import Comparison, Outcome, Side, compare, filter_time_us
 from .markup import card, text
 from .verdict import percent

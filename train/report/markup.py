@@ -7,8 +7,8 @@ import html
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from ..evaluation.summary import number
 from ..figures.picture import Key, Picture
-from ..summary import number
 from .style import STYLE
 
 

@@ -6,8 +6,8 @@ import json
 from collections.abc import Iterable, Mapping
 
 from ..config import ArmConfig, ExperimentConfig
-from ..run import FINISHED_FILE
-from ..summary import CONDITIONS, METRICS, NOT_JUDGED, OF_THE_JUDGE, Estimate, Summary, number
+from ..evaluation.summary import CONDITIONS, METRICS, NOT_JUDGED, OF_THE_JUDGE, Estimate, Summary, number
+from ..run.training import FINISHED_FILE
 from .markup import table, text
 
 _SHORT = (

@@ -9,9 +9,9 @@ from urllib.parse import quote
 
 from ..atomic import write_text
 from ..config import ExperimentConfig
+from ..evaluation.summary import Summary
 from ..figures.picture import Picture
 from ..figures.plane import judged_rows, plane_limits, plane_picture
-from ..summary import Summary
 from .experiment_page import check_reportable, report_path
 from .markup import document, pictures, section, text
 from .numbers import short_table

@@ -5,8 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from ..config import ExperimentConfig
-from ..curves import event_rate, learning_curve
-from ..evaluate import evaluated_steps, evaluation_folder
+from ..evaluation.curves import event_rate, learning_curve
+from ..evaluation.episode_selection import Pair, compared_pairs, shown_episode
+from ..evaluation.evaluate import evaluated_steps, evaluation_folder
+from ..evaluation.has_cost import judged_by
+from ..evaluation.scene import Scene, load_scenes
+from ..evaluation.step_log import MOST_STEPS, StepLog, pool
+from ..evaluation.summary import OF_THE_FILTER, SEEDS_FOR_AN_INTERVAL, Summary, over_seeds
 from ..figures.constraints import constraints_picture
 from ..figures.corrections import corrections_picture
 from ..figures.curve import curve_picture
@@ -17,11 +22,6 @@ from ..figures.plane import plane_picture
 from ..figures.scenes import scene_frame, scene_picture
 from ..figures.training_timeline import training_timeline_picture
 from ..figures.where import choose_view, where_picture
-from ..scene import Scene, load_scenes
-from ..shown import Pair, compared_pairs, shown_episode
-from ..step_log import MOST_STEPS, StepLog, pool
-from ..summary import OF_THE_FILTER, SEEDS_FOR_AN_INTERVAL, Summary, over_seeds
-from ..truth import judged_by
 from .markup import pictures, text
 
 _CURVES = {

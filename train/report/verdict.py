@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ..config import ExperimentConfig
-from ..summary import SEEDS_FOR_AN_INTERVAL, Estimate, Summary, number, spread
-from ..truth import judged_by
+from ..evaluation.has_cost import judged_by
+from ..evaluation.summary import SEEDS_FOR_AN_INTERVAL, Estimate, Summary, number, spread
 from .comparison import Comparison, Outcome, Side, compare, side
 
 

@@ -1,7 +1,7 @@
 import pytest
 from made_up import episode, write_evaluation
 
-from safe_wrappers.train.shown import compared_pairs, shown_episode
+from safe_wrappers.train.evaluation.episode_selection import compared_pairs, shown_episode
 
 
 def evaluated(experiment, violations=(0, 0, 0), changed=(0.0, 0.0, 0.0)):

@@ -22,13 +22,21 @@ from safe_wrappers.errors import SafeWrappersError
 from .output import lasting_output
 from .parent import end_with_parent
 from .progress_display import ProgressDisplay
-from .run import Progress as RunProgress
 from .stopping import Interrupted, RunStoppedError, stop_request
 
 Message = tuple[str, Any]
 _POLL_S: Final = 0.2
 _SAVE_S: Final = 60.0
 """How long stopped jobs may take: a rollout, its update and a checkpoint with a large replay buffer."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a job reports to: its steps so far, lines that a person should read, and figures by their names."""
+
+    steps: Callable[[int], None]
+    say: Callable[[str], None]
+    figures: Callable[[Mapping[str, str]], None] = lambda _: None
 
 
 @dataclass(frozen=True)
@@ -73,7 +81,8 @@ def run_jobs(jobs: Sequence[Job], workers: int | None, console: Console, title: 
     with (
         stop_request() as request,
         ProgressDisplay(title, unit, totals, console) as display,
-        _one_thread_each(),
+        # Read by the BLAS libraries when the spawned process loads them; more threads would only fight for cores.
+        environment(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")),
     ):
         try:
             while running or (waiting and not request.signum):
@@ -167,7 +176,7 @@ def _work(job: Job, sender: Connection) -> None:
 
     torch.set_num_threads(1)
     end_with_parent()
-    progress = RunProgress(
+    progress = Progress(
         steps=lambda steps: sender.send(("steps", steps)),
         say=lambda text: sender.send(("say", text)),
         figures=lambda figures: sender.send(("figures", figures)),
@@ -185,11 +194,10 @@ def _work(job: Job, sender: Connection) -> None:
 
 
 @contextmanager
-def _one_thread_each() -> Iterator[None]:
-    # Read by the BLAS libraries when the spawned process loads them; more threads would only fight for cores.
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    before: Mapping[str, str | None] = {name: os.environ.get(name) for name in names}
-    os.environ.update(dict.fromkeys(names, "1"))
+def environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Environment variables for the processes that are started inside."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
     try:
         yield
     finally:

@@ -7,8 +7,8 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from ..config import ArmConfig, FilterConfig
 from .checkpoint import Checkpoint
-from .config import ArmConfig, FilterConfig
 from .stack import make_stack
 
 

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from .config import ArmConfig, ExperimentConfig
+from ..config import ArmConfig, ExperimentConfig
+from ..tables import read_rows
 from .summary import SEEDS_FOR_AN_INTERVAL, interquartile_mean
-from .tables import read_rows
 
 _MOST_BINS = 40
 
@@ -53,7 +53,7 @@ def learning_curve(experiment: ExperimentConfig, arm: ArmConfig, metric: str) ->
     end = max(run[-1, 0] for run in runs)
     for bins in range(_MOST_BINS, 0, -1):
         edges = np.linspace(0, end, bins + 1)
-        means = np.array([_bin_means(run, edges) for run in runs])
+        means = np.array([_bin_ratios(edges, *run.T, np.ones(len(run))) for run in runs])
         if np.isfinite(means).all():
             break
     low, high = _interval(means)
@@ -86,20 +86,18 @@ def event_rate(
         return None
     ends, events, lengths = rows.T
     edges = np.linspace(0, ends.max(), _MOST_BINS + 1)
-    at = np.searchsorted(edges[1:-1], ends)
-    counts, steps = (np.bincount(at, weights=values, minlength=_MOST_BINS) for values in (events, lengths))
-    rates = np.full(_MOST_BINS, np.nan)
-    np.divide(1000 * counts, steps, out=rates, where=steps > 0)
-    return edges, rates, int(events.sum())
+    return edges, _bin_ratios(edges, ends, 1000 * events, lengths), int(events.sum())
 
 
-def _bin_means(run: NDArray[np.float64], edges: NDArray[np.float64]) -> NDArray[np.float64]:
-    at = np.searchsorted(edges[1:-1], run[:, 0])
-    counts = np.bincount(at, minlength=len(edges) - 1)
-    sums = np.bincount(at, weights=run[:, 1], minlength=len(edges) - 1)
-    means = np.full(len(counts), np.nan)
-    np.divide(sums, counts, out=means, where=counts > 0)
-    return means
+def _bin_ratios(
+    edges: NDArray[np.float64], at: NDArray[np.float64], over: NDArray[np.float64], under: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Sum over sum in each bin; NaN in an empty one."""
+    bins = np.searchsorted(edges[1:-1], at)
+    sums, counts = (np.bincount(bins, weights=w, minlength=len(edges) - 1) for w in (over, under))
+    ratios = np.full(len(counts), np.nan)
+    np.divide(sums, counts, out=ratios, where=counts > 0)
+    return ratios
 
 
 def _interval(means: NDArray[np.float64]) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:

@@ -16,7 +16,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from safe_wrappers import info as keys
 from safe_wrappers.wrappers.record_interventions import COLUMNS
 
-from .tables import append_row, read_rows, write_rows
+from ..tables import append_row, read_rows, write_rows
 
 EPISODE_COLUMNS: Final = ("timesteps", "env", *COLUMNS)
 _LAST_EPISODES: Final = 100

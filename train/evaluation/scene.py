@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 
-from .atomic import write_bytes
+from ..atomic import write_bytes
+from .step_log import is_violation
 
 _STATIC = ("hazard_positions", "hazard_radius", "goal_radius", "vase_positions")
 
@@ -56,7 +57,7 @@ class SceneRecorder:
         if not np.array_equal(goal, self._goals[-1]):
             self._goals.append(goal)
         self._intervened.append(bool(info.get(keys.CBF_INTERVENED, False)))
-        self._violated.append(info.get(keys.COST, 0) > 0 or info.get(keys.COST_SUBSTEP, 0) > 0)
+        self._violated.append(is_violation(info))
 
     def finish(self) -> Scene | None:
         """The episode's scene."""

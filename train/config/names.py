@@ -11,13 +11,13 @@ _MANY = 40
 """More names than this are not all listed, only those that come near."""
 
 
-def check_name(name: object, valid: Iterable[str], what: str) -> str:
+def check_name(name: object, valid: Iterable[str], where: str = "") -> str:
     """Returns the name if it is valid.
 
     Args:
         name: What was given.
         valid: The names that exist.
-        what: What kind of name it is and where it stands, for the message.
+        where: Where it stands, for the message; a validator of pydantic leaves it out, as `validate` adds it.
 
     Returns:
         The name.
@@ -33,4 +33,5 @@ def check_name(name: object, valid: Iterable[str], what: str) -> str:
     hint = f" Did you mean {near[0]!r}?" if near else ""
     if len(options) > _MANY:
         options = [*difflib.get_close_matches(str(name), options, n=8, cutoff=0.3), "..."]
-    raise UnknownNameError(f"{what}: unknown name {name!r}.{hint} Valid names: {', '.join(options)}.")
+    place = f"{where}: " if where else ""
+    raise UnknownNameError(f"{place}unknown name {name!r}.{hint} Valid names: {', '.join(options)}.")

@@ -62,7 +62,7 @@ ALGORITHMS: Final[Mapping[str, type[BaseAlgorithm]]] = _Algorithms()
 """Name -> class, Stable-Baselines3's and sb3-contrib's. `ConfigurationError` where the package is missing."""
 
 
-def check_algorithm(name: object, where: str) -> str:
+def check_algorithm(name: str) -> str:
     """Returns the name if a config may use it.
 
     Raises:
@@ -71,7 +71,6 @@ def check_algorithm(name: object, where: str) -> str:
     """
     if name in _NOT_OFFERED:
         raise ConfigurationError(
-            f"{where}: {name} is not offered: {_NOT_OFFERED[str(name)]}. Valid names:"
-            f" {', '.join(sorted(ALGORITHMS))}."
+            f"{name} is not offered: {_NOT_OFFERED[name]}. Valid names: {', '.join(sorted(ALGORITHMS))}."
         )
-    return check_name(name, ALGORITHMS, where)
+    return check_name(name, ALGORITHMS)

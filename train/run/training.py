@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import shutil
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,35 +20,28 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from safe_wrappers.errors import RunStateError
 from safe_wrappers.sb3 import InterventionCallback
 
-from .algorithms import ALGORITHMS
-from .atomic import write_json
-from .checkpoint import Checkpoint, latest_checkpoint, save_checkpoint
-from .config import ArmConfig, without_default_buffer_size
-from .hyperparameters import constructor_arguments
-from .lock import only_writer
-from .run_callbacks import (
+from ..atomic import write_json
+from ..config import ArmConfig
+from ..config.algorithms import ALGORITHMS
+from ..config.models import without_default_buffer_size
+from ..hyperparameters import constructor_arguments, learning_starts
+from ..processes.lock import only_writer
+from ..processes.parallel import Progress
+from ..processes.stopping import RunStoppedError, heeding_termination
+from .callbacks import (
     CheckpointCallback,
     EpisodeRows,
     ProgressCallback,
     StopCallback,
     TrainingStopped,
 )
-from .stopping import RunStoppedError, heeding_termination
+from .checkpoint import Checkpoint, latest_checkpoint, save_checkpoint
 from .vec_envs import make_vec_env
 
 RUN_FILE: Final = "run.json"
 FINISHED_FILE: Final = "finished.json"
 CHECKPOINTS: Final = "checkpoints"
 EVALUATION: Final = "evaluation"
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Where a run reports to: its steps so far, lines that a person should read, and figures by their names."""
-
-    steps: Callable[[int], None]
-    say: Callable[[str], None]
-    figures: Callable[[Mapping[str, str]], None] = lambda _: None
 
 
 def train_run(arm: ArmConfig, seed: int, folder: Path, progress: Progress) -> None:
@@ -280,8 +271,7 @@ def _continued(
     if isinstance(model, OffPolicyAlgorithm) and model.num_timesteps < arm.total_steps:
         assert model.replay_buffer is not None
         if model.replay_buffer.size() == 0:  # it went on from a final checkpoint, which has none
-            default = inspect.signature(ALGORITHMS[arm.algorithm]).parameters["learning_starts"].default
-            first = int(arm.hyperparameters.get("learning_starts", default))
+            first = learning_starts(arm)
             model.learning_starts = model.num_timesteps + first
             say(
                 f"goes on from step {model.num_timesteps} with an empty replay buffer (a finished run keeps none):"

@@ -24,8 +24,8 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from safe_wrappers.errors import RunStateError
 
-from .algorithms import ALGORITHMS
-from .atomic import write_json
+from ..atomic import write_json
+from ..config.algorithms import ALGORITHMS
 
 MODEL: Final = "model.zip"
 NORMALIZE: Final = "vecnormalize.pkl"

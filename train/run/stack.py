@@ -20,11 +20,11 @@ from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
 
-from .config import NAIVE, EnvConfig, FilterConfig, LearnerConfig
-from .env_ids import check_env_id
+from ..config import NAIVE, EnvConfig, FilterConfig, LearnerConfig
+from ..config.env_ids import check_env_id
+from ..config.names import check_name
+from ..local_imports import own_folders
 from .judge import ConstraintJudge
-from .local_imports import own_folders
-from .names import check_name
 
 
 def make_stack(
@@ -74,9 +74,9 @@ def make_stack(
 
 def _filtered(task: gym.Env[Any, Any], action_filter: FilterConfig) -> gym.Env[Any, Any]:
     """The task in its filter; as it is if there is none."""
-    if action_filter.kind == "protect":
-        return safe_wrappers.protect(task, **action_filter.kwargs)
-    if action_filter.kind == "factory":
+    if action_filter.protect is not None:
+        return safe_wrappers.protect(task, **action_filter.protect)
+    if action_filter.factory is not None:
         factory = _function(action_filter.factory, "filter.factory")
         try:
             filtered: gym.Env[Any, Any] = factory(task, **action_filter.kwargs)

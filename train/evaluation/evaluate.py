@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,14 +12,15 @@ from stable_baselines3.common.logger import configure
 from safe_wrappers import info as keys
 from safe_wrappers.wrappers.record_interventions import COLUMNS
 
-from .atomic import write_json
-from .config import ArmConfig, EvaluationConfig, FilterConfig
-from .policy import TrainedPolicy
-from .run import EVALUATION, Progress, finished_checkpoint
+from ..atomic import write_json
+from ..config import ArmConfig, EvaluationConfig, FilterConfig
+from ..processes.parallel import Progress
+from ..run.policy import TrainedPolicy
+from ..run.stack import make_stack
+from ..run.training import EVALUATION, finished_checkpoint
+from ..tables import write_rows
 from .scene import Scene, SceneRecorder, save_scenes
-from .stack import make_stack
 from .step_log import StepLog, StepRecorder, load_steps, save_steps
-from .tables import write_rows
 
 EVALUATION_COLUMNS: Final = ("episode_seed", *COLUMNS)
 STATE_FILE: Final = "evaluation.json"
@@ -40,6 +40,12 @@ def evaluation_folder(run_folder: Path) -> Path:
 def evaluated_steps(run_folder: Path, condition: str) -> StepLog | None:
     """The steps of a run's evaluation; None if it was not evaluated, or by a version that kept none."""
     return load_steps(evaluation_folder(run_folder) / f"{condition}_steps.npz")
+
+
+def conditions(arm: ArmConfig, default_filter: FilterConfig) -> dict[str, FilterConfig]:
+    """The filter that is on in each condition of an arm's evaluation; "filter_on" is left out where there is none."""
+    used = arm.filter if arm.filter.kind != "none" else default_filter
+    return {"filter_off": FilterConfig()} | ({"filter_on": used} if used.kind != "none" else {})
 
 
 def evaluate_run(
@@ -67,14 +73,11 @@ def evaluate_run(
         RunStateError: The run is not finished, or its folder or policy cannot be used.
     """
     checkpoint = finished_checkpoint(arm, seed, folder)
-    action_filter = arm.filter if arm.filter.kind != "none" else default_filter
-    conditions = {"filter_off": FilterConfig()}
-    if action_filter.kind != "none":
-        conditions["filter_on"] = action_filter
+    filters = conditions(arm, default_filter)
     out = evaluation_folder(folder)
     state = {
-        "settings": asdict(settings),
-        "filter": asdict(action_filter),
+        "settings": {"episodes": settings.episodes, "seed": settings.seed},
+        "filter": filters.get("filter_on", FilterConfig()).plain(),
         "timesteps": checkpoint.timesteps,
         "recording": _RECORDING,
     }
@@ -83,7 +86,7 @@ def evaluate_run(
     (out / STATE_FILE).unlink(missing_ok=True)  # from here on the rows may be of two settings
     policy = TrainedPolicy(arm, checkpoint)
     logger = configure(str(folder / "tensorboard"), ["tensorboard"])
-    for at, (condition, used) in enumerate(conditions.items()):
+    for at, (condition, used) in enumerate(filters.items()):
         evaluation = _Evaluation(arm, used)
         rows: list[dict[str, Any]] = []
         scenes: dict[int, Scene] = {}

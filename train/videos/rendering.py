@@ -9,7 +9,7 @@ import sys
 from dataclasses import dataclass
 from typing import Final
 
-from .config import EnvConfig
+from ..config import EnvConfig
 
 _SECONDS: Final = 60.0
 """A GL library that waits for a display never comes back."""
@@ -51,7 +51,7 @@ def find_rendering(env: EnvConfig) -> Rendering:
 def _probe(env: EnvConfig, variables: dict[str, str]) -> str:
     """What went wrong; empty if a frame was drawn."""
     task = json.dumps([env.id, env.kwargs, sys.path])
-    command = [sys.executable, "-m", f"{__package__}.render_probe", task]
+    command = [sys.executable, "-m", "safe_wrappers.train.render_probe", task]
     try:
         done = subprocess.run(
             command,

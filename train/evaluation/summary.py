@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from .atomic import write_json
-from .config import ExperimentConfig, FilterConfig
-from .evaluate import evaluation_folder
-from .tables import read_rows, write_rows
-from .truth import evaluated_without_cost
+from ..atomic import write_json
+from ..config import ExperimentConfig, FilterConfig
+from ..tables import read_rows, write_rows
+from .evaluate import conditions, evaluation_folder
+from .has_cost import evaluated_without_cost
 
 CONDITIONS: Final = {
     "training": "Training, all episodes",
@@ -199,16 +199,10 @@ def summarize(experiment: ExperimentConfig) -> Summary:
     table: Table = {}
     for arm in experiment.arms:
         table[arm.name] = {}
+        filters = {"training": arm.filter} | conditions(arm, experiment.evaluation_filter)
         unjudged = OF_THE_JUDGE if evaluated_without_cost(experiment, arm) else ()
         for condition in CONDITIONS:
-            own = condition == "training" or arm.filter.kind != "none"
-            used = (
-                FilterConfig()
-                if condition == "filter_off"
-                else arm.filter
-                if own
-                else experiment.evaluation_filter
-            )
+            used = filters.get(condition, FilterConfig())
             left_out = (OF_THE_FILTER if used.kind == "none" else ()) + (
                 OF_THE_LEASE if used.lease is None else ()
             )

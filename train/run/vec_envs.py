@@ -16,8 +16,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from safe_wrappers.errors import RunStateError
 
-from .config import ArmConfig
-from .parent import end_with_parent
+from ..config import ArmConfig
+from ..processes.parent import end_with_parent
 from .stack import make_stack
 
 _ENDED: Final = (

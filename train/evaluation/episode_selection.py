@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from .config import ArmConfig, ExperimentConfig
+from ..config import ArmConfig, ExperimentConfig
+from ..tables import read_rows
 from .evaluate import evaluation_folder
-from .tables import read_rows
 
 
 @dataclass(frozen=True)

@@ -19,27 +19,28 @@ _ROBOTICS: Final = re.compile(
 """The families of gymnasium-robotics: without the package there is no other way to know that an id is its own."""
 
 
-def check_env_id(env_id: str) -> None:
-    """Refuses an id that no installed package registers; imports gymnasium-robotics if it may be one of its ids.
+def check_env_id(env_id: str) -> str:
+    """Returns the id; refuses one that no installed package registers.
 
-    An id of the form `module:Id-v0` is left to `gymnasium.make`, which imports the module.
+    Imports gymnasium-robotics if it may be one of its ids. An id of the form `module:Id-v0` is left to
+    `gymnasium.make`, which imports the module.
 
     Raises:
         ConfigurationError: An id of gymnasium-robotics, which is not installed.
         UnknownNameError: An id that nobody registers; holds the nearest one.
     """
     if ":" in env_id or _registered(env_id):
-        return
+        return env_id
     if importlib.util.find_spec("gymnasium_robotics") is not None:
         gym.register_envs(importlib.import_module("gymnasium_robotics"))  # its import registers them
         if _registered(env_id):
-            return
+            return env_id
     elif _ROBOTICS.fullmatch(env_id):
         raise ConfigurationError(
-            f"env.id: {env_id} is an env of gymnasium-robotics, which is not installed:"
+            f"{env_id} is an env of gymnasium-robotics, which is not installed:"
             " pip install 'safe-wrappers[robotics]'"
         )
-    check_name(env_id, gym.registry, "env.id")
+    return check_name(env_id, gym.registry)
 
 
 def _registered(env_id: str) -> bool:

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,15 +12,17 @@ from rich.console import Console
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 
-from .atomic import write_bytes, write_json
-from .config import ArmConfig, EnvConfig, ExperimentConfig, FilterConfig
+from ..atomic import write_bytes, write_json
+from ..config import ArmConfig, EnvConfig, ExperimentConfig, FilterConfig
+from ..evaluation.episode_selection import ShownEpisode, shown_episode
+from ..evaluation.evaluate import conditions
+from ..evaluation.step_log import is_violation
+from ..processes.parallel import Job, Progress, RunsFailedError, environment, run_jobs
+from ..run.policy import TrainedPolicy
+from ..run.stack import make_stack
+from ..run.training import finished_checkpoint
 from .film import Film, encode, speed_of, stride_of
-from .parallel import Job, RunsFailedError, run_jobs
-from .policy import TrainedPolicy
 from .rendering import find_rendering
-from .run import Progress, finished_checkpoint
-from .shown import ShownEpisode, shown_episode
-from .stack import make_stack
 
 _PROBLEM: Final = "problem.json"
 
@@ -113,7 +112,7 @@ def _record_arms(
             ),
         )
         for arm in arms
-        for condition, used in _conditions(experiment, arm).items()
+        for condition, used in conditions(arm, experiment.evaluation_filter).items()
         if not _up_to_date(experiment, arm, condition, used, shown)
     ]
     if not jobs:
@@ -126,7 +125,7 @@ def _record_arms(
     if rendering.problem:
         return rendering.problem
     try:
-        with _environment(rendering.variables):
+        with environment(rendering.variables):
             run_jobs(jobs, experiment.workers, console, "Videos")
     except RunsFailedError as error:
         return f"filming {env.id} failed: {str(error).strip().splitlines()[-1]}"
@@ -162,7 +161,7 @@ def record_video(
             observation, _, terminated, truncated, info = env.step(policy(observation))
             film.add_step(
                 bool(info.get(keys.CBF_INTERVENED, False)),
-                info.get(keys.COST, 0) > 0 or info.get(keys.COST_SUBSTEP, 0) > 0,
+                is_violation(info),
             )
             judged |= keys.COST in info
             done = terminated or truncated
@@ -182,15 +181,10 @@ def record_video(
     progress.steps(1)
 
 
-def _conditions(experiment: ExperimentConfig, arm: ArmConfig) -> dict[str, FilterConfig]:
-    used = arm.filter if arm.filter.kind != "none" else experiment.evaluation_filter
-    return {"filter_off": FilterConfig()} | ({"filter_on": used} if used.kind != "none" else {})
-
-
 def _state(arm: ArmConfig, used: FilterConfig, shown: ShownEpisode, timesteps: int) -> dict[str, Any]:
     return {
         "arm": arm.fingerprint(),
-        "filter": asdict(used),
+        "filter": used.plain(),
         "seed": shown.seed,
         "episode_seed": shown.episode_seed,
         "timesteps": timesteps,
@@ -217,18 +211,3 @@ def _render_modes(env: EnvConfig) -> tuple[str, ...]:
     modes = tuple(made.unwrapped.metadata.get("render_modes") or ())
     made.close()
     return modes
-
-
-@contextmanager
-def _environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Environment variables for the processes that are started inside."""
-    before = {name: os.environ.get(name) for name in variables}
-    os.environ.update(variables)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .config import ArmConfig, ExperimentConfig
+from ..config import ArmConfig, ExperimentConfig
 from .evaluate import evaluation_folder
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Final
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 
-from .atomic import write_bytes
+from ..atomic import write_bytes
 from .coordinates import CoordinateReader
 
 MOST_STEPS: Final = 10_000
@@ -71,6 +71,11 @@ _PER_STEP: Final = tuple(
 )
 
 
+def is_violation(info: Mapping[str, Any]) -> bool:
+    """Whether a step's info has a cost, at the step's end or at any substep."""
+    return bool(info.get(keys.COST, 0) > 0 or info.get(keys.COST_SUBSTEP, 0) > 0)
+
+
 class StepRecorder:
     """Collects an evaluation's steps; keys that no filter wrote count as "did nothing".
 
@@ -114,7 +119,7 @@ class StepRecorder:
             "intervened": bool(info.get(keys.CBF_INTERVENED, False)),
             "infeasible": bool(info.get(keys.CBF_INFEASIBLE, False)),
             "fallback": bool(info.get(keys.CBF_FALLBACK, False)),
-            "violated": info.get(keys.COST, 0) > 0 or info.get(keys.COST_SUBSTEP, 0) > 0,
+            "violated": is_violation(info),
             "correction": info.get(keys.CBF_CORRECTION, 0.0),
             "margin": info.get(keys.CBF_MARGIN, np.nan),
             "cost": info.get(keys.COST, np.nan),

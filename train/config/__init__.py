@@ -1,0 +1,27 @@
+"""An experiment's settings: a YAML file and overrides, checked and turned into frozen dataclasses."""
+
+from .experiment import parse_experiment
+from .file import read_config
+from .models import (
+    NAIVE,
+    ArmConfig,
+    EnvConfig,
+    EvaluationConfig,
+    ExperimentConfig,
+    FilterConfig,
+    LearnerConfig,
+    NormalizeConfig,
+)
+
+__all__ = [
+    "NAIVE",
+    "ArmConfig",
+    "EnvConfig",
+    "EvaluationConfig",
+    "ExperimentConfig",
+    "FilterConfig",
+    "LearnerConfig",
+    "NormalizeConfig",
+    "parse_experiment",
+    "read_config",
+]

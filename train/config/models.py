@@ -1,0 +1,322 @@
+"""The settings of an experiment as frozen dataclasses: for each field its type, its default and what it means.
+
+The tables of `docs/config.md` are made of them.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Final, Literal
+
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, StrictBool, model_validator
+from pydantic.dataclasses import dataclass
+from pydantic_core import ArgsKwargs
+
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.protect import protect_options
+from safe_wrappers.wrappers.faults import FAULTS
+from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
+from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
+
+from .algorithm_settings import HER
+from .algorithms import check_algorithm
+from .env_ids import check_env_id
+from .names import check_name
+from .types import Count, FolderName, FunctionName, NonNegative, Number
+
+Options = dict[str, Any]
+
+
+def _keys(names: Iterable[str]) -> AfterValidator:
+    """A mapping may have these keys."""
+    valid = tuple(names)
+
+    def check(given: Any) -> Any:
+        for name in given or {}:
+            check_name(name, valid)
+        return given
+
+    return AfterValidator(check)
+
+
+def _arguments(of: Callable[..., Any], *not_in_yaml: str) -> list[str]:
+    return [name for name in inspect.signature(of).parameters if name not in ("env", *not_in_yaml)]
+
+
+def _check_faults(given: dict[str, Options]) -> dict[str, Options]:
+    for fault, arguments in given.items():
+        check_name(fault, FAULTS)
+        for name in arguments:
+            check_name(name, _arguments(FAULTS[fault]), fault)
+    return given
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid", use_attribute_docstrings=True))
+class Section:
+    """A mapping in a config. A key without a value has its default; a bare text stands for the key `text_is`."""
+
+    text_is: ClassVar[str] = ""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read(cls, given: Any) -> Any:
+        if given is None or isinstance(given, (cls, ArgsKwargs)):
+            return given or {}
+        if isinstance(given, str) and cls.text_is:
+            return {cls.text_is: given}
+        names = [field.name for field in fields(cls)]
+        if not isinstance(given, Mapping):
+            raise ConfigurationError(f"expected a mapping of {', '.join(names)}; got {given!r}.")
+        for name in given:
+            check_name(name, names)
+        return {name: value for name, value in given.items() if value is not None}
+
+
+@dataclass(frozen=True)
+class FilterConfig(Section):
+    """Which filter: `none`, `protect`, or a mapping. A lease without a clearance is given the filter's constraint."""
+
+    protect: Annotated[Options | None, _keys(protect_options() - {"plant"})] = None
+    """Options of `safe_wrappers.protect`, such as `margin` (added to the recipe's own)."""
+    factory: FunctionName | None = None
+    """`module:function`: called with the env, returns it filtered."""
+    kwargs: Options = Field(default_factory=dict)
+    """Further arguments of the factory."""
+    lease: Annotated[Options | None, _keys(_arguments(LeaseExpiry, "plant", "measured"))] = None
+    """Arguments of a [LeaseExpiry](wrappers/lease-expiry.md) around the filter."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short_forms(cls, given: Any) -> Any:
+        if isinstance(given, str):
+            return {"protect": {}} if check_name(given, ("none", "protect")) == "protect" else {}
+        if isinstance(given, Mapping):  # `protect:` without options
+            return {name: {} if value is None else value for name, value in given.items()}
+        return given
+
+    @model_validator(mode="after")
+    def _is_one_filter(self) -> FilterConfig:
+        both = self.protect is not None and self.factory is not None
+        idle = (self.kwargs and self.factory is None) or (self.lease is not None and self.kind == "none")
+        if both or idle:
+            raise ConfigurationError(
+                "expected none, protect, {protect: {...}} or {factory: 'module:function', kwargs: {...}}, with "
+                f"lease: {{...}} beside it if there is one; got {asdict(self)}."
+            )
+        return self
+
+    @property
+    def kind(self) -> Literal["none", "protect", "factory"]:
+        """Where the filter comes from."""
+        if self.protect is not None:
+            return "protect"
+        return "none" if self.factory is None else "factory"
+
+    def plain(self) -> dict[str, Any]:
+        """As run folders have it."""
+        arguments = self.kwargs if self.protect is None else self.protect
+        return {"kind": self.kind, "kwargs": arguments, "factory": self.factory or "", "lease": self.lease}
+
+
+def _judge(given: Any) -> Any:
+    if isinstance(given, FilterConfig | None):
+        return given
+    check_name(given, ("constraints",))
+    return FilterConfig()  # whose constraints they are is known when all arms are
+
+
+@dataclass(frozen=True)
+class EnvConfig(Section):
+    """Which env, and what is between the task and the filter; returns that are reported are always the task's own."""
+
+    text_is: ClassVar[str] = "id"
+
+    id: Annotated[str, AfterValidator(check_env_id)]
+    """As for `gymnasium.make`; ids of gymnasium-robotics too, if it is installed (`pip install
+    'safe-wrappers[robotics]'`). `module:Id-v0` imports the module first."""
+    kwargs: Options = Field(default_factory=dict)
+    """Passed to `gymnasium.make`."""
+    faults: Annotated[dict[str, Options], AfterValidator(_check_faults)] = Field(default_factory=dict)
+    """[Faults](wrappers/faults.md) between policy and robot, in training and evaluation: a wrapper's name and its
+    arguments, the innermost first."""
+    occlusion: Annotated[Options | None, _keys(_arguments(OcclusionPenalty))] = None
+    """Arguments of an [OcclusionPenalty](wrappers/occlusion-penalty.md) around the task, inside the filter."""
+    cost: FunctionName | None = None
+    """`module:function` that judges a task without a cost of its own: [CostFunction](wrappers/cost-function.md), in
+    all arms, in training and evaluation."""
+    judge: Annotated[FilterConfig | None, BeforeValidator(_judge)] = None
+    """`constraints`: the evaluation filter's own limits judge such a task, read from its true state, in all arms."""
+
+    @model_validator(mode="after")
+    def _has_one_judge(self) -> EnvConfig:
+        if self.cost is not None and self.judge is not None:
+            raise ConfigurationError("cost and judge both say who judges the task; leave one out.")
+        return self
+
+
+@dataclass(frozen=True)
+class LearnerConfig(Section):
+    """What the learner sees where the filter changed its action, by the names of Krasowski et al. (TMLR 2023)."""
+
+    text_is: ClassVar[str] = "kind"
+    _PENALISED: ClassVar = ("adaption_penalty", "both")
+
+    kind: Literal["naive", "adaption_penalty", "safe_action", "both"] = "naive"
+    """The last two are for SAC, TD3, DDPG, TQC and CrossQ."""
+    penalty: Annotated[Number, Field(ge=0)] = 0.0
+    """For `adaption_penalty` and `both`: taken off the reward of a changed step."""
+    per_correction: Annotated[Number, Field(ge=0)] = 0.0
+    """For the same: taken off per unit of correction."""
+
+    @model_validator(mode="after")
+    def _has_a_penalty_if_it_needs_one(self) -> LearnerConfig:
+        given = bool(self.penalty or self.per_correction)
+        if self.penalised and not given:
+            raise ConfigurationError(
+                f"{self.kind} needs a penalty in units of the task's reward, per changed step or per unit of"
+                f" correction: {{kind: {self.kind}, penalty: 0.1}} or {{kind: {self.kind}, per_correction: 0.1}}."
+            )
+        if given and not self.penalised:
+            raise ConfigurationError(f"{self.kind} takes no penalty; {' and '.join(self._PENALISED)} do.")
+        return self
+
+    @property
+    def penalised(self) -> bool:
+        """Whether the reward is reduced where the action was changed."""
+        return self.kind in self._PENALISED
+
+    @property
+    def stores_executed(self) -> bool:
+        """Whether the replay buffer holds executed actions."""
+        return self.kind in ("safe_action", "both")
+
+
+NAIVE: Final = LearnerConfig()
+
+
+@dataclass(frozen=True)
+class NormalizeConfig(Section):
+    """What SB3's VecNormalize scales."""
+
+    observation: StrictBool = False
+    """Observations are scaled by their running mean and deviation (VecNormalize)."""
+    reward: StrictBool = False
+    """Rewards are scaled by the running deviation of the return (VecNormalize)."""
+
+
+@dataclass(frozen=True)
+class EvaluationConfig(Section):
+    """Paired evaluation: the same episodes for every arm and seed."""
+
+    episodes: Count = 10
+    """Episodes per policy and condition."""
+    seed: NonNegative = 1_000_000
+    """Episode i starts from env seed `evaluation.seed` + i, in every arm and condition."""
+    filter: FilterConfig | None = None
+    """As `filter` of an arm: what is put on, in the evaluation with the filter on, where an arm has no filter of
+    its own. By default the first filtered arm's."""
+
+
+@dataclass(frozen=True)
+class ArmConfig(Section):
+    """All that decides how one arm trains."""
+
+    name: FolderName
+    env: EnvConfig
+    """The env: an id, or the keys of [`env`](#env)."""
+    algorithm: Annotated[str, AfterValidator(check_algorithm)]
+    """`PPO`, `A2C`, `SAC`, `TD3`, `DDPG`, `DQN`; with `pip install 'sb3-contrib>=2.6,<3'` also `TQC`, `CrossQ`,
+    `TRPO`, `QRDQN`. `DQN` and `QRDQN` are for discrete actions, and for arms without a filter."""
+    total_steps: Count
+    """Steps of all envs together; whole rollouts, so PPO may make a few more. May be [raised
+    later](cli.md#training-for-longer)."""
+    hyperparameters: Options = Field(default_factory=dict)
+    """Arguments of the algorithm's class, by SB3's names. An arm's are added to those at the top, if the algorithm
+    is the same. `policy` is `MlpPolicy`, or `MultiInputPolicy` where observations are dicts, if it is not given.
+    `buffer_size` is `total_steps`, at most a million. What the run decides itself (`env`, `seed`, `device`,
+    `verbose`, `tensorboard_log`, `stats_window_size`) is refused."""
+    filter: FilterConfig = FilterConfig()
+    """`none`, `protect`, or the keys of [`filter`](#filter)."""
+    learner: LearnerConfig = NAIVE
+    """What the learner sees where the filter changed an action: see [`learner`](#learner)."""
+    normalize: NormalizeConfig = NormalizeConfig()
+    n_envs: Count = 1
+    """Envs of a run."""
+    vec_env: Literal["dummy", "subproc"] = "dummy"
+    """Envs one after the other, or each in a process of its own: the same results, bit for bit. A run then has
+    `n_envs` processes more; set `workers` accordingly. May be changed later."""
+    checkpoint_every: Count = 50_000
+    """Steps between two checkpoints, saved between two rollouts. May be changed later."""
+    device: Literal["cpu", "cuda", "auto"] = "cpu"
+    """Torch's. May be changed later."""
+
+    @property
+    def replays_goals(self) -> bool:
+        """Whether the replay buffer is HER's, which gives transitions new goals."""
+        return self.hyperparameters.get("replay_buffer_class") == HER
+
+    def fingerprint(self) -> dict[str, Any]:
+        """What a run folder must agree on to be continued: all that changes what is learned."""
+        values = asdict(self) | {"filter": self.filter.plain()}
+        for harmless in ("name", "checkpoint_every", "device", "vec_env"):
+            del values[harmless]
+        without_default_buffer_size(values)
+        # As in the folders of runs that were made before there was a choice.
+        if self.learner == NAIVE:
+            del values["learner"]
+        if self.filter.lease is None:
+            del values["filter"]["lease"]
+        if self.env.judge is not None:
+            values["env"]["judge"] = self.env.judge.plain()
+        values["env"] = {
+            key: value for key, value in values["env"].items() if value or key in ("id", "kwargs")
+        }
+        return values
+
+
+@dataclass(frozen=True)
+class ExperimentConfig(Section):
+    """An experiment: arms times seeds, one folder."""
+
+    name: FolderName
+    """The experiment's folder below `output`."""
+    arms: tuple[ArmConfig, ...]
+    """What is compared: a name for each arm, which is its folder's, and below it the arm's keys."""
+    seeds: Annotated[list[NonNegative], Field(min_length=1)]
+    """Every arm is trained with each: networks, exploration and envs."""
+    output: Path = Path("runs")
+    """Where the experiment's folder is made."""
+    workers: Count | None = None
+    """Runs at a time, each in a process; by default one per core."""
+    evaluation: EvaluationConfig = EvaluationConfig()
+
+    @property
+    def folder(self) -> Path:
+        """Where everything of this experiment lies."""
+        return self.output / self.name
+
+    def run_folder(self, arm: ArmConfig, seed: int) -> Path:
+        """Where one run lies."""
+        return self.folder / arm.name / f"seed_{seed}"
+
+    @property
+    def evaluation_filter(self) -> FilterConfig:
+        """The filter of an unfiltered arm in the condition "filter on": as given, or the first filtered arm's."""
+        if self.evaluation.filter is not None:
+            return self.evaluation.filter
+        return next((arm.filter for arm in self.arms if arm.filter.kind != "none"), FilterConfig())
+
+
+def default_buffer_size(total_steps: int) -> int:
+    """Transitions: SB3's default of a million would be saved with every checkpoint, mostly empty."""
+    return min(1_000_000, total_steps)
+
+
+def without_default_buffer_size(fingerprint: dict[str, Any]) -> None:
+    """Takes the default size of the replay buffer out of a fingerprint: it grows with `total_steps`."""
+    hyperparameters = fingerprint.get("hyperparameters", {})
+    if hyperparameters.get("buffer_size") == default_buffer_size(fingerprint.get("total_steps", 0)):
+        del hyperparameters["buffer_size"]

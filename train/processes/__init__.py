@@ -1,0 +1,1 @@
+"""Runs in parallel processes: started, watched, stopped, and shown on the terminal."""

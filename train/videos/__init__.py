@@ -1,0 +1,1 @@
+"""The same episode on film, in every arm and condition."""
