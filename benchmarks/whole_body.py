@@ -31,6 +31,7 @@ from typing import Any
 import gymnasium as gym
 import mujoco
 import numpy as np
+from asking import Asked
 
 import safe_wrappers as sw
 from safe_wrappers.control.legged.support import common_plane, support_margin, support_polygon, zmp_of_forces
@@ -219,7 +220,7 @@ def ask_programs(robot: str, policy: Callable[[Any], Any], episodes: int, limit:
         "exact cones": sw.Stance(SHARE, cone="exact", joint_tolerance=None),
     }
     for constraint in (forecast, *programs.values()):
-        constraint.bind(plant)
+        constraint = Asked(constraint, plant)
     for episode in range(episodes):
         observation, _ = env.reset(seed=episode)
         done = False
@@ -227,12 +228,12 @@ def ask_programs(robot: str, policy: Callable[[Any], Any], episodes: int, limit:
             action = policy(observation)
             proposed = np.asarray(action, dtype=np.float64)
             plant.observe()
-            if not forecast.admits(plant, proposed):
+            if not forecast.admits(proposed):
                 answers.refused += 1
                 for name, program in programs.items():
-                    program.admits(plant, proposed)
-                    (answer,) = program.suggestions(plant, proposed)
-                    if forecast.admits(plant, answer):
+                    program.admits(proposed)
+                    (answer,) = program.candidates(proposed)
+                    if forecast.admits(answer):
                         answers.admitted[name] = answers.admitted.get(name, 0) + 1
                     distance = float(np.linalg.norm(answer - proposed))
                     answers.corrections.setdefault(name, []).append(distance)

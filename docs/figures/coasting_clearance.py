@@ -42,7 +42,7 @@ def ways() -> tuple[Array, list[Array], Array]:
     constraint, plant = env.constraints[0], env.plant
     while True:
         plant.observe()
-        if not constraint.admits(plant, np.ones(2)):
+        if not constraint.admits(np.ones(2)):
             break
         env.step(np.ones(2, dtype=np.float32))
     run = constraint._coasting.run

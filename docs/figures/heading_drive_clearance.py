@@ -30,12 +30,12 @@ def braking(detail: dict[str, Any]) -> tuple[Array, Any]:
     task.set_state(task.data.qpos.copy(), qvel)
     plant, bound = filtered.plant, filtered.constraints[0]
     plant.observe()
-    bound.value(plant)
+    bound.value()
     area = bound._path
     where = [task.agent_position]
     for _ in range(150):
         plant.observe()
-        env.step(bound.backup(plant))
+        env.step(bound.backup())
         where.append(task.agent_position)
     return np.array(where), area
 

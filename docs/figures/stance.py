@@ -2,6 +2,7 @@
 
 import gymnasium as gym
 import numpy as np
+from asking import Asked
 from matplotlib.figure import Figure
 
 import safe_wrappers as sw
@@ -35,10 +36,10 @@ def draw() -> Figure:
         distances = []
         for share in SHARES:
             stance = sw.Stance(float(share), joint_tolerance=None, **options)
-            stance.bind(plant)
-            stance.admits(plant, wanted)
-            (answer,) = stance.suggestions(plant, wanted)
-            distances.append(np.linalg.norm(answer - wanted) if stance.admits(plant, answer) else np.nan)
+            stance = Asked(stance, plant)
+            stance.admits(wanted)
+            (answer,) = stance.candidates(wanted)
+            distances.append(np.linalg.norm(answer - wanted) if stance.admits(answer) else np.nan)
         ax.plot(SHARES, distances, color=color, label=label)
     ax.set_xlabel("share of the model's friction")
     ax.set_ylabel("correction of the torques")

@@ -73,7 +73,7 @@ def test_the_judge_means_the_limit_that_the_filter_keeps(name):
                         )
                     env.plant.observe()
                     constraint.reset()  # it was carried there, it did not move
-                    h, missed = float(constraint.value(env.plant).min()), judge.start()
+                    h, missed = float(constraint.value().min()), judge.start()
                     if "disc" in name or "Maze" in name:
                         assert (h < 0.0) == (missed > 0.0)
                     else:

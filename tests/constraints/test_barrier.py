@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from asking import Asked
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError
@@ -57,24 +58,24 @@ def test_row_is_the_barrier_condition(x):
     given = sw.Barrier(h, gradient=lambda x: np.array([-2.0 * x[0]]), alpha=3.0, margin=0.05, curvature=0.7)
     by_differences = sw.Barrier(h, alpha=3.0, margin=0.05, curvature=0.7)
     for barrier in (given, by_differences):
-        barrier.bind(plant)
-        rows = barrier.rows(plant)
+        barrier = Asked(barrier, plant)
+        rows = barrier.rows()
         rng = np.random.default_rng(0)
         for u in rng.uniform(-1, 1, 20):
             step = 1e-6
             rate = (h([x + step * (-(x**2) + (4 + x) * u)]) - h([x])) / step
             left = rate + 3.0 * (h([x]) - 0.05) - 0.5 * 0.7 * 0.1
             assert rows.offsets[0] - rows.normals[0] @ [u] == pytest.approx(left, abs=1e-4)
-        np.testing.assert_allclose(barrier.value(plant), [h([x])])
+        np.testing.assert_allclose(barrier.value(), [h([x])])
 
 
 def test_a_class_k_function_is_used_as_given():
     plant = observed([0.5])
     barrier = sw.Barrier(h, alpha=lambda value: 2.0 * value**3)
-    barrier.bind(plant)
+    barrier = Asked(barrier, plant)
     linear = sw.Barrier(h, alpha=2.0)
-    linear.bind(plant)
-    difference = linear.rows(plant).offsets[0] - barrier.rows(plant).offsets[0]
+    linear = Asked(linear, plant)
+    difference = linear.rows().offsets[0] - barrier.rows().offsets[0]
     assert difference == pytest.approx(2.0 * 0.75 - 2.0 * 0.75**3)
 
 
@@ -243,8 +244,8 @@ def test_a_decay_that_outruns_the_hold_is_refused():
 def test_a_gradient_of_the_wrong_shape_is_refused():
     plant = observed([0.5])
     barrier = sw.Barrier(h, gradient=lambda x: [1.0, 2.0])
-    barrier.bind(plant)
+    barrier = Asked(barrier, plant)
     with pytest.raises(
         ConfigurationError, match=r"gradient must return the shape of the state \(1,\), got \(2,\)"
     ):
-        barrier.rows(plant)
+        barrier.rows()

@@ -6,6 +6,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from asking import Asked
 from gymnasium.envs.mujoco import MujocoEnv
 
 import safe_wrappers as sw
@@ -66,7 +67,7 @@ def test_rows_are_the_second_derivative_of_the_distance(tmp_path, kind):
     plant.bind(env)
     name, offset = {"bodies": ("ball", 0.0), "sites": ("nose", 0.05)}[kind]
     clear = sw.Clearance([DISCS[0]], braking=1.5, **{kind: [name]})
-    clear.bind(plant)
+    clear = Asked(clear, plant)
     rng = np.random.default_rng(0)
     asked = 0
     for _ in range(200):
@@ -82,9 +83,9 @@ def test_rows_are_the_second_derivative_of_the_distance(tmp_path, kind):
         approach = -(distance(step) - distance(-step)) / (2 * step)
         acceleration = -(distance(step) - 2 * distance(0.0) + distance(-step)) / step**2
         way = max(approach, 0.0) ** 2 / 3.0  # held braking takes up to brake hold^2 / 8 more
-        value = clear.value(plant)[0]
+        value = clear.value()[0]
         assert distance(0.0) - way - 1.5 * 0.02**2 / 8 - 1e-6 <= value <= distance(0.0) - way + 1e-6
-        rows = clear.rows(plant)
+        rows = clear.rows()
         if not len(rows.offsets):
             continue
         asked += 1
@@ -170,8 +171,8 @@ def test_far_away_no_rows_are_asked_for(tmp_path):
     plant.bind(env)
     plant.observe()
     clear = sw.Clearance([sw.Disc([50.0, 0.0], 0.3)], 1.5, bodies=["ball"])
-    clear.bind(plant)
-    rows = clear.rows(plant)
+    clear = Asked(clear, plant)
+    rows = clear.rows()
     assert rows.normals.shape == (0, 2) and rows.offsets.shape == (0,)
 
 
@@ -182,11 +183,11 @@ def test_several_points_and_obstacles_give_a_value_each(tmp_path):
     plant.bind(env)
     plant.observe()
     clear = sw.Clearance(DISCS, 1.5, bodies=["ball"], sites=["nose"])
-    clear.bind(plant)
+    clear = Asked(clear, plant)
     np.testing.assert_allclose(
-        clear.value(plant)[[0, 4]], [np.hypot(1.0, 0.3) - 0.3, np.hypot(0.95, 0.3) - 0.3]
+        clear.value()[[0, 4]], [np.hypot(1.0, 0.3) - 0.3, np.hypot(0.95, 0.3) - 0.3]
     )
-    assert clear.value(plant).shape == (8,)
+    assert clear.value().shape == (8,)
 
 
 def test_spheres_and_boxes_around_an_arm():
@@ -258,15 +259,15 @@ def test_approach_is_what_the_barrier_counts_the_stopping_distance_from(tmp_path
     plant = sw.MujocoPlant()
     plant.bind(env)
     clearance = sw.Clearance(DISCS, braking=2.0, radius=0.05, margin=0.3, state_error=0.1, **frame)
-    clearance.bind(plant)
+    clearance = Asked(clearance, plant)
     env.reset(seed=0)
     env.set_state(np.array([0.2, -0.1]), np.array([0.7, -0.4]))
     plant.observe()
-    room, speed = clearance.approach(plant)
+    room, speed = clearance.approach()
     point = np.array([0.2, -0.1]) + (np.array([0.05, 0.0]) if "sites" in frame else 0.0)
     for i, disc in enumerate(DISCS):
         way = np.asarray(disc.center)[:2] - point
         distance = np.linalg.norm(way)
         assert room[i] == pytest.approx(distance - disc.radius - 0.05, abs=1e-12)
         assert speed[i] == pytest.approx(np.array([0.7, -0.4]) @ way / distance, abs=1e-12)
-    assert clearance.value(plant) == pytest.approx(sampled_inset(room, speed, 2.0, env.dt), abs=1e-12)
+    assert clearance.value() == pytest.approx(sampled_inset(room, speed, 2.0, env.dt), abs=1e-12)

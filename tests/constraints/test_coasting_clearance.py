@@ -65,7 +65,7 @@ def test_a_control_is_admitted_iff_its_way_to_rest_keeps_the_margin(gap, speed_u
         way = least_way(env, control, hazard) - 0.2
         if abs(way - 0.005) < 1e-3 or at_rest < 0.006:
             continue  # too close to call, or already inside the margin
-        assert constraint.admits(plant, control) == (way > 0.005)
+        assert constraint.admits(control) == (way > 0.005)
 
 
 def test_no_control_is_admitted_as_long_as_its_way_is_clear():
@@ -75,17 +75,17 @@ def test_no_control_is_admitted_as_long_as_its_way_is_clear():
     for slack, admitted in ((0.002, True), (-0.002, False)):  # less than the margin, but clear; not clear
         env.unwrapped._hazards[:] = ahead_of(env, 0.2 + way + slack)
         plant.observe()
-        assert constraint.admits(plant, NONE) == admitted
-        assert constraint.admits(plant, -NONE) == admitted  # minus zero is no control, too
-        assert not constraint.admits(plant, FULL)
-        assert (constraint.shortfall(plant, NONE) < 0.0) == admitted
+        assert constraint.admits(NONE) == admitted
+        assert constraint.admits(-NONE) == admitted  # minus zero is no control, too
+        assert not constraint.admits(FULL)
+        assert (constraint.SHORTFALL(NONE) < 0.0) == admitted
 
 
 def test_far_from_everything_nothing_is_forecast():
     _, constraint, plant = bound([[3.0, 0.0]], reach=0.05, reach_s=0.13)
     constraint._coasting.run = None  # any forecast would fail
-    assert constraint.admits(plant, FULL)
-    assert constraint.value(plant) == pytest.approx(2.8)
+    assert constraint.admits(FULL)
+    assert constraint.value() == pytest.approx(2.8)
 
 
 def test_the_outline_counts_where_it_should():
@@ -93,28 +93,28 @@ def test_the_outline_counts_where_it_should():
     vases = [[0.18, 0.16 + 0.1415 + 0.008]]
     outlined = {"untouched": [sw.Discs("vase_positions", 0.1415)], "outline": SQUARE}
     _, constraint, plant = bound([], 2, vases, **outlined)
-    assert constraint.value(plant) == pytest.approx(0.008, abs=1e-6)
-    assert constraint.admits(plant, NONE)
-    assert [constraint.admits(plant, np.array([s, -s])) for s in (1.0, -1.0)] == [False, True]
+    assert constraint.value() == pytest.approx(0.008, abs=1e-6)
+    assert constraint.admits(NONE)
+    assert [constraint.admits(np.array([s, -s])) for s in (1.0, -1.0)] == [False, True]
     _, bare, plant = bound([], 2, vases, keep_out=[sw.Discs("vase_positions", 0.1415)])
-    assert all(bare.admits(plant, np.array([s, -s])) for s in (1.0, -1.0))
+    assert all(bare.admits(np.array([s, -s])) for s in (1.0, -1.0))
 
 
 def test_without_a_model_of_the_machine_alone_it_takes_the_plants():
     for alone in (None, "robot_model"):
         _, constraint, plant = bound([[0.215, 0.0]], vases=[[3.0, 3.0]], alone=alone)
         assert constraint._coasting._model is plant.model or alone is not None
-        assert not constraint.admits(plant, FULL)
-        assert constraint.admits(plant, BACK)
+        assert not constraint.admits(FULL)
+        assert constraint.admits(BACK)
 
 
 def test_a_reach_that_is_broken_is_dropped_with_a_warning():
     _, constraint, plant = bound([[0.2055, 0.0]], reach=0.001)
     with pytest.warns(UserWarning, match=r"farther than the declared reach of 0\.001 m"):
-        assert not constraint.admits(plant, FULL)
+        assert not constraint.admits(FULL)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert not constraint.admits(plant, FULL)
+        assert not constraint.admits(FULL)
     assert constraint._reach is None and not constraint._free
 
 
@@ -123,16 +123,16 @@ def test_what_stands_still_is_forecast_once():
     for _ in range(40):
         env.unwrapped.step(NONE)
     plant.observe()
-    constraint.admits(plant, FULL)
+    constraint.admits(FULL)
     run, calls = constraint._coasting.run, []
     constraint._coasting.run = lambda *arguments: calls.append(arguments) or run(*arguments)
     env.unwrapped.step(NONE)
     plant.observe()
-    answer = constraint.admits(plant, FULL)
+    answer = constraint.admits(FULL)
     assert not calls
     env.unwrapped._hazards[:] += 0.5  # it still stands, but the hazard has gone
     plant.observe()
-    assert constraint.admits(plant, FULL) and not answer
+    assert constraint.admits(FULL) and not answer
     assert calls
 
 

@@ -7,6 +7,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from asking import Asked
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
@@ -24,7 +25,7 @@ def bound(obstacles, delay_s=0.0, horizon_s=2.5, margin=MARGIN, env=None):
     plant = sw.MujocoPlant(delay_s=delay_s)
     plant.bind(env)
     clearance = sw.EscapeClearance("robot", obstacles, RADIUS, margin, horizon_s)
-    clearance.bind(plant)
+    clearance = Asked(clearance, plant)
     return env.unwrapped, plant, clearance
 
 
@@ -109,14 +110,14 @@ def test_what_is_left_is_what_mujoco_leaves():
     played, agreed, refused = Played(raw.model), 0, 0
     for qpos, qvel, control in random_states(30):
         anew(raw, plant, clearance, qpos, qvel)
-        now = clearance.value(plant)
+        now = clearance.value()
         cars = np.linalg.norm(raw.car_positions - qpos[:2], axis=1) - CAR - RADIUS
         pillars = np.linalg.norm(raw.pillar_positions - qpos[:2], axis=1) - PILLAR - RADIUS
         np.testing.assert_allclose(now, [*cars, *pillars], atol=1e-12)
         if now.min() < MARGIN:
             continue
         expected = left(played, raw, qpos, qvel, control[:2], MARGIN)
-        shortfall = clearance.shortfall(plant, control)
+        shortfall = clearance.SHORTFALL(control)
         if expected >= 0.0:  # where nothing is near it only says that there is room
             assert shortfall <= -expected + 1e-7
             agreed += 1
@@ -129,7 +130,7 @@ def test_what_is_left_is_what_mujoco_leaves():
             needed = best if -MARGIN < best < 0.0 else 0.0
             assert shortfall == pytest.approx(needed - expected, abs=1e-7)
             refused += 1
-        assert clearance.admits(plant, control) == (shortfall <= 1e-9)
+        assert clearance.admits(control) == (shortfall <= 1e-9)
     assert agreed > 8 and refused > 2, (agreed, refused)
 
 
@@ -138,17 +139,17 @@ def test_suggestions_and_the_backup_are_admitted_and_the_nearest_comes_first():
     tried = 0
     for qpos, qvel, control in random_states(300, seed=1):
         anew(raw, plant, clearance, qpos, qvel)
-        if clearance.value(plant).min() < MARGIN or clearance.admits(plant, control):
+        if clearance.value().min() < MARGIN or clearance.admits(control):
             continue
-        found = clearance.suggestions(plant, control)
+        found = clearance.candidates(control)
         for suggestion in found:
-            assert clearance.admits(plant, suggestion) and suggestion[2] == control[2]
+            assert clearance.admits(suggestion) and suggestion[2] == control[2]
             assert (np.abs(suggestion[:2]) <= np.maximum(1.0, np.abs(control[:2])) + 1e-12).all()
         away = [np.linalg.norm(s - control) for s in found]
         assert away == sorted(away)
         if found:
             tried += 1
-            assert clearance.admits(plant, clearance.backup(plant))
+            assert clearance.admits(clearance.backup())
     assert tried > 8
 
 
@@ -164,7 +165,7 @@ def test_under_a_delay_all_are_where_they_will_be():
             mujoco.mj_step(played.model, played.data)
         cars = foretold(qpos, qvel, np.array([actual]))[0]
         expected = np.linalg.norm(cars - played.data.qpos[:2], axis=1) - CAR - RADIUS
-        np.testing.assert_allclose(clearance.value(plant), expected, atol=1e-9)
+        np.testing.assert_allclose(clearance.value(), expected, atol=1e-9)
 
 
 def test_discs_that_move_go_straight_on_and_standing_ones_stay():
@@ -176,7 +177,7 @@ def test_discs_that_move_go_straight_on_and_standing_ones_stay():
     def met(obstacle):
         raw, plant, clearance = bound([obstacle], env=Published(gym.make("OccludedCrossing-v0")))
         anew(raw, plant, clearance, np.array([0, -2.0, 0, 9, 9, 9, 9, 9, 9]), np.zeros(9))
-        return clearance.value(plant)[0], clearance.admits(plant, np.zeros(3))
+        return clearance.value()[0], clearance.admits(np.zeros(3))
 
     distance, admitted = met(sw.Discs("balls", 0.3, velocity_attribute="rolling"))
     assert distance == pytest.approx(2.0 - 0.3 - RADIUS) and admitted
@@ -185,7 +186,7 @@ def test_discs_that_move_go_straight_on_and_standing_ones_stay():
         env=Published(gym.make("OccludedCrossing-v0")),
     )
     anew(raw, plant, clearance, np.array([0, -0.7, 0, 9, 9, 9, 9, 9, 9]), np.zeros(9))
-    forward, aside = clearance.shortfall(plant, [0, 1, 0]), clearance.shortfall(plant, [1, 0, 0])
+    forward, aside = clearance.SHORTFALL([0, 1, 0]), clearance.SHORTFALL([1, 0, 0])
     assert forward > aside  # it does not stand still: away to the side is the way
     with pytest.raises(ConfigurationError, match="3-dimensional obstacles cannot meet 2-dimensional points"):
         met(sw.Discs("balls", 0.3))  # a ball that stands somewhere in the air
@@ -204,7 +205,7 @@ def test_walls_alone_and_cars_alone():
         qvel = np.zeros(9)
         qvel[1] = vy
         anew(raw, plant, clearance, np.array([0, y, 0, 9, 9, 9, 9, 9, 9]), qvel)
-        assert clearance.admits(plant, np.array([0.0, control, 0.0])) == admitted, (y, vy, control)
+        assert clearance.admits(np.array([0.0, control, 0.0])) == admitted, (y, vy, control)
 
 
 def test_more_margin_refuses_more():
@@ -213,7 +214,7 @@ def test_more_margin_refuses_more():
         count = 0
         for qpos, qvel, control in random_states(150, seed=2):
             anew(raw, plant, clearance, qpos, qvel)
-            count += clearance.value(plant).min() >= 0.3 and not clearance.admits(plant, control)
+            count += clearance.value().min() >= 0.3 and not clearance.admits(control)
         return count
 
     assert refused(0.3) > refused(0.0) > 0
@@ -231,7 +232,7 @@ def test_what_is_less_known_keeps_it_farther_away():
         count = 0
         for qpos, qvel, control in random_states(150, seed=3):
             anew(raw, plant, clearance, qpos, qvel)
-            count += clearance.value(plant).min() >= MARGIN and not clearance.admits(plant, control)
+            count += clearance.value().min() >= MARGIN and not clearance.admits(control)
         refused.append(count)
     assert refused[0] < refused[1] < refused[2]
 
@@ -263,9 +264,9 @@ def test_a_plant_with_another_mass_is_read_anew():
     played, compared = Played(raw.model, mass=1.5), 0
     for qpos, qvel, control in random_states(25, seed=4):
         anew(raw, plant, clearance, qpos, qvel)
-        if clearance.value(plant).min() >= MARGIN:
+        if clearance.value().min() >= MARGIN:
             expected = left(played, raw, qpos, qvel, control[:2], MARGIN)
-            assert expected < 0.0 or clearance.admits(plant, control)
+            assert expected < 0.0 or clearance.admits(control)
             compared += 1
     assert compared > 10
 
@@ -347,18 +348,18 @@ def test_the_backup_stands_still_where_that_is_safe_and_goes_where_it_is_not():
     away = [-10.0, -15.0, -20.0, 10.0, 15.0, 20.0]
     speeds = [0.0] * 3 + [1.0] * 3 + [-1.0] * 3
     anew(raw, plant, clearance, [0.0, -2.9, 0.0, *away], speeds)
-    assert (clearance.backup(plant) == 0.0).all()
+    assert (clearance.backup() == 0.0).all()
     moving = [0.5, 0.3, *speeds[2:]]  # braking: against the motion, just to rest
     anew(raw, plant, clearance, [0.0, -2.9, 0.0, *away], moving)
-    backup = clearance.backup(plant)
+    backup = clearance.backup()
     assert (backup[:2] < 0.0).all() and backup[2] == 0.0
     kinds = set()
     for x in np.arange(-1.5, -0.7, 0.05):  # in the lane, a car that comes nearer and nearer
         anew(raw, plant, clearance, [0.0, -0.8, 0.0, x, *away[1:]], speeds)
-        stays = clearance.shortfall(plant, np.zeros(3)) <= 0.0
-        backup = clearance.backup(plant)
+        stays = clearance.SHORTFALL(np.zeros(3)) <= 0.0
+        backup = clearance.backup()
         assert np.abs(backup[:2]).max() == (0.0 if stays else 1.0)
-        assert clearance.shortfall(plant, backup) <= clearance.shortfall(plant, np.zeros(3))
+        assert clearance.SHORTFALL(backup) <= clearance.SHORTFALL(np.zeros(3))
         kinds.add(stays)
     assert kinds == {True, False}
 

@@ -35,7 +35,7 @@ def test_a_control_must_be_safe_for_every_corner_of_the_uncertainty():
         raw.set_state(qpos, qvel)
         env.plant.observe()
         limit._models = models
-        return not limit.admits(env.plant, push)
+        return not limit.admits(push)
 
     places = np.linspace(-0.4, 0.2, 600)
     by_all = np.array([refused(x, every) for x in places])
@@ -48,7 +48,7 @@ def test_a_control_must_be_safe_for_every_corner_of_the_uncertainty():
 def test_a_disc_ahead_on_the_left_is_passed_on_the_right(beside, side):
     env = filtered({"hazards": [[0.26, beside]]}, detour=True)
     (limit,) = env.constraints
-    around, turn_only = limit.suggestions(env.plant, np.array([1.0, 0.1]))
+    around, turn_only = limit.candidates(np.array([1.0, 0.1]))
     np.testing.assert_array_equal(around, [1.0, side])
     np.testing.assert_array_equal(turn_only, [0.0, side])
 
@@ -56,10 +56,10 @@ def test_a_disc_ahead_on_the_left_is_passed_on_the_right(beside, side):
 def test_no_detour_without_a_drive_or_without_a_disc_ahead():
     env = filtered({"hazards": [[0.26, 0.0]]}, detour=True)
     (limit,) = env.constraints
-    assert limit.suggestions(env.plant, np.array([0.0, 1.0])) == []
-    assert limit.suggestions(env.plant, np.array([-1.0, 0.0])) == []
+    assert limit.candidates(np.array([0.0, 1.0])) == []
+    assert limit.candidates(np.array([-1.0, 0.0])) == []
     env = filtered({"hazards": [[0.26, 0.0]]})
-    assert env.constraints[0].suggestions(env.plant, np.array([1.0, 0.0])) == []
+    assert env.filter.bound[0].candidates(np.array([1.0, 0.0])) == []
 
 
 @pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning")

@@ -6,6 +6,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from asking import Asked
 from gymnasium.envs.registration import EnvSpec
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -59,7 +60,7 @@ def ready(env, constraint):
     """The plant of an env at its present state, the constraint bound to it."""
     plant = sw.MujocoPlant()
     plant.bind(env)
-    constraint.bind(plant)
+    constraint = Asked(constraint, plant)
     constraint.reset()
     plant.observe()
     return plant
@@ -170,7 +171,7 @@ def test_speed_mass_and_push_are_those_of_the_moving_arm(seed):
     constraint = sw.ImpactSpeedLimit(["hand"], ["wall"], force_limit=100.0, stiffness=1e4)
     plant = ready(env, constraint)
     m, data, control = env.model, mujoco.MjData(env.model), rng.uniform(-1.0, 1.0, 3)
-    constraint.value(plant)
+    constraint.value()
     qpos, qvel = env.data.qpos.copy(), env.data.qvel.copy()
     constraint._at(plant, qpos, qvel, control)
     contact = constraint._contact(plant, 0)
@@ -216,7 +217,7 @@ def test_some_of_those_pushes_come_from_the_motion_and_some_from_rest():
     env, more = Scene(ARM), {True: 0, False: 0}
     constraint = sw.ImpactSpeedLimit(["hand"], ["wall"], force_limit=100.0, stiffness=1e4)
     plant, rng = ready(env, constraint), np.random.default_rng(0)
-    constraint.value(plant)
+    constraint.value()
     for _ in range(30):
         qpos = env.model.qpos0.copy()
         qpos[:3], qvel = rng.uniform(-0.8, 0.8, 3), np.zeros(env.model.nv)
@@ -309,7 +310,7 @@ def test_a_wall_that_the_env_moves_by_hand_is_taken_where_it_is():
     assert far == pytest.approx(LIMIT - 0.3 * np.sqrt(K * MASS))
     assert near == pytest.approx(LIMIT - np.hypot(K * 0.002, 0.3 * np.sqrt(K * MASS)), rel=1e-6)
     plant = ready(env, constraint)
-    assert not constraint.admits(plant, np.ones(1))  # 200 N more against 140
+    assert not constraint.admits(np.ones(1))  # 200 N more against 140
     env.data.mocap_pos[0, 0] = 9.0
     assert constraint.admits(ready(env, constraint), np.ones(1))
 
@@ -411,7 +412,7 @@ def test_pushing_counts_in_an_env_of_single_physics_steps():
     env.data.qpos[0] = 0.3 + 1e-6
     constraint = limit(holds=30)
     plant = ready(env, constraint)
-    assert constraint.admits(plant, np.full(1, 0.48)) and not constraint.admits(plant, np.full(1, 0.52))
+    assert constraint.admits(np.full(1, 0.48)) and not constraint.admits(np.full(1, 0.52))
 
 
 def test_a_forecast_that_mujoco_gives_up_is_refused():
@@ -420,9 +421,9 @@ def test_a_forecast_that_mujoco_gives_up_is_refused():
         env.data.qpos[0] = start
         constraint = limit()
         plant = ready(env, constraint)
-        constraint.value(plant)
-        assert not constraint.admits(plant, np.ones(1)) and constraint.shortfall(plant, np.ones(1)) == np.inf
-        assert constraint.admits(plant, np.zeros(1))
+        constraint.value()
+        assert not constraint.admits(np.ones(1)) and constraint.SHORTFALL(np.ones(1)) == np.inf
+        assert constraint.admits(np.zeros(1))
 
 
 def test_falling_counts():
@@ -485,7 +486,7 @@ def test_what_cannot_be_moved_towards_the_wall_is_left_alone():
     env.data.qvel[0] = 9.0
     constraint = limit()
     plant = ready(env, constraint)
-    assert constraint.value(plant) == LIMIT and constraint.admits(plant, np.ones(1))
+    assert constraint.value() == LIMIT and constraint.admits(np.ones(1))
 
 
 def test_a_contact_begins_where_mujoco_lets_it_begin():

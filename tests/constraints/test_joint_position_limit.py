@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from asking import Asked
 from gymnasium.envs.registration import EnvSpec
 from judged_loops import DRIVERS, Judge, drive, flagged, sliders
 
@@ -110,11 +111,11 @@ def test_from_outside_it_goes_inwards(start):
 def value(env, limit, qpos=None):
     plant = sw.MujocoPlant()
     plant.bind(env)
-    limit.bind(plant)
+    limit = Asked(limit, plant)
     if qpos is not None:
         env.unwrapped.data.qpos[: len(qpos)] = qpos
     plant.observe()
-    return limit.value(plant)
+    return limit.value()
 
 
 def test_one_value_per_bound_that_there_is():

@@ -4,6 +4,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from asking import Asked
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError
@@ -131,10 +132,10 @@ def test_value_and_rows_against_the_plants_own_prediction():
     plant = sw.MujocoPlant()
     plant.bind(env)
     limit = sw.JointSpeedLimit(4.0, margin=0.1)
-    limit.bind(plant)
+    limit = Asked(limit, plant)
     plant.observe()
-    np.testing.assert_allclose(limit.value(plant), [0.5, 1.0])
-    rows = limit.rows(plant)
+    np.testing.assert_allclose(limit.value(), [0.5, 1.0])
+    rows = limit.rows()
     drift, effect = plant.acceleration
     rng = np.random.default_rng(0)
     for u in rng.uniform(-1, 1, (50, 2)):
@@ -146,7 +147,7 @@ def test_value_and_rows_against_the_plants_own_prediction():
 def test_a_free_or_undriven_model_asks_for_names():
     filtered = sw.CBFActionFilter(gym.make("Ant-v5"), [sw.JointSpeedLimit(4.0)])
     filtered.reset(seed=0)
-    assert len(filtered.constraints[0].value(filtered.plant)) == 8  # the driven ones, not the free root
+    assert len(filtered.filter.bound[0].value()) == 8  # the driven ones, not the free root
     with pytest.raises(ConfigurationError, match="joint 'root' is neither a hinge nor a slide"):
         sw.CBFActionFilter(gym.make("Ant-v5"), [sw.JointSpeedLimit(4.0, joints=["root"])])
     with pytest.raises(

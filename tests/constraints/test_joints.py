@@ -84,7 +84,7 @@ def test_passive_joints_of_a_machine_driven_at_its_joints_need_no_names():
     for env_id, driven in (("InvertedDoublePendulum-v5", 1), ("Pusher-v5", 7), ("Ant-v5", 8)):
         filtered = sw.CBFActionFilter(gym.make(env_id), [sw.JointSpeedLimit(3.0)])
         filtered.reset(seed=0)
-        assert filtered.constraints[0].value(filtered.plant).size == driven
+        assert filtered.filter.bound[0].value().size == driven
 
 
 LEG = """

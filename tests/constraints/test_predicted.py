@@ -7,6 +7,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from asking import Asked
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from judged_loops import Judge, flagged, sliders
@@ -46,7 +47,7 @@ def looking(scene, limit, qpos, qvel):
     """The limit, bound to a plant that has seen this state."""
     plant = sw.MujocoPlant()
     plant.bind(scene)
-    limit.bind(plant)
+    limit = Asked(limit, plant)
     limit.reset()
     scene.data.qpos[:], scene.data.qvel[:] = qpos, qvel
     plant.observe()
@@ -76,9 +77,9 @@ def test_a_control_is_admitted_by_where_it_leads(x, v, u, holds, margin):
         other = -side - 2.0 * (1.0 - margin)
         missing = max(side.max() - start, side[-1] - start * np.exp(-holds * HOLD_S / 0.1), other.max())
     assume(abs(missing) > 1e-7 and abs(start) > 1e-9)
-    assert limit.admits(plant, np.array([u])) == (missing < 0.0)
-    assert limit.shortfall(plant, np.array([u])) == pytest.approx(missing, abs=1e-9)
-    assert limit.value(plant).min() == pytest.approx(1.0 - abs(x), abs=1e-12)
+    assert limit.admits(np.array([u])) == (missing < 0.0)
+    assert limit.SHORTFALL(np.array([u])) == pytest.approx(missing, abs=1e-9)
+    assert limit.value().min() == pytest.approx(1.0 - abs(x), abs=1e-12)
 
 
 def test_outside_it_comes_back_and_stays_whatever_the_policy_does():
@@ -219,9 +220,9 @@ def test_a_model_that_breaks_down_in_the_forecast_is_not_admitted(tmp_path, monk
     monkeypatch.chdir(tmp_path)  # it writes a log
     limit = sw.JointPositionLimit(-1e6, 1e6)
     plant = looking(sliders(actuator='motor gear="1000"', range_=None), limit, [0.0], [0.0])
-    assert limit.admits(plant, np.array([1.0]))
-    assert not limit.admits(plant, np.array([1e9]))
-    assert limit.admits(plant, np.array([2.0]))  # and the next one is a forecast again
+    assert limit.admits(np.array([1.0]))
+    assert not limit.admits(np.array([1e9]))
+    assert limit.admits(np.array([2.0]))  # and the next one is a forecast again
 
 
 @kinds
@@ -249,8 +250,8 @@ def test_a_state_that_is_no_number_admits_nothing(kind, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     limit = LIMITS[kind]()
     plant = looking(sliders(), limit, [np.nan], [0.0])
-    assert not limit.admits(plant, np.zeros(1))
-    assert limit.shortfall(plant, np.zeros(1)) == np.inf
+    assert not limit.admits(np.zeros(1))
+    assert limit.SHORTFALL(np.zeros(1)) == np.inf
 
 
 @kinds

@@ -35,10 +35,10 @@ def test_rows_and_forecast_agree_about_braking():
     # In the table a displacement of zero comes out, but too slowly.
     env = protected("FetchPush-v4")
     for constraint, slow in zip(env.constraints, (False, True), strict=True):
-        assert constraint.value(env.plant).min() < -0.003
-        left = float(constraint.slacks(env.plant, ZERO).min())
-        assert (left < 0.0) == slow != constraint.admits(env.plant, ZERO)
-        assert room(constraint.rows(env.plant), ZERO) == pytest.approx(left, abs=1e-5)
+        assert constraint.value().min() < -0.003
+        left = float(constraint.slacks(ZERO).min())
+        assert (left < 0.0) == slow != constraint.admits(ZERO)
+        assert room(constraint.rows(), ZERO) == pytest.approx(left, abs=1e-5)
 
 
 @pytest.mark.parametrize("way", [[1.0, 0.3, 0.2, 0.0], [-0.8, -1.0, 0.5, 0.0], [0.2, 0.9, 0.4, 0.0]])
@@ -46,12 +46,12 @@ def test_rows_foretell_forecasts(way):
     env = protected("FetchReach-v4")
     to_the_corner(env, way)
     box, plant = env.constraints[0], env.plant
-    rows = box.rows(plant)
+    rows = box.rows()
     rng = np.random.default_rng(0)
     broken = 0
     for _ in range(12):
         control = np.append(rng.uniform(-0.7, 0.7, 3), 0.0)
-        left = float(box.slacks(plant, control).min())
+        left = float(box.slacks(control).min())
         # What no control of the action space could break has no row.
         assert min(room(rows, control), 0.002) == pytest.approx(min(left, 0.002), abs=0.003)
         broken += left < -0.005
@@ -63,16 +63,16 @@ def test_a_cut_goes_through_its_forecast_and_aims_a_little_inward(monkeypatch):
     to_the_corner(env, [1.0, 1.0, 0.0, 0.0])
     box, plant = env.constraints[0], env.plant
     box.reset()  # no response of earlier steps
-    box.rows(plant)
+    box.rows()
     control = np.array([0.5, 0.2, 0.0, 0.0])
-    left = float(box.slacks(plant, control).min())
-    cut = box.cut(plant, control)
+    left = float(box.slacks(control).min())
+    cut = box.cut(control)
     assert left < -0.005
     assert room(cut, control) == pytest.approx(1.01 * left, rel=0.01)
     monkeypatch.setattr(predicted, "_RESOLUTION", 0.0)
     box.reset()
-    box.rows(plant)
-    exact = box.cut(plant, control)
+    box.rows()
+    exact = box.cut(control)
     # Rounding a control to single precision moves it by less than 1e-7.
     inward = exact.offsets - cut.offsets
     assert np.allclose(inward, 1e-6 * np.abs(cut.normals).sum(axis=1), rtol=0.02)
@@ -84,7 +84,7 @@ def test_who_is_far_from_a_limit_has_no_rows_and_forecasts_nothing(monkeypatch):
     env = sw.CBFActionFilter(gym.make("FetchReach-v4"), [box])
     env.reset(seed=0)
     monkeypatch.setattr(Recorder, "record", None)
-    assert not env.constraints[0].rows(env.plant).offsets.size
+    assert not env.filter.bound[0].rows().offsets.size
     env.step(np.ones(4, np.float32))
 
 

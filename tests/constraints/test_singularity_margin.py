@@ -6,6 +6,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from asking import Asked
 from fetch_truth import ARM, watch
 from gymnasium.envs.registration import EnvSpec
 from judged_loops import DRIVERS, Judge, Scene, drive, flagged
@@ -32,7 +33,7 @@ DRIVEN = ["rail", "a", "b", "c"]
 def bound(env, limit, plant=None):
     plant = plant or sw.MujocoPlant()
     plant.bind(env)
-    limit.bind(plant)
+    limit = Asked(limit, plant)
     limit.reset()
     plant.observe()
     return plant
@@ -96,7 +97,7 @@ def test_w_is_that_of_mujoco_s_jacobian_now_and_ahead(task):
     for _ in range(8):
         env.data.qpos[:], env.data.qvel[:] = rng.uniform(-1.5, 1.5, (2, 5))
         plant.observe()
-        assert limit.value(plant) == pytest.approx(expected(env.data.qpos), rel=1e-9, abs=1e-9)
+        assert limit.value() == pytest.approx(expected(env.data.qpos), rel=1e-9, abs=1e-9)
         forecast = plant.forecast(rng.uniform(-3.0, 3.0, 4), 2)
         room = limit._room(plant, forecast)
         assert room.shape == (10, 1)
@@ -119,10 +120,10 @@ def test_its_row_is_the_second_derivative_of_w_under_a_torque(task):
         env.data.qpos[:] = rng.uniform(-1.2, 1.2, 5) * [0.3, 1.0, 1.0, 1.0, 1.0]
         env.data.qvel[:] = rng.uniform(-1.0, 1.0, 5)
         plant.observe()
-        w = float(limit.value(plant)[0]) + 1.0
+        w = float(limit.value()[0]) + 1.0
         if w < 0.3:
             continue  # near the kink of |w| differences are no judge
-        rows = limit.rows(plant)
+        rows = limit.rows()
         assert rows.normals.shape == (1, 4)
         for u in rng.uniform(-3.0, 3.0, (2, 4)):
             data.qpos[:], data.qvel[:], data.ctrl[:] = env.data.qpos, env.data.qvel, u
@@ -131,7 +132,7 @@ def test_its_row_is_the_second_derivative_of_w_under_a_torque(task):
             for t in (-h, 0.0, h):
                 env.data.qpos[:] = data.qpos + t * data.qvel + 0.5 * t * t * acceleration
                 plant.observe()
-                ways.append(float(limit.value(plant)[0]))
+                ways.append(float(limit.value()[0]))
             env.data.qpos[:] = data.qpos
             rate, curve = (ways[2] - ways[0]) / (2.0 * h), (ways[2] - 2.0 * ways[1] + ways[0]) / h**2
             wanted = curve + 2.0 * a * rate + a * a * (w - 1.0 - 0.1)
@@ -149,12 +150,12 @@ def test_an_arm_on_a_base_that_floats_has_no_row_and_one_that_is_moved_by_hand_i
     env = Scene(floating.replace('<geom size=".05"/>', '<freejoint/><geom size=".05"/>'))
     limit = sw.SingularityMargin(1e-3, site="tip", directions="xy")
     plant = bound(env, limit)
-    assert limit.rows(plant).normals.shape == (0, 3)
+    assert limit.rows().normals.shape == (0, 3)
     env.data.qpos[3:7] = np.array([0.5, 0.1, 0.7, 0.5])
     mujoco.mj_forward(env.model, env.data)
     plant.observe()
     wanted = true_w(env.model, env.data, "site", "tip", ["a", "b", "c"], "xy")
-    assert limit.value(plant) == pytest.approx(wanted / 1e-3 - 1.0)
+    assert limit.value() == pytest.approx(wanted / 1e-3 - 1.0)
 
     env = Scene(floating.replace('<body name="base"', '<body name="base" mocap="true"'))
     limit = sw.SingularityMargin(1e-3, site="tip", directions="xy")
@@ -164,7 +165,7 @@ def test_an_arm_on_a_base_that_floats_has_no_row_and_one_that_is_moved_by_hand_i
     mujoco.mj_forward(env.model, env.data)
     plant.observe()
     wanted = true_w(env.model, env.data, "site", "tip", ["a", "b", "c"], "xy")
-    assert limit.value(plant) == pytest.approx(wanted / 1e-3 - 1.0)
+    assert limit.value() == pytest.approx(wanted / 1e-3 - 1.0)
 
 
 def test_a_square_task_is_not_passed_through_its_singular_pose():
@@ -176,14 +177,14 @@ def test_a_square_task_is_not_passed_through_its_singular_pose():
             np.array([0.3, side * 0.5, 0.1, -0.1]), np.array([0.0, -side * 40.0, 0.0, 0.0])
         )
         plant = bound(env, limit)
-        assert limit.value(plant) == pytest.approx(0.011 * np.sin(0.5) / 0.003 - 1.0)
+        assert limit.value() == pytest.approx(0.011 * np.sin(0.5) / 0.003 - 1.0)
         forecast = plant.forecast(np.zeros(2), 2)
         crossing = forecast.qpos[:, 1]
         assert (crossing * side).min() < -0.2  # it does pass through, to where w is large again
         np.testing.assert_allclose(
             limit._room(plant, forecast)[:, 0], side * 0.011 * np.sin(crossing) / 0.003 - 1.0
         )
-        assert not limit.admits(plant, np.zeros(2))
+        assert not limit.admits(np.zeros(2))
 
 
 def test_a_copy_has_kinematics_of_its_own():
@@ -193,7 +194,7 @@ def test_a_copy_has_kinematics_of_its_own():
     twin = copy.deepcopy(limit)
     env.data.qpos[:] = [0.1, 0.5, -0.4, 0.3, 0.2]
     plant.observe()
-    assert twin.value(plant) == limit.value(plant)
+    assert twin.value() == limit.value()
 
 
 # A validated threshold ----------------------------------------------------------------------------------------
@@ -221,7 +222,7 @@ def test_a_validated_threshold_is_that_of_the_sampled_configurations():
     assert ((w > found.threshold) & (need > 2.0)).mean() <= 2.0 * found.unseen(0.99)
     given = sw.SingularityMargin(found.threshold, site="tip")
     plant = bound(env, given)
-    assert given.validated is None and given.value(plant) == limit.value(plant)
+    assert given.validated is None and given.value() == limit.value()
 
 
 def test_no_threshold_that_keeps_the_rates_is_an_error():

@@ -7,6 +7,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from asking import Asked
 from gymnasium.envs.registration import EnvSpec
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
@@ -27,10 +28,10 @@ def watching(env, **options):
     limit = sw.SpeedLimit(**{"limit": 50.0, "holds": 1, **options})
     plant = sw.MujocoPlant()
     plant.bind(env)
-    limit.bind(plant)
+    limit = Asked(limit, plant)
     limit.reset()
     plant.observe()
-    limit.value(plant)
+    limit.value()
     return limit, plant
 
 
@@ -50,13 +51,13 @@ def test_the_forecast_speed_is_the_one_that_the_task_judges(robot, version):
     for _ in range(60):
         action = rng.uniform(env.action_space.low, env.action_space.high)
         plant.observe()
-        present = limit.value(plant)[0]
+        present = limit.value()[0]
         if speeds and not plane:  # the step behind it is judged by the same measure
             assert 50.0 - present == pytest.approx(speeds[-1], abs=1e-12)
         forecast = plant.forecast(action)
         ahead = 50.0 - limit._room(plant, forecast)
         assert ahead.shape == (1, 2)
-        assert limit.shortfall(plant, action) == pytest.approx(ahead.max() - 50.0, abs=1e-12)
+        assert limit.SHORTFALL(action) == pytest.approx(ahead.max() - 50.0, abs=1e-12)
         *_, terminated, _, info = env.step(action)
         wrong = np.maximum(wrong, np.abs(ahead[0] - info["speed"]))
         speeds.append(info["speed"])
@@ -129,10 +130,10 @@ def test_a_control_is_admitted_by_the_speed_it_leads_to(v, u, direction, average
         moving = np.stack([moving.mean(axis=0), moving[:-1].sum(axis=0) / substeps])
     left = 2.0 - margin - MEASURES[direction](moving).max()
     assume(abs(left) > 1e-7)
-    assert limit.admits(plant, np.array(u)) == (left > 0.0)
-    assert limit.shortfall(plant, np.array(u)) == pytest.approx(-left, abs=1e-7)
+    assert limit.admits(np.array(u)) == (left > 0.0)
+    assert limit.SHORTFALL(np.array(u)) == pytest.approx(-left, abs=1e-7)
     start = np.einsum("b,bi->i", np.asarray(weights), velocities(v, [0.0, 0.0], timestep, 1)[0])
-    assert limit.value(plant)[0] == pytest.approx(2.0 - MEASURES[direction](start), abs=1e-9)
+    assert limit.value()[0] == pytest.approx(2.0 - MEASURES[direction](start), abs=1e-9)
 
 
 @pytest.mark.parametrize(("timestep", "substeps"), [(0.01, 5), (0.002, 10), (0.005, 1), (0.01, 20)])
@@ -224,7 +225,7 @@ def test_a_speed_that_is_kept_only_to_be_exceeded_next_is_refused_now():
         env.data.qvel[0] = 0.6
         mujoco.mj_forward(env.model, env.data)
         limit, plant = watching(env, limit=1.0, direction="+x", holds=holds)
-        admitted[holds] = [limit.admits(plant, np.array([u])) for u in (-1.0, 1.0)]
+        admitted[holds] = [limit.admits(np.array([u])) for u in (-1.0, 1.0)]
     # The averages of the next steps, braking: 0.72, 0.92, 1.12; at full throttle: 0.78, 1.0 + ...
     assert admitted == {1: [True, True], 2: [True, False], 3: [False, False]}
 
@@ -241,7 +242,7 @@ def test_under_a_delay_only_the_predicted_states_count():
         position = float(env.data.qpos[0])
         plant.observe()
         filtered._margin()
-        assert filtered.constraints[0]._room(plant, plant.forecast(np.zeros(1))).shape == (1, 1)
+        assert filtered.filter.bound[0]._room(plant, plant.forecast(np.zeros(1))).shape == (1, 1)
         decision = filtered._decider.decide(np.array([20.0 * (-1.0) ** (k // 20)]), np.zeros(1))
         plant.executed(decision.control)
         queue.append(float(decision.control[0]))

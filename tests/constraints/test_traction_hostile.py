@@ -203,7 +203,7 @@ def test_a_quarter_car_by_its_equations(ground, speed, action):
         v, w, impulse = equations(ground, MOST * info["executed_action"][0], before, raw.dt)
         np.testing.assert_allclose(raw.data.qvel[[0, 2]], (v, w), rtol=5e-3, atol=5e-3)
         env.plant.observe()
-        env.constraints[0].rows(env.plant)
+        env.filter.bound[0].rows()
         errors.append(abs(traction._traction[0] - impulse / raw.dt) / (MASS * 9.81))
         slips.append(abs(slip_of(v, w)))
     assert max(errors) < 0.02  # of the load
@@ -240,11 +240,11 @@ def test_a_drive_of_the_plants_model_that_changes_is_read_anew():
     env = sw.SlipLimiter(Trolley(0.15), wheels=["left", "right"])
     env.reset(seed=0)
     traction, plant = env.constraints[0], env.plant
-    before = traction.rows(plant).normals
+    before = traction.rows().normals
     plant.model.actuator_gear[:, 0] *= 2.0
     plant.revision += 1
     plant.observe()
-    np.testing.assert_allclose(traction.rows(plant).normals, 2.0 * before)
+    np.testing.assert_allclose(traction.rows().normals, 2.0 * before)
 
 
 @pytest.mark.parametrize("change", ["geoms more", "geoms less", "cone"])
@@ -270,9 +270,9 @@ def test_loads_are_the_envs_whatever_the_plants_model_looks_like(change):
                 mujoco.mj_contactForce(env.model, env.data, i, force)
                 expected[k] += force[0]
     filtered.plant.observe()
-    filtered.constraints[0].rows(filtered.plant)
+    filtered.filter.bound[0].rows()
     assert (expected > 5.0).all()
-    np.testing.assert_allclose(filtered.constraints[0]._load, expected, rtol=1e-6)
+    np.testing.assert_allclose(filtered.filter.bound[0]._load, expected, rtol=1e-6)
 
 
 SERVOS = "".join(f'<velocity joint="{side}" kv="{{kv}}" ctrlrange="-40 40"/>' for side in ("left", "right"))
@@ -294,9 +294,9 @@ def test_wheels_that_touch_nothing_feel_no_force(actuators, integrator, substeps
     for _ in range(6):
         raw.step(np.array([0.5, -0.3]) * env.action_space.high)
         env.plant.observe()
-        env.constraints[0].rows(env.plant)
+        env.filter.bound[0].rows()
     assert np.abs(raw.data.qvel[6:]).min() > 0.3
-    np.testing.assert_allclose(env.constraints[0]._traction, 0.0, atol=1e-4)
+    np.testing.assert_allclose(env.filter.bound[0]._traction, 0.0, atol=1e-4)
 
 
 @pytest.mark.parametrize(("kv", "substeps"), [(0.5, 25), (5.0, 5), (5.0, 25)])
@@ -337,7 +337,7 @@ def test_a_second_look_changes_nothing():
     watched, left_alone = (start(rover(), ground="ice", speed=2.0) for _ in range(2))
     for _ in range(30):
         watched.plant.observe()
-        watched.constraints[0].rows(watched.plant)
+        watched.filter.bound[0].rows()
         got, expected = watched.step(FULL)[4], left_alone.step(FULL)[4]
         np.testing.assert_array_equal(got["executed_action"], expected["executed_action"])
         np.testing.assert_array_equal(got["slip/mu_estimate"], expected["slip/mu_estimate"])
@@ -351,9 +351,9 @@ def test_a_clock_that_is_set_back_measures_nothing():
     raw = env.unwrapped
     mujoco.mj_resetData(raw.model, raw.data)
     raw.set_state(raw.init_qpos.copy(), np.zeros(raw.model.nv))
-    known = env.constraints[0]._estimate.mean
+    known = env.filter.bound[0]._estimate.mean
     info = env.step(FULL)[4]
-    np.testing.assert_array_equal(env.constraints[0]._traction, 0.0)
+    np.testing.assert_array_equal(env.filter.bound[0]._traction, 0.0)
     np.testing.assert_array_equal(info["slip/mu_estimate"], known)
     fresh = start(rover(), ground="wet").step(FULL)[4]
     # As from a fresh start but for the limit, which the estimate has moved.
@@ -386,11 +386,11 @@ def test_a_state_that_is_no_number_is_forgotten():
     assert (traction._present > 0.0).all()
     raw.data.qvel[6] = np.nan
     env.plant.observe()
-    assert np.isnan(traction.rows(env.plant).offsets).all()
-    assert np.isfinite(traction.backup(env.plant)).all()
+    assert np.isnan(traction.rows().offsets).all()
+    assert np.isfinite(traction.backup()).all()
     raw.data.qvel[:] = good
     env.plant.observe()
-    assert np.isfinite(traction.rows(env.plant).offsets).all()
+    assert np.isfinite(traction.rows().offsets).all()
     np.testing.assert_array_equal(traction._present, 0.0)
 
 

@@ -86,7 +86,7 @@ def test_a_wheel_that_is_hardly_loaded_teaches_nothing():
     start(env, ground="wet", speed=2.0)
     for _ in range(40):
         info = env.step(FULL)[4]
-    wheels, before = env.constraints[0]._wheels, info["slip/mu_estimate"]
+    wheels, before = env.filter.bound[0]._wheels, info["slip/mu_estimate"]
     measured = wheels.loads
     wheels.loads = lambda model, data: 0.01 * measured(model, data)  # for one step: it hops
     env.step(FULL)
@@ -157,11 +157,11 @@ def test_a_row_that_no_torque_can_break_is_left_out():
     env = rover(friction=1e6)
     start(env, speed=1.0)
     env.plant.observe()
-    assert env.constraints[0].rows(env.plant).normals.shape == (0, 5)
+    assert env.filter.bound[0].rows().normals.shape == (0, 5)
     tight = rover()
     start(tight, speed=1.0)
     tight.plant.observe()
-    normals = tight.constraints[0].rows(tight.plant).normals
+    normals = tight.filter.bound[0].rows().normals
     assert normals.shape == (8, 5)
     assert (normals[:, 4] == 0.0).all()  # the steering's
 
@@ -210,7 +210,7 @@ def test_a_measurement_that_is_no_number_is_reported_and_forgotten():
     start(env, ground="wet", speed=2.0)
     for _ in range(20):
         env.step(FULL)
-    wheels = env.constraints[0]._wheels
+    wheels = env.filter.bound[0]._wheels
     measured = wheels.loads
     wheels.loads = lambda model, data: np.nan * measured(model, data)
     with warnings.catch_warnings():
@@ -258,7 +258,7 @@ def test_a_row_that_is_no_number_is_kept_and_fails():
     start(env, speed=1.0)
     env.plant.observe()
     traction = env.constraints[0]
-    traction.rows(env.plant)
+    traction.rows()
     traction._window = tuple(np.nan * end for end in traction._window)
     assert np.isnan(traction._bounds(env.plant).offsets).all()
     assert traction._bounds(env.plant).offsets.shape == (8,)

@@ -4,6 +4,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from asking import Asked
 from gymnasium.envs.registration import EnvSpec
 from judged_loops import DRIVERS, Judge, Scene, drive, flagged
 
@@ -14,7 +15,7 @@ from safe_wrappers.errors import ConfigurationError, UnknownNameError
 def bound(env, limit):
     plant = sw.MujocoPlant()
     plant.bind(env)
-    limit.bind(plant)
+    limit = Asked(limit, plant)
     limit.reset()
     plant.observe()
     return plant
@@ -57,7 +58,7 @@ def test_bodies_sites_and_geoms_are_where_mujoco_has_them_now_and_ahead():
         plant.observe()
         truth.qpos[:] = env.data.qpos
         mujoco.mj_forward(env.model, truth)
-        np.testing.assert_allclose(limit.value(plant).reshape(5, 3), true_points(truth), atol=1e-12)
+        np.testing.assert_allclose(limit.value().reshape(5, 3), true_points(truth), atol=1e-12)
         forecast = plant.forecast(rng.uniform(-1.0, 1.0, 2), 2)
         room = limit._room(plant, forecast)
         assert room.shape == (10, 15)
@@ -107,7 +108,7 @@ def test_published_obstacles_are_taken_where_they_are():
         plant.observe()
         raw = env.unwrapped
         away = np.linalg.norm(raw.hazard_positions - raw.data.body("agent").xpos[:2], axis=1) - 0.2
-        np.testing.assert_allclose(limit.value(plant), away, atol=1e-12)
+        np.testing.assert_allclose(limit.value(), away, atol=1e-12)
 
 
 def test_where_nothing_stands_nothing_is_refused():

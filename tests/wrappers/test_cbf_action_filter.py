@@ -488,7 +488,7 @@ class Switch(Raw):
         super().__init__([[1.0], [-1.0]], [-0.2, -0.4])
 
     def rows(self, plant):
-        return super().rows(plant) if self.on else sw.HalfSpaces.none(1)
+        return super().rows() if self.on else sw.HalfSpaces.none(1)
 
 
 CONTRADICTION = Raw([[1.0], [-1.0]], [-0.2, -0.4])  # u <= -0.2 and u >= 0.4

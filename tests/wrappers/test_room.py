@@ -6,6 +6,7 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
+from asking import Asked
 from braked_cart import BrakedCart, cart_plant, lease_by_bisection, read_cart
 from worlds import SpeedRow
 
@@ -127,12 +128,12 @@ def test_a_joint_position_limit_with_a_closing_speed(env_id):
     )
     again, plant = copy.deepcopy(limit), sw.MujocoPlant()
     plant.bind(env.env)
-    again.bind(plant)
+    again = Asked(again, plant)
     env.reset(seed=3)
     rng, seen = np.random.default_rng(0), set()
     for _ in range(60):
         plant.observe()
-        value = again.value(plant).min()
+        value = again.value().min()
         assert value <= 0.8 - abs(env.unwrapped.data.joint(joint).qpos[0]) + 1e-12
         wanted = (value - 0.05 - 0.02 - 0.01) / 4.0 - 0.015
         got = granted(env, env.action_space.high * rng.choice([-1.0, 1.0]))
@@ -160,7 +161,7 @@ def test_a_heading_drive_brakes_by_its_own_backup():
     env = sw.LeaseExpiry(gym.make("SafePointGoal1-v0"), clearance, closing_speed=4.0, longest_s=0.2)
     again, plant = copy.deepcopy(clearance), sw.MujocoPlant()
     plant.bind(env.env)
-    again.bind(plant)
+    again = Asked(again, plant)
     layout = {"layout": {"agent": [0.0, 0.0, 0.0], "hazards": [[1.5, 0.0]]}}
     env.reset(seed=0, options=layout)
     braked = 0
@@ -168,7 +169,7 @@ def test_a_heading_drive_brakes_by_its_own_backup():
         if t > 25:
             env.deliver(None)
         plant.observe()
-        wanted = again.backup(plant)
+        wanted = again.backup()
         info = env.step(np.array([1.0, 0.0], np.float32))[4]
         if info["lease/braking"]:
             braked += 1
@@ -182,14 +183,14 @@ def test_a_heading_drive_never_violates_when_commands_stop():
     bare = gym.make("SafePointGoal1-v0")
     plant, watch = sw.MujocoPlant(), copy.deepcopy(clearance)
     plant.bind(bare)
-    watch.bind(plant)
+    watch = Asked(watch, plant)
     rng, fastest = np.random.default_rng(0), 0.0
     for seed in range(4):
         bare.reset(seed=seed)
         before = None
         for t in range(200):
             plant.observe()
-            value = float(watch.value(plant)[0])
+            value = float(watch.value()[0])
             if before is not None:
                 fastest = max(fastest, (before - value) / 0.02)
             before = value

@@ -155,7 +155,7 @@ def test_rows_of_a_forecast_keep_a_share_of_the_box_for_rounding(unit):
         )
         constraint = Forecasting(unit)
         constraint._stamp, constraint._response, constraint._reach = None, None, None
-        rows = constraint.rows(plant)
+        rows = constraint.rows()
         return np.append(rows.normals[0] * unit, rows.offsets[0])
 
     np.testing.assert_allclose(row(unit), row(1.0), rtol=0.0, atol=1e-10)
