@@ -17,7 +17,6 @@ from safe_wrappers.constraints import (
     Disc,
     Discs,
     EscapeClearance,
-    HalfSpaces,
     HeadingDriveClearance,
     ImpactSpeedLimit,
     JointPositionLimit,
@@ -37,6 +36,7 @@ from safe_wrappers.constraints import (
 )
 from safe_wrappers.envs import register_envs as _register_envs
 from safe_wrappers.errors import SafeWrappersError, UnsafeStateWarning
+from safe_wrappers.filter.constraint import BoundConstraint, HalfSpaces
 from safe_wrappers.filter.projection import Projection, project
 from safe_wrappers.plants.analytic import AnalyticPlant
 from safe_wrappers.plants.displacement import DisplacementPlant
@@ -66,6 +66,7 @@ __all__ = [
     "AnalyticPlant",
     "BalanceMonitor",
     "Barrier",
+    "BoundConstraint",
     "Box",
     "CBFActionFilter",
     "ChunkHandover",

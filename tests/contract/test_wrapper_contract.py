@@ -550,8 +550,9 @@ def test_constraints_and_plant_survive_pickling(case, bound):
     if bound:
         env = sw.CBFActionFilter(gym.make(env_id), **arguments())
         env.reset(seed=0)
-        constraints, plant = pickle.loads(pickle.dumps((env.constraints, env.plant)))
-        for mine, theirs in zip(env.constraints, constraints, strict=True):
+        bound, plant = pickle.loads(pickle.dumps((env.filter.bound, env.plant)))
+        assert plant.stamp == env.plant.stamp
+        for mine, theirs in zip(env.filter.bound, bound, strict=True):
             np.testing.assert_array_equal(mine.value(), theirs.value())
     else:
         constraints, plant = pickle.loads(pickle.dumps((arguments()["constraints"], sw.MujocoPlant())))

@@ -43,7 +43,7 @@ def check_info(info, size):
         assert np.isfinite(info[key]), key
     for key in (keys.PROPOSED_ACTION, keys.EXECUTED_ACTION):
         assert info[key].dtype == np.float64 and info[key].shape == (size,)
-    assert {k for k in info if k.startswith("cbf/")} == BOOLS | FLOATS | {keys.CBF_REFUSED}
+    assert {k for k in info if k.startswith("cbf/")} == BOOLS | FLOATS | {keys.CBF_REFUSED, keys.CBF_STAGE}
 
 
 # What reaches the env -----------------------------------------------------------------------------------------
@@ -246,7 +246,7 @@ def test_unknown_names_and_bad_margins_are_refused(options, error, message):
 @pytest.mark.parametrize(
     ("constraint", "message"),
     [
-        (lambda: "fast", r"object with rows\(plant\)"),
+        (lambda: "fast", r"a sw.Constraint"),
         (
             lambda: {"kind": "Clearence"},
             "unknown constraint kind 'Clearence'; the kinds are Barrier, Clearance",
@@ -393,7 +393,7 @@ def test_another_dt_than_the_envs_is_refused(hold):
 
 
 def test_a_constraint_without_margin_cannot_be_widened():
-    with pytest.raises(ConfigurationError, match="Raw has no margin to widen"):
+    with pytest.raises(ConfigurationError, match="no margin to widen"):
         cart([Raw([[1.0]], [1.0])], margin=0.1)
 
 
@@ -479,16 +479,19 @@ def test_pendulum_started_too_fast_slows_down():
 # Infeasible steps and fallbacks -------------------------------------------------------------------------------
 
 
-class Switch(Raw):
+class Switch(sw.Constraint):
     """Asks for nothing, or, switched on, for a contradiction."""
 
     on = False
 
-    def __init__(self):
-        super().__init__([[1.0], [-1.0]], [-0.2, -0.4])
+    def bind(self, plant):
+        return BoundSwitch(self, plant)
 
-    def rows(self, plant):
-        return super().rows() if self.on else sw.HalfSpaces.none(1)
+
+class BoundSwitch(sw.BoundConstraint):
+    def rows(self):
+        contradiction = sw.HalfSpaces(np.array([[1.0], [-1.0]]), np.array([-0.2, -0.4]))
+        return contradiction if self.spec.on else sw.HalfSpaces.none(1)
 
 
 CONTRADICTION = Raw([[1.0], [-1.0]], [-0.2, -0.4])  # u <= -0.2 and u >= 0.4

@@ -17,7 +17,7 @@ def kept_or_flagged(env, action, info):
         inner = inner.env
     executed = info["executed_action"]
     if not (info["cbf/infeasible"] or info["cbf/fallback"]):
-        assert inner.constraints[0].admits(executed)
+        assert inner.filter.bound[0].admits(executed)
     if not info["cbf/intervened"]:
         assert executed.tobytes() == action.astype(np.float64).tobytes()
 

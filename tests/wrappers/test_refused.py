@@ -140,7 +140,7 @@ def too_fast():
 
 def failing(env, control):
     """The filter's own measure: the largest shortfall in shares of the constraint's scale."""
-    return max(c.SHORTFALL(control) / c.scale for c in env.constraints)
+    return max(-c.slack(control) / c.scale for c in env.filter.bound)
 
 
 def compared(env, steps, monkeypatch):
@@ -212,12 +212,11 @@ def test_scales_are_the_limits_where_there_is_one():
         "SpeedLimit": (sw.SpeedLimit(2.5), 2.5),
         "JointSpeedLimit": (sw.JointSpeedLimit([4.0, 3.0]), 3.0),
         "JointPositionLimit": (sw.JointPositionLimit(-1.0, 1.0), 1.0),
-        "Workspace": (sw.Workspace([0.0] * 3), 1.0),
-        "Upright": (sw.Upright(tilt=0.5), 1.0),
+        "Workspace": (sw.Workspace([0.0] * 3, bodies=["fingertip"]), 1.0),
+        "Upright": (sw.Upright(tilt=0.5, body="fingertip"), 1.0),
     }
-    assert {name: limit.scale for name, (limit, _) in scales.items()} == {
-        name: scale for name, (_, scale) in scales.items()
-    }
+    env = sw.CBFActionFilter(gym.make("Reacher-v5"), [limit for limit, _ in scales.values()])
+    assert [c.scale for c in env.filter.bound] == [scale for _, scale in scales.values()]
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
-from asking import Asked
 from braked_cart import BrakedCart, cart_plant, lease_by_bisection, read_cart
 from worlds import SpeedRow
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.rollout import Predicted
+from safe_wrappers.constraints.rollout import BoundRollout, RolloutMemory
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.filter.fallback import brake
 
@@ -128,16 +128,16 @@ def test_an_action_space_of_another_size_is_refused_in_every_unit(unit):
         sw.MujocoPlant().bind(Slider(unit, space=0.5))
 
 
-class Forecasting(Predicted):
+class Forecasting(BoundRollout):
     """What is left is linear in the control, in shares of its box."""
 
     def __init__(self, unit):
-        self.margin, self.holds, self.reach, self.unit_of_control = 0.0, 1, None, unit
+        self.unit_of_control = unit
 
-    def _now(self, plant):
+    def _now(self):
         return np.array([1.0])
 
-    def _room(self, plant, forecast):
+    def _room(self, forecast):
         return np.array([[0.3 - forecast @ np.array([1.0, 0.5]) / self.unit_of_control]])
 
 
@@ -154,7 +154,9 @@ def test_rows_of_a_forecast_keep_a_share_of_the_box_for_rounding(unit):
             forecast=lambda control, holds: control,
         )
         constraint = Forecasting(unit)
-        constraint._stamp, constraint._response, constraint._reach = None, None, None
+        constraint.spec, constraint.plant = SimpleNamespace(margin=0.0, holds=1), plant
+        constraint._reach = None
+        constraint.observe(RolloutMemory())
         rows = constraint.rows()
         return np.append(rows.normals[0] * unit, rows.offsets[0])
 
