@@ -31,6 +31,7 @@ class SafetyFilter:
 
     Attributes:
         bound: The constraints on the plant, in their order.
+        reporting: Those of them that write info keys of their own.
         margin: The smallest h of the observed state; inf if there is none, NaN if the state or an h is not a number.
 
     Raises:
@@ -50,7 +51,7 @@ class SafetyFilter:
         self.plant = plant
         self.bound: list[BoundConstraint] = [constraint.bind(plant) for constraint in constraints]
         _refuse_same_keys(self.bound)
-        self._reporting = [c for c in self.bound if c.info_keys]
+        self.reporting = [c for c in self.bound if c.info_keys]
         self._search = SafeActionSearch(plant, self.bound, Fallback(fallback, self.bound), solver, low, high)
         self._low, self._high = low, high
 
@@ -95,14 +96,15 @@ class SafetyFilter:
         self._last = control
         self.plant.executed(control)
         if self.margin == self.margin:
-            self._memories = [c.executed(control) for c in self.bound]
+            for i, c in enumerate(self.bound):
+                self._memories[i] = c.executed(control)
 
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
         """The constraints' own info keys about the observed state; None after a reset."""
         if self.margin != self.margin:
             proposed = executed = None
         found: dict[str, Any] = {}
-        for c in self._reporting:
+        for c in self.reporting:
             found |= c.info(proposed, executed)
         return found
 

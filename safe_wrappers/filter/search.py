@@ -115,7 +115,7 @@ class SafeActionSearch:
 
     def _decide(self, proposal: Array, last: Array) -> Decision:
         refused = bool(self._predicting) and not self._admitted(proposal)
-        strict = self._rows(self._rows_only)
+        strict = self._rows(self._rows_only) if self._rows_only else _NO_ROWS
         if not refused:
             if not strict[1].size:
                 return Decision(proposal, Stage.PROPOSAL, changed=False)
@@ -258,10 +258,11 @@ class SafeActionSearch:
         return self._fallback(self._plant, last, self._low, self._high, least)
 
     def _admitted(self, control: Array) -> bool:
-        admitted = all(c.admits(control) for c in self._predicting)
-        if not admitted:
-            self._tried.append(control)
-        return admitted
+        for c in self._predicting:
+            if not c.admits(control):
+                self._tried.append(control)
+                return False
+        return True
 
     def _keeps(self, control: Array, strict: Rows) -> bool:
         return self._within(control, strict) and self._admitted(control)

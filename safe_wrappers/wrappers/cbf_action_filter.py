@@ -194,7 +194,8 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         info[keys.PROPOSED_ACTION] = proposed
         info[keys.EXECUTED_ACTION] = executed.copy()
         info[keys.CBF_STAGE] = int(decision.stage)
-        info |= self.filter.info(proposed, executed)
+        if self.filter.reporting:
+            info |= self.filter.info(proposed, executed)
         return observation, reward, terminated, truncated, info
 
     def _checked(self, action: Any) -> Array:

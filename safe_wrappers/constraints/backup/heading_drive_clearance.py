@@ -147,6 +147,7 @@ class BoundHeadingDriveClearance(BoundConstraint):
         x, y, reserve = motion.x, motion.y, self.spec.margin + self.spec.state_error
         kept = path.reach + self._swivel
         bounds: list[tuple[float, _Circle]] = []
+        best = math.inf
         for obstacle in self.spec.obstacles:
             if isinstance(obstacle, Discs):
                 where, room = obstacle.centers(self.plant).tolist(), obstacle.radius + reserve
@@ -154,10 +155,11 @@ class BoundHeadingDriveClearance(BoundConstraint):
                 where, room = [obstacle.center], obstacle.radius + reserve
             for center in where:
                 cx, cy = center[0], center[1]
-                bounds.append((math.hypot(cx - x, cy - y) - room - kept, (cx, cy, room)))
+                bound = math.hypot(cx - x, cy - y) - room - kept
+                bounds.append((bound, (cx, cy, room)))
+                # A position that is not a number may be anywhere: the clearance is then not a number either.
+                best = best if bound == bound else math.nan
         bounds.sort()
-        # A position that is not a number may be anywhere: the clearance is then not a number either.
-        best = math.nan if any(bound != bound for bound, _ in bounds) else math.inf
         for bound, disc in bounds:
             if not bound < best:
                 break
