@@ -9,16 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
+from safe_wrappers.appendix.watchdog.reachability import jerk_limited_reach, reach, transit_time
 from safe_wrappers.control.watchdog import reachability
-from safe_wrappers.control.watchdog.reachability import (
-    MotionLimits,
-    admits,
-    furthest,
-    jerk_limited_reach,
-    jerk_limited_time,
-    reach,
-    transit_time,
-)
+from safe_wrappers.control.watchdog.reachability import MotionLimits, admits, furthest, jerk_limited_time
 from safe_wrappers.errors import ConfigurationError
 
 POSITIVE = st.floats(0.1, 10.0)

@@ -5,9 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from safe_wrappers.appendix.legged.balance import balance
 from safe_wrappers.control.contact.friction_cone import tangents
 from safe_wrappers.control.legged import support_distances as module
-from safe_wrappers.control.legged.support import balance, common_plane, support_polygon
+from safe_wrappers.control.legged.support import common_plane, support_polygon
 from safe_wrappers.control.legged.support_distances import support_distances
 from safe_wrappers.errors import ConfigurationError
 

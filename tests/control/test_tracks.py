@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safe_wrappers.control.estimation.covariance import blind_covariance, double_integrator_covariance
+from safe_wrappers.appendix.estimation.covariance import blind_covariance, double_integrator_covariance
 from safe_wrappers.control.estimation.tracks import Motion, Tracks, largest_deviation
 
 MOTIONS = [

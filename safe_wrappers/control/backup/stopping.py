@@ -18,31 +18,6 @@ _RETREAT_RATE = 1.0
 """1/s: how fast a violation is to shrink once the room is gone."""
 
 
-def kinetic_inset(clearance: ArrayLike, speed: ArrayLike, brake: float) -> Array:
-    """`h = D - v^2 / (2 a_brake)`; receding (v <= 0) needs no stopping distance.
-
-    Args:
-        clearance: Distance to the obstacle D in m (or rad), shape (...).
-        speed: Approach speed v in m/s, positive towards the obstacle, shape (...).
-        brake: a_brake in m/s^2, positive.
-    """
-    approach = np.maximum(np.asarray(speed, dtype=np.float64), 0.0)
-    return np.asarray(np.asarray(clearance, dtype=np.float64) - approach**2 / (2.0 * brake))
-
-
-def kinetic_row(clearance: ArrayLike, speed: ArrayLike, brake: float, gamma: float) -> Array:
-    """The continuous row: the largest admissible approach acceleration, `(a_brake / v)(gamma h - v)`.
-
-    Only for v > 0. At standstill the row is singular and says nothing: there it returns +inf where the
-    inset is positive and 0 where it is not (the start rule of the continuous form: do not set off).
-    """
-    v = np.asarray(speed, dtype=np.float64)
-    h = kinetic_inset(clearance, speed, brake)
-    moving = v > 0.0
-    safe_v = np.where(moving, v, 1.0)
-    return np.asarray(np.where(moving, brake / safe_v * (gamma * h - safe_v), np.where(h > 0.0, np.inf, 0.0)))
-
-
 def predicted_approach(
     clearance: ArrayLike, speed: ArrayLike, delay_s: float, pending: ArrayLike
 ) -> tuple[Array, Array]:

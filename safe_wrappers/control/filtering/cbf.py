@@ -36,15 +36,6 @@ def linear_decay(h: ArrayLike, alpha: float) -> Array:
     return alpha * np.asarray(h, dtype=np.float64)
 
 
-def power_decay(h: ArrayLike, alpha: float, power: float) -> Array:
-    """The extended class-K function `alpha * sign(h) |h|^power`: odd, so an unsafe state is driven back.
-
-    Below 1, `power` lets the state come close quickly and brakes late; above 1 it brakes early.
-    """
-    value = np.asarray(h, dtype=np.float64)
-    return np.asarray(alpha * np.sign(value) * np.abs(value) ** power)
-
-
 def cbf_rows(lf_h: ArrayLike, lg_h: ArrayLike, decay: ArrayLike) -> tuple[Array, Array]:
     """The barrier condition as half-spaces `normals @ u <= offsets`.
 
@@ -59,35 +50,6 @@ def cbf_rows(lf_h: ArrayLike, lg_h: ArrayLike, decay: ArrayLike) -> tuple[Array,
     return -np.asarray(lg_h, dtype=np.float64), np.asarray(lf_h, dtype=np.float64) + np.asarray(
         decay, dtype=np.float64
     )
-
-
-def best_rate(lf_h: ArrayLike, lg_h: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> Array:
-    """The largest `h'` that any control in the box reaches, shape (...)."""
-    effect = np.asarray(lg_h, dtype=np.float64)
-    corner = np.where(effect > 0, np.asarray(upper), np.where(effect < 0, np.asarray(lower), 0.0))
-    return np.asarray(np.asarray(lf_h) + np.einsum("...m,...m->...", effect, corner))
-
-
-def nagumo_holds(
-    h: ArrayLike,
-    lf_h: ArrayLike,
-    lg_h: ArrayLike,
-    lower: ArrayLike,
-    upper: ArrayLike,
-    boundary: float = 1e-9,
-) -> NDArray[np.bool_]:
-    """Nagumo's test at the boundary: on `|h| <= boundary` some control in the box gives `h' >= 0`.
-
-    Away from the boundary the tangent cone is the whole space and the test holds; outside the set
-    (`h < -boundary`) invariance is already lost and it does not.
-
-    Returns:
-        Boolean array of shape (...).
-    """
-    value = np.asarray(h, dtype=np.float64)
-    on_boundary = np.abs(value) <= boundary
-    viable = best_rate(lf_h, lg_h, lower, upper) >= 0.0
-    return np.asarray((value > boundary) | (on_boundary & viable))
 
 
 def numerical_gradient(h: Callable[[Array], float], x: ArrayLike, step: float = 1e-6) -> Array:

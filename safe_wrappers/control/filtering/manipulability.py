@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.control.numerics.finite import finite_arrays
+from safe_wrappers.control.numerics.finite import finite_array, finite_arrays
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -45,7 +45,7 @@ def manipulability(jacobian: ArrayLike) -> Array:
     Returns:
         In (m/s)^m per (rad/s)^m for m translations and hinges.
     """
-    j = _jacobian(jacobian)
+    j = checked_jacobian(jacobian)
     m, n = j.shape[-2:]
     if n < m:
         return np.zeros(j.shape[:-2])
@@ -83,7 +83,7 @@ class VelocityEllipsoid:
 
 def velocity_ellipsoid(jacobian: ArrayLike) -> VelocityEllipsoid:
     """Axes and lengths of the velocity ellipsoid of a Jacobian of shape (..., m, n), by SVD."""
-    j = _jacobian(jacobian)
+    j = checked_jacobian(jacobian)
     m, n = j.shape[-2:]
     axes, lengths, _ = np.linalg.svd(j, full_matrices=True)
     if n < m:
@@ -100,7 +100,7 @@ def manipulability_gradient(jacobian: ArrayLike, derivative: ArrayLike) -> Array
         jacobian: Shape (..., m, n), n >= m.
         derivative: dJ/dq_k, shape (..., k, m, n), as from `chain_derivative`.
     """
-    j, d = _jacobian(jacobian), _finite("derivative", derivative)
+    j, d = checked_jacobian(jacobian), _finite("derivative", derivative)
     m, n = j.shape[-2:]
     if d.ndim < 3 or d.shape[-2:] != (m, n):
         raise ConfigurationError(f"derivative has the shape (..., k, {m}, {n}), got {d.shape}")
@@ -130,28 +130,12 @@ def chain_derivative(linear: ArrayLike, angular: ArrayLike) -> Array:
         raise ConfigurationError(f"linear and angular have the shape (..., 3, n), got {v.shape}")
     v, w = np.swapaxes(v, -1, -2), np.swapaxes(w, -1, -2)  # (..., n, 3)
     n = v.shape[-2]
-    carried = _cross(w[..., :, None, :], v[..., None, :, :])  # w_k x v_j
-    turned = _cross(w[..., :, None, :], w[..., None, :, :])  # w_k x w_j
+    carried = cross(w[..., :, None, :], v[..., None, :, :])  # w_k x v_j
+    turned = cross(w[..., :, None, :], w[..., None, :, :])  # w_k x w_j
     before = np.tri(n, dtype=bool).T[..., None]  # joint k not after joint j
     moves = np.where(before, carried, np.swapaxes(carried, -2, -3))  # else w_j x v_k
     turns = np.where(before, turned, 0.0)
     return np.asarray(np.swapaxes(np.concatenate([moves, turns], axis=-1), -1, -2))
-
-
-def joint_rates(jacobian: ArrayLike, twist: ArrayLike) -> Array:
-    """Joint rates of the least norm whose twist comes closest to the wanted one, shape (..., n).
-
-    The ideal inverse model. Near rank loss the rates grow without bound; past the rounding (a singular value below
-    max(m, n) times the machine's precision times the largest) a direction counts as lost and is not asked for.
-
-    Args:
-        jacobian: Shape (..., m, n).
-        twist: Shape (..., m), per second.
-    """
-    j, wanted = _jacobian(jacobian), _finite("twist", twist)
-    if wanted.ndim < 1 or wanted.shape[-1] != j.shape[-2]:
-        raise ConfigurationError(f"twist has the shape (..., {j.shape[-2]}), got {wanted.shape}")
-    return np.asarray(np.einsum("...nm,...m->...n", _inverse(j), wanted))
 
 
 def worst_joint_rates(jacobian: ArrayLike) -> Array:
@@ -160,55 +144,9 @@ def worst_joint_rates(jacobian: ArrayLike) -> Array:
     The norm of the joint's row of the pseudo-inverse. None of them exceeds `1 / smallest singular value`, which is
     the largest norm of all rates together.
     """
-    j = _jacobian(jacobian)
+    j = checked_jacobian(jacobian)
     lost = np.isinf(velocity_ellipsoid(j).condition)
-    return np.asarray(np.where(lost[..., None], np.inf, np.linalg.norm(_inverse(j), axis=-1)))
-
-
-def reframed(jacobian: ArrayLike, rotation: ArrayLike, offset: ArrayLike) -> Array:
-    """A six-row Jacobian in another frame, shape (..., 6, n).
-
-    Twists are (velocity of a point, angular velocity), as MuJoCo has them: of the point itself, in the world's axes.
-    From there, with R the end-effector's axes and p its place in the world,
-
-    * the **body** twist is `reframed(J, R, 0)`: the same point, in its own axes;
-    * the **spatial** twist is `reframed(J, eye(3), -p)`: of the point that passes through the world's origin.
-
-    Args:
-        jacobian: Shape (..., 6, n): three rows of a point's velocity, three of the angular velocity.
-        rotation: The new axes as columns, in the old ones, shape (..., 3, 3); refused if not orthonormal.
-        offset: New point of reference minus the old one, in the old axes, m, shape (..., 3).
-    """
-    j, r, p = _jacobian(jacobian), _finite("rotation", rotation), _finite("offset", offset)
-    if j.shape[-2] != 6:
-        raise ConfigurationError(f"a twist has six rows, got a Jacobian of shape {j.shape}")
-    if r.shape[-2:] != (3, 3) or np.abs(np.swapaxes(r, -1, -2) @ r - np.eye(3)).max(initial=0.0) > 1e-6:
-        raise ConfigurationError(f"rotation is orthonormal, of shape (..., 3, 3); got {rotation!r}")
-    if p.ndim < 1 or p.shape[-1] != 3:
-        raise ConfigurationError(f"offset has the shape (..., 3), got {p.shape}")
-    v, w = j[..., :3, :], j[..., 3:, :]
-    there = v + np.swapaxes(_cross(np.swapaxes(w, -1, -2), p[..., None, :]), -1, -2)
-    back = np.swapaxes(r, -1, -2)
-    return np.concatenate([back @ there, back @ w], axis=-2)
-
-
-def task_jacobian(
-    jacobian: ArrayLike, directions: str = "xyz", rotations: str = "", length: float | None = None
-) -> Array:
-    """The rows of a six-row Jacobian that a task is about, shape (..., m, n).
-
-    Args:
-        jacobian: Shape (..., 6, n), see `reframed`.
-        directions: Of translation: some of "xyz", in the Jacobian's own axes.
-        rotations: Likewise, about which axes.
-        length: By which a rotation counts as a translation, m: of the tool, say. Needed if there are both, which
-            have no unit in common.
-    """
-    j = _jacobian(jacobian)
-    if j.shape[-2] != 6:
-        raise ConfigurationError(f"a twist has six rows, got a Jacobian of shape {j.shape}")
-    rows, scale = task_rows(directions, rotations, length)
-    return np.asarray(j[..., rows, :] * scale[:, None])
+    return np.asarray(np.where(lost[..., None], np.inf, np.linalg.norm(pseudo_inverse(j), axis=-1)))
 
 
 def task_rows(directions: str, rotations: str, length: float | None) -> tuple[NDArray[np.int64], Array]:
@@ -283,7 +221,7 @@ def validated_threshold(jacobians: ArrayLike, task_speed: float, rate_limit: Arr
     Raises:
         ConfigurationError: There is none: the configuration of the largest w needs more than the limit.
     """
-    j = _jacobian(jacobians)
+    j = checked_jacobian(jacobians)
     if j.ndim != 3 or not len(j):
         raise ConfigurationError(f"jacobians has the shape (samples, m, n), samples > 0; got {j.shape}")
     speed, limit = float(_finite("task_speed", task_speed)), _finite("rate_limit", rate_limit)
@@ -306,16 +244,21 @@ def validated_threshold(jacobians: ArrayLike, task_speed: float, rate_limit: Arr
     return ValidatedThreshold(threshold, len(j), above, int(exceeding.sum()))
 
 
-def _inverse(jacobian: Array) -> Array:
+def pseudo_inverse(jacobian: Array) -> Array:
     """Pseudo-inverse, shape (..., n, m)."""
     return np.asarray(np.linalg.pinv(jacobian, rcond=max(jacobian.shape[-2:]) * _EPSILON))
 
 
 def _finite(name: str, value: ArrayLike) -> Array:
-    return finite_arrays(**{name: value})[0]
+    return finite_array(name, value)
 
 
-def _jacobian(value: ArrayLike) -> Array:
+def checked_jacobian(value: ArrayLike) -> Array:
+    """A finite Jacobian as float64, shape (..., m, n).
+
+    Raises:
+        ConfigurationError: For another shape, or numbers that are not finite.
+    """
     j = _finite("jacobian", value)
     if j.ndim < 2 or 0 in j.shape[-2:]:
         raise ConfigurationError(f"a Jacobian has the shape (..., directions, joints), got {j.shape}")
@@ -325,6 +268,6 @@ def _jacobian(value: ArrayLike) -> Array:
 _NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
-def _cross(a: Array, b: Array) -> Array:
+def cross(a: Array, b: Array) -> Array:
     """Cross product of vectors along the last axis; np.cross is several times slower for few."""
     return a[..., _NEXT] * b[..., _AFTER] - a[..., _AFTER] * b[..., _NEXT]

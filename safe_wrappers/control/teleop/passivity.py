@@ -49,18 +49,6 @@ class Waves(NamedTuple):
     w: Array
 
 
-class Port(NamedTuple):
-    """A port's two quantities.
-
-    Attributes:
-        effort: F, N (or N m), shape (..., m).
-        flow: v, m/s (or rad/s), shape (..., m).
-    """
-
-    effort: Array
-    flow: Array
-
-
 class EffortAndWave(NamedTuple):
     """What a side that knows its flow works out.
 
@@ -71,29 +59,6 @@ class EffortAndWave(NamedTuple):
 
     effort: Array
     outgoing: Array
-
-
-class FlowAndWave(NamedTuple):
-    """What a side that knows its effort works out.
-
-    Attributes:
-        flow: v, m/s, shape (..., m).
-        outgoing: The wave to be sent, sqrt(W), shape (..., m).
-    """
-
-    flow: Array
-    outgoing: Array
-
-
-def port_power(effort: ArrayLike, flow: ArrayLike) -> Array:
-    """`F.v`, the power into the component, shape (...), W.
-
-    Args:
-        effort: N (or N m), shape (..., m), or a number.
-        flow: m/s (or rad/s), of the same shape.
-    """
-    f, v = same_shape(effort=effort, flow=flow)
-    return np.asarray(f * v if f.ndim == 0 else (f * v).sum(axis=-1))
 
 
 def to_waves(effort: ArrayLike, flow: ArrayLike, impedance: float) -> Waves:
@@ -113,19 +78,6 @@ def to_waves(effort: ArrayLike, flow: ArrayLike, impedance: float) -> Waves:
     return Waves(np.asarray((f + b * v) / root), np.asarray((f - b * v) / root))
 
 
-def from_waves(u: ArrayLike, w: ArrayLike, impedance: float) -> Port:
-    """Its inverse, `F = sqrt(b / 2) (u + w)` and `v = (u - w) / sqrt(2 b)`.
-
-    Args:
-        u: Wave into the component, sqrt(W), shape (..., m), or a number.
-        w: Wave out of it, of the same shape.
-        impedance: b > 0, N s/m.
-    """
-    into, out = same_shape(u=u, w=w)
-    b = positive("impedance", impedance)
-    return Port(np.asarray(math.sqrt(b / 2.0) * (into + out)), np.asarray((into - out) / math.sqrt(2.0 * b)))
-
-
 def effort_and_outgoing(flow: ArrayLike, incoming: ArrayLike, impedance: float) -> EffortAndWave:
     """The operator's side: it knows its flow and the wave w that came back, and feels F while it sends u.
 
@@ -140,35 +92,6 @@ def effort_and_outgoing(flow: ArrayLike, incoming: ArrayLike, impedance: float) 
     b = positive("impedance", impedance)
     root = math.sqrt(2.0 * b)
     return EffortAndWave(np.asarray(b * v + root * w), np.asarray(root * v + w))
-
-
-def flow_and_outgoing(effort: ArrayLike, incoming: ArrayLike, impedance: float) -> FlowAndWave:
-    """The remote side: it knows its effort and the wave u that arrived, and moves with v while it sends w back.
-
-    `v = (sqrt(2 b) u - F) / b` and `w = sqrt(2 / b) F - u`.
-
-    Args:
-        effort: F, with which the channel pushes what is behind it, N, shape (..., m), or a number.
-        incoming: u, sqrt(W), of the same shape.
-        impedance: b > 0, N s/m.
-    """
-    f, u = same_shape(effort=effort, incoming=incoming)
-    b = positive("impedance", impedance)
-    return FlowAndWave(
-        np.asarray((math.sqrt(2.0 * b) * u - f) / b), np.asarray(math.sqrt(2.0) / math.sqrt(b) * f - u)
-    )
-
-
-def wave_power(u: ArrayLike, w: ArrayLike) -> Array:
-    """`|u|^2 / 2 - |w|^2 / 2`, the power into the component, shape (...), W.
-
-    Args:
-        u: Wave into it, sqrt(W), shape (..., m), or a number.
-        w: Wave out of it, of the same shape.
-    """
-    into, out = same_shape(u=u, w=w)
-    power = 0.5 * (into - out) * (into + out)
-    return np.asarray(power if power.ndim == 0 else power.sum(axis=-1))
 
 
 class EnergyLedger:

@@ -56,84 +56,6 @@ class Passivated(NamedTuple):
     debt_j: float
 
 
-class PassivityObserver:
-    """Sums the energy of a port. Several ports of one component are one whose efforts and flows are concatenated.
-
-    Args:
-        initial_storage_j: What the component may give away beyond what it took, at least 0 J.
-    """
-
-    def __init__(self, initial_storage_j: float = 0.0) -> None:
-        self._energy = RunningSum(energy_j("initial_storage_j", initial_storage_j))
-
-    def add(self, effort: ArrayLike, flow: ArrayLike, time_s: float) -> float:
-        """Account one interval.
-
-        Args:
-            effort: N, shape (m,), or a number; held over the interval, or its mean.
-            flow: m/s, of the same shape; the other way round.
-            time_s: Length of the interval, > 0.
-
-        Returns:
-            `observed_j` after it.
-        """
-        f, v = port_vectors(effort=effort, flow=flow)
-        self._energy.add(port_energy(f, v, positive("time_s", time_s)))
-        return self._energy.value
-
-    @property
-    def observed_j(self) -> float:
-        """Initial storage and all energy since, J: below 0 the component was active."""
-        return self._energy.value
-
-
-class PassivityController:
-    """Keeps one port's observed energy from turning negative, with the smallest damping that does.
-
-    Args:
-        causality: Which of the two is changed, see above.
-        initial_storage_j: See `PassivityObserver`.
-        limit: Largest size of what is added, N (m/s in admittance causality), > 0; None: none.
-
-    Raises:
-        ConfigurationError: For an unknown causality, negative storage, or a limit that is not positive.
-    """
-
-    def __init__(
-        self, causality: Causality = "impedance", initial_storage_j: float = 0.0, limit: float | None = None
-    ) -> None:
-        self._damper = _Damper(causality, limit)
-        self._settled = PassivityObserver(initial_storage_j)
-        self._last: _Interval | None = None
-
-    @property
-    def observed_j(self) -> float:
-        """Energy at the end of the last interval, if it went as sampled, J."""
-        if self._last is None:
-            return self._settled.observed_j
-        return self._settled.observed_j + self._last.energy_j + self._last.damped_j
-
-    def modify(
-        self, effort: ArrayLike, flow: ArrayLike, time_s: float, actual: ArrayLike | None = None
-    ) -> Passivated:
-        """The port's effort and flow for the coming interval.
-
-        Args:
-            effort: What the component would answer with (what it sees, in admittance causality), N, shape (m,).
-            flow: What it sees (would answer with), m/s, of the same shape.
-            time_s: Length of the interval over which they will be held, > 0.
-            actual: What the seen quantity truly was on average since the last call (a displacement over its time,
-                say), of the same shape; None: as sampled.
-        """
-        interval = self._damper.interval(effort, flow, time_s)
-        if self._last is not None:
-            last = self._last.settled(actual)
-            self._settled.add(last.answer + last.added, last.seen, last.time_s)
-        owed = -(self._settled.observed_j + interval.energy_j)
-        result, self._last = self._damper.dissipate(interval, owed)
-        return result
-
-
 class EnergyReference:
     """One end of a two-port channel that gives out no more energy than it has heard the other end took in.
 
@@ -156,11 +78,11 @@ class EnergyReference:
     def __init__(
         self, causality: Causality = "impedance", initial_storage_j: float = 0.0, limit: float | None = None
     ) -> None:
-        self._damper = _Damper(causality, limit)
+        self._damper = Damper(causality, limit)
         self._initial = energy_j("initial_storage_j", initial_storage_j)
         self._taken_in, self._given_out, self._dissipated = RunningSum(), RunningSum(), RunningSum()
         self._heard = 0.0
-        self._last: _Interval | None = None
+        self._last: Interval | None = None
 
     @property
     def message_j(self) -> float:
@@ -208,7 +130,7 @@ class EnergyReference:
         f, v = port_vectors(effort=effort, flow=flow)
         self._book(port_energy(f, v, positive("time_s", time_s)))
 
-    def _settle(self, last: "_Interval", actual: ArrayLike | None) -> None:
+    def _settle(self, last: "Interval", actual: ArrayLike | None) -> None:
         interval = last.settled(actual)
         through, damped = interval.energy_j, interval.damped_j
         self._dissipated.add(damped)
@@ -218,7 +140,7 @@ class EnergyReference:
         (self._taken_in if through_j > 0.0 else self._given_out).add(abs(through_j))
 
 
-class _Interval(NamedTuple):
+class Interval(NamedTuple):
     """A port as sampled at the start of an interval, and what is added to the quantity that the component answers."""
 
     answer: Array
@@ -236,7 +158,7 @@ class _Interval(NamedTuple):
         """Of what was added alone."""
         return port_energy(self.added, self.seen, self.time_s)
 
-    def settled(self, actual: ArrayLike | None) -> "_Interval":
+    def settled(self, actual: ArrayLike | None) -> "Interval":
         """The same with what was truly seen."""
         if actual is None:
             return self
@@ -246,7 +168,7 @@ class _Interval(NamedTuple):
         return self._replace(seen=given)
 
 
-class _Damper:
+class Damper:
     """The smallest damping that dissipates an energy, as far as that is possible."""
 
     def __init__(self, causality: Causality, limit: float | None) -> None:
@@ -257,17 +179,23 @@ class _Damper:
         self._answers_effort = causality == "impedance"
         self._limit = math.inf if limit is None else positive("limit", limit)
 
-    def interval(self, effort: ArrayLike, flow: ArrayLike, time_s: float) -> _Interval:
+    def interval(self, effort: ArrayLike, flow: ArrayLike, time_s: float) -> Interval:
+        """The port as sampled, without damping.
+
+        Raises:
+            ConfigurationError: For sizes that differ, energy that is not finite, or a time that is not positive.
+        """
         f, v = port_vectors(effort=effort, flow=flow)
         answer, seen = (f, v) if self._answers_effort else (v, f)
         time = positive("time_s", time_s)
         port_energy(f, v, time)  # finite, before anything is changed
-        return _Interval(answer.copy(), seen.copy(), np.zeros_like(answer), time)
+        return Interval(answer.copy(), seen.copy(), np.zeros_like(answer), time)
 
-    def dissipate(self, interval: _Interval, owed_j: float) -> tuple[Passivated, _Interval]:
-        size, reach = 0.0, math.hypot(*interval.seen) * interval.time_s
-        if owed_j > 0.0 and reach > 0.0:
-            size = min(owed_j / reach, self._limit)
+    def dissipate(self, interval: Interval, owed_j: float) -> tuple[Passivated, Interval]:
+        """Damp so that `owed_j` is dissipated, or as much as the limit allows."""
+        size, travel = 0.0, math.hypot(*interval.seen) * interval.time_s
+        if owed_j > 0.0 and travel > 0.0:
+            size = min(owed_j / travel, self._limit)
         if not 0.0 < size < math.inf:
             size = 0.0
         else:
@@ -275,5 +203,5 @@ class _Damper:
             interval = interval._replace(added=size * direction)
         changed = interval.answer + interval.added if size else interval.answer
         effort, flow = (changed, interval.seen) if self._answers_effort else (interval.seen, changed)
-        debt = max(0.0, owed_j - size * reach)
+        debt = max(0.0, owed_j - size * travel)
         return Passivated(effort.copy(), flow.copy(), size, debt), interval

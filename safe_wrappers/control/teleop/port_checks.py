@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.control.numerics.finite import finite_arrays
+from safe_wrappers.control.numerics.finite import finite_array
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -17,7 +17,7 @@ def same_shape(**values: ArrayLike) -> tuple[Array, Array]:
     Raises:
         ConfigurationError: What is no number, not finite, or of two shapes.
     """
-    first, second = (finite_arrays(**{name: value})[0] for name, value in values.items())
+    first, second = (finite_array(name, value) for name, value in values.items())
     if first.shape != second.shape:
         a, b = values
         raise ConfigurationError(f"expected {a} and {b} of one shape, got {first.shape} and {second.shape}")

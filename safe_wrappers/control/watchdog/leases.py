@@ -69,23 +69,6 @@ class LeaseDelays:
         return self.detect_s + self.hold_s + self.age_s + self.act_s
 
 
-def stopping_distance(speed: ArrayLike, braking: ArrayLike) -> Array:
-    """`v^2 / (2 a_brake)`, 0 for a machine that stands or recedes.
-
-    Args:
-        speed: Approach speed v in m/s (or rad/s), shape (...).
-        braking: Verified deceleration a_brake in m/s^2, shape (...).
-
-    Returns:
-        Distance in m, shape (...); inf where the braking is not positive or an input is not finite.
-    """
-    v, b = np.asarray(speed, dtype=np.float64), np.asarray(braking, dtype=np.float64)
-    known = np.isfinite(v) & np.isfinite(b) & (b > 0.0)
-    with np.errstate(over="ignore"):
-        way = np.maximum(np.where(known, v, 0.0), 0.0) ** 2 / (2.0 * np.where(known, b, 1.0))
-    return np.asarray(np.where(known, way, np.inf))
-
-
 def longest_lease(
     clearance: ArrayLike,
     speed: ArrayLike,

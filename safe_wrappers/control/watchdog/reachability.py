@@ -27,8 +27,6 @@ State = tuple[ArrayLike, ArrayLike, ArrayLike]
 
 _ROUNDING = 32.0 * float(np.finfo(np.float64).eps)
 """Relative; more than the roundings below can add up to, and nothing that a machine would notice."""
-_HALVINGS = 60
-"""Bisections until an interval is as small as rounding."""
 
 
 @dataclass(frozen=True)
@@ -50,58 +48,13 @@ class MotionLimits:
     _arrays: tuple[Array, Array, Array] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        checked = _limits(self.max_acceleration, self.max_speed, self.max_jerk)
+        checked = checked_limits(self.max_acceleration, self.max_speed, self.max_jerk)
         object.__setattr__(self, "_arrays", checked)
 
     @property
     def arrays(self) -> tuple[Array, Array, Array]:
         """Acceleration, speed, jerk."""
         return self._arrays
-
-
-def transit_time(distance: ArrayLike, max_acceleration: ArrayLike, max_speed: ArrayLike = np.inf) -> Array:
-    """The shortest time of a move from rest to rest: triangular up to `d = v_max^2 / a_max`, then trapezoidal.
-
-    A lower bound for a machine that has other limits besides.
-
-    Args:
-        distance: m, of either sign, shape (...).
-        max_acceleration: a_max for speeding up and for braking, m/s^2, shape (...).
-        max_speed: v_max, m/s, shape (...).
-
-    Returns:
-        Time in s, shape (...); inf for a distance that is not finite.
-
-    Raises:
-        ConfigurationError: For a limit that is not positive, or an acceleration that is not finite.
-    """
-    a, v, _ = _limits(max_acceleration, max_speed, np.inf)
-    d = np.abs(np.asarray(distance, dtype=np.float64))
-    d = np.where(np.isfinite(d), d, np.inf)
-    with np.errstate(invalid="ignore"):
-        time = np.where(d <= v * (v / a), 2.0 * np.sqrt(d / a), d / v + v / a)
-    return np.asarray(np.where(np.isinf(d), np.inf, time))
-
-
-def reach(duration: ArrayLike, max_acceleration: ArrayLike, max_speed: ArrayLike = np.inf) -> Array:
-    """The longest move from rest to rest within a time, the inverse of `transit_time`.
-
-    Args:
-        duration: s, shape (...).
-        max_acceleration: a_max, m/s^2, shape (...).
-        max_speed: v_max, m/s, shape (...).
-
-    Returns:
-        Distance in m, shape (...); 0 for a duration that is negative or NaN.
-
-    Raises:
-        ConfigurationError: For a limit that is not positive, or an acceleration that is not finite.
-    """
-    a, v, _ = _limits(max_acceleration, max_speed, np.inf)
-    time = np.asarray(duration, dtype=np.float64)
-    time = np.maximum(np.where(np.isnan(time), 0.0, time), 0.0)
-    with np.errstate(invalid="ignore", over="ignore"):
-        return np.asarray(np.where(time <= 2.0 * (v / a), 0.25 * a * time**2, v * (time - v / a)))
 
 
 def furthest(
@@ -134,7 +87,7 @@ def furthest(
     Raises:
         ConfigurationError: For a limit that is not positive, or an acceleration limit that is not finite.
     """
-    a_max, v_max, jerk = _limits(max_acceleration, max_speed, max_jerk)
+    a_max, v_max, jerk = checked_limits(max_acceleration, max_speed, max_jerk)
     time, v, a = (np.asarray(x, dtype=np.float64) for x in (duration, velocity, acceleration))
     known = np.isfinite(time) & np.isfinite(v) & np.isfinite(a) & (time >= 0.0)
     time, v, a = (np.where(known, x, 0.0) for x in (time, v, a))
@@ -229,7 +182,7 @@ def _furthest_unmeasured(
     max_jerk: ArrayLike,
 ) -> tuple[Array, Array]:
     """`furthest` for whatever acceleration at the start: a start inside the limits is never carried over them."""
-    a_max, v_max, jerk = _limits(max_acceleration, max_speed, max_jerk)
+    a_max, v_max, jerk = checked_limits(max_acceleration, max_speed, max_jerk)
     v = np.asarray(velocity, dtype=np.float64)
     _, highest = furthest(duration, v, a_max, v_max, a_max, np.where(v > v_max, jerk, np.inf))
     lowest, _ = furthest(duration, v, -a_max, v_max, a_max, np.where(v < -v_max, jerk, np.inf))
@@ -273,70 +226,11 @@ def jerk_limited_time(start: State, end: State, limits: MotionLimits) -> Array:
     for i in np.ndindex(whole.shape):
         if whole[i]:
             states = ((p0[i], v0[i], a0[i]), (p1[i], v1[i], a1[i]))
-            times[i] = _profile(*states, (a_lim[i], v_lim[i], j_lim[i])).duration
+            times[i] = jerk_limited_profile(*states, (a_lim[i], v_lim[i], j_lim[i])).duration
     return times
 
 
-def jerk_limited_reach(
-    duration: ArrayLike, start_velocity: ArrayLike, start_acceleration: ArrayLike, limits: MotionLimits
-) -> tuple[Array, Array]:
-    """The lowest and the highest displacement at which an axis can be at rest within a time.
-
-    All rest positions between the two can be reached as well, as long as the start keeps the limits: the motions are
-    a convex set. Found by bisection over ruckig's times, on the inner side.
-
-    Args:
-        duration: s, shape (...).
-        start_velocity: m/s, shape (...).
-        start_acceleration: m/s^2, shape (...).
-        limits: Of every axis.
-
-    Returns:
-        Lowest and highest displacement in m, shape (...). Where the time does not suffice to stop at all, or an input
-        is not finite, the empty interval (inf, -inf).
-
-    Raises:
-        ConfigurationError: Where ruckig finds no profile.
-    """
-    given = [np.asarray(x, dtype=np.float64) for x in (duration, start_velocity, start_acceleration)]
-    time, v, a, a_max, v_max, jerk = np.broadcast_arrays(*given, *limits.arrays)
-    lowest, highest = np.full(time.shape, np.inf), np.full(time.shape, -np.inf)
-    for i in np.ndindex(time.shape):
-        if np.isfinite([time[i], v[i], a[i]]).all():
-            ends = _rest_ends(
-                float(time[i]), float(v[i]), float(a[i]), (float(a_max[i]), float(v_max[i]), float(jerk[i]))
-            )
-            if ends is not None:
-                lowest[i], highest[i] = ends
-    return lowest, highest
-
-
-def _rest_ends(
-    time: float, v: float, a: float, limits: tuple[float, float, float]
-) -> tuple[float, float] | None:
-    a_max, v_max, jerk = limits
-    axis = tuple(np.array([x]) for x in limits)
-    start = (np.zeros(1), np.array([v]), np.array([a]))
-    nothing = np.zeros(1)
-    stop = _profile(start, (nothing, nothing, nothing), axis, ruckig.ControlInterface.Velocity)
-    if stop.duration > time:
-        return None
-    at_stop = float(stop.at_time(stop.duration)[0][0])
-
-    def inside(position: float) -> bool:
-        return bool(_profile(start, (np.array([position]), nothing, nothing), axis).duration <= time)
-
-    ends = []
-    for beyond in furthest(time, v, a, v_max, a_max, jerk):
-        reached, missed = at_stop, float(beyond)
-        for _ in range(_HALVINGS):
-            middle = 0.5 * (reached + missed)
-            reached, missed = (middle, missed) if inside(middle) else (reached, middle)
-        ends.append(reached)
-    return ends[0], ends[1]
-
-
-def _profile(
+def jerk_limited_profile(
     start: tuple[Array, ...],
     end: tuple[Array, ...],
     limits: tuple[Array, ...],
@@ -365,9 +259,14 @@ def _told(values: tuple[Array, ...]) -> str:
     return str(tuple(np.round(v, 6).tolist() for v in values))
 
 
-def _limits(
+def checked_limits(
     max_acceleration: ArrayLike, max_speed: ArrayLike, max_jerk: ArrayLike
 ) -> tuple[Array, Array, Array]:
+    """Acceleration, speed and jerk limits as float64.
+
+    Raises:
+        ConfigurationError: For a limit that is not positive, or an acceleration that is not finite.
+    """
     named = {"max_acceleration": max_acceleration, "max_speed": max_speed, "max_jerk": max_jerk}
     checked = []
     for name, value in named.items():
