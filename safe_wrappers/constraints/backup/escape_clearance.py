@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
 from safe_wrappers.constraints.obstacles.obstacles import Discs, distances
 from safe_wrappers.constraints.obstacles.tracked_discs import TrackedDiscs
-from safe_wrappers.control.backup.evasive_maneuvers import Escapes, Manoeuvre
+from safe_wrappers.control.backup.evasive_maneuvers import EvasiveManeuvers, Maneuver
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import HalfSpaces, Promise, non_negative, positive
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
@@ -120,12 +120,12 @@ class EscapeClearance:
                 f"horizon_s = {self.horizon_s:g} s is too short for control steps of {plant.hold_s:g} s: a manoeuvre "
                 f"takes {longest} of them before it brakes"
             )
-        bank = [Manoeuvre(0.0, 0.0, 0)]
-        bank += [Manoeuvre(x, y, going) for x, y in _DIRECTIONS for going in range(1, longest + 1)]
-        self._escapes = Escapes(point.axes, bank, np.arange(0, holds + 1, _EVERY))
+        bank = [Maneuver(0.0, 0.0, 0)]
+        bank += [Maneuver(x, y, going) for x, y in _DIRECTIONS for going in range(1, longest + 1)]
+        self._escapes = EvasiveManeuvers(point.axes, bank, np.arange(0, holds + 1, _EVERY))
         starts = [max(1, round(seconds / plant.hold_s)) for seconds in _GOING_S]
-        self._usual = [0, *(bank.index(Manoeuvre(x, y, n)) for x, y in _DIRECTIONS for n in starts)]
-        self._firsts_of = [0, *(bank.index(Manoeuvre(x, y, 1)) for x, y in _DIRECTIONS)]
+        self._usual = [0, *(bank.index(Maneuver(x, y, n)) for x, y in _DIRECTIONS for n in starts)]
+        self._firsts_of = [0, *(bank.index(Maneuver(x, y, 1)) for x, y in _DIRECTIONS)]
         self._tried: list[tuple[Array, NDArray[np.intp]]] = []
 
     def reset(self) -> None:

@@ -123,7 +123,7 @@ class HeadingDriveClearance:
         speed = math.hypot(motion.vx, motion.vy) + abs(self.drive.com_offset * motion.yaw_rate)
         self._loss = self._push + speed * (self.drive.hold_s + self._turn * self.drive.coast_time)
         x, y, reserve = motion.x, motion.y, self.margin + self.state_error
-        kept = path.reach + self._swivel
+        kept = path.radius + self._swivel
         bounds: list[tuple[float, _Circle]] = []
         for obstacle in self.obstacles:
             if isinstance(obstacle, Discs):
