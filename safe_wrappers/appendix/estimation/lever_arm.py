@@ -2,7 +2,9 @@
 
 The sensor sits at P, the body turns about O, the lever arm is r = P - O; then, all in the same axes,
 
-    v_P = v_O + ω x r,        a_P = a_O + α x r + ω x (ω x r).
+    v_P = v_O + ω x r,        a_P = a_O + α x r + ω x (ω x r):
+
+the second term of the acceleration is tangential, the third centripetal.
 """
 
 from __future__ import annotations

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.control.filtering.manipulability import (
-    _finite,
     checked_jacobian,
-    cross,
     pseudo_inverse,
     task_rows,
 )
+from safe_wrappers.control.numerics.finite import finite_array
+from safe_wrappers.control.numerics.spatial import cross
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -29,7 +29,7 @@ def joint_rates(jacobian: ArrayLike, twist: ArrayLike) -> Array:
         jacobian: Shape (..., m, n).
         twist: Shape (..., m), per second.
     """
-    j, wanted = checked_jacobian(jacobian), _finite("twist", twist)
+    j, wanted = checked_jacobian(jacobian), finite_array("twist", twist)
     if wanted.ndim < 1 or wanted.shape[-1] != j.shape[-2]:
         raise ConfigurationError(f"twist has the shape (..., {j.shape[-2]}), got {wanted.shape}")
     return np.asarray(np.einsum("...nm,...m->...n", pseudo_inverse(j), wanted))
@@ -49,7 +49,7 @@ def reframed(jacobian: ArrayLike, rotation: ArrayLike, offset: ArrayLike) -> Arr
         rotation: The new axes as columns, in the old ones, shape (..., 3, 3); refused if not orthonormal.
         offset: New point of reference minus the old one, in the old axes, m, shape (..., 3).
     """
-    j, r, p = checked_jacobian(jacobian), _finite("rotation", rotation), _finite("offset", offset)
+    j, r, p = checked_jacobian(jacobian), finite_array("rotation", rotation), finite_array("offset", offset)
     if j.shape[-2] != 6:
         raise ConfigurationError(f"a twist has six rows, got a Jacobian of shape {j.shape}")
     if r.shape[-2:] != (3, 3) or np.abs(np.swapaxes(r, -1, -2) @ r - np.eye(3)).max(initial=0.0) > 1e-6:

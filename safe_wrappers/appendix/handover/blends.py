@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.appendix.handover.polynomials import bracketed_root
-from safe_wrappers.control.handover.smoothstep import ROUND_UP, _positive, smoothstep
+from safe_wrappers.control.handover.smoothstep import ROUND_UP, check_positive, smoothstep
 from safe_wrappers.control.numerics.finite import finite_arrays
 
 Array = NDArray[np.float64]
@@ -116,7 +116,7 @@ def moving_blend_interval(
     prior, prior_rate, new, new_rate, limit = finite_arrays(
         prior=prior, prior_rate=prior_rate, new=new, new_rate=new_rate, rate_limit=rate_limit
     )
-    _positive("rate_limit", limit)
+    check_positive("rate_limit", limit)
     step = new - prior
     up = np.where(step < 0.0, -1.0, 1.0)
     start, end = up * prior_rate, up * new_rate

@@ -6,7 +6,7 @@ Conventions as in `safe_wrappers.control.legged.centroidal`. Source: appendix "C
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.control.legged.centroidal import _inertias, _masses
+from safe_wrappers.control.legged.centroidal import checked_inertias, checked_masses
 from safe_wrappers.control.numerics.finite import finite_array, finite_arrays
 from safe_wrappers.errors import ConfigurationError
 
@@ -29,9 +29,9 @@ def centroidal_momentum_matrix(
         linear_jacobians: Of those points, shape (..., n, 3, nv).
         angular_jacobians: Of the bodies' angular velocities, shape (..., n, 3, nv).
     """
-    m, _, p, com = _masses(masses, positions)
+    m, _, p, com = checked_masses(masses, positions)
     jac, turn = finite_arrays(linear_jacobians=linear_jacobians, angular_jacobians=angular_jacobians)
-    inertia = _inertias(inertias)
+    inertia = checked_inertias(inertias)
     moved = m[..., None, None] * jac
     arm = (p - com[..., None, :])[..., None]
     orbital = np.cross(arm, moved, axis=-2).sum(axis=-3)
@@ -59,11 +59,11 @@ def centroidal_bias_rate(
         linear_drifts: `dJ/dt qvel` of those points, shape (..., n, 3), m/s^2.
         angular_drifts: `dJ/dt qvel` of the angular velocities, shape (..., n, 3), rad/s^2.
     """
-    m, _, p, com = _masses(masses, positions)
+    m, _, p, com = checked_masses(masses, positions)
     linear, turn, spin = finite_arrays(
         linear_drifts=linear_drifts, angular_drifts=angular_drifts, angular_velocities=angular_velocities
     )
-    inertia = _inertias(inertias)
+    inertia = checked_inertias(inertias)
     moved = m[..., None] * linear
     own = np.einsum("...nij,...nj->...ni", inertia, turn)
     gyroscopic = np.cross(spin, np.einsum("...nij,...nj->...ni", inertia, spin))

@@ -1,11 +1,11 @@
-"""Unilateral contact: gap, force, and by how much they miss complementarity.
+"""Unilateral contact: residuals of the complementarity of gap and force.
 
 Source: appendix "Rigid Body Contact Mechanics". An ideal contact only pushes, and only when closed:
 
     gap >= 0,    force >= 0,    gap * force = 0.
 
-Contacts that give way, MuJoCo's among them, miss this by design: their force comes from a penetration (or from a
-margin before the touch). The residuals say by how much; that they are small does not make a simulation true.
+Compliant contacts, MuJoCo's among them, violate this by design: their force comes from a penetration (or from a
+margin before the touch). Small residuals do not validate a simulation.
 """
 
 from typing import NamedTuple
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 class ComplementarityResiduals(NamedTuple):
-    """By how much contacts miss the three conditions, each shape (...), 0 where they hold.
+    """Violations of the three conditions, each shape (...), 0 where they hold.
 
     Attributes:
         penetration: Depth, m.

@@ -1,13 +1,12 @@
-"""Contact forces that ground can give: it pushes, and holds sideways only in proportion.
+"""Friction cones: which contact forces are feasible.
 
 Source: appendix "Physical contact feasibility constraints". A force f on the robot, at a contact with unit normal n
-(pointing at the robot) and friction coefficient mu, is one that ground can give where
+(pointing at the robot) and friction coefficient mu, is feasible where
 
     f_n = f . n >= 0    and    |f - f_n n| <= mu f_n.
 
-The cone is what Coulomb's law says of a point with one coefficient in every direction. The coefficient is measured
-with an error, changes with the ground, and drops once something slides: inside the cone of an optimistic number is
-not yet safe. Nor does it say that a foothold carries the load.
+This is Coulomb's law for a point with one coefficient in every direction. The coefficient is measured with an error,
+changes with the ground, and drops once something slides. Nor does the cone say that a foothold carries the load.
 """
 
 import math
@@ -21,7 +20,7 @@ from safe_wrappers.errors import ConfigurationError
 Array = NDArray[np.float64]
 
 _UNIT = 1e-6
-"""How far a normal's length may be off 1."""
+"""Tolerance of a normal's length."""
 
 
 def normal_and_tangential(forces: ArrayLike, normals: ArrayLike) -> tuple[Array, Array]:
@@ -40,7 +39,7 @@ def normal_and_tangential(forces: ArrayLike, normals: ArrayLike) -> tuple[Array,
 
 
 def cone_excess(forces: ArrayLike, normals: ArrayLike, friction: ArrayLike) -> Array:
-    """By how much a force misses the worse of the two conditions, shape (...), N: at most 0 inside the cone."""
+    """Largest violation of the two conditions, shape (...), N: at most 0 inside the cone."""
     along, rest = normal_and_tangential(forces, normals)
     return np.asarray(np.maximum(np.linalg.norm(rest, axis=-1) - checked_friction(friction) * along, -along))
 
@@ -72,9 +71,9 @@ def friction_pyramid(
 ) -> Array:
     """Half-spaces inside the friction cone: `rows @ f <= 0` is a pyramid whose edges lie on the cone.
 
-    An inner approximation, for any number of edges: whatever the rows allow, the cone allows. What it gives away:
-    halfway between two edges it allows `cos(pi / edges)` of the friction, and the share of the cone's cross-section
-    that it covers is `sin(2 pi / edges) / (2 pi / edges)`; four edges: 71 % and 64 %, eight: 92 % and 90 %.
+    An inner approximation for any number of edges. Halfway between two edges it allows `cos(pi / edges)` of the
+    friction; it covers the share `sin(2 pi / edges) / (2 pi / edges)` of the cone's cross-section. Four edges: 71 %
+    and 64 %, eight: 92 % and 90 %.
 
     Args:
         normals: Unit normals, pointing at the robot, shape (..., 3).

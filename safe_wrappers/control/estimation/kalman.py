@@ -1,13 +1,13 @@
-"""The sampled Kalman filter for many tracks at once, and the test of whether its covariance tells the truth.
+"""The sampled Kalman filter for many tracks at once.
 
-The filter is the fast path, run at every step of an env: it checks nothing. Check the matrices once, beforehand,
-with `safe_wrappers.control.estimation.covariance.checked_covariance` and `checked_noise`; take `transition` and
-`noise` from its `discretise`, so that steps of any length agree with the model in continuous time.
+It runs at every step of an env and checks nothing. Check the matrices once, beforehand, with
+`safe_wrappers.control.estimation.covariance.checked_covariance` and `checked_noise`; take `transition` and `noise`
+from its `discretise`, so that steps of any length agree with the model in continuous time.
 
 The update has Joseph's form: symmetric and positive semidefinite for any gain, rounding included.
 
 Source: Kalman (1960); Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001),
-sections 5.2 and 5.4, for the consistency test.
+section 5.2. The consistency test: `safe_wrappers.appendix.estimation.consistency`.
 """
 
 from typing import NamedTuple
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 class Updated(NamedTuple):
-    """What a measurement leaves.
+    """State of the filter after a measurement.
 
     Attributes:
         mean: Estimate after it, shape (..., n).
@@ -58,7 +58,7 @@ def predict(
 
 
 def update(mean: Array, cov: Array, measured: Array, C: Array, R: Array) -> Updated:
-    """Take in one measurement `y = C x + v` per track.
+    """Update with one measurement `y = C x + v` per track.
 
     Args:
         mean: Estimate, shape (..., n).

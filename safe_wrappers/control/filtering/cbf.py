@@ -1,4 +1,4 @@
-"""Barrier conditions on a control: Lie derivatives, class-K decay, Nagumo's boundary test, relative degree.
+"""Barrier conditions on a control: Lie derivatives, class-K decay, relative degree.
 
 Source: appendix "Safety and Control Barrier Functions" (Lie derivatives and forward invariance; Nagumo's
 viability theorem). A barrier `h` is positive inside the safe set. For `x' = f(x) + g(x) u` the condition
@@ -26,7 +26,9 @@ def lie_derivatives(gradient: ArrayLike, f: ArrayLike, g: ArrayLike) -> tuple[Ar
         `Lf h` of shape (...) and `Lg h` of shape (..., m).
     """
     dh, drift, effect = (np.asarray(part, dtype=np.float64) for part in (gradient, f, g))
-    if dh.ndim == drift.ndim == 1 and effect.ndim == 2:  # one state: the filter's case, and half the time
+    if (
+        dh.ndim == drift.ndim == 1 and effect.ndim == 2
+    ):  # a single state, as in the filter: half the time of einsum
         return np.asarray(dh @ drift), np.asarray(dh @ effect)
     return np.einsum("...n,...n->...", dh, drift), np.einsum("...n,...nm->...m", dh, effect)
 
@@ -66,13 +68,13 @@ def numerical_gradient(h: Callable[[Array], float], x: ArrayLike, step: float = 
 
 
 def acts(gradient: Array, effect: Array, height: float, share: float) -> bool:
-    """Whether some control changes a function at first order by more than a share of what it could.
+    """Whether some control enters the derivative of a function, up to a relative tolerance.
 
     Args:
         gradient: Of the function, shape (n,).
         effect: Control matrix g, shape (n, m).
-        height: The function's value. A gradient below a hundredth of it may be the round-off of differences.
-        share: What counts as none.
+        height: The function's value. A gradient below a hundredth of it may be round-off of finite differences.
+        share: Relative tolerance.
     """
     size = max(float(np.abs(gradient).max(initial=0.0)), 1e-2 * abs(height))
     return bool((np.abs(gradient @ effect) > share * size * np.abs(effect).max(axis=0, initial=0.0)).any())

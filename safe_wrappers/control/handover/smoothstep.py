@@ -1,9 +1,8 @@
-"""Bumpless transfer: one command handed to another over a blend, and the shortest blend that a rate limit allows.
+"""Bumpless transfer: the smoothstep, and the shortest blend of two commands that a rate limit allows.
 
 Everything is element by element, with NumPy's broadcasting. The blended quantity u is any command; the limit
 bounds its time derivative, in units of u per second. Only where u is a commanded acceleration is that derivative
-the commanded jerk. It is a bound on the command: what the plant makes of it (its measured jerk, tracking error,
-clearance) is checked elsewhere.
+the commanded jerk. It bounds the command, not the plant's response.
 
 Source: appendix "Bumpless transfer and smoothstep blending".
 """
@@ -23,7 +22,12 @@ ROUND_UP = 1.0 + 1e-12
 """Blend times are lengthened by this factor, so that rounding never makes them too short."""
 
 
-def _positive(name: str, values: Array) -> None:
+def check_positive(name: str, values: Array) -> None:
+    """Refuse values that are not all > 0.
+
+    Raises:
+        ConfigurationError: It names the argument.
+    """
     if not (values > 0.0).all():
         raise ConfigurationError(f"{name} must be > 0, got {values}")
 
@@ -54,14 +58,14 @@ def smoothstep(s: ArrayLike, derivative: int = 0) -> Array:
 
 
 def shortest_latched_blend(step: ArrayLike, rate_limit: ArrayLike) -> Array:
-    """Shortest blend time in s between two commands that stand still: 1.875 |step| / rate_limit.
+    """Shortest blend time in s between two constant commands: 1.875 |step| / rate_limit.
 
-    Holds for fixed, latched endpoints only; for moving ones see `shortest_moving_blend`. Rounded up in the twelfth
-    digit; 0 without a step.
+    Holds for fixed endpoints only; for moving ones see
+    `safe_wrappers.appendix.handover.blends.shortest_moving_blend`. Rounded up in the twelfth digit; 0 without a step.
 
     Raises:
         ConfigurationError: For a limit that is not positive, or input that is not finite.
     """
     step, limit = finite_arrays(step=step, rate_limit=rate_limit)
-    _positive("rate_limit", limit)
+    check_positive("rate_limit", limit)
     return np.asarray(SMOOTHSTEP_PEAK_RATE * np.abs(step) / limit * ROUND_UP)

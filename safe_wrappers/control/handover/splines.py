@@ -1,12 +1,13 @@
-"""Quintic and cubic Hermite segments: closed forms, and what happens between their ends.
+"""Quintic and cubic Hermite segments in closed form.
 
 Boundary values have any shape (...) that broadcasts; the duration is in s, > 0, and broadcasts with them. Times
 of evaluation are common to the whole batch, and their axes come last: times of shape (k,) give (..., k), one time
 gives (...). Positions in any unit q, velocities in q/s, and so on.
 
-A quintic matches position, velocity and acceleration at both ends, so a join of two has no acceleration step. The
-ends say nothing of the interior: check `interior_extrema` and `peak_torque` against the machine's limits. A cubic
-Hermite spline is once continuously differentiable only: the torque steps at every knot (`knot_torque_step`).
+A quintic matches position, velocity and acceleration at both ends, so joined segments have no acceleration step.
+Between the ends, check `interior_extrema` and `peak_torque` against the machine's limits. A cubic Hermite spline is
+continuously differentiable only once: the torque steps at every knot (`knot_torque_step`). These three functions are
+in `safe_wrappers.appendix.handover.splines`.
 
 Source: appendix "Smooth Trajectories and Bumpless Transfer".
 """
@@ -76,7 +77,7 @@ def quintic_coefficients(
 def evaluate(coefficients: ArrayLike, t: ArrayLike, derivative: int = 0) -> Array:
     """A segment, or its derivative of any order, at times t in s from its start.
 
-    The polynomial goes on outside [0, T]; nothing is clamped.
+    Times outside [0, T] are not clamped.
 
     Args:
         coefficients: Shape (..., n), lowest power first.
@@ -121,7 +122,7 @@ def hermite(
     t: ArrayLike,
     derivative: int = 0,
 ) -> Array:
-    """The cubic through two positions with two velocities, at times t in s from its start; nothing is clamped.
+    """The cubic through two positions with two velocities, at times t in s from its start, not clamped.
 
     Args:
         q0: Position at t = 0, shape (...).
@@ -172,17 +173,17 @@ def checked_samples(
 def hermite_series(
     times: ArrayLike, positions: ArrayLike, velocities: ArrayLike, at: ArrayLike, derivative: int = 0
 ) -> Array:
-    """A stream of samples at the times of another one, for example 30 Hz frames at the ticks of a 1 kHz loop.
+    """Samples interpolated at other times, for example 30 Hz frames at the ticks of a 1 kHz loop.
 
     Every pair of neighbouring samples is joined by a cubic, so position and velocity are continuous; acceleration
-    is not, and at a knot it is that of the segment after it (of the last one at the end). A value between two
-    samples needs the later one: a loop that runs in real time is late by up to one sample interval.
+    is not, and at a knot it is that of the following segment (of the last one at the end). A value between two
+    samples needs the later one, so a real-time loop is late by up to one sample interval.
 
     Args:
         times: Sample times in s, strictly rising, evenly spaced or not, shape (k,).
         positions: Shape (..., k).
         velocities: Shape (..., k).
-        at: Times asked for, shape () or (m,), within the samples: nothing is extrapolated.
+        at: Times, shape () or (m,), within the samples.
         derivative: By time: 0 for position, 1 velocity, 2 acceleration, 3 jerk.
 
     Returns:
@@ -190,7 +191,7 @@ def hermite_series(
 
     Raises:
         ConfigurationError: For times that do not rise, shapes that do not fit, values that are not finite, or
-            times asked for before the first or after the last sample.
+            times before the first or after the last sample.
     """
     knots, q, v = checked_samples(times, positions, velocities)
     asked = np.asarray(at, dtype=np.float64)

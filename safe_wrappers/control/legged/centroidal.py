@@ -1,4 +1,4 @@
-"""Centroidal momentum: what all bodies of a robot do together, seen from their centre of mass.
+"""Centroidal momentum: linear and angular momentum of a robot about its centre of mass.
 
 Source: appendix "Centroidal momentum dynamics". Only forces from outside change it:
 
@@ -8,9 +8,8 @@ Conventions, of everything here: vectors are in the world's axes; forces and mom
 `h_lin = m c'`; `h_ang` is about the (moving) centre of mass, so that gravity does not appear in its rate; where both
 are stacked, the linear part comes first (Orin and Goswami put the angular part first).
 
-What it is not: the momentum says which wrench from outside a motion needs. That contacts can give it
-(`friction_cone`) and motors can make them give it (`whole_body`) are questions of their own; and a model of the
-linear part alone mispredicts the moments that the contacts must give.
+The momentum's rate is the external wrench that a motion needs. Whether contacts (`friction_cone`) and motors
+(`whole_body`) can produce it has to be checked separately; a model of the linear part alone mispredicts the moments.
 """
 
 from typing import NamedTuple
@@ -25,7 +24,7 @@ Array = NDArray[np.float64]
 
 
 class CentroidalMomentum(NamedTuple):
-    """Of several bodies together.
+    """Momentum of several bodies.
 
     Attributes:
         mass: Shape (...), kg.
@@ -58,9 +57,9 @@ def centroidal_momentum(
         inertias: About them, in the world's axes, shape (..., n, 3, 3), kg m^2.
         angular_velocities: Shape (..., n, 3), rad/s.
     """
-    m, total, p, com = _masses(masses, positions)
+    m, total, p, com = checked_masses(masses, positions)
     v, spin = finite_arrays(velocities=velocities, angular_velocities=angular_velocities)
-    inertia = _inertias(inertias)
+    inertia = checked_inertias(inertias)
     linear = np.einsum("...n,...ni->...i", m, v)
     # Relative to the centre of mass; the bodies' velocities need no such shift, since sum m (p - c) = 0.
     orbital = np.cross(p - com[..., None, :], m[..., None] * v).sum(axis=-2)
@@ -68,8 +67,12 @@ def centroidal_momentum(
     return CentroidalMomentum(total, com, linear / total[..., None], linear, angular)
 
 
-def _masses(masses: ArrayLike, positions: ArrayLike) -> tuple[Array, Array, Array, Array]:
-    """Masses (..., n), their sum (...), positions (..., n, 3), centre of mass (..., 3)."""
+def checked_masses(masses: ArrayLike, positions: ArrayLike) -> tuple[Array, Array, Array, Array]:
+    """Masses (..., n), their sum (...), positions (..., n, 3), centre of mass (..., 3).
+
+    Raises:
+        ConfigurationError: Other shapes, negative or only zero masses, numbers that are not finite.
+    """
     m, p = finite_array("masses", masses), finite_array("positions", positions)
     if m.ndim == 0 or p.ndim < 2 or p.shape[-1] != 3 or p.shape[-2] != m.shape[-1]:
         raise ConfigurationError(
@@ -81,7 +84,12 @@ def _masses(masses: ArrayLike, positions: ArrayLike) -> tuple[Array, Array, Arra
     return m, total, p, np.einsum("...n,...ni->...i", m, p) / total[..., None]
 
 
-def _inertias(inertias: ArrayLike) -> Array:
+def checked_inertias(inertias: ArrayLike) -> Array:
+    """Inertias as float64, shape (..., n, 3, 3).
+
+    Raises:
+        ConfigurationError: Another shape, or numbers that are not finite.
+    """
     inertia = finite_array("inertias", inertias)
     if inertia.ndim < 3 or inertia.shape[-2:] != (3, 3):
         raise ConfigurationError(f"inertias must have shape (..., n, 3, 3), got {inertia.shape}")

@@ -1,12 +1,11 @@
-"""Zero moment point and support polygon: whether coplanar contacts can hold a robot up without tipping.
+"""Support plane and support polygon of contacts, and the inset as rows on contact forces.
 
 Source: appendix "Physical contact feasibility constraints", third condition. The zero moment point is where, on the
 plane of support, the contact forces have no tangential moment. Forces that push at points of the plane keep it
 inside the convex hull of these points: the support polygon. An inset keeps a distance from its edges.
 
-It holds for the model it names: contacts in one plane, that do not slip. Contacts at several heights need the
-general question whether the wrench is feasible (`whole_body`); here they are flagged, `coplanar` False, and get no
-number. And crossing an edge predicts no particular fall: a robot may step, or tip about an edge and come back.
+It assumes contacts in one plane that do not slip; contacts at several heights need the feasibility of the wrench
+(`whole_body`). Crossing an edge does not imply a fall: a robot may step, or tip about an edge and come back.
 """
 
 import math
@@ -22,9 +21,9 @@ from safe_wrappers.errors import ConfigurationError
 Array = NDArray[np.float64]
 
 COPLANAR_M = 0.01
-"""m; contacts farther than this from one plane are not called coplanar unless the caller says otherwise."""
+"""m; default of the largest distance of coplanar contacts from their plane."""
 COPLANAR_RAD = 0.05
-"""rad; the same for the directions of their normals."""
+"""rad; default of the largest angle between their normals and the mean."""
 _ROUNDING = 1e-12
 
 
@@ -59,7 +58,7 @@ def common_plane(
     tolerance_m: float = COPLANAR_M,
     tolerance_rad: float = COPLANAR_RAD,
 ) -> Plane | None:
-    """The plane that contacts share, or None: they are at several heights, or face different ways.
+    """The plane of coplanar contacts, or None where they are at several heights or face different ways.
 
     Args:
         points: Shape (k, 3), m.
@@ -106,7 +105,7 @@ def support_polygon(points: ArrayLike) -> Array:
 
     chain = list(ordered)
     corners = half(chain) + half(chain[::-1])
-    # What stands out by no more than rounding is a point on an edge.
+    # A corner that protrudes by no more than rounding is a point on an edge.
     least = _ROUNDING * float(np.ptp(ordered, axis=0).max())
     i = 0
     while i < len(corners) > 2:

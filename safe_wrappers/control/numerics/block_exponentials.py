@@ -1,7 +1,7 @@
-"""Covariance over a stretch of time, exactly: the Lyapunov and the Riccati equation by block matrix exponentials.
+"""Exact covariance over a time: block matrix exponentials and doubling.
 
-The exponential is taken over a stretch so short that it is well conditioned; doubling leads from there to the full
-time. Nothing is checked here: `safe_wrappers.control.estimation.covariance` does that. What overflows is not finite.
+The exponential is taken over a time so short that it is well conditioned; doubling extends it to the full time.
+Arguments are checked by `safe_wrappers.control.estimation.covariance`. Results that overflow are not finite.
 
 Source: Van Loan, "Computing integrals involving the matrix exponential" (1978); Anderson and Moore, "Optimal
 Filtering" (1979), section 6.7, for doubling.
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _TERMS = 24
-"""Terms of the exponential's series: for matrices of norm 2 the first one left out is below 1e-17."""
+"""Terms of the exponential's series: for matrices of norm 2 the first neglected one is below 1e-17."""
 
 
 class Discrete(NamedTuple):
@@ -31,7 +31,7 @@ class Discrete(NamedTuple):
 
 
 def van_loan(a: Array, q: Array, times: Array) -> Discrete:
-    """`discretise` without its checks; what overflows is not finite."""
+    """`safe_wrappers.control.estimation.covariance.discretise` without its checks."""
     n = len(a)
     size = norm_or_one(q)
     doublings = doublings_for(norm_or_one(a), times)
@@ -51,7 +51,7 @@ def van_loan(a: Array, q: Array, times: Array) -> Discrete:
 
 
 def integral(a: Array, times: Array) -> Array:
-    """The integral of `exp(A s)` from 0 to each time, shape (..., n, n); what overflows is not finite."""
+    """The integral of `exp(A s)` from 0 to each time, shape (..., n, n)."""
     n = len(a)
     doublings = doublings_for(norm_or_one(a), times)
     base = (times / 2.0**doublings)[..., None, None]
@@ -68,14 +68,14 @@ def integral(a: Array, times: Array) -> Array:
 
 
 def norm_or_one(matrix: Array) -> float:
-    """Its Frobenius norm; 1 for a zero matrix, to divide by."""
+    """The Frobenius norm; 1 for a zero matrix."""
     return float(np.linalg.norm(matrix)) or 1.0
 
 
 def short_exponential(matrix: Array) -> Array:
     """The exponential of matrices of norm 2 at most, by its series.
 
-    `scipy.linalg.expm` waits for the threads of its BLAS even for a 4 x 4 matrix: milliseconds on a busy machine.
+    Faster than `scipy.linalg.expm`, which waits for BLAS threads even for a 4 x 4 matrix.
     """
     term = np.eye(matrix.shape[-1])
     total = np.broadcast_to(term, matrix.shape).copy()
@@ -86,5 +86,5 @@ def short_exponential(matrix: Array) -> Array:
 
 
 def doublings_for(rate: float, times: Array) -> NDArray[np.int64]:
-    """How often each time is halved until `rate time <= 1`, in which the exponential is well conditioned."""
+    """Number of halvings of each time until `rate time <= 1`, for which the exponential is well conditioned."""
     return np.maximum(np.ceil(np.log2(np.maximum(rate * times, 1.0))), 0.0).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Polynomials of low degree, many at a time: values, derivatives, and exact extrema over an interval.
+"""Polynomials of low degree, many at a time: values and derivatives.
 
 Coefficients lie on the last axis, lowest power first; every axis before it is a batch.
 """

@@ -1,13 +1,8 @@
-"""Frames in space: poses of sensors, and what a lever arm does to what they measure.
+"""Frames in space: points in a sensor's frame, and velocity at a lever arm.
 
 A pose is a rotation matrix (3, 3), whose columns are the frame's axes in the outer frame, and a position (3,), m, of
-its origin there. The sensor sits at P, the body turns about O, the lever arm is r = P - O; then, all in the same
-axes,
-
-    v_P = v_O + ω x r,        a_P = a_O + α x r + ω x (ω x r):
-
-the second term of the acceleration is tangential, the third centripetal. Whoever takes what is measured at P for what
-happens at O is wrong by those terms, which the inverses here take off again.
+its origin there. The sensor sits at P, the body turns about O, the lever arm is r = P - O; then v_P = v_O + ω x r,
+all in the same axes. Accelerations: `safe_wrappers.appendix.estimation.lever_arm`.
 """
 
 from __future__ import annotations
@@ -55,7 +50,7 @@ def to_sensor(points: Array, rotation: Array, position: Array) -> Array:
 
 
 def from_sensor(points: Array, rotation: Array, position: Array) -> Array:
-    """Points in a sensor's frame in the world, shape (..., 3), m: the inverse of `to_sensor`."""
+    """World points from a sensor's frame, shape (..., 3), m: the inverse of `to_sensor`."""
     return np.asarray(points @ rotation.T + position)
 
 

@@ -1,22 +1,21 @@
-"""Damping that appears when a port has given away more energy than it may: passivity in the time domain.
+"""Time-domain passivity control: damping as soon as a port has given out more energy than allowed.
 
-Hannaford and Ryu (2002), "Time-domain passivity control of haptic interfaces": an observer sums the energy at a
-port, and a controller adds just as much damping as brings the sum back to zero, at the very tick at which it would
-turn negative, and none otherwise. Ryu, Artigas and Preusche (2010), "A passive bilateral control scheme for a
-teleoperator with time-varying communication delay": over a network each side sends the energy that it has taken in,
-and gives out no more than what it has heard of; that holds for any delay, jitter, reordering and loss.
+Ryu, Artigas and Preusche (2010), "A passive bilateral control scheme for a teleoperator with time-varying
+communication delay": over a network each side sends the energy that it has taken in, and gives out no more than what
+the other side has reported; that holds for any delay, jitter, reordering and loss. The damping is that of Hannaford
+and Ryu (2002), "Time-domain passivity control of haptic interfaces"; their observer and controller of one port are in
+`safe_wrappers.appendix.teleop.passivity_controller`.
 
 Power is positive into the component (the virtual wall, the channel). In *impedance* causality the component answers
 a flow with an effort, so damping adds effort along the flow; in *admittance* causality it answers an effort with a
 flow, and damping adds flow along the effort.
 
-Nothing dissipates without flow (without effort), and a limit on the damping leaves some of the work undone. What is
-left is a debt: it is reported, carried over, and paid as soon as that is possible. Without a limit the damping at a
-small flow is a large effort for one tick; a real drive saturates, so declare where. Damping is computed for a flow
-that goes on as it was sampled. What it truly was is accounted one tick later (`actual`), so one interval's error is
-never summed up, and it is why energy can be a little below zero in between.
+Nothing is dissipated without flow (without effort), or beyond a limit on the damping. The rest is a debt: reported,
+carried over, and dissipated as soon as possible. Without a limit the damping at a small flow is a large effort for
+one tick; a real drive saturates, so declare its limit. Damping is computed for the sampled flow; the actual one is
+accounted one tick later (`actual`), so errors do not accumulate, but the energy may be slightly negative in between.
 
-That energy is kept says nothing about force or clearance.
+Passivity bounds neither force nor clearance.
 """
 
 import math
@@ -46,8 +45,8 @@ class Passivated(NamedTuple):
     Attributes:
         effort: N, shape (m,); in impedance causality the one to be applied.
         flow: m/s, shape (m,); in admittance causality the one to be applied.
-        correction: Size of what was added, N (m/s in admittance causality); 0: nothing was changed, bit for bit.
-        debt_j: What should have been dissipated and could not, J.
+        correction: Size of the added damping, N (m/s in admittance causality); 0: unchanged, bit for bit.
+        debt_j: Energy that should have been dissipated and could not, J.
     """
 
     effort: Array
@@ -57,18 +56,18 @@ class Passivated(NamedTuple):
 
 
 class EnergyReference:
-    """One end of a two-port channel that gives out no more energy than it has heard the other end took in.
+    """One end of a two-port channel that gives out no more energy than the other end reports as taken in.
 
-    Both ends: `receive` what has arrived, `modify`, and send `message_j` on. The sum of both ports' energies is then
-    never below minus the initial storages (and debts), whatever the network does to the messages: the number sent
-    only grows, and only the largest that was heard counts. Power is positive into the channel at *both* ends.
+    At every tick both ends `receive` what has arrived, `modify`, and send `message_j`. The sum of both ports'
+    energies is then never below minus the initial storages (and debts), for any network: the number sent never falls,
+    and only the largest received one counts. Power is positive into the channel at *both* ends.
 
-    Without any storage two such ends may never start: an end that moves something waits for energy, and the other
-    takes none in while it feels no force. The price of starting is what is declared here, once.
+    Without initial storage two such ends may never start: an end that moves something needs energy, and the other
+    takes none in while it feels no force.
 
     Args:
         causality: Which of the two this end changes, see above.
-        initial_storage_j: What this end may give out without having heard anything, at least 0 J.
+        initial_storage_j: Energy that this end may give out without any report, at least 0 J.
         limit: Largest size of what is added, N (m/s in admittance causality), > 0; None: none.
 
     Raises:
@@ -86,21 +85,21 @@ class EnergyReference:
 
     @property
     def message_j(self) -> float:
-        """What this end has taken in from outside, J, without what it dissipated itself. Never falls; send this."""
+        """Energy that this end has taken in from outside, J, without its own dissipation; to be sent. Never falls."""
         return self._taken_in.value
 
     @property
     def heard_j(self) -> float:
-        """The most that the other end is known to have taken in, J."""
+        """Largest energy that the other end has reported to have taken in, J."""
         return self._heard
 
     @property
     def budget_j(self) -> float:
-        """What this end may still give out, J; below 0 it is in debt."""
+        """Energy that this end may still give out, J; below 0 it is in debt."""
         return self._initial + self._heard + self._dissipated.value - self._given_out.value
 
     def receive(self, *messages_j: float) -> None:
-        """Take messages from the other end, late, doubled and out of order as they come.
+        """Take messages from the other end, in any order, duplicates included.
 
         Args:
             *messages_j: Values of its `message_j`.
@@ -120,11 +119,11 @@ class EnergyReference:
         return result
 
     def account(self, effort: ArrayLike, flow: ArrayLike, time_s: float) -> None:
-        """Account an interval in which nothing was damped: for who keeps to `budget_j` by other means than `modify`.
+        """Account an interval without damping, for callers that keep to `budget_j` by other means than `modify`.
 
         Args:
             effort: N, shape (m,), or a number; held over the interval, or its mean.
-            flow: m/s, of the same shape; the other way round.
+            flow: m/s, of the same shape; the mean where the effort is held, and held where it is the mean.
             time_s: Length of the interval, > 0.
         """
         f, v = port_vectors(effort=effort, flow=flow)
@@ -141,7 +140,7 @@ class EnergyReference:
 
 
 class Interval(NamedTuple):
-    """A port as sampled at the start of an interval, and what is added to the quantity that the component answers."""
+    """A port as sampled at the start of an interval, and the damping added to the component's answer."""
 
     answer: Array
     seen: Array
@@ -150,16 +149,16 @@ class Interval(NamedTuple):
 
     @property
     def energy_j(self) -> float:
-        """Without what was added."""
+        """Energy without damping, J."""
         return port_energy(self.answer, self.seen, self.time_s)
 
     @property
     def damped_j(self) -> float:
-        """Of what was added alone."""
+        """Energy of the damping alone, J."""
         return port_energy(self.added, self.seen, self.time_s)
 
     def settled(self, actual: ArrayLike | None) -> "Interval":
-        """The same with what was truly seen."""
+        """The interval with the actual value of the seen quantity."""
         if actual is None:
             return self
         given = port_vector("actual", actual)
@@ -169,7 +168,7 @@ class Interval(NamedTuple):
 
 
 class Damper:
-    """The smallest damping that dissipates an energy, as far as that is possible."""
+    """The smallest damping that dissipates an energy, within a limit."""
 
     def __init__(self, causality: Causality, limit: float | None) -> None:
         if causality not in get_args(Causality):
@@ -188,7 +187,7 @@ class Damper:
         f, v = port_vectors(effort=effort, flow=flow)
         answer, seen = (f, v) if self._answers_effort else (v, f)
         time = positive("time_s", time_s)
-        port_energy(f, v, time)  # finite, before anything is changed
+        port_energy(f, v, time)  # raises before anything is changed
         return Interval(answer.copy(), seen.copy(), np.zeros_like(answer), time)
 
     def dissipate(self, interval: Interval, owed_j: float) -> tuple[Passivated, Interval]:

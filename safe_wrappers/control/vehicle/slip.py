@@ -1,13 +1,12 @@
-"""Longitudinal slip of a driven wheel: the slip ratio's two forms, the window it leaves, the wheel's own equation.
+"""Longitudinal slip of a driven wheel: the slip ratio, and the wheel speeds that keep it within a limit.
 
 Speeds are signed along the wheel's heading: the wheel's circumferential speed `r w` (radius times angular rate)
 and the ground speed `v_x` of its centre. Slip has the sign of the force on the vehicle: positive when the wheel
-runs ahead of the ground. Reversing mirrors everything.
+is faster than the ground. Reversing mirrors everything.
 
-Source: appendix "Wheel slip ratio and friction boundaries". Its two forms are two measures, not one: they agree to
-first order for small slip, and exactly through `normalized_slip`. In the piecewise form the denominator is the
-slower of the two speeds, so it has no bound; in the normalised form it is the faster one, so 1 is a wheel that spins
-on the spot and -1 a locked one. Limits here are in the normalised form.
+Source: appendix "Wheel slip ratio and friction boundaries". Slip here is in the normalised form: the denominator is
+the faster of the two speeds, so 1 is a wheel that spins on the spot and -1 a locked one. The unbounded piecewise form
+is in `safe_wrappers.appendix.vehicle.slip`.
 """
 
 import math
@@ -27,17 +26,16 @@ def slip_ratio(wheel_speed: ArrayLike, ground_speed: ArrayLike, regularization: 
     Args:
         wheel_speed: r w, m/s, any shape.
         ground_speed: v_x, m/s, broadcast against it.
-        regularization: Speed below which slip is counted against it, m/s, > 0: at rest there is no ratio, and slip
-            fades out with the sliding speed.
+        regularization: Least denominator, m/s, > 0: near rest the slip is proportional to the sliding speed.
 
     Returns:
-        Slip, in [-1, 1] while wheel and ground move the same way; up to 2 in size when they oppose each other.
+        Slip, in [-1, 1] while wheel and ground move the same way; up to 2 in size in opposite directions.
 
     Raises:
         ConfigurationError: Numbers that are not finite, or a regularization that is not positive.
     """
     wheel, ground = finite_arrays(wheel_speed=wheel_speed, ground_speed=ground_speed)
-    _positive("regularization", regularization, "m/s")
+    check_positive("regularization", regularization, "m/s")
     return np.asarray(
         (wheel - ground) / np.maximum(np.maximum(np.abs(wheel), np.abs(ground)), regularization)
     )
@@ -52,13 +50,13 @@ def slip_window(ground_speed: ArrayLike, max_slip: ArrayLike, regularization: fl
         regularization: As in `slip_ratio`, m/s.
 
     Returns:
-        Smallest and largest r w, m/s: at them the slip is `-max_slip` and `max_slip`.
+        Smallest and largest r w, m/s, at which the slip is `-max_slip` and `max_slip`.
 
     Raises:
         ConfigurationError: A number out of its range.
     """
     ground, slip = finite_arrays(ground_speed=ground_speed, max_slip=max_slip)
-    _positive("regularization", regularization, "m/s")
+    check_positive("regularization", regularization, "m/s")
     if not ((slip > 0.0) & (slip < 1.0)).all():
         raise ConfigurationError(
             "max_slip is a normalised slip ratio in (0, 1), where 1 is a wheel that spins on the spot; got "
@@ -72,6 +70,11 @@ def _fastest(ground: Array, slip: Array, floor: float) -> Array:
     return np.asarray(np.where(ground > floor * (1.0 - slip), ground / (1.0 - slip), braking_or_slow))
 
 
-def _positive(name: str, value: float, unit: str) -> None:
+def check_positive(name: str, value: float, unit: str) -> None:
+    """Refuse a number that is not finite and > 0.
+
+    Raises:
+        ConfigurationError: It names the argument and its unit.
+    """
     if not (math.isfinite(value) and value > 0.0):
         raise ConfigurationError(f"{name} must be a finite number > 0 in {unit}, got {value!r}")

@@ -1,12 +1,10 @@
-"""Traction curves: longitudinal friction over slip, with a peak and a falling slope behind it.
+"""Traction curves: longitudinal friction over slip, with a peak and a falling slope beyond it.
 
-Two shapes, both odd in slip: Burckhardt's exponential and Pacejka's Magic Formula. `MAGIC_FORMULA` and `BURCKHARDT`
-hold one curve per ground, all of them with the peak between slips of 0.10 and 0.15; `BURCKHARDT_PUBLISHED` holds
-the coefficients as published, whose peaks lie at 0.17 (dry), 0.13 (wet), 0.06 (snow) and nowhere (ice).
+Pacejka's Magic Formula, odd in slip. `MAGIC_FORMULA` holds one curve per ground, with the peak between slips of 0.10
+and 0.15. Burckhardt's curve is in `safe_wrappers.appendix.vehicle.burckhardt`.
 
-Source: appendix "Wheel slip ratio and friction boundaries"; M. Burckhardt, Fahrwerktechnik: Radschlupf-
-Regelsysteme, 1993 (coefficients as reprinted in U. Kiencke and L. Nielsen, Automotive Control Systems); H. Pacejka,
-Tire and Vehicle Dynamics. They are curves of tyres on roads: a robot's wheel has its own, to be measured.
+Source: appendix "Wheel slip ratio and friction boundaries"; H. Pacejka, Tire and Vehicle Dynamics. The curves are of
+tyres on roads: a robot's wheel has its own, to be measured.
 """
 
 import math
@@ -42,7 +40,7 @@ class MagicFormula:
 
     Attributes:
         stiffness: B.
-        shape: C, in (1, 2): how far the curve falls behind its peak.
+        shape: C, in (1, 2): how far the curve falls beyond its peak.
         peak_friction: D, > 0.
         curvature: E, <= 1.
     """
@@ -61,7 +59,7 @@ class MagicFormula:
 
     @classmethod
     def from_peak(cls, peak_friction: float, peak_slip: float, shape: float = 1.65) -> "MagicFormula":
-        """The curve without E whose peak is where it is wanted.
+        """The curve with E = 0 and a given peak.
 
         Args:
             peak_friction: > 0.
@@ -118,4 +116,4 @@ MAGIC_FORMULA: Final[Mapping[str, MagicFormula]] = MappingProxyType(
         "ice": MagicFormula.from_peak(peak_friction=0.1, peak_slip=0.10),
     }
 )
-"""By ground; at slip 1 about two thirds of the peak are left. `SafeRover-v0` drives on these."""
+"""By ground; at slip 1 about two thirds of the peak remain. Used by `SafeRover-v0`."""

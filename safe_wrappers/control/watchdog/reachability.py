@@ -1,12 +1,13 @@
-"""How far a machine can get in a time, and how long it takes: idealised, and with limited jerk.
+"""Reachability in time: bounds on the displacement within a time, and jerk-limited motion times.
 
-Source: appendix "Trajectory transit time and reachable distance". Two kinds of answers, for two uses:
+Source: appendix "Trajectory transit time and reachable distance".
 
-* Necessary bounds (`transit_time`, `reach`, `furthest`, `admits`): every further limit only shrinks what can be
-  reached, so what lies outside is refused before anything else is computed, and nothing that is possible ever is.
-* The constrained profile itself (`jerk_limited_time`, `jerk_limited_reach`), solved by ruckig for the stated velocity
-  and acceleration at both ends. It is not the trapezoid plus an offset: a minimum-time profile may have four or seven
-  phases of jerk.
+* `furthest` and `admits` are necessary bounds: further limits only shrink the reachable set, so a goal outside is
+  refused before anything else is computed, and no reachable goal is.
+* `jerk_limited_time` is the duration of the constrained profile itself, solved by ruckig for the given velocity and
+  acceleration at both ends.
+
+`safe_wrappers.appendix.watchdog.reachability` has moves from rest to rest, and displacements with limited jerk.
 
 Metres stand for any unit of length: radians do as well.
 """
@@ -26,12 +27,12 @@ State = tuple[ArrayLike, ArrayLike, ArrayLike]
 """Position (m), velocity (m/s), acceleration (m/s^2), each of shape (..., axes) or scalar."""
 
 _ROUNDING = 32.0 * float(np.finfo(np.float64).eps)
-"""Relative; more than the roundings below can add up to, and nothing that a machine would notice."""
+"""Relative bound on the accumulated rounding below."""
 
 
 @dataclass(frozen=True)
 class MotionLimits:
-    """Symmetric limits of every axis; scalars count for all of them.
+    """Symmetric limits of every axis; scalars apply to all of them.
 
     Attributes:
         max_acceleration: m/s^2, finite.
@@ -67,15 +68,15 @@ def furthest(
 ) -> tuple[Array, Array]:
     """Bounds on the displacement at any moment within a time, from a moving start to any speed at the end.
 
-    Upwards the acceleration grows by the largest jerk up to its limit, and the speed to its limit, without the
-    winding down of the acceleration that a real machine needs before it: no admissible motion gets farther, and the
-    bound is exact where the speed limit is not met or the jerk not limited. A start outside the limits moves them: a
-    machine that is too fast may stay as fast, and one whose acceleration carries it over the limit may go there.
+    Upwards the acceleration grows by the largest jerk up to its limit, and the speed up to its limit, without the
+    decrease of acceleration that a real machine needs before it: no admissible motion gets farther, and the bound is
+    exact where the speed limit is not reached or the jerk not limited. A start outside the limits widens them to its
+    speed, or to the speed that its acceleration leads to.
 
     Args:
         duration: s, shape (...).
         velocity: At the start, m/s, shape (...).
-        acceleration: At the start, m/s^2, shape (...); without a limit on the jerk it does not matter.
+        acceleration: At the start, m/s^2, shape (...); without effect if the jerk is not limited.
         max_speed: m/s, shape (...); inf: none.
         max_acceleration: m/s^2, shape (...).
         max_jerk: m/s^3, shape (...); inf: none.
@@ -119,7 +120,7 @@ def _highest(time: Array, v: Array, a: Array, v_max: Array, a_max: Array, jerk: 
         at_end = at_end + second * (v + first * (a + 0.5 * j * first) + 0.5 * a_max * second)
         cruise = time - climb
         at_end = at_end + np.where(cruise > 0.0, v_max * cruise, 0.0)
-        # Braking at the start: the body may be highest where it turns, before it comes back.
+        # Braking at the start: the highest point may be where the motion reverses.
         square = a * a - 2.0 * j * v
         turn = 2.0 * v / (np.sqrt(np.maximum(square, 0.0)) - a)
         turns = (v > 0.0) & (a < 0.0) & (square > 0.0)
@@ -143,8 +144,8 @@ def admits(
 ) -> NDArray[np.bool_]:
     """Whether a position may be reached within a time, at any speed: a necessary condition, axis by axis.
 
-    False means that no admissible motion gets there (`furthest`). True promises nothing: path, torque and stopping
-    still need their check.
+    False: no admissible motion gets there (`furthest`). True is not sufficient: path, torque and stopping remain to
+    be checked.
 
     Args:
         goal: m, shape (...).
@@ -154,9 +155,8 @@ def admits(
         max_speed: m/s, shape (...); inf: none.
         max_acceleration: m/s^2, shape (...).
         max_jerk: m/s^3, shape (...); inf: none.
-        acceleration: At the start, m/s^2, shape (...); a machine that is already accelerating gets farther than one
-            that is not. None: not measured. Then the most is counted on at once, which leaves the limit on the jerk
-            a say only over how far a start that is too fast may go.
+        acceleration: At the start, m/s^2, shape (...). None: not measured; then the largest one is assumed, and the
+            jerk limit only matters for a start above the speed limit.
 
     Returns:
         Shape (...). False where anything is not finite or the duration is negative.
@@ -181,7 +181,7 @@ def _furthest_unmeasured(
     max_acceleration: ArrayLike,
     max_jerk: ArrayLike,
 ) -> tuple[Array, Array]:
-    """`furthest` for whatever acceleration at the start: a start inside the limits is never carried over them."""
+    """`furthest` for any acceleration at the start; a start inside the limits stays inside."""
     a_max, v_max, jerk = checked_limits(max_acceleration, max_speed, max_jerk)
     v = np.asarray(velocity, dtype=np.float64)
     _, highest = furthest(duration, v, a_max, v_max, a_max, np.where(v > v_max, jerk, np.inf))
@@ -192,8 +192,8 @@ def _furthest_unmeasured(
 def jerk_limited_time(start: State, end: State, limits: MotionLimits) -> Array:
     """The shortest time in which all axes arrive at their end state together.
 
-    At rest ends it is the slowest axis's own time; with moving ends it may be longer, since an axis cannot wait. A
-    start outside the limits is first led back inside, as fast as they allow.
+    Between states of rest it is the slowest axis's own time; with moving ends it may be longer, since an axis cannot
+    wait. A start outside the limits is first brought back inside, as fast as they allow.
 
     Args:
         start: Position, velocity, acceleration.
@@ -201,8 +201,8 @@ def jerk_limited_time(start: State, end: State, limits: MotionLimits) -> Array:
         limits: Of every axis.
 
     Returns:
-        Time in s, shape (...). inf where a state is not finite, and where the end state cannot be arrived at inside
-        the limits: too fast, too strongly accelerated, or braking from a speed that was over the limit.
+        Time in s, shape (...). inf where a state is not finite, and where the end state violates the limits: too
+        fast, too strongly accelerated, or reached only from above the speed limit.
 
     Raises:
         ConfigurationError: Where the shapes do not fit together, or ruckig finds no profile for other reasons.
@@ -218,7 +218,7 @@ def jerk_limited_time(start: State, end: State, limits: MotionLimits) -> Array:
         ) from None
     possible = np.all([np.isfinite(x) for x in (p0, v0, a0, p1, v1, a1)], axis=0)
     with np.errstate(invalid="ignore", over="ignore"):
-        # Arriving with an acceleration against the motion, the speed was higher before.
+        # With an end acceleration against the motion, the speed before was higher.
         before = np.where(v1 * a1 < 0.0, 0.5 * a1 * (a1 / j_lim), 0.0)
         possible &= (np.abs(v1) + before <= v_lim) & (np.abs(a1) <= a_lim)
     whole = possible.all(axis=-1)
