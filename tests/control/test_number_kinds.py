@@ -105,7 +105,7 @@ CALLS = {
     "project, one row": (lambda *a: projection.project(*a)[0], [[1, 1], [[1, 1]], [1], -1, 1]),
     "project, rows": (lambda *a: projection.project(*a)[0], [[1, 1], [[2, 1], [1, 2]], [1, 1], -1, 1]),
     "transit_time": (appendix_reachability.transit_time, [9, 2, 3]),
-    "reach": (appendix_reachability.reach, [9, 2, 3]),
+    "reachable_distance": (appendix_reachability.reachable_distance, [9, 2, 3]),
     "hold_lag_s": (sampling.hold_lag_s, [2]),
     "phase_lag": (sampling.phase_lag, [2, 1, 1]),
     "slip_ratio": (slip.slip_ratio, [3, 2, 1]),

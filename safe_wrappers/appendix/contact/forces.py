@@ -52,9 +52,9 @@ def plane_gap(point: ArrayLike, normal: ArrayLike, offset: ArrayLike, radius: Ar
 def unilateral_force(
     gap: ArrayLike, gap_rate: ArrayLike, stiffness: ArrayLike, damping: ArrayLike = 0.0
 ) -> Array:
-    """Force of a contact that gives way, `max(0, -k gap - c gap')` where closed, else 0, shape (...), N.
+    """Force of a compliant contact, `max(0, -k gap - c gap')` where closed, else 0, shape (...), N.
 
-    A spring and a damper side by side, cut where they would pull.
+    A spring and a damper in parallel, without tension.
 
     Args:
         gap: Signed distance, m.
@@ -69,7 +69,7 @@ def unilateral_force(
 
 
 def friction_ratio(forces: ArrayLike, normals: ArrayLike, friction: ArrayLike) -> Array:
-    """How much of the friction is used, `|f_t| / (mu f_n)`, shape (...): at most 1 inside the cone.
+    """Used share of the friction, `|f_t| / (mu f_n)`, shape (...): at most 1 inside the cone.
 
     Infinite where the ground would have to pull, or to hold sideways without pressure; 0 where there is no force.
 
@@ -92,12 +92,12 @@ def friction_ratio(forces: ArrayLike, normals: ArrayLike, friction: ArrayLike) -
 def in_cone(
     forces: ArrayLike, normals: ArrayLike, friction: ArrayLike, tolerance: float = 0.0
 ) -> NDArray[np.bool_]:
-    """Whether ground can give each force, shape (...).
+    """Whether each force lies in its friction cone, shape (...).
 
     Args:
         forces: On the robot, shape (..., 3), N.
         normals: Unit normals, shape (..., 3).
         friction: Coefficient mu, at least 0, shape (...).
-        tolerance: What either condition may be missed by, N.
+        tolerance: Largest accepted violation of either condition, N.
     """
     return np.asarray(cone_excess(forces, normals, friction) <= tolerance)

@@ -5,16 +5,15 @@ deformation". The elastic part is one mass against one massless linear spring wi
 
     m x'' = -k x - m a,    x(0) = 0, x'(0) = v,    w = sqrt(k / m),
 
-up to the first peak of the deflection x. What it leaves out is the user's to bound: stiffness that grows with
-depth, damping, a pad that runs out of stroke or ages, a second contact, motors that push on (`braking` below zero
-counts a constant push). None of it makes a contact safe; it says what force follows from what speed.
+up to the first peak of the deflection x. Not modelled: stiffness that grows with depth, damping, a pad at the end of
+its stroke, ageing, a second contact, motors that keep pushing (`braking` below zero counts a constant push). The
+functions relate force to speed; they do not certify a contact as safe.
 
 **Braking after contact is too late.** The peak comes a quarter of a period after the touch, typically 20 to 50 ms.
-A brake that acts later takes nothing off it (`attenuation_after_delay`), so clearance before contact is what
-protects.
+A brake that acts later does not reduce it (`attenuation_after_delay`), so protection needs clearance before contact.
 
-Arguments are numbers or arrays that broadcast. Speeds are approach speeds, positive towards the obstacle; what
-recedes counts as at rest. Stiffness (`inf`: rigid) and mass (`inf`: it does not give way) are positive, and not both
+Arguments are numbers or arrays that broadcast. Speeds are approach speeds, positive towards the obstacle; negative
+ones count as at rest. Stiffness (`inf`: rigid) and mass (`inf`: it does not give way) are positive, and not both
 infinite. Anything else raises `ConfigurationError`.
 """
 
@@ -58,9 +57,9 @@ def normal_impulse(mass: ArrayLike, velocity: ArrayLike, restitution: ArrayLike)
 
 
 def effective_mass(inertia: ArrayLike, jacobian: ArrayLike) -> Array:
-    """What a machine weighs to whoever pushes it along one direction at one point, `1 / (J M^-1 J')`, kg.
+    """Effective mass of a machine at one point along one direction, `1 / (J M^-1 J')`, kg.
 
-    Each direction for itself: contacts that act together share the inertia (`contact_lcp.delassus_matrix`).
+    Each direction separately: simultaneous contacts share the inertia (`contact_lcp.delassus_matrix`).
 
     Args:
         inertia: Joint-space inertia M, symmetric and positive definite, shape (..., n, n).
@@ -204,10 +203,9 @@ def braked_peak_force(
 def attenuation_after_delay(
     speed: ArrayLike, mass: ArrayLike, stiffness: ArrayLike, braking: ArrayLike, latency: ArrayLike
 ) -> Array:
-    """The share of the peak force that a brake `latency` seconds after the first touch still takes off, shape (...).
+    """Relative reduction of the peak force by a brake `latency` seconds after the first touch, shape (...).
 
-    Exactly 0 from the `time_to_peak` on: braking that starts by then changes nothing about the peak. 0 as well where
-    there is no peak to take anything off. Negative for a push.
+    Exactly 0 from the `time_to_peak` on, and where there is no peak. Negative for a push.
 
     Args:
         speed: See `braked_deflection`.
@@ -225,7 +223,7 @@ def attenuation_after_delay(
 def _checked(
     speed: ArrayLike, mass: ArrayLike, stiffness: ArrayLike, moving: str = "speed", least: float = -np.inf
 ) -> tuple[Array, Array, Array]:
-    """What moves, and mass and stiffness."""
+    """Speed (or force), mass and stiffness as float64."""
     v = finite_array(moving, speed)
     if not (v >= least).all():
         raise ConfigurationError(f"{moving} must be at least {least}, got {v}")
@@ -236,6 +234,6 @@ def _checked(
 
 
 def _times(speed: Array, factor: Array) -> Array:
-    """Their product, and 0 for what does not approach, whatever the factor: 0 times inf is not a number."""
+    """Their product; 0 where the speed is not positive, also for an infinite factor."""
     some = speed > 0.0
     return np.asarray(np.where(some, np.where(some, speed, 1.0) * factor, 0.0))

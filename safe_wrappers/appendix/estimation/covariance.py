@@ -39,7 +39,7 @@ of a double pole are not known any better than that."""
 
 
 def lyapunov_rate(P: Array, A: Array, Q: Array) -> Array:
-    """`A P + P A' + Q`: the growth while nothing is seen.
+    """`A P + P A' + Q`: growth without measurements.
 
     Args:
         P: Covariance, shape (..., n, n).
@@ -70,7 +70,7 @@ def riccati_rate(P: Array, A: Array, Q: Array, C: Array, R: Array) -> Array:
 
 
 def kalman_bucy_gain(P: Array, C: Array, R: Array) -> Array:
-    """`P C' R^-1`: how the filter in continuous time weighs the innovation.
+    """`P C' R^-1`: gain of the filter in continuous time.
 
     Args:
         P: Covariance, shape (..., n, n).
@@ -142,10 +142,10 @@ def seen_covariance(
 
 
 def double_integrator_covariance(P0: ArrayLike, intensity: float, time_s: ArrayLike) -> Array:
-    """The closed form for position and velocity under white acceleration noise, while nothing is seen.
+    """The closed form for position and velocity under white acceleration noise, without measurements.
 
     `sigma_p^2 = P11 + 2 P12 t + P22 t^2 + q t^3 / 3`, `P12 + P22 t + q t^2 / 2`, `P22 + q t`: the uncertain velocity
-    tells with t^2, the noise with t^3.
+    enters with t^2, the noise with t^3.
 
     Args:
         P0: Covariance of position and velocity at the start, shape (2, 2).
@@ -173,7 +173,7 @@ def double_integrator_covariance(P0: ArrayLike, intensity: float, time_s: ArrayL
 
 
 def steady_state(A: ArrayLike, Q: ArrayLike, C: ArrayLike, R: ArrayLike) -> Array:
-    """The covariance that measuring without end leads to, from whatever start: the algebraic Riccati equation.
+    """The limit of the covariance under continuous measurement, from any start: the algebraic Riccati equation.
 
     Args:
         A: System matrix, 1/s, shape (n, n).

@@ -90,7 +90,7 @@ def nonlinear_observability(
     order: int | None = None,
     tolerance: float | None = None,
 ) -> NonlinearObservability:
-    """What the outputs h(x) of x' = f(x) tell of the state, near x.
+    """Local observability of x' = f(x) from the outputs h(x), near x.
 
     The rows are the differentials of the Lie derivatives of h along f at x (Hermann and Krener 1977). They are the
     Taylor coefficients, in time, of the output's sensitivity to the initial state, and are found by running f and h

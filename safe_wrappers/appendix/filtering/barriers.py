@@ -25,8 +25,8 @@ def kinetic_inset(clearance: ArrayLike, speed: ArrayLike, brake: float) -> Array
 def kinetic_row(clearance: ArrayLike, speed: ArrayLike, brake: float, gamma: float) -> Array:
     """The continuous row: the largest admissible approach acceleration, `(a_brake / v)(gamma h - v)`.
 
-    Only for v > 0. At standstill the row is singular and says nothing: there it returns +inf where the
-    inset is positive and 0 where it is not (the start rule of the continuous form: do not set off).
+    For v > 0. At standstill the row is singular: +inf is returned where the inset is positive, else 0 (the start
+    rule of the continuous form: do not start to move).
     """
     v = np.asarray(speed, dtype=np.float64)
     h = kinetic_inset(clearance, speed, brake)

@@ -23,12 +23,12 @@ Array = NDArray[np.float64]
 
 
 class Balance(NamedTuple):
-    """Whether contact forces are clear of tipping.
+    """Zero moment point of contact forces, and its margin against tipping.
 
     Attributes:
         coplanar: Whether the contacts lie in one plane. Where not, `zmp` and `margin` are NaN: the model does not
-            hold, whatever its number would be.
-        zmp: Zero moment point, shape (3,), m; NaN where nothing presses on the plane.
+            hold.
+        zmp: Zero moment point, shape (3,), m; NaN without pressure on the plane.
         margin: Its distance from the polygon's edge minus the inset, m; negative outside.
     """
 
@@ -40,7 +40,7 @@ class Balance(NamedTuple):
 def zmp_of_forces(points: ArrayLike, forces: ArrayLike, ground: Plane, moments: ArrayLike = 0.0) -> Array:
     """Where contact wrenches have no tangential moment, on the plane; shape (..., 3), m.
 
-    NaN where nothing presses on the plane: then there is no such point.
+    NaN without pressure on the plane, where it does not exist.
 
     Args:
         points: Shape (..., k, 3), m.

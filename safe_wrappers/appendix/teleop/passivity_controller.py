@@ -16,7 +16,7 @@ class PassivityObserver:
     """Sums the energy of a port. Several ports of one component are one whose efforts and flows are concatenated.
 
     Args:
-        initial_storage_j: What the component may give away beyond what it took, at least 0 J.
+        initial_storage_j: Energy that the component may give out beyond what it took in, at least 0 J.
     """
 
     def __init__(self, initial_storage_j: float = 0.0) -> None:

@@ -62,7 +62,9 @@ def transit_time(distance: ArrayLike, max_acceleration: ArrayLike, max_speed: Ar
     return np.asarray(np.where(np.isinf(d), np.inf, time))
 
 
-def reach(duration: ArrayLike, max_acceleration: ArrayLike, max_speed: ArrayLike = np.inf) -> Array:
+def reachable_distance(
+    duration: ArrayLike, max_acceleration: ArrayLike, max_speed: ArrayLike = np.inf
+) -> Array:
     """The longest move from rest to rest within a time, the inverse of `transit_time`.
 
     Args:

@@ -1,13 +1,13 @@
-"""What holding a command and sending it late cost a loop in phase.
+"""Phase lag of a control loop by zero-order hold and delay.
 
 In phase a zero-order hold equals a delay of half its interval, in the baseband: a sampled loop also sees aliases,
-which that does not count. So the figures are good well below the sampling frequency and optimistic towards the
-Nyquist frequency, at and beyond which they mean nothing and are refused. Take an integrator under a proportional
-controller: crossing over at a tenth of the sampling frequency it has 0.3 degrees less than is said here, at 2 / hold
-it is unstable and 33 degrees are said to be left.
+which that neglects. So the figures are accurate well below the sampling frequency, optimistic towards the Nyquist
+frequency, and refused from there on. Example, an integrator under a proportional controller: at a crossover of a
+tenth of the sampling frequency its margin is 0.3 degrees less than computed here; at 2 / hold it is unstable, with
+33 degrees computed.
 
-What is lost is the stated stability reserve. Whether a machine is stable depends on the sampled plant, its
-compensation, the jitter and the measured total response.
+The phase margin is a nominal reserve. Whether a machine is stable depends on the sampled plant, its compensation, the
+jitter and the measured total response.
 
 Source: appendix "Discrete-time sampling and zero-order hold phase lag" with its footnote 2. Arguments broadcast.
 """
