@@ -17,7 +17,7 @@ UPRIGHT = np.tile(UP, (4, 1))
 
 
 def one_by_one(instant, points, normals, forces):
-    """Each instant's, by the polygon that `control.support` builds."""
+    """Each instant's, by the polygon that `support_polygon` builds."""
     found = []
     for when in np.unique(instant):
         here = instant == when

@@ -9,10 +9,9 @@ Unilateral contact and dry friction in finite freedom dynamics. With impulses p 
     least = -e J v      where the contact is closed, or e > 0 and free motion would close it: Newton's restitution;
     least = -gap / h    elsewhere: it may close by the end of the step, and no more.
 
-**It is linear only because of what is assumed**, and the appendix's caveat holds: no friction; inertia, forces and
-normals frozen over the step; gaps that change by `h J v+`; an impulse per contact at one instant; one restitution law
-for impacts that happen together, where real ones have an order. It shows what rigid contact asks for; it is no
-evidence that a machine does it.
+**The problem is linear by assumption**: no friction; inertia, forces and normals frozen over the step; gaps that
+change by `h J v+`; an impulse per contact at one instant; one restitution law for simultaneous impacts, where real ones have
+an order. It is an idealisation of rigid contact, not a prediction for a machine.
 """
 
 from typing import NamedTuple

@@ -94,10 +94,10 @@ def nonlinear_observability(
 
     The rows are the differentials of the Lie derivatives of h along f at x (Hermann and Krener 1977). They are the
     Taylor coefficients, in time, of the output's sensitivity to the initial state, and are found by running f and h
-    on truncated Taylor series (`control.numerics.taylor`): no differences, no step size; rounding is all that they
-    err by, and what a relative error of 1e-12 in x could make of zero counts as zero. Each output's rows are scaled
-    by the time on which that output changes, and each state's column by its size (by a factor of up to a thousand),
-    so that units do not decide.
+    on truncated Taylor series (`taylor.output_series`), without differences or step size: they are exact up to
+    rounding, and values that a relative error of 1e-12 in x could make of zero count as zero. Each output's rows are
+    scaled by the time on which that output changes, and each state's column by its size (by a factor of up to a
+    thousand), so that the result does not depend on units.
 
     Known inputs belong into f: close over them. An input that varies is an extra state that is measured.
 
@@ -108,7 +108,7 @@ def nonlinear_observability(
 
     Args:
         f: Rates of the states: takes an array of shape (n,), returns n numbers. Written with NumPy's functions
-            (`control.taylor` lists them), not with `math`.
+            (`safe_wrappers.appendix.estimation.taylor` lists them), not with `math`.
         h: Outputs: takes the same, returns m numbers. Also written with NumPy's functions.
         x: The state, shape (n,).
         names: Of the n states; x0, x1, ... if not given.

@@ -10,7 +10,7 @@ Array = NDArray[np.float64]
 
 
 class Bodies(NamedTuple):
-    """Motion of the n moving bodies of a robot, in the world's axes, as `control.centroidal` takes it.
+    """Motion of the n moving bodies of a robot, in the world's axes, as arguments of the centroidal functions.
 
     Attributes:
         ids: Shape (n,).
