@@ -10,8 +10,8 @@ Unilateral contact and dry friction in finite freedom dynamics. With impulses p 
     least = -gap / h    elsewhere: it may close by the end of the step, and no more.
 
 **The problem is linear by assumption**: no friction; inertia, forces and normals frozen over the step; gaps that
-change by `h J v+`; an impulse per contact at one instant; one restitution law for simultaneous impacts, where real ones have
-an order. It is an idealisation of rigid contact, not a prediction for a machine.
+change by `h J v+`; an impulse per contact at one instant; one restitution law for simultaneous impacts, where real
+ones have an order. It is an idealisation of rigid contact, not a prediction for a machine.
 """
 
 from typing import NamedTuple
