@@ -38,7 +38,7 @@ from safe_wrappers.control.legged.whole_body import (
     solve_pyramid,
 )
 from safe_wrappers.errors import SafeWrappersError
-from safe_wrappers.plants.queries.floating_base import floating_base_terms
+from safe_wrappers.plants.queries.floating_base import equations_of_motion
 
 RESULTS = Path(__file__).parent / "results"
 SHARE, SETTLE_S = 0.7, 0.05
@@ -104,7 +104,7 @@ def record(robot: str, policy: str, count: int, seed: int = 0) -> Iterator[Whole
 
 def at(plant: sw.MujocoPlant, nominal: Any) -> WholeBodyProblem | None:
     """The problem at a plant's state; None if no contact carries force."""
-    terms = floating_base_terms(plant)
+    terms = equations_of_motion(plant.model, plant.forward(), plant.actuators)
     c = terms.contacts
     pressing = np.einsum("ki,ki->k", c.forces, c.normals) > 0.0
     if not pressing.any():

@@ -30,9 +30,9 @@ from numpy.typing import NDArray
 import safe_wrappers as sw
 from benchmarks.crossing_drivers import DRIVERS
 from benchmarks.tracked import CROSSING, crossing
-from safe_wrappers.appendix.sigma_coverage import chebyshev_tail, gaussian_tail
-from safe_wrappers.control.estimation.covariance import double_integrator_covariance
-from safe_wrappers.control.estimation.kalman import chi_square_band, normalised_error_squared
+from safe_wrappers.appendix.estimation.consistency import chi_square_band, normalised_error_squared
+from safe_wrappers.appendix.estimation.covariance import double_integrator_covariance
+from safe_wrappers.appendix.estimation.sigma_coverage import chebyshev_tail, gaussian_tail
 from safe_wrappers.errors import UnsafeStateWarning
 
 Array = NDArray[np.float64]

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from safe_wrappers.appendix.flexible_joint import resonances, torque_slew_limit
+from safe_wrappers.appendix.handover.flexible_joint import resonances, torque_slew_limit
 
 RAMP_ENERGY = 1e-3
 """J that one ramp of torque at the rate limit may leave ringing in the arm, in any pose."""
 PERIODS = 1.2
 """Of the lowest resonance, that a blend takes at the least: over so long a smoothstep from one held torque to another
-leaves at most a tenth of the energy that the step itself would (`appendix.flexible_joint.smoothstep_energy`)."""
+leaves at most a tenth of the energy that the step itself would (`flexible_joint.smoothstep_energy`)."""
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ from numpy.typing import NDArray
 import safe_wrappers as sw
 from benchmarks.chunk_policy import RUNS, TASKS, Policy, Task, policy
 from benchmarks.seam_bounds import Bounds, bounds_of
-from safe_wrappers.appendix.flexible_joint import manifold
+from safe_wrappers.appendix.handover.flexible_joint import manifold
 from safe_wrappers.control.handover.seams import BLENDS
 from safe_wrappers.control.handover.smoothstep import smoothstep
 

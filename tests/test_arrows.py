@@ -38,7 +38,7 @@ MAY_USE = {
 LEARNERS = {"torch", "stable_baselines3"}
 FORBIDDEN = {
     "control": LEARNERS | {"gymnasium", "mujoco"},
-    "appendix": LEARNERS | {"gymnasium", "mujoco"},
+    "appendix": LEARNERS | {"gymnasium"},
     "filter": LEARNERS | {"gymnasium", "mujoco"},
     "plants": LEARNERS,
     "constraints": LEARNERS,

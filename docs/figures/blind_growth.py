@@ -4,11 +4,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from _style import FORBIDDEN, GRID, INK, OFF, ON, OTHER, panels
-from safe_wrappers.control.estimation.covariance import (
-    blind_covariance,
-    blind_time,
-    double_integrator_covariance,
-)
+from safe_wrappers.appendix.estimation.covariance import blind_covariance, double_integrator_covariance
+from safe_wrappers.control.estimation.covariance import blind_time
 
 P0 = np.diag([0.05**2, 0.15**2])
 INTENSITY = 0.0225

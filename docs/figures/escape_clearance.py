@@ -10,7 +10,7 @@ from matplotlib.patches import Circle, FancyBboxPatch
 import safe_wrappers as sw
 from _crossing import road, tracked
 from _style import FORBIDDEN, OFF, ON, SAFE, panels
-from safe_wrappers.control.backup.evasive_maneuvers import Escapes, Manoeuvre
+from safe_wrappers.control.backup.evasive_maneuvers import EvasiveManeuvers, Maneuver
 from safe_wrappers.plants.queries.planar_point import planar_point
 
 LAYOUT = {
@@ -44,11 +44,11 @@ def draw() -> Figure:
             pad = f"round,pad={raw.car_radius}"
             ax.add_patch(FancyBboxPatch(corner, *size, boxstyle=pad, color=FORBIDDEN, alpha=0.12, lw=0))
     point = planar_point(plant, np.inf, "robot")
-    ways = [Manoeuvre(0.0, 0.0, 0)]
+    ways = [Maneuver(0.0, 0.0, 0)]
     for x, y in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)):
-        ways += [Manoeuvre(x, y, round(s / plant.hold_s)) for s in (0.3, 0.8)]
+        ways += [Maneuver(x, y, round(s / plant.hold_s)) for s in (0.3, 0.8)]
     instants = np.arange(0, round(2.4 / plant.hold_s) + 1)
-    x, y = Escapes(point.axes, ways, instants).paths(
+    x, y = EvasiveManeuvers(point.axes, ways, instants).paths(
         raw.agent_position[None], raw.agent_velocity[None], np.arange(len(ways))
     )
     times = plant.hold_s * instants

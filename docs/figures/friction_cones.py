@@ -18,7 +18,7 @@ from safe_wrappers.control.legged.whole_body import (
     solve_cone,
     solve_pyramid,
 )
-from safe_wrappers.plants.queries.floating_base import floating_base_terms
+from safe_wrappers.plants.queries.floating_base import equations_of_motion
 
 SHARE, EDGES, REACH = 0.7, (4, 6, 8, 12, 16, 24, 32), 1.6
 TORQUE = 0.02
@@ -38,7 +38,7 @@ def problems(count: int) -> list[WholeBodyProblem]:
         if step < 40:
             continue
         plant.observe()
-        terms = floating_base_terms(plant)
+        terms = equations_of_motion(plant.model, plant.forward(), plant.actuators)
         c = terms.contacts
         problem = WholeBodyProblem(
             terms.inertia,

@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 import safe_wrappers as sw
 from _cart import Cart, run, wall
 from _style import FORBIDDEN, GRID, OFF, ON, panels
-from safe_wrappers.control.backup.stopping import kinetic_row
+from safe_wrappers.appendix.filtering.barriers import kinetic_row
 
 WALL, GAMMA = 1.0, 2.0
 

@@ -7,7 +7,7 @@ from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 
 from _style import FORBIDDEN, INK, OFF, ON, OTHER, SAFE, panels
-from safe_wrappers.control.estimation.covariance import blind_covariance
+from safe_wrappers.appendix.estimation.covariance import blind_covariance
 from safe_wrappers.control.estimation.kalman import update
 
 Array = NDArray[np.float64]

@@ -7,7 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from _style import FORBIDDEN, GRID, INK, OFF, ON, OTHER, panels
-from safe_wrappers.control.teleop.passivity import ChannelLedger, from_waves
+from safe_wrappers.appendix.teleop.waves import from_waves
+from safe_wrappers.control.teleop.passivity import ChannelLedger
 from safe_wrappers.control.teleop.wave_line import Rule, WaveLine
 
 TICKS = 48

@@ -50,8 +50,8 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
 
     **What it promises.** If the tracked things move as declared, the sensor's noise is as declared, and nothing else
     is measured than what is in sight, then the errors have the covariances that are given: see the tails in
-    `control.tails` for what k sigma means. It is no hard bound, and not about things that are not tracked. An
-    estimate that is one step old is never used: the estimate is of the state that the action acts on.
+    `appendix.estimation.sigma_coverage` for what k sigma means. It is no hard bound, and not about things that are
+    not tracked. An estimate that is one step old is never used: the estimate is of the state that the action acts on.
 
     **Order.** Inside the filter, which reads the estimates: ``CBFActionFilter(OcclusionPenalty(env, ...), ...)``.
     Returns that are recorded outside hold the penalty; `RecordInterventions` adds it back.

@@ -14,7 +14,7 @@ from benchmarks import occlusion, occlusion_cost
 from benchmarks.crossing_drivers import DRIVERS
 from benchmarks.occlusion import Episode, Job, collisions_job, consistency_table, episode, phases, violations
 from benchmarks.tracked import CROSSING, PATROLLED, crossing
-from safe_wrappers.control.estimation.kalman import normalised_error_squared
+from safe_wrappers.appendix.estimation.consistency import normalised_error_squared
 from safe_wrappers.envs.occluded_crossing import CAR_ACCELERATION_NOISE, CAR_SPEED_STD, CAR_TIME_CONSTANT_S
 
 CONFIG = Path(__file__).parents[2] / "configs" / "occluded_crossing_ppo.yaml"

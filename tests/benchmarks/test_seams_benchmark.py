@@ -16,7 +16,7 @@ from benchmarks import chunk_policy, seam_bounds, seams
 from benchmarks.chunk_policy import TASKS, basis
 from benchmarks.seam_bounds import Bounds, bounds_of
 from benchmarks.seams import Job, Recorder, alone, episode, faded_in, jobs, table
-from safe_wrappers.appendix.flexible_joint import smoothstep_energy, step_energy
+from safe_wrappers.appendix.handover.flexible_joint import smoothstep_energy, step_energy
 
 FLEX, REACHER = TASKS[:2]
 TINY = tuple(dataclasses.replace(task, steps=1, rollout=64) for task in TASKS[:2])  # one rollout

@@ -19,7 +19,8 @@ from benchmarks.traction import (
     stopping_distance,
     tables,
 )
-from safe_wrappers.control.vehicle.traction_curves import MAGIC_FORMULA, peak
+from safe_wrappers.appendix.vehicle.burckhardt import peak
+from safe_wrappers.control.vehicle.traction_curves import MAGIC_FORMULA
 
 HARD = ("full throttle", "panic brake", "pulse")
 G = 9.81

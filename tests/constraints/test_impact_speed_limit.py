@@ -14,14 +14,14 @@ from judged_loops import Scene
 from scipy.integrate import solve_ivp
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.contact.impact_speed_limit import _Contact
-from safe_wrappers.control.contact.body_regions import BODY_REGIONS
-from safe_wrappers.control.contact.impact import (
+from safe_wrappers.appendix.contact.impact import (
     attenuation_after_delay,
     effective_mass,
     peak_force,
     time_to_peak,
 )
+from safe_wrappers.constraints.contact.impact_speed_limit import _Contact
+from safe_wrappers.control.contact.body_regions import BODY_REGIONS
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 
 # A mass on a slide before a wall ------------------------------------------------------------------------------

@@ -5,14 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from safe_wrappers.appendix.filtering.barriers import best_rate, nagumo_holds, power_decay
 from safe_wrappers.control.filtering.cbf import (
-    best_rate,
     cbf_rows,
     lie_derivatives,
     linear_decay,
-    nagumo_holds,
     numerical_gradient,
-    power_decay,
     relative_degree,
 )
 

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from safe_wrappers.control.legged.centroidal import (
+from safe_wrappers.appendix.legged.centroidal import (
     centroidal_bias_rate,
-    centroidal_momentum,
     centroidal_momentum_matrix,
     momentum_rate,
 )
+from safe_wrappers.control.legged.centroidal import centroidal_momentum
 from safe_wrappers.errors import ConfigurationError
 
 

@@ -8,18 +8,20 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from safe_wrappers.control.estimation.covariance import (
+from safe_wrappers.appendix.estimation.covariance import (
     blind_covariance,
-    checked_covariance,
-    checked_noise,
-    discretise,
-    discretise_drift,
     double_integrator_covariance,
     kalman_bucy_gain,
     lyapunov_rate,
     riccati_rate,
     seen_covariance,
     steady_state,
+)
+from safe_wrappers.control.estimation.covariance import (
+    checked_covariance,
+    checked_noise,
+    discretise,
+    discretise_drift,
 )
 from safe_wrappers.errors import ConfigurationError
 

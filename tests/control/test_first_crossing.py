@@ -9,11 +9,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from safe_wrappers.control.estimation.covariance import (
-    blind_covariance,
-    blind_time,
-    double_integrator_covariance,
-)
+from safe_wrappers.appendix.estimation.covariance import blind_covariance, double_integrator_covariance
+from safe_wrappers.control.estimation.covariance import blind_time
 from safe_wrappers.errors import ConfigurationError
 
 INTEGRATOR = np.array([[0.0, 1.0], [0.0, 0.0]])

@@ -7,11 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from safe_wrappers.appendix.contact.forces import friction_ratio, in_cone
 from safe_wrappers.control.contact.friction_cone import (
     cone_excess,
     friction_pyramid,
-    friction_ratio,
-    in_cone,
     normal_and_tangential,
     tangents,
 )

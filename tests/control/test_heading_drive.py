@@ -188,7 +188,7 @@ def test_the_turn_that_is_left_is_mujocos():
         for _ in range(20):
             env.step(np.zeros(2))
             headings.append(env.data.qpos[2])
-        assert drive.turn_left(rate) == pytest.approx(headings[-1], abs=6e-3)
+        assert drive.residual_turn_angle(rate) == pytest.approx(headings[-1], abs=6e-3)
 
 
 # Distance to the area -----------------------------------------------------------------------------------------
@@ -228,8 +228,7 @@ def test_distance_agrees_with_brute_force(forward, sideways, share, spread, angl
         x=0.1, y=-0.2, ex=e[0], ey=e[1], sx=s[0], sy=s[1],
         forward=forward, sideways=sideways, crossing=crossing, spread=spread,
     )  # fmt: skip
-    if "reach" in StoppingPath._fields:
-        fields["reach"] = math.hypot(forward, sideways)
+    fields["radius"] = math.hypot(forward, sideways)
     path = StoppingPath(**fields)
     start = np.array([0.1, -0.2])
     area = [start, start + forward * e + crossing * s, start + forward * e + sideways * s]
@@ -241,14 +240,14 @@ def test_distance_agrees_with_brute_force(forward, sideways, share, spread, angl
     else:
         assert path.distance(px, py) == pytest.approx(expected, abs=1e-3)
     assert path.end_distance(px, py) == pytest.approx(np.linalg.norm(area[2] - [px, py]))
-    assert path.reach >= max(np.linalg.norm(c - start) for c in area) - 1e-12
+    assert path.radius >= max(np.linalg.norm(c - start) for c in area) - 1e-12
 
 
 def test_a_body_at_rest_is_a_point():
     _, _, drive = robot()
     path = drive.stopping_path(Motion(0.5, 0.25, 1.0, 0.0, 0.0, 0.0))
     assert path.distance(0.5, 1.25) == pytest.approx(1.0)
-    assert path.reach == pytest.approx(0.0, abs=1e-12)
+    assert path.radius == pytest.approx(0.0, abs=1e-12)
 
 
 @settings(max_examples=100, deadline=None)

@@ -7,8 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from safe_wrappers.control.estimation.covariance import discretise, discretise_drift, seen_covariance
-from safe_wrappers.control.estimation.kalman import chi_square_band, normalised_error_squared, predict, update
+from safe_wrappers.appendix.estimation.consistency import chi_square_band, normalised_error_squared
+from safe_wrappers.appendix.estimation.covariance import seen_covariance
+from safe_wrappers.control.estimation.covariance import discretise, discretise_drift
+from safe_wrappers.control.estimation.kalman import predict, update
 from safe_wrappers.errors import ConfigurationError
 
 INTEGRATOR = np.array([[0.0, 1.0], [0.0, 0.0]])

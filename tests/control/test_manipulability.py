@@ -8,13 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from safe_wrappers.appendix.filtering.manipulability import joint_rates, reframed, task_jacobian
 from safe_wrappers.control.filtering.manipulability import (
     chain_derivative,
-    joint_rates,
     manipulability,
     manipulability_gradient,
-    reframed,
-    task_jacobian,
     validated_threshold,
     velocity_ellipsoid,
     worst_joint_rates,

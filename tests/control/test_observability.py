@@ -10,13 +10,15 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.linalg import subspace_angles
 
+from safe_wrappers.appendix.estimation.observability import (
+    nonlinear_observability,
+    pbh_test,
+)
 from safe_wrappers.control.estimation.observability import (
     described,
     described_subspace,
     linear_observability,
-    nonlinear_observability,
     observability_matrix,
-    pbh_test,
 )
 from safe_wrappers.errors import ConfigurationError
 

@@ -7,16 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from safe_wrappers.appendix.teleop.waves import flow_and_outgoing, from_waves, port_power, wave_power
 from safe_wrappers.control.numerics.running_sum import RunningSum
 from safe_wrappers.control.teleop.passivity import (
     ChannelLedger,
     EnergyLedger,
     effort_and_outgoing,
-    flow_and_outgoing,
-    from_waves,
-    port_power,
     to_waves,
-    wave_power,
 )
 from safe_wrappers.errors import ConfigurationError
 

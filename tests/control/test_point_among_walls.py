@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from safe_wrappers.control.backup.damped_axis import HeldAxis
+from safe_wrappers.control.backup.damped_axis import DampedAxis
 from safe_wrappers.control.backup.point_among_walls import PointAmongWalls, PointMotion
 from safe_wrappers.control.numerics.rectangles import apart
 
@@ -18,8 +18,8 @@ CLIP = 5.0
 
 def among(clip_known, substeps=1, walls=(*WALLS, BLOCK)):
     clip = CLIP if clip_known else math.inf
-    x_axis = HeldAxis(0.998, 0.24 / substeps, 0.01, substeps, -1.0, 1.0, clip)
-    y_axis = HeldAxis(0.99, 0.2 / substeps, 0.01, substeps, -0.7, 0.9, clip)
+    x_axis = DampedAxis(0.998, 0.24 / substeps, 0.01, substeps, -1.0, 1.0, clip)
+    y_axis = DampedAxis(0.99, 0.2 / substeps, 0.01, substeps, -0.7, 0.9, clip)
     return PointAmongWalls(x_axis, y_axis, list(walls), clip_known)
 
 

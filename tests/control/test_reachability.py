@@ -9,16 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
+from safe_wrappers.appendix.watchdog.reachability import jerk_limited_reach, reachable_distance, transit_time
 from safe_wrappers.control.watchdog import reachability
-from safe_wrappers.control.watchdog.reachability import (
-    MotionLimits,
-    admits,
-    furthest,
-    jerk_limited_reach,
-    jerk_limited_time,
-    reach,
-    transit_time,
-)
+from safe_wrappers.control.watchdog.reachability import MotionLimits, admits, furthest, jerk_limited_time
 from safe_wrappers.errors import ConfigurationError
 
 POSITIVE = st.floats(0.1, 10.0)
@@ -74,7 +67,7 @@ def test_transit_time_is_ruckigs_without_a_limit_on_the_jerk(distance, accelerat
 @settings(max_examples=200, deadline=None)
 @given(st.floats(0, 30), POSITIVE, POSITIVE)
 def test_reach_is_the_inverse_of_the_transit_time(time, acceleration, speed):
-    assert transit_time(reach(time, acceleration, speed), acceleration, speed) == pytest.approx(
+    assert transit_time(reachable_distance(time, acceleration, speed), acceleration, speed) == pytest.approx(
         time, abs=1e-6
     )
 
@@ -82,7 +75,7 @@ def test_reach_is_the_inverse_of_the_transit_time(time, acceleration, speed):
 @pytest.mark.parametrize("time, distance", [(1.0, 0.5), (2.0, 2.0), (4.0, 6.0), (0.0, 0.0)])
 def test_both_regimes_by_hand(time, distance):
     # 2 m/s^2, 2 m/s: triangular up to 2 s and 2 m, then 2 m per second
-    assert reach(time, 2.0, 2.0) == pytest.approx(distance)
+    assert reachable_distance(time, 2.0, 2.0) == pytest.approx(distance)
     assert transit_time([distance, -distance], 2.0, 2.0) == pytest.approx([time, time])
 
 
@@ -94,7 +87,7 @@ def test_bang_bang_gets_as_far_as_reach():
             left = time - (k + 0.5) * h
             faster = min(v + 1.3 * h, speed, max(0.0, 1.3 * (left - 0.5 * h)))
             x, v = x + 0.5 * h * (v + faster), faster
-        assert reach(time, 1.3, speed) == pytest.approx(x, rel=1e-3)
+        assert reachable_distance(time, 1.3, speed) == pytest.approx(x, rel=1e-3)
         assert v == pytest.approx(0.0, abs=1e-3)
 
 
@@ -110,8 +103,8 @@ def test_times_and_reaches_of_the_unknown():
     with np.errstate(all="raise"):
         assert transit_time([np.nan, np.inf, -np.inf], 1.0).tolist() == [np.inf] * 3
         assert transit_time([np.inf, 3.0], 1.0, 1.0).tolist() == [np.inf, 4.0]
-        assert reach([np.nan, -1.0, 0.0, np.inf], 1.0, 2.0).tolist() == [0.0, 0.0, 0.0, np.inf]
-        assert reach(4.0, 1.0) == 4.0
+        assert reachable_distance([np.nan, -1.0, 0.0, np.inf], 1.0, 2.0).tolist() == [0.0, 0.0, 0.0, np.inf]
+        assert reachable_distance(4.0, 1.0) == 4.0
 
 
 # With limited jerk.

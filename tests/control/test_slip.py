@@ -8,14 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from safe_wrappers.control.vehicle.slip import (
+from safe_wrappers.appendix.vehicle.slip import (
     normalized_slip,
     piecewise_slip_ratio,
-    slip_ratio,
-    slip_window,
     spins_out,
     wheel_acceleration,
 )
+from safe_wrappers.control.vehicle.slip import slip_ratio, slip_window
 from safe_wrappers.control.vehicle.traction_curves import MAGIC_FORMULA
 from safe_wrappers.errors import ConfigurationError
 

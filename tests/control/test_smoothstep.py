@@ -8,13 +8,15 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BPoly
 
-from safe_wrappers.control.handover.smoothstep import (
-    SMOOTHSTEP_PEAK_RATE,
+from safe_wrappers.appendix.handover.blends import (
     blend,
     blend_rate,
     moving_blend_interval,
-    shortest_latched_blend,
     shortest_moving_blend,
+)
+from safe_wrappers.control.handover.smoothstep import (
+    SMOOTHSTEP_PEAK_RATE,
+    shortest_latched_blend,
     smoothstep,
 )
 from safe_wrappers.errors import ConfigurationError

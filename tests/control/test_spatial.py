@@ -8,18 +8,16 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from safe_wrappers.control.numerics.spatial import (
+from safe_wrappers.appendix.estimation.lever_arm import (
     centre_acceleration,
     centre_acceleration_from_imu,
     centre_velocity,
-    from_sensor,
     imu_specific_force,
     lever_arm_acceleration,
-    lever_arm_velocity,
     rigid_transform,
     sensor_pose,
-    to_sensor,
 )
+from safe_wrappers.control.numerics.spatial import from_sensor, lever_arm_velocity, to_sensor
 from safe_wrappers.errors import ConfigurationError
 
 SPINNING = """

@@ -7,18 +7,20 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.interpolate import BPoly, CubicHermiteSpline
 
-from safe_wrappers.control.handover import splines
-from safe_wrappers.control.handover.splines import (
-    evaluate,
-    hermite,
-    hermite_series,
+from safe_wrappers.appendix.handover import splines as appendix_splines
+from safe_wrappers.appendix.handover.splines import (
     interior_extrema,
     knot_acceleration_step,
     knot_torque_step,
     peak_torque,
-    quintic_coefficients,
     quintic_reduced_system,
     quintic_system,
+)
+from safe_wrappers.control.handover.splines import (
+    evaluate,
+    hermite,
+    hermite_series,
+    quintic_coefficients,
 )
 from safe_wrappers.errors import ConfigurationError
 
@@ -111,7 +113,7 @@ def test_times_come_last_and_batches_are_element_by_element():
 def test_jerk_profile_is_the_printed_quadratic():
     _, _, c = segments(1)
     t = np.linspace(0, 1, 5)
-    profile = splines.jerk_profile(c)
+    profile = appendix_splines.jerk_profile(c)
     np.testing.assert_allclose(profile[0], [6 * c[0, 3], 24 * c[0, 4], 60 * c[0, 5]], rtol=1e-15)
     np.testing.assert_allclose(evaluate(profile, t), evaluate(c, t, 3), rtol=1e-13)
 

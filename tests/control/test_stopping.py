@@ -5,10 +5,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from safe_wrappers.appendix.filtering.barriers import kinetic_inset, kinetic_row
 from safe_wrappers.control.backup import stopping
 from safe_wrappers.control.backup.stopping import (
-    kinetic_inset,
-    kinetic_row,
     predicted_approach,
     sampled_acceleration_limit,
     sampled_inset,

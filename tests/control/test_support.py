@@ -8,17 +8,9 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from safe_wrappers.control.legged.centroidal import momentum_rate
-from safe_wrappers.control.legged.support import (
-    balance,
-    common_plane,
-    plane,
-    support_margin,
-    support_polygon,
-    support_rows,
-    zmp_of_forces,
-    zmp_of_motion,
-)
+from safe_wrappers.appendix.legged.balance import balance, support_margin, zmp_of_forces, zmp_of_motion
+from safe_wrappers.appendix.legged.centroidal import momentum_rate
+from safe_wrappers.control.legged.support import common_plane, plane, support_polygon, support_rows
 from safe_wrappers.errors import ConfigurationError
 
 UP = np.array([0.0, 0.0, 1.0])

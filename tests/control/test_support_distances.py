@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from safe_wrappers.appendix.legged.balance import balance
 from safe_wrappers.control.contact.friction_cone import tangents
-from safe_wrappers.control.legged import support_distances as module
-from safe_wrappers.control.legged.support import balance, common_plane, support_polygon
+from safe_wrappers.control.legged.support import common_plane, support_polygon
 from safe_wrappers.control.legged.support_distances import support_distances
 from safe_wrappers.errors import ConfigurationError
 
@@ -17,7 +17,7 @@ UPRIGHT = np.tile(UP, (4, 1))
 
 
 def one_by_one(instant, points, normals, forces):
-    """Each instant's, by the polygon that `control.support` builds."""
+    """Each instant's, by the polygon that `support_polygon` builds."""
     found = []
     for when in np.unique(instant):
         here = instant == when
@@ -94,16 +94,19 @@ def test_as_one_by_one(seed, instants, contacts, coarse, rough):
     )
 
 
-def test_many_contacts_are_taken_a_few_instants_at_a_time(monkeypatch):
+def test_instants_beyond_what_fits_in_memory_at_once_give_the_same():
     rng = np.random.default_rng(0)
-    instant = np.repeat(np.arange(7), 5)
-    points = np.column_stack([rng.uniform(-1.0, 1.0, (35, 2)), np.zeros(35)])
-    normals, forces = np.tile(UP, (35, 1)), np.outer(rng.uniform(0.0, 1.0, 35), UP)
+    instants, each = 70, 40
+    instant = np.repeat(np.arange(instants), each)
+    points = np.column_stack([rng.uniform(-1.0, 1.0, (instant.size, 2)), np.zeros(instant.size)])
+    normals, forces = np.tile(UP, (instant.size, 1)), np.outer(rng.uniform(0.0, 1.0, instant.size), UP)
     whole = support_distances(instant, points, normals, forces)
-    for products in (1, 300):
-        monkeypatch.setattr(module, "_PRODUCTS", products)
-        np.testing.assert_array_equal(support_distances(instant, points, normals, forces), whole)
-    assert whole.shape == (7,)
+    alone = [
+        support_distances(instant[s], points[s], normals[s], forces[s])
+        for s in (slice(i, i + each) for i in range(0, instant.size, each))
+    ]
+    assert whole.shape == (instants,)
+    np.testing.assert_array_equal(whole, np.concatenate(alone))
 
 
 def test_bad_input_is_refused_in_words():

@@ -16,7 +16,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 from scipy.stats import kstest
 
-from safe_wrappers.appendix.flexible_joint import (
+from safe_wrappers.appendix.handover.flexible_joint import (
     accelerations,
     boundary_layer_energy,
     damping_ratios,

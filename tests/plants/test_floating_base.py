@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from safe_wrappers.control.contact.friction_cone import friction_pyramid, friction_ratio, in_cone
-from safe_wrappers.control.legged.centroidal import (
+from safe_wrappers.appendix.contact.forces import friction_ratio, in_cone
+from safe_wrappers.appendix.legged.balance import balance
+from safe_wrappers.appendix.legged.centroidal import (
     centroidal_bias_rate,
-    centroidal_momentum,
     centroidal_momentum_matrix,
     momentum_rate,
 )
-from safe_wrappers.control.legged.support import balance
+from safe_wrappers.appendix.legged.moving_bodies import moving_bodies
+from safe_wrappers.control.contact.friction_cone import friction_pyramid
+from safe_wrappers.control.legged.centroidal import centroidal_momentum
 from safe_wrappers.control.legged.whole_body import WholeBodyProblem, rigid_forces, solve_cone, solve_pyramid
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.queries.floating_base import (
     contact_points,
     equations_of_motion,
-    floating_base_terms,
-    moving_bodies,
 )
 
 ZOO = """
@@ -85,7 +85,7 @@ def pushed(terms):
 def test_the_equations_of_motion_hold_with_mujocos_own_accelerations_and_forces(walker):
     touched = 0
     for plant in walker(60):
-        terms, data = floating_base_terms(plant), plant.data
+        terms, data = equations_of_motion(plant.model, plant.forward(), plant.actuators), plant.data
         left = terms.inertia @ data.qacc + terms.bias
         right = terms.actuation @ data.ctrl + pushed(terms)
         assert left == pytest.approx(right, abs=1e-9 * (1.0 + np.abs(right).max()))
@@ -188,7 +188,7 @@ def bodies_of(bodies):
 def test_forces_are_what_mujocos_own_friction_allows(walker):
     seen = 0
     for plant in walker(40):
-        contacts = floating_base_terms(plant).contacts
+        contacts = equations_of_motion(plant.model, plant.forward(), plant.actuators).contacts
         assert in_cone(contacts.forces, contacts.normals, contacts.friction, 1e-6).all()
         # Its pyramid, edge on its first tangent.
         sides = friction_pyramid(contacts.normals, contacts.friction, 4, contacts.first_tangents)
@@ -200,7 +200,7 @@ def test_forces_are_what_mujocos_own_friction_allows(walker):
 def test_drifts_are_what_jacobians_change_by(walker):
     compared = 0
     for plant in walker(25):
-        terms, model = floating_base_terms(plant), plant.model
+        terms, model = equations_of_motion(plant.model, plant.forward(), plant.actuators), plant.model
         contacts, bodies = terms.contacts, moving_bodies(model, plant.data)
         moved = mujoco.MjData(model)
         dt = 1e-6
@@ -298,7 +298,7 @@ def test_the_tree_below_a_body_is_a_robot_of_its_own():
 
 def test_the_momentum_rate_is_that_of_the_contact_wrenches(walker):
     for plant in walker(30):
-        terms, data = floating_base_terms(plant), plant.data
+        terms, data = equations_of_motion(plant.model, plant.forward(), plant.actuators), plant.data
         bodies = moving_bodies(plant.model, data)
         rate = centroidal_momentum_matrix(*bodies_of(bodies)) @ data.qacc + centroidal_bias_rate(
             bodies.masses,
@@ -387,7 +387,7 @@ def test_the_rigid_forces_of_a_standing_ant_are_its_weight_and_need_next_to_no_c
     for _ in range(60):
         env.step(np.zeros(8, np.float32))
     plant.observe()
-    terms = floating_base_terms(plant)
+    terms = equations_of_motion(plant.model, plant.forward(), plant.actuators)
     c = terms.contacts
     assert len(c.points) >= 3
     problem = WholeBodyProblem(
@@ -417,7 +417,7 @@ def test_the_rigid_forces_of_a_standing_ant_are_its_weight_and_need_next_to_no_c
 def test_every_answer_on_a_struggling_robot_is_inside_its_cones_whatever_its_status(walker):
     seen = set()
     for plant in walker(120):
-        terms = floating_base_terms(plant)
+        terms = equations_of_motion(plant.model, plant.forward(), plant.actuators)
         c = terms.contacts
         if not len(c.points):
             continue

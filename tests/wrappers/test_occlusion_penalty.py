@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from occlusion_world import STILL, WALL, Turning, straight
 
 import safe_wrappers as sw
-from safe_wrappers.control.estimation.covariance import blind_covariance, double_integrator_covariance
+from safe_wrappers.appendix.estimation.covariance import blind_covariance, double_integrator_covariance
 from safe_wrappers.errors import (
     ConfigurationError,
     SafeWrappersError,

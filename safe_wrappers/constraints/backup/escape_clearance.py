@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
 from safe_wrappers.constraints.obstacles.obstacles import Discs, distances
 from safe_wrappers.constraints.obstacles.tracked_discs import TrackedDiscs
-from safe_wrappers.control.backup.evasive_maneuvers import Escapes, Manoeuvre
+from safe_wrappers.control.backup.evasive_maneuvers import EvasiveManeuvers, Maneuver
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import (
     BoundConstraint,
@@ -137,12 +137,12 @@ class BoundEscapeClearance(BoundConstraint):
                 f"horizon_s = {self.spec.horizon_s:g} s is too short for control steps of {self.plant.hold_s:g} s: "
                 f"a manoeuvre takes {longest} of them before it brakes"
             )
-        bank = [Manoeuvre(0.0, 0.0, 0)]
-        bank += [Manoeuvre(x, y, going) for x, y in _DIRECTIONS for going in range(1, longest + 1)]
-        self._escapes = Escapes(point.axes, bank, np.arange(0, holds + 1, _EVERY))
+        bank = [Maneuver(0.0, 0.0, 0)]
+        bank += [Maneuver(x, y, going) for x, y in _DIRECTIONS for going in range(1, longest + 1)]
+        self._escapes = EvasiveManeuvers(point.axes, bank, np.arange(0, holds + 1, _EVERY))
         starts = [max(1, round(seconds / self.plant.hold_s)) for seconds in _GOING_S]
-        self._usual = [0, *(bank.index(Manoeuvre(x, y, n)) for x, y in _DIRECTIONS for n in starts)]
-        self._firsts_of = [0, *(bank.index(Manoeuvre(x, y, 1)) for x, y in _DIRECTIONS)]
+        self._usual = [0, *(bank.index(Maneuver(x, y, n)) for x, y in _DIRECTIONS for n in starts)]
+        self._firsts_of = [0, *(bank.index(Maneuver(x, y, 1)) for x, y in _DIRECTIONS)]
 
     def executed(self, control: Array) -> Memory:
         """The manoeuvre that is open after the control: that of the nearest one that was asked about."""

@@ -145,7 +145,7 @@ class BoundHeadingDriveClearance(BoundConstraint):
         speed = math.hypot(motion.vx, motion.vy) + abs(self.drive.com_offset * motion.yaw_rate)
         self._loss = self._push + speed * (self.drive.hold_s + self._turn * self.drive.coast_time)
         x, y, reserve = motion.x, motion.y, self.spec.margin + self.spec.state_error
-        kept = path.reach + self._swivel
+        kept = path.radius + self._swivel
         bounds: list[tuple[float, _Circle]] = []
         best = math.inf
         for obstacle in self.spec.obstacles:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from safe_wrappers.constraints.contact.geom_gaps import GeomGaps
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.control.contact.body_regions import body_region
-from safe_wrappers.control.contact.impact import series_stiffness
+from safe_wrappers.control.contact.stiffness import series_stiffness
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Promise, non_negative, positive
 from safe_wrappers.plants.mujoco.forecast import Forecast
@@ -30,7 +30,7 @@ class ImpactSpeedLimit(RolloutConstraint):
     A mass m that meets a spring k at the speed v, and is pushed on by F_p, presses with at most
     `F_p + sqrt(F_p^2 + k m v^2)`. So the speed allowed at the first touch is `sqrt(F (F - 2 F_p) / (k m))`, with the
     push F_p towards the obstacle counted (motors, gravity, centrifugal forces) and a pull *not*: braking after
-    contact comes too late (`control.contact.impact.attenuation_after_delay`). m is the machine's effective mass at
+    contact comes too late (`appendix.contact.impact.attenuation_after_delay`). m is the machine's effective mass at
     the very point and along the very normal, by the model's Jacobian and inertia, so it changes with the pose.
 
     The speed is reduced before contact: the plant's model is stepped through the held action, and then with the
@@ -43,7 +43,7 @@ class ImpactSpeedLimit(RolloutConstraint):
     geoms at a time; friction, and forces through other contacts and joint stops, are not counted. That braking
     always can keep it afterwards holds as long as it takes no more than `holds` control steps, or `braking` is true.
     Obstacles are taken where they are; who walks into the robot is not slowed down. The physics step should be short
-    against the contact (a tenth of `control.contact.impact.time_to_peak`, say). Hence best effort.
+    against the contact (a tenth of `appendix.contact.impact.time_to_peak`, say). Hence best effort.
 
     `value`, N: the limit less the peak that a contact at the present speed would have. Before contact, without
     `braking`, it is not below zero, since the machine may still slow down; with it, the speed counts that this

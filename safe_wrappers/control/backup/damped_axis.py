@@ -1,15 +1,15 @@
-"""One axis of a damped point mass under a held force: its exact step, its stopping distance, and the inverse.
+"""One axis of a damped point mass under a held force: exact step, stopping distance and its inverse.
 
 A physics step maps speed v and control u to `v' = decay v + gain u` and moves by `timestep v'` (MuJoCo's
 semi-implicit Euler step with implicit joint damping; decay = 1 without damping). A control is held for `substeps`
-of them. All of that is linear, so three things are exact and cheap:
+of them. These maps are linear, so three results are exact and cheap:
 
 * A hold: `v_end = A v + B u`, `x_end = x + P v + Q u`.
-* The brake: the full opposing control for as many holds as it takes, and in the last one just the control
-  `-A v / B` that ends it at rest; full braking, held for all of it, would reverse the motion. Within each of these
-  holds the speed falls monotonically to zero or above, so the body never turns back.
-* The stopping distance: while the number n of full holds is the same, every map is linear in v, so the distance
-  is piecewise linear in v, with a knot at each speed that n full holds take away exactly. It is tabulated once.
+* Braking: the full opposing control for as many holds as needed, and in the last one the control `-A v / B` that
+  ends it at rest (full braking held to its end would reverse the motion). Within each of these holds the speed falls
+  monotonically to zero, so the body never turns back.
+* The stopping distance: for a fixed number n of full holds every map is linear in v, so the distance is piecewise
+  linear in v, with a knot at each speed that n full holds remove exactly. It is tabulated once.
 
 An env may clip the speed at the start of every control step (PointMaze: 5 m/s). Braking from above the clip is
 then braking from the clip: the table is flat there.
@@ -20,9 +20,9 @@ import math
 from dataclasses import dataclass, field
 
 _MOST_HOLDS = 4096
-"""Length of the table, in holds of full braking; faster than it knows is counted as never stopping."""
+"""Length of the table, in holds of full braking; the distance beyond it is infinite."""
 _FLAT = 1e9
-"""m/s; the stopping distance is flat from the clip up to here."""
+"""m/s; end of the constant part of the table above the clip."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,9 @@ class _Stops:
 
     Attributes:
         speeds: The knots, m/s, ascending from 0.
-        ways: Stopping distance at each, m.
-        totals: Way of the hold that ends at this speed (its share that depends on it) and the stop after it, m.
+        ways: Stopping distance at each knot, m.
+        totals: Stopping distance plus that part of the preceding hold's displacement that is proportional to the
+            knot's speed, m.
     """
 
     speeds: list[float]
@@ -44,7 +45,7 @@ class _Stops:
         return _interpolate(self.speeds, self.ways, speed)
 
     def speed(self, total: float) -> float:
-        """The inverse over `totals`; the fastest that the table knows beyond it."""
+        """The inverse of `totals`; the largest tabulated speed beyond it."""
         if total >= self.totals[-1]:
             return self.speeds[-1]
         return _interpolate(self.totals, self.speeds, total)
@@ -59,8 +60,8 @@ def _interpolate(xs: list[float], ys: list[float], x: float) -> float:
 
 
 @dataclass(frozen=True)
-class HeldAxis:
-    """The constants of one axis.
+class DampedAxis:
+    """Constants of one axis.
 
     Attributes:
         decay: Share of the speed that one physics step keeps without control, in (0, 1].
@@ -69,7 +70,7 @@ class HeldAxis:
         substeps: Physics steps per control step.
         low: Smallest control, < 0.
         high: Largest control, > 0.
-        clip: Speed to which the env clips the motion at the start of every control step, m/s; inf: it does not.
+        clip: Speed to which the env clips the motion at the start of every control step, m/s; inf for none.
     """
 
     decay: float
@@ -85,9 +86,9 @@ class HeldAxis:
     add: float = field(init=False)
     """B: speed that one hold adds per control, m/s."""
     drift: float = field(init=False)
-    """P: way in one hold per speed, s."""
+    """P: displacement in one hold per speed, s."""
     shift: float = field(init=False)
-    """Q: way in one hold per control, m."""
+    """Q: displacement in one hold per control, m."""
     _up: _Stops = field(init=False, repr=False)
     _down: _Stops = field(init=False, repr=False)
 
@@ -103,9 +104,11 @@ class HeldAxis:
         object.__setattr__(self, "_down", self._table(self.high))
 
     def _table(self, brake: float) -> _Stops:
-        """Knots until the speed that no control can exceed, or the clip."""
+        """The table for one direction of motion, up to the clip or to `_MOST_HOLDS` knots."""
         loss, lost_way = self.add * brake, self.shift * brake
-        just_stops = self.drift - self.shift * self.keep / self.add  # way of the last hold, per speed
+        just_stops = (
+            self.drift - self.shift * self.keep / self.add
+        )  # displacement of the last hold, per speed
         speeds, ways = [0.0, loss / self.keep], [0.0, just_stops * loss / self.keep]
         while len(speeds) < _MOST_HOLDS and speeds[-1] < self.clip:
             speed = (speeds[-1] + loss) / self.keep
@@ -120,16 +123,16 @@ class HeldAxis:
         return _Stops(speeds, ways, [per_speed * v + w for v, w in zip(speeds, ways, strict=True)])
 
     def clipped(self, v: float) -> float:
-        """The speed with which a control step starts."""
+        """The speed after the env's clip."""
         return max(-self.clip, min(v, self.clip))
 
     def step(self, x: float, v: float, u: float) -> tuple[float, float]:
-        """Position and speed at the end of a hold; `v` is clipped already."""
+        """Position and speed at the end of a hold; `v` is already clipped."""
         u = max(self.low, min(u, self.high))
         return x + self.drift * v + self.shift * u, self.keep * v + self.add * u
 
     def rest(self, x: float, v: float) -> float:
-        """Where braking comes to rest."""
+        """Position at which braking comes to rest."""
         return x + self._up.way(v) if v >= 0.0 else x - self._down.way(-v)
 
     def brake(self, v: float) -> float:
@@ -151,7 +154,7 @@ class HeldAxis:
         return points
 
     def extent(self, x: float, v: float, u: float) -> tuple[float, float]:
-        """Least and greatest position during a hold, its start included; `v` is clipped already."""
+        """Least and greatest position during a hold, its start included; `v` is already clipped."""
         end, speed = self.step(x, v, u)
         if self.substeps == 1 or v * speed >= 0.0:
             return min(x, end), max(x, end)
@@ -166,8 +169,8 @@ class HeldAxis:
     def control_to_rest_at(self, x: float, v: float, target: float) -> float:
         """The control whose hold, and braking after it, comes to rest at `target`; it may be out of bounds.
 
-        `rest` after a hold grows with the control, so this is the bound on the control that keeps the rest point
-        on this side of the target. `v` is clipped already.
+        The rest point grows with the control, so this is the bound on controls that stop before the target. `v` is
+        already clipped.
         """
         per_speed = self.shift / self.add
         way = target - x - (self.drift - per_speed * self.keep) * v

@@ -1,10 +1,10 @@
-"""Escapes: where a point mass is, at each control step, if it goes off in some direction and then brakes to rest.
+"""Positions of a point mass along evasive manoeuvres: drive in some direction, then brake to rest.
 
-A manoeuvre holds a full (or no) control along each axis for some control steps, then brakes each axis for itself,
-fully, and in its last hold just to rest (`held_axis.py`). Along one axis the way of the go-phase is linear in the
-present state. The way of the braking is piecewise linear in the speed at which it begins, with a knot at each speed
-that whole holds of full braking take away exactly; so it is tabulated once, and every manoeuvre from many states is a
-few array operations, exact to rounding.
+A manoeuvre holds a full (or no) control along each axis for some control steps (the drive phase), then brakes each
+axis separately: fully, and in its last hold just enough to end at rest (`damped_axis.py`). Along one axis the
+displacement of the drive phase is linear in the present state. The displacement of braking is piecewise linear in the
+speed at which it begins, with a knot at each speed that whole holds of full braking remove exactly; it is tabulated
+once. So every manoeuvre from many states takes a few array operations, exact to rounding.
 """
 
 from typing import NamedTuple
@@ -12,16 +12,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.control.backup.damped_axis import HeldAxis
+from safe_wrappers.control.backup.damped_axis import DampedAxis
 
 Array = NDArray[np.float64]
 
 _FASTEST_M_S = 50.0
-"""Speeds up to here are tabulated."""
+"""Speeds up to this one are tabulated."""
 
 
-class Manoeuvre(NamedTuple):
-    """Controls along x and y, as shares (-1 to 1) of what the axis has in that direction, for so many holds."""
+class Maneuver(NamedTuple):
+    """Controls along x and y, as shares (-1 to 1) of the limit in that direction, and how many holds they last."""
 
     x: float
     y: float
@@ -29,18 +29,18 @@ class Manoeuvre(NamedTuple):
 
 
 class _Braking(NamedTuple):
-    """Way of braking over time, from one direction of motion.
+    """Displacement of braking over time, for one direction of motion.
 
     Attributes:
         speeds: Knots, m/s, ascending from 0, shape (k,).
-        ways: After so many holds, m, shape (k, holds + 1).
+        ways: Displacement after 0, 1, ... holds, m, shape (k, holds + 1).
     """
 
     speeds: Array
     ways: Array
 
     def at(self, speed: Array, holds: NDArray[np.intp]) -> Array:
-        """Ways for speeds (c, m) >= 0 after so many holds (m, k), shape (c, m, k)."""
+        """Displacements for speeds (c, m) >= 0 after the given holds (m, k), shape (c, m, k)."""
         last = len(self.speeds) - 1
         i = np.minimum(np.maximum(self.speeds.searchsorted(speed, side="right"), 1), last)
         low, high = self.speeds[i - 1], self.speeds[i]
@@ -50,7 +50,7 @@ class _Braking(NamedTuple):
 
 
 class _Prepared(NamedTuple):
-    """What go-phases make of an axis's position and speed, and the braking after them; m manoeuvres, k instants."""
+    """Drive phases as maps of an axis's speed, and the braking after them; m manoeuvres, k instants."""
 
     drift: Array
     shift: Array
@@ -62,17 +62,17 @@ class _Prepared(NamedTuple):
     symmetric: bool
 
 
-class Escapes:
-    """All of some manoeuvres, along both axes.
+class EvasiveManeuvers:
+    """A set of manoeuvres along both axes.
 
     Args:
         axes: Constants of the motion along x and y.
         manoeuvres: At least one.
-        instants: Numbers of holds after which positions are asked for, ascending.
+        instants: Numbers of holds after which positions are returned, ascending.
     """
 
     def __init__(
-        self, axes: tuple[HeldAxis, HeldAxis], manoeuvres: list[Manoeuvre], instants: NDArray[np.intp]
+        self, axes: tuple[DampedAxis, DampedAxis], manoeuvres: list[Maneuver], instants: NDArray[np.intp]
     ) -> None:
         self.manoeuvres = manoeuvres
         self.instants = instants
@@ -84,19 +84,19 @@ class Escapes:
                 for axis, along in zip(axes, shares, strict=True)
             ]
         ).T
-        """Of the go-phases, shape (manoeuvres, 2)."""
+        """Of the drive phases, shape (manoeuvres, 2)."""
         self._going = np.array([m.holds for m in manoeuvres])
         self._parts = [self._prepared(axis, self.controls[:, i]) for i, axis in enumerate(axes)]
 
-    def _prepared(self, axis: HeldAxis, controls: Array) -> _Prepared:
+    def _prepared(self, axis: DampedAxis, controls: Array) -> _Prepared:
         n = int(self.instants[-1])
-        keep, add = np.ones(n + 1), np.zeros(n + 1)  # speed after k holds, of speed and of control
-        drift, shift = np.zeros(n + 1), np.zeros(n + 1)  # and the way
+        keep, add = np.ones(n + 1), np.zeros(n + 1)  # speed after k holds, per speed and per control
+        drift, shift = np.zeros(n + 1), np.zeros(n + 1)  # and the displacement
         for k in range(n):
             keep[k + 1], add[k + 1] = axis.keep * keep[k], axis.keep * add[k] + axis.add
             drift[k + 1] = drift[k] + axis.drift * keep[k]
             shift[k + 1] = shift[k] + axis.drift * add[k] + axis.shift
-        steps = np.minimum(self.instants, self._going[:, None])  # holds of the go-phase done by then
+        steps = np.minimum(self.instants, self._going[:, None])  # holds of the drive phase completed by then
         return _Prepared(
             drift[steps],
             shift[steps] * controls[:, None],
@@ -114,7 +114,7 @@ class Escapes:
         Args:
             position: Shape (c, 2), m.
             velocity: Shape (c, 2), m/s.
-            which: Indices of the manoeuvres that are asked for, shape (m,).
+            which: Indices of manoeuvres, shape (m,).
 
         Returns:
             Along x and along y, shapes (c, m, instants), m.
@@ -140,10 +140,12 @@ class Escapes:
         return np.array([axis.brake(float(v)) for axis, v in zip(self._axes, velocity, strict=True)])
 
 
-def _braking(axis: HeldAxis, brake: float, holds: int) -> _Braking:
-    """Table of a direction of motion, against a control of size `brake`."""
+def _braking(axis: DampedAxis, brake: float, holds: int) -> _Braking:
+    """Table for one direction of motion, braked by a control of size `brake`."""
     loss, lost_way = axis.add * brake, axis.shift * brake
-    per_speed = axis.drift - axis.shift * axis.keep / axis.add  # way of the last hold, which ends at rest
+    per_speed = (
+        axis.drift - axis.shift * axis.keep / axis.add
+    )  # displacement of the last hold, which ends at rest
     speeds, ways = [0.0], [np.zeros(holds + 1)]
     speed = loss / axis.keep
     while speeds[-1] < _FASTEST_M_S:

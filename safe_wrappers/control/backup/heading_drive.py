@@ -1,8 +1,8 @@
-"""A planar body driven along its heading: exact held-step prediction and its stopping path in closed form.
+"""A planar body driven along its heading: exact prediction of held controls, and its stopping path in closed form.
 
-The body slides in the plane with linear damping, turns about a vertical axis, and is pushed along its heading
-only, so nothing brakes it sideways. Two facts carry the safety argument (both also hold for MuJoCo's
-semi-implicit Euler step, exactly):
+The body slides in the plane with linear damping, turns about a vertical axis, and is driven along its heading only;
+sideways only damping brakes it. The safety argument rests on two facts, exact also for MuJoCo's semi-implicit Euler
+step:
 
 * Without drive the body coasts to rest at `p + (m / c) v`, whatever the step size, in a straight line.
 * With the drive braking along a fixed heading, the forward part stops after
@@ -10,12 +10,12 @@ semi-implicit Euler step, exactly):
   The forward part decays faster, so the path is a convex curve from p, tangent to v, to that end point: it lies
   in the triangle of p, the crossing of the tangent with the forward stop, and the end point.
 
-A clearance counted from that triangle never falls while the backup manoeuvre (brake along the heading, hold the
-heading) runs; so it is a control barrier that is always feasible, for any number of obstacles at once. With
-uncertain mass and damping the longest forward and sideways stops span a trapezoid with the same property.
+The clearance of that triangle never falls while the backup manoeuvre (brake along the heading, hold the heading)
+runs. So it is a control barrier that is always feasible, for any number of obstacles at once. With uncertain mass and
+damping the longest forward and sideways stops span a trapezoid with the same property.
 
-Source: appendix "Relative degree and kinetic stopping insets" (encode momentum and available braking before
-regulating a clearance), for this plant. Plain floats: at this size they are faster than arrays.
+Source: appendix "Relative degree and kinetic stopping insets", for this plant. Plain floats: at this size they are
+faster than arrays.
 """
 
 import math
@@ -23,10 +23,10 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 _WANDER = 0.012
-"""Metres that the stopping path bends per metre of sideways coasting, at most.
+"""Bound on the lateral deviation of the stopping path, per metre of sideways coasting.
 
-The drag acts at the turning axis, behind the centre of mass, so it turns a body that slides; the servo resists
-in the mean only, chattering about zero. Measured against MuJoCo: 0.0104 at 1.3 m/s, less below.
+The drag acts at the turning axis, behind the centre of mass, so it turns a sliding body; the servo, chattering about
+zero, resists only on average. Measured in MuJoCo: 0.0104 at 1.3 m/s, less at lower speeds.
 """
 
 
@@ -42,7 +42,7 @@ class Motion(NamedTuple):
 
 
 class StoppingPath(NamedTuple):
-    """Where a braking body goes, in its heading frame mirrored so that every number is non-negative.
+    """Area that a braking body stays in, in its heading frame, mirrored so that every number is non-negative.
 
     Attributes:
         x, y: Position now, m.
@@ -51,9 +51,9 @@ class StoppingPath(NamedTuple):
         forward: Distance until the forward motion stops, m.
         sideways: Distance that the sideways motion coasts, m.
         crossing: Sideways distance at which the tangent of the motion reaches `forward`, m.
-        reach: No point of the area is farther than this from the present position, m.
-        spread: True where mass or damping are uncertain: the trapezoid instead of the triangle.
-        wander: How far the drag may turn the body off this path, m; distances are counted from there.
+        radius: Of a circle around the present position that contains the area and its wander, m.
+        spread: Whether mass or damping are uncertain: a trapezoid instead of a triangle.
+        wander: Bound on the deviation from the path by drag, m; subtracted from distances.
     """
 
     x: float
@@ -65,12 +65,12 @@ class StoppingPath(NamedTuple):
     forward: float
     sideways: float
     crossing: float
-    reach: float
+    radius: float
     spread: bool
     wander: float = 0.0
 
     def distance(self, px: float, py: float) -> float:
-        """Signed distance from a point to the area and its wander, m: negative inside."""
+        """Signed distance of a point from the area enlarged by its wander, m: negative inside."""
         dx, dy = px - self.x, py - self.y
         a, b = dx * self.ex + dy * self.ey, dx * self.sx + dy * self.sy
         s, c, e = self.forward, self.crossing, self.sideways
@@ -86,7 +86,7 @@ class StoppingPath(NamedTuple):
         return (-near if inside else near) - self.wander
 
     def end_distance(self, px: float, py: float) -> float:
-        """Distance from a point to where the body comes to rest, its wander taken off, m."""
+        """Distance of a point from the rest position, less the wander, m."""
         end_x = self.x + self.forward * self.ex + self.sideways * self.sx
         end_y = self.y + self.forward * self.ey + self.sideways * self.sy
         return math.hypot(px - end_x, py - end_y) - self.wander
@@ -103,7 +103,7 @@ def _to_segment(px: float, py: float, ax: float, ay: float, bx: float, by: float
 
 @dataclass(frozen=True, slots=True)
 class HeadingDrive:
-    """The constants of the body.
+    """Constants of the body.
 
     Attributes:
         mass: kg.
@@ -142,7 +142,7 @@ class HeadingDrive:
 
     @property
     def coast_time(self) -> float:
-        """Longest coasting time constant m / c inside the uncertainty, s: it coasts this times its speed."""
+        """Longest time constant of coasting, m / c, inside the uncertainty, s: coasting distance per speed."""
         return self.mass * (1.0 + self.uncertainty) / (self.damping * (1.0 - self.uncertainty))
 
     @property
@@ -156,7 +156,7 @@ class HeadingDrive:
         return self.drive_limit / (self.mass * (1.0 - self.uncertainty)) * self.hold_s
 
     def corners(self) -> "list[HeadingDrive]":
-        """The bodies at the corners of the uncertainty, each certain; this one alone if nothing is uncertain."""
+        """The bodies at the corners of the uncertainty, each without uncertainty; this one if there is none."""
         if self.uncertainty == 0.0:
             return [self]
         factors = (1.0 - self.uncertainty, 1.0 + self.uncertainty)
@@ -176,8 +176,8 @@ class HeadingDrive:
     def brake_distance(self, speed: float) -> float:
         """Longest distance to a stop under full braking, m, for a forward speed in m/s (>= 0).
 
-        Heavier and less damped is longer, so the worst case is at the corner of the uncertainty. The last hold
-        brakes just enough to end at rest, which adds at most a quarter of a hold's speed change times its half.
+        The distance is longest for the heaviest and least damped body of the uncertainty. The last hold brakes just
+        enough to end at rest, which adds at most an eighth of a hold's speed change times the hold.
         """
         mass, damping = self.mass * (1.0 + self.uncertainty), self.damping * (1.0 - self.uncertainty)
         time, terminal = mass / damping, self.drive_limit / damping
@@ -189,11 +189,11 @@ class HeadingDrive:
         force = -forward_speed * self.mass / self.hold_s
         return max(-self.drive_limit, min(force, self.drive_limit)) / self.drive_gain
 
-    def turn_left(self, yaw_rate: float) -> float:
-        """The angle that the body still turns while the servo brakes its turning, rad.
+    def residual_turn_angle(self, yaw_rate: float) -> float:
+        """Angle by which the body still turns while the servo brakes its rotation, rad.
 
-        Stepped, not integrated: the torque stops the turn within a few physics steps, and 1 mrad of heading is
-        0.5 mm of stopping path. The servo never comes quite to rest; what remains is an oscillation about zero.
+        Simulated step by step: the torque stops the rotation within a few physics steps, and 1 mrad of heading is
+        0.5 mm of stopping path. The oscillation of the servo about zero is left out.
         """
         h, m_l = self.timestep, self.mass + self.timestep * self.damping
         inertia = self.yaw_inertia + h * self.yaw_damping - (self.mass * self.com_offset) ** 2 / m_l
@@ -211,12 +211,12 @@ class HeadingDrive:
 
         Args:
             motion: State to stop from.
-            brake: False coasts along the heading too: longer, and the drive is not needed at all.
+            brake: False: coast along the heading too, without the drive, over a longer distance.
         """
-        heading = motion.heading + self.turn_left(motion.yaw_rate)
+        heading = motion.heading + self.residual_turn_angle(motion.yaw_rate)
         cos, sin = math.cos(heading), math.sin(heading)
         ahead = motion.vx * cos + motion.vy * sin
-        # The centre of mass coasts, not the turning axis: its sideways speed carries the yaw rate's share.
+        # Sideways the centre of mass coasts, not the turning axis: add the share of the yaw rate.
         aside = motion.vy * cos - motion.vx * sin + self.com_offset * motion.yaw_rate
         flip_a, flip_s = (-1.0 if ahead < 0.0 else 1.0), (-1.0 if aside < 0.0 else 1.0)
         ahead, aside = abs(ahead), abs(aside)
@@ -241,7 +241,7 @@ class HeadingDrive:
         )
 
     def predict(self, motion: Motion, drive: float, turn: float) -> Motion:
-        """Hold both controls for one control step, by the physics engine's own semi-implicit Euler step."""
+        """Motion after both controls were held for one control step, by semi-implicit Euler steps as in MuJoCo."""
         x, y, heading, vx, vy, yaw_rate = motion
         h, r, m = self.timestep, self.com_offset, self.mass
         push = max(-self.drive_limit, min(self.drive_gain * drive, self.drive_limit))

@@ -3,10 +3,10 @@
 Source: appendix "Relative degree and kinetic stopping insets" and its footnote 1. A clearance D has relative
 degree two under an acceleration command, so the barrier is the clearance left after braking,
 `h = D - v^2 / (2 a_brake)` with approach speed v. The appendix's caveat is a requirement here: state error,
-hold interval and delay are reserves inside the barrier, so that what is promised holds between samples too.
+hold interval and delay are reserves inside the barrier, so that the guarantee holds between samples too.
 
 `a_brake` is a *validated lower bound* on the deceleration that the actuators can give in every state of the
-declared envelope. Nothing here can check that; the constraint that uses it says where its bound comes from.
+declared envelope. It is not checked here; the constraint that uses it says where its bound comes from.
 """
 
 import numpy as np
@@ -15,40 +15,23 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 _RETREAT_RATE = 1.0
-"""1/s: how fast a violation is to shrink once the room is gone."""
-
-
-def kinetic_inset(clearance: ArrayLike, speed: ArrayLike, brake: float) -> Array:
-    """`h = D - v^2 / (2 a_brake)`; receding (v <= 0) needs no stopping distance.
-
-    Args:
-        clearance: Distance to the obstacle D in m (or rad), shape (...).
-        speed: Approach speed v in m/s, positive towards the obstacle, shape (...).
-        brake: a_brake in m/s^2, positive.
-    """
-    approach = np.maximum(np.asarray(speed, dtype=np.float64), 0.0)
-    return np.asarray(np.asarray(clearance, dtype=np.float64) - approach**2 / (2.0 * brake))
-
-
-def kinetic_row(clearance: ArrayLike, speed: ArrayLike, brake: float, gamma: float) -> Array:
-    """The continuous row: the largest admissible approach acceleration, `(a_brake / v)(gamma h - v)`.
-
-    Only for v > 0. At standstill the row is singular and says nothing: there it returns +inf where the
-    inset is positive and 0 where it is not (the start rule of the continuous form: do not set off).
-    """
-    v = np.asarray(speed, dtype=np.float64)
-    h = kinetic_inset(clearance, speed, brake)
-    moving = v > 0.0
-    safe_v = np.where(moving, v, 1.0)
-    return np.asarray(np.where(moving, brake / safe_v * (gamma * h - safe_v), np.where(h > 0.0, np.inf, 0.0)))
+"""1/s: rate at which a violation is to shrink."""
 
 
 def predicted_approach(
     clearance: ArrayLike, speed: ArrayLike, delay_s: float, pending: ArrayLike
 ) -> tuple[Array, Array]:
-    """Clearance and approach speed after the delay, while already sent commands give `pending` (m/s^2).
+    """Clearance and approach speed after a delay with a constant approach acceleration.
 
-    Use the commands in flight where they are known, else the worst acceleration that they may be.
+    Args:
+        clearance: m, shape (...).
+        speed: Approach speed, m/s, shape (...).
+        delay_s: s.
+        pending: Approach acceleration during the delay, m/s^2, shape (...): of the commands in flight, or the largest
+            possible one.
+
+    Returns:
+        Clearance, m, and approach speed, m/s, shape (...) each.
     """
     v = np.asarray(speed, dtype=np.float64)
     a = np.asarray(pending, dtype=np.float64)
@@ -59,11 +42,11 @@ def predicted_approach(
 
 
 def held_stopping_distance(speed: ArrayLike, brake: float, hold_s: float) -> Array:
-    """The shortest way to a stop when every deceleration, at most `brake`, is held for a whole interval.
+    """The shortest stopping distance when every deceleration, at most `brake`, is held for a whole interval.
 
-    Full braking for as many holds as it takes, the last one just strong enough to end at rest: the chord of
-    `v^2 / (2 a_brake)` between whole multiples of the speed that one hold takes away. It exceeds the
-    continuous distance by at most `a_brake hold^2 / 8`, and, unlike it, can be kept without a kick back.
+    Full braking for as many holds as needed, the last one just strong enough to end at rest: the chord of
+    `v^2 / (2 a_brake)` between whole multiples of the speed that one hold removes. It exceeds the continuous distance
+    by at most `a_brake hold^2 / 8`, and braking along it never reverses the motion.
     """
     loss = brake * hold_s
     holds = np.maximum(np.asarray(speed, dtype=np.float64), 0.0) / loss
@@ -84,11 +67,11 @@ def sampled_acceleration_limit(
 ) -> Array:
     """The largest approach acceleration that may be *held* for a whole control interval.
 
-    Over the delay the commands in flight act, over the hold the new one, and from there on held braking must
-    still stop the machine inside the room: `way in the hold + held_stopping_distance(v_end) <= room`, solved
-    exactly for v_end. So no sampling reserve is wasted, and it is valid at standstill: this is the start rule.
-    From outside the set the limit is the braking that halts inside the room that is left, and, with the room
-    gone, a retreat that shrinks the violation by 1/e in about a second.
+    Over the delay the commands in flight act, over the hold the new one, and from there on held braking must stop
+    the machine inside the room (clearance less reserves): `distance in the hold + held_stopping_distance(v_end) <=
+    room`, solved exactly for v_end. No sampling reserve is needed, and it is valid at standstill. From outside the
+    set the limit is the braking that halts inside the remaining room and, without room, a retreat that shrinks the
+    violation by 1/e in about a second.
 
     Args:
         clearance: Measured clearance D in m, shape (...).
@@ -106,12 +89,12 @@ def sampled_acceleration_limit(
     """
     room0, v = predicted_approach(clearance, speed, delay_s, pending)
     room = room0 - state_error - margin
-    # In units of the speed and the way of one hold of full braking the condition on the end speed w is
+    # In units of the speed and the distance of one hold of full braking the condition on the end speed w is
     # w / 2 + (chord of w^2 / 2) <= left, which at whole w = k reads k (k + 1) / 2 and has slope k + 1 above it.
     left = (room - 0.5 * v * hold_s) / (brake * hold_s**2)
     whole = np.floor(0.5 * (np.sqrt(1.0 + 8.0 * np.maximum(left, 0.0)) - 1.0))
     end = (whole + (left - 0.5 * whole * (whole + 1.0)) / (whole + 1.0)) * brake * hold_s
-    # Nothing left: the machine must turn round inside the hold, before the room ends if there is some.
+    # Otherwise the motion must reverse inside the hold, before the room ends if there is some.
     approach = np.maximum(v, 0.0)
     with np.errstate(divide="ignore", over="ignore"):
         halting = -(approach**2) / (2.0 * np.where(room > 0.0, room, np.inf))

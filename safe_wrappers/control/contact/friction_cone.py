@@ -1,13 +1,12 @@
-"""Contact forces that ground can give: it pushes, and holds sideways only in proportion.
+"""Friction cones: which contact forces are feasible.
 
 Source: appendix "Physical contact feasibility constraints". A force f on the robot, at a contact with unit normal n
-(pointing at the robot) and friction coefficient mu, is one that ground can give where
+(pointing at the robot) and friction coefficient mu, is feasible where
 
     f_n = f . n >= 0    and    |f - f_n n| <= mu f_n.
 
-The cone is what Coulomb's law says of a point with one coefficient in every direction. The coefficient is measured
-with an error, changes with the ground, and drops once something slides: inside the cone of an optimistic number is
-not yet safe. Nor does it say that a foothold carries the load.
+This is Coulomb's law for a point with one coefficient in every direction. The coefficient is measured with an error,
+changes with the ground, and drops once something slides. Nor does the cone say that a foothold carries the load.
 """
 
 import math
@@ -15,13 +14,13 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.control.numerics.finite import finite_arrays
+from safe_wrappers.control.numerics.finite import finite_array, finite_arrays
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
 
 _UNIT = 1e-6
-"""How far a normal's length may be off 1."""
+"""Tolerance of a normal's length."""
 
 
 def normal_and_tangential(forces: ArrayLike, normals: ArrayLike) -> tuple[Array, Array]:
@@ -39,45 +38,10 @@ def normal_and_tangential(forces: ArrayLike, normals: ArrayLike) -> tuple[Array,
     return along, f - along[..., None] * n
 
 
-def friction_ratio(forces: ArrayLike, normals: ArrayLike, friction: ArrayLike) -> Array:
-    """How much of the friction is used, `|f_t| / (mu f_n)`, shape (...): at most 1 inside the cone.
-
-    Infinite where the ground would have to pull, or to hold sideways without pressure; 0 where there is no force.
-
-    Args:
-        forces: On the robot, shape (..., 3), N.
-        normals: Unit normals, shape (..., 3).
-        friction: Coefficient mu, at least 0, shape (...).
-    """
-    along, rest = normal_and_tangential(forces, normals)
-    sideways = np.linalg.norm(rest, axis=-1)
-    mu = _coefficient(friction)
-    held, sideways = np.broadcast_arrays(mu * along, sideways)
-    pulls = np.broadcast_to(along < 0.0, held.shape)
-    ratio = np.zeros(held.shape)
-    np.divide(sideways, held, out=ratio, where=held > 0.0)
-    ratio[(held <= 0.0) & (sideways > 0.0) | pulls] = np.inf
-    return ratio
-
-
-def in_cone(
-    forces: ArrayLike, normals: ArrayLike, friction: ArrayLike, tolerance: float = 0.0
-) -> NDArray[np.bool_]:
-    """Whether ground can give each force, shape (...).
-
-    Args:
-        forces: On the robot, shape (..., 3), N.
-        normals: Unit normals, shape (..., 3).
-        friction: Coefficient mu, at least 0, shape (...).
-        tolerance: What either condition may be missed by, N.
-    """
-    return np.asarray(cone_excess(forces, normals, friction) <= tolerance)
-
-
 def cone_excess(forces: ArrayLike, normals: ArrayLike, friction: ArrayLike) -> Array:
-    """By how much a force misses the worse of the two conditions, shape (...), N: at most 0 inside the cone."""
+    """Largest violation of the two conditions, shape (...), N: at most 0 inside the cone."""
     along, rest = normal_and_tangential(forces, normals)
-    return np.asarray(np.maximum(np.linalg.norm(rest, axis=-1) - _coefficient(friction) * along, -along))
+    return np.asarray(np.maximum(np.linalg.norm(rest, axis=-1) - checked_friction(friction) * along, -along))
 
 
 def tangents(normals: ArrayLike, first: ArrayLike | None = None) -> Array:
@@ -107,9 +71,9 @@ def friction_pyramid(
 ) -> Array:
     """Half-spaces inside the friction cone: `rows @ f <= 0` is a pyramid whose edges lie on the cone.
 
-    An inner approximation, for any number of edges: whatever the rows allow, the cone allows. What it gives away:
-    halfway between two edges it allows `cos(pi / edges)` of the friction, and the share of the cone's cross-section
-    that it covers is `sin(2 pi / edges) / (2 pi / edges)`; four edges: 71 % and 64 %, eight: 92 % and 90 %.
+    An inner approximation for any number of edges. Halfway between two edges it allows `cos(pi / edges)` of the
+    friction; it covers the share `sin(2 pi / edges) / (2 pi / edges)` of the cone's cross-section. Four edges: 71 %
+    and 64 %, eight: 92 % and 90 %.
 
     Args:
         normals: Unit normals, pointing at the robot, shape (..., 3).
@@ -124,7 +88,7 @@ def friction_pyramid(
     """
     if not isinstance(edges, int | np.integer) or edges < 3:
         raise ConfigurationError(f"edges is a whole number, 3 or more, got {edges!r}")
-    n, mu = _unit(normals), _coefficient(friction)
+    n, mu = _unit(normals), checked_friction(friction)
     frame = tangents(n, first)
     middle = (np.arange(edges) + 0.5) * (2.0 * math.pi / edges)
     facing = np.stack([np.cos(middle), np.sin(middle)], axis=-1)
@@ -139,7 +103,7 @@ def _forces_and_normals(forces: ArrayLike, normals: ArrayLike) -> tuple[Array, A
 
 
 def _unit(normals: ArrayLike) -> Array:
-    (n,) = finite_arrays(normals=normals)
+    n = finite_array("normals", normals)
     if n.ndim == 0 or n.shape[-1] != 3:
         raise ConfigurationError(f"normals must have shape (..., 3), got {n.shape}")
     length = np.linalg.norm(n, axis=-1)
@@ -148,8 +112,13 @@ def _unit(normals: ArrayLike) -> Array:
     return n
 
 
-def _coefficient(friction: ArrayLike) -> Array:
-    (mu,) = finite_arrays(friction=friction)
+def checked_friction(friction: ArrayLike) -> Array:
+    """Friction coefficients as float64.
+
+    Raises:
+        ConfigurationError: For a coefficient that is negative or not finite.
+    """
+    mu = finite_array("friction", friction)
     if not (mu >= 0.0).all():
         raise ConfigurationError(f"friction must be 0 or more, got {mu}")
     return mu

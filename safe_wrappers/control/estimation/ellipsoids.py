@@ -1,7 +1,7 @@
-"""Ellipsoids: how far points are from them, and which way leads out.
+"""Signed distances of points from ellipsoids, and their normals.
 
-A moving obstacle whose position is known with a covariance is an obstacle somewhere in an ellipsoid; one that may
-have been displaced along a line is an ellipsoid without width. Both are the same set here.
+A moving obstacle whose position is known with a covariance lies somewhere in an ellipsoid; one that may have been
+displaced along a line, in a degenerate ellipsoid without width. Both are handled alike.
 """
 
 import math
@@ -18,11 +18,11 @@ Array = NDArray[np.float64]
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 """Error of an eigenvalue over the largest one, where the shape is not diagonal."""
 _UNEVEN = 1e-9
-"""Asymmetry and negative eigenvalues up to here, relative, are a user's rounding."""
+"""Relative asymmetry and relative size of negative eigenvalues that are accepted as rounding."""
 _CONVERGED = 1e-11
 """Of the secular equation; the distance errs with its square, and downwards."""
 _TINY = 1e-150
-"""Smaller is zero: squares underflow, quotients overflow."""
+"""Smaller numbers count as zero: their squares underflow, quotients by them overflow."""
 _MOST_STEPS = 100
 
 
@@ -66,7 +66,7 @@ def ellipsoid_gap(offset: Array, shape: Array) -> tuple[Array, Array]:
 
 
 def _dimension(offset: Array, shape: Array) -> int:
-    """Of the space, once everything about the arguments but the eigenvalues is known to be in order."""
+    """Dimension of the space; checks everything but the eigenvalues."""
     d = offset.shape[-1] if offset.ndim == 2 else 0
     if d not in (2, 3) or shape.shape != (*offset.shape, d):
         raise ConfigurationError(
@@ -94,7 +94,7 @@ def _gap(y: list[float], squares: list[float], coupled: bool) -> tuple[float, li
     normal = [x * s / (s + b) if b > 0.0 else x for x, b in zip(y, beyond, strict=True)]
     length = math.hypot(*normal)
     if length < _TINY:
-        # In the plane that the shortest axis crosses: nearest are two points, above and below; one of them is taken.
+        # The point lies in the plane across the shortest axis: two nearest points, one of them is taken.
         normal = [axes[0] * x / b if b > 0.0 else 0.0 for x, b in zip(y, beyond, strict=True)]
         normal[0] = math.sqrt(max(1.0 - filled, 0.0))
         length = math.hypot(*normal)
@@ -102,9 +102,9 @@ def _gap(y: list[float], squares: list[float], coupled: bool) -> tuple[float, li
     return sum(map(mul, y, normal)) - math.hypot(*map(mul, axes, normal)), normal
 
 
-def _secular_root(reach: Iterable[float], beyond: list[float]) -> tuple[float, float]:
-    """The root s >= 0 of G(s) = sum of (reach / (s + beyond))² = 1, or 0 where there is none, and G there."""
-    terms = [(c, b) for c, b in zip(reach, beyond, strict=True) if c > _TINY]
+def _secular_root(numerators: Iterable[float], beyond: list[float]) -> tuple[float, float]:
+    """The root s >= 0 of G(s) = sum of (numerator / (s + beyond))² = 1, or 0 where there is none, and G there."""
+    terms = [(c, b) for c, b in zip(numerators, beyond, strict=True) if c > _TINY]
     # Each term alone bounds the root from below; from there on no denominator is smaller than its numerator.
     s = max([0.0, *[c - b for c, b in terms]])
     total = 0.0

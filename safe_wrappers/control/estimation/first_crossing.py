@@ -1,7 +1,7 @@
-"""The first time at which a covariance that nothing measures reaches a bound in some direction, never late.
+"""The first time at which a covariance without measurements reaches a bound in some direction, never late.
 
-The growth need not be monotonic: an oscillator's covariance swings, and a correlation may let it sink first. So the
-search goes from window to window, each shown to be free before time moves on, by the better of two bounds:
+The growth need not be monotonic: an oscillator's covariance swings, and a correlation may decrease it first. The
+search proceeds by windows, each shown to be below the bound by the better of two estimates:
 
 - the Taylor series of the variance with its remainder: tight near the crossing, but only for windows up to 1 over
   the norm of A;
@@ -9,8 +9,8 @@ search goes from window to window, each shown to be free before time moves on, b
 
 Both rest on the rate X = dP/dt, which obeys X' = A X + X A'.
 
-The cost grows with the number of swings within the horizon. Nothing is checked here:
-`safe_wrappers.control.estimation.covariance.blind_time` does that.
+The cost grows with the number of swings within the horizon. Arguments are checked by the caller,
+`safe_wrappers.control.estimation.covariance.blind_time`.
 """
 
 import math
@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 _ORDER = 12
 """Terms of the Taylor series: at the longest window the remainder is 1e-5 of the rate's norm times the window."""
 _RESOLUTION = 1e-9
-"""Relative to the time: a shorter free window is taken for the crossing itself."""
+"""Relative to the time: the search ends where no longer window is free."""
 
 
 def first_crossing(P0: Array, a: Array, q: Array, rows: Array, goal: float, horizon: float) -> float:
@@ -37,14 +37,14 @@ def first_crossing(P0: Array, a: Array, q: Array, rows: Array, goal: float, hori
         q: Q, shape (n, n).
         rows: D, shape (m, n).
         goal: Bound on the variance, > 0.
-        horizon: How far to look, s.
+        horizon: Latest time that is considered, s.
 
     Returns:
         s: 0 if the goal is reached at once, inf if it is not within the horizon.
     """
     if largest_variance(rows, P0) >= goal:
         return 0.0
-    # The remainder is measured in norms: in balanced coordinates they are the least wasteful.
+    # The remainder is bounded by norms, which are tightest in balanced coordinates.
     from scipy.linalg import matrix_balance  # here: SciPy takes a while to import
 
     a, scales = matrix_balance(a, permute=False)

@@ -1,13 +1,13 @@
-"""The sampled Kalman filter for many tracks at once, and the test of whether its covariance tells the truth.
+"""The sampled Kalman filter for many tracks at once.
 
-The filter is the fast path, run at every step of an env: it checks nothing. Check the matrices once, beforehand,
-with `safe_wrappers.control.estimation.covariance.checked_covariance` and `checked_noise`; take `transition` and
-`noise` from its `discretise`, so that steps of any length agree with the model in continuous time.
+It runs at every step of an env and checks nothing. Check the matrices once, beforehand, with
+`safe_wrappers.control.estimation.covariance.checked_covariance` and `checked_noise`; take `transition` and `noise`
+from its `discretise`, so that steps of any length agree with the model in continuous time.
 
 The update has Joseph's form: symmetric and positive semidefinite for any gain, rounding included.
 
 Source: Kalman (1960); Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001),
-sections 5.2 and 5.4, for the consistency test.
+section 5.2. The consistency test: `safe_wrappers.appendix.estimation.consistency`.
 """
 
 from typing import NamedTuple
@@ -15,13 +15,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.errors import ConfigurationError
-
 Array = NDArray[np.float64]
 
 
 class Updated(NamedTuple):
-    """What a measurement leaves.
+    """State of the filter after a measurement.
 
     Attributes:
         mean: Estimate after it, shape (..., n).
@@ -60,7 +58,7 @@ def predict(
 
 
 def update(mean: Array, cov: Array, measured: Array, C: Array, R: Array) -> Updated:
-    """Take in one measurement `y = C x + v` per track.
+    """Update with one measurement `y = C x + v` per track.
 
     Args:
         mean: Estimate, shape (..., n).
@@ -86,43 +84,3 @@ def update(mean: Array, cov: Array, measured: Array, C: Array, R: Array) -> Upda
         innovation,
         innovation_cov,
     )
-
-
-def normalised_error_squared(error: Array, cov: Array) -> Array:
-    """`e' P^-1 e` (NEES): n on average where P is the covariance of e.
-
-    Args:
-        error: True minus estimated state, shape (..., n).
-        cov: Covariance that the filter claims, positive definite, shape (..., n, n).
-
-    Returns:
-        Shape (...), dimensionless.
-    """
-    weighted = np.linalg.solve(cov, error[..., None])[..., 0]
-    return np.asarray((error * weighted).sum(axis=-1))
-
-
-def chi_square_band(n: int, runs: int, confidence: float = 0.95) -> tuple[float, float]:
-    """The band in which the mean of `normalised_error_squared` over independent runs lies, if filter and truth agree.
-
-    Args:
-        n: Dimension of the state.
-        runs: Number of independent runs that the mean is taken over.
-        confidence: Probability of the band, as much left out below as above.
-
-    Returns:
-        Lower and upper end. Below: the filter doubts itself too much; above: it trusts itself too much.
-
-    Raises:
-        ConfigurationError: For n or runs below 1, or a confidence outside (0, 1).
-    """
-    for name, count in (("n", n), ("runs", runs)):
-        if not isinstance(count, int | np.integer) or count < 1:
-            raise ConfigurationError(f"{name} must be a whole number of at least 1, got {count!r}")
-    if not 0.0 < confidence < 1.0:
-        raise ConfigurationError(f"confidence must lie between 0 and 1, both excluded, got {confidence!r}")
-    outside = 0.5 * (1.0 - confidence)
-    from scipy.special import gammaincinv  # here: SciPy takes a while to import
-
-    low, high = 2.0 * gammaincinv(0.5 * n * runs, [outside, 1.0 - outside]) / runs
-    return float(low), float(high)

@@ -1,13 +1,13 @@
-"""Tracks: what is believed of several things that move, seen or not: means, covariances, and where they may be soon.
+"""Tracks of several moving objects, measured or not: means, covariances and predictions.
 
 Each track has the state (position, velocity), of one, two or three coordinates each, with
 
     p' = v,    v' = (mean_velocity - v) / reversion_s + w,    E[w(t) w(s)'] = q delta(t - s):
 
-a double integrator driven by white acceleration noise (`reversion_s` infinite), or one whose velocity goes back to
-its mean. Between measurements the covariance follows the Lyapunov equation, exactly; a measurement is a Kalman
-update. A covariance bounds nothing by itself: what k standard deviations promise depends on the tail and on the
-model (`appendix.sigma_coverage`).
+a double integrator driven by white acceleration noise (`reversion_s` infinite), or one whose velocity reverts to its
+mean. Between measurements the covariance follows the Lyapunov equation, exactly; a measurement is a Kalman update. A
+covariance alone bounds nothing: the coverage of k standard deviations depends on the tail and on the model
+(`safe_wrappers.appendix.estimation.sigma_coverage`).
 
 Source: appendix "Continuous Lyapunov and Riccati covariance dynamics".
 """
@@ -24,16 +24,16 @@ from safe_wrappers.control.estimation.kalman import predict, update
 Array = NDArray[np.float64]
 
 _KEPT = 256
-"""How many discretisations are remembered."""
+"""Number of cached discretisations."""
 
 
 class Motion(NamedTuple):
-    """How one track moves.
+    """Motion model of one track.
 
     Attributes:
         intensity: Of the acceleration noise, q, shape (d, d), m^2/s^3.
-        reversion_s: Time constant with which the velocity goes back to its mean, s; inf: it does not.
-        mean_velocity: What it goes back to, shape (d,), m/s.
+        reversion_s: Time constant with which the velocity reverts to its mean, s; inf for none.
+        mean_velocity: Shape (d,), m/s.
     """
 
     intensity: Array
@@ -62,7 +62,7 @@ class Tracks:
     """Means and covariances of n tracks.
 
     Args:
-        motions: One per track, all of as many coordinates.
+        motions: One per track, all of the same number of coordinates.
 
     Attributes:
         mean: Positions and velocities, shape (n, 2d), m and m/s.
@@ -99,14 +99,14 @@ class Tracks:
         self.covariance = np.array(covariance, dtype=np.float64)
 
     def advance(self, time_s: float) -> None:
-        """Let time pass without a measurement."""
+        """Predict over a time without measurements."""
         over = self._over(time_s)
         self.mean, self.covariance = predict(
             self.mean, self.covariance, over.transition, over.noise, over.drift
         )
 
     def see(self, which: NDArray[np.intp], measured: Array, matrix: Array, noise: Array) -> None:
-        """Take measurements of some tracks.
+        """Update some tracks with measurements.
 
         Args:
             which: Their indices, shape (k,).
@@ -118,7 +118,7 @@ class Tracks:
         self.mean[which], self.covariance[which] = updated.mean, updated.cov
 
     def ahead(self, times_s: Sequence[float]) -> tuple[Array, Array]:
-        """Positions and their covariances some times ahead, if nothing is seen until then.
+        """Predicted positions and their covariances at several times ahead, without measurements until then.
 
         Returns:
             Shapes (k, n, d), m, and (k, n, d, d), m^2.
@@ -129,7 +129,7 @@ class Tracks:
         return positions, spread + over.noise
 
     def _ahead(self, times_s: tuple[float, ...]) -> _Over:
-        """What concerns positions, over several times at once."""
+        """The rows of positions, over several times at once."""
         stacked = self._stacked.get(times_s)
         if stacked is None:
             d = self.coordinates
@@ -158,7 +158,7 @@ class Tracks:
 
 
 def _keep(kept: dict[Any, _Over], key: Any, over: _Over) -> None:
-    """Remember, but not without end: in an env whose steps all differ in length nothing is asked for twice."""
+    """Cache, at most `_KEPT` entries: in an env whose steps all differ in length none is used twice."""
     if len(kept) >= _KEPT:
         kept.clear()
     kept[key] = over

@@ -1,4 +1,4 @@
-"""Barrier conditions on a control: Lie derivatives, class-K decay, Nagumo's boundary test, relative degree.
+"""Barrier conditions on a control: Lie derivatives, class-K decay, relative degree.
 
 Source: appendix "Safety and Control Barrier Functions" (Lie derivatives and forward invariance; Nagumo's
 viability theorem). A barrier `h` is positive inside the safe set. For `x' = f(x) + g(x) u` the condition
@@ -26,7 +26,9 @@ def lie_derivatives(gradient: ArrayLike, f: ArrayLike, g: ArrayLike) -> tuple[Ar
         `Lf h` of shape (...) and `Lg h` of shape (..., m).
     """
     dh, drift, effect = (np.asarray(part, dtype=np.float64) for part in (gradient, f, g))
-    if dh.ndim == drift.ndim == 1 and effect.ndim == 2:  # one state: the filter's case, and half the time
+    if (
+        dh.ndim == drift.ndim == 1 and effect.ndim == 2
+    ):  # a single state, as in the filter: half the time of einsum
         return np.asarray(dh @ drift), np.asarray(dh @ effect)
     return np.einsum("...n,...n->...", dh, drift), np.einsum("...n,...nm->...m", dh, effect)
 
@@ -34,15 +36,6 @@ def lie_derivatives(gradient: ArrayLike, f: ArrayLike, g: ArrayLike) -> tuple[Ar
 def linear_decay(h: ArrayLike, alpha: float) -> Array:
     """The linear class-K function `alpha * h` (alpha in 1/s)."""
     return alpha * np.asarray(h, dtype=np.float64)
-
-
-def power_decay(h: ArrayLike, alpha: float, power: float) -> Array:
-    """The extended class-K function `alpha * sign(h) |h|^power`: odd, so an unsafe state is driven back.
-
-    Below 1, `power` lets the state come close quickly and brakes late; above 1 it brakes early.
-    """
-    value = np.asarray(h, dtype=np.float64)
-    return np.asarray(alpha * np.sign(value) * np.abs(value) ** power)
 
 
 def cbf_rows(lf_h: ArrayLike, lg_h: ArrayLike, decay: ArrayLike) -> tuple[Array, Array]:
@@ -61,35 +54,6 @@ def cbf_rows(lf_h: ArrayLike, lg_h: ArrayLike, decay: ArrayLike) -> tuple[Array,
     )
 
 
-def best_rate(lf_h: ArrayLike, lg_h: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> Array:
-    """The largest `h'` that any control in the box reaches, shape (...)."""
-    effect = np.asarray(lg_h, dtype=np.float64)
-    corner = np.where(effect > 0, np.asarray(upper), np.where(effect < 0, np.asarray(lower), 0.0))
-    return np.asarray(np.asarray(lf_h) + np.einsum("...m,...m->...", effect, corner))
-
-
-def nagumo_holds(
-    h: ArrayLike,
-    lf_h: ArrayLike,
-    lg_h: ArrayLike,
-    lower: ArrayLike,
-    upper: ArrayLike,
-    boundary: float = 1e-9,
-) -> NDArray[np.bool_]:
-    """Nagumo's test at the boundary: on `|h| <= boundary` some control in the box gives `h' >= 0`.
-
-    Away from the boundary the tangent cone is the whole space and the test holds; outside the set
-    (`h < -boundary`) invariance is already lost and it does not.
-
-    Returns:
-        Boolean array of shape (...).
-    """
-    value = np.asarray(h, dtype=np.float64)
-    on_boundary = np.abs(value) <= boundary
-    viable = best_rate(lf_h, lg_h, lower, upper) >= 0.0
-    return np.asarray((value > boundary) | (on_boundary & viable))
-
-
 def numerical_gradient(h: Callable[[Array], float], x: ArrayLike, step: float = 1e-6) -> Array:
     """Central differences of a scalar function, shape (n,); the step is relative for large entries."""
     point = np.asarray(x, dtype=np.float64)
@@ -104,13 +68,13 @@ def numerical_gradient(h: Callable[[Array], float], x: ArrayLike, step: float = 
 
 
 def acts(gradient: Array, effect: Array, height: float, share: float) -> bool:
-    """Whether some control changes a function at first order by more than a share of what it could.
+    """Whether some control enters the derivative of a function, up to a relative tolerance.
 
     Args:
         gradient: Of the function, shape (n,).
         effect: Control matrix g, shape (n, m).
-        height: The function's value. A gradient below a hundredth of it may be the round-off of differences.
-        share: What counts as none.
+        height: The function's value. A gradient below a hundredth of it may be round-off of finite differences.
+        share: Relative tolerance.
     """
     size = max(float(np.abs(gradient).max(initial=0.0)), 1e-2 * abs(height))
     return bool((np.abs(gradient @ effect) > share * size * np.abs(effect).max(axis=0, initial=0.0)).any())

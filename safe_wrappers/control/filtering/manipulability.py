@@ -1,19 +1,19 @@
-"""Manipulability: how far a pose is from losing a direction of its task, and what joint rates that costs.
+"""Manipulability: distance of a pose from a singularity of its task, and the joint rates needed near it.
 
 Source: appendix "Forward kinematics and singularities", and its footnote 3 (Yoshikawa's measure). For a task Jacobian
 J of shape (m, n), twist = J @ joint rates, `w = sqrt(det(J J'))` is the product of J's singular values: the volume of
-the velocity ellipsoid, but for a constant of m. w = 0 marks rank loss. What w does not say:
+the velocity ellipsoid up to a constant of m. w = 0 is rank loss. Limits of w:
 
 * **w does not bound the smallest singular value**, and so no joint rate: an ellipsoid of the same volume may be long
-  and thin. A threshold on w means something only once it has been validated for the machine (`validated_threshold`).
-* Near rank loss an inverse-kinematics command can exceed the limits of rate and torque. What the drives do then is
-  theirs: actuators saturate first, and the tool leaves its path.
+  and thin. A threshold on w has to be validated for the machine (`validated_threshold`).
+* Near rank loss an inverse-kinematics command can exceed the limits of rate and torque: actuators saturate, and the
+  tool leaves its path.
 * **Units.** Rows of translation (m/rad for a hinge) and of rotation (rad/rad) do not add up. A task that has both
-  needs a length by which its rotations count (`task_jacobian`), and w depends on it by a constant factor,
-  length^rotations, which moves no singularity. Singular values, condition and the ellipsoid's axes change otherwise.
+  needs a length that weighs rotations (`task_rows`), and w depends on it by a constant factor,
+  length^rotations, which moves no singularity. Singular values, condition and axes of the ellipsoid do change.
   A joint that slides beside one that turns mixes units in the columns likewise.
-* **Frames.** The twist's convention has to be declared (`reframed`). w of all six rows is the same in each, because
-  the adjoint has determinant 1. w of some of the rows is not; singular values are not.
+* **Frames.** w of all six rows is the same in each frame, because the adjoint has determinant 1
+  (`safe_wrappers.appendix.filtering.manipulability.reframed`). w of some rows and singular values are not.
 
 Arrays have leading batch axes (...). Jacobians are of shape (..., m, n); what is not finite raises
 `ConfigurationError`.
@@ -24,7 +24,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.control.numerics.finite import finite_arrays
+from safe_wrappers.control.numerics.finite import finite_array, finite_arrays
+from safe_wrappers.control.numerics.spatial import cross
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -35,9 +36,8 @@ _EPSILON = float(np.finfo(np.float64).eps)
 def manipulability(jacobian: ArrayLike) -> Array:
     """`w = sqrt(det(J J'))`, shape (...), never below zero; exactly zero where rows depend on each other.
 
-    By a QR factorisation of J'. The determinant of `J J'` itself squares the condition: its relative error grows with
-    the square of it, and near rank loss it is negative, whose root is not a number. QR and SVD are both good
-    to the condition times the rounding; QR takes a quarter of the time.
+    By a QR factorisation of J', as accurate as an SVD in a quarter of the time. The determinant of `J J'` itself
+    would square the condition, and be negative near rank loss.
 
     Args:
         jacobian: Shape (..., m, n). With fewer joints than task directions w is zero everywhere.
@@ -45,12 +45,12 @@ def manipulability(jacobian: ArrayLike) -> Array:
     Returns:
         In (m/s)^m per (rad/s)^m for m translations and hinges.
     """
-    j = _jacobian(jacobian)
+    j = checked_jacobian(jacobian)
     m, n = j.shape[-2:]
     if n < m:
         return np.zeros(j.shape[:-2])
     diagonal = np.abs(np.diagonal(np.linalg.qr(np.swapaxes(j, -1, -2), mode="r"), axis1=-2, axis2=-1))
-    # A row that depends on those before it leaves rounding on the diagonal, in proportion to its own length.
+    # A dependent row leaves rounding on the diagonal, in proportion to its own length.
     noise = n * _EPSILON * np.linalg.norm(j, axis=-1)
     return np.asarray(np.prod(np.where(diagonal > noise, diagonal, 0.0), axis=-1))
 
@@ -83,7 +83,7 @@ class VelocityEllipsoid:
 
 def velocity_ellipsoid(jacobian: ArrayLike) -> VelocityEllipsoid:
     """Axes and lengths of the velocity ellipsoid of a Jacobian of shape (..., m, n), by SVD."""
-    j = _jacobian(jacobian)
+    j = checked_jacobian(jacobian)
     m, n = j.shape[-2:]
     axes, lengths, _ = np.linalg.svd(j, full_matrices=True)
     if n < m:
@@ -92,15 +92,15 @@ def velocity_ellipsoid(jacobian: ArrayLike) -> VelocityEllipsoid:
 
 
 def manipulability_gradient(jacobian: ArrayLike, derivative: ArrayLike) -> Array:
-    """dw/dq, shape (..., k): `w tr(J^+ dJ/dq_k)`, without the division by what vanishes at rank loss.
+    """dw/dq, shape (..., k): `w tr(J^+ dJ/dq_k)`, without dividing by a vanishing singular value.
 
-    w has a kink where it is zero: there the answer is the slope on one of the two sides.
+    w has a kink where it is zero; there the slope of one side is returned.
 
     Args:
         jacobian: Shape (..., m, n), n >= m.
         derivative: dJ/dq_k, shape (..., k, m, n), as from `chain_derivative`.
     """
-    j, d = _jacobian(jacobian), _finite("derivative", derivative)
+    j, d = checked_jacobian(jacobian), finite_array("derivative", derivative)
     m, n = j.shape[-2:]
     if d.ndim < 3 or d.shape[-2:] != (m, n):
         raise ConfigurationError(f"derivative has the shape (..., k, {m}, {n}), got {d.shape}")
@@ -117,11 +117,11 @@ def manipulability_gradient(jacobian: ArrayLike, derivative: ArrayLike) -> Array
 def chain_derivative(linear: ArrayLike, angular: ArrayLike) -> Array:
     """dJ/dq of a chain of hinges and slides, from its own Jacobian alone: shape (..., n, 6, n).
 
-    `out[..., k, :, j]` is how column j changes with joint k: joint k carries along what comes after it
-    (`w_k x column`), and moves the tip, which is what column j turns about (`w_j x v_k`). Exact.
+    `out[..., k, :, j]` is the derivative of column j by joint k: `w_k x column` for joints k before j, whose motion
+    carries joint j along, else `w_j x v_k`, by the motion of the tip. Exact.
 
     Args:
-        linear: Velocity of the tip per joint, shape (..., 3, n), in axes that stand still; joints in their order
+        linear: Velocity of the tip per joint, shape (..., 3, n), in fixed axes; joints in their order
             from the base.
         angular: Angular velocity of the last link per joint, likewise; zeros for slides.
     """
@@ -130,28 +130,12 @@ def chain_derivative(linear: ArrayLike, angular: ArrayLike) -> Array:
         raise ConfigurationError(f"linear and angular have the shape (..., 3, n), got {v.shape}")
     v, w = np.swapaxes(v, -1, -2), np.swapaxes(w, -1, -2)  # (..., n, 3)
     n = v.shape[-2]
-    carried = _cross(w[..., :, None, :], v[..., None, :, :])  # w_k x v_j
-    turned = _cross(w[..., :, None, :], w[..., None, :, :])  # w_k x w_j
+    carried = cross(w[..., :, None, :], v[..., None, :, :])  # w_k x v_j
+    turned = cross(w[..., :, None, :], w[..., None, :, :])  # w_k x w_j
     before = np.tri(n, dtype=bool).T[..., None]  # joint k not after joint j
     moves = np.where(before, carried, np.swapaxes(carried, -2, -3))  # else w_j x v_k
     turns = np.where(before, turned, 0.0)
     return np.asarray(np.swapaxes(np.concatenate([moves, turns], axis=-1), -1, -2))
-
-
-def joint_rates(jacobian: ArrayLike, twist: ArrayLike) -> Array:
-    """Joint rates of the least norm whose twist comes closest to the wanted one, shape (..., n).
-
-    The ideal inverse model. Near rank loss the rates grow without bound; past the rounding (a singular value below
-    max(m, n) times the machine's precision times the largest) a direction counts as lost and is not asked for.
-
-    Args:
-        jacobian: Shape (..., m, n).
-        twist: Shape (..., m), per second.
-    """
-    j, wanted = _jacobian(jacobian), _finite("twist", twist)
-    if wanted.ndim < 1 or wanted.shape[-1] != j.shape[-2]:
-        raise ConfigurationError(f"twist has the shape (..., {j.shape[-2]}), got {wanted.shape}")
-    return np.asarray(np.einsum("...nm,...m->...n", _inverse(j), wanted))
 
 
 def worst_joint_rates(jacobian: ArrayLike) -> Array:
@@ -160,55 +144,9 @@ def worst_joint_rates(jacobian: ArrayLike) -> Array:
     The norm of the joint's row of the pseudo-inverse. None of them exceeds `1 / smallest singular value`, which is
     the largest norm of all rates together.
     """
-    j = _jacobian(jacobian)
+    j = checked_jacobian(jacobian)
     lost = np.isinf(velocity_ellipsoid(j).condition)
-    return np.asarray(np.where(lost[..., None], np.inf, np.linalg.norm(_inverse(j), axis=-1)))
-
-
-def reframed(jacobian: ArrayLike, rotation: ArrayLike, offset: ArrayLike) -> Array:
-    """A six-row Jacobian in another frame, shape (..., 6, n).
-
-    Twists are (velocity of a point, angular velocity), as MuJoCo has them: of the point itself, in the world's axes.
-    From there, with R the end-effector's axes and p its place in the world,
-
-    * the **body** twist is `reframed(J, R, 0)`: the same point, in its own axes;
-    * the **spatial** twist is `reframed(J, eye(3), -p)`: of the point that passes through the world's origin.
-
-    Args:
-        jacobian: Shape (..., 6, n): three rows of a point's velocity, three of the angular velocity.
-        rotation: The new axes as columns, in the old ones, shape (..., 3, 3); refused if not orthonormal.
-        offset: New point of reference minus the old one, in the old axes, m, shape (..., 3).
-    """
-    j, r, p = _jacobian(jacobian), _finite("rotation", rotation), _finite("offset", offset)
-    if j.shape[-2] != 6:
-        raise ConfigurationError(f"a twist has six rows, got a Jacobian of shape {j.shape}")
-    if r.shape[-2:] != (3, 3) or np.abs(np.swapaxes(r, -1, -2) @ r - np.eye(3)).max(initial=0.0) > 1e-6:
-        raise ConfigurationError(f"rotation is orthonormal, of shape (..., 3, 3); got {rotation!r}")
-    if p.ndim < 1 or p.shape[-1] != 3:
-        raise ConfigurationError(f"offset has the shape (..., 3), got {p.shape}")
-    v, w = j[..., :3, :], j[..., 3:, :]
-    there = v + np.swapaxes(_cross(np.swapaxes(w, -1, -2), p[..., None, :]), -1, -2)
-    back = np.swapaxes(r, -1, -2)
-    return np.concatenate([back @ there, back @ w], axis=-2)
-
-
-def task_jacobian(
-    jacobian: ArrayLike, directions: str = "xyz", rotations: str = "", length: float | None = None
-) -> Array:
-    """The rows of a six-row Jacobian that a task is about, shape (..., m, n).
-
-    Args:
-        jacobian: Shape (..., 6, n), see `reframed`.
-        directions: Of translation: some of "xyz", in the Jacobian's own axes.
-        rotations: Likewise, about which axes.
-        length: By which a rotation counts as a translation, m: of the tool, say. Needed if there are both, which
-            have no unit in common.
-    """
-    j = _jacobian(jacobian)
-    if j.shape[-2] != 6:
-        raise ConfigurationError(f"a twist has six rows, got a Jacobian of shape {j.shape}")
-    rows, scale = task_rows(directions, rotations, length)
-    return np.asarray(j[..., rows, :] * scale[:, None])
+    return np.asarray(np.where(lost[..., None], np.inf, np.linalg.norm(pseudo_inverse(j), axis=-1)))
 
 
 def task_rows(directions: str, rotations: str, length: float | None) -> tuple[NDArray[np.int64], Array]:
@@ -241,14 +179,14 @@ def task_rows(directions: str, rotations: str, length: float | None) -> tuple[ND
 
 @dataclass(frozen=True, slots=True)
 class ValidatedThreshold:
-    """What a sample of configurations says about a threshold on w.
+    """A threshold on w, validated on a sample of configurations.
 
     Attributes:
         threshold: No sampled configuration with w above it needs more than the rate limit. The smallest such number;
             the smallest w that was sampled if none needs more.
-        samples: How many configurations were looked at.
-        above: How many of them have a w above the threshold.
-        exceeding: How many need more than the limit, all of them at or below the threshold.
+        samples: Number of configurations.
+        above: Number with a w above the threshold.
+        exceeding: Number that need more than the limit, all at or below the threshold.
     """
 
     threshold: float
@@ -257,11 +195,11 @@ class ValidatedThreshold:
     exceeding: int
 
     def unseen(self, confidence: float = 0.95) -> float:
-        """The largest share of configurations that may exceed the limit above the threshold all the same.
+        """Upper bound on the share of configurations above the threshold that exceed the limit.
 
-        Holds with that confidence for independent samples of the distribution that configurations have in use: had
-        the share been larger, all samples would have missed it with a probability of `(1 - share)^samples` at most.
-        Of configurations that an adversary picks it says nothing.
+        Holds with that confidence for independent samples of the distribution that configurations have in use: with a
+        larger share, all samples would miss it with a probability of at most `(1 - share)^samples`. It does not hold
+        for configurations chosen by an adversary.
         """
         if not 0.0 < confidence < 1.0:
             raise ConfigurationError(f"confidence is between 0 and 1, got {confidence!r}")
@@ -271,9 +209,8 @@ class ValidatedThreshold:
 def validated_threshold(jacobians: ArrayLike, task_speed: float, rate_limit: ArrayLike) -> ValidatedThreshold:
     """The smallest threshold on w above which no sampled configuration needs more than the joints' rate limit.
 
-    It proves nothing between the samples, nothing for another task speed, direction weighting, frame or joint
-    selection, and nothing about a controller that does not invert J by least norm; nor does it concern torques. See
-    `ValidatedThreshold.unseen` for what a sample does say.
+    It holds for the samples, this task speed, direction weighting, frame and joint selection, and controllers that
+    invert J by least norm; torques are not considered. `ValidatedThreshold.unseen` bounds the rest statistically.
 
     Args:
         jacobians: Task Jacobians of sampled configurations, shape (samples, m, n).
@@ -283,10 +220,10 @@ def validated_threshold(jacobians: ArrayLike, task_speed: float, rate_limit: Arr
     Raises:
         ConfigurationError: There is none: the configuration of the largest w needs more than the limit.
     """
-    j = _jacobian(jacobians)
+    j = checked_jacobian(jacobians)
     if j.ndim != 3 or not len(j):
         raise ConfigurationError(f"jacobians has the shape (samples, m, n), samples > 0; got {j.shape}")
-    speed, limit = float(_finite("task_speed", task_speed)), _finite("rate_limit", rate_limit)
+    speed, limit = float(finite_array("task_speed", task_speed)), finite_array("rate_limit", rate_limit)
     if speed <= 0.0 or limit.shape not in ((), (j.shape[-1],)) or not (limit > 0.0).all():
         raise ConfigurationError(
             f"task_speed and rate_limit are > 0, one limit or {j.shape[-1]} of them; got {task_speed!r} and "
@@ -306,25 +243,18 @@ def validated_threshold(jacobians: ArrayLike, task_speed: float, rate_limit: Arr
     return ValidatedThreshold(threshold, len(j), above, int(exceeding.sum()))
 
 
-def _inverse(jacobian: Array) -> Array:
-    """Pseudo-inverse, shape (..., n, m)."""
+def pseudo_inverse(jacobian: Array) -> Array:
+    """Pseudo-inverse of a Jacobian (..., m, n), shape (..., n, m)."""
     return np.asarray(np.linalg.pinv(jacobian, rcond=max(jacobian.shape[-2:]) * _EPSILON))
 
 
-def _finite(name: str, value: ArrayLike) -> Array:
-    return finite_arrays(**{name: value})[0]
+def checked_jacobian(value: ArrayLike) -> Array:
+    """A finite Jacobian as float64, shape (..., m, n).
 
-
-def _jacobian(value: ArrayLike) -> Array:
-    j = _finite("jacobian", value)
+    Raises:
+        ConfigurationError: For another shape, or numbers that are not finite.
+    """
+    j = finite_array("jacobian", value)
     if j.ndim < 2 or 0 in j.shape[-2:]:
         raise ConfigurationError(f"a Jacobian has the shape (..., directions, joints), got {j.shape}")
     return j
-
-
-_NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Cross product of vectors along the last axis; np.cross is several times slower for few."""
-    return a[..., _NEXT] * b[..., _AFTER] - a[..., _AFTER] * b[..., _NEXT]

@@ -1,6 +1,6 @@
-"""The seam between two streams of held commands: the plan that leads from one into the other, and its measure.
+"""The seam between two streams of held commands: the blend from one into the other.
 
-A stream is what a policy asks for at the next control steps, shape (n, m): one command per step, in action units.
+A stream is a policy's commands for the next control steps, shape (n, m): one per step, in action units.
 Source: appendix "Smooth Trajectories and Bumpless Transfer". Its bounds are for continuous commands; here the
 commands are held between samples, so that what is bounded is the difference of neighbours: with `rate_limit` in
 action units per second no two neighbours differ by more than `rate_limit * hold_s`. The mean of a rate over a step
@@ -23,18 +23,18 @@ Blend = Literal["smoothstep", "quintic", "hermite"]
 BLENDS: Final = ("smoothstep", "quintic", "hermite")
 
 DIFFERENCES: Final = 3
-"""A seam is measured by the largest first, second and third difference of the commands around it."""
+"""Orders of differences by which seams are measured: first, second, third."""
 
 
 @dataclass(frozen=True, slots=True)
 class Seam:
-    """How one stream leads into the next.
+    """Transition from one stream into the next.
 
     Attributes:
         plan: The commands from the seam on, shape (n, m): the blend, then the new stream bit for bit.
         steps: Control steps of the blend: the first `steps` commands are mixed. 0: the new stream at once.
-        limited: Which commands had to be held back beyond the blend to keep the rate limit, shape (n,): the
-            new stream is too short for a blend that keeps it, or is too fast by itself.
+        limited: Which commands were rate-limited in addition to the blend, shape (n,): the new stream is too short
+            for a blend that keeps the limit, or exceeds it by itself.
     """
 
     plan: Array
@@ -56,22 +56,22 @@ def join(
 ) -> Seam:
     """The shortest blend from what was sent into a new stream that keeps the rate limit.
 
-    "smoothstep" mixes the two streams with the weight `smoothstep((i + 1) / (n + 1))` at step i of n. The prior
-    stream moves on along its left-over if that lasts for the whole blend; a left-over is never padded, so a longer
-    blend starts from the last command, latched. "quintic" and "hermite" need no prior: they bridge from the last
-    command to the new stream with its first (hermite) and second (quintic) derivatives matched at both ends, taken
-    from differences of the commands; a bridge that leaves the box is clipped to it.
+    "smoothstep" mixes the two streams with the weight `smoothstep((i + 1) / (n + 1))` at step i of n. The remainder
+    of the prior stream is used if it lasts for the whole blend; otherwise the last command is held.
+    "quintic" and "hermite" need no prior: they bridge from the last command to the new stream with matching first
+    (hermite) and second (quintic) derivatives at both ends, from differences of the commands; a bridge that leaves
+    the box is clipped.
 
-    If no blend that ends inside the new stream keeps the limit, the one that exceeds it least is taken and held
-    back step by step: the limit holds, and the command is late instead.
+    If no blend that ends inside the new stream keeps the limit, the one that exceeds it least is rate-limited step by
+    step: the limit holds, and the commands lag behind.
 
     Args:
         sent: The latest commands, oldest first, shape (k, m), k >= 0; with none there is no seam.
-        prior: The left-over of the stream in force for the next steps, shape (p, m), p >= 0.
+        prior: Remaining commands of the present stream, shape (p, m), p >= 0.
         new: The new stream for the next steps, shape (n, m), n >= 1.
         hold_s: Control interval, s.
         blend: Which blend.
-        fewest: The blend takes at least so many steps (fewer only if the new stream is shorter).
+        fewest: Least number of steps of the blend (fewer only if the new stream is shorter).
         rate_limit: Largest ``|du/dt|``, action units per second: of every component, or of each, shape (m,).
         low: Action box, for the bridges, shape (m,) or a number.
         high: Likewise.
@@ -99,9 +99,9 @@ def join(
 
 
 def limit_rate(commands: Array, before: Array | None, step: Array | float) -> tuple[Array, NDArray[np.bool_]]:
-    """Hold commands back so that no two neighbours differ by more than `step`; and which of them it had to.
+    """Limit the difference of neighbouring commands to `step`; returns them and which were changed.
 
-    Commands that keep the limit come back bit for bit.
+    Commands within the limit are returned bit for bit.
 
     Args:
         commands: Shape (n, m).
@@ -133,7 +133,7 @@ def _peaks(candidates: Array, before: Array, first: int, step: Array) -> Array:
 
 
 def _phases(steps: int, longest: int) -> Array:
-    """Normalised time of every step of a blend of so many, shape (longest + 1,); 1 from its end on."""
+    """Normalised time at every step of a blend of `steps` steps, shape (longest + 1,); 1 from its end on."""
     return np.asarray(np.minimum((np.arange(longest + 1) + 1.0) / (steps + 1.0), 1.0))
 
 
@@ -147,7 +147,7 @@ def _weights(first: int, longest: int) -> Array:
 
 @lru_cache(maxsize=256)
 def _basis(order: int, first: int, longest: int) -> Array:
-    """What each boundary value of a bridge of unit duration adds at every step, shape (c, longest + 1, 2 order).
+    """Contribution of each boundary value of a bridge of unit duration at every step, (c, longest + 1, 2 order).
 
     Order 2: value and rate at the start, value and rate at the end (hermite). Order 3: with the second derivatives.
     """

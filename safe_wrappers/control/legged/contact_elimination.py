@@ -1,9 +1,9 @@
-"""Contact forces as a function of the control: what contacts that move as wanted settle, and what they leave open.
+"""Contact forces as a function of the control, by eliminating the wanted contact accelerations.
 
-With qacc = M^-1 (B u + J' f - h), the contacts' accelerations are affine in u and f. Wanting them settles all of f
-but the forces inside the robot, which do no motion (two feet pressing against each other through a rigid ground).
-So the unknowns of a whole-body problem are the control, by how much the contacts miss their accelerations, and the
-inner forces: few, and of curvatures that a solver can work with.
+With qacc = M^-1 (B u + J' f - h), the contacts' accelerations are affine in u and f. Prescribing them determines f up
+to inner forces, which cause no motion (two feet pressing against each other through a rigid ground). So the unknowns
+of a whole-body problem are the control, the misses (errors of the contact accelerations) and the inner forces: few,
+and well conditioned.
 """
 
 from typing import NamedTuple
@@ -16,7 +16,7 @@ from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem
 Array = NDArray[np.float64]
 
 _RANK = 1e-9
-"""Eigenvalues of the contacts' inverse inertia below this share of the largest are none."""
+"""Eigenvalues of the contacts' inverse inertia below this share of the largest count as zero."""
 
 
 class Motion(NamedTuple):
@@ -26,10 +26,10 @@ class Motion(NamedTuple):
         free: Shape (nv,).
         by_control: Shape (nv, nu).
         by_force: Shape (nv, 3 s).
-        axes: Shape (3 s, r): along which of the axes of f a contact holds, and gives force. All three with friction,
-            the normal alone without.
+        axes: Shape (3 s, r): directions in which contacts give force. All three with friction, the normal alone
+            without.
         held: Jacobian along these axes, shape (r, nv).
-        wanted: What `held @ qacc` is to be, shape (r,), m/s^2.
+        wanted: Wanted `held @ qacc`, shape (r,), m/s^2.
     """
 
     free: Array
@@ -46,11 +46,11 @@ class Elimination(NamedTuple):
     Attributes:
         offset: Shape (3 s,), N.
         matrix: Shape (3 s, n).
-        controls: How many of the unknowns are controls.
-        misses: How many are misses, m/s^2: coordinates, in an orthonormal basis, of what the contacts' accelerations
-            differ from the wanted ones. None if they are to be met.
-        contradiction: Shape (r,), m/s^2: what of the wanted accelerations no motion gives, because they contradict
-            each other.
+        controls: Number of controls among the unknowns.
+        misses: How many are misses, m/s^2: coordinates, in an orthonormal basis, of the contacts' accelerations minus
+            the wanted ones. 0 if these are met exactly.
+        contradiction: Shape (r,), m/s^2: the part of the wanted accelerations that no motion gives, because they
+            contradict each other.
     """
 
     offset: Array
@@ -72,7 +72,7 @@ class Elimination(NamedTuple):
 
 
 def motion_of(problem: WholeBodyProblem) -> Motion:
-    """The accelerations that controls and forces make."""
+    """The accelerations of a problem as a function of controls and forces."""
     nv, nu = problem.actuation.shape
     kept = problem.stance
     stacked = problem.jacobians[kept].reshape(-1, nv)
@@ -96,7 +96,7 @@ def _axes(normals: Array, friction: Array) -> Array:
 
 
 def eliminate(motion: Motion) -> tuple[Elimination, Elimination]:
-    """The forces of contacts that move as wanted, and of contacts that may miss it.
+    """The forces of contacts that move as wanted, and of contacts that may deviate.
 
     Returns:
         One without misses, one with them.
@@ -113,7 +113,7 @@ def eliminate(motion: Motion) -> tuple[Elimination, Elimination]:
     by_miss = moving / values[counts]
     inverse = by_miss @ moving.T
     by_control = -inverse @ (motion.held @ motion.by_control)
-    # Inner forces make no acceleration, so no control reaches what is wanted along them.
+    # Inner forces cause no acceleration, so no control meets a wanted acceleration along them.
     contradiction = inner @ (inner.T @ missing)
     offset = motion.axes @ (inverse @ missing)
     rigid = motion.axes @ np.concatenate([by_control, inner], axis=1)

@@ -1,12 +1,11 @@
-"""Joint positions within their range, not only now but until the end of a control step.
+"""Bounds on joint accelerations that keep positions within their ranges until the end of a control step.
 
-Source: appendix "Hierarchical whole-body control quadratic program", its caveat: a bound on the present position is
-none on what happens between samples. With a constant acceleration the position is a parabola, and the largest one
-that keeps it below a limit all the way is known in closed form.
+Source: appendix "Hierarchical whole-body control quadratic program", its caveat: a bound at the present position does
+not cover the motion between samples. With a constant acceleration the position is a parabola, and the largest
+acceleration that keeps it below a limit has a closed form.
 
-It is a bound for one step ahead. A joint that may still be stopped is another question: choose the horizon no shorter
-than stopping takes, or the next step finds no torque that is strong enough. And the acceleration of a machine is not
-constant over a step; contacts, above all, change it.
+It is a bound for one step. Choose the horizon no shorter than stopping takes, or a later step may find no sufficient
+torque. Real accelerations are not constant over a step; contacts, above all, change them.
 """
 
 import numpy as np
@@ -19,9 +18,9 @@ Array = NDArray[np.float64]
 
 
 def largest_acceleration(distance: ArrayLike, speed: ArrayLike, horizon_s: float) -> Array:
-    """The largest constant acceleration that does not pass a limit at any time up to a horizon, shape (...).
+    """The largest constant acceleration that stays within a limit until a horizon, shape (...).
 
-    From beyond the limit (a negative distance): the largest that is back at it by the end of the horizon.
+    From beyond the limit (a negative distance): the largest that returns to it by the end of the horizon.
 
     Args:
         distance: To the limit, shape (...), m or rad.
@@ -32,9 +31,9 @@ def largest_acceleration(distance: ArrayLike, speed: ArrayLike, horizon_s: float
     if not 0.0 < horizon_s < np.inf:
         raise ConfigurationError(f"horizon_s must be a positive number of seconds, got {horizon_s}")
     at_end = 2.0 * (d - horizon_s * v) / horizon_s**2
-    # A parabola whose top is before the end: the top may reach the limit, no more.
+    # Where the top of the parabola is before the end, the top may just reach the limit.
     top_is_inside = (d > 0.0) & (2.0 * d < horizon_s * v)
-    with np.errstate(over="ignore"):  # a hair from the limit: the strongest that is still a number
+    with np.errstate(over="ignore"):  # very close to the limit: the largest finite number
         at_top = np.maximum(-(v * v) / (2.0 * np.where(d > 0.0, d, 1.0)), -np.finfo(np.float64).max)
     return np.asarray(np.where(top_is_inside, at_top, at_end))
 

@@ -1,9 +1,9 @@
 """The zero moment point's distance from the edge of the support polygon, at many instants at once.
 
-The same numbers as `control.support` gives instant by instant (`common_plane`, `support_polygon`, `zmp_of_forces`,
-`support_margin`), without building the polygons. For a point inside a convex hull, the distance to its boundary is
-the least of `max_k (p_k - x) . u` over directions u, and it is least across an edge. An edge joins two of the points;
-what lies across two points that are no edge is no nearer. So all pairs are tried, and no edge is looked for.
+The same numbers as `safe_wrappers.appendix.legged.balance` gives instant by instant, without building polygons. For a
+point inside a convex hull, the distance to its boundary is the least of `max_k (p_k - x) . u` over directions u,
+attained across an edge. An edge joins two of the points, and pairs that are no edge give no smaller distance, so the
+minimum is taken over all pairs.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 _ROUNDING = 1e-12
 """Of the points' extent: a narrower hull is a line."""
 _PRODUCTS = 2_000_000
-"""How many products of pairs and points are held at once."""
+"""Largest number of products of pairs and points in memory at once."""
 
 
 def support_distances(

@@ -1,4 +1,4 @@
-"""One instant of a robot in contact, as a whole-body controller is asked about it.
+"""The whole-body control problem at one instant of a robot in contact.
 
 Source: appendix "Floating-base equations of motion" and "Hierarchical whole-body control quadratic program":
 
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """Something to accelerate: `weight * |jacobian @ qacc + drift - target|^2` is added to the objective.
+    """An acceleration task: `weight * |jacobian @ qacc + drift - target|^2` is added to the objective.
 
     Attributes:
         jacobian: Shape (r, nv).
@@ -43,21 +43,21 @@ class WholeBodyProblem:
         actuation: B, shape (nv, nu): generalised force per control.
         jacobians: J_k of the contact points, shape (k, 3, nv); k may be 0.
         drift: `dJ/dt qvel` of the contact points, shape (k, 3), m/s^2.
-        normals: Unit normals, pointing at what the forces push, shape (k, 3).
-        friction: Coefficients, at least 0, shape (k,). Without friction, at 0, a contact gives force, and is asked to
-            move as wanted, along its normal alone.
+        normals: Unit normals, pointing at the body that the forces push, shape (k, 3).
+        friction: Coefficients, at least 0, shape (k,). At 0 a contact gives force, and has a wanted acceleration,
+            along its normal only.
         lower: Smallest control, shape (nu,).
         upper: Largest control, shape (nu,).
-        nominal: The control to stay close to, shape (nu,).
-        contact_acceleration: Wanted of the contact points, shape (k, 3), m/s^2; None is none: the points stay.
+        nominal: The control whose distance is minimised, shape (nu,).
+        contact_acceleration: Wanted at the contact points, shape (k, 3), m/s^2; None is zero.
         control_weight: Of the squared distance from the nominal, positive, a number or shape (nu,).
-        force_weight: Of the squared contact forces, positive, per N^2. It chooses among forces that do the same;
-            a large one moves the control away from the nominal.
-        contact_softness: 0 asks for the wanted contact accelerations exactly. Larger: a miss r (m/s^2) costs
-            `r^2 / contact_softness` instead; a nominal that needs none is still left alone.
+        force_weight: Of the squared contact forces, positive, per N^2. It chooses among forces of equal effect; a
+            large one moves the control away from the nominal.
+        contact_softness: 0 requires the wanted contact accelerations exactly. Larger: a miss r (m/s^2) costs
+            `r^2 / contact_softness` instead; a nominal without misses stays unchanged.
         breaking: Contacts that are to open, shape (k,): their force is 0 and their acceleration along the normal is
-            at least the wanted one. None is none of them.
-        first_tangents: Direction of each pyramid's first edge, shape (k, 3); None chooses.
+            at least the wanted one. None: no contact opens.
+        first_tangents: Direction of each pyramid's first edge, shape (k, 3); None for a default.
         tasks: See `Task`; with any, no control is `inactive`.
         acceleration_rows: G in `G qacc <= g`, shape (m, nv) (`predicted_position_rows` makes some).
         acceleration_limits: g, shape (m,).
@@ -93,7 +93,7 @@ class WholeBodyProblem:
     weights: Array = field(init=False)
     """`control_weight` as an array, shape (nu,)."""
     wanted: Array = field(init=False)
-    """`contact_acceleration`, or zeros, minus the drift: what `J qacc` is to be, shape (k, 3)."""
+    """Wanted `J qacc`: `contact_acceleration`, or zeros, minus the drift, shape (k, 3)."""
 
     def __post_init__(self) -> None:
         for one, other in (("acceleration_rows", "acceleration_limits"), ("force_rows", "force_limits")):

@@ -2,7 +2,7 @@
 
     minimise 1/2 y' H y + q' y    so that    G y <= h,  lower <= y <= upper,  c_i + C_i y in the cone,
 
-where a cone is {(t, x): |x| <= t}. Answers are candidates: who asks checks them with a residual of his own.
+where a cone is {(t, x): |x| <= t}. Answers are candidates: the caller checks their residuals.
 """
 
 from typing import NamedTuple
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _UNBOUNDED = 1e30
-"""What daqp takes as "no bound"."""
+"""daqp's infinity."""
 _ACCURACY = 1e-10
-"""What clarabel is asked for; a little less is taken, since the caller checks."""
+"""Tolerance for clarabel; answers of slightly lower accuracy are accepted, since the caller checks."""
 _FOUND = (
     clarabel.SolverStatus.Solved,
     clarabel.SolverStatus.AlmostSolved,
@@ -28,7 +28,7 @@ _FAILED, _INFEASIBLE, _SOLVED = "failed", "infeasible", "solved"
 
 
 class Program(NamedTuple):
-    """The program above, without cones where they are None.
+    """The program above.
 
     Attributes:
         hessian: Shape (n, n), positive definite.
@@ -51,7 +51,7 @@ class Program(NamedTuple):
     cone_offsets: Array | None = None
 
     def with_first(self, values: Array) -> "Program":
-        """The program in the other unknowns, the first ones given."""
+        """The program in the remaining unknowns, with the first ones fixed."""
         i = len(values)
         cones, offsets = self.cones, self.cone_offsets
         if cones is not None and offsets is not None:
@@ -68,7 +68,7 @@ class Program(NamedTuple):
         )
 
     def softened(self, count: int) -> "Program":
-        """The first rows may be broken: half the squares of what they are exceeded by is added to the objective."""
+        """The first rows made soft: half the squares of their violations are added to the objective."""
         n, k = self.linear.size, self.limits.size
         hessian = np.zeros((n + count, n + count))
         hessian[:n, :n] = self.hessian
@@ -89,7 +89,7 @@ class Program(NamedTuple):
         )
 
     def scaled(self) -> tuple["Program", Array]:
-        """The same with unit curvature along each unknown, and what its answer is to be multiplied with."""
+        """The program scaled to unit curvature along each unknown, and the factor of its answer."""
         scale = 1.0 / np.sqrt(self.hessian.diagonal())
         cones = None if self.cones is None else self.cones * scale
         return self._replace(
@@ -103,10 +103,10 @@ class Program(NamedTuple):
 
 
 class Candidate(NamedTuple):
-    """What a backend says.
+    """Answer of a solver.
 
     Attributes:
-        verdict: "solved", "infeasible" (the backend claims that there is no answer) or "failed".
+        verdict: "solved", "infeasible" (claimed by the solver) or "failed".
         y: The answer, shape (n,); None unless solved.
     """
 
@@ -130,7 +130,7 @@ def by_daqp(program: Program) -> Candidate:
 
 
 def by_clarabel(program: Program) -> Candidate:
-    """Interior-point solution, with cones or without."""
+    """Interior-point solution, with or without cones."""
     from scipy import sparse  # here: SciPy takes a while to import
 
     p, scale = program.scaled()

@@ -1,4 +1,4 @@
-"""Convex outlines in the plane: how far points are from them."""
+"""Convex hulls of points in the plane, and signed distances from them."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,10 @@ def convex_outline(points: Array) -> Array:
         points: Shape (n, 2), m.
 
     Returns:
-        Shape (c, 2), m; points on an edge are left out.
+        Shape (c, 2), m, without points on edges.
 
     Raises:
-        ValueError: All points lie on one line: there is no area to go around.
+        ValueError: All points lie on one line.
     """
     ordered = sorted({(float(x), float(y)) for x, y in points})
     corners = _chain(ordered)[:-1] + _chain(ordered[::-1])[:-1]

@@ -1,7 +1,7 @@
-"""Axis-aligned rectangles in the plane: how far apart they are, and fewer of them that cover the same area.
+"""Axis-aligned rectangles in the plane: distances, and merging of adjacent ones.
 
-The signed distance is Euclidean outside and, where two rectangles overlap, minus the shortest way along an axis that
-separates them. Plain floats: at this size they are faster than arrays.
+The signed distance is Euclidean outside and, where two rectangles overlap, minus the shortest translation along an
+axis that separates them. Plain floats: at this size they are faster than arrays.
 """
 
 import math
@@ -26,10 +26,10 @@ def apart(a: Rectangle, b: Rectangle) -> float:
 
 
 def closer(around: Rectangle, among: Iterable[Rectangle], limit: float) -> list[Rectangle]:
-    """Those that are closer than `limit` >= 0, m."""
+    """The rectangles that are closer than `limit` >= 0, m."""
     x0, x1, y0, y1 = around[0] - limit, around[1] + limit, around[2] - limit, around[3] + limit
     found = [r for r in among if r[0] < x1 and r[1] > x0 and r[2] < y1 and r[3] > y0]
-    # Off a corner it may be farther away than along either axis.
+    # Near a corner the Euclidean distance may be larger than along either axis.
     return [r for r in found if apart(around, r) < limit] if found else found
 
 

@@ -1,11 +1,11 @@
-"""A sum over millions of steps that loses no more than one rounding (Neumaier's compensated summation)."""
+"""Compensated summation (Neumaier): sums over millions of steps are accurate to about one rounding."""
 
 
 class RunningSum:
-    """What has been added so far, read as `value`.
+    """The sum of the numbers added so far, read as `value`.
 
     Args:
-        start: Where it starts.
+        start: Initial value.
     """
 
     def __init__(self, start: float = 0.0) -> None:

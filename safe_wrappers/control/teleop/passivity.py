@@ -1,23 +1,23 @@
-"""Energy at a port: ledgers, wave variables, and what a channel with a delay may give back.
+"""Energy at a port: ledgers of ports and channels, wave variables.
 
 Source: appendix "Passivity and Energy-Bounded Interaction". A port has an effort F (N or N m) and a flow v (m/s or
 rad/s); their product is power, *positive into the component*. A component with storage V >= 0 is passive when
 
     integral of F.v dt  >=  V(T) - V(0) + dissipated  >=  -V(0)        (the appendix's equation 2)
 
-so nobody gets more out of it than was in it at the start. What this does not say:
+so no more energy comes out than was stored at the start. Limits of passivity:
 
-- It is no limit on force. A loaded mechanism may release all of its storage at once, and hurt.
-- It bounds no displacement; clearances need a bound of their own (`leases.round_trip_ceiling`).
+- It does not limit force. A loaded mechanism may release all of its storage at once, and hurt.
+- It does not bound displacement; clearances need another bound (`leases.round_trip_ceiling`).
 - Passive parts connected with matching signs are passive together; converging needs more. A human, a powered tool
   or an active environment is not passive without evidence.
-- A delay turns effort and flow into an active two-port at some frequencies, but no phase (90 degrees, say) tells at
-  which: that depends on what is connected. Measure it (`ChannelLedger`).
-- The wave transform keeps a channel passive for a *fixed* delay. Delays that vary, loss, sampling and saturation
-  need the rules of `wave_line` or of `passivity_control`.
+- Effort and flow sent with a delay form an active two-port at some frequencies; which ones depends on what is
+  connected, not on the phase alone. Measure it (`ChannelLedger`).
+- The wave transform keeps a channel passive for a *fixed* delay. Varying delay, loss, sampling and saturation need
+  the rules of `wave_line` or of `passivity_control`.
 
-A sum of samples is the integral only if one of the two is held over the interval and the other is its mean: an
-effort that is held times a displacement is exact, a product of two samples is an estimate.
+A sum of samples is the integral only if one of the two is held over the interval and the other is its mean: a held
+effort times a displacement is exact, a product of two samples is an estimate.
 
 Efforts, flows and waves are numbers (a port of one component) or arrays of shape (m,); functions without memory also
 take leading batch axes, (..., m). What is not finite raises `ConfigurationError`.
@@ -41,59 +41,24 @@ class Waves(NamedTuple):
     """A pair of waves, each in sqrt(W).
 
     Attributes:
-        u: The one that goes into the component, shape (..., m).
-        w: The one that comes out of it, shape (..., m).
+        u: Into the component, shape (..., m).
+        w: Out of the component, shape (..., m).
     """
 
     u: Array
     w: Array
 
 
-class Port(NamedTuple):
-    """A port's two quantities.
-
-    Attributes:
-        effort: F, N (or N m), shape (..., m).
-        flow: v, m/s (or rad/s), shape (..., m).
-    """
-
-    effort: Array
-    flow: Array
-
-
 class EffortAndWave(NamedTuple):
-    """What a side that knows its flow works out.
+    """Effort and outgoing wave of a side whose flow is known.
 
     Attributes:
         effort: F, N, shape (..., m).
-        outgoing: The wave to be sent, sqrt(W), shape (..., m).
+        outgoing: Wave to be sent, sqrt(W), shape (..., m).
     """
 
     effort: Array
     outgoing: Array
-
-
-class FlowAndWave(NamedTuple):
-    """What a side that knows its effort works out.
-
-    Attributes:
-        flow: v, m/s, shape (..., m).
-        outgoing: The wave to be sent, sqrt(W), shape (..., m).
-    """
-
-    flow: Array
-    outgoing: Array
-
-
-def port_power(effort: ArrayLike, flow: ArrayLike) -> Array:
-    """`F.v`, the power into the component, shape (...), W.
-
-    Args:
-        effort: N (or N m), shape (..., m), or a number.
-        flow: m/s (or rad/s), of the same shape.
-    """
-    f, v = same_shape(effort=effort, flow=flow)
-    return np.asarray(f * v if f.ndim == 0 else (f * v).sum(axis=-1))
 
 
 def to_waves(effort: ArrayLike, flow: ArrayLike, impedance: float) -> Waves:
@@ -105,7 +70,7 @@ def to_waves(effort: ArrayLike, flow: ArrayLike, impedance: float) -> Waves:
         impedance: b > 0, N s/m.
 
     Returns:
-        The waves; `wave_power` of them is `port_power` of the arguments.
+        The waves; their power `(|u|^2 - |w|^2) / 2` is `F.v`.
     """
     f, v = same_shape(effort=effort, flow=flow)
     b = positive("impedance", impedance)
@@ -113,23 +78,10 @@ def to_waves(effort: ArrayLike, flow: ArrayLike, impedance: float) -> Waves:
     return Waves(np.asarray((f + b * v) / root), np.asarray((f - b * v) / root))
 
 
-def from_waves(u: ArrayLike, w: ArrayLike, impedance: float) -> Port:
-    """Its inverse, `F = sqrt(b / 2) (u + w)` and `v = (u - w) / sqrt(2 b)`.
-
-    Args:
-        u: Wave into the component, sqrt(W), shape (..., m), or a number.
-        w: Wave out of it, of the same shape.
-        impedance: b > 0, N s/m.
-    """
-    into, out = same_shape(u=u, w=w)
-    b = positive("impedance", impedance)
-    return Port(np.asarray(math.sqrt(b / 2.0) * (into + out)), np.asarray((into - out) / math.sqrt(2.0 * b)))
-
-
 def effort_and_outgoing(flow: ArrayLike, incoming: ArrayLike, impedance: float) -> EffortAndWave:
-    """The operator's side: it knows its flow and the wave w that came back, and feels F while it sends u.
+    """The operator's side: effort F and outgoing wave u for a known flow and the incoming wave w.
 
-    `F = b v + sqrt(2 b) w` and `u = sqrt(2 b) v + w`. The operator feels a damper b whatever has arrived.
+    `F = b v + sqrt(2 b) w` and `u = sqrt(2 b) v + w`. The operator always feels a damper b.
 
     Args:
         flow: v, m/s, shape (..., m), or a number.
@@ -142,37 +94,8 @@ def effort_and_outgoing(flow: ArrayLike, incoming: ArrayLike, impedance: float) 
     return EffortAndWave(np.asarray(b * v + root * w), np.asarray(root * v + w))
 
 
-def flow_and_outgoing(effort: ArrayLike, incoming: ArrayLike, impedance: float) -> FlowAndWave:
-    """The remote side: it knows its effort and the wave u that arrived, and moves with v while it sends w back.
-
-    `v = (sqrt(2 b) u - F) / b` and `w = sqrt(2 / b) F - u`.
-
-    Args:
-        effort: F, with which the channel pushes what is behind it, N, shape (..., m), or a number.
-        incoming: u, sqrt(W), of the same shape.
-        impedance: b > 0, N s/m.
-    """
-    f, u = same_shape(effort=effort, incoming=incoming)
-    b = positive("impedance", impedance)
-    return FlowAndWave(
-        np.asarray((math.sqrt(2.0 * b) * u - f) / b), np.asarray(math.sqrt(2.0) / math.sqrt(b) * f - u)
-    )
-
-
-def wave_power(u: ArrayLike, w: ArrayLike) -> Array:
-    """`|u|^2 / 2 - |w|^2 / 2`, the power into the component, shape (...), W.
-
-    Args:
-        u: Wave into it, sqrt(W), shape (..., m), or a number.
-        w: Wave out of it, of the same shape.
-    """
-    into, out = same_shape(u=u, w=w)
-    power = 0.5 * (into - out) * (into + out)
-    return np.asarray(power if power.ndim == 0 else power.sum(axis=-1))
-
-
 class EnergyLedger:
-    """The two sides of equation 2 for one component, kept over any number of steps.
+    """Accounts the two sides of equation 2 for one component, over any number of steps.
 
     Several ports of one component are one port whose efforts and flows are concatenated.
 
@@ -200,9 +123,9 @@ class EnergyLedger:
 
         Args:
             effort: F, N, shape (m,), or a number; held over the interval, or its mean.
-            flow: v, m/s, of the same shape; the other way round.
+            flow: v, m/s, of the same shape; the mean where the effort is held, and held where it is the mean.
             time_s: Length of the interval, > 0.
-            stored_j: V at its end, if known, at least 0; unknown counts as 0, the least that it can be.
+            stored_j: V at its end, if known, at least 0; None counts as 0, the least possible.
             dissipated_j: Energy lost as heat within the interval, if known, at least 0.
         """
         time = positive("time_s", time_s)
@@ -211,7 +134,7 @@ class EnergyLedger:
         dissipated = energy_j("dissipated_j", dissipated_j)
         self._absorbed.add(port_energy(f, v, time))
         self._dissipated.add(dissipated)
-        # Storage is worked out from a state that is itself rounded at every step, so it counts anew each time.
+        # Storage is computed from a state that is rounded at every step, so its rounding counts each time.
         exchanged = float(np.abs(f) @ np.abs(v)) * time + dissipated
         self._rounding += (f.size + 4) * _EPS * (exchanged + stored)
         self._lowest = min(self._lowest, self._absorbed.value)
@@ -225,35 +148,35 @@ class EnergyLedger:
 
     @property
     def absorbed_j(self) -> float:
-        """Integral of F.v dt, J: positive has gone in."""
+        """Integral of F.v dt, J: positive into the component."""
         return self._absorbed.value
 
     @property
     def dissipated_j(self) -> float:
-        """What is known to have become heat, J."""
+        """Known dissipation, J."""
         return self._dissipated.value
 
     @property
     def extracted_j(self) -> float:
-        """The most net energy that had been taken out at any time so far, J, at least 0."""
+        """Largest net energy extracted at any time so far, J, at least 0."""
         return -self._lowest
 
     @property
     def extractable_j(self) -> float:
-        """The most that may still come out, `V(0) + absorbed - dissipated`, J; below 0 it was not passive."""
+        """Largest energy that may still come out, `V(0) + absorbed - dissipated`, J; below 0: not passive."""
         return self._initial + self.absorbed_j - self.dissipated_j
 
     @property
     def created_j(self) -> float:
-        """By how much the left side of equation 2 fell below the right one, at the worst time so far, J.
+        """Largest violation of equation 2 so far, J.
 
-        The right side is as tight as what `add` was told of storage and dissipation; told nothing, it is -V(0).
+        Its right side uses the storage and dissipation that `add` was given; without them it is -V(0).
         """
         return self._created
 
     @property
     def rounding_j(self) -> float:
-        """Bound on what rounding has done to these sums and to the storage that `add` was told of, J."""
+        """Bound on the rounding of these sums and of the storage that `add` was given, J."""
         return self._rounding + 4.0 * _EPS * self._initial
 
     @property
@@ -263,7 +186,7 @@ class EnergyLedger:
 
 
 class ChannelLedger:
-    """Energy of a two-port channel of any coding, `E_ch(T) - E_ch(0) <= integral of (P_m - P_s) dt`.
+    """Energy of a two-port channel with any coding, `E_ch(T) - E_ch(0) <= integral of (P_m - P_s) dt`.
 
     Energy goes in at the port m (the operator's) and comes out at the port s (the remote one): F.v is positive into
     the channel at m, and positive out of it at s.
@@ -292,8 +215,8 @@ class ChannelLedger:
             effort_s: At the remote port, N, shape (m,), or a number.
             flow_s: m/s, of the same shape.
             time_s: Length of the interval, > 0.
-            stored_j: What is in flight at its end, if known (`WaveLine.in_flight_j` and `reserve_j` of both
-                directions): it has to be paid for too.
+            stored_j: Energy in flight at its end, if known (`WaveLine.in_flight_j` and `reserve_j` of both
+                directions).
         """
         f_m, v_m = port_vectors(effort_m=effort_m, flow_m=flow_m)
         f_s, v_s = port_vectors(effort_s=effort_s, flow_s=flow_s)
@@ -301,17 +224,17 @@ class ChannelLedger:
 
     @property
     def net_j(self) -> float:
-        """Integral of P_m - P_s, J: what went in beyond what came out."""
+        """Integral of P_m - P_s, J: net energy into the channel."""
         return self._both.absorbed_j
 
     @property
     def stored_j(self) -> float:
-        """The most that the channel can hold now, `E_ch(0) + net`, J; below 0 more came out than ever was in it."""
+        """Largest possible energy in the channel now, `E_ch(0) + net`, J; below 0: not passive."""
         return self._both.extractable_j
 
     @property
     def created_j(self) -> float:
-        """What came out (or was left in flight) beyond what went in and was there at the start, at worst, J."""
+        """Largest excess so far of energy out (or in flight) over energy in and initial storage, J."""
         return self._both.created_j
 
     @property

@@ -1,22 +1,21 @@
-"""Damping that appears when a port has given away more energy than it may: passivity in the time domain.
+"""Time-domain passivity control: damping as soon as a port has given out more energy than allowed.
 
-Hannaford and Ryu (2002), "Time-domain passivity control of haptic interfaces": an observer sums the energy at a
-port, and a controller adds just as much damping as brings the sum back to zero, at the very tick at which it would
-turn negative, and none otherwise. Ryu, Artigas and Preusche (2010), "A passive bilateral control scheme for a
-teleoperator with time-varying communication delay": over a network each side sends the energy that it has taken in,
-and gives out no more than what it has heard of; that holds for any delay, jitter, reordering and loss.
+Ryu, Artigas and Preusche (2010), "A passive bilateral control scheme for a teleoperator with time-varying
+communication delay": over a network each side sends the energy that it has taken in, and gives out no more than what
+the other side has reported; that holds for any delay, jitter, reordering and loss. The damping is that of Hannaford
+and Ryu (2002), "Time-domain passivity control of haptic interfaces"; their observer and controller of one port are in
+`safe_wrappers.appendix.teleop.passivity_controller`.
 
 Power is positive into the component (the virtual wall, the channel). In *impedance* causality the component answers
 a flow with an effort, so damping adds effort along the flow; in *admittance* causality it answers an effort with a
 flow, and damping adds flow along the effort.
 
-Nothing dissipates without flow (without effort), and a limit on the damping leaves some of the work undone. What is
-left is a debt: it is reported, carried over, and paid as soon as that is possible. Without a limit the damping at a
-small flow is a large effort for one tick; a real drive saturates, so declare where. Damping is computed for a flow
-that goes on as it was sampled. What it truly was is accounted one tick later (`actual`), so one interval's error is
-never summed up, and it is why energy can be a little below zero in between.
+Nothing is dissipated without flow (without effort), or beyond a limit on the damping. The rest is a debt: reported,
+carried over, and dissipated as soon as possible. Without a limit the damping at a small flow is a large effort for
+one tick; a real drive saturates, so declare its limit. Damping is computed for the sampled flow; the actual one is
+accounted one tick later (`actual`), so errors do not accumulate, but the energy may be slightly negative in between.
 
-That energy is kept says nothing about force or clearance.
+Passivity bounds neither force nor clearance.
 """
 
 import math
@@ -46,8 +45,8 @@ class Passivated(NamedTuple):
     Attributes:
         effort: N, shape (m,); in impedance causality the one to be applied.
         flow: m/s, shape (m,); in admittance causality the one to be applied.
-        correction: Size of what was added, N (m/s in admittance causality); 0: nothing was changed, bit for bit.
-        debt_j: What should have been dissipated and could not, J.
+        correction: Size of the added damping, N (m/s in admittance causality); 0: unchanged, bit for bit.
+        debt_j: Energy that should have been dissipated and could not, J.
     """
 
     effort: Array
@@ -56,97 +55,19 @@ class Passivated(NamedTuple):
     debt_j: float
 
 
-class PassivityObserver:
-    """Sums the energy of a port. Several ports of one component are one whose efforts and flows are concatenated.
-
-    Args:
-        initial_storage_j: What the component may give away beyond what it took, at least 0 J.
-    """
-
-    def __init__(self, initial_storage_j: float = 0.0) -> None:
-        self._energy = RunningSum(energy_j("initial_storage_j", initial_storage_j))
-
-    def add(self, effort: ArrayLike, flow: ArrayLike, time_s: float) -> float:
-        """Account one interval.
-
-        Args:
-            effort: N, shape (m,), or a number; held over the interval, or its mean.
-            flow: m/s, of the same shape; the other way round.
-            time_s: Length of the interval, > 0.
-
-        Returns:
-            `observed_j` after it.
-        """
-        f, v = port_vectors(effort=effort, flow=flow)
-        self._energy.add(port_energy(f, v, positive("time_s", time_s)))
-        return self._energy.value
-
-    @property
-    def observed_j(self) -> float:
-        """Initial storage and all energy since, J: below 0 the component was active."""
-        return self._energy.value
-
-
-class PassivityController:
-    """Keeps one port's observed energy from turning negative, with the smallest damping that does.
-
-    Args:
-        causality: Which of the two is changed, see above.
-        initial_storage_j: See `PassivityObserver`.
-        limit: Largest size of what is added, N (m/s in admittance causality), > 0; None: none.
-
-    Raises:
-        ConfigurationError: For an unknown causality, negative storage, or a limit that is not positive.
-    """
-
-    def __init__(
-        self, causality: Causality = "impedance", initial_storage_j: float = 0.0, limit: float | None = None
-    ) -> None:
-        self._damper = _Damper(causality, limit)
-        self._settled = PassivityObserver(initial_storage_j)
-        self._last: _Interval | None = None
-
-    @property
-    def observed_j(self) -> float:
-        """Energy at the end of the last interval, if it went as sampled, J."""
-        if self._last is None:
-            return self._settled.observed_j
-        return self._settled.observed_j + self._last.energy_j + self._last.damped_j
-
-    def modify(
-        self, effort: ArrayLike, flow: ArrayLike, time_s: float, actual: ArrayLike | None = None
-    ) -> Passivated:
-        """The port's effort and flow for the coming interval.
-
-        Args:
-            effort: What the component would answer with (what it sees, in admittance causality), N, shape (m,).
-            flow: What it sees (would answer with), m/s, of the same shape.
-            time_s: Length of the interval over which they will be held, > 0.
-            actual: What the seen quantity truly was on average since the last call (a displacement over its time,
-                say), of the same shape; None: as sampled.
-        """
-        interval = self._damper.interval(effort, flow, time_s)
-        if self._last is not None:
-            last = self._last.settled(actual)
-            self._settled.add(last.answer + last.added, last.seen, last.time_s)
-        owed = -(self._settled.observed_j + interval.energy_j)
-        result, self._last = self._damper.dissipate(interval, owed)
-        return result
-
-
 class EnergyReference:
-    """One end of a two-port channel that gives out no more energy than it has heard the other end took in.
+    """One end of a two-port channel that gives out no more energy than the other end reports as taken in.
 
-    Both ends: `receive` what has arrived, `modify`, and send `message_j` on. The sum of both ports' energies is then
-    never below minus the initial storages (and debts), whatever the network does to the messages: the number sent
-    only grows, and only the largest that was heard counts. Power is positive into the channel at *both* ends.
+    At every tick both ends `receive` what has arrived, `modify`, and send `message_j`. The sum of both ports'
+    energies is then never below minus the initial storages (and debts), for any network: the number sent never falls,
+    and only the largest received one counts. Power is positive into the channel at *both* ends.
 
-    Without any storage two such ends may never start: an end that moves something waits for energy, and the other
-    takes none in while it feels no force. The price of starting is what is declared here, once.
+    Without initial storage two such ends may never start: an end that moves something needs energy, and the other
+    takes none in while it feels no force.
 
     Args:
         causality: Which of the two this end changes, see above.
-        initial_storage_j: What this end may give out without having heard anything, at least 0 J.
+        initial_storage_j: Energy that this end may give out without any report, at least 0 J.
         limit: Largest size of what is added, N (m/s in admittance causality), > 0; None: none.
 
     Raises:
@@ -156,29 +77,29 @@ class EnergyReference:
     def __init__(
         self, causality: Causality = "impedance", initial_storage_j: float = 0.0, limit: float | None = None
     ) -> None:
-        self._damper = _Damper(causality, limit)
+        self._damper = Damper(causality, limit)
         self._initial = energy_j("initial_storage_j", initial_storage_j)
         self._taken_in, self._given_out, self._dissipated = RunningSum(), RunningSum(), RunningSum()
         self._heard = 0.0
-        self._last: _Interval | None = None
+        self._last: Interval | None = None
 
     @property
     def message_j(self) -> float:
-        """What this end has taken in from outside, J, without what it dissipated itself. Never falls; send this."""
+        """Energy that this end has taken in from outside, J, without its own dissipation; to be sent. Never falls."""
         return self._taken_in.value
 
     @property
     def heard_j(self) -> float:
-        """The most that the other end is known to have taken in, J."""
+        """Largest energy that the other end has reported to have taken in, J."""
         return self._heard
 
     @property
     def budget_j(self) -> float:
-        """What this end may still give out, J; below 0 it is in debt."""
+        """Energy that this end may still give out, J; below 0 it is in debt."""
         return self._initial + self._heard + self._dissipated.value - self._given_out.value
 
     def receive(self, *messages_j: float) -> None:
-        """Take messages from the other end, late, doubled and out of order as they come.
+        """Take messages from the other end, in any order, duplicates included.
 
         Args:
             *messages_j: Values of its `message_j`.
@@ -198,17 +119,17 @@ class EnergyReference:
         return result
 
     def account(self, effort: ArrayLike, flow: ArrayLike, time_s: float) -> None:
-        """Account an interval in which nothing was damped: for who keeps to `budget_j` by other means than `modify`.
+        """Account an interval without damping, for callers that keep to `budget_j` by other means than `modify`.
 
         Args:
             effort: N, shape (m,), or a number; held over the interval, or its mean.
-            flow: m/s, of the same shape; the other way round.
+            flow: m/s, of the same shape; the mean where the effort is held, and held where it is the mean.
             time_s: Length of the interval, > 0.
         """
         f, v = port_vectors(effort=effort, flow=flow)
         self._book(port_energy(f, v, positive("time_s", time_s)))
 
-    def _settle(self, last: "_Interval", actual: ArrayLike | None) -> None:
+    def _settle(self, last: "Interval", actual: ArrayLike | None) -> None:
         interval = last.settled(actual)
         through, damped = interval.energy_j, interval.damped_j
         self._dissipated.add(damped)
@@ -218,8 +139,8 @@ class EnergyReference:
         (self._taken_in if through_j > 0.0 else self._given_out).add(abs(through_j))
 
 
-class _Interval(NamedTuple):
-    """A port as sampled at the start of an interval, and what is added to the quantity that the component answers."""
+class Interval(NamedTuple):
+    """A port as sampled at the start of an interval, and the damping added to the component's answer."""
 
     answer: Array
     seen: Array
@@ -228,16 +149,16 @@ class _Interval(NamedTuple):
 
     @property
     def energy_j(self) -> float:
-        """Without what was added."""
+        """Energy without damping, J."""
         return port_energy(self.answer, self.seen, self.time_s)
 
     @property
     def damped_j(self) -> float:
-        """Of what was added alone."""
+        """Energy of the damping alone, J."""
         return port_energy(self.added, self.seen, self.time_s)
 
-    def settled(self, actual: ArrayLike | None) -> "_Interval":
-        """The same with what was truly seen."""
+    def settled(self, actual: ArrayLike | None) -> "Interval":
+        """The interval with the actual value of the seen quantity."""
         if actual is None:
             return self
         given = port_vector("actual", actual)
@@ -246,8 +167,8 @@ class _Interval(NamedTuple):
         return self._replace(seen=given)
 
 
-class _Damper:
-    """The smallest damping that dissipates an energy, as far as that is possible."""
+class Damper:
+    """The smallest damping that dissipates an energy, within a limit."""
 
     def __init__(self, causality: Causality, limit: float | None) -> None:
         if causality not in get_args(Causality):
@@ -257,17 +178,23 @@ class _Damper:
         self._answers_effort = causality == "impedance"
         self._limit = math.inf if limit is None else positive("limit", limit)
 
-    def interval(self, effort: ArrayLike, flow: ArrayLike, time_s: float) -> _Interval:
+    def interval(self, effort: ArrayLike, flow: ArrayLike, time_s: float) -> Interval:
+        """The port as sampled, without damping.
+
+        Raises:
+            ConfigurationError: For sizes that differ, energy that is not finite, or a time that is not positive.
+        """
         f, v = port_vectors(effort=effort, flow=flow)
         answer, seen = (f, v) if self._answers_effort else (v, f)
         time = positive("time_s", time_s)
-        port_energy(f, v, time)  # finite, before anything is changed
-        return _Interval(answer.copy(), seen.copy(), np.zeros_like(answer), time)
+        port_energy(f, v, time)  # raises before anything is changed
+        return Interval(answer.copy(), seen.copy(), np.zeros_like(answer), time)
 
-    def dissipate(self, interval: _Interval, owed_j: float) -> tuple[Passivated, _Interval]:
-        size, reach = 0.0, math.hypot(*interval.seen) * interval.time_s
-        if owed_j > 0.0 and reach > 0.0:
-            size = min(owed_j / reach, self._limit)
+    def dissipate(self, interval: Interval, owed_j: float) -> tuple[Passivated, Interval]:
+        """Damp so that `owed_j` is dissipated, or as much as the limit allows."""
+        size, travel = 0.0, math.hypot(*interval.seen) * interval.time_s
+        if owed_j > 0.0 and travel > 0.0:
+            size = min(owed_j / travel, self._limit)
         if not 0.0 < size < math.inf:
             size = 0.0
         else:
@@ -275,5 +202,5 @@ class _Damper:
             interval = interval._replace(added=size * direction)
         changed = interval.answer + interval.added if size else interval.answer
         effort, flow = (changed, interval.seen) if self._answers_effort else (interval.seen, changed)
-        debt = max(0.0, owed_j - size * reach)
+        debt = max(0.0, owed_j - size * travel)
         return Passivated(effort.copy(), flow.copy(), size, debt), interval

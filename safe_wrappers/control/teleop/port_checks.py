@@ -1,23 +1,23 @@
-"""Arguments of energy ports: one step's effort and flow, positive numbers, energies; or an error that names them."""
+"""Argument checks of energy ports: effort and flow of one step, positive numbers, energies."""
 
 import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.control.numerics.finite import finite_arrays
+from safe_wrappers.control.numerics.finite import finite_array
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
 
 
 def same_shape(**values: ArrayLike) -> tuple[Array, Array]:
-    """Two finite arrays of one shape, without broadcasting: a port that does not match is a mistake.
+    """Two finite arrays of one shape, without broadcasting.
 
     Raises:
         ConfigurationError: What is no number, not finite, or of two shapes.
     """
-    first, second = (finite_arrays(**{name: value})[0] for name, value in values.items())
+    first, second = (finite_array(name, value) for name, value in values.items())
     if first.shape != second.shape:
         a, b = values
         raise ConfigurationError(f"expected {a} and {b} of one shape, got {first.shape} and {second.shape}")
@@ -25,7 +25,7 @@ def same_shape(**values: ArrayLike) -> tuple[Array, Array]:
 
 
 def port_vector(name: str, value: ArrayLike) -> Array:
-    """One quantity of a port as (m,); a number is (1,). Whether it is finite shows in `port_energy`.
+    """One quantity of a port as (m,); a number is (1,). `port_energy` checks that it is finite.
 
     Raises:
         ConfigurationError: What is no number, of more than one axis, or empty.
@@ -58,9 +58,9 @@ def port_energy(effort: Array, flow: Array, time_s: float) -> float:
     """`F.v dt`, J.
 
     Raises:
-        ConfigurationError: For a product that is not finite: it has a factor that is not, or it overflows.
+        ConfigurationError: For a product that is not finite.
     """
-    # One look at the product instead of two at the factors: this runs at every tick.
+    # Checking the product instead of both factors saves time at every tick.
     with np.errstate(over="ignore", invalid="ignore"):
         energy = float(effort @ flow) * time_s
     if not math.isfinite(energy):
@@ -71,7 +71,7 @@ def port_energy(effort: Array, flow: Array, time_s: float) -> float:
 
 
 def _is_number(value: object) -> bool:
-    """A scalar of Python or NumPy, or an array without axes."""
+    """Whether it is a real scalar of Python or NumPy, or an array without axes."""
     return isinstance(value, (int, float, np.number)) or (
         isinstance(value, np.ndarray) and value.ndim == 0 and value.dtype.kind in "iuf"
     )

@@ -1,23 +1,22 @@
-"""One direction of a wave channel over a network: packets late, out of order, lost, several at once or none.
+"""One direction of a wave channel over a network with delay, jitter, reordering and loss.
 
-A wave that was sent for one tick carries `|u|^2 / 2 * tick`. The channel stays passive if what is put out never
-carries more than what has arrived and was not put out yet. Holding the last sample while nothing arrives, the usual
-thing to do, breaks that: it puts the same energy out again at every tick. A wave line pays for everything that it
-puts out.
+A wave sent for one tick carries the energy `|u|^2 / 2 * tick`. The channel stays passive if the energy put out never
+exceeds the energy that has arrived and was not put out before. Holding the last sample while nothing arrives, as is
+common, violates this: it puts the same energy out at every tick. A wave line accounts for all energy it puts out.
 
-Three rules say what is put out:
+Three rules for what is put out:
 
-- ``"queue"``: every wave that arrives is put out once, one per tick, the one that was sent first first; zero while
-  there is none. Neither energy nor the wave's integral is lost to jitter. The price is delay: every tick that found
-  the queue empty adds a tick, until it is that of the latest packet.
-- ``"hold"``: the newest wave that has arrived, as large as the reserve can pay for. The reserve is fed by packets
-  that are overtaken or come several at once. The shortest delay; the wave's integral, and with it the position of
-  the remote side, drifts.
+- ``"queue"``: every wave that arrives is put out once, one per tick, in the order of sending; zero while there is
+  none. Neither energy nor the wave's integral is lost to jitter. Every tick with an empty queue adds a tick of delay,
+  up to that of the latest packet.
+- ``"hold"``: the newest wave that has arrived, scaled down to the reserve of energy. Packets that are overtaken or
+  arrive several at once add to the reserve. The shortest delay; the wave's integral, and with it the position of the
+  remote side, drifts.
 - ``"zero"``: the sum of what arrives within the tick, scaled down to the energy that arrived; zero if nothing does.
-  No memory at all, and jitter costs signal.
+  No memory; jitter loses signal.
 
-Source: appendix "Passivity preservation via wave variables", whose fixed delay this replaces. That it is passive
-bounds no force and no displacement.
+Source: appendix "Passivity preservation via wave variables", extended from a fixed delay. Passivity bounds neither
+force nor displacement.
 """
 
 import heapq
@@ -38,12 +37,12 @@ Rule = Literal["queue", "hold", "zero"]
 
 
 class WaveLine:
-    """Accounts one direction. It carries nothing itself: `send` notes what leaves, `deliver` takes what arrives.
+    """Energy account of one direction: `send` notes what leaves, `deliver` takes what arrives. It carries no data.
 
-    At all times ``put_in_j = put_out_j + in_flight_j + reserve_j + lost_j``, none of them negative.
+    Always ``put_in_j = put_out_j + in_flight_j + reserve_j + lost_j``, none of them negative.
 
     Args:
-        time_s: The tick: every wave sent or put out lasts so long, > 0.
+        time_s: The tick, duration of every wave sent or put out, s, > 0.
         rule: See above.
         components: m, of a wave.
 
@@ -81,7 +80,7 @@ class WaveLine:
 
     @property
     def in_flight_j(self) -> float:
-        """Energy of the packets that have neither arrived nor been declared lost, J."""
+        """Energy of the packets that have neither arrived nor been declared lost, J, at least 0."""
         return max(self._in_flight.value, 0.0)
 
     @property
@@ -91,7 +90,7 @@ class WaveLine:
 
     @property
     def lost_j(self) -> float:
-        """Energy that will never come out, J: of lost packets, and what the rule could not use."""
+        """Energy that will never come out, J: of lost packets, and not used by the rule."""
         return self._lost.value
 
     def send(self, wave: ArrayLike, sequence: int) -> None:
@@ -115,7 +114,7 @@ class WaveLine:
         self._put_in.add(energy)
 
     def lose(self, sequence: int) -> None:
-        """Declare a packet lost. One that was never declared lost counts as in flight; later it is ignored.
+        """Declare a packet lost; its later arrival is ignored. Until then it counts as in flight.
 
         Raises:
             ConfigurationError: If it is not in flight.
@@ -125,10 +124,10 @@ class WaveLine:
         self._lost.add(self._landed(sequence))
 
     def deliver(self, packets: Iterable[tuple[int, ArrayLike]]) -> Array:
-        """What is put out during this tick. Call it once per tick, also when nothing has arrived.
+        """The wave put out during this tick. Call it once per tick, also when nothing has arrived.
 
         Args:
-            packets: Those that arrived since the last tick, (sequence, wave) in any order. A second copy is ignored.
+            packets: Arrivals since the last tick, (sequence, wave) in any order. Duplicates are ignored.
 
         Returns:
             The wave, sqrt(W), shape (m,).
@@ -143,7 +142,7 @@ class WaveLine:
         fresh = []
         for sequence, wave in arrived:
             if sequence in self._flying:
-                # What was sent pays, not what has become of it on the way.
+                # The energy as sent counts, not that of the received wave.
                 fresh.append((int(sequence), self._landed(sequence), wave))
         if self.rule == "queue":
             return self._next_in_queue(fresh)
@@ -158,11 +157,11 @@ class WaveLine:
         return put_out
 
     def _landed(self, sequence: int) -> float:
-        """Energy of a packet that is in flight no longer."""
+        """Take a packet out of flight; its energy."""
         energy = self._flying.pop(sequence)
         self._in_flight.add(-energy)
         if not self._flying:
-            self._in_flight = RunningSum()  # exactly
+            self._in_flight = RunningSum()  # exactly zero
         return energy
 
     def _next_in_queue(self, fresh: list[tuple[int, float, Array]]) -> Array:
@@ -193,11 +192,11 @@ class WaveLine:
         return self._held
 
     def _affordable(self, wave: Array, available: float) -> tuple[Array, float]:
-        """The wave, or as much of it as may be put out, and its energy, which is never above what is available."""
+        """The wave, scaled down to the available energy where needed, and its energy, never above it."""
         energy = self._energy(wave)
         shrink = 1.0
         while energy > available:
-            # The first try may be above by a rounding.
+            # Rounding may leave the first try slightly above.
             shrink *= 1.0 - 2.0**-50
             scaled = wave * (math.sqrt(available / energy) * shrink)
             wave, energy = scaled, self._energy(scaled)

@@ -1,10 +1,10 @@
-"""The peak of a traction curve, estimated while driving: how high, at which slip, and how sure that is.
+"""Online estimate of a traction curve's peak: its height, its slip, and their uncertainty.
 
-Every measured pair of slip and friction coefficient lies on the ground's curve, of which only a stretch is seen: at
-small slip only the slope, which fits a high peak far off as well as a low one nearby. So there is a hypothesis per
-slip of the peak, each with a Gaussian estimate of the peak's height (a Kalman filter: the coefficient is linear in
-it), weighted by how well it has predicted. Height and weights fade with the distance travelled, because the ground
-changes; a measurement that no hypothesis can explain starts them afresh.
+Every measured pair of slip and friction coefficient lies on the ground's curve. At small slip it shows the slope
+only, which fits a high peak at large slip as well as a low one at small slip. So there is a hypothesis per slip of
+the peak, each with a Gaussian estimate of the peak's height (a Kalman filter: the coefficient is linear in it),
+weighted by its likelihood. Height and weights fade with the distance travelled, because the ground changes; a
+measurement that no hypothesis explains resets them.
 
 Source: appendix "Wheel slip ratio and friction boundaries" (peak and falling slope); the curve's shape is the Magic
 Formula's. The bank of hypotheses is textbook multiple-model estimation. The standard deviations hold for noise
@@ -21,15 +21,15 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 PEAK_SLIPS: Final = (0.05, 0.07, 0.09, 0.11, 0.13, 0.15, 0.18, 0.22)
-"""The hypotheses."""
+"""Slips of the peak, one per hypothesis."""
 _SHAPE: Final = 1.65
 _PRIOR_MEAN, _PRIOR_STD = 0.5, 0.5
 _DRIFT: Final = 0.1
 """Standard deviation that a metre of travel adds to the height."""
 _MEMORY_M: Final = 5.0
-"""Metres after which the hypotheses' weights have faded to a third."""
+"""Metres after which the hypotheses' log-weights have faded to 1/e."""
 _SURPRISE: Final = 4.0
-"""Standard deviations beyond which a measurement says that the ground is another one."""
+"""Standard deviations beyond which a measurement resets the estimate."""
 
 
 class FrictionEstimate:
@@ -91,7 +91,7 @@ class FrictionEstimate:
         return np.asarray(np.sin(_SHAPE * np.arctan(np.abs(slip)[:, None] * self._stretch)))
 
     def travel(self, distance: Array) -> None:
-        """Fade what is known over distances travelled, shape (n,), m, >= 0."""
+        """Fade the estimate over distances travelled, shape (n,), m, >= 0."""
         self._variance = np.minimum(self._variance + (_DRIFT**2 * distance)[:, None], _PRIOR_STD**2)
         self._log_weight *= np.exp(-distance / _MEMORY_M)[:, None]
         self._weights = None

@@ -1,11 +1,11 @@
-"""A driven wheel over one control interval: what its drive torque and the ground's force make of its rate.
+"""A driven wheel over one control interval: its rate under drive torque and traction force.
 
 `I w' = tau - k w - b w - r F`, with torque and force constant over the interval and k the feedback of a speed servo,
 stepped as a physics engine steps it (damping implicit, as MuJoCo's Euler, implicit and implicitfast do):
-`w+ = decay w + gain (tau - r F)`, exactly. Engines that do otherwise (Runge-Kutta) differ by a share of the rate of
-half the time step over the wheel's time constant I / b, per time constant: little, unless the axle is very stiff.
-Read backwards it measures F, the traction-force observer of traction control: no force sensor, and no friction model.
-What else brakes the axle (dry friction, a spring) is measured as the ground's.
+`w+ = decay w + gain (tau - r F)`, exactly. Other integrators (Runge-Kutta) differ by a relative rate of half the time
+step over the wheel's time constant I / b, per time constant: little, unless the axle is strongly damped. Solved for F
+it is the traction-force observer of traction control, without force sensor and friction model. Other torques on the
+axle (dry friction, a spring) appear in F.
 
 Source: appendix "Wheel slip ratio and friction boundaries" (the wheel's equation).
 """
@@ -25,7 +25,7 @@ class Response(NamedTuple):
     """`w+ = decay w + gain (tau - r F)`.
 
     Attributes:
-        decay: Share of the rate that damping and feedback leave, at most 1.
+        decay: Share of the rate that remains after damping and feedback, at most 1.
         gain: Rate per torque, rad/(s N m).
     """
 
@@ -63,14 +63,14 @@ class Wheel:
         Args:
             timestep: s.
             substeps: Of one control interval.
-            feedback: k of speed servos, N m s/rad; their torque here is the one at a standstill.
-            implicit: Whether the engine steps the feedback like damping, instead of by the rate before the step.
+            feedback: k of speed servos, N m s/rad; `torque` is then their torque at standstill.
+            implicit: Whether the engine integrates the feedback implicitly, like damping.
         """
         k = np.asarray(feedback, dtype=np.float64)
         effective = self.inertia + timestep * (self.damping + (k if implicit else 0.0))
         share = (self.inertia - (0.0 if implicit else timestep * k)) / effective
         decay = share**substeps
-        # (1 - decay) / (b + k), without the quotient: both may be 0.
+        # (1 - decay) / (b + k), also where both are 0.
         gain = timestep / effective * sum(share**step for step in range(substeps))
         return Response(decay, np.asarray(gain))
 

@@ -1,21 +1,20 @@
-"""Watchdog leases: how long a command may stay in force when nothing renews it.
+"""Watchdog leases: how long a command may stay in force without renewal.
 
-Source: appendix "Kinematic derivation of watchdog validity leases". From the moment that a reading was taken to the
-moment that the brakes hold, five intervals pass one after the other: the lease itself, the detection of its end, a
-window of confirmation, the age of the reading and the onset of the actuator. What is travelled in them, and the way
-of braking after them, must fit into the measured clearance:
+Source: appendix "Kinematic derivation of watchdog validity leases". From the reading of the clearance until full
+braking, five intervals pass: the lease, the detection of its end, a confirmation window, the age of the reading and
+the onset of the actuator. The distance travelled in them, and the stopping distance, must fit into the clearance:
 
-    way(lease + detect + hold + age + act) + stopping distance + localisation + margin <= clearance
+    travel(lease + detect + hold + age + act) + stopping distance + localisation + margin <= clearance
 
-The appendix lets the machine cruise at constant speed until it brakes. `acceleration` drops that assumption: the
-machine may speed up by as much until then, which is what a policy that dies with the throttle open does.
+In the appendix the machine keeps its speed until it brakes. With `acceleration` it may speed up until then, as a
+machine whose policy fails at full throttle does.
 
-`braking` is a *verified lower bound* on the deceleration. Nothing here can check it.
+`braking` is a *verified lower bound* on the deceleration; it is not checked here.
 
-A human who steers from afar is late by the video, the reaction and the network's round trip instead. The same room
-bounds what the network may take (`round_trip_ceiling`; appendix "Teleoperation network round-trip time bounds").
+A remote operator has the delays of video, reaction and network round trip instead. `round_trip_ceiling` bounds the
+round trip (appendix "Teleoperation network round-trip time bounds").
 
-A lease of zero or less means: revoke now. Rounding only ever shortens a lease, and what is not finite revokes.
+A lease of zero or less means: revoke now. Rounding only shortens a lease, and inputs that are not finite revoke.
 """
 
 import math
@@ -29,24 +28,22 @@ from safe_wrappers.errors import ConfigurationError
 Array = NDArray[np.float64]
 
 _ROUNDING = 16.0 * float(np.finfo(np.float64).eps)
-"""Relative; more than the roundings of any formula below can add up to."""
-
-
+"""Relative bound on the accumulated rounding of the formulas below."""
 _TINY = 1e-300
-"""The same for numbers so small that their relative precision is gone."""
+"""Absolute reserve for subnormal numbers, whose relative precision is lost."""
 _LONGEST = 1e300
-"""s; a machine that creeps has no longer lease: the next number may be no number."""
+"""s; largest finite lease, so that nothing overflows."""
 
 
 @dataclass(frozen=True)
 class LeaseDelays:
-    """The delays beside the lease itself, in s.
+    """Delays in addition to the lease, in s.
 
     Attributes:
         detect_s: T_detect, until the end of the lease is recognised.
-        hold_s: T_hold, a window of confirmation in which the last command goes on.
-        age_s: t_age, how old the reading of the clearance is when the lease is granted.
-        act_s: T_act, until the full deceleration is there.
+        hold_s: T_hold, a confirmation window in which the last command continues.
+        age_s: t_age, age of the clearance's reading when the lease is granted.
+        act_s: T_act, until full deceleration.
 
     Raises:
         ConfigurationError: For a delay that is negative or not finite.
@@ -69,23 +66,6 @@ class LeaseDelays:
         return self.detect_s + self.hold_s + self.age_s + self.act_s
 
 
-def stopping_distance(speed: ArrayLike, braking: ArrayLike) -> Array:
-    """`v^2 / (2 a_brake)`, 0 for a machine that stands or recedes.
-
-    Args:
-        speed: Approach speed v in m/s (or rad/s), shape (...).
-        braking: Verified deceleration a_brake in m/s^2, shape (...).
-
-    Returns:
-        Distance in m, shape (...); inf where the braking is not positive or an input is not finite.
-    """
-    v, b = np.asarray(speed, dtype=np.float64), np.asarray(braking, dtype=np.float64)
-    known = np.isfinite(v) & np.isfinite(b) & (b > 0.0)
-    with np.errstate(over="ignore"):
-        way = np.maximum(np.where(known, v, 0.0), 0.0) ** 2 / (2.0 * np.where(known, b, 1.0))
-    return np.asarray(np.where(known, way, np.inf))
-
-
 def longest_lease(
     clearance: ArrayLike,
     speed: ArrayLike,
@@ -96,7 +76,7 @@ def longest_lease(
     acceleration: ArrayLike = 0.0,
     top_speed: ArrayLike = np.inf,
 ) -> Array:
-    """The longest T_lease for which a machine that nobody renews still stops inside the clearance.
+    """The longest T_lease after which a machine without renewal still stops inside the clearance.
 
     The largest tau = T_lease + delays_s with, for approach speed v, acceleration a and braking b,
 
@@ -105,8 +85,8 @@ def longest_lease(
     (a = 0 is the appendix's formula), where the speed v + a tau stops growing at `top_speed`. It is solved exactly:
     with w the speed at brake onset, `w^2 = (2 a room + v^2) b / (a + b)`.
 
-    A receding machine (v < 0) that cannot accelerate, or one that stands still and cannot, never uses up positive
-    room: its lease is inf. With acceleration it may turn round, and that is counted.
+    The lease is inf for a machine that recedes or stands still, cannot accelerate and has room left. With
+    acceleration a receding machine may reverse, which is counted.
 
     Args:
         clearance: D_clear as measured `age` ago, m, shape (...).
@@ -114,7 +94,7 @@ def longest_lease(
         braking: Verified lower bound on the deceleration, m/s^2, shape (...).
         delays_s: T_detect + T_hold + t_age + T_act (`LeaseDelays.total_s`), s, shape (...).
         localisation: delta_loc, bound on the error of the clearance, m, shape (...).
-        margin: delta_margin, clearance to be kept at rest, m, shape (...).
+        margin: delta_margin, clearance at rest, m, shape (...).
         acceleration: Largest approach acceleration that any command may cause until the brakes hold, m/s^2.
         top_speed: Bound on the approach speed that this acceleration may lead to, m/s; a measured speed above it
             counts as the bound. inf: none.
@@ -127,7 +107,7 @@ def longest_lease(
         ConfigurationError: For a negative delay, localisation bound, margin, acceleration or top speed.
     """
     given = (clearance, speed, braking, delays_s, localisation, margin, acceleration, top_speed)
-    # One lease at a time: a control step asks for a few, and for those NumPy's overhead is the larger part.
+    # Scalar arithmetic: for the few leases of a control step it is faster than arrays.
     several = np.broadcast(*(np.asarray(x, dtype=np.float64) for x in given))
     _not_negative(
         delays_s=delays_s,
@@ -142,7 +122,7 @@ def longest_lease(
 def _lease_or_none(*machine: float) -> float:
     try:
         return _lease(*machine)
-    except ZeroDivisionError:  # a speed that has underflowed: not known, so no lease
+    except ZeroDivisionError:  # a speed that underflowed counts as unknown
         return -math.inf
 
 
@@ -197,21 +177,21 @@ def round_trip_ceiling(
 
         T_RTT <= (D_clear - d_brake) / v - (T_video + T_human + T_act),    d_brake = v^2 / (2 a_brake)
 
-    A round trip above it means that the operator cannot see the obstacle and brake in time: the machine has to brake
-    by itself. It holds for the clearance and the speed at which it was worked out, so it has to be worked out anew
-    all the time, at the machine's own rate. It bounds displacement and says nothing of energy or contact force.
+    Above it the operator cannot brake in time, and the machine has to brake by itself. It holds for the given
+    clearance and speed, so it has to be computed at every control step. It bounds displacement, not energy or contact
+    force.
 
     Args:
         clearance: D_clear as measured by the machine, m, shape (...).
         speed: Approach speed v, m/s, positive towards the obstacle, shape (...).
         braking: Verified lower bound on the deceleration a_brake, m/s^2, shape (...).
         video_s: T_video, from the exposure to the operator's display, s, shape (...). Where the downlink is part of
-            it, it must not be counted in the round trip again.
+            it, it must not be counted in the round trip as well.
         human_s: T_human, the operator's reaction, s, shape (...); 0.15 to 0.25 s in the appendix.
-        act_s: T_act, until the full deceleration is there, s, shape (...).
+        act_s: T_act, until full deceleration, s, shape (...).
         localisation: Bound on the error of the clearance, m, shape (...).
-        margin: Clearance to be kept at rest, m, shape (...).
-        acceleration: Largest approach acceleration until the brakes hold, m/s^2; 0 is the appendix's constant speed.
+        margin: Clearance at rest, m, shape (...).
+        acceleration: Largest approach acceleration until full braking, m/s^2; 0 is the appendix's constant speed.
         top_speed: Bound on the speed that this may lead to, m/s; inf: none.
 
     Returns:
@@ -229,10 +209,10 @@ def round_trip_ceiling(
 
 
 def longest_lease_of_room(room: ArrayLike, closing_speed: ArrayLike, delays_s: ArrayLike) -> Array:
-    """The longest lease from a barrier that already counts the stopping distance: `room / closing - delays`.
+    """The longest lease from a barrier that includes the stopping distance: `room / closing - delays`.
 
     Args:
-        room: Value h of the barrier, in any unit U, shape (...): what is left after braking.
+        room: Value h of the barrier, the clearance left after braking, in any unit U, shape (...).
         closing_speed: Bound on how fast h may fall under any command until the brakes hold, U/s, shape (...).
         delays_s: The other four delays, s, shape (...).
 
@@ -259,7 +239,7 @@ def longest_lease_of_room(room: ArrayLike, closing_speed: ArrayLike, delays_s: A
 
 def _not_negative(**values: ArrayLike) -> None:
     for name, value in values.items():
-        # Of nothing, too: no surface near.
+        # Empty arrays, of no surface near, pass.
         least = (
             value
             if isinstance(value, float)

@@ -1,12 +1,13 @@
-"""How far a machine can get in a time, and how long it takes: idealised, and with limited jerk.
+"""Reachability in time: bounds on the displacement within a time, and jerk-limited motion times.
 
-Source: appendix "Trajectory transit time and reachable distance". Two kinds of answers, for two uses:
+Source: appendix "Trajectory transit time and reachable distance".
 
-* Necessary bounds (`transit_time`, `reach`, `furthest`, `admits`): every further limit only shrinks what can be
-  reached, so what lies outside is refused before anything else is computed, and nothing that is possible ever is.
-* The constrained profile itself (`jerk_limited_time`, `jerk_limited_reach`), solved by ruckig for the stated velocity
-  and acceleration at both ends. It is not the trapezoid plus an offset: a minimum-time profile may have four or seven
-  phases of jerk.
+* `furthest` and `admits` are necessary bounds: further limits only shrink the reachable set, so a goal outside is
+  refused before anything else is computed, and no reachable goal is.
+* `jerk_limited_time` is the duration of the constrained profile itself, solved by ruckig for the given velocity and
+  acceleration at both ends.
+
+`safe_wrappers.appendix.watchdog.reachability` has moves from rest to rest, and displacements with limited jerk.
 
 Metres stand for any unit of length: radians do as well.
 """
@@ -26,14 +27,12 @@ State = tuple[ArrayLike, ArrayLike, ArrayLike]
 """Position (m), velocity (m/s), acceleration (m/s^2), each of shape (..., axes) or scalar."""
 
 _ROUNDING = 32.0 * float(np.finfo(np.float64).eps)
-"""Relative; more than the roundings below can add up to, and nothing that a machine would notice."""
-_HALVINGS = 60
-"""Bisections until an interval is as small as rounding."""
+"""Relative bound on the accumulated rounding below."""
 
 
 @dataclass(frozen=True)
 class MotionLimits:
-    """Symmetric limits of every axis; scalars count for all of them.
+    """Symmetric limits of every axis; scalars apply to all of them.
 
     Attributes:
         max_acceleration: m/s^2, finite.
@@ -50,58 +49,13 @@ class MotionLimits:
     _arrays: tuple[Array, Array, Array] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        checked = _limits(self.max_acceleration, self.max_speed, self.max_jerk)
+        checked = checked_limits(self.max_acceleration, self.max_speed, self.max_jerk)
         object.__setattr__(self, "_arrays", checked)
 
     @property
     def arrays(self) -> tuple[Array, Array, Array]:
         """Acceleration, speed, jerk."""
         return self._arrays
-
-
-def transit_time(distance: ArrayLike, max_acceleration: ArrayLike, max_speed: ArrayLike = np.inf) -> Array:
-    """The shortest time of a move from rest to rest: triangular up to `d = v_max^2 / a_max`, then trapezoidal.
-
-    A lower bound for a machine that has other limits besides.
-
-    Args:
-        distance: m, of either sign, shape (...).
-        max_acceleration: a_max for speeding up and for braking, m/s^2, shape (...).
-        max_speed: v_max, m/s, shape (...).
-
-    Returns:
-        Time in s, shape (...); inf for a distance that is not finite.
-
-    Raises:
-        ConfigurationError: For a limit that is not positive, or an acceleration that is not finite.
-    """
-    a, v, _ = _limits(max_acceleration, max_speed, np.inf)
-    d = np.abs(np.asarray(distance, dtype=np.float64))
-    d = np.where(np.isfinite(d), d, np.inf)
-    with np.errstate(invalid="ignore"):
-        time = np.where(d <= v * (v / a), 2.0 * np.sqrt(d / a), d / v + v / a)
-    return np.asarray(np.where(np.isinf(d), np.inf, time))
-
-
-def reach(duration: ArrayLike, max_acceleration: ArrayLike, max_speed: ArrayLike = np.inf) -> Array:
-    """The longest move from rest to rest within a time, the inverse of `transit_time`.
-
-    Args:
-        duration: s, shape (...).
-        max_acceleration: a_max, m/s^2, shape (...).
-        max_speed: v_max, m/s, shape (...).
-
-    Returns:
-        Distance in m, shape (...); 0 for a duration that is negative or NaN.
-
-    Raises:
-        ConfigurationError: For a limit that is not positive, or an acceleration that is not finite.
-    """
-    a, v, _ = _limits(max_acceleration, max_speed, np.inf)
-    time = np.asarray(duration, dtype=np.float64)
-    time = np.maximum(np.where(np.isnan(time), 0.0, time), 0.0)
-    with np.errstate(invalid="ignore", over="ignore"):
-        return np.asarray(np.where(time <= 2.0 * (v / a), 0.25 * a * time**2, v * (time - v / a)))
 
 
 def furthest(
@@ -114,15 +68,15 @@ def furthest(
 ) -> tuple[Array, Array]:
     """Bounds on the displacement at any moment within a time, from a moving start to any speed at the end.
 
-    Upwards the acceleration grows by the largest jerk up to its limit, and the speed to its limit, without the
-    winding down of the acceleration that a real machine needs before it: no admissible motion gets farther, and the
-    bound is exact where the speed limit is not met or the jerk not limited. A start outside the limits moves them: a
-    machine that is too fast may stay as fast, and one whose acceleration carries it over the limit may go there.
+    Upwards the acceleration grows by the largest jerk up to its limit, and the speed up to its limit, without the
+    decrease of acceleration that a real machine needs before it: no admissible motion gets farther, and the bound is
+    exact where the speed limit is not reached or the jerk not limited. A start outside the limits widens them to its
+    speed, or to the speed that its acceleration leads to.
 
     Args:
         duration: s, shape (...).
         velocity: At the start, m/s, shape (...).
-        acceleration: At the start, m/s^2, shape (...); without a limit on the jerk it does not matter.
+        acceleration: At the start, m/s^2, shape (...); without effect if the jerk is not limited.
         max_speed: m/s, shape (...); inf: none.
         max_acceleration: m/s^2, shape (...).
         max_jerk: m/s^3, shape (...); inf: none.
@@ -134,7 +88,7 @@ def furthest(
     Raises:
         ConfigurationError: For a limit that is not positive, or an acceleration limit that is not finite.
     """
-    a_max, v_max, jerk = _limits(max_acceleration, max_speed, max_jerk)
+    a_max, v_max, jerk = checked_limits(max_acceleration, max_speed, max_jerk)
     time, v, a = (np.asarray(x, dtype=np.float64) for x in (duration, velocity, acceleration))
     known = np.isfinite(time) & np.isfinite(v) & np.isfinite(a) & (time >= 0.0)
     time, v, a = (np.where(known, x, 0.0) for x in (time, v, a))
@@ -166,7 +120,7 @@ def _highest(time: Array, v: Array, a: Array, v_max: Array, a_max: Array, jerk: 
         at_end = at_end + second * (v + first * (a + 0.5 * j * first) + 0.5 * a_max * second)
         cruise = time - climb
         at_end = at_end + np.where(cruise > 0.0, v_max * cruise, 0.0)
-        # Braking at the start: the body may be highest where it turns, before it comes back.
+        # Braking at the start: the highest point may be where the motion reverses.
         square = a * a - 2.0 * j * v
         turn = 2.0 * v / (np.sqrt(np.maximum(square, 0.0)) - a)
         turns = (v > 0.0) & (a < 0.0) & (square > 0.0)
@@ -190,8 +144,8 @@ def admits(
 ) -> NDArray[np.bool_]:
     """Whether a position may be reached within a time, at any speed: a necessary condition, axis by axis.
 
-    False means that no admissible motion gets there (`furthest`). True promises nothing: path, torque and stopping
-    still need their check.
+    False: no admissible motion gets there (`furthest`). True is not sufficient: path, torque and stopping remain to
+    be checked.
 
     Args:
         goal: m, shape (...).
@@ -201,9 +155,8 @@ def admits(
         max_speed: m/s, shape (...); inf: none.
         max_acceleration: m/s^2, shape (...).
         max_jerk: m/s^3, shape (...); inf: none.
-        acceleration: At the start, m/s^2, shape (...); a machine that is already accelerating gets farther than one
-            that is not. None: not measured. Then the most is counted on at once, which leaves the limit on the jerk
-            a say only over how far a start that is too fast may go.
+        acceleration: At the start, m/s^2, shape (...). None: not measured; then the largest one is assumed, and the
+            jerk limit only matters for a start above the speed limit.
 
     Returns:
         Shape (...). False where anything is not finite or the duration is negative.
@@ -228,8 +181,8 @@ def _furthest_unmeasured(
     max_acceleration: ArrayLike,
     max_jerk: ArrayLike,
 ) -> tuple[Array, Array]:
-    """`furthest` for whatever acceleration at the start: a start inside the limits is never carried over them."""
-    a_max, v_max, jerk = _limits(max_acceleration, max_speed, max_jerk)
+    """`furthest` for any acceleration at the start; a start inside the limits stays inside."""
+    a_max, v_max, jerk = checked_limits(max_acceleration, max_speed, max_jerk)
     v = np.asarray(velocity, dtype=np.float64)
     _, highest = furthest(duration, v, a_max, v_max, a_max, np.where(v > v_max, jerk, np.inf))
     lowest, _ = furthest(duration, v, -a_max, v_max, a_max, np.where(v < -v_max, jerk, np.inf))
@@ -239,8 +192,8 @@ def _furthest_unmeasured(
 def jerk_limited_time(start: State, end: State, limits: MotionLimits) -> Array:
     """The shortest time in which all axes arrive at their end state together.
 
-    At rest ends it is the slowest axis's own time; with moving ends it may be longer, since an axis cannot wait. A
-    start outside the limits is first led back inside, as fast as they allow.
+    Between states of rest it is the slowest axis's own time; with moving ends it may be longer, since an axis cannot
+    wait. A start outside the limits is first brought back inside, as fast as they allow.
 
     Args:
         start: Position, velocity, acceleration.
@@ -248,8 +201,8 @@ def jerk_limited_time(start: State, end: State, limits: MotionLimits) -> Array:
         limits: Of every axis.
 
     Returns:
-        Time in s, shape (...). inf where a state is not finite, and where the end state cannot be arrived at inside
-        the limits: too fast, too strongly accelerated, or braking from a speed that was over the limit.
+        Time in s, shape (...). inf where a state is not finite, and where the end state violates the limits: too
+        fast, too strongly accelerated, or reached only from above the speed limit.
 
     Raises:
         ConfigurationError: Where the shapes do not fit together, or ruckig finds no profile for other reasons.
@@ -265,7 +218,7 @@ def jerk_limited_time(start: State, end: State, limits: MotionLimits) -> Array:
         ) from None
     possible = np.all([np.isfinite(x) for x in (p0, v0, a0, p1, v1, a1)], axis=0)
     with np.errstate(invalid="ignore", over="ignore"):
-        # Arriving with an acceleration against the motion, the speed was higher before.
+        # With an end acceleration against the motion, the speed before was higher.
         before = np.where(v1 * a1 < 0.0, 0.5 * a1 * (a1 / j_lim), 0.0)
         possible &= (np.abs(v1) + before <= v_lim) & (np.abs(a1) <= a_lim)
     whole = possible.all(axis=-1)
@@ -273,70 +226,11 @@ def jerk_limited_time(start: State, end: State, limits: MotionLimits) -> Array:
     for i in np.ndindex(whole.shape):
         if whole[i]:
             states = ((p0[i], v0[i], a0[i]), (p1[i], v1[i], a1[i]))
-            times[i] = _profile(*states, (a_lim[i], v_lim[i], j_lim[i])).duration
+            times[i] = jerk_limited_profile(*states, (a_lim[i], v_lim[i], j_lim[i])).duration
     return times
 
 
-def jerk_limited_reach(
-    duration: ArrayLike, start_velocity: ArrayLike, start_acceleration: ArrayLike, limits: MotionLimits
-) -> tuple[Array, Array]:
-    """The lowest and the highest displacement at which an axis can be at rest within a time.
-
-    All rest positions between the two can be reached as well, as long as the start keeps the limits: the motions are
-    a convex set. Found by bisection over ruckig's times, on the inner side.
-
-    Args:
-        duration: s, shape (...).
-        start_velocity: m/s, shape (...).
-        start_acceleration: m/s^2, shape (...).
-        limits: Of every axis.
-
-    Returns:
-        Lowest and highest displacement in m, shape (...). Where the time does not suffice to stop at all, or an input
-        is not finite, the empty interval (inf, -inf).
-
-    Raises:
-        ConfigurationError: Where ruckig finds no profile.
-    """
-    given = [np.asarray(x, dtype=np.float64) for x in (duration, start_velocity, start_acceleration)]
-    time, v, a, a_max, v_max, jerk = np.broadcast_arrays(*given, *limits.arrays)
-    lowest, highest = np.full(time.shape, np.inf), np.full(time.shape, -np.inf)
-    for i in np.ndindex(time.shape):
-        if np.isfinite([time[i], v[i], a[i]]).all():
-            ends = _rest_ends(
-                float(time[i]), float(v[i]), float(a[i]), (float(a_max[i]), float(v_max[i]), float(jerk[i]))
-            )
-            if ends is not None:
-                lowest[i], highest[i] = ends
-    return lowest, highest
-
-
-def _rest_ends(
-    time: float, v: float, a: float, limits: tuple[float, float, float]
-) -> tuple[float, float] | None:
-    a_max, v_max, jerk = limits
-    axis = tuple(np.array([x]) for x in limits)
-    start = (np.zeros(1), np.array([v]), np.array([a]))
-    nothing = np.zeros(1)
-    stop = _profile(start, (nothing, nothing, nothing), axis, ruckig.ControlInterface.Velocity)
-    if stop.duration > time:
-        return None
-    at_stop = float(stop.at_time(stop.duration)[0][0])
-
-    def inside(position: float) -> bool:
-        return bool(_profile(start, (np.array([position]), nothing, nothing), axis).duration <= time)
-
-    ends = []
-    for beyond in furthest(time, v, a, v_max, a_max, jerk):
-        reached, missed = at_stop, float(beyond)
-        for _ in range(_HALVINGS):
-            middle = 0.5 * (reached + missed)
-            reached, missed = (middle, missed) if inside(middle) else (reached, middle)
-        ends.append(reached)
-    return ends[0], ends[1]
-
-
-def _profile(
+def jerk_limited_profile(
     start: tuple[Array, ...],
     end: tuple[Array, ...],
     limits: tuple[Array, ...],
@@ -365,9 +259,14 @@ def _told(values: tuple[Array, ...]) -> str:
     return str(tuple(np.round(v, 6).tolist() for v in values))
 
 
-def _limits(
+def checked_limits(
     max_acceleration: ArrayLike, max_speed: ArrayLike, max_jerk: ArrayLike
 ) -> tuple[Array, Array, Array]:
+    """Acceleration, speed and jerk limits as float64.
+
+    Raises:
+        ConfigurationError: For a limit that is not positive, or an acceleration that is not finite.
+    """
     named = {"max_acceleration": max_acceleration, "max_speed": max_speed, "max_jerk": max_jerk}
     checked = []
     for name, value in named.items():

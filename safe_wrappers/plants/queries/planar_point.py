@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.control.backup.damped_axis import HeldAxis
+from safe_wrappers.control.backup.damped_axis import DampedAxis
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
@@ -34,7 +34,7 @@ class PlanarPoint:
     """
 
     body: int
-    axes: tuple[HeldAxis, HeldAxis]
+    axes: tuple[DampedAxis, DampedAxis]
     joints: tuple[int, int]
     actuators: tuple[int, int]
     origin: tuple[float, float]
@@ -114,7 +114,7 @@ def _actuators(m: mujoco.MjModel, joints: tuple[int, int], alone: bool) -> tuple
 
 def _measured(
     plant: MujocoPlant, order: tuple[int, int], actuators: tuple[int, int], clip: float
-) -> tuple[HeldAxis, HeldAxis]:
+) -> tuple[DampedAxis, DampedAxis]:
     """The axes' constants from single physics steps of the plant's model without contacts."""
     m = plant.model
     least, most = plant.acting_range
@@ -150,7 +150,7 @@ def _measured(
                 f"springs, gravity or friction along them; Euler integrator); one step is {wrong:.2g} off that"
             )
     x_axis, y_axis = (
-        HeldAxis(float(decay[i]), float(gain[i]), h, plant.substeps, float(low[i]), float(high[i]), clip)
+        DampedAxis(float(decay[i]), float(gain[i]), h, plant.substeps, float(low[i]), float(high[i]), clip)
         for i in range(2)
     )
     return x_axis, y_axis

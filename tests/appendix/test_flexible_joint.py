@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.interpolate import BPoly
 
-from safe_wrappers.appendix.flexible_joint import (
+from safe_wrappers.appendix.handover.flexible_joint import (
     accelerations,
     boundary_layer_energy,
     damping_ratios,

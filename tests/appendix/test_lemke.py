@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog, nnls
 
-from safe_wrappers.appendix.lemke import LcpStatus, solve_lcp
+from safe_wrappers.appendix.contact.lemke import LcpStatus, solve_lcp
 from safe_wrappers.errors import ConfigurationError
 
 

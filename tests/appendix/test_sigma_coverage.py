@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2, laplace, norm, t, uniform
 
-from safe_wrappers.appendix.sigma_coverage import (
+from safe_wrappers.appendix.estimation.sigma_coverage import (
     ASSUMPTIONS,
     chebyshev_tail,
     gaussian_tail,

@@ -1,13 +1,13 @@
-"""What holding a command and sending it late cost a loop in phase.
+"""Phase lag of a control loop by zero-order hold and delay.
 
 In phase a zero-order hold equals a delay of half its interval, in the baseband: a sampled loop also sees aliases,
-which that does not count. So the figures are good well below the sampling frequency and optimistic towards the
-Nyquist frequency, at and beyond which they mean nothing and are refused. Take an integrator under a proportional
-controller: crossing over at a tenth of the sampling frequency it has 0.3 degrees less than is said here, at 2 / hold
-it is unstable and 33 degrees are said to be left.
+which that neglects. So the figures are accurate well below the sampling frequency, optimistic towards the Nyquist
+frequency, and refused from there on. Example, an integrator under a proportional controller: at a crossover of a
+tenth of the sampling frequency its margin is 0.3 degrees less than computed here; at 2 / hold it is unstable, with
+33 degrees computed.
 
-What is lost is the stated stability reserve. Whether a machine is stable depends on the sampled plant, its
-compensation, the jitter and the measured total response.
+The phase margin is a nominal reserve. Whether a machine is stable depends on the sampled plant, its compensation, the
+jitter and the measured total response.
 
 Source: appendix "Discrete-time sampling and zero-order hold phase lag" with its footnote 2. Arguments broadcast.
 """
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
 
@@ -92,3 +93,31 @@ def margin_left(
     if not np.isfinite(margin).all():
         raise ConfigurationError(f"phase_margin must be finite (rad), got {margin}")
     return np.asarray(margin - phase_lag(crossover, hold_s, compute_s, bus_s))
+
+
+def phase_margin_left(plant: Plant, phase_margin: float, crossover: float) -> float:
+    """Phase margin in rad that a loop through this plant keeps of its continuous, delay-free design.
+
+    The plant's `delay_s` (evidence, detection and actuation together) and half its `hold_s` are what the loop is
+    late by. That holds well below the sampling frequency.
+
+    Args:
+        plant: Any plant that knows its hold; a `MujocoPlant` learns it from the env when it is bound.
+        phase_margin: Margin of the controller's design, rad.
+        crossover: Crossover frequency of its open loop, rad/s, below the Nyquist frequency.
+
+    Returns:
+        What is left, rad; zero or less means that the stated reserve is used up.
+
+    Raises:
+        ConfigurationError: For a plant without a hold yet, a crossover that is not positive or not below the
+            Nyquist frequency, or a margin that is not finite.
+    """
+    try:
+        hold_s = plant.hold_s
+    except AttributeError:
+        raise ConfigurationError(
+            "this plant does not know its hold_s yet: it reads it from the env; call plant.bind(env), or put it "
+            "into a CBFActionFilter first"
+        ) from None
+    return float(margin_left(phase_margin, crossover, hold_s, plant.delay_s))

@@ -7,7 +7,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from safe_wrappers.control.contact.impact import (
+from safe_wrappers.appendix.contact.impact import (
     attenuation_after_delay,
     braked_deflection,
     braked_peak_force,
@@ -17,10 +17,10 @@ from safe_wrappers.control.contact.impact import (
     peak_force,
     reduced_mass,
     restitution_velocity,
-    series_stiffness,
     speed_limit,
     time_to_peak,
 )
+from safe_wrappers.control.contact.stiffness import series_stiffness
 from safe_wrappers.errors import ConfigurationError
 
 speeds, masses = st.floats(0.01, 10.0), st.floats(0.05, 100.0)

@@ -5,23 +5,23 @@ deformation". The elastic part is one mass against one massless linear spring wi
 
     m x'' = -k x - m a,    x(0) = 0, x'(0) = v,    w = sqrt(k / m),
 
-up to the first peak of the deflection x. What it leaves out is the user's to bound: stiffness that grows with
-depth, damping, a pad that runs out of stroke or ages, a second contact, motors that push on (`braking` below zero
-counts a constant push). None of it makes a contact safe; it says what force follows from what speed.
+up to the first peak of the deflection x. Not modelled: stiffness that grows with depth, damping, a pad at the end of
+its stroke, ageing, a second contact, motors that keep pushing (`braking` below zero counts a constant push). The
+functions relate force to speed; they do not certify a contact as safe.
 
 **Braking after contact is too late.** The peak comes a quarter of a period after the touch, typically 20 to 50 ms.
-A brake that acts later takes nothing off it (`attenuation_after_delay`), so clearance before contact is what
-protects.
+A brake that acts later does not reduce it (`attenuation_after_delay`), so protection needs clearance before contact.
 
-Arguments are numbers or arrays that broadcast. Speeds are approach speeds, positive towards the obstacle; what
-recedes counts as at rest. Stiffness (`inf`: rigid) and mass (`inf`: it does not give way) are positive, and not both
+Arguments are numbers or arrays that broadcast. Speeds are approach speeds, positive towards the obstacle; negative
+ones count as at rest. Stiffness (`inf`: rigid) and mass (`inf`: it does not give way) are positive, and not both
 infinite. Anything else raises `ConfigurationError`.
 """
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.control.numerics.finite import finite_arrays
+from safe_wrappers.control.contact.stiffness import in_series, number_or_inf, positive
+from safe_wrappers.control.numerics.finite import finite_array, finite_arrays
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -52,14 +52,14 @@ def normal_impulse(mass: ArrayLike, velocity: ArrayLike, restitution: ArrayLike)
         velocity: See `restitution_velocity`.
         restitution: See `restitution_velocity`.
     """
-    m, v = finite_arrays(mass=_positive("mass", mass), velocity=velocity)
+    m, v = finite_arrays(mass=positive("mass", mass), velocity=velocity)
     return np.asarray(m * (restitution_velocity(v, restitution) - v))
 
 
 def effective_mass(inertia: ArrayLike, jacobian: ArrayLike) -> Array:
-    """What a machine weighs to whoever pushes it along one direction at one point, `1 / (J M^-1 J')`, kg.
+    """Effective mass of a machine at one point along one direction, `1 / (J M^-1 J')`, kg.
 
-    Each direction for itself: contacts that act together share the inertia (`contact_lcp.delassus_matrix`).
+    Each direction separately: simultaneous contacts share the inertia (`contact_lcp.delassus_matrix`).
 
     Args:
         inertia: Joint-space inertia M, symmetric and positive definite, shape (..., n, n).
@@ -68,7 +68,7 @@ def effective_mass(inertia: ArrayLike, jacobian: ArrayLike) -> Array:
     Returns:
         Shape of the rows without their last axis; inf where no joint moves the point along the direction.
     """
-    m, j = (finite_arrays(**{name: a})[0] for name, a in (("inertia", inertia), ("jacobian", jacobian)))
+    m, j = finite_array("inertia", inertia), finite_array("jacobian", jacobian)
     n = j.shape[-1] if j.ndim else 0
     if m.ndim < 2 or n == 0 or m.shape[-2:] != (n, n):
         raise ConfigurationError(
@@ -94,18 +94,7 @@ def reduced_mass(mass: ArrayLike, other: ArrayLike) -> Array:
         mass: kg, shape (...).
         other: kg, shape (...); inf is a wall.
     """
-    return _in_series(_positive("mass", mass), _positive("other", other))
-
-
-def series_stiffness(*stiffness: ArrayLike) -> Array:
-    """Stiffness of springs behind each other, `1 / k = 1/k1 + 1/k2 + ...`, shape (...), N/m.
-
-    Args:
-        *stiffness: One or more, N/m, shape (...); inf is rigid.
-    """
-    if not stiffness:
-        raise ConfigurationError("series_stiffness needs at least one stiffness")
-    return _in_series(*(_positive("stiffness", k) for k in stiffness))
+    return in_series(positive("mass", mass), positive("other", other))
 
 
 def peak_deflection(speed: ArrayLike, mass: ArrayLike, stiffness: ArrayLike) -> Array:
@@ -175,7 +164,7 @@ def braked_deflection(
         latency: From the first touch to the brake's action, at least 0, s.
     """
     v, m, k = _checked(speed, mass, stiffness)
-    (a,), late = finite_arrays(braking=braking), _numbers("latency", latency)
+    (a,), late = finite_arrays(braking=braking), number_or_inf("latency", latency)
     if not (late >= 0.0).all():
         raise ConfigurationError(f"latency must be 0 s or more, got {late}")
     root = np.sqrt(m / k)
@@ -207,17 +196,16 @@ def braked_peak_force(
         braking: See `braked_deflection`.
         latency: See `braked_deflection`.
     """
-    (k,) = finite_arrays(stiffness=stiffness)
+    k = finite_array("stiffness", stiffness)
     return np.asarray(k * braked_deflection(speed, mass, k, braking, latency))
 
 
 def attenuation_after_delay(
     speed: ArrayLike, mass: ArrayLike, stiffness: ArrayLike, braking: ArrayLike, latency: ArrayLike
 ) -> Array:
-    """The share of the peak force that a brake `latency` seconds after the first touch still takes off, shape (...).
+    """Relative reduction of the peak force by a brake `latency` seconds after the first touch, shape (...).
 
-    Exactly 0 from the `time_to_peak` on: braking that starts by then changes nothing about the peak. 0 as well where
-    there is no peak to take anything off. Negative for a push.
+    Exactly 0 from the `time_to_peak` on, and where there is no peak. Negative for a push.
 
     Args:
         speed: See `braked_deflection`.
@@ -235,40 +223,17 @@ def attenuation_after_delay(
 def _checked(
     speed: ArrayLike, mass: ArrayLike, stiffness: ArrayLike, moving: str = "speed", least: float = -np.inf
 ) -> tuple[Array, Array, Array]:
-    """What moves, and mass and stiffness."""
-    (v,) = finite_arrays(**{moving: speed})
+    """Speed (or force), mass and stiffness as float64."""
+    v = finite_array(moving, speed)
     if not (v >= least).all():
         raise ConfigurationError(f"{moving} must be at least {least}, got {v}")
-    m, k = _positive("mass", mass), _positive("stiffness", stiffness)
+    m, k = positive("mass", mass), positive("stiffness", stiffness)
     if (np.isinf(m) & np.isinf(k)).any():
         raise ConfigurationError("mass and stiffness are both infinite: such an impact has no finite answer")
     return v, m, k
 
 
-def _positive(name: str, value: ArrayLike) -> Array:
-    array = _numbers(name, value)
-    if not (array > 0.0).all():
-        raise ConfigurationError(f"{name} must be positive, got {array}")
-    return array
-
-
-def _numbers(name: str, value: ArrayLike) -> Array:
-    """As `finite_arrays` has them, but infinity is a number here."""
-    try:
-        return np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ConfigurationError(f"{name} is a number or an array of numbers, got {value!r}") from None
-
-
-def _in_series(*parts: Array) -> Array:
-    total: Array = np.zeros(())
-    for part in parts:
-        total = total + 1.0 / part
-    with np.errstate(divide="ignore"):
-        return np.asarray(1.0 / total)
-
-
 def _times(speed: Array, factor: Array) -> Array:
-    """Their product, and 0 for what does not approach, whatever the factor: 0 times inf is not a number."""
+    """Their product; 0 where the speed is not positive, also for an infinite factor."""
     some = speed > 0.0
     return np.asarray(np.where(some, np.where(some, speed, 1.0) * factor, 0.0))

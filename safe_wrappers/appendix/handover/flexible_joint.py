@@ -1,4 +1,4 @@
-"""Flexible joints: two masses and a spring per joint, the rigid manifold, and the energy that rings.
+"""Flexible joints: two masses and a spring per joint, the rigid manifold, and the energy of oscillation.
 
 Source: appendix "Flexible joint dynamics and singular perturbations", after Spong (1987), Modeling and Control of
 Elastic Joint Robots. Motor angles theta (behind the gear), link angles q, spring torque z = K (theta - q):
@@ -6,19 +6,19 @@ Elastic Joint Robots. Motor angles theta (behind the gear), link angles q, sprin
     M(q) q'' + C(q, q') q' + g(q) = z + D (theta' - q')
     J theta'' + B theta' + z + D (theta' - q') = torque
 
-D, damping across the spring, is ours; the appendix has it zero. With the slow angles frozen, z is an oscillator about
-the manifold z0: with W = J^-1 + M^-1, the deflection's deviation d = K^-1 (z - z0) and its rate v,
+The damping D across the spring is an addition; the appendix has it zero. With the slow angles frozen, z is an
+oscillator about the manifold z0: with W = J^-1 + M^-1, the deflection's deviation d = K^-1 (z - z0) and its rate v,
 
     dv/dt = -W K d        and        E = (d . K d + v . W^-1 v) / 2,
 
-and E, in J, is kept but for damping. A torque change moves the manifold; what it leaves in E rings on at the
+and E, in J, changes only by damping. A torque change moves the manifold and leaves energy E, which oscillates at the
 `resonances`.
 
-**Frozen** means: over some periods of the resonances the pose, velocities and bias hardly change. The figures of
-energy are the boundary layer's, exact in that limit; the tests say how far off they are on a moving arm. A bound on
-the torque's rate alone bounds no energy: a torque that wiggles at a resonance pumps it, however slowly it changes,
-until damping takes out as much. The bounds here are for one monotone change from one constant torque to another.
-Before it, sqrt(E) may be there already, and changes that follow each other may add up their sqrt(E).
+**Frozen** means that pose, velocities and bias hardly change over some periods of the resonances. The energies are
+those of the boundary layer, exact in that limit; the tests give the errors on a moving arm. A bound on the torque's
+rate alone bounds no energy: a torque that oscillates at a resonance adds energy, however slowly it changes, until
+damping balances it. The bounds here are for one monotone change from one constant torque to another; the sqrt(E) of
+successive changes may add up.
 
 Common arguments: `stiffness` K and `rotor_inertia` J, diagonals, shape (n,), N m/rad and kg m^2, positive;
 `link_inertia` M, shape (..., n, n), kg m^2, symmetric and positive definite. Leading axes of every other argument

@@ -9,10 +9,9 @@ Unilateral contact and dry friction in finite freedom dynamics. With impulses p 
     least = -e J v      where the contact is closed, or e > 0 and free motion would close it: Newton's restitution;
     least = -gap / h    elsewhere: it may close by the end of the step, and no more.
 
-**It is linear only because of what is assumed**, and the appendix's caveat holds: no friction; inertia, forces and
-normals frozen over the step; gaps that change by `h J v+`; an impulse per contact at one instant; one restitution law
-for impacts that happen together, where real ones have an order. It shows what rigid contact asks for; it is no
-evidence that a machine does it.
+**The problem is linear by assumption**: no friction; inertia, forces and normals frozen over the step; gaps that
+change by `h J v+`; an impulse per contact at one instant; one restitution law for simultaneous impacts, where real
+ones have an order. It is an idealisation of rigid contact, not a prediction for a machine.
 """
 
 from typing import NamedTuple
@@ -20,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.appendix.lemke import LcpStatus, solve_lcp
-from safe_wrappers.control.numerics.finite import finite_arrays
+from safe_wrappers.appendix.contact.lemke import LcpStatus, solve_lcp
+from safe_wrappers.control.numerics.finite import finite_array
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -126,7 +125,7 @@ def _cholesky(m: Array) -> Array:
 
 
 def _matrices(inertia: ArrayLike, jacobian: ArrayLike) -> tuple[Array, Array]:
-    m, j = (finite_arrays(**{name: a})[0] for name, a in (("inertia", inertia), ("jacobian", jacobian)))
+    m, j = finite_array("inertia", inertia), finite_array("jacobian", jacobian)
     if m.ndim != 2 or m.shape[0] != m.shape[1] or j.ndim != 2 or j.shape[1] != len(m) or not len(m):
         raise ConfigurationError(
             f"expected an inertia of shape (n, n) and a jacobian of shape (k, n), got {m.shape} and {j.shape}"
@@ -137,7 +136,7 @@ def _matrices(inertia: ArrayLike, jacobian: ArrayLike) -> tuple[Array, Array]:
 
 
 def _vector(name: str, value: ArrayLike, size: int) -> Array:
-    (array,) = finite_arrays(**{name: value})
+    array = finite_array(name, value)
     if array.shape != (size,):
         raise ConfigurationError(f"{name} must have shape ({size},), got {array.shape}")
     return array

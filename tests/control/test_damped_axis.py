@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safe_wrappers.control.backup.damped_axis import HeldAxis
+from safe_wrappers.control.backup.damped_axis import DampedAxis
 from safe_wrappers.control.backup.stopping import held_stopping_distance
 
 SPEEDS = st.floats(-7.0, 7.0).map(lambda v: round(v, 6))
@@ -17,7 +17,7 @@ CONTROLS = st.floats(-1.0, 1.0)
 
 @st.composite
 def axes(draw, clip=True):
-    return HeldAxis(
+    return DampedAxis(
         decay=draw(st.floats(0.8, 1.0)),
         gain=draw(st.floats(0.01, 0.5)),
         timestep=draw(st.sampled_from([0.002, 0.01, 0.05])),
@@ -104,7 +104,7 @@ def test_more_control_never_rests_or_reaches_less_far(axis, x, v, a, b):
 @settings(max_examples=100, deadline=None)
 @given(axes(clip=False), PLACES, SPEEDS, st.floats(0.3, 8.0))
 def test_a_clip_never_leads_farther(axis, x, v, clip):
-    clipped = HeldAxis(axis.decay, axis.gain, axis.timestep, axis.substeps, axis.low, axis.high, clip)
+    clipped = DampedAxis(axis.decay, axis.gain, axis.timestep, axis.substeps, axis.low, axis.high, clip)
     free, held = axis.rest(x, v), clipped.rest(x, v)
     assert min(x, free) - 1e-12 <= held <= max(x, free) + 1e-12
 
@@ -114,12 +114,12 @@ def test_a_clip_never_leads_farther(axis, x, v, clip):
 def test_without_damping_a_finely_stepped_hold_is_the_held_formula(speed, holds):
     # A thousand steps a hold: the step's own share of the way, gain * timestep, is below the tolerance.
     brake, hold, steps = 3.0, 0.1, 1000
-    axis = HeldAxis(1.0, brake * hold / steps, hold / steps, steps, -1.0, 1.0)
+    axis = DampedAxis(1.0, brake * hold / steps, hold / steps, steps, -1.0, 1.0)
     assert axis.rest(0.0, speed) == pytest.approx(float(held_stopping_distance(speed, brake, hold)), abs=1e-3)
 
 
 def test_faster_than_the_table_knows_never_stops():
-    axis = HeldAxis(1.0, 0.1, 0.01, 1, -1.0, 1.0)
+    axis = DampedAxis(1.0, 0.1, 0.01, 1, -1.0, 1.0)
     assert axis.rest(0.0, 400.0) < math.inf
     assert axis.rest(0.0, 500.0) == math.inf
     assert axis.rest(0.0, -500.0) == -math.inf
@@ -127,5 +127,5 @@ def test_faster_than_the_table_knows_never_stops():
 
 
 def test_the_two_directions_have_their_own_brakes():
-    axis = HeldAxis(1.0, 0.1, 0.01, 1, low=-0.5, high=1.0)
+    axis = DampedAxis(1.0, 0.1, 0.01, 1, low=-0.5, high=1.0)
     assert axis.rest(0.0, 3.0) == pytest.approx(2.0 * -axis.rest(0.0, -3.0), rel=0.02)

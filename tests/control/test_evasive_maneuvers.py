@@ -1,23 +1,23 @@
-"""Escapes against the manoeuvre played hold by hold, physics step by physics step."""
+"""Evasive manoeuvres against the manoeuvre played hold by hold, physics step by physics step."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safe_wrappers.control.backup.damped_axis import HeldAxis
-from safe_wrappers.control.backup.evasive_maneuvers import Escapes, Manoeuvre
+from safe_wrappers.control.backup.damped_axis import DampedAxis
+from safe_wrappers.control.backup.evasive_maneuvers import EvasiveManeuvers, Maneuver
 
 AXES = (
-    HeldAxis(0.98, 0.04, 0.01, 4, -1.0, 1.0),
-    HeldAxis(1.0, 0.05, 0.02, 3, -0.7, 1.3),  # no damping, and stronger one way than the other
+    DampedAxis(0.98, 0.04, 0.01, 4, -1.0, 1.0),
+    DampedAxis(1.0, 0.05, 0.02, 3, -0.7, 1.3),  # no damping, and stronger one way than the other
 )
 BANK = [
-    Manoeuvre(0.0, 0.0, 0),
-    Manoeuvre(1.0, 0.0, 1),
-    Manoeuvre(-1.0, 0.0, 5),
-    Manoeuvre(0.0, 1.0, 9),
-    Manoeuvre(0.5, -1.0, 20),
+    Maneuver(0.0, 0.0, 0),
+    Maneuver(1.0, 0.0, 1),
+    Maneuver(-1.0, 0.0, 5),
+    Maneuver(0.0, 1.0, 9),
+    Maneuver(0.5, -1.0, 20),
 ]
 INSTANTS = np.arange(0, 41, 2)
 
@@ -50,11 +50,11 @@ speed = st.floats(-6.0, 6.0)
 @given(position=st.tuples(speed, speed), velocities=st.lists(st.tuples(speed, speed), min_size=1, max_size=4))
 @settings(deadline=None, max_examples=60)
 def test_every_way_is_the_manoeuvre_played(position, velocities):
-    escapes = Escapes(AXES, BANK, INSTANTS)
+    bank = EvasiveManeuvers(AXES, BANK, INSTANTS)
     velocity = np.array(velocities)
     which = np.array([4, 0, 2, 3])
     starts = np.broadcast_to(np.array(position), velocity.shape)
-    ways = escapes.paths(starts, velocity, which)
+    ways = bank.paths(starts, velocity, which)
     for i, axis in enumerate(AXES):
         for c, v in enumerate(velocity[:, i]):
             for row, m in enumerate(which):
@@ -63,7 +63,7 @@ def test_every_way_is_the_manoeuvre_played(position, velocities):
 
 
 def test_speeds_at_the_knots_are_as_exact():
-    escapes = Escapes(AXES, BANK[:1], INSTANTS)
+    bank = EvasiveManeuvers(AXES, BANK[:1], INSTANTS)
     for i, axis in enumerate(AXES):
         for brake, direction in ((-axis.low, 1.0), (axis.high, -1.0)):
             v = 0.0
@@ -71,24 +71,24 @@ def test_speeds_at_the_knots_are_as_exact():
                 v = (v + axis.add * brake) / axis.keep
                 velocity = np.zeros((1, 2))
                 velocity[0, i] = direction * v
-                way = escapes.paths(np.zeros((1, 2)), velocity, np.array([0]))[i][0, 0]
+                way = bank.paths(np.zeros((1, 2)), velocity, np.array([0]))[i][0, 0]
                 xs = played(axis, 0.0, direction * v, 0.0, 0, int(INSTANTS[-1]))
                 np.testing.assert_allclose(way, np.array(xs)[INSTANTS], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("m", range(len(BANK)))
 def test_the_first_control_begins_the_manoeuvre(m):
-    escapes = Escapes(AXES, BANK, np.arange(0, 41))
+    bank = EvasiveManeuvers(AXES, BANK, np.arange(0, 41))
     velocity = np.array([1.1, -0.4])
-    control = escapes.first(m, velocity)
+    control = bank.first(m, velocity)
     for i, axis in enumerate(AXES):
         after = substeps(axis, 0.3, velocity[i], control[i])[0]
-        way = escapes.paths(np.array([[0.3, 0.3]]), velocity[None], np.array([m]))[i][0, 0]
+        way = bank.paths(np.array([[0.3, 0.3]]), velocity[None], np.array([m]))[i][0, 0]
         assert after == pytest.approx(way[1], abs=1e-12)
     assert (np.abs(control) <= [1.0, 1.3]).all() and control[1] >= -0.7
 
 
 def test_it_stays_where_it_has_come_to_rest():
-    escapes = Escapes(AXES, BANK, np.array([0, 60, 61, 80]))
-    for way in escapes.paths(np.zeros((1, 2)), np.array([[2.0, -2.0]]), np.arange(len(BANK))):
+    bank = EvasiveManeuvers(AXES, BANK, np.array([0, 60, 61, 80]))
+    for way in bank.paths(np.zeros((1, 2)), np.array([[2.0, -2.0]]), np.arange(len(BANK))):
         assert (np.ptp(way[..., 1:], axis=-1) < 1e-12).all()

@@ -18,7 +18,7 @@ inequality in d dimensions; Pukelsheim, "The Three Sigma Rule" (1994), for the u
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.control.numerics.finite import finite_arrays
+from safe_wrappers.control.numerics.finite import finite_array
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 
 Array = NDArray[np.float64]
@@ -97,7 +97,7 @@ def sigmas_for(probability: ArrayLike, dimensions: int = 1, assume: str = "gauss
         UnknownNameError: For another assumption; it lists these.
         ConfigurationError: For a probability outside (0, 1), fewer than one dimension, or "unimodal" in several.
     """
-    (p,) = finite_arrays(probability=probability)
+    p = finite_array("probability", probability)
     if not ((p > 0.0) & (p < 1.0)).all():
         raise ConfigurationError(f"probability must lie between 0 and 1, both excluded, got {probability!r}")
     d = _dimensions(dimensions)
@@ -117,7 +117,7 @@ def sigmas_for(probability: ArrayLike, dimensions: int = 1, assume: str = "gauss
 
 
 def _checked(sigmas: ArrayLike, dimensions: int) -> tuple[Array, int]:
-    (k,) = finite_arrays(sigmas=sigmas)
+    k = finite_array("sigmas", sigmas)
     if (k < 0.0).any():
         raise ConfigurationError(f"sigmas must be at least 0, got {sigmas!r}")
     return k, _dimensions(dimensions)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from safe_wrappers.appendix.delay_budget import phase_margin_left
+from safe_wrappers.appendix.watchdog.sampling import phase_margin_left
 from safe_wrappers.errors import ConfigurationError
 
 CART = """

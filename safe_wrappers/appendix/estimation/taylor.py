@@ -1,7 +1,7 @@
 """Truncated Taylor series in time, with derivatives by the initial state: numbers that functions can be run on.
 
-Run f on them and the solution of x' = f(x) comes out as a Taylor series; run h on that and the outputs do. No step
-size, no differences: every coefficient is right up to rounding. Functions may use + - * / ** @, comparisons,
+Evaluating f on them gives the solution of x' = f(x) as a Taylor series, and h on that the outputs, without step size
+or differences: every coefficient is exact up to rounding. Functions may use + - * / ** @, comparisons,
 `np.array([...])`, indexing, sums, and NumPy's sin, cos, tan, arcsin, arccos, arctan, arctan2, sinh, cosh, tanh, exp,
 log, sqrt, square, hypot, abs, minimum, maximum, clip, dot, cross and linalg.norm. NumPy leaves hypot and arctan2 to
 their first argument, which must not be a plain number: 2 + 0 * x, not 2. Where functions branch, the branch taken at
@@ -64,7 +64,7 @@ def _run(name: str, function: Function, states: Array) -> Array:
     except (TypeError, AttributeError) as error:
         raise ConfigurationError(
             f"{name} is run on Taylor series, and this failed: {error}. It may use arithmetic and NumPy's elementary "
-            "functions (see safe_wrappers.control.numerics.taylor), not `math`, must build its result by "
+            "functions (see safe_wrappers.appendix.estimation.taylor), not `math`, must build its result by "
             "`np.array([...])` and give hypot and arctan2 a first argument that varies (2 + 0 * x for 2)"
         ) from error
     if not np.isfinite(found).all():

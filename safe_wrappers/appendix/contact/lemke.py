@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.control.numerics.finite import finite_arrays
+from safe_wrappers.control.numerics.finite import finite_array
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -67,7 +67,7 @@ def solve_lcp(matrix: ArrayLike, vector: ArrayLike) -> LcpSolution:
     Raises:
         ConfigurationError: Other shapes, or what is not finite.
     """
-    m, q = (finite_arrays(**{name: a})[0] for name, a in (("matrix", matrix), ("vector", vector)))
+    m, q = finite_array("matrix", matrix), finite_array("vector", vector)
     n = len(q) if q.ndim == 1 else 0
     if n == 0 or m.shape != (n, n):
         raise ConfigurationError(

@@ -1,0 +1,1 @@
+"""Contact: impacts, forces of simple shapes, contact steps as linear complementarity problems."""

@@ -1,0 +1,1 @@
+"""Estimation: covariance, filter consistency, observability, tail probabilities, lever arms."""

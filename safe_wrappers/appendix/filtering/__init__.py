@@ -1,0 +1,1 @@
+"""Barriers in continuous time, and least-norm joint rates."""

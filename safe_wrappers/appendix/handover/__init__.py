@@ -1,0 +1,1 @@
+"""Trajectories: splines, blends, polynomial extrema, flexible joints."""

@@ -1,0 +1,126 @@
+"""Quintic and cubic segments: linear systems, extrema inside a segment, steps of torque at the knots.
+
+Source: appendix "Smooth Trajectories and Bumpless Transfer".
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from safe_wrappers.appendix.handover.polynomials import Extrema, extrema
+from safe_wrappers.control.handover.splines import checked_samples, hermite_at, positive_duration
+from safe_wrappers.control.numerics.polynomials import differentiate
+from safe_wrappers.errors import ConfigurationError
+
+Array = NDArray[np.float64]
+
+
+def quintic_system(duration: ArrayLike) -> Array:
+    """The confluent Vandermonde matrix M, shape (..., 6, 6), of `M a = (q0, q0', q0'', q1, q1', q1'')`."""
+    span = positive_duration(duration)
+    matrix = np.zeros((*span.shape, 6, 6))
+    for order, row in enumerate(np.eye(6)[:3] * [1.0, 1.0, 2.0, 0.0, 0.0, 0.0]):
+        matrix[..., order, :] = row
+        factors = np.array([np.prod(np.arange(power, power - order, -1.0)) for power in range(6)])
+        for power in range(order, 6):
+            matrix[..., 3 + order, power] = factors[power] * span ** (power - order)
+    return matrix
+
+
+def quintic_reduced_system(duration: ArrayLike) -> tuple[Array, Array]:
+    """The matrix, shape (..., 3, 3), of the three highest coefficients, and its analytic inverse.
+
+    `matrix @ (a3, a4, a5)` is what the end state lacks after the start state's parabola: `(q1 - q0 - q0' T -
+    q0'' T^2 / 2, q1' - q0' - q0'' T, q1'' - q0'')`. Its determinant is 2 T^9, so T > 0 has one solution.
+    """
+    t = positive_duration(duration)
+    matrix = quintic_system(t)[..., 3:, 3:]
+    rows = [
+        [10.0 / t**3, -4.0 / t**2, 0.5 / t],
+        [-15.0 / t**4, 7.0 / t**3, -1.0 / t**2],
+        [6.0 / t**5, -3.0 / t**4, 0.5 / t**3],
+    ]
+    return matrix, np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def jerk_profile(coefficients: ArrayLike) -> Array:
+    """The jerk of quintics as a quadratic in t: `(6 a3, 24 a4, 60 a5)`, shape (..., 3), lowest power first."""
+    return differentiate(coefficients, 3)
+
+
+def interior_extrema(coefficients: ArrayLike, duration: ArrayLike, derivative: int) -> Extrema:
+    """Smallest and largest position, velocity, acceleration or jerk over the whole segment, with their times.
+
+    Not a search over samples: between the roots of the next derivative a polynomial is monotone.
+
+    Args:
+        coefficients: Shape (..., 6).
+        duration: T in s, > 0, shape () or (...).
+        derivative: 0 for position, 1 velocity, 2 acceleration, 3 jerk.
+
+    Raises:
+        ConfigurationError: For another derivative, or a duration that is not positive.
+    """
+    if derivative not in (0, 1, 2, 3):
+        raise ConfigurationError(f"derivative is 0, 1, 2 or 3, got {derivative!r}")
+    return extrema(differentiate(coefficients, derivative), positive_duration(duration))
+
+
+def peak_torque(coefficients: ArrayLike, duration: ArrayLike, inertia: ArrayLike) -> Array:
+    """Largest inertial torque over the segment, given an upper bound of the inertia, shape (...).
+
+    The bound times the largest |acceleration|: gravity, friction, Coriolis terms and the coupling of joints come
+    on top of it, and so does the response of an elastic joint.
+
+    Args:
+        coefficients: Shape (..., 6), rad.
+        duration: T in s, > 0.
+        inertia: Upper bound along the segment, kg m^2, > 0, shape () or (...).
+
+    Raises:
+        ConfigurationError: For an inertia or a duration that is not positive.
+    """
+    bound = np.asarray(inertia, dtype=np.float64)
+    if not (np.isfinite(bound).all() and (bound > 0.0).all()):
+        raise ConfigurationError(f"inertia is an upper bound in kg m^2, > 0 and finite; got {bound}")
+    return np.asarray(bound * interior_extrema(coefficients, duration, 2).peak)
+
+
+def knot_acceleration_step(times: ArrayLike, positions: ArrayLike, velocities: ArrayLike) -> Array:
+    """Jump of the acceleration of `hermite_series` at its inner knots, shape (..., k - 2); arguments as there."""
+    knots, q, v = checked_samples(times, positions, velocities)
+    span = np.diff(knots)
+    ends = (q[..., :-1], v[..., :-1], q[..., 1:], v[..., 1:])
+    before, after = hermite_at(ends, span, span, 2), hermite_at(ends, span, np.zeros_like(span), 2)
+    return np.asarray(after[..., 1:] - before[..., :-1])
+
+
+def knot_torque_step(
+    inertia: ArrayLike, times: ArrayLike, positions: ArrayLike, velocities: ArrayLike
+) -> Array:
+    """Torque step M(q) dq'' at the inner knots of `hermite_series`, to be held against the torque-slew limit.
+
+    Args:
+        inertia: One number in kg m^2 for independent joints; or matrices M, shape (n, n), or (k - 2, n, n) for one
+            per inner knot.
+        times: Shape (k,), s.
+        positions: Shape (..., k), and (..., n, k) with matrices.
+        velocities: Shaped as the positions.
+
+    Returns:
+        Steps in N m, shaped as the positions but k - 2 long.
+
+    Raises:
+        ConfigurationError: As `hermite_series`, or for an inertia of another shape.
+    """
+    step = knot_acceleration_step(times, positions, velocities)
+    m = np.asarray(inertia, dtype=np.float64)
+    if m.ndim == 0:
+        return np.asarray(m * step)
+    joints = step.shape[-2] if step.ndim > 1 else 0
+    if m.shape not in ((joints, joints), (step.shape[-1], joints, joints)):
+        raise ConfigurationError(
+            f"inertia is one number, or has shape (n, n) or (k - 2, n, n) with positions (..., n, k); "
+            f"got {m.shape} with {joints} joints and {step.shape[-1]} inner knots"
+        )
+    by_knot = np.swapaxes(step, -1, -2)[..., None]
+    return np.asarray(np.swapaxes((m @ by_knot)[..., 0], -1, -2))

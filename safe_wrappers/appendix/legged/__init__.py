@@ -1,0 +1,1 @@
+"""Centroidal momentum, zero moment point, moving bodies of a model."""

@@ -1,0 +1,1 @@
+"""Wave variables, and the passivity controller of one port."""

@@ -1,0 +1,1 @@
+"""Wheel slip and Burckhardt's traction curve."""

@@ -1,0 +1,1 @@
+"""Reachability, and the phase that sampling and delay cost."""

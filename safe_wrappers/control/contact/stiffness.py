@@ -1,0 +1,55 @@
+"""Springs in series."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from safe_wrappers.errors import ConfigurationError
+
+Array = NDArray[np.float64]
+
+
+def series_stiffness(*stiffness: ArrayLike) -> Array:
+    """Stiffness of springs in series, `1 / k = 1/k1 + 1/k2 + ...`, shape (...), N/m.
+
+    Args:
+        *stiffness: One or more, N/m, > 0, shape (...); inf is rigid.
+
+    Raises:
+        ConfigurationError: For no spring at all, or a stiffness that is not positive.
+    """
+    if not stiffness:
+        raise ConfigurationError("series_stiffness needs at least one stiffness")
+    return in_series(*(positive("stiffness", k) for k in stiffness))
+
+
+def positive(name: str, value: ArrayLike) -> Array:
+    """Positive numbers as float64, inf included.
+
+    Raises:
+        ConfigurationError: For anything else; it names the argument.
+    """
+    array = number_or_inf(name, value)
+    if not (array > 0.0).all():
+        raise ConfigurationError(f"{name} must be positive, got {array}")
+    return array
+
+
+def number_or_inf(name: str, value: ArrayLike) -> Array:
+    """Numbers as float64, not checked for infinity.
+
+    Raises:
+        ConfigurationError: For what is no number; it names the argument.
+    """
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ConfigurationError(f"{name} is a number or an array of numbers, got {value!r}") from None
+
+
+def in_series(*parts: Array) -> Array:
+    """`1 / (1/p1 + 1/p2 + ...)`, shape (...); inf for a sum of zero."""
+    total: Array = np.zeros(())
+    for part in parts:
+        total = total + 1.0 / part
+    with np.errstate(divide="ignore"):
+        return np.asarray(1.0 / total)
