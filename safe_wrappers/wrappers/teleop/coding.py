@@ -2,8 +2,9 @@
 
 import heapq
 import math
-from typing import Any, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,12 +12,19 @@ from safe_wrappers.control.teleop.passivity import effort_and_outgoing, to_waves
 from safe_wrappers.control.teleop.passivity_control import EnergyReference
 from safe_wrappers.control.teleop.port_checks import port_energy
 from safe_wrappers.control.teleop.wave_line import Rule, WaveLine
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import non_negative, positive
+from safe_wrappers.plants.plant import refuse_changed_actions
 from safe_wrappers.wrappers.teleop.link import Packet
-from safe_wrappers.wrappers.teleop.port import PortReading
+from safe_wrappers.wrappers.teleop.port import PortReading, TeleopPort
 
 Array = NDArray[np.float64]
 
 Coding = Literal["plain", "wave"]
+Passivity = Literal["none", "controller"]
+
+_STORAGE_J: Final = 0.02
+"""What each end of a passivity controller may give out unpaid, unless it is said."""
 
 
 class Up(NamedTuple):
@@ -76,6 +84,9 @@ class PlainCoding:
         reading: Of the machine's port; None: there is none, and no energies are known.
         tick_s: s.
     """
+
+    storage_j = 0.0
+    """What each end may give out unpaid, J."""
 
     def __init__(self, reading: PortReading | None, tick_s: float) -> None:
         self._reading, self._tick_s = reading, tick_s
@@ -148,13 +159,13 @@ class PaidCoding(PlainCoding):
 
     def __init__(self, reading: PortReading, tick_s: float, limit: float | None, storage_j: float) -> None:
         super().__init__(reading, tick_s)
-        self._port, self._limit, self._storage_j = reading, limit, storage_j
+        self._port, self._limit, self.storage_j = reading, limit, storage_j
 
     def reset(self, observation: Any) -> None:
         """As `PlainCoding.reset`."""
         super().reset(observation)
-        near = EnergyReference("impedance", self._storage_j, self._limit)
-        self._ends = near, EnergyReference("admittance", self._storage_j)
+        near = EnergyReference("impedance", self.storage_j, self._limit)
+        self._ends = near, EnergyReference("admittance", self.storage_j)
         self._late = self._felt = self._port.effort
 
     def near(self, flow: Array | None) -> Any:
@@ -308,3 +319,47 @@ class WaveCoding(PlainCoding):
             heapq.heappush(self._waiting, (packet.sequence, packet.load.seen_s))
         if self._waiting:
             self._seen_s = heapq.heappop(self._waiting)[1]
+
+
+def coding_from(
+    env: gym.Env[Any, Any],
+    port: TeleopPort | None,
+    tick_s: float,
+    coding: Coding,
+    impedance: float | None,
+    passivity: Passivity,
+    damping_limit: float | None,
+    storage_j: float | None,
+    rule: Rule,
+) -> PlainCoding:
+    """The coding that a channel's arguments ask for.
+
+    Raises:
+        ConfigurationError: Arguments that do not go together, or a port that is missing.
+    """
+    if passivity == "none" and not (damping_limit is None and storage_j is None):
+        raise ConfigurationError('damping_limit and storage_j are for passivity="controller"')
+    storage_j = non_negative("storage_j", _STORAGE_J if storage_j is None else storage_j, "J")
+    if damping_limit is not None:
+        damping_limit = positive("damping_limit", damping_limit, "N")
+    if coding == "wave" and passivity == "controller":
+        raise ConfigurationError(
+            'waves pay for their energy already: passivity="controller" is for plain coding'
+        )
+    if coding == "plain" and impedance is not None:
+        raise ConfigurationError(f'impedance is for coding="wave"; got {impedance!r} with plain coding')
+    reading = None if port is None else PortReading(env, port)
+    if coding == "plain" and passivity == "none":
+        return PlainCoding(reading, tick_s)
+    if reading is None:
+        what = 'coding="wave"' if coding == "wave" else 'passivity="controller"'
+        raise ConfigurationError(
+            f"{what} needs a port, and {env.unwrapped!r} publishes none: say which entries of the action are a flow "
+            'and which of the observation its effort, port={"flow": [0, 1], "effort": [4, 5]}'
+        )
+    refuse_changed_actions(env)
+    if coding == "plain":
+        return PaidCoding(reading, tick_s, damping_limit, storage_j)
+    if impedance is None:
+        raise ConfigurationError('coding="wave" needs an impedance, in N s/m')
+    return WaveCoding(reading, tick_s, positive("impedance", impedance, "N s/m"), rule)
