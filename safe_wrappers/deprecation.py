@@ -41,7 +41,7 @@ def deprecated_parameters(
         def accepting(*args: Any, **kwargs: Any) -> None:
             old = dict(zip(positional, args[places:], strict=False))
             old |= {name: kwargs.pop(name) for name in (*renames, *homes) if name in kwargs}
-            if not old:
+            if not old or len(args) > places + len(positional):
                 init(*args, **kwargs)
                 return
             bound = signature.bind_partial(*args[:places], **kwargs)

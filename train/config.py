@@ -6,13 +6,15 @@ import inspect
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Final
 
+from safe_wrappers.deprecation import deprecated_names
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.protect import protect_options
 from safe_wrappers.wrappers.faults import FAULTS
+from safe_wrappers.wrappers.lease.stopping_budget import StoppingBudget
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 
@@ -30,9 +32,10 @@ _NOT_HYPERPARAMETERS: Final = {"self", "env", "seed", "device", "verbose", "tens
 _PROTECT_OPTIONS: Final = protect_options() - {"plant"}
 _LEASE_OPTIONS: Final = [
     name
-    for name in inspect.signature(LeaseExpiry).parameters
+    for name in (*inspect.signature(LeaseExpiry).parameters, *deprecated_names(LeaseExpiry))
     if name not in ("env", "plant", "measured")  # what a YAML file cannot hold
 ]
+_BUDGET_OPTIONS: Final = [field.name for field in fields(StoppingBudget)]
 _OCCLUSION_OPTIONS: Final = [name for name in inspect.signature(OcclusionPenalty).parameters if name != "env"]
 _ARM_KEYS: Final = (
     "filter",
@@ -83,7 +86,7 @@ class EnvConfig:
 class FilterConfig:
     """Which filter: `none`, `protect`, `{protect: {...}}`, `{factory: "module:function", kwargs: {...}}`.
 
-    With `lease: {...}` beside it, the arguments of a `LeaseExpiry` around the filter; its clearance, if it is left
+    With `lease: {...}` beside it, the arguments of a `LeaseExpiry` around the filter; its budget's clearance, if left
     out, is the filter's own constraint.
     """
 
@@ -357,6 +360,10 @@ def _filter(value: Any, where: str) -> FilterConfig:
         lease = dict(_mapping(value["lease"], f"{where}.lease"))
         for key in lease:
             check_name(key, _LEASE_OPTIONS, f"{where}.lease")
+        if "budget" in lease:
+            lease["budget"] = dict(_mapping(lease["budget"], f"{where}.lease.budget"))
+            for key in lease["budget"]:
+                check_name(key, _BUDGET_OPTIONS, f"{where}.lease.budget")
     value = {key: given for key, given in value.items() if key != "lease"}
     if set(value) == {"protect"}:
         options = dict(_mapping(value["protect"], f"{where}.protect"))
