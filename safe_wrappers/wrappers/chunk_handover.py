@@ -60,19 +60,18 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
     **What it guarantees.** With `rate_limit`, the commands u[k] and u[k+1] that this wrapper sends in neighbouring
     control steps of an episode differ by at most `rate_limit` times the control interval in every component, whatever
     the chunks: where no blend can keep the limit the commands are held back, which is counted (`handover/limited`),
-    and are late. No entry of a chunk that is not finite is executed: such a chunk is refused as a whole, the
-    left-over goes on, then the fallback. Entries outside the env's action box are clipped to it.
+    and are late. A chunk with an entry that is not finite is refused as a whole: the left-over goes on, then the
+    fallback. Entries outside the env's action box are clipped to it.
 
-    **What it does not.** |du/dt| here is that difference of neighbouring commands over the control interval, and no
-    derivative: each command is held for its interval, so the signal itself jumps from one to the next. The first
-    command of an episode has no neighbour before it. A filter inside may have to break the limit, and then
-    `handover/peak_jerk`, measured on neighbouring executed commands, shows it. Measured jerk, tracking and stopping
-    are the plant's. It does not check that a chunk is safe: `LeaseExpiry` and `CBFActionFilter` belong inside.
+    **What it does not.** The limit is on the difference of neighbouring commands over the control interval: each
+    command is held for its interval, so the signal itself jumps, and the first command of an episode has no
+    neighbour. A filter inside may have to break the limit; `handover/peak_jerk` is measured on executed commands. It
+    does not check that a chunk is safe: `LeaseExpiry` and `CBFActionFilter` belong inside.
 
-    **Chunks of one** (`chunk_size=1, execution_horizon=1`) are for ordinary policies: commands pass as they are,
-    held back by `rate_limit` alone, and only a change of who gives them is blended: call `switch("human")`, give
-    the human's actions, `switch("policy")`. The fallback is such a change, too. An action of shape (m,) will do. A
-    single action has no left-over and is for one control step, so one that comes late is refused.
+    **Chunks of one** (`chunk_size=1, execution_horizon=1`) are for ordinary policies, whose actions of shape (m,) are
+    taken, too: commands pass as they are, held back by `rate_limit` alone, and only a change of their source is
+    blended: call `switch("human")`, give the human's actions, `switch("policy")`. The fallback is such a change, too.
+    A single action is for one control step, so one that comes late is refused.
 
     **Baselines** without any bound: blend="replace" takes the new chunk at once, blend="ensemble" averages all
     chunks at hand with weights exp(-decay i), i = 0 the oldest (temporal ensembling, Zhao et al., RSS 2023).

@@ -241,11 +241,6 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         info[keys.LEASE_BRAKING] = not covered
         return observation, reward, terminated, truncated, info
 
-    @property
-    def now_s(self) -> float:
-        """Seconds of the episode so far, on the clock of control steps."""
-        return self._steps_done * self.hold_s
-
     def admits_chunk(self, end: Array, duration_s: float) -> bool:
         """Whether the end of a chunk of position setpoints is within `reach`; a refusal is in the next step's info.
 

@@ -10,9 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.control.numerics.running_sum import RunningSum
-from safe_wrappers.control.teleop.passivity import ChannelLedger
-from safe_wrappers.control.teleop.port_checks import port_energy
 from safe_wrappers.control.teleop.wave_line import Rule
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.fallback import FallbackFunction
@@ -23,10 +20,11 @@ from safe_wrappers.wrappers.cbf_action_filter import is_filtered
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
 from safe_wrappers.wrappers.common.plain_data import plain_data, recorded, settings_from
 from safe_wrappers.wrappers.common.receiver import CommandReceiver, action_array
-from safe_wrappers.wrappers.teleop.coding import Coding, Down, Passivity, Up, coding_from
+from safe_wrappers.wrappers.teleop.coding import Coding, Down, Passivity, Up
 from safe_wrappers.wrappers.teleop.link import Line, Link, link_from
 from safe_wrappers.wrappers.teleop.port import TeleopPort, port_from
 from safe_wrappers.wrappers.teleop.round_trip import RoundTripCeiling, RoundTripWatch
+from safe_wrappers.wrappers.teleop.wave_coding import coding_from
 
 Array = NDArray[np.float64]
 
@@ -146,12 +144,8 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         watched = (
             None if ceiling is None else settings_from(RoundTripCeiling, ceiling, "ceiling", ", or None")
         )
-        for name, known in (
-            ("coding", Coding),
-            ("passivity", Passivity),
-            ("missing", Missing),
-            ("wave_rule", Rule),
-        ):
+        choices = {"coding": Coding, "passivity": Passivity, "missing": Missing, "wave_rule": Rule}
+        for name, known in choices.items():
             if arguments[name] not in get_args(known):
                 raise ConfigurationError(
                     f"{name} is one of {', '.join(get_args(known))}; got {arguments[name]!r}"
@@ -209,8 +203,6 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         if self._watch is not None:
             self._watch.reset()
         self._coding.reset(observation)
-        self._ledger = ChannelLedger(2.0 * self._coding.storage_j)
-        self._energy_in, self._energy_out = RunningSum(), RunningSum()
         self._steps_done = self._lost = 0
         self._observed_s = 0.0
         self._images: list[float] = [0.0]  # when the image was taken that was shown after each step
@@ -252,11 +244,6 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             self._watch.look()
         self._report(info, round_trip_s, ceiling_s, min(clearance_m, self._measured[1]))
         return shown, reward, terminated, truncated, info
-
-    @property
-    def now_s(self) -> float:
-        """Seconds of the episode so far, on the clock of control steps."""
-        return self._steps_done * self.hold_s
 
     @property
     def revoked(self) -> bool:
@@ -332,12 +319,7 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         self._images.append(max(self._images[-1], newest.taken_s))
         shown = coding.shown(arrived, _copy(newest.observation))
         if given is not None:
-            assert self.port is not None
-            felt = np.asarray(shown[list(self.port.effort)], dtype=np.float64)
-            moved = np.zeros_like(felt) if self._moved is None else self._moved
-            self._ledger.add(felt, moved, *given, self.hold_s, coding.stored_j)
-            self._energy_in.add(port_energy(felt, moved, self.hold_s))
-            self._energy_out.add(port_energy(*given, self.hold_s))
+            coding.account(self._moved, shown, given)
         return shown
 
     @property
@@ -353,10 +335,10 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         info[keys.TELEOP_CEILING_S] = ceiling_s
         info[keys.TELEOP_CLEARANCE_M] = clearance_m
         info[keys.TELEOP_REVOKED] = self.revoked
-        info[keys.TELEOP_ENERGY_IN_J] = self._energy_in.value
-        info[keys.TELEOP_ENERGY_OUT_J] = self._energy_out.value
+        info[keys.TELEOP_ENERGY_IN_J] = self._coding.energy_in.value
+        info[keys.TELEOP_ENERGY_OUT_J] = self._coding.energy_out.value
         info[keys.TELEOP_IN_FLIGHT_J] = self._coding.stored_j
-        info[keys.TELEOP_CREATED_J] = self._ledger.created_j
+        info[keys.TELEOP_CREATED_J] = self._coding.ledger.created_j
         info[keys.TELEOP_LOST] = self._lost
         info[keys.TELEOP_LATE] = self._up.late
 

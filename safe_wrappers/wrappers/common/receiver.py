@@ -1,7 +1,6 @@
 """CommandReceiver: a wrapper that is told how old a command is."""
 
 import math
-from abc import ABC, abstractmethod
 from typing import Any
 
 import gymnasium as gym
@@ -13,7 +12,7 @@ from safe_wrappers.errors import ActionError
 from safe_wrappers.plants.plant import wrappers_of
 
 
-class CommandReceiver(ABC):
+class CommandReceiver:
     """Base of `ChunkHandover`, `LeaseExpiry`, `TeleopChannel` and the faults.
 
     An action of Gymnasium carries no time stamp, so a policy that repeats itself cannot be told from one that works.
@@ -21,12 +20,15 @@ class CommandReceiver(ABC):
     the action was made from the newest observation.
     """
 
+    hold_s: float
+    """Control interval, s."""
+    _steps_done: int
     _observed_s: float | None
 
     @property
-    @abstractmethod
     def now_s(self) -> float:
         """Seconds of the episode so far, on the clock of control steps."""
+        return self._steps_done * self.hold_s
 
     def set_observation_time(self, observed_s: float | None) -> None:
         """Say which observation the next action is made from.

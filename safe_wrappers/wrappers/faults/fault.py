@@ -1,7 +1,7 @@
 """Fault: a seeded wrapper between policy and robot that loses, repeats or delays commands."""
 
 import copy
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from typing import Any, ClassVar, NamedTuple, SupportsFloat
 
 import gymnasium as gym
@@ -28,7 +28,7 @@ class Carried(NamedTuple):
     observed_s: float
 
 
-class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, CommandReceiver):
+class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, CommandReceiver, ABC):
     """Base of the faults.
 
     Put it outermost: outside `LeaseExpiry` and `ChunkHandover`, which it tells how old a command is, or that none has
@@ -47,13 +47,13 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
 
     _last: Any
 
-    def __init__(self, env: gym.Env[Any, Any], hold_s: float | None, **arguments: Any) -> None:
+    def __init__(self, env: gym.Env[Any, Any], hold_s: float | None = None, **arguments: Any) -> None:
         gym.utils.RecordConstructorArgs.__init__(self, hold_s=hold_s, **arguments)
         gym.Wrapper.__init__(self, env)
         if not isinstance(env.action_space, gym.spaces.Box):
             raise ConfigurationError(f"a fault carries actions of a Box action space, got {env.action_space}")
         self._inside = receiver_inside(env)
-        self._hold_s = 0.0 if self._inside is not None else check_timing(env, hold_s)
+        self.hold_s = 0.0 if self._inside is not None else check_timing(env, hold_s)
         if self._inside is not None and hold_s is not None:
             raise ConfigurationError(
                 f"{type(self._inside).__name__} inside counts the time: leave hold_s out"
@@ -93,7 +93,7 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
     @property
     def now_s(self) -> float:
         """Seconds of the episode so far."""
-        return self._inside.now_s if self._inside is not None else self._steps_done * self._hold_s
+        return super().now_s if self._inside is None else self._inside.now_s
 
     def admits_chunk(self, end: NDArray[np.float64], duration_s: float) -> bool:
         """What the receiver inside says."""

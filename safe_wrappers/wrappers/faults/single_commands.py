@@ -11,36 +11,37 @@ from safe_wrappers.wrappers.faults.fault import Carried, Fault
 from safe_wrappers.wrappers.faults.parameters import probability
 
 
-class DroppedRefreshes(Fault):
-    """Loses every command with the same probability, independently of the others.
+class ShareFault(Fault):
+    """Base of the faults that strike a share of the commands.
 
     Args:
         env: See `Fault`.
-        share: Probability that a command is lost, from 0 to 1.
+        share: Probability that a command is struck, independently of the others, from 0 to 1.
         hold_s: See `Fault`.
     """
 
     def __init__(self, env: gym.Env[Any, Any], share: float, hold_s: float | None = None) -> None:
         self._share = probability("share", share)
         super().__init__(env, hold_s, share=self._share)
+
+    def strikes(self) -> bool:
+        """Whether it strikes the next command."""
+        return bool(self.random.draw.random() < self._share)
+
+
+class DroppedRefreshes(ShareFault):
+    """Loses a share of the commands. Arguments: see `ShareFault`."""
 
     def carry(self, given: Carried | None, now_s: float) -> Carried | None:
         """The command, or nothing."""
-        return None if self.random.draw.random() < self._share else given
+        return None if self.strikes() else given
 
 
-class RepeatedCommands(Fault):
-    """Sends the command that arrived last once more, with its old observation time, and loses the new one.
+class RepeatedCommands(ShareFault):
+    """Loses a share of the commands, and sends the one that arrived last once more. Arguments: see `ShareFault`.
 
-    Args:
-        env: See `Fault`.
-        share: Probability that a command is replaced by the one before, from 0 to 1.
-        hold_s: See `Fault`.
+    It keeps its old observation time.
     """
-
-    def __init__(self, env: gym.Env[Any, Any], share: float, hold_s: float | None = None) -> None:
-        self._share = probability("share", share)
-        super().__init__(env, hold_s, share=self._share)
 
     def begin(self) -> None:
         """Nothing has arrived that could be repeated."""
@@ -48,10 +49,10 @@ class RepeatedCommands(Fault):
 
     def carry(self, given: Carried | None, now_s: float) -> Carried | None:
         """The command, or the one before."""
-        if self.random.draw.random() >= self._share:
-            self._before = given if given is not None else self._before
-            return given
-        return self._before
+        if self.strikes():
+            return self._before
+        self._before = given if given is not None else self._before
+        return given
 
 
 class Jitter(Fault):
