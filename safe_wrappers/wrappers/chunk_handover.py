@@ -276,7 +276,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             left, inside = self._queue.left(chunk), self._inside
             admits = len(left) > 0  # it came in time
             if admits and inside is not None:
-                admits = inside.admits_chunk(left[-1], len(left) * self.hold_s)
+                admits = inside.admits(left[-1], len(left))
             if not admits:
                 refused = True
                 continue

@@ -241,16 +241,16 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         info[keys.LEASE_BRAKING] = not covered
         return observation, reward, terminated, truncated, info
 
-    def admits_chunk(self, end: Array, duration_s: float) -> bool:
+    def admits(self, end: Array, steps: int) -> bool:
         """Whether the end of a chunk of position setpoints is within `reach`; a refusal is in the next step's info.
 
         Necessary only: what is admitted still needs its path and its stopping checked. True without `reach`.
 
         Args:
             end: The chunk's last command, shape (m,).
-            duration_s: From now to the end of that command, s.
+            steps: Control steps from now to the end of that command.
         """
-        admitted = self._admission is None or self._admission.admits(end, duration_s)
+        admitted = self._admission is None or self._admission.admits(end, steps * self.hold_s)
         self._chunk_refused |= not admitted
         return admitted
 

@@ -44,12 +44,12 @@ class CommandReceiver:
             raise ActionError(f"observed_s is a time in seconds, or None for nothing; got {observed_s!r}")
         self._observed_s = observed_s
 
-    def admits_chunk(self, end: NDArray[np.float64], duration_s: float) -> bool:
+    def admits(self, end: NDArray[np.float64], steps: int) -> bool:
         """Whether a chunk may be executed; `ChunkHandover` asks before it takes one over.
 
         Args:
             end: The chunk's last command, shape (m,).
-            duration_s: From now to the end of that command, s.
+            steps: Control steps from now to the end of that command.
         """
         return True
 

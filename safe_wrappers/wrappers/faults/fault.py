@@ -95,9 +95,9 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
         """Seconds of the episode so far."""
         return super().now_s if self._inside is None else self._inside.now_s
 
-    def admits_chunk(self, end: NDArray[np.float64], duration_s: float) -> bool:
+    def admits(self, end: NDArray[np.float64], steps: int) -> bool:
         """What the receiver inside says."""
-        return self._inside is None or self._inside.admits_chunk(end, duration_s)
+        return self._inside is None or self._inside.admits(end, steps)
 
     def begin(self) -> None:
         """A new episode; `random` is ready."""
