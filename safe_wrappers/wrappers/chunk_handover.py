@@ -20,6 +20,7 @@ from safe_wrappers.plants.template import PlantOfSpec, own_plant
 from safe_wrappers.stack import Layer, refuse_order
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
 from safe_wrappers.wrappers.common.plain_data import recorded
+from safe_wrappers.wrappers.common.plain_numbers import plain_numbers
 from safe_wrappers.wrappers.common.receiver import CommandReceiver, receiver_inside
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 from safe_wrappers.wrappers.handover.macro_info import macro_info
@@ -147,7 +148,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         if blend not in (*BLENDS, *BASELINES):
             raise UnknownNameError(f"no blend {blend!r}; choose {', '.join((*BLENDS, *BASELINES))}")
         decay = non_negative("decay", decay, "a number")
-        blend_time, rate_limit, hold_s = _plain(blend_time), _plain(rate_limit), _plain(hold_s)
+        blend_time, rate_limit, hold_s = map(plain_numbers, (blend_time, rate_limit, hold_s))
         gym.utils.RecordConstructorArgs.__init__(
             self,
             **recorded(
@@ -156,9 +157,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
                 execution_horizon=sizes.horizon,
                 inference_delay=sizes.delay[0] if sizes.delay[0] == sizes.delay[1] else list(sizes.delay),
                 blend_time=blend_time,
-                rate_limit=[_plain(x) for x in rate_limit]
-                if isinstance(rate_limit, Sequence)
-                else rate_limit,
+                rate_limit=rate_limit,
                 plant=None if plant is None else PlantOfSpec(plant),
                 hold_s=hold_s,
                 decay=decay,
@@ -339,8 +338,3 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             keys.HANDOVER_LIMITED: limited,
             keys.HANDOVER_STEPS: len(commands),
         }
-
-
-def _plain(value: Any) -> Any:
-    """A spec is written as JSON, which knows no NumPy."""
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value

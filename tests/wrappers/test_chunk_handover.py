@@ -18,7 +18,7 @@ from slow_handover import BLENDS, Slow, measured
 import safe_wrappers as sw
 from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError
 from safe_wrappers.wrappers.common.receiver import CommandReceiver
-from safe_wrappers.wrappers.faults import ClockSkew, FrozenPolicy, RepeatedCommands
+from safe_wrappers.wrappers.faults import ClockSkew, DroppedRefreshes, FrozenPolicy, RepeatedCommands
 
 HOLD = 0.1
 TYPES = {
@@ -1060,7 +1060,8 @@ def test_whoever_is_inside_is_told_what_every_command_is_made_from():
     assert told == wanted
 
 
-def test_admission_inside_refuses_a_chunk_and_the_left_over_goes_on():
+@pytest.mark.parametrize("between", [lambda env: env, lambda env: DroppedRefreshes(env, 0.0)])
+def test_admission_inside_refuses_a_chunk_and_the_left_over_goes_on(between):
     def reach(env):
         return np.zeros(1), np.zeros(1)
 
@@ -1071,7 +1072,7 @@ def test_admission_inside_refuses_a_chunk_and_the_left_over_goes_on():
         measured=reach,
         fallback="zero",
     )
-    env = sw.ChunkHandover(lease, 6, 3, rate_limit=5.0, fallback="zero")
+    env = sw.ChunkHandover(between(lease), 6, 3, rate_limit=5.0, fallback="zero")
     env.reset(seed=0)
     assert not env.step(np.full((6, 1), 0.1, np.float32))[4]["handover/refused"]
     far = env.step(np.full((6, 1), 0.9, np.float32))[4]  # 0.6 s at 1 per second
