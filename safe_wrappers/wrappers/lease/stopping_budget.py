@@ -17,7 +17,7 @@ from safe_wrappers.filter.constraint import Constraint, non_negative, positive
 from safe_wrappers.plants.default import default_plant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import constraint_from
-from safe_wrappers.wrappers.common.plain_data import settings_from
+from safe_wrappers.wrappers.common.plain_data import check_fields, settings_from
 
 Array = NDArray[np.float64]
 
@@ -74,17 +74,12 @@ class StoppingBudget:
                 "clearance is a constraint, such as sw.Clearance(...), or a function of the env that returns the "
                 f"clearance in m and the approach speed in m/s; got {given!r}"
             )
-        for name, unit in (("localisation", "m"), ("margin", "m"), ("act_s", "s")):
-            object.__setattr__(self, name, non_negative(name, getattr(self, name), unit))
-        for name, unit in (
-            ("braking", "m/s^2"),
-            ("top_speed", "m/s"),
-            ("closing_speed", "the constraint's unit per second"),
-        ):
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, positive(name, getattr(self, name), unit))
-        if self.acceleration is not None:
-            object.__setattr__(self, "acceleration", non_negative("acceleration", self.acceleration, "m/s^2"))
+        check_fields(self, non_negative, ["localisation", "margin"], "m")
+        check_fields(self, non_negative, ["act_s"], "s")
+        check_fields(self, non_negative, ["acceleration"], "m/s^2")
+        check_fields(self, positive, ["braking"], "m/s^2")
+        check_fields(self, positive, ["top_speed"], "m/s")
+        check_fields(self, positive, ["closing_speed"], "the constraint's unit per second")
         if self.measures_approach:
             self._check_bounds_on_approach()
         else:

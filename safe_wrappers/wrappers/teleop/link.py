@@ -9,7 +9,7 @@ import gymnasium as gym
 
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import non_negative, positive
-from safe_wrappers.wrappers.common.plain_data import settings_from
+from safe_wrappers.wrappers.common.plain_data import check_fields, settings_from
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 from safe_wrappers.wrappers.faults.on_off import OnOffProcess
 from safe_wrappers.wrappers.faults.parameters import probability
@@ -46,8 +46,7 @@ class Link:
     outage_length_s: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("delay_s", "jitter_s"):
-            object.__setattr__(self, name, non_negative(name, getattr(self, name), "s"))
+        check_fields(self, non_negative, ["delay_s", "jitter_s"], "s")
         if self.longest_s > LONGEST_DELAY_S:
             raise ConfigurationError(
                 f"a line remembers packets for {LONGEST_DELAY_S:g} s; got delays of up to {self.longest_s:g} s"
@@ -60,9 +59,7 @@ class Link:
                 "an outage needs both outage_between_s and outage_length_s, in s; got "
                 f"{self.outage_between_s!r} and {self.outage_length_s!r}"
             )
-        for name in ("outage_between_s", "outage_length_s"):
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, positive(name, getattr(self, name), "s"))
+        check_fields(self, positive, ["outage_between_s", "outage_length_s"], "s")
 
     @property
     def longest_s(self) -> float:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import non_negative
-from safe_wrappers.wrappers.common.plain_data import settings_from
+from safe_wrappers.wrappers.common.plain_data import check_fields, settings_from
 
 Array = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ class TeleopPort:
             raise ConfigurationError(
                 f"a port has as many efforts as flows; got flow {list(self.flow)} and effort {list(self.effort)}"
             )
-        object.__setattr__(self, "feedthrough", non_negative("feedthrough", self.feedthrough, "N s/m"))
+        check_fields(self, non_negative, ["feedthrough"], "N s/m")
 
 
 def port_from(given: Any, env: gym.Env[Any, Any]) -> TeleopPort | None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint, non_negative, positive
+from safe_wrappers.wrappers.common.plain_data import check_fields
 from safe_wrappers.wrappers.lease.stopping_budget import (
     BoundBudget,
     ClearanceFunction,
@@ -59,10 +60,9 @@ class RoundTripCeiling:
                 "in m/s"
             )
         object.__setattr__(self, "budget", budget)
-        for name in ("video_s", "human_s"):
-            object.__setattr__(self, name, non_negative(name, getattr(self, name), "s"))
-        object.__setattr__(self, "longest_s", positive("longest_s", self.longest_s, "s"))
-        object.__setattr__(self, "release", positive("release", self.release, "a share of the ceiling"))
+        check_fields(self, non_negative, ["video_s", "human_s"], "s")
+        check_fields(self, positive, ["longest_s"], "s")
+        check_fields(self, positive, ["release"], "a share of the ceiling")
         if self.release > 1.0:
             raise ConfigurationError(
                 f"release is a share of the ceiling, above 0 and at most 1; got {self.release}"
