@@ -267,12 +267,10 @@ def by_wrapper(case: Case) -> bool:
     limits = {"max_speed": m.speed, "max_acceleration": m.acceleration, "max_jerk": m.jerk}
     wrapper = sw.LeaseExpiry(
         Still(m.speed.size),
-        lambda env: (1.0, 0.0),
-        braking=1.0,
-        acceleration=0.0,
+        sw.StoppingBudget(lambda env: (1.0, 0.0), braking=1.0, acceleration=0.0),
         reach={name: limit.tolist() for name, limit in limits.items()},
         measured=lambda env: (m.position, m.velocity),
-        longest_s=max(1.0, case.hold_s),
+        max_lease_s=max(1.0, case.hold_s),
         fallback="zero",
         hold_s=case.hold_s,
     )

@@ -115,7 +115,7 @@ def train(task: Task) -> tuple[Any, VecNormalize]:
         given: dict[str, Any] = {"blend": "replace"}
         if task.bounded:
             bounds = bounds_of(env, task.horizon, task.range_per_second)
-            given = {"jerk_limit": bounds.jerk_limit, "blend_time": bounds.blend_time}
+            given = {"rate_limit": bounds.rate_limit, "blend_time": bounds.blend_time}
         handover = sw.ChunkHandover(env, task.chunk, task.horizon, list(task.delays), **given)
         return Monitor(Knots(handover, task.knots))
 

@@ -65,13 +65,15 @@ _ATTACKING = {
 Make = Callable[[], gym.Env[Any, Any]]
 
 
-def _late_commands(env_id: str, constraint: sw.Constraint, jerk_limit: float, **lease: Any) -> Make:
+def _late_commands(env_id: str, constraint: sw.Constraint, rate_limit: float, **bounds: float) -> Make:
     """Faults around a handover around a lease around a filter."""
 
     def make() -> gym.Env[Any, Any]:
         env: Any = sw.CBFActionFilter(gym.make(env_id), [constraint])
-        env = sw.RecordInterventions(sw.LeaseExpiry(env, constraint, **lease))
-        env = sw.ChunkHandover(env, 6, 3, [0, 2], jerk_limit=jerk_limit)
+        env = sw.RecordInterventions(
+            sw.LeaseExpiry(env, sw.StoppingBudget(constraint, **bounds), max_lease_s=0.15)
+        )
+        env = sw.ChunkHandover(env, 6, 3, [0, 2], rate_limit=rate_limit)
         return RepeatedCommands(Jitter(Outages(env, 0.5, 0.2), 0.05), 0.2)
 
     return make
@@ -91,28 +93,29 @@ def _teleop() -> gym.Env[Any, Any]:
     clamp = sw.Clearance(
         [sw.Plane([0.0, CLAMP_Y], [0.0, -1.0])], TELEOP_BRAKING, bodies=["tool"], radius=TOOL_RADIUS
     )
-    ceiling = sw.RoundTripCeiling(clamp, None, TELEOP_ACCELERATION, TELEOP_TOP_SPEED)
+    ceiling = sw.RoundTripCeiling(
+        sw.StoppingBudget(clamp, acceleration=TELEOP_ACCELERATION, top_speed=TELEOP_TOP_SPEED)
+    )
     env = gym.make("TeleopContact-v0")
     return sw.TeleopChannel(env, link, link, coding="wave", impedance=40.0, ceiling=ceiling)
 
 
 def _lease_alone() -> gym.Env[Any, Any]:
     rail = sw.Clearance([sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])], bodies=["cart"], braking=8.0)
-    env = sw.LeaseExpiry(gym.make("InvertedPendulum-v5"), rail, acceleration=20.0, longest_s=0.12)
+    env = sw.LeaseExpiry(
+        gym.make("InvertedPendulum-v5"), sw.StoppingBudget(rail, acceleration=20.0), max_lease_s=0.12
+    )
     return Outages(sw.RecordInterventions(env), 0.12, 0.3)
 
 
 _POINT = sw.HeadingDriveClearance([sw.Discs("hazard_positions", radius=0.2)], margin=0.004)
 _STACKS: dict[str, Make] = {
-    "SafePointGoal1, late commands": _late_commands(
-        "SafePointGoal1-v0", _POINT, 40.0, closing_speed=4.0, longest_s=0.15
-    ),
+    "SafePointGoal1, late commands": _late_commands("SafePointGoal1-v0", _POINT, 40.0, closing_speed=4.0),
     "Reacher, late commands": _late_commands(
         "Reacher-v5",
         sw.JointPositionLimit(-1.5, 1.5, ["joint1"]),
         40.0,
         closing_speed=10.0,
-        longest_s=0.15,
     ),
     "InvertedPendulum, a lease alone": _lease_alone,
     "Hopper, all contacts": _hopper,

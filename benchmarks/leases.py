@@ -112,17 +112,19 @@ def stack(mode: str, drive: Drive, outages: tuple[float, float]) -> tuple[Any, C
     if mode not in ("alive", "no lease"):
         env = sw.LeaseExpiry(
             cart,
-            cart.reading,
-            braking=drive.braking,
-            acceleration=drive.acceleration,
-            top_speed=drive.top_speed,
+            sw.StoppingBudget(
+                cart.reading,
+                braking=drive.braking,
+                acceleration=drive.acceleration,
+                top_speed=drive.top_speed,
+                act_s=drive.act_s,
+                localisation=drive.localisation,
+                margin=drive.margin,
+            ),
             detect_s=drive.detect_s,
             confirm_s=drive.confirm_s,
             age_s=drive.age_s,
-            act_s=drive.act_s,
-            localisation=drive.localisation,
-            margin=drive.margin,
-            longest_s=drive.longest_s,
+            max_lease_s=drive.longest_s,
             fallback=full_brake,
         )
     if mode in ("no lease", "lease", "head on"):
@@ -171,11 +173,12 @@ def worst_case(longer: float, seed: tuple[int, ...]) -> dict[str, Any]:
     env.reset(options={"drive": drive})
     steps = 0
     with mock.patch(
-        "safe_wrappers.wrappers.lease.room.longest_lease", lambda *a, **k: longer * longest_lease(*a, **k)
+        "safe_wrappers.wrappers.lease.stopping_budget.longest_lease",
+        lambda *a, **k: longer * longest_lease(*a, **k),
     ):
         while not (cart.touched or cart.at_rest):
             _, _, _, _, info = env.step(np.array([1.0]))
-            env.deliver(None)
+            env.set_observation_time(None)
             steps += 1
             if steps == 1 and info["lease/braking"]:
                 raise AssertionError("the first command got no lease")

@@ -20,12 +20,12 @@ class Bounds:
     """Of the blends on one env.
 
     Attributes:
-        jerk_limit: One for each control, action units per second.
+        rate_limit: One for each control, action units per second.
         blend_time: s.
         reasons: How they were chosen, for the table.
     """
 
-    jerk_limit: list[float]
+    rate_limit: list[float]
     blend_time: float
     reasons: str
 

@@ -10,7 +10,7 @@ chunks are jagged inside, and their own inside shakes the arm, not the seam. The
 without any bound, so what a bound costs in return is what it costs a policy that does not know of it.
 
 Plain replacement and temporal ensembling bound nothing. The blends are measured with a bound on the command's rate
-alone (`jerk_limit`), with a least duration alone (`blend_time`), and with both: the shortest blend that keeps a rate
+alone (`rate_limit`), with a least duration alone (`blend_time`), and with both: the shortest blend that keeps a rate
 may still ring, and a policy that asks for faster changes than the rate allows loses return. Both come from the arm,
 or from the action's range, as `bounds_of` says.
 A trial with blends of 0.12 s had been seen when the rule for the arm's `blend_time` was written down; it gives
@@ -197,7 +197,7 @@ def episode(env: Any, recorder: Recorder, act: Policy, job: Job, bounds: Bounds,
             infos.append(info)
     commands = np.array(recorder.commands)
     step = np.abs(np.diff(commands, axis=0, prepend=commands[:1])) / env.hold_s
-    rates = (step / bounds.jerk_limit).max(axis=1)
+    rates = (step / bounds.rate_limit).max(axis=1)
     blend_times = np.array([info["handover/blend_time"] for info in infos])
     energy = np.array(recorder.energy)
     ends = [*takeovers[1:], len(commands)]
@@ -226,9 +226,9 @@ def run(job: Job, task: Task, act: Policy) -> dict[str, Any]:
     bounds = bounds_of(recorder, task.horizon, task.range_per_second)
     given: dict[str, Any] = {
         "-": {},
-        RATE: {"jerk_limit": bounds.jerk_limit},
+        RATE: {"rate_limit": bounds.rate_limit},
         TIME: {"blend_time": bounds.blend_time},
-        RATE_AND_TIME: {"jerk_limit": bounds.jerk_limit, "blend_time": bounds.blend_time},
+        RATE_AND_TIME: {"rate_limit": bounds.rate_limit, "blend_time": bounds.blend_time},
     }[job.bounds]
     env = sw.ChunkHandover(recorder, task.chunk, task.horizon, job.delay, blend=job.blend, **given)
     seeds = range(1000 * job.seed, 1000 * job.seed + job.episodes)

@@ -96,7 +96,9 @@ def reading(env: gym.Env[Any, Any]) -> tuple[list[float], list[float]]:
 def channel(job: Job) -> sw.TeleopChannel:
     """The env behind its channel."""
     ceiling = sw.RoundTripCeiling(
-        reading, braking=TELEOP_BRAKING, acceleration=TELEOP_ACCELERATION, top_speed=TELEOP_TOP_SPEED
+        sw.StoppingBudget(
+            reading, braking=TELEOP_BRAKING, acceleration=TELEOP_ACCELERATION, top_speed=TELEOP_TOP_SPEED
+        )
     )
     return sw.TeleopChannel(
         gym.make("TeleopContact-v0", max_episode_steps=job.steps, disable_env_checker=True),

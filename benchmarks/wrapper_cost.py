@@ -39,7 +39,7 @@ def bounded(blend: str) -> Wrap:
     def wrap(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
         space: Any = env.action_space
         limit = 0.05 * (space.high - space.low) / env.get_wrapper_attr("dt")
-        return sw.ChunkHandover(env, SIZE, HORIZON, blend=blend, jerk_limit=limit.tolist())
+        return sw.ChunkHandover(env, SIZE, HORIZON, blend=blend, rate_limit=limit.tolist())
 
     return wrap
 
@@ -47,7 +47,7 @@ def bounded(blend: str) -> Wrap:
 def protected_lease(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
     """A lease from a Clearance, read from the MuJoCo model."""
     clearance = sw.Clearance(RAIL, bodies=["cart"], braking=8.0)
-    return sw.LeaseExpiry(env, clearance, acceleration=1.0)
+    return sw.LeaseExpiry(env, sw.StoppingBudget(clearance, acceleration=1.0))
 
 
 ROWS: list[tuple[str, str, Wrap]] = [
@@ -61,7 +61,7 @@ ROWS: list[tuple[str, str, Wrap]] = [
     (
         "Reacher-v5",
         "LeaseExpiry, the user's clearance",
-        lambda env: sw.LeaseExpiry(env, reading, braking=1.0, acceleration=0.1),
+        lambda env: sw.LeaseExpiry(env, sw.StoppingBudget(reading, braking=1.0, acceleration=0.1)),
     ),
     ("InvertedPendulum-v5", "LeaseExpiry, Clearance", protected_lease),
     (

@@ -49,6 +49,7 @@ from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.chunk_handover import ChunkHandover
 from safe_wrappers.wrappers.contact_monitor import ContactMonitor
 from safe_wrappers.wrappers.cost_function import CostFunction
+from safe_wrappers.wrappers.lease.stopping_budget import StoppingBudget
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.occlusion.sensor import Sensor
 from safe_wrappers.wrappers.occlusion.track import Track
@@ -101,6 +102,7 @@ __all__ = [
     "SpeedLimit",
     "Sphere",
     "Stance",
+    "StoppingBudget",
     "SupportMargin",
     "TeleopChannel",
     "TeleopPort",

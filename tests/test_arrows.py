@@ -21,7 +21,7 @@ ROOMS = {
     "envs": ROOT / "envs",
     "train": ROOT / "train",
 }
-COMMON = {"errors", "info"}
+COMMON = {"deprecation", "errors", "info"}
 """Single modules at the top that every room may use; `protect` and the package itself are the top."""
 BELOW_WRAPPERS = {"control", "plants", "filter", "constraints", "serialize", "stack", *COMMON}
 MAY_USE = {

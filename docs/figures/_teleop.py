@@ -22,7 +22,9 @@ def ceiling() -> sw.RoundTripCeiling:
     """Over the clearance to the clamp."""
     face = sw.Plane([0.0, CLAMP_Y], [0.0, -1.0])
     clamp = sw.Clearance([face], TELEOP_BRAKING, bodies=["tool"], radius=TOOL_RADIUS, margin=0.001)
-    return sw.RoundTripCeiling(clamp, acceleration=TELEOP_ACCELERATION, top_speed=TELEOP_TOP_SPEED)
+    return sw.RoundTripCeiling(
+        sw.StoppingBudget(clamp, acceleration=TELEOP_ACCELERATION, top_speed=TELEOP_TOP_SPEED)
+    )
 
 
 def episode(

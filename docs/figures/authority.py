@@ -48,20 +48,19 @@ def run() -> tuple[Cart, Log, list[dict[str, Any]]]:
     filtered = sw.CBFActionFilter(cart, [wall(WALL)], plant=plant(cart))
     lease = sw.LeaseExpiry(
         filtered,
-        wall(WALL),
-        acceleration=1.0,
-        least_s=HORIZON * STEP_S,
+        sw.StoppingBudget(wall(WALL), acceleration=1.0),
+        min_lease_s=HORIZON * STEP_S,
         blend_time=0.2,
         fallback=stop,
         plant=plant(cart),
     )
     log = Log(lease)
-    env = sw.ChunkHandover(log, CHUNK, HORIZON, DELAY, jerk_limit=4.0, fallback="zero")
+    env = sw.ChunkHandover(log, CHUNK, HORIZON, DELAY, rate_limit=4.0, fallback="zero")
     env.reset(seed=0)
     infos = []
     for number in range(CHUNKS):
         if number in SILENT:
-            env.deliver(None)
+            env.set_observation_time(None)
         infos.append(env.step(planned(cart.state))[4])
     return cart, log, infos
 

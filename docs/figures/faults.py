@@ -34,7 +34,7 @@ class Arrivals(gym.Wrapper[Any, Any, Any, Any], CommandReceiver):
         """Seconds so far."""
         return self.steps * STEP_S
 
-    def deliver(self, observed_s: float | None) -> None:
+    def set_observation_time(self, observed_s: float | None) -> None:
         """One command, or none."""
         if observed_s is not None:
             self.seen.append((self.now_s, self.now_s - observed_s))

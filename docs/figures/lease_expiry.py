@@ -37,7 +37,11 @@ def run(leased: bool) -> tuple[Any, list[dict[str, Any]]]:
     """Clearance at every step, and what the lease said."""
     cart = Cart((0.0, 0.0), dt=STEP_S)
     lease = sw.LeaseExpiry(
-        cart, read, braking=1.0, acceleration=1.0, blend_time=0.3, fallback=stop, plant=plant(cart)
+        cart,
+        sw.StoppingBudget(read, braking=1.0, acceleration=1.0),
+        blend_time=0.3,
+        fallback=stop,
+        plant=plant(cart),
     )
     env: Any = lease if leased else cart
     env.reset(seed=0)
@@ -47,7 +51,7 @@ def run(leased: bool) -> tuple[Any, list[dict[str, Any]]]:
         if not silent:
             action = np.array([policy(cart.state)])
         elif leased:
-            lease.deliver(None)
+            lease.set_observation_time(None)
         infos.append(env.step(action)[4])
         clearance.append(WALL - cart.state[0])
     return np.array(clearance), infos

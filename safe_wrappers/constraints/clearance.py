@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,6 +79,7 @@ class Clearance(Constraint):
     state_error: float = 0.0
 
     promise: Promise = field(default="best effort", init=False)
+    measures_approach: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         self.obstacles = obstacles_from(self.obstacles)

@@ -112,6 +112,8 @@ class BoundRollout(BoundSlacks):
     """
 
     spec: Any
+    _value: Array
+    _response: tuple[Array, int] | None
 
     def __init__(self, spec: RolloutConstraint, plant: Plant) -> None:
         super().__init__(spec, mujoco_rollouts(plant, type(spec).__name__))
@@ -131,7 +133,7 @@ class BoundRollout(BoundSlacks):
 
     def observe(self, memory: RolloutMemory) -> None:
         """Take what is left at the present state, and whether it is so much that nothing need be forecast."""
-        self._value: Array = self._now()
+        self._value = self._now()
         self._linear: HalfSpaces | None = None
         self._linearized = 0
         self._least = float(self._value.min(initial=np.inf))

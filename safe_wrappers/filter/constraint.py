@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,12 @@ class Constraint(ABC):
     """
 
     promise: Promise = "best effort"
+    measures_approach: ClassVar[bool] = False
+    """Whether `BoundConstraint.approach` measures clearance and approach speed."""
+    margin = 0.0
+    """Kept free before the limit, in the constraint's own unit."""
+    state_error = 0.0
+    """Bound on the error of what is measured, in the same unit."""
 
     @abstractmethod
     def bind(self, plant: Plant) -> "BoundConstraint":
@@ -88,8 +94,8 @@ class BoundConstraint:
     """Whether `admits` and `slack` predict a held control; else they evaluate the rows."""
     has_value: bool = False
     """Whether there is a barrier: set for every subclass that overrides `value`."""
-    has_approach: bool = False
-    """Whether clearance and approach speed are measured: set for every subclass that overrides `approach`."""
+    has_backup: bool = False
+    """Whether it knows a backup control: set for every subclass that overrides `backup`."""
     tolerance: float = 0.0
     """How far below zero a slack may be and count as rounding."""
     info_keys: tuple[str, ...] = ()
@@ -98,7 +104,7 @@ class BoundConstraint:
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         cls.has_value = cls.value is not BoundConstraint.value
-        cls.has_approach = cls.approach is not BoundConstraint.approach
+        cls.has_backup = cls.backup is not BoundConstraint.backup
 
     def __init__(self, spec: Any, plant: Any) -> None:
         self.spec, self.plant = spec, plant

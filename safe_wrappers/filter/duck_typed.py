@@ -42,6 +42,8 @@ class DuckTyped(Constraint):
     def __init__(self, given: Any) -> None:
         self.given = given
         self.promise = getattr(given, "promise", "best effort")
+        self.measures_approach = hasattr(given, "approach")  # type: ignore[misc]
+        self.margin, self.state_error = (getattr(given, name, 0.0) for name in ("margin", "state_error"))
 
     def bind(self, plant: Plant) -> "BoundDuckTyped":
         """A copy of the object, bound if it wants to be."""
@@ -63,7 +65,7 @@ class BoundDuckTyped(BoundConstraint):
         super().__init__(spec, plant)
         self._given = copy.deepcopy(spec.given)
         self.predicts = hasattr(self._given, "admits")
-        self.has_value, self.has_approach = (hasattr(self._given, name) for name in ("value", "approach"))
+        self.has_value, self.has_backup = (hasattr(self._given, name) for name in ("value", "backup"))
         if hasattr(self._given, "report"):
             self.info_keys = ("*",)
         if hasattr(self._given, "bind"):

@@ -1,4 +1,4 @@
-"""ChunkHandover: the policy gives chunks, the robot gets one smooth stream of commands."""
+"""ChunkHandover: from the chunks of a policy to one stream of commands with a bounded rate."""
 
 import math
 import warnings
@@ -11,25 +11,27 @@ from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES
+from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ActionError, UnknownNameError
 from safe_wrappers.filter.constraint import non_negative
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.plant import Plant, check_actions, check_timing
 from safe_wrappers.plants.template import PlantOfSpec, own_plant
 from safe_wrappers.stack import Layer, refuse_order
-from safe_wrappers.wrappers.common.fallback_controller import StandIn
+from safe_wrappers.wrappers.common.fallback_controller import FallbackController
+from safe_wrappers.wrappers.common.plain_data import recorded
+from safe_wrappers.wrappers.common.plain_numbers import plain_numbers
 from safe_wrappers.wrappers.common.receiver import CommandReceiver, receiver_inside
-from safe_wrappers.wrappers.common.wrapper_rng import OwnRandom
+from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 from safe_wrappers.wrappers.handover.macro_info import macro_info
-from safe_wrappers.wrappers.handover.queue import BASELINES, ChunkQueue, Command
+from safe_wrappers.wrappers.handover.queue import BASELINES, ENSEMBLE, Chunk, ChunkQueue, Command
 from safe_wrappers.wrappers.handover.sizes import ChunkSizes, blend_bounds
 from safe_wrappers.wrappers.handover.upsampling import Upsampling
-from safe_wrappers.wrappers.lease_expiry import lease_inside
 
 Array = NDArray[np.float64]
 
 _SAME_STEP: Final = 1e-6
-"""Control steps: a stamp that falls short of a step by less is meant to be that step's."""
+"""Control steps: an observation time that falls short of a step by less counts as that step's."""
 _REST: Final = {
     keys.HANDOVER_PEAK_JERK: 0.0,
     keys.HANDOVER_BLEND_TIME: 0.0,
@@ -42,6 +44,7 @@ _REST: Final = {
 """What a reset reports beside `handover/seam_jump`."""
 
 
+@deprecated_parameters(renamed={"jerk_limit": "rate_limit"})
 class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, CommandReceiver):
     """Executes action chunks that come late, over seams that keep a rate limit.
 
@@ -51,26 +54,25 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
     goes on for d steps, then the new chunk takes over at its entry d. At the start of an episode, with no left-over
     yet, and whenever the queue runs dry, the fallback acts.
 
-    **Seams.** The new chunk is blended in over the shortest time that keeps `jerk_limit`, and at least over
+    **Seams.** The new chunk is blended in over the shortest time that keeps `rate_limit`, and at least over
     `blend_time`; with neither given, over the left-over. See `control/handover/seams.py`. A chunk whose step at the
     seam keeps the limit anyhow is executed bit for bit (without a `blend_time`).
 
-    **What it guarantees.** With `jerk_limit`, the commands u[k] and u[k+1] that this wrapper sends in neighbouring
-    control steps of an episode differ by at most `jerk_limit` times the control interval in every component, whatever
+    **What it guarantees.** With `rate_limit`, the commands u[k] and u[k+1] that this wrapper sends in neighbouring
+    control steps of an episode differ by at most `rate_limit` times the control interval in every component, whatever
     the chunks: where no blend can keep the limit the commands are held back, which is counted (`handover/limited`),
-    and are late. No entry of a chunk that is not finite is executed: such a chunk is refused as a whole, the
-    left-over goes on, then the fallback. Entries outside the env's action box are clipped to it.
+    and are late. A chunk with an entry that is not finite is refused as a whole: the left-over goes on, then the
+    fallback. Entries outside the env's action box are clipped to it.
 
-    **What it does not.** |du/dt| here is that difference of neighbouring commands over the control interval, and no
-    derivative: each command is held for its interval, so the signal itself jumps from one to the next. The first
-    command of an episode has no neighbour before it. A filter inside may have to break the limit, and then
-    `handover/peak_jerk`, measured on neighbouring executed commands, shows it. Measured jerk, tracking and stopping
-    are the plant's. It does not check that a chunk is safe: `LeaseExpiry` and `CBFActionFilter` belong inside.
+    **What it does not.** The limit is on the difference of neighbouring commands over the control interval: each
+    command is held for its interval, so the signal itself jumps, and the first command of an episode has no
+    neighbour. A filter inside may have to break the limit; `handover/peak_jerk` is measured on executed commands. It
+    does not check that a chunk is safe: `LeaseExpiry` and `CBFActionFilter` belong inside.
 
-    **Chunks of one** (`chunk_size=1, execution_horizon=1`) are for ordinary policies: commands pass as they are,
-    held back by `jerk_limit` alone, and only a change of who gives them is blended: call `switch("human")`, give
-    the human's actions, `switch("policy")`. The fallback is such a change, too. An action of shape (m,) will do. A
-    single action has no left-over and is for one control step, so one that comes late is refused.
+    **Chunks of one** (`chunk_size=1, execution_horizon=1`) are for ordinary policies, whose actions of shape (m,) are
+    taken, too: commands pass as they are, held back by `rate_limit` alone, and only a change of their source is
+    blended: call `switch("human")`, give the human's actions, `switch("policy")`. The fallback is such a change, too.
+    A single action is for one control step, so one that comes late is refused.
 
     **Baselines** without any bound: blend="replace" takes the new chunk at once, blend="ensemble" averages all
     chunks at hand with weights exp(-decay i), i = 0 the oldest (temporal ensembling, Zhao et al., RSS 2023).
@@ -82,7 +84,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         inference_delay: d, control steps; or [least, most], drawn anew for every chunk.
         blend: "smoothstep", "quintic", "hermite", or a baseline.
         blend_time: s, the least duration of a blend.
-        jerk_limit: Bound on |du/dt| = |u[k+1] - u[k]| / control interval, of neighbouring commands, for every action
+        rate_limit: Bound on |du/dt| = |u[k+1] - u[k]| / control interval, of neighbouring commands, for every action
             component, or a list with one for each, action units per second (the mean jerk over a control interval,
             where the command is an acceleration or a torque).
         fallback: "brake", "hold", "zero", or a function of the plant; "brake" needs MuJoCo or a plant.
@@ -92,8 +94,8 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         steps_per_entry: Control steps from one entry of a chunk to the next, for policies that are slower than the
             control loop: the commands between are a cubic Hermite spline's (`wrappers/handover/upsampling.py`). H
             then is `(chunk_size - 1) * steps_per_entry + 1` control steps.
-        clock_error_s: Bound on how far ahead the clock of who stamps the chunks may be, s: a stamp that is ahead of
-            `now_s` by no more counts as now. One that is farther ahead is refused.
+        clock_error_s: Bound on how far ahead observation times may be, s: one that is ahead of `now_s` by no more
+            counts as now; a chunk that is farther ahead is refused.
 
     Info, at every step (see `safe_wrappers.info`): ``handover/seam_jump``, ``handover/peak_jerk``,
     ``handover/blend_time``, ``handover/starved``, ``handover/limited``, ``handover/refused``,
@@ -107,7 +109,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
-        >>> env = sw.ChunkHandover(gym.make("Reacher-v5"), chunk_size=16, execution_horizon=8, jerk_limit=20.0)
+        >>> env = sw.ChunkHandover(gym.make("Reacher-v5"), chunk_size=16, execution_horizon=8, rate_limit=20.0)
         >>> _ = env.reset(seed=0)
         >>> info = env.step(env.action_space.sample())[4]
         >>> info["handover/peak_jerk"] <= 20.0
@@ -119,7 +121,6 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
 
     layer: ClassVar = Layer.HANDOVER
 
-    _evidence: float | None
     _executed: Array
 
     def __init__(
@@ -130,7 +131,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         inference_delay: int | Sequence[int] = 0,
         blend: str = "smoothstep",
         blend_time: float | None = None,
-        jerk_limit: float | Sequence[float] | None = None,
+        rate_limit: float | Sequence[float] | None = None,
         fallback: str | FallbackFunction = "brake",
         plant: Plant | None = None,
         hold_s: float | None = None,
@@ -138,6 +139,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         steps_per_entry: int = 1,
         clock_error_s: float = 0.0,
     ) -> None:
+        arguments = dict(locals())
         # First: with a handover inside the actions are no vector either.
         refuse_order(env, self.layer, type(self).__name__)
         space = check_actions(env)
@@ -146,21 +148,21 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         if blend not in (*BLENDS, *BASELINES):
             raise UnknownNameError(f"no blend {blend!r}; choose {', '.join((*BLENDS, *BASELINES))}")
         decay = non_negative("decay", decay, "a number")
-        blend_time, jerk_limit, hold_s = _plain(blend_time), _plain(jerk_limit), _plain(hold_s)
+        blend_time, rate_limit, hold_s = map(plain_numbers, (blend_time, rate_limit, hold_s))
         gym.utils.RecordConstructorArgs.__init__(
             self,
-            chunk_size=sizes.entries,
-            execution_horizon=sizes.horizon,
-            inference_delay=sizes.delay[0] if sizes.delay[0] == sizes.delay[1] else list(sizes.delay),
-            blend=blend,
-            blend_time=blend_time,
-            jerk_limit=[_plain(x) for x in jerk_limit] if isinstance(jerk_limit, Sequence) else jerk_limit,
-            fallback=fallback,
-            plant=None if plant is None else PlantOfSpec(plant),
-            hold_s=hold_s,
-            decay=decay,
-            steps_per_entry=sizes.steps_per_entry,
-            clock_error_s=clock_error_s,
+            **recorded(
+                arguments,
+                chunk_size=sizes.entries,
+                execution_horizon=sizes.horizon,
+                inference_delay=sizes.delay[0] if sizes.delay[0] == sizes.delay[1] else list(sizes.delay),
+                blend_time=blend_time,
+                rate_limit=rate_limit,
+                plant=None if plant is None else PlantOfSpec(plant),
+                hold_s=hold_s,
+                decay=decay,
+                steps_per_entry=sizes.steps_per_entry,
+            ),
         )
         gym.Wrapper.__init__(self, env)
         self.chunk_size, self.execution_horizon, self.blend = sizes.entries, sizes.horizon, blend
@@ -174,25 +176,23 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             np.repeat(space.high[None], sizes.entries, axis=0),
             dtype=space.dtype,
         )
-        self._stand_in = StandIn(env, fallback, plant)
-        fewest, rate_limit = blend_bounds(sizes, space, self.hold_s, blend, blend_time, jerk_limit)
+        self._fallback = FallbackController(env, fallback, plant)
+        fewest, rate_limits = blend_bounds(sizes, space, self.hold_s, blend, blend_time, rate_limit)
         self._queue = ChunkQueue(
             self._controls,
             self.hold_s,
             blend=blend,
             fewest=fewest,
-            rate_limit=rate_limit,
+            rate_limit=rate_limits,
             low=np.asarray(space.low, np.float64),
             high=np.asarray(space.high, np.float64),
             dtype=space.dtype,
             decay=decay,
         )
         self._inside = receiver_inside(env)
-        lease = lease_inside(env)
-        self._admit = lease.admits if lease is not None else None
-        self._random = OwnRandom(type(self).__name__)
+        self._random = WrapperRng(type(self).__name__)
         self._warned = False
-        self._forget()
+        self._start()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -200,9 +200,9 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         """Reset the env and forget all chunks; the delays' random numbers start anew with a seed."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._random.reset(self.env, seed)
-        self._stand_in.reset()
+        self._fallback.reset()
         self._queue.reset()
-        self._forget()
+        self._start()
         info.update(_REST)
         info[keys.HANDOVER_SEAM_JUMP] = np.zeros(DIFFERENCES)
         return observation, info
@@ -214,14 +214,17 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         terminated = truncated = False
         for _ in range(self.execution_horizon):
             now = self._queue.now
-            command = self._queue.next(self._stand_in.command, self._admit)
+            admitted, one_refused = self._admitted()
+            refused |= one_refused
+            command = self._queue.next(admitted, self._fallback.command)
             if command.took_over:
                 latency = now - command.observed
             if self._inside is not None:
-                self._inside.deliver(None if command.observed < 0 else command.observed * self.hold_s)
+                observed_s = None if command.observed < 0 else command.observed * self.hold_s
+                self._inside.set_observation_time(observed_s)
             observation, reward, terminated, truncated, info = self.env.step(command.control)
             executed = np.array(info.get(keys.EXECUTED_ACTION, command.control), dtype=np.float64)
-            self._stand_in.executed(executed)
+            self._fallback.executed(executed)
             self._executed = np.concatenate([self._executed, executed[None]])
             self._in_seam.append(self._seams_at(now, command))
             total += float(reward)
@@ -229,34 +232,20 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             commands.append(command)
             if terminated or truncated:
                 break
-        self._evidence = self.now_s
+        self._observed_s = self.now_s
         info = macro_info(infos)
         info.update(self._measured(commands))
-        info[keys.HANDOVER_REFUSED] = refused or any(c.refused for c in commands)
+        info[keys.HANDOVER_REFUSED] = refused
         info[keys.HANDOVER_LATENCY] = latency
         return observation, total, terminated, truncated, info
-
-    # How others tell what a chunk is made from --------------------------------------------------------------------
 
     @property
     def now_s(self) -> float:
         """Seconds of the episode so far, on the clock of control steps."""
         return self._queue.now * self.hold_s
 
-    def deliver(self, observed_s: float | None) -> None:
-        """Say what the next chunk is made from; without a word it is made from the newest observation.
-
-        Args:
-            observed_s: When its observation was made, on the clock of `now_s`; a chunk that is not newer than the
-                newest one before, or is from the future, is refused. None: nothing arrives, the next step's
-                chunk is disregarded.
-        """
-        if observed_s is not None and not math.isfinite(observed_s):
-            raise ActionError(f"observed_s is a time in seconds, or None for nothing; got {observed_s!r}")
-        self._evidence = observed_s
-
     def switch(self, source: str) -> None:
-        """Somebody else gives the commands from now on: the change is blended, from the last command.
+        """Name the source of the chunks from now on; the change is blended, from the last command.
 
         Args:
             source: Any name, such as "human" or "policy".
@@ -278,21 +267,38 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             )
         return chunk
 
+    def _admitted(self) -> tuple[list[Chunk], bool]:
+        """The chunks that may take over now, the newest first; and whether one was refused."""
+        admitted: list[Chunk] = []
+        refused = False
+        for chunk in self._queue.arrived():
+            left, inside = self._queue.left(chunk), self._inside
+            admits = len(left) > 0  # it came in time
+            if admits and inside is not None:
+                admits = inside.admits(left[-1], len(left))
+            if not admits:
+                refused = True
+                continue
+            admitted.append(chunk)
+            if self.blend != ENSEMBLE:
+                break
+        return admitted, refused
+
     def _submit(self, chunk: Array) -> bool:
         """Send the chunk on its way; False if one came and was refused."""
         delay = int(self._random.draw.integers(self._delay[0], self._delay[1] + 1))
-        if self._evidence is None:
+        if self._observed_s is None:
             return True
         if not np.isfinite(chunk).all():
             return False
-        evidence = self._evidence
-        if self.now_s < evidence <= self.now_s + self._clock_error_s + _SAME_STEP * self.hold_s:
-            evidence = self.now_s
-        observed = math.floor(evidence / self.hold_s + _SAME_STEP)
+        observed_s = self._observed_s
+        if self.now_s < observed_s <= self.now_s + self._clock_error_s + _SAME_STEP * self.hold_s:
+            observed_s = self.now_s
+        observed = math.floor(observed_s / self.hold_s + _SAME_STEP)
         return self._queue.submit(self._upsampling.commands(chunk), observed, self._queue.now + delay)
 
-    def _forget(self) -> None:
-        self._evidence = 0.0
+    def _start(self) -> None:
+        self._observed_s = 0.0
         self._executed = np.zeros((0, self._controls))
         self._in_seam: list[bool] = []
         self._seam_until = -1
@@ -319,7 +325,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         if limited and not self._warned:
             self._warned = True
             warnings.warn(
-                "a command was held back to keep jerk_limit: the chunk is too short for a blend that keeps it, or "
+                "a command was held back to keep rate_limit: the chunk is too short for a blend that keeps it, or "
                 "moves too fast by itself (handover/limited counts the control steps)",
                 UserWarning,
                 stacklevel=3,
@@ -332,8 +338,3 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             keys.HANDOVER_LIMITED: limited,
             keys.HANDOVER_STEPS: len(commands),
         }
-
-
-def _plain(value: Any) -> Any:
-    """A spec is written as JSON, which knows no NumPy."""
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value

@@ -21,7 +21,7 @@ from safe_wrappers.plants.mujoco.plant import control_interval
 from safe_wrappers.plants.plant import read_attribute
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight
 from safe_wrappers.stack import Layer, refuse_order
-from safe_wrappers.wrappers.common.wrapper_rng import OwnRandom
+from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 from safe_wrappers.wrappers.occlusion.sensor import Sensor, sensor_from
 from safe_wrappers.wrappers.occlusion.track import Track, track_from
 
@@ -143,7 +143,7 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
             observe=bool(observe),
         )
         gym.Wrapper.__init__(self, env)
-        self._raw, self._d, self._random = raw, len(axes), OwnRandom("OcclusionPenalty")
+        self._raw, self._d, self._random = raw, len(axes), WrapperRng("OcclusionPenalty")
         self._hold_s = control_interval(raw)
         self._matrix, self._noise = self.sensor.matrices(self._d)
         self._noise_root = np.linalg.cholesky(self._noise)

@@ -98,7 +98,7 @@ def test_what_is_measured_at_scripted_seams(delay):
 @pytest.mark.filterwarnings("ignore:a command was held back")
 def test_a_blend_that_keeps_the_limit_and_is_cut_short():
     found, recorder = run_scripted(
-        0, "quintic", Bounds([5.0, 5.0], 0.5, ""), blend_time=0.5, jerk_limit=[5.0, 5.0]
+        0, "quintic", Bounds([5.0, 5.0], 0.5, ""), blend_time=0.5, rate_limit=[5.0, 5.0]
     )
     assert (found.rates <= 1.0).all()
     assert (found.rates > 0.5).any()
@@ -143,7 +143,7 @@ def test_the_arms_bounds_keep_what_they_say():
             env.reset(seed=0)
             raw.set_state(np.array([0.0, 0.0, elbow, 0.0]), np.zeros(4))
             for k in range(12):
-                torque = np.array(signs) * bounds.jerk_limit * min(k + 1, 6) * 0.01
+                torque = np.array(signs) * bounds.rate_limit * min(k + 1, 6) * 0.01
                 energy = raw.step(torque)[4]["vibration_energy"]
                 worst = max(worst, energy if k >= 6 else 0.0)
         assert worst < 1.1 * seam_bounds.RAMP_ENERGY
@@ -167,7 +167,7 @@ def test_alone_a_held_torque_shakes_nothing_and_a_step_does_what_its_energy_says
 
 def test_reachers_bounds_come_from_the_action_and_the_time_between_seams():
     bounds = bounds_of(gym.make("Reacher-v5"), REACHER.horizon, 1.0)
-    assert bounds.jerk_limit == [2.0, 2.0]
+    assert bounds.rate_limit == [2.0, 2.0]
     assert bounds.blend_time == pytest.approx(0.1)
 
 
@@ -227,7 +227,7 @@ def test_a_bounded_policy_is_trained_through_its_bounds(monkeypatch):
     for task in (TINY[0], dataclasses.replace(TINY[0], bounded=True)):
         chunk_policy.train(task)
     bounds = bounds_of(gym.make("FlexJointReach-v0"), FLEX.horizon, 1.0)
-    assert {"jerk_limit": bounds.jerk_limit, "blend_time": bounds.blend_time} in given
+    assert {"rate_limit": bounds.rate_limit, "blend_time": bounds.blend_time} in given
     assert {"blend": "replace"} in given and len(given) == 8
 
 

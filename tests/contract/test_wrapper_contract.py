@@ -71,7 +71,7 @@ EXAMPLES = {
                 "execution_horizon": 3,
                 "inference_delay": [0, 2],
                 "blend": "quintic",
-                "jerk_limit": [20.0, 30.0],
+                "rate_limit": [20.0, 30.0],
             },
         ),
         "chunks of one": (
@@ -98,24 +98,30 @@ EXAMPLES = {
         "a Clearance": (
             "InvertedPendulum-v5",
             lambda: {
-                "clearance": sw.Clearance(
-                    [sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])], bodies=["cart"], braking=8.0
+                "budget": sw.StoppingBudget(
+                    sw.Clearance(
+                        [sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])], bodies=["cart"], braking=8.0
+                    ),
+                    acceleration=20.0,
+                    top_speed=5.0,
+                    act_s=0.01,
                 ),
-                "acceleration": 20.0,
-                "top_speed": 5.0,
-                "act_s": 0.01,
                 "brake_blend_time": 0.04,
             },
         ),
         "a value with a closing speed": (
             TASK,
-            lambda: {"clearance": _clearance(), "closing_speed": 4.0, "blend_time": 0.0},
+            lambda: {
+                "budget": {"clearance": _clearance(), "closing_speed": 4.0},
+                "blend_time": 0.0,
+            },
         ),
         "limits of reach": (
             "Reacher-v5",
             lambda: {
-                "clearance": sw.JointPositionLimit(-2.0, 2.0, ["joint1"], margin=0.01),
-                "closing_speed": 10.0,
+                "budget": sw.StoppingBudget(
+                    sw.JointPositionLimit(-2.0, 2.0, ["joint1"], margin=0.01), closing_speed=10.0
+                ),
                 "reach": {"max_acceleration": [8.0, 20.0], "max_speed": 4.0},
                 "fallback": "hold",
             },
@@ -189,9 +195,11 @@ EXAMPLES = {
                 "impedance": 40.0,
                 "wave_rule": "hold",
                 "ceiling": sw.RoundTripCeiling(
-                    sw.Clearance([sw.Plane([0, 0.25], [0, -1])], 24.0, bodies=["tool"], radius=0.015),
-                    acceleration=55.0,
-                    top_speed=1.4,
+                    sw.StoppingBudget(
+                        sw.Clearance([sw.Plane([0, 0.25], [0, -1])], 24.0, bodies=["tool"], radius=0.015),
+                        acceleration=55.0,
+                        top_speed=1.4,
+                    )
                 ),
             },
         ),
@@ -459,7 +467,7 @@ def test_info_has_the_same_keys_and_types_at_every_step(name, case):
         if name in CHUNKED:
             for value in (np.nan, 9.0):
                 seen.append(types(env.step(np.full(env.action_space.shape, value))[4]))
-            env.deliver(None)
+            env.set_observation_time(None)
             seen.append(types(env.step(env.action_space.low)[4]))
     assert all(s == seen[0] for s in seen)
     added = seen[0].keys() - env.unwrapped.step(env.unwrapped.action_space.low)[4].keys()
@@ -568,10 +576,10 @@ def harmless(name, case):
     if name == "CBFActionFilter":
         return sw.CBFActionFilter(Witness(gym.make("Reacher-v5")), [sw.JointSpeedLimit(1e9)])
     if name in CHUNKED:
-        return getattr(sw, name)(Witness(gym.make("Reacher-v5", max_episode_steps=500)), 5, 3, jerk_limit=1e6)
+        return getattr(sw, name)(Witness(gym.make("Reacher-v5", max_episode_steps=500)), 5, 3, rate_limit=1e6)
     if name == "LeaseExpiry":
         far = sw.JointSpeedLimit(1e9)
-        return sw.LeaseExpiry(Witness(gym.make("Reacher-v5")), far, closing_speed=1.0)
+        return sw.LeaseExpiry(Witness(gym.make("Reacher-v5")), sw.StoppingBudget(far, closing_speed=1.0))
     if name == "SlipLimiter":  # a ground that is said to carry any torque
         return sw.SlipLimiter(Witness(gym.make("SafeRover-v0")), list(WHEELS), friction=1e9)
     if name == "WholeBodyFilter":

@@ -41,7 +41,7 @@ class Recorder(gym.Wrapper):
 
 def chunked(size=10, horizon=4, delay=(0, 2)):
     env = Recorder(gym.make("Reacher-v5"))
-    return Monitor(sw.ChunkHandover(env, size, horizon, list(delay), jerk_limit=LIMIT))
+    return Monitor(sw.ChunkHandover(env, size, horizon, list(delay), rate_limit=LIMIT))
 
 
 class Infos(BaseCallback):

@@ -63,7 +63,9 @@ def test_layers_and_judges_that_are_not_there_log_no_zeros(tmp_path, leased):
     env = gym.make("InvertedPendulum-v5", max_episode_steps=16)  # reports no cost
     if leased:
         rail = [sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])]
-        env = sw.LeaseExpiry(env, sw.Clearance(rail, bodies=["cart"], braking=8.0), acceleration=1.0)
+        env = sw.LeaseExpiry(
+            env, sw.StoppingBudget(sw.Clearance(rail, bodies=["cart"], braking=8.0), acceleration=1.0)
+        )
     model = PPO("MlpPolicy", RecordInterventions(env), n_steps=32, n_epochs=1, batch_size=32, device="cpu")
     model.set_logger(configure(str(tmp_path), ["tensorboard"]))
     model.learn(32, callback=InterventionCallback())
@@ -77,8 +79,10 @@ def lost_now_and_then():
     """The whole stack, whose policy is never heard at all."""
     cart = gym.make("InvertedPendulum-v5", max_episode_steps=16)
     rail = [sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])]
-    lease = sw.LeaseExpiry(cart, sw.Clearance(rail, bodies=["cart"], braking=8.0), acceleration=1.0)
-    stack = sw.ChunkHandover(sw.RecordInterventions(lease), 8, 4, jerk_limit=10.0)
+    lease = sw.LeaseExpiry(
+        cart, sw.StoppingBudget(sw.Clearance(rail, bodies=["cart"], braking=8.0), acceleration=1.0)
+    )
+    stack = sw.ChunkHandover(sw.RecordInterventions(lease), 8, 4, rate_limit=10.0)
     return Monitor(DroppedRefreshes(stack, share=1.0))
 
 

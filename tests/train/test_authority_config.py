@@ -14,7 +14,7 @@ from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.wrappers.faults import DroppedRefreshes, Outages
 
 OUTAGES = {"mean_between_s": 0.2, "mean_length_s": 0.2}
-LEASE = {"closing_speed": 3.0, "least_s": 0.02}
+LEASE = {"budget": {"closing_speed": 3.0}, "min_lease_s": 0.02}
 
 
 def parsed(tmp_path="runs", env="SafePointGoal1-v0", **arms):
@@ -50,7 +50,13 @@ def test_they_are_read_and_change_the_runs_fingerprint_only_where_they_are():
             "Did you mean 'mean_between_s'",
         ),
         ({"id": "Reacher-v5", "faults": ["Outages"]}, "none", ConfigurationError, "env.faults"),
-        ("Reacher-v5", {"protect": {}, "lease": {"closing": 1}}, UnknownNameError, "closing_speed"),
+        (
+            "Reacher-v5",
+            {"protect": {}, "lease": {"budget": {"closing": 1}}},
+            UnknownNameError,
+            "closing_speed",
+        ),
+        ("Reacher-v5", {"protect": {}, "lease": {"budget": 1.0}}, ConfigurationError, "lease.budget"),
         ("Reacher-v5", {"protect": {}, "lease": {"plant": 1}}, UnknownNameError, "unknown name 'plant'"),
         ("Reacher-v5", {"lease": LEASE}, ConfigurationError, "beside it"),
     ],
@@ -83,10 +89,21 @@ def test_the_stack_has_every_layer_in_its_place():
 
 def test_the_leases_room_is_the_filters_unless_it_is_given():
     two = FilterConfig(protect={}, lease=LEASE)
-    with pytest.raises(ConfigurationError, match="2 constraints; say which room"):
+    with pytest.raises(ConfigurationError, match="2 constraints; say which one"):
         make_stack(EnvConfig("Pusher-v5"), two)
-    given = {"clearance": {"kind": "JointSpeedLimit", "limit": 6.0}, "closing_speed": 100.0}
-    assert make_stack(EnvConfig("Pusher-v5"), FilterConfig(protect={}, lease=given))
+    budget = {"clearance": {"kind": "JointSpeedLimit", "limit": 6.0}, "closing_speed": 100.0}
+    assert make_stack(EnvConfig("Pusher-v5"), FilterConfig(protect={}, lease={"budget": budget}))
+
+
+def test_a_lease_as_it_was_written_before_there_were_budgets_is_read():
+    clearance = {"kind": "JointSpeedLimit", "limit": 4.0}
+    for old in (
+        {"closing_speed": 3.0, "least_s": 0.02},
+        {"clearance": clearance, "closing_speed": 3.0, "least_s": 0.02},
+    ):
+        (arm,) = parsed(env="Reacher-v5", a={"filter": {"protect": {}, "lease": old}}).arms
+        with pytest.warns(DeprecationWarning, match=r"min_lease_s=..., budget=StoppingBudget\(clearance"):
+            assert make_stack(arm.env, arm.filter).env.spec is not None
 
 
 def test_arguments_that_are_missing_are_named():

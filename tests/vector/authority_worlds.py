@@ -23,17 +23,16 @@ def cart(index=0, chunked=True):
     env = sw.CBFActionFilter(ScheduledCart(index), [wall], plant=_plant(), fallback="hold")
     env = sw.LeaseExpiry(
         env,
-        wall,
-        acceleration=1.0,
+        sw.StoppingBudget(wall, acceleration=1.0),
         plant=_plant(),
         fallback="hold",
-        longest_s=0.3,
-        least_s=0.1,
+        max_lease_s=0.3,
+        min_lease_s=0.1,
         brake_blend_time=0.1,
     )
     env = sw.RecordInterventions(env)
     if chunked:
-        env = sw.ChunkHandover(env, 4, 2, [0, 2], jerk_limit=6.0, fallback="hold")
+        env = sw.ChunkHandover(env, 4, 2, [0, 2], rate_limit=6.0, fallback="hold")
     return RepeatedCommands(Outages(env, 0.6, 0.3), 0.2)
 
 
@@ -46,8 +45,10 @@ def point_goal(index=0):
     clearance = sw.HeadingDriveClearance(HAZARDS, margin=0.004)
     env = AtHazard(gym.make("SafePointGoal1-v0", max_episode_steps=14 + 4 * index))
     env = sw.CBFActionFilter(env, [clearance], fallback="hold")
-    env = sw.LeaseExpiry(env, clearance, closing_speed=4.0, longest_s=0.2, least_s=0.08)
-    env = sw.ChunkHandover(sw.RecordInterventions(env), 6, 2, [0, 2], jerk_limit=40.0)
+    env = sw.LeaseExpiry(
+        env, sw.StoppingBudget(clearance, closing_speed=4.0), max_lease_s=0.2, min_lease_s=0.08
+    )
+    env = sw.ChunkHandover(sw.RecordInterventions(env), 6, 2, [0, 2], rate_limit=40.0)
     return FrozenPolicy(Jitter(env, 0.05), 0.1, 0.1)
 
 
@@ -55,7 +56,7 @@ def pendulum(index=0):
     """Lease and faults alone, no filter; the pole falls by itself."""
     clearance = sw.Clearance(RAIL, bodies=["cart"], braking=8.0)
     env = gym.make("InvertedPendulum-v5", max_episode_steps=8 + index)
-    env = sw.LeaseExpiry(env, clearance, acceleration=20.0, longest_s=0.12)
+    env = sw.LeaseExpiry(env, sw.StoppingBudget(clearance, acceleration=20.0), max_lease_s=0.12)
     return Outages(sw.RecordInterventions(env), 0.12, 0.3)
 
 

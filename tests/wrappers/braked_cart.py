@@ -5,6 +5,7 @@ with a bisection where the library has a closed form.
 """
 
 import math
+from dataclasses import fields
 from typing import ClassVar
 
 import gymnasium as gym
@@ -111,6 +112,12 @@ def read_cart(env):
     """For LeaseExpiry's `clearance`."""
     clearance, speed = env.unwrapped.measured()
     return [clearance], [speed]
+
+
+def lease(env, clearance, **options):
+    """A LeaseExpiry, with the options of its budget among the others."""
+    budget = {f.name: options.pop(f.name) for f in fields(sw.StoppingBudget) if f.name in options}
+    return sw.LeaseExpiry(env, sw.StoppingBudget(clearance, **budget), **options)
 
 
 def stop(plant):

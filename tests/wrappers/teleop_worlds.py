@@ -1,5 +1,7 @@
 """What the tests of TeleopChannel share: the task behind a channel, drivers, and energy counted from outside."""
 
+from dataclasses import fields
+
 import gymnasium as gym
 import numpy as np
 
@@ -23,7 +25,8 @@ def clamp(braking=TELEOP_BRAKING, margin=MARGIN):
 
 def ceiling(braking=TELEOP_BRAKING, margin=MARGIN, **changes):
     arguments = {"acceleration": TELEOP_ACCELERATION, "top_speed": TELEOP_TOP_SPEED} | changes
-    return sw.RoundTripCeiling(clamp(braking, margin), **arguments)
+    budget = {f.name: arguments.pop(f.name) for f in fields(sw.StoppingBudget) if f.name in arguments}
+    return sw.RoundTripCeiling(sw.StoppingBudget(clamp(braking, margin), **budget), **arguments)
 
 
 def channel(uplink=0.0, downlink=0.0, inside=None, **options):

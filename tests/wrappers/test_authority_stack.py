@@ -8,7 +8,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from braked_cart import BrakedCart, cart_plant, read_cart, stop
+from braked_cart import BrakedCart, cart_plant, lease, read_cart, stop
 from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.utils.env_checker import check_env
 
@@ -37,10 +37,10 @@ class Task:
         return sw.AdaptionPenalty(env, penalty=0.1)
 
     def expiry(self, env):
-        return sw.LeaseExpiry(env, self.constraint(), **self.lease)
+        return lease(env, self.constraint(), **self.lease)
 
     def handover(self, env):
-        return sw.ChunkHandover(env, 6, 3, [0, 2], jerk_limit=40.0)
+        return sw.ChunkHandover(env, 6, 3, [0, 2], rate_limit=40.0)
 
     def outages(self, env):
         return Outages(env, mean_between_s=0.3, mean_length_s=0.2)
@@ -59,17 +59,17 @@ TASKS = {
     "point": Task(
         "SafePointGoal1-v0",
         lambda: sw.HeadingDriveClearance(HAZARDS, margin=0.004),
-        {"closing_speed": 4.0, "longest_s": 0.15},
+        {"closing_speed": 4.0, "max_lease_s": 0.15},
     ),
     "pendulum": Task(
         "InvertedPendulum-v5",
         lambda: sw.Clearance(RAIL, bodies=["cart"], braking=8.0),
-        {"acceleration": 20.0, "longest_s": 0.2},
+        {"acceleration": 20.0, "max_lease_s": 0.2},
     ),
     "reacher": Task(
         "Reacher-v5",
         lambda: sw.JointPositionLimit(-1.5, 1.5, ["joint1"]),
-        {"closing_speed": 10.0, "longest_s": 0.15},
+        {"closing_speed": 10.0, "max_lease_s": 0.15},
     ),
 }
 ORDER = ["filter", "expiry", "record", "penalty", "handover", "outages", "repeats"]
@@ -220,9 +220,9 @@ def test_with_nothing_to_say_every_layer_passes_on_the_same_bits(layers):
     env = watch = Watch(gym.make("Reacher-v5"))
     far = sw.JointSpeedLimit(1e9)
     env = sw.CBFActionFilter(env, [far])
-    env = sw.LeaseExpiry(env, sw.JointSpeedLimit(1e9), closing_speed=1.0)
+    env = sw.LeaseExpiry(env, sw.StoppingBudget(sw.JointSpeedLimit(1e9), closing_speed=1.0))
     if "handover" in layers:
-        env = sw.ChunkHandover(env, 4, 2, jerk_limit=1e6)
+        env = sw.ChunkHandover(env, 4, 2, rate_limit=1e6)
     env.reset(seed=0)
     rng, wanted = np.random.default_rng(0), []
     for _ in range(20):
@@ -264,7 +264,9 @@ def test_a_leased_and_filtered_point_goal_never_violates_whatever_the_policy_or_
 ):
     made = TASKS["point"]
     env = made.filter(gym.make(made.env_id, max_episode_steps=400))
-    env = sw.LeaseExpiry(env, made.constraint(), closing_speed=4.0, longest_s=0.3, least_s=least)
+    env = sw.LeaseExpiry(
+        env, sw.StoppingBudget(made.constraint(), closing_speed=4.0), max_lease_s=0.3, min_lease_s=least
+    )
     env = fault(sw.RecordInterventions(env))
     rng = np.random.default_rng(0)
     told = dict.fromkeys(("lease/braking", "lease/expired", "cbf/intervened"), 0)
@@ -302,10 +304,9 @@ def test_next_to_a_hazard_a_least_lease_lets_the_command_out_through_the_filter(
     for least in (0.0, 0.02):
         env = sw.LeaseExpiry(
             made.filter(gym.make(made.env_id)),
-            made.constraint(),
-            closing_speed=4.0,
-            longest_s=0.3,
-            least_s=least,
+            sw.StoppingBudget(made.constraint(), closing_speed=4.0),
+            max_lease_s=0.3,
+            min_lease_s=least,
         )
         env.reset(seed=0, options=layout)
         for _ in range(40):
@@ -331,15 +332,12 @@ def test_chunks_under_a_lease_hit_nothing_whatever_is_lost(blend):
             if guarded:
                 env = sw.LeaseExpiry(
                     cart,
-                    read_cart,
-                    braking=cart.braking,
-                    acceleration=cart.drive,
-                    act_s=delay,
+                    sw.StoppingBudget(read_cart, braking=cart.braking, acceleration=cart.drive, act_s=delay),
                     brake_blend_time=float(rng.choice([0.0, 3.0 * dt])),
                     fallback=stop,
                     plant=cart_plant(dt),
                 )
-            bound = {} if blend in ("replace", "ensemble") else {"jerk_limit": 5.0 / dt}
+            bound = {} if blend in ("replace", "ensemble") else {"rate_limit": 5.0 / dt}
             env = sw.ChunkHandover(env, 8, 4, [0, 3], blend=blend, fallback="zero", **bound)
             env = Outages(DroppedRefreshes(env, 0.2), 10.0 * dt, 10.0 * dt)
             env.reset(seed=seed)
@@ -435,9 +433,14 @@ def far_away(env):
 
 def admitted_stack(env, reach=LIMITS, **more):
     env = sw.LeaseExpiry(
-        env, far_away, braking=1.0, acceleration=0.0, reach=reach, longest_s=5.0, fallback="hold", **more
+        env,
+        sw.StoppingBudget(far_away, braking=1.0, acceleration=0.0),
+        reach=reach,
+        max_lease_s=5.0,
+        fallback="hold",
+        **more,
     )
-    return sw.ChunkHandover(env, 10, 5, jerk_limit=50.0, fallback="hold")
+    return sw.ChunkHandover(env, 10, 5, rate_limit=50.0, fallback="hold")
 
 
 def simulated_reach(time, v, speed, acceleration, sign):
@@ -523,7 +526,9 @@ def test_a_limit_on_the_jerk_refuses_nothing_that_a_machine_in_full_acceleration
 
 
 def test_single_commands_are_not_a_chunks_business(arm):
-    env = sw.LeaseExpiry(arm, far_away, braking=1.0, acceleration=0.0, reach=LIMITS, fallback="hold")
+    env = sw.LeaseExpiry(
+        arm, sw.StoppingBudget(far_away, braking=1.0, acceleration=0.0), reach=LIMITS, fallback="hold"
+    )
     env.reset(seed=0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

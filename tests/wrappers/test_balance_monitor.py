@@ -478,7 +478,7 @@ def test_an_env_that_makes_itself_another_model():
 
 def test_inside_a_chunk_shares_are_means_peaks_the_largest_and_margins_those_of_polygons():
     single, inner = (sw.BalanceMonitor(gym.make("Ant-v5", terminate_when_unhealthy=False)) for _ in range(2))
-    chunked = sw.ChunkHandover(inner, 4, 4, jerk_limit=1e6)
+    chunked = sw.ChunkHandover(inner, 4, 4, rate_limit=1e6)
     single.reset(seed=0), chunked.reset(seed=0)
     mixed = 0
     for chunk in actions(single, 100, share=0.1).reshape(25, 4, -1):
@@ -500,7 +500,7 @@ def test_inside_a_chunk_shares_are_means_peaks_the_largest_and_margins_those_of_
 def test_a_chunk_is_partial_if_any_of_its_steps_was():
     meddling = Meddling(gym.make("HalfCheetah-v5"))
     meddling.at = (7,)
-    env = sw.ChunkHandover(sw.BalanceMonitor(meddling), 5, 5, jerk_limit=1e6)
+    env = sw.ChunkHandover(sw.BalanceMonitor(meddling), 5, 5, rate_limit=1e6)
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="balance/partial"):
         partial = [env.step(chunk)[4][keys.BALANCE_PARTIAL] for chunk in actions(env, 3)]

@@ -339,7 +339,7 @@ def test_composed_actions_are_not_called_discrete_and_the_remedy_works(kind):
     wraps = (
         filtered,
         lambda env: sw.LeaseExpiry(
-            env, lambda env: (9.0, 0.0), braking=1.0, acceleration=1.0, fallback="zero"
+            env, sw.StoppingBudget(lambda env: (9.0, 0.0), braking=1.0, acceleration=1.0), fallback="zero"
         ),
         lambda env: sw.ChunkHandover(env, 1, 1, fallback="zero", blend_time=0.2),
         lambda env: sw.TeleopChannel(env, 0.0, 0.0),

@@ -18,7 +18,7 @@ from slow_handover import BLENDS, Slow, measured
 import safe_wrappers as sw
 from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError
 from safe_wrappers.wrappers.common.receiver import CommandReceiver
-from safe_wrappers.wrappers.faults import ClockSkew, FrozenPolicy, RepeatedCommands
+from safe_wrappers.wrappers.faults import ClockSkew, DroppedRefreshes, FrozenPolicy, RepeatedCommands
 
 HOLD = 0.1
 TYPES = {
@@ -74,7 +74,7 @@ class Scenario:
             self.delay[0] if self.delay[0] == self.delay[1] else list(self.delay),
             blend=self.blend,
             blend_time=None if self.fewest is None else (self.fewest + 1) * HOLD,
-            jerk_limit=self.limit,
+            rate_limit=self.limit,
             fallback=Wander(self.seed, self.controls, self.scale) if wander else self.fallback,
             plant=counting_plant(HOLD) if wander else None,
         )
@@ -150,11 +150,11 @@ def act(event, env, oracle, chunk, rng, names):
     """Let the event happen to both; the chunk, and the control step of its observation, None for nothing."""
     observed = oracle.now
     if event == "nothing":
-        env.deliver(None)
+        env.set_observation_time(None)
         return chunk, None
     if event in ("stale", "older", "future"):
         observed += {"stale": -int(rng.integers(1, 4)), "older": -9, "future": 2}[event]
-        env.deliver(observed * HOLD)
+        env.set_observation_time(observed * HOLD)
     if event in ("nan", "inf"):
         chunk = chunk.copy()
         where = tuple(rng.integers(0, chunk.shape))
@@ -270,7 +270,7 @@ def test_without_need_for_a_blend_the_chunks_bits_are_executed(blend, dtype):
     rng = np.random.default_rng(0)
     stream = rng.uniform(-1, 1, (40, 2)).astype(dtype)
     chunks = [stream[i : i + 8] for i in range(0, 32, 4)]  # they agree where they overlap
-    env = sw.ChunkHandover(Line(2, dtype=dtype), 8, 4, 2, blend=blend, jerk_limit=20.0, fallback="zero")
+    env = sw.ChunkHandover(Line(2, dtype=dtype), 8, 4, 2, blend=blend, rate_limit=20.0, fallback="zero")
     commands, infos = run(env, chunks)
     assert commands[2:].tobytes() == stream[2:32].tobytes()
     assert [i["handover/limited"] for i in infos] == [0] * 8
@@ -281,7 +281,7 @@ def test_without_need_for_a_blend_the_chunks_bits_are_executed(blend, dtype):
 def test_a_stream_at_exactly_the_limit_is_not_held_back():
     """Steps of 0.1 / s for 0.1 s are 0.25 exactly in float32: the limit itself is allowed, bit for bit."""
     stream = np.array([[0.0], [0.25], [0.5], [0.25], [0.0], [-0.25], [-0.5], [-0.75]], np.float32)
-    env = sw.ChunkHandover(Line(dt=0.1), 4, 4, jerk_limit=2.5, fallback="zero")
+    env = sw.ChunkHandover(Line(dt=0.1), 4, 4, rate_limit=2.5, fallback="zero")
     commands, infos = run(env, [stream[:4], stream[4:]])
     assert commands.tobytes() == stream.tobytes()
     assert [i["handover/limited"] for i in infos] == [0, 0]
@@ -291,7 +291,7 @@ def test_a_stream_at_exactly_the_limit_is_not_held_back():
 def test_ordinary_policies_pass_bit_for_bit_as_chunks_of_one():
     rng = np.random.default_rng(1)
     actions = rng.uniform(-1, 1, (50, 3)).astype(np.float32)
-    env = sw.ChunkHandover(Line(3), 1, 1, jerk_limit=20.0, fallback="zero")
+    env = sw.ChunkHandover(Line(3), 1, 1, rate_limit=20.0, fallback="zero")
     commands, infos = run(env, actions[:, None])
     assert commands.tobytes() == actions.tobytes()
     assert all(i["handover/blend_time"] == 0.0 and i["handover/latency"] == 0 for i in infos)
@@ -300,7 +300,7 @@ def test_ordinary_policies_pass_bit_for_bit_as_chunks_of_one():
 
 def test_chunks_outside_the_box_are_clipped_to_it_before_they_are_limited():
     """A policy that asks for 1000 in a box of 1 must not be a long way from -1."""
-    env = sw.ChunkHandover(Line(), 4, 4, jerk_limit=10.0, fallback="zero")
+    env = sw.ChunkHandover(Line(), 4, 4, rate_limit=10.0, fallback="zero")
     up, down = np.full((4, 1), 1000.0, np.float32), np.full((4, 1), -1000.0, np.float32)
     commands, _ = run(env, [up, down])
     assert commands[:4, 0].tolist() == [1.0] * 4
@@ -311,7 +311,7 @@ def test_chunks_outside_the_box_are_clipped_to_it_before_they_are_limited():
 @pytest.mark.parametrize("blend", [*BLENDS, "replace", "ensemble"])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_numbers_beyond_the_envs_dtype_stay_finite(low, blend, dtype):
-    bounds = {} if blend in ("replace", "ensemble") else {"jerk_limit": 5.0}
+    bounds = {} if blend in ("replace", "ensemble") else {"rate_limit": 5.0}
     env = sw.ChunkHandover(
         Line(low=low, high=-low, dtype=dtype), 4, 2, blend=blend, fallback="zero", **bounds
     )
@@ -352,12 +352,12 @@ def test_random_delays_are_drawn_within_bounds_all_of_them_and_again_with_the_se
             found.append([env.step(numbered(k, 12))[4]["handover/latency"] for k in range(40)])
         return found
 
-    env = sw.ChunkHandover(Line(), 12, 6, [1, 4], fallback="zero", jerk_limit=50.0)
+    env = sw.ChunkHandover(Line(), 12, 6, [1, 4], fallback="zero", rate_limit=50.0)
     first, second = latencies(env, 3, episodes=2)
     assert set(first) == {1, 2, 3, 4} == set(second) and first != second
     assert latencies(env, 3, episodes=2) == [first, second]
     assert latencies(env, 4) != [first]
-    again = sw.ChunkHandover(Line(), 12, 6, [1, 4], fallback="zero", jerk_limit=50.0)
+    again = sw.ChunkHandover(Line(), 12, 6, [1, 4], fallback="zero", rate_limit=50.0)
     assert latencies(again, 3) == [first]
 
 
@@ -387,7 +387,7 @@ def test_a_stale_stamp_is_consumed_from_its_age_on():
     env.step(numbered(1, 8))
     env.step(numbered(2, 8))
     assert env.now_s == pytest.approx(0.4)
-    env.deliver(0.3)  # made at control step 3, there at 4: its entry 1
+    env.set_observation_time(0.3)  # made at control step 3, there at 4: its entry 1
     info = env.step(numbered(3, 8))[4]
     assert info["handover/latency"] == 1 and not info["handover/refused"]
     np.testing.assert_array_equal(env.unwrapped.given[4:], numbered(3, 8)[1:3])
@@ -402,7 +402,7 @@ def test_chunks_that_are_not_newer_or_from_the_future_are_refused(stamp, why):
     env.reset(seed=0)
     for k in (1, 2, 3):
         env.step(numbered(k, 8))  # the third is from 0.4 s
-    env.deliver(stamp)
+    env.set_observation_time(stamp)
     info = env.step(numbered(4, 8))[4]
     assert info["handover/refused"] and info["handover/latency"] == -1, why
     np.testing.assert_array_equal(env.unwrapped.given[6:], numbered(3, 8)[2:4])
@@ -413,25 +413,25 @@ def test_nothing_delivered_is_no_refusal():
     env = sw.ChunkHandover(Line(), 8, 2, blend="replace", fallback="zero")
     env.reset(seed=0)
     env.step(numbered(1, 8))
-    env.deliver(None)
+    env.set_observation_time(None)
     info = env.step(np.full((8, 1), np.nan))[4]
     assert not info["handover/refused"] and info["handover/starved"] == 0
     np.testing.assert_array_equal(env.unwrapped.given[2:], numbered(1, 8)[2:4])
 
 
 def test_a_reset_forgets_chunks_stamps_and_commands():
-    env = sw.ChunkHandover(Line(), 8, 4, 4, jerk_limit=0.5, fallback="zero")
+    env = sw.ChunkHandover(Line(), 8, 4, 4, rate_limit=0.5, fallback="zero")
     fresh, _ = run(env, [numbered(k, 8) for k in range(4)])
     env.reset(seed=0)
     env.step(np.ones((8, 1), np.float32))
-    env.deliver(None)
+    env.set_observation_time(None)
     again, infos = run(env, [numbered(k, 8) for k in range(4)])
     assert again.tobytes() == fresh.tobytes()
     assert infos[0]["handover/starved"] == 4
 
 
 def test_an_episode_does_not_begin_with_the_last_ones_command():
-    env = sw.ChunkHandover(Line(), 8, 4, 2, jerk_limit=50.0, fallback="hold")
+    env = sw.ChunkHandover(Line(), 8, 4, 2, rate_limit=50.0, fallback="hold")
     run(env, [np.full((8, 1), 0.5, np.float32)] * 2)
     commands, _ = run(env, [np.full((8, 1), 0.5, np.float32)])
     assert commands[:, 0].tolist() == [0.0, 0.0, 0.5, 0.5]
@@ -458,12 +458,12 @@ def test_a_chunk_with_one_bad_entry_is_refused_whole_then_left_over_then_fallbac
 @pytest.mark.parametrize("blend", BLENDS)
 def test_into_the_fallback_and_back_is_bumpless(blend):
     limit = 1.0
-    env = sw.ChunkHandover(Line(), 8, 4, blend=blend, jerk_limit=limit, fallback="zero")
+    env = sw.ChunkHandover(Line(), 8, 4, blend=blend, rate_limit=limit, fallback="zero")
     env.reset(seed=0)
     high, infos = np.full((8, 1), 0.9, np.float32), []
     for step in range(14):
         if 2 <= step < 8:
-            env.deliver(None)
+            env.set_observation_time(None)
         infos.append(env.step(high)[4])
     commands = np.array(env.unwrapped.given)[:, 0]
     assert np.abs(np.diff(commands)).max() <= limit * HOLD + 1e-7
@@ -476,7 +476,7 @@ def test_into_the_fallback_and_back_is_bumpless(blend):
 
 def test_at_the_start_of_an_episode_the_fallback_acts_until_a_chunk_is_there():
     env = sw.ChunkHandover(
-        Line(), 8, 4, 3, jerk_limit=50.0, fallback=Wander(1, 1, 0.2), plant=counting_plant()
+        Line(), 8, 4, 3, rate_limit=50.0, fallback=Wander(1, 1, 0.2), plant=counting_plant()
     )
     commands, infos = run(env, [np.full((8, 1), 0.1, np.float32)] * 2)
     np.testing.assert_allclose(commands[:3, 0], [Wander(1, 1, 0.2).at(k)[0] for k in range(3)], atol=1e-7)
@@ -490,7 +490,7 @@ def test_a_broken_fallback_sends_nothing_that_is_not_finite(value):
         4,
         2,
         2,
-        jerk_limit=5.0,
+        rate_limit=5.0,
         fallback=lambda p: [value],
         plant=counting_plant(),
     )
@@ -503,7 +503,7 @@ def test_a_broken_fallback_sends_nothing_that_is_not_finite(value):
 
 def test_a_human_takes_over_and_gives_back_bumplessly():
     limit = 2.0
-    env = sw.ChunkHandover(Line(), 1, 1, jerk_limit=limit, fallback="zero")
+    env = sw.ChunkHandover(Line(), 1, 1, rate_limit=limit, fallback="zero")
     env.reset(seed=0)
     sent = []
 
@@ -546,7 +546,7 @@ def test_a_switch_waits_for_the_new_sources_chunk():
     """With a delay the old source's left-over goes on bit for bit until the new one's chunk is there."""
     rng = np.random.default_rng(0)
     stream = rng.uniform(-0.1, 0.1, (16, 1)).astype(np.float32)
-    env = sw.ChunkHandover(Line(), 8, 4, 2, jerk_limit=3.0, fallback="hold")
+    env = sw.ChunkHandover(Line(), 8, 4, 2, rate_limit=3.0, fallback="hold")
     env.reset(seed=0)
     env.step(stream[:8])
     env.switch("human")
@@ -561,7 +561,7 @@ def test_a_source_may_be_called_anything():
     env.reset(seed=0)
     env.switch("fallback")
     env.step(np.full((1, 1), 0.5, np.float32))
-    env.deliver(None)
+    env.set_observation_time(None)
     info = env.step(np.full((1, 1), 0.5, np.float32))[4]
     assert info["handover/starved"] == 1 and info["handover/blend_time"] == 0.5
     assert 0.0 < float(env.unwrapped.given[-1][0]) < 0.5
@@ -578,7 +578,7 @@ def test_blend_time_is_the_least_duration_rounded_up():
 
 
 def test_reset_reports_the_same_keys_and_types_as_a_step():
-    env = sw.ChunkHandover(Line(), 4, 2, jerk_limit=5.0, fallback="zero")
+    env = sw.ChunkHandover(Line(), 4, 2, rate_limit=5.0, fallback="zero")
     info = env.reset(seed=0)[1]
     assert types(info) == TYPES == types(env.step(numbered(0, 4))[4])
     assert not info["handover/seam_jump"].any() and info["handover/latency"] == -1
@@ -591,7 +591,7 @@ def test_an_episode_may_end_inside_a_chunk(ends_at):
     def infos(line):
         return {"cost": float(line.steps)}
 
-    env = sw.ChunkHandover(Line(ends_at=ends_at, infos=infos), 8, 4, 1, jerk_limit=5.0, fallback="zero")
+    env = sw.ChunkHandover(Line(ends_at=ends_at, infos=infos), 8, 4, 1, rate_limit=5.0, fallback="zero")
     env.reset(seed=0)
     done, steps, rewards, cost = False, [], 0.0, 0.0
     while not done:
@@ -604,7 +604,7 @@ def test_an_episode_may_end_inside_a_chunk(ends_at):
 
 
 def test_truncation_inside_a_chunk():
-    env = sw.ChunkHandover(gym.wrappers.TimeLimit(Line(), 6), 8, 4, jerk_limit=5.0, fallback="zero")
+    env = sw.ChunkHandover(gym.wrappers.TimeLimit(Line(), 6), 8, 4, rate_limit=5.0, fallback="zero")
     env.reset(seed=0)
     assert env.step(numbered(1, 8))[2:4] == (False, False)
     _, reward, terminated, truncated, info = env.step(numbered(1, 8))
@@ -621,7 +621,7 @@ def test_what_was_executed_is_measured_not_what_was_sent():
             info["executed_action"] = done
             return observation, reward, terminated, truncated, info
 
-    env = sw.ChunkHandover(Flips(Line()), 4, 2, jerk_limit=5.0, fallback="zero")
+    env = sw.ChunkHandover(Flips(Line()), 4, 2, rate_limit=5.0, fallback="zero")
     commands, infos = run(env, [np.full((4, 1), 0.5, np.float32)] * 3)
     assert np.abs(commands).tolist() == [[0.5]] * 6
     assert [i["handover/peak_jerk"] for i in infos] == [10.0] * 3
@@ -632,7 +632,7 @@ def test_what_was_executed_is_measured_not_what_was_sent():
 def test_a_seam_ends_the_blend_before_it_and_its_window():
     """A blend of nine is cut off by a chunk that needs one of one: what comes later is nobody's seam."""
     a, b = np.zeros((14, 1), np.float32), np.full((14, 1), 1.0, np.float32)
-    env = sw.ChunkHandover(Line(), 14, 2, jerk_limit=2.0, fallback="zero")
+    env = sw.ChunkHandover(Line(), 14, 2, rate_limit=2.0, fallback="zero")
     env.reset(seed=0)
     env.step(a)
     infos = [env.step(b)[4]]
@@ -641,7 +641,7 @@ def test_a_seam_ends_the_blend_before_it_and_its_window():
     late[7:] += 0.1
     infos += [env.step(late)[4]]
     for _ in range(3):
-        env.deliver(None)
+        env.set_observation_time(None)
         infos.append(env.step(late)[4])
     assert infos[0]["handover/blend_time"] == pytest.approx(1.0)
     assert infos[1]["handover/blend_time"] == 0.0
@@ -650,9 +650,9 @@ def test_a_seam_ends_the_blend_before_it_and_its_window():
 
 
 def test_it_says_once_that_commands_are_held_back():
-    env = sw.ChunkHandover(Line(), 4, 4, jerk_limit=1.0, fallback="zero")
+    env = sw.ChunkHandover(Line(), 4, 4, rate_limit=1.0, fallback="zero")
     env.reset(seed=0)
-    with pytest.warns(UserWarning, match=r"jerk_limit.*handover/limited"):
+    with pytest.warns(UserWarning, match=r"rate_limit.*handover/limited"):
         env.step(np.array([[-1.0], [1.0], [-1.0], [1.0]], np.float32))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -662,7 +662,7 @@ def test_it_says_once_that_commands_are_held_back():
 def test_the_chunk_that_was_given_is_not_changed_and_may_be_reused():
     chunk = np.linspace(-2, 2, 8).reshape(8, 1).astype(np.float32)
     before = chunk.tobytes()
-    env = sw.ChunkHandover(Line(), 8, 2, jerk_limit=0.3, fallback="zero")
+    env = sw.ChunkHandover(Line(), 8, 2, rate_limit=0.3, fallback="zero")
     env.reset(seed=0)
     for _ in range(4):
         env.step(chunk)
@@ -729,7 +729,7 @@ def test_replacement_is_the_new_chunk_at_once_and_its_seam_is_measured():
 
 
 def handover(env, **changed):
-    arguments = {"chunk_size": 8, "execution_horizon": 4, "fallback": "zero", "jerk_limit": 5.0, **changed}
+    arguments = {"chunk_size": 8, "execution_horizon": 4, "fallback": "zero", "rate_limit": 5.0, **changed}
     return sw.ChunkHandover(env, **arguments)
 
 
@@ -764,32 +764,32 @@ def handover(env, **changed):
         ({"blend": "linear"}, "no blend 'linear'; choose smoothstep, quintic, hermite, replace, ensemble"),
         ({"blend": None}, "no blend None"),
         ({"blend": "replace"}, "baseline that bounds nothing.*smoothstep"),
-        ({"blend": "ensemble", "jerk_limit": None, "blend_time": 0.3}, "baseline that bounds nothing"),
-        ({"jerk_limit": 0.0}, "jerk_limit .*> 0"),
-        ({"jerk_limit": -1.0}, "jerk_limit .*> 0"),
-        ({"jerk_limit": math.nan}, "jerk_limit .*finite"),
-        ({"jerk_limit": math.inf}, "jerk_limit .*finite"),
-        ({"jerk_limit": "fast"}, "jerk_limit .*number"),
-        ({"jerk_limit": [5.0, 5.0]}, "one for each of the 1 action components"),
-        ({"jerk_limit": []}, "one for each of the 1 action components"),
-        ({"jerk_limit": [-1.0]}, "jerk_limit .*> 0"),
-        ({"jerk_limit": [[1.0]]}, "jerk_limit .*number"),
-        ({"jerk_limit": 1e-7}, "float32 resolves.*choose a larger one"),
+        ({"blend": "ensemble", "rate_limit": None, "blend_time": 0.3}, "baseline that bounds nothing"),
+        ({"rate_limit": 0.0}, "rate_limit .*> 0"),
+        ({"rate_limit": -1.0}, "rate_limit .*> 0"),
+        ({"rate_limit": math.nan}, "rate_limit .*finite"),
+        ({"rate_limit": math.inf}, "rate_limit .*finite"),
+        ({"rate_limit": "fast"}, "rate_limit .*number"),
+        ({"rate_limit": [5.0, 5.0]}, "one for each of the 1 action components"),
+        ({"rate_limit": []}, "one for each of the 1 action components"),
+        ({"rate_limit": [-1.0]}, "rate_limit .*> 0"),
+        ({"rate_limit": [[1.0]]}, "rate_limit .*number"),
+        ({"rate_limit": 1e-7}, "float32 resolves.*choose a larger one"),
         ({"blend_time": 0.0}, "blend_time .*> 0"),
         ({"blend_time": -0.1}, "blend_time .*> 0"),
         ({"blend_time": math.nan}, "blend_time .*finite"),
         ({"blend_time": 0.9}, "blend_time = 0.9 s is longer.*8 control steps.*choose a longer chunk_size"),
         ({"blend_time": 0.7, "inference_delay": 3}, "5 control steps"),
         (
-            {"jerk_limit": None, "execution_horizon": 8},
-            "no left-over to blend with: pass jerk_limit or blend_time",
+            {"rate_limit": None, "execution_horizon": 8},
+            "no left-over to blend with: pass rate_limit or blend_time",
         ),
-        ({"jerk_limit": None, "execution_horizon": 5, "inference_delay": [0, 3]}, "no left-over"),
-        ({"jerk_limit": None, "chunk_size": 1, "execution_horizon": 1}, "no left-over"),
+        ({"rate_limit": None, "execution_horizon": 5, "inference_delay": [0, 3]}, "no left-over"),
+        ({"rate_limit": None, "chunk_size": 1, "execution_horizon": 1}, "no left-over"),
         ({"hold_s": 0.2}, "dt = 0.1"),
         ({"hold_s": 0.0}, "hold_s .*> 0"),
-        ({"decay": -0.1, "blend": "ensemble", "jerk_limit": None}, "decay .*>= 0"),
-        ({"decay": math.nan, "blend": "ensemble", "jerk_limit": None}, "decay .*finite"),
+        ({"decay": -0.1, "blend": "ensemble", "rate_limit": None}, "decay .*>= 0"),
+        ({"decay": math.nan, "blend": "ensemble", "rate_limit": None}, "decay .*finite"),
         ({"fallback": "sleep"}, "no fallback 'sleep'; choose brake, hold, zero"),
         ({"fallback": "brake"}, "(?i)mujoco"),
         ({"plant": 3}, "plant is a MujocoPlant"),
@@ -803,12 +803,12 @@ def test_bad_arguments_are_refused_with_a_way_out(changed, says):
 @pytest.mark.parametrize("limit", [[5.0, 1e-7], [1e-7, 5.0]])
 def test_every_component_needs_a_limit_that_its_numbers_resolve(limit):
     with pytest.raises(ConfigurationError, match="float32 resolves"):
-        handover(Line(2), jerk_limit=limit)
+        handover(Line(2), rate_limit=limit)
 
 
 def test_the_longest_blend_time_that_fits_is_accepted():
-    assert handover(Line(), blend_time=0.8, jerk_limit=None).hold_s == HOLD
-    assert handover(Line(), blend_time=0.5, inference_delay=3, jerk_limit=None).chunk_size == 8
+    assert handover(Line(), blend_time=0.8, rate_limit=None).hold_s == HOLD
+    assert handover(Line(), blend_time=0.5, inference_delay=3, rate_limit=None).chunk_size == 8
 
 
 def test_an_env_that_does_not_say_how_long_a_step_lasts_needs_hold_s():
@@ -863,7 +863,7 @@ def test_stamps_are_times(stamp):
     env = handover(Line())
     env.reset(seed=0)
     with pytest.raises(ActionError, match="time in seconds"):
-        env.deliver(stamp)
+        env.set_observation_time(stamp)
 
 
 def test_a_step_before_the_first_reset_is_refused():
@@ -872,17 +872,19 @@ def test_a_step_before_the_first_reset_is_refused():
 
 
 def reacher(**arguments):
-    return sw.ChunkHandover(gym.make("Reacher-v5"), 8, 4, jerk_limit=20.0, **arguments)
+    return sw.ChunkHandover(gym.make("Reacher-v5"), 8, 4, rate_limit=20.0, **arguments)
 
 
 @pytest.mark.parametrize(
     "outer",
     [
         lambda env: sw.CBFActionFilter(env, [sw.JointSpeedLimit(4.0)]),
-        lambda env: sw.LeaseExpiry(env, lambda e: ([1.0], [0.0]), braking=1.0, acceleration=1.0),
+        lambda env: sw.LeaseExpiry(
+            env, sw.StoppingBudget(lambda e: ([1.0], [0.0]), braking=1.0, acceleration=1.0)
+        ),
         sw.RecordInterventions,
         lambda env: sw.AdaptionPenalty(env, penalty=1.0),
-        lambda env: sw.ChunkHandover(env, 8, 4, jerk_limit=20.0),
+        lambda env: sw.ChunkHandover(env, 8, 4, rate_limit=20.0),
     ],
 )
 @pytest.mark.parametrize("between", [lambda env: env, lambda env: gym.wrappers.TimeLimit(env, 5)])
@@ -896,7 +898,7 @@ def test_orders_known_to_be_wrong_are_refused(outer, between):
     [
         (sw.RecordInterventions, r"ChunkHandover\(RecordInterventions"),
         (lambda env: sw.AdaptionPenalty(env, penalty=1.0), r"ChunkHandover\(AdaptionPenalty"),
-        (lambda env: sw.ChunkHandover(env, 8, 4, jerk_limit=20.0), "takes chunks already"),
+        (lambda env: sw.ChunkHandover(env, 8, 4, rate_limit=20.0), "takes chunks already"),
     ],
 )
 def test_wrong_orders_are_named(outer, says):
@@ -905,7 +907,7 @@ def test_wrong_orders_are_named(outer, says):
 
 
 def test_a_spec_holds_plain_data():
-    env = sw.ChunkHandover(gym.make("Reacher-v5"), np.int64(8), np.int32(4), (1, 2), jerk_limit=20.0)
+    env = sw.ChunkHandover(gym.make("Reacher-v5"), np.int64(8), np.int32(4), (1, 2), rate_limit=20.0)
     kwargs = env.spec.additional_wrappers[-1].kwargs
     assert kwargs["inference_delay"] == [1, 2] and type(kwargs["chunk_size"]) is int
     assert (
@@ -927,7 +929,7 @@ def test_a_spec_holds_plain_data():
 )
 def test_limits_may_be_numpys_and_are_recorded_as_plain_numbers(limit):
     env = sw.ChunkHandover(
-        gym.make("Reacher-v5"), 8, 4, jerk_limit=limit, blend_time=np.float32(0.1), hold_s=np.float64(0.02)
+        gym.make("Reacher-v5"), 8, 4, rate_limit=limit, blend_time=np.float32(0.1), hold_s=np.float64(0.02)
     )
     again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
     assert (
@@ -937,7 +939,7 @@ def test_limits_may_be_numpys_and_are_recorded_as_plain_numbers(limit):
 
 def test_each_component_keeps_its_own_limit():
     limits = np.array([2.0, 0.5])
-    env = sw.ChunkHandover(Line(2), 8, 4, 2, jerk_limit=limits, fallback="zero")
+    env = sw.ChunkHandover(Line(2), 8, 4, 2, rate_limit=limits, fallback="zero")
     rng = np.random.default_rng(0)
     commands, _ = run(env, rng.uniform(-1, 1, (20, 8, 2)).astype(np.float32))
     steps = np.abs(np.diff(commands.astype(np.float64), axis=0)).max(axis=0)
@@ -946,7 +948,7 @@ def test_each_component_keeps_its_own_limit():
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_bad_entry_of_a_slower_policy_refuses_its_chunk(bad):
-    env = sw.ChunkHandover(Line(), 4, 3, jerk_limit=5.0, fallback="zero", steps_per_entry=3)
+    env = sw.ChunkHandover(Line(), 4, 3, rate_limit=5.0, fallback="zero", steps_per_entry=3)
     env.reset(seed=0)
     chunk = numbered(1, 4)
     chunk[3] = bad
@@ -955,7 +957,7 @@ def test_a_bad_entry_of_a_slower_policy_refuses_its_chunk(bad):
 
 
 def test_in_the_middle_of_an_episode_it_can_be_pickled():
-    env = sw.ChunkHandover(Line(), 8, 4, [0, 3], jerk_limit=2.0, fallback="zero")
+    env = sw.ChunkHandover(Line(), 8, 4, [0, 3], rate_limit=2.0, fallback="zero")
     env.reset(seed=2)
     rng = np.random.default_rng(0)
     chunks = rng.uniform(-1, 1, (10, 8, 1)).astype(np.float32)
@@ -978,7 +980,7 @@ def test_bug_latency_is_measured_consumption_not_an_estimate():
     env = sw.ChunkHandover(Line(), 8, 4, 0, blend="replace", fallback="zero")
     env.reset(seed=0)
     env.step(numbered(1, 8))
-    env.deliver(0.2)
+    env.set_observation_time(0.2)
     info = env.step(numbered(2, 8))[4]
     np.testing.assert_array_equal(env.unwrapped.given[4:], numbered(2, 8)[2:6])
     assert info["handover/latency"] == 2
@@ -1000,10 +1002,10 @@ def test_bug_blend_weight_is_not_constant():
 
 def test_bug_an_empty_queue_never_sends_nothing():
     """Every control step of every step has a command, though nothing ever comes."""
-    env = sw.ChunkHandover(Line(), 8, 4, 2, jerk_limit=5.0, fallback="zero")
+    env = sw.ChunkHandover(Line(), 8, 4, 2, rate_limit=5.0, fallback="zero")
     env.reset(seed=0)
     for _ in range(5):
-        env.deliver(None)
+        env.set_observation_time(None)
         assert env.step(numbered(1, 8))[4]["handover/starved"] == 4
     assert len(env.unwrapped.given) == 20
 
@@ -1015,7 +1017,7 @@ def test_bug_a_latency_spike_is_forgotten():
     latencies = []
     for k in range(5):
         if k == 2:
-            env.deliver(env.now_s - 0.2)
+            env.set_observation_time(env.now_s - 0.2)
         latencies.append(env.step(numbered(k, 8))[4]["handover/latency"])
     assert latencies == [1, 1, 3, 1, 1]
 
@@ -1038,40 +1040,39 @@ class Listener(gym.Wrapper, CommandReceiver):
         self.stamps = []
         return self.env.reset(**how)
 
-    def deliver(self, observed_s):
+    def set_observation_time(self, observed_s):
         self.stamps.append(observed_s)
 
 
 def test_whoever_is_inside_is_told_what_every_command_is_made_from():
     """Nothing before the first chunk; the chunk in force for its commands, its left-over, and while it starves."""
-    env = sw.ChunkHandover(Listener(Line()), 6, 3, 1, jerk_limit=5.0, fallback="zero")
+    env = sw.ChunkHandover(Listener(Line()), 6, 3, 1, rate_limit=5.0, fallback="zero")
     env.reset(seed=0)
     env.step(numbered(1, 6))
     env.step(numbered(2, 6))
     for _ in range(2):
-        env.deliver(None)
+        env.set_observation_time(None)
         env.step(numbered(3, 6))
-    env.deliver(1.1)  # made at control step 11, there at 13
+    env.set_observation_time(1.1)  # made at control step 11, there at 13
     env.step(numbered(4, 6))
     wanted = [None, 0, 0, 0, 3, 3, 3, 3, 3, 3, 3, 3, 3, 11, 11]
     told = [None if stamp is None else round(stamp / HOLD, 6) for stamp in env.env.stamps]
     assert told == wanted
 
 
-def test_admission_inside_refuses_a_chunk_and_the_left_over_goes_on():
+@pytest.mark.parametrize("between", [lambda env: env, lambda env: DroppedRefreshes(env, 0.0)])
+def test_admission_inside_refuses_a_chunk_and_the_left_over_goes_on(between):
     def reach(env):
         return np.zeros(1), np.zeros(1)
 
     lease = sw.LeaseExpiry(
         Line(),
-        lambda env: ([9.0], [0.0]),
-        braking=1.0,
-        acceleration=1.0,
+        sw.StoppingBudget(lambda env: ([9.0], [0.0]), braking=1.0, acceleration=1.0),
         reach={"max_speed": 1.0, "max_acceleration": 10.0},
         measured=reach,
         fallback="zero",
     )
-    env = sw.ChunkHandover(lease, 6, 3, jerk_limit=5.0, fallback="zero")
+    env = sw.ChunkHandover(between(lease), 6, 3, rate_limit=5.0, fallback="zero")
     env.reset(seed=0)
     assert not env.step(np.full((6, 1), 0.1, np.float32))[4]["handover/refused"]
     far = env.step(np.full((6, 1), 0.9, np.float32))[4]  # 0.6 s at 1 per second
@@ -1083,7 +1084,7 @@ def test_admission_inside_refuses_a_chunk_and_the_left_over_goes_on():
 
 
 def test_a_frozen_policy_runs_dry_and_the_fallback_acts():
-    env = sw.ChunkHandover(Line(), 8, 4, jerk_limit=5.0, fallback="zero")
+    env = sw.ChunkHandover(Line(), 8, 4, rate_limit=5.0, fallback="zero")
     frozen = FrozenPolicy(env, mean_between_s=1e-9, mean_length_s=1e9)
     frozen.reset(seed=0)
     infos = [frozen.step(np.full((8, 1), 0.3, np.float32))[4] for _ in range(6)]
@@ -1092,7 +1093,7 @@ def test_a_frozen_policy_runs_dry_and_the_fallback_acts():
 
 
 def test_a_repeated_chunk_is_refused():
-    env = RepeatedCommands(sw.ChunkHandover(Line(), 8, 4, jerk_limit=5.0, fallback="zero"), share=0.5)
+    env = RepeatedCommands(sw.ChunkHandover(Line(), 8, 4, rate_limit=5.0, fallback="zero"), share=0.5)
     env.reset(seed=0)
     infos = [env.step(numbered(k, 8))[4] for k in range(40)]
     again = [i["fault/active"] for i in infos]
@@ -1107,7 +1108,7 @@ def test_unknown_names_are_unknown_names():
 
 def test_an_ordinary_policys_action_is_a_chunk_of_one():
     one = gym.make("Reacher-v5")
-    env = sw.ChunkHandover(gym.make("Reacher-v5"), 1, 1, jerk_limit=1e6)
+    env = sw.ChunkHandover(gym.make("Reacher-v5"), 1, 1, rate_limit=1e6)
     one.reset(seed=0)
     env.reset(seed=0)
     one.action_space.seed(0)
@@ -1117,12 +1118,12 @@ def test_an_ordinary_policys_action_is_a_chunk_of_one():
     with pytest.raises(ActionError, match=r"\(1, 2\)"):
         env.step(np.zeros(3))
     with pytest.raises(ActionError, match=r"\(2, 2\)"):
-        sw.ChunkHandover(gym.make("Reacher-v5"), 2, 1, jerk_limit=1.0).step(np.zeros(2))
+        sw.ChunkHandover(gym.make("Reacher-v5"), 2, 1, rate_limit=1.0).step(np.zeros(2))
 
 
 @pytest.mark.parametrize(("allowed_s", "refused"), [(0.0, True), (0.025, True), (0.03, False), (1.0, False)])
 def test_a_clock_that_is_ahead_is_forgiven_as_far_as_it_is_declared(allowed_s, refused):
-    arm = sw.ChunkHandover(gym.make("FlexJointReach-v0"), 8, 4, jerk_limit=50.0, clock_error_s=allowed_s)
+    arm = sw.ChunkHandover(gym.make("FlexJointReach-v0"), 8, 4, rate_limit=50.0, clock_error_s=allowed_s)
     env = ClockSkew(arm, offset_s=0.03)  # three control steps
     env.reset(seed=0)
     assert gym.make(arm.spec).get_wrapper_attr("_clock_error_s") == allowed_s
@@ -1135,4 +1136,4 @@ def test_a_clock_that_is_ahead_is_forgiven_as_far_as_it_is_declared(allowed_s, r
 
 def test_a_clock_error_is_a_time():
     with pytest.raises(ConfigurationError, match="clock_error_s"):
-        sw.ChunkHandover(gym.make("Reacher-v5"), 8, 4, jerk_limit=50.0, clock_error_s=-0.1)
+        sw.ChunkHandover(gym.make("Reacher-v5"), 8, 4, rate_limit=50.0, clock_error_s=-0.1)

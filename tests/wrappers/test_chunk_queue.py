@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -43,8 +44,22 @@ def never():
     raise AssertionError("the fallback was asked, though commands are planned")
 
 
-def run(queue, ticks, stand_in=fallback, admit=None):
-    return [queue.next(stand_in, admit) for _ in range(ticks)]
+def tick(queue, stand_in=fallback, admit=lambda end, steps: True):
+    """One command, of the newest chunk that is admitted, and whether one was refused, as `ChunkHandover` does it."""
+    admitted, refused = [], False
+    for chunk in queue.arrived():
+        left = queue.left(chunk)
+        if len(left) and admit(left[-1], len(left)):
+            admitted.append(chunk)
+            if queue._blend != "ensemble":
+                break
+        else:
+            refused = True
+    return SimpleNamespace(**queue.next(admitted, stand_in)._asdict(), refused=refused)
+
+
+def run(queue, ticks, *how, **admit):
+    return [tick(queue, *how, **admit) for _ in range(ticks)]
 
 
 def controls(commands):
@@ -85,7 +100,7 @@ def test_whatever_the_order_of_arrival_the_newest_observation_that_is_there_coun
             k, size, due = submissions[t]
             assert q.submit(numbered(k, size), t, due)
             known.append((t, k, size, due))
-        command = q.next(fallback)
+        command = tick(q)
         # In force is the newest that has arrived in time to have an entry left when it came.
         best = None
         for seen, k, size, due in known:
@@ -152,7 +167,7 @@ def test_an_older_chunk_steps_in_for_a_newer_one_that_is_refused():
     run(q, 1)
     q.submit(numbered(2, 9), 1, 2)
     run(q, 1)
-    command = q.next(never, lambda end, steps: end[0] < 200)
+    command = tick(q, never, lambda end, steps: end[0] < 200)
     assert (
         float(command.control[0]) == 102 and command.refused and command.took_over and command.observed == 0
     )
@@ -193,7 +208,7 @@ def test_the_ensemble_by_its_formula(seed, decay, m):
             chunk, due = rng.uniform(-1, 1, (int(rng.integers(1, 8)), m)), t + int(rng.integers(0, 4))
             q.submit(chunk, t, due)
             known.append((t, due, chunk))
-        command = q.next(lambda: np.full(m, 7.0))
+        command = tick(q, lambda: np.full(m, 7.0))
         used = [(seen, due, chunk) for seen, due, chunk in known if due <= t and due - seen < len(chunk)]
         # A chunk that arrives after a newer one that could be used has been overtaken.
         used = [u for u in used if not any(v[0] > u[0] and v[1] < u[1] for v in used)]
@@ -221,7 +236,7 @@ def test_commands_stay_in_the_box_and_the_limit_whatever_the_fallback_does(blend
     for t in range(200):
         if rng.random() < 0.2:
             q.submit(rng.uniform(-3, 3, (4, 1)), t, t + int(rng.integers(0, 3)))
-        sent.append(q.next(lambda: rng.choice([-1e30, 1e30], 1)).control)
+        sent.append(tick(q, lambda: rng.choice([-1e30, 1e30], 1)).control)
     sent = np.array(sent)
     assert sent.dtype == np.float32 and np.abs(sent).max() == 0.5
     assert np.abs(np.diff(sent.astype(np.float64), axis=0)).max() <= 0.1

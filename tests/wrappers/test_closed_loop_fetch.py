@@ -284,7 +284,7 @@ def test_commands_in_flight_are_counted_on():
 
 def test_leases_and_chunks_work_on_an_arm():
     env = sw.protect(fetch("FetchReach-v4"))
-    env = sw.LeaseExpiry(env, env.constraints[0], closing_speed=1.0, least_s=0.04)
+    env = sw.LeaseExpiry(env, sw.StoppingBudget(env.constraints[0], closing_speed=1.0), min_lease_s=0.04)
     env = sw.ChunkHandover(env, chunk_size=8, execution_horizon=4, inference_delay=1)
     env.reset(seed=0)
     chunk = np.zeros(env.action_space.shape, np.float32)

@@ -53,7 +53,7 @@ def episodes(env, chunks, steps, seed=0, late=None):
                 found.append((np.array(recorder.commands), recorder.infos))
             env.reset(seed=seed if not k else None)
         if late is not None and late.random() < 0.2:
-            env.deliver(None)
+            env.set_observation_time(None)
         _, _, terminated, truncated, info = env.step(next(chunks))
         infos.append(info)
         seams += info["handover/latency"] >= 0
@@ -68,7 +68,7 @@ def test_hundreds_of_seams_and_not_one_beyond_the_limit(env_id, blend):
     """Late by chance, lost by chance, with the brake as the fallback."""
     limit = ENVS[env_id]
     recorder = Recorder(gym.make(env_id))
-    env = sw.ChunkHandover(recorder, 24, 8, [0, 5], blend=blend, jerk_limit=limit)
+    env = sw.ChunkHandover(recorder, 24, 8, [0, 5], blend=blend, rate_limit=limit)
     rng = np.random.default_rng(0)
     infos, found, seams = episodes(env, smooth_chunks(env, rng), 120, late=rng)
     assert seams > 80 and len(found) >= 4
@@ -83,7 +83,7 @@ def test_hundreds_of_seams_and_not_one_beyond_the_limit(env_id, blend):
 
 def vibration(blend, limit, rng_seed=0):
     """Mean over the steps of the largest vibration energy of each, J, with the same chunks for every blend."""
-    bounds = {"jerk_limit": limit} if blend in BLENDS else {}
+    bounds = {"rate_limit": limit} if blend in BLENDS else {}
     recorder = Recorder(gym.make("FlexJointReach-v0"))
     env = sw.ChunkHandover(recorder, 48, 16, 2, blend=blend, fallback="hold", **bounds)
     infos, found, _ = episodes(env, smooth_chunks(env, np.random.default_rng(rng_seed)), 39)
@@ -106,7 +106,7 @@ def test_a_filter_inside_may_break_the_limit_and_then_it_shows():
     """What is sent keeps it; what is executed is the filter's, and that is what is reported."""
     recorder = Recorder(sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(6.0)]))
     limit = 4.0
-    env = sw.ChunkHandover(recorder, 24, 8, 2, jerk_limit=limit)
+    env = sw.ChunkHandover(recorder, 24, 8, 2, rate_limit=limit)
     rng = np.random.default_rng(0)
     env.reset(seed=0)
     above, last = 0, None
@@ -124,7 +124,7 @@ def test_a_filter_inside_may_break_the_limit_and_then_it_shows():
 
 def test_what_a_filter_lets_pass_keeps_the_limit_as_executed_action():
     recorder = Recorder(sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(1e9)]))
-    env = sw.ChunkHandover(recorder, 24, 8, [0, 5], jerk_limit=4.0)
+    env = sw.ChunkHandover(recorder, 24, 8, [0, 5], rate_limit=4.0)
     rng = np.random.default_rng(0)
     for _, infos in episodes(env, smooth_chunks(env, rng), 30, late=rng)[1]:
         executed = np.array([i["executed_action"] for i in infos], np.float64)
@@ -135,7 +135,7 @@ def test_control_goes_from_a_policy_to_a_human_and_back_on_an_arm():
     """Single actions as chunks of one: the policy swings, the human pulls the other way."""
     limit = 30.0
     recorder = Recorder(gym.make("FlexJointReach-v0"))
-    env = sw.ChunkHandover(recorder, 1, 1, jerk_limit=limit)
+    env = sw.ChunkHandover(recorder, 1, 1, rate_limit=limit)
     env.reset(seed=0)
     high = env.action_space.high
     asked = np.array(
@@ -157,9 +157,11 @@ def test_control_goes_from_a_policy_to_a_human_and_back_on_an_arm():
 def test_a_stack_of_handover_lease_and_filter_keeps_its_figures():
     """The whole stack on the arm of Reacher, with commands that are lost."""
     inner = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(6.0)])
-    lease = sw.LeaseExpiry(inner, lambda env: ([1.0], [0.0]), braking=1.0, acceleration=1.0, longest_s=0.3)
+    lease = sw.LeaseExpiry(
+        inner, sw.StoppingBudget(lambda env: ([1.0], [0.0]), braking=1.0, acceleration=1.0), max_lease_s=0.3
+    )
     recorder = Recorder(lease)
-    env = sw.ChunkHandover(recorder, 16, 4, [0, 3], jerk_limit=8.0)
+    env = sw.ChunkHandover(recorder, 16, 4, [0, 3], rate_limit=8.0)
     rng = np.random.default_rng(1)
     infos, found, seams = episodes(env, smooth_chunks(env, rng), 60, late=rng)
     assert seams > 30

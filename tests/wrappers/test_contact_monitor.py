@@ -204,7 +204,7 @@ def test_what_a_broken_simulation_was_reset_to_is_no_contact():
 def test_inside_a_chunk_impulses_add_up_and_peaks_are_the_largest():
     single, chunked = (gym.make("HalfCheetah-v5") for _ in range(2))
     single = sw.ContactMonitor(single)
-    chunked = sw.ChunkHandover(sw.ContactMonitor(chunked), 5, 5, jerk_limit=1e6)
+    chunked = sw.ChunkHandover(sw.ContactMonitor(chunked), 5, 5, rate_limit=1e6)
     single.reset(seed=0), chunked.reset(seed=0)
     for chunk in actions(single, 100).reshape(20, 5, -1):
         macro = chunked.step(chunk)[4]
@@ -218,7 +218,7 @@ def test_inside_a_chunk_impulses_add_up_and_peaks_are_the_largest():
 def test_a_chunk_is_partial_if_any_of_its_steps_was():
     meddling = Meddling(gym.make("HalfCheetah-v5"))
     meddling.at = (7,)
-    env = sw.ChunkHandover(sw.ContactMonitor(meddling), 5, 5, jerk_limit=1e6)
+    env = sw.ChunkHandover(sw.ContactMonitor(meddling), 5, 5, rate_limit=1e6)
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="contact/partial"):
         partial = [env.step(chunk)[4][keys.CONTACT_PARTIAL] for chunk in actions(env, 3)]

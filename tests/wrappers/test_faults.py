@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
-from braked_cart import BrakedCart, cart_plant, read_cart, stop
+from braked_cart import BrakedCart, cart_plant, lease, read_cart, stop
 from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -61,7 +61,7 @@ class Ear(gym.Wrapper, CommandReceiver):
     def now_s(self):
         return len(self.heard) * self.hold_s
 
-    def deliver(self, observed_s):
+    def set_observation_time(self, observed_s):
         self.stamp = observed_s
 
 
@@ -368,7 +368,7 @@ def test_now_is_the_receivers_clock():
 
 def leased(cart, **more):
     given_ = {"braking": cart.braking, "acceleration": cart.drive, "fallback": stop}
-    return sw.LeaseExpiry(cart, read_cart, plant=cart_plant(cart.dt), **{**given_, **more})
+    return lease(cart, read_cart, plant=cart_plant(cart.dt), **{**given_, **more})
 
 
 NESTED = [
@@ -427,7 +427,7 @@ def test_nothing_is_hit_whatever_goes_wrong(kinds):
 @pytest.mark.parametrize("kind", ["FrozenPolicy", "RepeatedCommands"])
 def test_repeats_are_caught_though_commands_keep_coming(kind):
     cart = BrakedCart(wall=1e6)
-    ear = Ear(leased(cart, longest_s=0.3))
+    ear = Ear(leased(cart, max_lease_s=0.3))
     more = {"share": 0.97} if kind == "RepeatedCommands" else {"mean_between_s": 0.5, "mean_length_s": 5.0}
     env = faulty(kind, ear.env, **more)
     env.reset(seed=1)
@@ -443,7 +443,7 @@ def test_chunks_are_carried_lost_and_repeated_as_a_whole(kind):
     chunks = sw.ChunkHandover(cart, 6, 2, blend="replace", fallback="zero")
     heard = []
     true = chunks.step
-    chunks.step = lambda action: (heard.append((chunks._evidence, np.array(action))), true(action))[1]
+    chunks.step = lambda action: (heard.append((chunks._observed_s, np.array(action))), true(action))[1]
     env = faulty(kind, chunks)
     env.reset(seed=2)
     sent = [np.full((6, 2), 0.01 * t) + np.arange(6)[:, None] * 0.001 for t in range(40)]
@@ -466,7 +466,7 @@ def test_chunks_are_carried_lost_and_repeated_as_a_whole(kind):
 
 def test_a_clock_that_is_ahead_is_refused_and_one_within_the_declared_error_is_not():
     for offset, error, refused in ((0.3, 0.0, True), (0.3, 0.35, False), (-0.3, 0.0, False)):
-        env = ClockSkew(leased(BrakedCart(wall=1e6), clock_error_s=error, longest_s=0.9), offset_s=offset)
+        env = ClockSkew(leased(BrakedCart(wall=1e6), clock_error_s=error, max_lease_s=0.9), offset_s=offset)
         env.reset(seed=0)
         assert [env.step(FULL)[4]["lease/refused"] for _ in range(5)] == [refused] * 5
 
@@ -538,7 +538,9 @@ def _timeless():
 def test_orders_that_are_refused():
     with pytest.raises(ConfigurationError, match="Outages inside LeaseExpiry"):
         leased_over = faulty("Outages", BrakedCart())
-        sw.LeaseExpiry(leased_over, read_cart, braking=1.0, acceleration=1.0, fallback="zero")
+        sw.LeaseExpiry(
+            leased_over, sw.StoppingBudget(read_cart, braking=1.0, acceleration=1.0), fallback="zero"
+        )
     with pytest.raises(ConfigurationError, match="Outages inside CBFActionFilter"):
         sw.CBFActionFilter(faulty("Outages", gym.make("Reacher-v5")), [sw.JointSpeedLimit(4.0)])
 

@@ -6,13 +6,13 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from braked_cart import Book, BrakedCart, cart_plant, lease_by_bisection, read_cart, stop, worst_way
+from braked_cart import Book, BrakedCart, cart_plant, lease, lease_by_bisection, read_cart, stop, worst_way
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.wrappers.lease.room import Room
+from safe_wrappers.wrappers.lease.stopping_budget import BoundBudget
 
 pytestmark = pytest.mark.filterwarnings("ignore:the policy's action is not finite")
 FULL = np.array([1.0, 0.0])
@@ -22,7 +22,7 @@ def leased(env, **more):
     """The cart under a lease that knows its drive and brake."""
     cart = env.unwrapped
     known = {"braking": cart.braking, "acceleration": cart.drive, "fallback": stop}
-    return sw.LeaseExpiry(env, read_cart, **{**known, "plant": cart_plant(cart.dt), **more})
+    return lease(env, read_cart, **{**known, "plant": cart_plant(cart.dt), **more})
 
 
 def lease_info(info):
@@ -50,13 +50,13 @@ def draw(rng):
         "age_s": cart["age_s"],
         "localisation": cart["noise"],
         "margin": float(rng.choice([0.0, rng.uniform(0.0, 0.2)])),
-        "longest_s": float(rng.choice([2 * dt, 5 * dt, rng.uniform(2 * dt, 1.0), 1.0])),
+        "max_lease_s": float(rng.choice([2 * dt, 5 * dt, rng.uniform(2 * dt, 1.0), 1.0])),
         "blend_time": float(rng.choice([0.0, dt, rng.uniform(0.0, 5 * dt)])),
         "brake_blend_time": float(rng.choice([0.0, dt, rng.uniform(0.0, 3 * dt)])),
         "clock_error_s": float(rng.choice([0.0, rng.uniform(0.0, 2 * dt)])),
         "top_speed": None if math.isinf(cart["top"]) else cart["top"],
     }
-    options["longest_s"] = max(options["longest_s"], options["blend_time"] + 2 * dt)
+    options["max_lease_s"] = max(options["max_lease_s"], options["blend_time"] + 2 * dt)
     # Wherever it starts, it can still stop, if the brakes are put on now, with all their delays.
     fades = math.ceil(options["brake_blend_time"] / dt) * dt
     way, speed = worst_way(cart["delay_s"] + fades, v, cart["drive"], cart["top"])
@@ -100,7 +100,7 @@ def follow(seed, steps=60):
     book = Book(
         env.hold_s,
         lease,
-        longest=options["longest_s"],
+        longest=options["max_lease_s"],
         blend=options["blend_time"],
         brake_blend=options["brake_blend_time"],
         clock_error=options["clock_error_s"],
@@ -118,7 +118,7 @@ def follow(seed, steps=60):
         if t >= dead_from:
             stamp = None
         if stamp != t * env.hold_s or rng.random() < 0.5:
-            env.deliver(stamp)
+            env.set_observation_time(stamp)
         asked = len(read)
         before = cart.readings
         info = env.step(action)[4]
@@ -157,7 +157,7 @@ def test_every_step_is_what_the_book_says_in_many_episodes():
 @pytest.mark.parametrize("drive", [0.0, 1.5])
 def test_the_lease_is_just_long_enough_and_one_five_percent_longer_hits(dt, drive, monkeypatch):
     rng = np.random.default_rng(int(100 * dt + 10 * drive))
-    true = Room.longest_lease
+    true = BoundBudget.longest_time
     hits = 0
     for _ in range(20):
         braking, v, steps = rng.uniform(1.0, 6.0), rng.uniform(0.3, 3.0), int(rng.integers(20, 40))
@@ -167,18 +167,18 @@ def test_the_lease_is_just_long_enough_and_one_five_percent_longer_hits(dt, driv
         # The lease is worth exactly so many steps. It is granted `age` late: the cart has sped up by nothing, then.
         wall = way + speed**2 / (2.0 * braking) + 1e-7
         for stretch in (1.0, 1.05):
-            monkeypatch.setattr(Room, "longest_lease", lambda self, d, s=stretch: s * true(self, d))
+            monkeypatch.setattr(BoundBudget, "longest_time", lambda self, d, s=stretch: s * true(self, d))
             cart = BrakedCart(dt, wall, drive, braking, v=v, delay_s=detect + confirm + act)
             # The worst case of an old reading: full drive from the moment on at which it was taken.
             cart.reset()
             x, now = worst_way(age, v, drive, math.inf)
-            env = leased(cart, detect_s=detect, confirm_s=confirm, age_s=age, act_s=act, longest_s=10.0)
+            env = leased(cart, detect_s=detect, confirm_s=confirm, age_s=age, act_s=act, max_lease_s=10.0)
             env.reset(options={"start": (x, now)})
             cart.applied = (1.0, 0.0)
             cart.measured = lambda w=wall, v=v: (w, v)
             braked = [env.step(FULL)[4]["lease/braking"]]
             while cart.v > 0.0 and len(braked) < 2000:
-                env.deliver(None)
+                env.set_observation_time(None)
                 braked.append(env.step(FULL)[4]["lease/braking"])
             assert cart.v == 0.0
             if stretch == 1.0:
@@ -211,14 +211,14 @@ def test_every_part_of_the_budget_is_needed(part):
             )
             # The fallback fades in whether that is counted or not.
             fades = part == "brake_blend_time"
-            env = leased(cart, longest_s=2.0, **({part: size} if counted or fades else {}))
+            env = leased(cart, max_lease_s=2.0, **({part: size} if counted or fades else {}))
             if fades and not counted:
                 env._delays_s = 0.0
             env.reset(seed=seed)
             dead_from = rng.integers(1, 20)
             for t in range(80):
                 if t >= dead_from:
-                    env.deliver(None)
+                    env.set_observation_time(None)
                 env.step(FULL)
             hits[counted] += cart.farthest > cart.wall
     assert hits[True] == 0 and hits[False] > 5, hits
@@ -228,11 +228,11 @@ def test_a_hair_less_than_whole_steps_is_a_step_less():
     # What counts as the same time is never taken from the clearance.
     for hair, steps in ((5e-7, 4), (-2e-6, 5)):
         cart = BrakedCart(wall=0.1 * (5.0 - hair), drive=0.0, v=1.0, braking=1e12)
-        env = leased(cart, longest_s=9.0)
+        env = leased(cart, max_lease_s=9.0)
         env.reset()
         braking = [env.step(FULL)[4]["lease/braking"]]
         for _ in range(6):
-            env.deliver(None)
+            env.set_observation_time(None)
             braking.append(env.step(FULL)[4]["lease/braking"])
         assert braking.index(True) == steps and cart.farthest <= cart.wall
 
@@ -243,7 +243,7 @@ def test_a_hair_less_than_whole_steps_is_a_step_less():
 def far(**more):
     """A cart with all the room in the world."""
     cart = BrakedCart(wall=1e6, drive=1.0, **more)
-    return cart, leased(cart, longest_s=0.5, blend_time=0.3, brake_blend_time=0.2)
+    return cart, leased(cart, max_lease_s=0.5, blend_time=0.3, brake_blend_time=0.2)
 
 
 def test_expired_once_then_braking_until_something_fresh_comes_and_smoothly_back():
@@ -251,7 +251,7 @@ def test_expired_once_then_braking_until_something_fresh_comes_and_smoothly_back
     env.reset()
     infos = [env.step(FULL)[4]]
     for _ in range(9):
-        env.deliver(None)
+        env.set_observation_time(None)
         infos.append(env.step(FULL)[4])
     assert [i["lease/expired"] for i in infos] == [False] * 5 + [True] + [False] * 4
     assert [i["lease/braking"] for i in infos] == [False] * 5 + [True] * 5
@@ -259,7 +259,7 @@ def test_expired_once_then_braking_until_something_fresh_comes_and_smoothly_back
         [i["lease/remaining_s"] for i in infos[:6]], [0.4, 0.3, 0.2, 0.1, 0, 0], atol=1e-12
     )
     for stamp in (0.0, -1.0, 0.05, 99.0):  # in force before, older, older than the newest, from the future
-        env.deliver(0.0 if stamp == 0.05 else stamp)
+        env.set_observation_time(0.0 if stamp == 0.05 else stamp)
         assert env.step(FULL)[4]["lease/braking"]
     assert not env.step(FULL)[4]["lease/braking"]
     for _ in range(4):
@@ -283,7 +283,7 @@ def smooth_step(s):
 
 def test_refused_brakes_at_once_though_the_old_lease_would_run_on():
     cart = BrakedCart(wall=1e6, drive=1.0)
-    env = leased(cart, longest_s=1.0)
+    env = leased(cart, max_lease_s=1.0)
     env.reset()
     assert env.step(FULL)[4]["lease/remaining_s"] == pytest.approx(0.9)
     cart.wall = cart.x + 0.01
@@ -291,23 +291,23 @@ def test_refused_brakes_at_once_though_the_old_lease_would_run_on():
     assert lease_info(info) == (False, True, True) and info["lease/remaining_s"] == 0.0
     assert cart.given[-1].tolist() == [0.0, 1.0]
     cart.wall = 1e6
-    env.deliver(0.1)  # the refused one again, when there is room: still not fresh
+    env.set_observation_time(0.1)  # the refused one again, when there is room: still not fresh
     assert env.step(FULL)[4]["lease/braking"]
     assert not env.step(FULL)[4]["lease/braking"]
 
 
 def test_a_lease_of_one_step_gives_authority_back_and_its_end_on_the_way_brakes_at_once():
     cart = BrakedCart(wall=1e6, drive=0.0, v=1.0, braking=1e6)
-    env = leased(cart, longest_s=5.0, blend_time=0.5, fallback=gently)
+    env = leased(cart, max_lease_s=5.0, blend_time=0.5, fallback=gently)
     env.reset()
-    env.deliver(None)
+    env.set_observation_time(None)
     env.step(FULL)
     cart.wall = cart.x + 0.09
     assert lease_info(env.step(FULL)[4]) == (False, True, True)
     cart.wall = cart.x + 0.21
     assert lease_info(env.step(FULL)[4]) == (False, False, False)
     for wanted in ((False, False, False), (True, False, True)):
-        env.deliver(None)
+        env.set_observation_time(None)
         assert lease_info(env.step(FULL)[4]) == wanted
     weights = [smooth_step(i / 6.0) for i in (1, 2)]
     np.testing.assert_allclose([g[0] for g in cart.given], [0.0, 0.0, *weights, 0.0], atol=1e-7)
@@ -317,7 +317,7 @@ def test_nothing_yet_is_braking_and_not_expired():
     cart, env = far()
     info = env.reset()[1]
     assert lease_info(info) == (False, False, False) and info["lease/remaining_s"] == 0.0
-    env.deliver(None)
+    env.set_observation_time(None)
     info = env.step(FULL)[4]
     assert lease_info(info) == (False, False, True)
     assert cart.given[-1].tolist() == [0.0, 1.0] and cart.readings == 0
@@ -328,7 +328,7 @@ def test_none_holds_the_command_in_force():
     env.reset()
     env.step(np.array([0.25, 0.0]))
     for junk in (np.array([np.nan, 0.0]), FULL, np.array([-1.0, 1.0])):
-        env.deliver(None)
+        env.set_observation_time(None)
         env.step(junk)
         assert cart.given[-1].tolist() == [0.25, 0.0]
 
@@ -336,24 +336,24 @@ def test_none_holds_the_command_in_force():
 def test_the_age_of_a_command_counts():
     for age in (0.0, 0.15):
         cart = BrakedCart(wall=10.0, drive=0.0, v=1.0, braking=1e9)
-        env = leased(cart, longest_s=1e3)
+        env = leased(cart, max_lease_s=1e3)
         env.reset()
         for stamp in (0.0, None, None):
-            env.deliver(stamp)
+            env.set_observation_time(stamp)
             env.step(FULL)
-        env.deliver(0.3 - age)
+        env.set_observation_time(0.3 - age)
         left = cart.wall - cart.x
         assert env.step(FULL)[4]["lease/remaining_s"] == pytest.approx(left - age - 0.1)
 
 
 def test_clock_error_counts_and_lets_stamps_be_that_wrong():
     cart = BrakedCart(wall=10.0, drive=0.0, v=1.0, braking=1e9)
-    env = leased(cart, longest_s=1e3, clock_error_s=0.25)
+    env = leased(cart, max_lease_s=1e3, clock_error_s=0.25)
     env.reset()
     assert env.step(FULL)[4]["lease/remaining_s"] == pytest.approx(10.0 - 0.25 - 0.1)
-    env.deliver(0.1 + 0.24)
+    env.set_observation_time(0.1 + 0.24)
     assert not env.step(FULL)[4]["lease/refused"]
-    env.deliver(0.2 + 0.26)
+    env.set_observation_time(0.2 + 0.26)
     assert env.step(FULL)[4]["lease/refused"]
 
 
@@ -362,11 +362,11 @@ def test_an_older_stamp_is_refused_and_the_command_in_force_goes_on():
     env.reset()
     for u in (0.1, 0.2, 0.3):
         env.step(np.array([u, 0.0]))
-    env.deliver(0.1)
+    env.set_observation_time(0.1)
     info = env.step(FULL)[4]
     assert lease_info(info) == (False, True, False)
     assert cart.given[-1][0] == pytest.approx(0.3)
-    env.deliver(0.2)  # the evidence in force: executed, on the old lease
+    env.set_observation_time(0.2)  # the evidence in force: executed, on the old lease
     before = cart.readings
     info = env.step(np.array([-0.5, 0.0]))[4]
     assert cart.given[-1][0] == -0.5 and cart.readings == before
@@ -376,7 +376,7 @@ def test_an_older_stamp_is_refused_and_the_command_in_force_goes_on():
 def test_a_chunks_commands_share_one_lease():
     cart = BrakedCart(wall=1e6)
     env = sw.ChunkHandover(
-        leased(cart, longest_s=0.6), 6, 3, 2, jerk_limit=1e3, fallback="zero", plant=cart_plant(0.1)
+        leased(cart, max_lease_s=0.6), 6, 3, 2, rate_limit=1e3, fallback="zero", plant=cart_plant(0.1)
     )
     env.reset(seed=0)
     infos = [env.step(np.tile([u, 0.0], (6, 1)))[4] for u in (0.1, 0.2, 0.3)]
@@ -411,7 +411,7 @@ def test_commands_pass_bit_for_bit_while_leases_last(dtype):
             before = action.tobytes()
             env.step(action)
             assert env.env.sent.tobytes() == before and env.env.sent.dtype == given_as
-            env.deliver(None)  # held: the same bits again
+            env.set_observation_time(None)  # held: the same bits again
             env.step(np.zeros(2))
             assert env.env.sent.tobytes() == before and env.env.sent.dtype == given_as
     assert env.step([0.5, 0.25])[4]["lease/braking"] is False
@@ -439,12 +439,12 @@ def test_actions_are_not_changed_in_place():
 @pytest.mark.parametrize("huge", [1e300, -1e300, 1.7e308])
 def test_what_is_finite_stays_finite_in_a_blend(huge):
     cart = BrakedCart(wall=1e9, drive=1.0)
-    env = leased(Witness(cart), longest_s=0.4, blend_time=0.2, brake_blend_time=0.2)
+    env = leased(Witness(cart), max_lease_s=0.4, blend_time=0.2, brake_blend_time=0.2)
     env.reset()
     rng = np.random.default_rng(0)
     for t in range(30):
         if rng.random() < 0.7 or t < 4:
-            env.deliver(None)
+            env.set_observation_time(None)
         env.step(np.array([huge if t % 2 else -huge, huge]))
         assert np.isfinite(env.env.sent).all()
 
@@ -459,7 +459,7 @@ def test_keys_and_types_are_the_same_at_resets_and_steps():
     infos = [env.reset()[1]]
     for t in range(40):
         if t % 5 == 3:
-            env.deliver(None)
+            env.set_observation_time(None)
         infos.append(env.step(np.array([np.nan, 0.0]) if t % 7 == 6 else FULL)[4])
     for info in infos:
         assert {k: type(v) for k, v in info.items() if k.startswith("lease/")} == kinds
@@ -473,7 +473,7 @@ def test_it_says_what_was_executed():
     env.reset()
     for t in range(20):
         if t > 3:
-            env.deliver(None)
+            env.set_observation_time(None)
         info = env.step(FULL)[4]
         np.testing.assert_array_equal(info["executed_action"], cart.given[-1].astype(np.float64))
     assert info["executed_action"].tolist() == [0.0, 1.0]
@@ -493,11 +493,11 @@ class OneInfo(gym.Wrapper):
 
 def test_an_env_that_hands_out_one_info_dict_makes_nothing_stale():
     cart = BrakedCart(wall=1e6)
-    env = leased(OneInfo(cart), longest_s=0.3, brake_blend_time=0.2)
+    env = leased(OneInfo(cart), max_lease_s=0.3, brake_blend_time=0.2)
     env.reset()
     for t in range(12):
         if t % 6 > 1:
-            env.deliver(None)
+            env.set_observation_time(None)
         info = env.step(np.array([0.1 * t, 0.0]))[4]
         np.testing.assert_array_equal(info["executed_action"], cart.given[-1].astype(np.float64))
     assert (
@@ -509,7 +509,9 @@ def test_a_filter_inside_has_the_last_word_on_what_was_executed():
     env = gym.make("InvertedPendulum-v5")
     rail = [sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])]
     inside = sw.CBFActionFilter(env, [sw.Clearance(rail, bodies=["cart"], braking=8.0)])
-    env = sw.LeaseExpiry(inside, sw.Clearance(rail, bodies=["cart"], braking=8.0), acceleration=30.0)
+    env = sw.LeaseExpiry(
+        inside, sw.StoppingBudget(sw.Clearance(rail, bodies=["cart"], braking=8.0), acceleration=30.0)
+    )
     env.reset(seed=0)
     changed = 0
     for _ in range(40):
@@ -537,7 +539,7 @@ def test_reset_forgets_the_episode():
         seen = [env.reset(seed=0)]
         for t in range(20):
             if t % 4 == 1:
-                env.deliver(None)
+                env.set_observation_time(None)
             *rest, info = env.step(FULL)
             seen.append((*map(str, rest), str(info)))
         return str(seen)
@@ -547,7 +549,7 @@ def test_reset_forgets_the_episode():
     used.reset()
     for _ in range(7):
         used.step(-FULL)
-    used.deliver(None)
+    used.set_observation_time(None)
     assert trace(used) == first
     # An action before the episode's first observation is one of the new episode.
     used.reset()
@@ -556,29 +558,29 @@ def test_reset_forgets_the_episode():
 
 def test_hold_holds_what_was_executed_last_and_nothing_after_a_reset():
     cart = BrakedCart(wall=1e6)
-    env = leased(cart, longest_s=0.1, blend_time=0.0, fallback="hold", plant=None)
+    env = leased(cart, max_lease_s=0.1, blend_time=0.0, fallback="hold", plant=None)
     for wanted in ([0.3, 0.0], [-0.4, 0.0]):
         env.reset()
-        env.deliver(None)
+        env.set_observation_time(None)
         env.step(FULL)
         assert cart.given[-1].tolist() == [0.0, 0.0]
         env.step(np.array(wanted))
         for _ in range(2):
-            env.deliver(None)
+            env.set_observation_time(None)
             assert env.step(FULL)[4]["lease/braking"]
             np.testing.assert_allclose(cart.given[-1], wanted, atol=1e-7)
 
 
 @pytest.mark.parametrize("dt", [0.05, 0.1])
 def test_the_clock_is_the_envs(dt):
-    env = leased(BrakedCart(dt, wall=1e6), longest_s=0.5)
+    env = leased(BrakedCart(dt, wall=1e6), max_lease_s=0.5)
     env.reset()
     assert env.hold_s == dt and env.now_s == 0.0
     env.step(FULL)
     granted, lasted = env.now_s, 0
     assert granted == dt
     while True:
-        env.deliver(None)
+        env.set_observation_time(None)
         if env.step(FULL)[4]["lease/braking"]:
             break
         lasted += 1
@@ -598,7 +600,7 @@ def test_bounds_and_times_are_finite_and_not_negative(name, value):
         leased(BrakedCart(), **{name: value})
 
 
-@pytest.mark.parametrize("name", ["braking", "longest_s", "top_speed", "hold_s"])
+@pytest.mark.parametrize("name", ["braking", "max_lease_s", "top_speed", "hold_s"])
 @pytest.mark.parametrize("value", [*BAD[:-1], 0.0])
 def test_what_must_be_positive(name, value):
     with pytest.raises(ConfigurationError, match=name):
@@ -616,12 +618,16 @@ def test_missing_bounds():
 @pytest.mark.parametrize("clearance", [1.0, None, "wall", [1.0], sw.Clearance, sw.Plane([0.0], [1.0])])
 def test_a_clearance_that_is_neither(clearance):
     with pytest.raises(ConfigurationError, match="a constraint"):
-        sw.LeaseExpiry(BrakedCart(), clearance, braking=1.0, acceleration=1.0, fallback="zero")
+        sw.LeaseExpiry(
+            BrakedCart(), sw.StoppingBudget(clearance, braking=1.0, acceleration=1.0), fallback="zero"
+        )
 
 
 def test_an_unknown_kind_of_constraint_or_fallback():
     with pytest.raises(UnknownNameError, match="Clearance"):
-        sw.LeaseExpiry(BrakedCart(), {"kind": "Room"}, braking=1.0, acceleration=1.0, fallback="zero")
+        sw.LeaseExpiry(
+            BrakedCart(), sw.StoppingBudget({"kind": "Room"}, braking=1.0, acceleration=1.0), fallback="zero"
+        )
     with pytest.raises(UnknownNameError, match="brake, hold, zero"):
         leased(BrakedCart(), fallback="stop")
 
@@ -634,9 +640,9 @@ def test_brake_needs_a_machine_that_says_what_moves():
 
 
 def test_leases_that_could_never_be_used_are_refused():
-    with pytest.raises(ConfigurationError, match="longest_s"):
-        leased(BrakedCart(dt=0.1), longest_s=0.05)
-    leased(BrakedCart(dt=0.1), longest_s=0.1)
+    with pytest.raises(ConfigurationError, match="max_lease_s"):
+        leased(BrakedCart(dt=0.1), max_lease_s=0.05)
+    leased(BrakedCart(dt=0.1), max_lease_s=0.1)
 
 
 @pytest.mark.parametrize(
@@ -666,7 +672,9 @@ def test_reach_needs_to_know_where_the_machine_is():
 def test_a_function_that_returns_something_else(seen):
     env = leased(BrakedCart())
     env.close()
-    env = sw.LeaseExpiry(BrakedCart(), lambda env: seen, braking=1.0, acceleration=1.0, fallback="zero")
+    env = sw.LeaseExpiry(
+        BrakedCart(), sw.StoppingBudget(lambda env: seen, braking=1.0, acceleration=1.0), fallback="zero"
+    )
     env.reset()
     with pytest.raises(ConfigurationError, match="clearance"):
         env.step(FULL)
@@ -675,23 +683,23 @@ def test_a_function_that_returns_something_else(seen):
 def test_orders_that_are_refused():
     once = leased(BrakedCart())
     with pytest.raises(ConfigurationError, match="inside LeaseExpiry"):
-        sw.LeaseExpiry(once, read_cart, braking=1.0, acceleration=1.0, fallback="zero")
-    chunked = sw.ChunkHandover(BrakedCart(), 4, 2, jerk_limit=10.0, fallback="zero")
+        sw.LeaseExpiry(once, sw.StoppingBudget(read_cart, braking=1.0, acceleration=1.0), fallback="zero")
+    chunked = sw.ChunkHandover(BrakedCart(), 4, 2, rate_limit=10.0, fallback="zero")
     with pytest.raises(ConfigurationError, match=r"ChunkHandover\(LeaseExpiry"):
-        sw.LeaseExpiry(chunked, read_cart, braking=1.0, acceleration=1.0, fallback="zero")
+        sw.LeaseExpiry(chunked, sw.StoppingBudget(read_cart, braking=1.0, acceleration=1.0), fallback="zero")
     with pytest.raises(ConfigurationError, match=r"LeaseExpiry\(CBFActionFilter"):
         sw.CBFActionFilter(once, [sw.Barrier(lambda x: 1.0 - x[1])], plant=cart_plant(0.1))
     with pytest.raises(ConfigurationError, match="outside"):
         changed = gym.wrappers.RescaleAction(BrakedCart(), 0.0, 1.0)
-        sw.LeaseExpiry(changed, read_cart, braking=1.0, acceleration=1.0, fallback="zero")
+        sw.LeaseExpiry(changed, sw.StoppingBudget(read_cart, braking=1.0, acceleration=1.0), fallback="zero")
     with pytest.raises(ConfigurationError, match="outside"):
         changed = gym.wrappers.StickyAction(BrakedCart(), 0.5)
-        sw.LeaseExpiry(changed, read_cart, braking=1.0, acceleration=1.0, fallback="zero")
+        sw.LeaseExpiry(changed, sw.StoppingBudget(read_cart, braking=1.0, acceleration=1.0), fallback="zero")
 
 
 def test_an_env_that_takes_no_box_of_actions():
     with pytest.raises(ConfigurationError, match="Box"):
-        sw.LeaseExpiry(gym.make("CartPole-v1"), read_cart, braking=1.0, acceleration=1.0)
+        sw.LeaseExpiry(gym.make("CartPole-v1"), sw.StoppingBudget(read_cart, braking=1.0, acceleration=1.0))
 
 
 def test_actions_of_the_wrong_shape_do_not_step_the_env():
@@ -702,14 +710,14 @@ def test_actions_of_the_wrong_shape_do_not_step_the_env():
             env.step(action)
     for stamp in (math.nan, math.inf):
         with pytest.raises(ActionError, match="observed_s"):
-            env.deliver(stamp)
+            env.set_observation_time(stamp)
     assert cart.given == []
 
 
 def test_a_fallback_of_the_wrong_shape_is_named():
     env = leased(BrakedCart(), fallback=lambda plant: [0.0])
     env.reset()
-    env.deliver(None)
+    env.set_observation_time(None)
     with pytest.raises(ConfigurationError, match=r"shape \(2,\)"):
         env.step(FULL)
 
@@ -720,6 +728,6 @@ def test_a_fallback_that_is_not_finite_or_outside_the_box_is_made_so():
     env = leased(cart, fallback=lambda plant: next(answers))
     env.reset()
     for wanted in ([0.0, 0.0], [1.0, 0.0]):
-        env.deliver(None)
+        env.set_observation_time(None)
         env.step(FULL)
         assert cart.given[-1].tolist() == wanted

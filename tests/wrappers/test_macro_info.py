@@ -106,7 +106,7 @@ def test_an_env_that_reuses_its_info_dict():
         shared["cost"] = float(line.steps)
         return shared
 
-    env = sw.ChunkHandover(Line(infos=infos), 4, 4, jerk_limit=5.0, fallback="zero")
+    env = sw.ChunkHandover(Line(infos=infos), 4, 4, rate_limit=5.0, fallback="zero")
     env.reset(seed=0)
     assert env.step(np.zeros((4, 1), np.float32))[4]["cost"] == 1 + 2 + 3 + 4
     assert shared == {"cost": 4.0}, "what is the env's own is left alone"
@@ -135,7 +135,7 @@ def bang(env, steps, seed=0):
 def test_no_intervention_of_the_filter_is_lost_and_penalties_explain_the_reward():
     env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(6.0)])
     recorder = Recorder(sw.AdaptionPenalty(env, penalty=0.5, per_correction=0.25))
-    env = sw.ChunkHandover(recorder, 6, 5, jerk_limit=1000.0)
+    env = sw.ChunkHandover(recorder, 6, 5, rate_limit=1000.0)
     env.reset(seed=0)
     intervened = []
     for chunk in bang(env, 10):
@@ -155,15 +155,13 @@ def test_no_braking_of_the_lease_and_no_fault_inside_is_lost():
     line = Line(low=-1.0, high=1.0)
     lease = sw.LeaseExpiry(
         line,
-        lambda env: ([1.0], [0.0]),
-        braking=1.0,
-        acceleration=1.0,
-        longest_s=0.1,
+        sw.StoppingBudget(lambda env: ([1.0], [0.0]), braking=1.0, acceleration=1.0),
+        max_lease_s=0.1,
         blend_time=0.0,
         fallback="zero",
     )
     recorder = Recorder(DroppedRefreshes(lease, share=0.3))
-    env = sw.ChunkHandover(recorder, 8, 4, jerk_limit=50.0, fallback="zero")
+    env = sw.ChunkHandover(recorder, 8, 4, rate_limit=50.0, fallback="zero")
     env.reset(seed=0)
     for _ in range(10):
         info = env.step(np.full((8, 1), 0.5, np.float32))[4]
@@ -179,7 +177,7 @@ def test_penalties_for_not_seeing_explain_a_chunk_s_reward_and_no_expiry_inside_
     cars = [sw.Track("car*", acceleration_noise=[0.2, 0.0])]
     seen = sw.OcclusionPenalty(gym.make("OccludedCrossing-v0"), cars, "eye", tolerance=0.5, weight=0.1)
     recorder = Recorder(seen)
-    env = sw.ChunkHandover(recorder, 6, 5, jerk_limit=1e6, fallback="zero")
+    env = sw.ChunkHandover(recorder, 6, 5, rate_limit=1e6, fallback="zero")
     env.reset(seed=0)
     lost = 0
     for chunk in bang(env, 30):

@@ -106,7 +106,7 @@ def on_wheels(env):
 
 
 def lease(env):
-    return sw.LeaseExpiry(env, lambda env: (9.0, 0.0), braking=1.0, acceleration=1.0)
+    return sw.LeaseExpiry(env, sw.StoppingBudget(lambda env: (9.0, 0.0), braking=1.0, acceleration=1.0))
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """RoundTripWatch: the appendix's ceiling from measured clearance and speed, and the stop that needs no operator."""
 
+import json
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -7,24 +9,28 @@ from teleop_worlds import ceiling, place
 
 import safe_wrappers as sw
 from safe_wrappers.envs.teleop_contact import CLAMP_Y, TOOL_RADIUS
-from safe_wrappers.wrappers.teleop.round_trip import RoundTripWatch, ceiling_data, ceiling_from
+from safe_wrappers.wrappers.common.plain_data import plain_data, settings_from
+from safe_wrappers.wrappers.teleop.round_trip import RoundTripWatch
 
 ROOM = CLAMP_Y - TOOL_RADIUS
 HOLD = 0.001
 
 
 def watch(env, wanted):
-    plant = sw.MujocoPlant() if hasattr(wanted.clearance, "rows") else None
+    made = RoundTripWatch(env, wanted, HOLD)
+    plant = made.budget.plant_of(None)
     if plant is not None:
         plant.bind(env)
-    made = RoundTripWatch(env, wanted, plant, HOLD)
+    made.budget.bind(plant)
     made.reset()
     return made
 
 
 @pytest.fixture
 def env():
-    return gym.make("TeleopContact-v0")
+    made = gym.make("TeleopContact-v0")
+    made.reset(seed=0)
+    return made
 
 
 @pytest.mark.parametrize("speed", [0.05, 0.2, 1.0])
@@ -83,8 +89,8 @@ def approach(env):
 
 
 def test_a_function_of_the_env_measures_as_well(env):
-    limits = {"acceleration": 55.0, "braking": 24.0, "margin": 0.001, "longest_s": 9.0}
-    by_function = watch(env, sw.RoundTripCeiling(approach, **limits))
+    budget = sw.StoppingBudget(approach, acceleration=55.0, braking=24.0, margin=0.001)
+    by_function = watch(env, sw.RoundTripCeiling(budget, longest_s=9.0))
     by_constraint = watch(env, ceiling(longest_s=9.0))
     place(env, (0.0, 0.1), (0.0, 0.3))
     for looking in (by_function, by_constraint):
@@ -99,7 +105,9 @@ def test_a_function_of_the_env_measures_as_well(env):
 
 @pytest.mark.parametrize("answer", [(np.nan, 0.1), (0.1, np.inf), (-np.inf, 0.0)])
 def test_what_cannot_be_read_has_no_ceiling(env, answer):
-    looking = watch(env, sw.RoundTripCeiling(lambda env: answer, braking=1.0, acceleration=1.0))
+    looking = watch(
+        env, sw.RoundTripCeiling(sw.StoppingBudget(lambda env: answer, braking=1.0, acceleration=1.0))
+    )
     env.reset(seed=0)
     looking.look()
     assert not looking.readable and looking.ceiling_s == -1.0 and looking.clearance_m == 0.0
@@ -108,6 +116,7 @@ def test_what_cannot_be_read_has_no_ceiling(env, answer):
 
 def test_a_ceiling_is_plain_data():
     wanted = ceiling(video_s=0.05, release=0.5)
-    data = ceiling_data(wanted)
-    assert ceiling_data(ceiling_from(data)) == data and data["clearance"]["kind"] == "Clearance"
-    assert ceiling_from(None) is None and ceiling_data(None) is None
+    data = plain_data(wanted)
+    assert json.loads(json.dumps(data)) == data
+    assert plain_data(settings_from(sw.RoundTripCeiling, data, "ceiling")) == data
+    assert data["budget"]["clearance"]["kind"] == "Clearance"

@@ -37,7 +37,7 @@ MAKE = {
     "protect": sw.protect,
     "SlipLimiter": lambda env: sw.SlipLimiter(env, list(WHEELS)),
     "WholeBodyFilter": lambda env: sw.WholeBodyFilter(env, contacts="pyramid"),
-    "LeaseExpiry": lambda env: sw.LeaseExpiry(env, room, braking=9.0, acceleration=20.0),
+    "LeaseExpiry": lambda env: sw.LeaseExpiry(env, sw.StoppingBudget(room, braking=9.0, acceleration=20.0)),
     "TeleopChannel": lambda env: sw.TeleopChannel(env, 0.06, 0.04),
     "OcclusionPenalty": tracked,
     "ContactMonitor": sw.ContactMonitor,

@@ -71,20 +71,20 @@ def test_a_silent_operator_grows_old_and_a_stamp_from_the_future_is_not_believed
     for _ in range(10):
         env.step(np.zeros(2))
     for _ in range(5):
-        env.deliver(None)
+        env.set_observation_time(None)
         age = env.step(np.full(2, 0.9))[4]["teleop/round_trip_s"]
     assert age == pytest.approx(0.002 + 0.003)
     for _ in range(3):
-        env.deliver(env.now_s + 0.1)
+        env.set_observation_time(env.now_s + 0.1)
         info = env.step(np.full(2, 0.9))[4]
     assert info["teleop/round_trip_s"] > age and (info["executed_action"] == 0.0).all()
     # An older image, by a fault outside: the command is as old as that.
     for _ in range(6):
-        env.deliver(env.now_s - 0.004)
+        env.set_observation_time(env.now_s - 0.004)
         age = env.step(np.zeros(2))[4]["teleop/round_trip_s"]
     assert age == pytest.approx(0.006)
     with pytest.raises(ActionError, match="time in seconds"):
-        env.deliver(np.nan)
+        env.set_observation_time(np.nan)
 
 
 def test_faults_and_recording_belong_outside():
@@ -101,14 +101,14 @@ def test_faults_and_recording_belong_outside():
 def test_what_acts_while_nothing_arrives_is_declared(missing, expected):
     env = channel(missing=missing)
     place(env)
-    env.deliver(None)
+    env.set_observation_time(None)
     first = env.step(np.full(2, 0.5))[4]["executed_action"]
     if missing != "fallback":
         assert (first == 0.0).all()  # before the first command
     for _ in range(30):
         info = env.step(np.array([0.0, 0.5]))[4]
     assert info["executed_action"][1] == 0.5
-    env.deliver(None)
+    env.set_observation_time(None)
     executed = env.step(np.full(2, 0.9))[4]["executed_action"]
     if expected is None:
         assert executed[1] < 0.0  # it brakes
@@ -223,7 +223,7 @@ def refused(error=ConfigurationError, inside=None, env_id="TeleopContact-v0", ma
         ({"missing": "wait"}, "missing is one of"),
         ({"wave_rule": "wait"}, "wave_rule is one of"),
         ({"seed": 0.5}, "seed"),
-        ({"port": {"flow": [0]}}, "flow and effort"),
+        ({"port": {"flow": [0]}}, "needs effort"),
         ({"port": {"flow": [0, 1], "effort": [4]}}, "as many"),
         ({"port": {"flow": [0, 0], "effort": [4, 5]}}, "once"),
         ({"port": {"flow": [0, 2], "effort": [4, 5]}}, "only 2"),
@@ -232,11 +232,17 @@ def refused(error=ConfigurationError, inside=None, env_id="TeleopContact-v0", ma
         ({"port": 3}, "TeleopPort"),
         ({"ceiling": 0.2}, "RoundTripCeiling"),
         (
-            {"ceiling": {"clearance": sw.JointSpeedLimit(1.0), "acceleration": 1.0}},
+            {"ceiling": {"budget": {"clearance": sw.JointSpeedLimit(1.0), "closing_speed": 1.0}}},
             "how fast it is approached",
         ),
-        ({"ceiling": {"clearance": lambda env: (1.0, 0.0), "acceleration": 1.0}}, "braking is missing"),
-        ({"ceiling": {"clearance": lambda env: (1.0, 0.0), "braking": 1.0}}, "acceleration is missing"),
+        (
+            {"ceiling": {"budget": {"clearance": lambda env: (1.0, 0.0), "acceleration": 1.0}}},
+            "braking is missing",
+        ),
+        (
+            {"ceiling": {"budget": {"clearance": lambda env: (1.0, 0.0), "braking": 1.0}}},
+            "acceleration is missing",
+        ),
         ({"hold_s": 0.002}, "hold_s"),
     ],
 )
@@ -247,7 +253,7 @@ def test_what_cannot_be_is_refused_when_it_is_built(options, match):
 def test_unknown_names_are_refused_with_those_there_are():
     refused(UnknownNameError, uplink={"delay": 0.1}, match="delay_s")
     refused(UnknownNameError, port={"flows": [0], "effort": [1]}, match="feedthrough")
-    refused(UnknownNameError, ceiling={"clearence": None}, match="clearance")
+    refused(UnknownNameError, ceiling={"budget": {"clearence": None}}, match="clearance")
     refused(UnknownNameError, missing="fallback", fallback="stop", match="brake")
 
 
@@ -275,7 +281,7 @@ def test_wrong_orders_are_refused():
     refused(inside=sw.RecordInterventions, match="put it outside")
     refused(inside=lambda env: sw.TeleopChannel(env, **link), match="TeleopChannel inside")
     refused(inside=lambda env: sw.ChunkHandover(env, 4, 2), match="ChunkHandover inside")
-    lease = {"clearance": clamp(), "acceleration": 55.0}
+    lease = {"budget": {"clearance": clamp(), "acceleration": 55.0}}
     refused(inside=lambda env: sw.LeaseExpiry(env, **lease), match="LeaseExpiry inside")
     late = sw.TeleopChannel(gym.make("TeleopContact-v0"), **link)
     for outside in (

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.wrappers.teleop.link import LONGEST_DELAY_S, Line, link_data, link_from
+from safe_wrappers.wrappers.common.plain_data import plain_data
+from safe_wrappers.wrappers.teleop.link import LONGEST_DELAY_S, Line, link_from
 
 TICK = 0.001
 
@@ -30,7 +31,7 @@ def traffic(made, ticks=400):
         sent[sequence] = k
         if lost:
             came[sequence] = None
-        for packet in made.arrived(k * TICK):
+        for packet in made.receive(k * TICK):
             assert packet.load == sent[packet.sequence] and packet.sequence not in came
             came[packet.sequence] = k
             order.append(packet.sequence)
@@ -109,7 +110,7 @@ def test_lost_packets_do_not_shift_the_others_times():
 
 def test_links_are_plain_data():
     link = sw.Link(0.1, 0.02, 0.1, False, 2.0, 0.3)
-    data = json.loads(json.dumps(link_data(link)))
+    data = json.loads(json.dumps(plain_data(link)))
     assert link_from("uplink", data) == link == link_from("uplink", link)
     assert link_from("uplink", 0.2) == sw.Link(0.2)
     with pytest.raises(dataclasses.FrozenInstanceError):

@@ -113,9 +113,7 @@ def test_between_release_and_ceiling_authority_stays_where_it_is():
     # A clearance that a test can move, a machine that approaches at 1 m/s for ever.
     reading = {"clearance": 2.0}
     wanted = sw.RoundTripCeiling(
-        lambda env: (reading["clearance"], 1.0),
-        braking=1e6,
-        acceleration=0.0,
+        sw.StoppingBudget(lambda env: (reading["clearance"], 1.0), braking=1e6, acceleration=0.0),
         video_s=0.0,
         human_s=0.0,
         longest_s=9.0,
@@ -141,7 +139,7 @@ def test_an_operator_who_goes_silent_loses_authority_at_rest_too():
         env.step(np.zeros(2))
     flags = []
     for _ in range(300):
-        env.deliver(None)
+        env.set_observation_time(None)
         flags.append(env.step(np.zeros(2))[4]["teleop/revoked"])
     assert not any(flags[:198]) and all(flags[202:])
     assert not env.step(np.zeros(2))[4]["teleop/revoked"]
@@ -160,7 +158,7 @@ def test_next_to_the_clamp_the_operator_may_still_back_off():
 
 def test_a_state_that_is_no_number_revokes():
     answers = iter([(0.5, 0.0)] * 5 + [(np.nan, 0.0)] * 3 + [(0.5, 0.0)] * 50)
-    wanted = sw.RoundTripCeiling(lambda env: next(answers), braking=1.0, acceleration=0.0)
+    wanted = sw.RoundTripCeiling(sw.StoppingBudget(lambda env: next(answers), braking=1.0, acceleration=0.0))
     env = channel(ceiling=wanted)
     place(env)
     flags = [env.step(np.zeros(2))[4]["teleop/revoked"] for _ in range(20)]
@@ -170,7 +168,7 @@ def test_a_state_that_is_no_number_revokes():
 def test_an_arm_that_is_far_from_the_task_is_watched_as_well():
     # A cart on a rail, 40 ms a step, whose operator drives at its end.
     rail = sw.Clearance([sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])], bodies=["cart"], braking=8.0)
-    watched = sw.RoundTripCeiling(rail, acceleration=30.0, human_s=0.1, video_s=0.0)
+    watched = sw.RoundTripCeiling(sw.StoppingBudget(rail, acceleration=30.0), human_s=0.1, video_s=0.0)
     for wanted in (watched, None):
         env = sw.TeleopChannel(gym.make("InvertedPendulum-v5"), 0.04, 0.04, ceiling=wanted)
         env.reset(seed=0)

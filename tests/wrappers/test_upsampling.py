@@ -37,7 +37,7 @@ class Sent(gym.Wrapper):
 
 def test_a_slow_chunk_drives_a_fast_loop_late_and_within_the_limit():
     inner = Sent(gym.make("FlexJointReach-v0"))
-    env = sw.ChunkHandover(inner, 5, 10, inference_delay=3, steps_per_entry=5, jerk_limit=[30.0, 10.0])
+    env = sw.ChunkHandover(inner, 5, 10, inference_delay=3, steps_per_entry=5, rate_limit=[30.0, 10.0])
     assert env.action_space.shape == (5, 2)
     env.reset(seed=0)
     rng = np.random.default_rng(0)
@@ -96,5 +96,5 @@ def test_it_is_recorded():
 def test_bad_sizes(sizes, words):
     with pytest.raises(ConfigurationError, match=words):
         sw.ChunkHandover(
-            gym.make("Reacher-v5"), **{"chunk_size": 5, "execution_horizon": 3, "jerk_limit": 5.0, **sizes}
+            gym.make("Reacher-v5"), **{"chunk_size": 5, "execution_horizon": 3, "rate_limit": 5.0, **sizes}
         )

@@ -15,9 +15,11 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, StrictB
 from pydantic.dataclasses import dataclass
 from pydantic_core import ArgsKwargs
 
+from safe_wrappers.deprecation import deprecated_names
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.protect import protect_options
 from safe_wrappers.wrappers.faults import FAULTS
+from safe_wrappers.wrappers.lease.stopping_budget import StoppingBudget
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 
@@ -44,6 +46,17 @@ def _keys(names: Iterable[str]) -> AfterValidator:
 
 def _arguments(of: Callable[..., Any], *not_in_yaml: str) -> list[str]:
     return [name for name in inspect.signature(of).parameters if name not in ("env", *not_in_yaml)]
+
+
+def _lease(given: Any) -> Any:
+    """Arguments of a LeaseExpiry; those of its budget may stand beside it, as they once did."""
+    valid = (*_arguments(LeaseExpiry, "plant", "measured"), *deprecated_names(LeaseExpiry))
+    for name in given or {}:
+        check_name(name, valid)
+    budget = (given or {}).get("budget")
+    for name in budget if isinstance(budget, Mapping) else ():
+        check_name(name, [field.name for field in fields(StoppingBudget)], "budget")
+    return given
 
 
 def _check_faults(given: dict[str, Options]) -> dict[str, Options]:
@@ -85,7 +98,7 @@ class FilterConfig(Section):
     """`module:function`: called with the env, returns it filtered."""
     kwargs: Options = Field(default_factory=dict)
     """Further arguments of the factory."""
-    lease: Annotated[Options | None, _keys(_arguments(LeaseExpiry, "plant", "measured"))] = None
+    lease: Annotated[Options | None, AfterValidator(_lease)] = None
     """Arguments of a [LeaseExpiry](wrappers/lease-expiry.md) around the filter."""
 
     @model_validator(mode="before")

@@ -53,7 +53,7 @@ def learning_curve(experiment: ExperimentConfig, arm: ArmConfig, metric: str) ->
     end = max(run[-1, 0] for run in runs)
     for bins in range(_MOST_BINS, 0, -1):
         edges = np.linspace(0, end, bins + 1)
-        means = np.array([_bin_ratios(edges, *run.T, np.ones(len(run))) for run in runs])
+        means = np.array([_bin_ratios(edges, run[:, 0], run[:, 1], np.ones(len(run))) for run in runs])
         if np.isfinite(means).all():
             break
     low, high = _interval(means)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import importlib
 from collections.abc import Mapping
 from typing import Any
@@ -90,15 +89,18 @@ def _filtered(task: gym.Env[Any, Any], action_filter: FilterConfig) -> gym.Env[A
 
 def _leased(task: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> LeaseExpiry:
     """The lease around a filter; its clearance, if none is given, is what the filter keeps."""
-    if "clearance" in arguments:
+    budget = arguments.get("budget", {})
+    if "clearance" in arguments or "clearance" in budget:
         return LeaseExpiry(task, **arguments)
     constraints = getattr(task, "constraints", [])
     if len(constraints) != 1:
         raise ConfigurationError(
-            f"lease: the filter has {len(constraints)} constraints; say which room the "
-            "lease is to be made from with clearance: {kind: ..., ...}"
+            f"lease: the filter has {len(constraints)} constraints; say which one the lease is made from with "
+            "budget: {clearance: {kind: ..., ...}, ...}"
         )
-    return LeaseExpiry(task, copy.deepcopy(constraints[0]), **arguments)
+    # Without a budget its bounds stand beside it, as they once did; LeaseExpiry takes them and warns.
+    clearance = {"clearance": constraints[0], **budget} if budget else constraints[0]
+    return LeaseExpiry(task, **{**arguments, "budget": clearance})
 
 
 def _function(name: str, where: str) -> Any:

@@ -1,4 +1,4 @@
-"""StandIn: the fallback of a wrapper that filters nothing: who acts when nobody else may."""
+"""FallbackController: the fallback of wrappers that filter nothing."""
 
 from typing import Any
 
@@ -7,25 +7,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.fallback import Fallback, FallbackFunction
 from safe_wrappers.plants.default import default_plant
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
 
 
-class StandIn:
+class FallbackController:
     """A fallback with the plant that it needs, bound to an env.
 
     Args:
         env: What is wrapped.
         choice: "brake", "hold", "zero", or a function of the plant.
         plant: None reads the env's MuJoCo model where the choice needs one.
-        backups: Constraints that bring their own stopping control.
+        constraint: Bound here; "brake" is its backup control, if it has one.
+
+    Attributes:
+        plant: Bound to the env; None where none is needed.
+        constraint: On the plant.
 
     Raises:
-        ConfigurationError: The choice needs a plant that is not there.
+        ConfigurationError: "brake" on a plant that does not say what moves.
         UnsupportedEnvError: No MuJoCo env, and no plant given.
     """
 
@@ -34,20 +38,24 @@ class StandIn:
         env: gym.Env[Any, Any],
         choice: str | FallbackFunction,
         plant: Plant | None,
-        backups: list[Any] | None = None,
+        constraint: Constraint | None = None,
     ) -> None:
         space: Any = env.action_space
         self._low, self._high = np.asarray(space.low, np.float64), np.asarray(space.high, np.float64)
-        self._fallback = Fallback(choice, backups or [])
-        needed = callable(choice) or choice == "brake"
-        self.plant: Plant | None = plant if plant is not None else (default_plant(env) if needed else None)
-        if self.plant is not None:
-            self.plant.bind(env)
-            if choice == "brake" and not backups and not isinstance(self.plant, MujocoPlant):
+        if plant is None and (callable(choice) or choice == "brake"):
+            plant = default_plant(env)
+        if plant is not None:
+            plant.bind(env)
+        self.constraint = constraint.bind(plant) if constraint is not None and plant is not None else None
+        if plant is not None:
+            known = self.constraint is not None and self.constraint.has_backup
+            if choice == "brake" and not (known or plant.can_brake):
                 raise ConfigurationError(
-                    f'"brake" needs a MujocoPlant, which knows what moves; with a {type(self.plant).__name__} choose '
+                    f'"brake" needs a MujocoPlant, which knows what moves; with a {type(plant).__name__} choose '
                     '"hold", "zero" or a function of the plant'
                 )
+        self._fallback = Fallback(choice, [] if self.constraint is None else [self.constraint])
+        self.plant = plant
         self.reset()
 
     def reset(self) -> None:
@@ -55,17 +63,20 @@ class StandIn:
         self._last = np.clip(np.zeros_like(self._low), self._low, self._high)
         if self.plant is not None:
             self.plant.executed(None)
+        self._memory = None if self.constraint is None else self.constraint.start()
 
     def executed(self, control: Array) -> None:
-        """Remember what was sent, for "hold" and for the plant's delay."""
+        """Keep what was sent, for "hold" and for the plant's delay."""
         self._last = control
         if self.plant is not None:
             self.plant.executed(control)
 
     def command(self) -> Array:
-        """What the fallback does now: finite, inside the action box, shape (m,)."""
+        """The fallback's control at the present state: finite, inside the action box, shape (m,)."""
         readable = True
         if self.plant is not None:
             self.plant.observe()
             readable = bool(np.isfinite(self.plant.state).all())
+            if readable and self.constraint is not None:
+                self.constraint.observe(self._memory)
         return self._fallback(self.plant, self._last, self._low, self._high, None, readable)

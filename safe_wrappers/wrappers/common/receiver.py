@@ -1,36 +1,77 @@
-"""CommandReceiver: a wrapper that must know how old a command is, not only what it says."""
+"""CommandReceiver: a wrapper that is told how old a command is."""
 
-from abc import ABC, abstractmethod
+import math
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
 
+from safe_wrappers.deprecation import deprecated_method
+from safe_wrappers.errors import ActionError
 from safe_wrappers.plants.plant import wrappers_of
 
 
-class CommandReceiver(ABC):
-    """What `ChunkHandover` and `LeaseExpiry` have in common: they are told what the next action is made from.
+class CommandReceiver:
+    """Base of `ChunkHandover`, `LeaseExpiry`, `TeleopChannel` and the faults.
 
-    An action of Gymnasium says nothing of its age: a frozen policy that repeats itself looks alive. So whoever
-    carries actions (a fault, a queue, a network) may `deliver` a stamp before `step`; without a word the action is
-    made from the newest observation.
+    An action of Gymnasium carries no time stamp, so a policy that repeats itself cannot be told from one that works.
+    Whoever carries actions (a fault, a queue, a network) calls `set_observation_time` before `step`; without a call
+    the action was made from the newest observation.
     """
 
+    hold_s: float
+    """Control interval, s."""
+    _steps_done: int
+    _observed_s: float | None
+
     @property
-    @abstractmethod
     def now_s(self) -> float:
         """Seconds of the episode so far, on the clock of control steps."""
+        return self._steps_done * self.hold_s
 
-    @abstractmethod
-    def deliver(self, observed_s: float | None) -> None:
-        """Say what the next action is made from.
+    def set_observation_time(self, observed_s: float | None) -> None:
+        """Say which observation the next action is made from.
 
         Args:
-            observed_s: When its observation was made, s on the clock of `now_s`; None: nothing arrives, and the
-                next step's action is disregarded.
+            observed_s: When that observation was returned, s on the clock of `now_s`. None: no action arrives, the
+                next step's is disregarded.
+
+        Raises:
+            ActionError: Not a finite time.
         """
+        if observed_s is not None and not math.isfinite(observed_s):
+            raise ActionError(f"observed_s is a time in seconds, or None for nothing; got {observed_s!r}")
+        self._observed_s = observed_s
+
+    def admits(self, end: NDArray[np.float64], steps: int) -> bool:
+        """Whether a chunk may be executed; `ChunkHandover` asks before it takes one over.
+
+        Args:
+            end: The chunk's last command, shape (m,).
+            steps: Control steps from now to the end of that command.
+        """
+        return True
+
+    deliver = deprecated_method("deliver", "set_observation_time")
 
 
 def receiver_inside(env: gym.Env[Any, Any]) -> CommandReceiver | None:
-    """The outermost receiver of an env's wrappers."""
+    """The outermost receiver among an env's wrappers."""
     return next((inner for inner in wrappers_of(env) if isinstance(inner, CommandReceiver)), None)
+
+
+def action_array(action: Any, shape: tuple[int, ...]) -> NDArray[Any]:
+    """A copy of an action, in its own dtype: a policy may reuse its buffer.
+
+    Raises:
+        ActionError: No numbers, or another shape.
+    """
+    try:
+        given = np.array(action)
+        given.astype(np.float64)
+    except (TypeError, ValueError):
+        raise ActionError(f"expected an action of shape {shape}, got {action!r}") from None
+    if given.shape != shape:
+        raise ActionError(f"expected an action of shape {shape}, got shape {given.shape}")
+    return given

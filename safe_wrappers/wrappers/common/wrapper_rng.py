@@ -1,4 +1,4 @@
-"""OwnRandom: a wrapper's random numbers, which never touch the env's."""
+"""WrapperRng: random numbers of a wrapper, apart from the env's generator."""
 
 import zlib
 from typing import Any
@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 
 
-class OwnRandom:
+class WrapperRng:
     """A generator that starts anew with the seed of a reset, and goes on from one episode to the next without one.
 
     Drawing from the env's generator would change its next episodes, and ruin paired runs. The env's first seed is

@@ -1,12 +1,13 @@
 """What goes wrong between a policy and a robot, as seeded wrappers: to test with, and to train against."""
 
-from safe_wrappers.wrappers.faults.clock_skew import ClockSkew
-from safe_wrappers.wrappers.faults.dropped_refreshes import DroppedRefreshes
 from safe_wrappers.wrappers.faults.fault import Fault
-from safe_wrappers.wrappers.faults.frozen_policy import FrozenPolicy
-from safe_wrappers.wrappers.faults.jitter import Jitter
-from safe_wrappers.wrappers.faults.outages import Outages
-from safe_wrappers.wrappers.faults.repeated_commands import RepeatedCommands
+from safe_wrappers.wrappers.faults.on_off import FrozenPolicy, Outages
+from safe_wrappers.wrappers.faults.single_commands import (
+    ClockSkew,
+    DroppedRefreshes,
+    Jitter,
+    RepeatedCommands,
+)
 
 FAULTS: dict[str, type[Fault]] = {
     kind.__name__: kind

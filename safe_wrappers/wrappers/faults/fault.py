@@ -1,18 +1,19 @@
-"""Fault: something between the policy and the robot that loses, repeats or delays commands."""
+"""Fault: a seeded wrapper between policy and robot that loses, repeats or delays commands."""
 
 import copy
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from typing import Any, ClassVar, NamedTuple, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.plant import check_timing, wrappers_of
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.receiver import CommandReceiver, receiver_inside
-from safe_wrappers.wrappers.common.wrapper_rng import OwnRandom
+from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 
 
 class Carried(NamedTuple):
@@ -20,47 +21,48 @@ class Carried(NamedTuple):
 
     Attributes:
         action: What the policy gave.
-        observed_s: When the observation was made that it was made from, s.
+        observed_s: When the observation was returned that it was made from, s.
     """
 
     action: Any
     observed_s: float
 
 
-class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, CommandReceiver):
-    """Carries every action of the policy to the robot, and does it badly.
+class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, CommandReceiver, ABC):
+    """Base of the faults.
 
     Put it outermost: outside `LeaseExpiry` and `ChunkHandover`, which it tells how old a command is, or that none has
-    come. Without either of them inside nobody notices: the robot goes on with the last command, as a motor drive that
-    holds its setpoint does. Faults may be nested. A chunk is carried, lost or repeated as a whole.
+    come. Without either of them inside the robot goes on with the last command, as a motor drive that holds its
+    setpoint does. Faults may be nested. A chunk is carried, lost or repeated as a whole.
 
     Info, at every step: ``fault/active`` (bool).
 
     Args:
         env: With a Box action space; it must say how long a step lasts (`dt`) if nothing inside counts the time.
         hold_s: The time that a step lasts, s; None reads the env's.
+        arguments: Of the fault itself, for the spec.
     """
 
     layer: ClassVar = Layer.FAULT
 
-    _evidence: float | None
     _last: Any
 
-    def __init__(self, env: gym.Env[Any, Any], hold_s: float | None) -> None:
+    def __init__(self, env: gym.Env[Any, Any], hold_s: float | None = None, **arguments: Any) -> None:
+        gym.utils.RecordConstructorArgs.__init__(self, hold_s=hold_s, **arguments)
         gym.Wrapper.__init__(self, env)
         if not isinstance(env.action_space, gym.spaces.Box):
             raise ConfigurationError(f"a fault carries actions of a Box action space, got {env.action_space}")
         self._inside = receiver_inside(env)
-        self._hold_s = 0.0 if self._inside is not None else check_timing(env, hold_s)
+        self.hold_s = 0.0 if self._inside is not None else check_timing(env, hold_s)
         if self._inside is not None and hold_s is not None:
             raise ConfigurationError(
                 f"{type(self._inside).__name__} inside counts the time: leave hold_s out"
             )
-        # Two of a kind, one around the other, must not strike together.
+        # Nested faults of one kind must not strike together.
         same = _count(env, type(self))
         self._nested = _count(env, Fault) > 0
-        self.random = OwnRandom(type(self).__name__ + (f" {same + 1}" if same else ""))
-        self._forget()
+        self.random = WrapperRng(type(self).__name__ + (f" {same + 1}" if same else ""))
+        self._start()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -68,35 +70,34 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
         """Reset the env, and what is on its way; the random numbers start anew with a seed."""
         observation, info = self.env.reset(seed=seed, options=options)
         self.random.reset(self.env, seed)
-        self._forget()
+        self._start()
         self.begin()
         info[keys.FAULT_ACTIVE] = False
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Carry the action, or not, and step the env with what arrives."""
-        now_s = self.now_s
-        given = None if self._evidence is None else Carried(copy.copy(action), self._evidence)
-        arrived = self.carry(given, now_s)
+        given = None if self._observed_s is None else Carried(copy.copy(action), self._observed_s)
+        arrived = self.carry(given, self.now_s)
         active = arrived is not given or arrived is None
         if arrived is not None:
             self._last = arrived.action
         if self._inside is not None:
-            self._inside.deliver(None if arrived is None else arrived.observed_s)
+            self._inside.set_observation_time(None if arrived is None else arrived.observed_s)
         observation, reward, terminated, truncated, info = self.env.step(copy.copy(self._last))
         self._steps_done += 1
-        self._evidence = self.now_s
+        self._observed_s = self.now_s
         info[keys.FAULT_ACTIVE] = bool(active or (self._nested and info[keys.FAULT_ACTIVE]))
         return observation, reward, terminated, truncated, info
 
     @property
     def now_s(self) -> float:
         """Seconds of the episode so far."""
-        return self._inside.now_s if self._inside is not None else self._steps_done * self._hold_s
+        return super().now_s if self._inside is None else self._inside.now_s
 
-    def deliver(self, observed_s: float | None) -> None:
-        """What a fault outside of this one says of the next action."""
-        self._evidence = observed_s
+    def admits(self, end: NDArray[np.float64], steps: int) -> bool:
+        """What the receiver inside says."""
+        return self._inside is None or self._inside.admits(end, steps)
 
     def begin(self) -> None:
         """A new episode; `random` is ready."""
@@ -110,9 +111,9 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
             now_s: Seconds of the episode so far.
         """
 
-    def _forget(self) -> None:
+    def _start(self) -> None:
         self._steps_done = 0
-        self._evidence = 0.0
+        self._observed_s = 0.0
         space: Any = self.env.action_space
         self._last = np.clip(np.zeros(space.shape), space.low, space.high).astype(space.dtype)
 

@@ -1,4 +1,4 @@
-"""ChunkQueue: the commands that a robot executes while chunks arrive, late, broken or not at all."""
+"""ChunkQueue: which command a robot executes while chunks arrive late, broken or not at all."""
 
 import math
 from collections.abc import Callable
@@ -22,7 +22,7 @@ _WHOLE: Final = 1e-6
 
 
 class Command(NamedTuple):
-    """What to send now.
+    """What to send in a control step.
 
     Attributes:
         control: Shape (m,), in the env's dtype and inside its box.
@@ -32,7 +32,6 @@ class Command(NamedTuple):
         took_over: A chunk took over with it.
         seam: There is a seam before it: another chunk, another source, or the fallback began.
         blend_steps: Control steps of the blend that begins with this command; 0 if none does.
-        refused: A chunk was there and could not take over: it came too late, or was not admitted.
     """
 
     control: NDArray[Any]
@@ -42,17 +41,24 @@ class Command(NamedTuple):
     took_over: bool
     seam: bool
     blend_steps: int
-    refused: bool
 
 
-class _Chunk(NamedTuple):
+class Chunk(NamedTuple):
+    """A chunk on its way, or there.
+
+    Attributes:
+        commands: Shape (h, m), the first one for the control step of the observation.
+        observed: Control step of the observation.
+        due: Control step at which it is there.
+    """
+
     commands: Array
     observed: int
     due: int
 
 
 class _Fade(NamedTuple):
-    """A mode switch under way: out of a latched command, into whatever comes now."""
+    """A mode switch under way: from a latched command into the commands of the new source."""
 
     latched: Array
     steps: int
@@ -115,8 +121,8 @@ class ChunkQueue:
         self._observed = -1
         self._sent = self._none
         self._plan, self._limited = self._none, np.zeros(0, dtype=bool)
-        self._coming: list[_Chunk] = []
-        self._averaged: list[_Chunk] = []
+        self._coming: list[Chunk] = []
+        self._averaged: list[Chunk] = []
         self._in_force = self._source
         self._acting: str | None = None
         self._fade: _Fade | None = None
@@ -136,25 +142,32 @@ class ChunkQueue:
         if not newest < observed <= self.now or not np.isfinite(commands).all():
             return False
         boxed = np.clip(commands, self._low, self._high)
-        self._coming.append(_Chunk(boxed, observed, due))
+        self._coming.append(Chunk(boxed, observed, due))
         return True
 
     def switch(self, source: str) -> None:
         """Chunks that take over from now on are somebody else's; the change is blended, from the last command."""
         self._source = source
 
-    def next(
-        self, fallback: Callable[[], Array], admit: Callable[[Array, int], bool] | None = None
-    ) -> Command:
+    def arrived(self) -> list[Chunk]:
+        """The chunks that are there and wait for admission, the newest observation first."""
+        return [c for c in reversed(self._coming) if c.due <= self.now]
+
+    def left(self, chunk: Chunk) -> Array:
+        """The commands of a chunk from now on, shape (k, m); none if it comes too late."""
+        return chunk.commands[self.now - chunk.observed :]
+
+    def next(self, admitted: list[Chunk], fallback: Callable[[], Array]) -> Command:
         """The command of this control step.
 
         Args:
+            admitted: Of the chunks that have `arrived` those that may take over, the newest first; the others are
+                refused, or overtaken.
             fallback: Asked when nothing is planned; returns a finite control of shape (m,).
-            admit: Asked before a chunk takes over: its last command, shape (m,), and the control steps from now to
-                the end of that command; False refuses the chunk.
         """
         newest = self._observed
-        seam, blend_steps, refused = self._take_over(admit)
+        self._coming = [c for c in self._coming if c.due > self.now]
+        seam, blend_steps = self._take_over(admitted) if admitted else (False, 0)
         control, limited = self._planned()
         starved = control is None
         if control is None:
@@ -170,42 +183,21 @@ class ChunkQueue:
         sent, held = self._sendable(self._faded(control))
         self._sent = np.concatenate([self._sent[-DIFFERENCES + 1 :], sent[None].astype(np.float64)])
         self.now += 1
-        return Command(
-            sent,
-            self._observed,
-            starved,
-            limited or held,
-            self._observed > newest,
-            seam,
-            blend_steps,
-            refused,
-        )
+        took_over = self._observed > newest
+        return Command(sent, self._observed, starved, limited or held, took_over, seam, blend_steps)
 
-    def _take_over(self, admit: Callable[[Array, int], bool] | None) -> tuple[bool, int, bool]:
-        """Let the newest chunk that is there and may take over: is it a seam, its blend's steps, is one refused."""
-        there = [c for c in self._coming if c.due <= self.now]
-        self._coming = [c for c in self._coming if c.due > self.now]
-        refused = False
-        admitted: list[_Chunk] = []
-        for chunk in reversed(there):  # they came in the order of their observations
-            if not self._is_admitted(chunk, admit):
-                refused = True
-                continue
-            admitted.insert(0, chunk)
-            if self._blend != ENSEMBLE:
-                break
-        if not admitted:
-            return False, 0, refused
-        newest = admitted[-1]
+    def _take_over(self, admitted: list[Chunk]) -> tuple[bool, int]:
+        """Let the newest of these take over, or all in an ensemble: whether it is a seam, and its blend's steps."""
+        newest = admitted[0]
         self._coming = [c for c in self._coming if c.observed > newest.observed]
         self._observed, self._in_force = newest.observed, self._source
         if self._blend == ENSEMBLE:
-            self._averaged += admitted
-            return len(self._sent) > 0, 0, refused
-        fresh = newest.commands[self.now - newest.observed :]
+            self._averaged += reversed(admitted)
+            return len(self._sent) > 0, 0
+        fresh = self.left(newest)
         if self._blend == REPLACE or len(newest.commands) == 1:
             self._plan, self._limited = fresh, np.zeros(len(fresh), dtype=bool)
-            return self._blend == REPLACE and len(self._sent) > 0, 0, refused
+            return self._blend == REPLACE and len(self._sent) > 0, 0
         joined = join(
             self._sent,
             self._plan,
@@ -219,11 +211,7 @@ class ChunkQueue:
         )
         self._plan, self._limited = joined.plan, joined.limited
         self._fade = None
-        return len(self._sent) > 0, joined.steps, refused
-
-    def _is_admitted(self, chunk: _Chunk, admit: Callable[[Array, int], bool] | None) -> bool:
-        fresh = chunk.commands[self.now - chunk.observed :]
-        return len(fresh) > 0 and (admit is None or admit(fresh[-1], len(fresh)))
+        return len(self._sent) > 0, joined.steps
 
     def _planned(self) -> tuple[Array | None, bool]:
         if self._blend == ENSEMBLE:

@@ -82,7 +82,7 @@ def blend_bounds(
     hold_s: float,
     blend: str,
     blend_time: float | None,
-    jerk_limit: float | Sequence[float] | None,
+    rate_limit: float | Sequence[float] | None,
 ) -> tuple[int, Array]:
     """The fewest steps of a blend, and the rate limit of every component, shape (m,), infinite where there is none.
 
@@ -91,13 +91,13 @@ def blend_bounds(
             blend over.
     """
     if blend in BASELINES:
-        if blend_time is not None or jerk_limit is not None:
+        if blend_time is not None or rate_limit is not None:
             raise ConfigurationError(
-                f"blend={blend!r} is a baseline that bounds nothing: leave blend_time and jerk_limit out, or choose "
+                f"blend={blend!r} is a baseline that bounds nothing: leave blend_time and rate_limit out, or choose "
                 f"{', '.join(BLENDS)}"
             )
         return 0, np.full(space.shape, np.inf)
-    fewest, rate_limit = 0, np.full(space.shape, np.inf)
+    fewest, limits = 0, np.full(space.shape, np.inf)
     if blend_time is not None:
         fewest = max(math.ceil(positive("blend_time", blend_time, "s") / hold_s - _WHOLE) - 1, 1)
         available = sizes.chunk - sizes.delay[1]
@@ -106,22 +106,22 @@ def blend_bounds(
                 f"blend_time = {blend_time} s is longer than what a chunk has left when it takes over, {available} "
                 f"control steps of {hold_s} s: choose a longer chunk_size or a shorter blend_time"
             )
-    if jerk_limit is not None:
-        rate_limit = _rate_limit(jerk_limit, rate_limit.size)
+    if rate_limit is not None:
+        limits = _rate_limits(rate_limit, limits.size)
         resolution = _rounding(space)
-        if (rate_limit * hold_s <= resolution).any():
+        if (limits * hold_s <= resolution).any():
             raise ConfigurationError(
-                f"jerk_limit = {jerk_limit} per second is not above what {space.dtype} resolves in steps of {hold_s} "
+                f"rate_limit = {rate_limit} per second is not above what {space.dtype} resolves in steps of {hold_s} "
                 f"s, {resolution / hold_s:.3g}: choose a larger one"
             )
-    if blend_time is None and jerk_limit is None:
+    if blend_time is None and rate_limit is None:
         fewest = sizes.leftover
         if fewest == 0:
             raise ConfigurationError(
                 f"chunk_size = {sizes.chunk}, execution_horizon = {sizes.horizon} and inference_delay = "
-                f"{sizes.delay[1]} leave no left-over to blend with: pass jerk_limit or blend_time"
+                f"{sizes.delay[1]} leave no left-over to blend with: pass rate_limit or blend_time"
             )
-    return fewest, rate_limit
+    return fewest, limits
 
 
 def _size(entries: int, apart: int, letter: str) -> str:
@@ -145,15 +145,15 @@ def _delay(value: Any) -> tuple[int, int]:
     return counts[0], counts[1]
 
 
-def _rate_limit(jerk_limit: Any, controls: int) -> Array:
+def _rate_limits(rate_limit: Any, controls: int) -> Array:
     unit = "action units per second"
-    if not isinstance(jerk_limit, list | tuple | np.ndarray):
-        return np.full(controls, positive("jerk_limit", jerk_limit, unit))
-    if len(jerk_limit) != controls:
+    if not isinstance(rate_limit, list | tuple | np.ndarray):
+        return np.full(controls, positive("rate_limit", rate_limit, unit))
+    if len(rate_limit) != controls:
         raise ConfigurationError(
-            f"jerk_limit is one number, or one for each of the {controls} action components; got {jerk_limit!r}"
+            f"rate_limit is one number, or one for each of the {controls} action components; got {rate_limit!r}"
         )
-    return np.array([positive("jerk_limit", each, unit) for each in jerk_limit])
+    return np.array([positive("rate_limit", each, unit) for each in rate_limit])
 
 
 def _rounding(space: gym.spaces.Box) -> float:

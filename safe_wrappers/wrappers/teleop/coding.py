@@ -1,22 +1,22 @@
-"""How commands and forces are written into packets: as they are, paid for by energy, or as waves."""
+"""How commands and forces are written into packets: as they are, or with their energy paid for."""
 
-import heapq
 import math
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.control.teleop.passivity import effort_and_outgoing, to_waves
+from safe_wrappers.control.numerics.running_sum import RunningSum
+from safe_wrappers.control.teleop.passivity import ChannelLedger
 from safe_wrappers.control.teleop.passivity_control import EnergyReference
 from safe_wrappers.control.teleop.port_checks import port_energy
-from safe_wrappers.control.teleop.wave_line import Rule, WaveLine
 from safe_wrappers.wrappers.teleop.link import Packet
 from safe_wrappers.wrappers.teleop.port import PortReading
 
 Array = NDArray[np.float64]
 
 Coding = Literal["plain", "wave"]
+Passivity = Literal["none", "controller"]
 
 
 class Up(NamedTuple):
@@ -77,12 +77,17 @@ class PlainCoding:
         tick_s: s.
     """
 
+    storage_j = 0.0
+    """What each end may give out unpaid, J."""
+
     def __init__(self, reading: PortReading | None, tick_s: float) -> None:
         self._reading, self._tick_s = reading, tick_s
 
     def reset(self, observation: Any) -> None:
         """A new episode, whose first observation the operator knows."""
         self._seen_s = 0.0
+        self.ledger = ChannelLedger(2.0 * self.storage_j)
+        self.energy_in, self.energy_out = RunningSum(), RunningSum()
         if self._reading is not None:
             self._reading.reset(observation)
             self._still = np.zeros(self._reading.effort.size)
@@ -129,6 +134,21 @@ class PlainCoding:
         """
         return observation
 
+    def account(self, moved: Array | None, shown: Any, given: Given) -> None:
+        """Add up the energies of a tick at the two ports.
+
+        Args:
+            moved: The operator's flow, shape (m,); None: he is not there.
+            shown: The observation that he gets.
+            given: Effort and flow at the machine.
+        """
+        assert self._reading is not None
+        felt = self._reading.of(shown)
+        moved = np.zeros_like(felt) if moved is None else moved
+        self.ledger.add(felt, moved, *given, self._tick_s, self.stored_j)
+        self.energy_in.add(port_energy(felt, moved, self._tick_s))
+        self.energy_out.add(port_energy(*given, self._tick_s))
+
     @property
     def stored_j(self) -> float:
         """Energy on its way, J."""
@@ -148,13 +168,13 @@ class PaidCoding(PlainCoding):
 
     def __init__(self, reading: PortReading, tick_s: float, limit: float | None, storage_j: float) -> None:
         super().__init__(reading, tick_s)
-        self._port, self._limit, self._storage_j = reading, limit, storage_j
+        self._port, self._limit, self.storage_j = reading, limit, storage_j
 
     def reset(self, observation: Any) -> None:
         """As `PlainCoding.reset`."""
         super().reset(observation)
-        near = EnergyReference("impedance", self._storage_j, self._limit)
-        self._ends = near, EnergyReference("admittance", self._storage_j)
+        near = EnergyReference("impedance", self.storage_j, self._limit)
+        self._ends = near, EnergyReference("admittance", self.storage_j)
         self._late = self._felt = self._port.effort
 
     def near(self, flow: Array | None) -> Any:
@@ -199,112 +219,3 @@ class PaidCoding(PlainCoding):
         self._ends[0].receive(*(packet.load.extra for packet in arrived))
         self._late = self._port.of(observation)
         return self._port.replaced(observation, self._felt)
-
-
-class WaveCoding(PlainCoding):
-    """Flow and effort as waves, each of which pays for what it does at the other end.
-
-    Args:
-        reading: See `PlainCoding`; needed.
-        tick_s: s.
-        impedance: N s/m.
-        rule: Of both `WaveLine`s.
-    """
-
-    def __init__(self, reading: PortReading, tick_s: float, impedance: float, rule: Rule) -> None:
-        super().__init__(reading, tick_s)
-        self._port, self._impedance, self._rule = reading, impedance, rule
-
-    def reset(self, observation: Any) -> None:
-        """As `PlainCoding.reset`."""
-        super().reset(observation)
-        m = self._still.size
-        self._up, self._down = (WaveLine(self._tick_s, self._rule, m) for _ in range(2))
-        self._back: list[tuple[int, Array]] = []
-        self._waiting: list[tuple[int, float]] = []
-        self._incoming = self._felt = self._still
-        self._owed_j = 0.0
-
-    def near(self, flow: Array | None) -> Any:
-        """As `PlainCoding.near`; a wave that comes back while the operator is away ends there."""
-        incoming = self._down.deliver(self._back)
-        self._back = []
-        if flow is None:
-            self._felt = self._still
-            return None
-        self._felt, outgoing = effort_and_outgoing(flow, incoming, self._impedance)
-        return outgoing
-
-    def sent_up(self, sequence: int, extra: Any, lost: bool) -> None:
-        """As `PlainCoding.sent_up`."""
-        self._up.send(extra, sequence)
-        if lost:
-            self._up.lose(sequence)
-
-    def far(self, arrived: list[Packet], newest: Up | None, flow: Array | None) -> Order:
-        """As `PlainCoding.far`; it asks the waves alone."""
-        wave = self._up.deliver([(packet.sequence, packet.load.extra) for packet in arrived])
-        self._note_age(arrived, newest)
-        # What the machine took beyond what had arrived is paid first.
-        energy = self._energy(wave)
-        paid = min(self._owed_j, energy)
-        if paid > 0.0:
-            self._owed_j -= paid
-            wave = wave * math.sqrt((energy - paid) / energy)
-        self._incoming = wave
-        b = self._impedance
-        # The effort answers the flow at once where there is a damper, so both are solved for together.
-        decoded = (math.sqrt(2.0 * b) * wave - self._port.base) / (b + self._port.feedthrough)
-        return Order(decoded, self._seen_s)
-
-    def settle(self, flow: Array, observation: Any, obeyed: bool) -> tuple[Any, Given | None]:
-        """As `PlainCoding.settle`; a port that is still, because the brake acts, swallows the wave.
-
-        Thrown back, as by a locked tool, waves of a hand that does not give way would pile up without bound in the
-        channel, and come out when authority is given back.
-        """
-        _, given = super().settle(flow, observation, obeyed)
-        assert given is not None
-        if not obeyed:
-            return self._still, given
-        acted, moved = given
-        _, outgoing = to_waves(acted, moved, self._impedance)
-        # Where the machine saturates, or a filter inside has changed the flow, the two waves do not match.
-        left = self._energy(self._incoming) - port_energy(acted, moved, self._tick_s)
-        energy = self._energy(outgoing)
-        if left < 0.0:
-            self._owed_j -= left
-            outgoing = np.zeros_like(outgoing)
-        elif energy > left:
-            outgoing = outgoing * (math.sqrt(left / energy) * (1.0 - 1e-15))
-        return outgoing, given
-
-    def sent_down(self, sequence: int, extra: Any, lost: bool) -> None:
-        """As `PlainCoding.sent_down`."""
-        self._down.send(extra, sequence)
-        if lost:
-            self._down.lose(sequence)
-
-    def shown(self, arrived: list[Packet], observation: Any) -> Any:
-        """As `PlainCoding.shown`: what the operator felt stands where the machine's effort was."""
-        self._back += [(packet.sequence, packet.load.extra) for packet in arrived]
-        return self._port.replaced(observation, self._felt)
-
-    @property
-    def stored_j(self) -> float:
-        """Energy on its way, and of waves that have arrived and were not put out yet, J."""
-        return sum(line.in_flight_j + line.reserve_j for line in (self._up, self._down))
-
-    def _energy(self, wave: Array) -> float:
-        return 0.5 * port_energy(wave, wave, self._tick_s)
-
-    def _note_age(self, arrived: list[Packet], newest: Up | None) -> None:
-        """How old the wave is that is put out now; the last one's age goes on while there is none."""
-        if self._rule != "queue":
-            if newest is not None:
-                self._seen_s = newest.seen_s
-            return
-        for packet in arrived:
-            heapq.heappush(self._waiting, (packet.sequence, packet.load.seen_s))
-        if self._waiting:
-            self._seen_s = heapq.heappop(self._waiting)[1]

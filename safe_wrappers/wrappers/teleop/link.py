@@ -1,18 +1,18 @@
-"""Link: one direction of a network, with a delay, jitter, loss and outages; and what is on its way in it."""
+"""Link: one direction of a network, with delay, jitter, loss and outages; and the packets in it."""
 
 import heapq
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import gymnasium as gym
 
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import non_negative, positive
-from safe_wrappers.wrappers.common.wrapper_rng import OwnRandom
+from safe_wrappers.wrappers.common.plain_data import check_fields, settings_from
+from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
+from safe_wrappers.wrappers.faults.on_off import OnOffProcess
 from safe_wrappers.wrappers.faults.parameters import probability
-from safe_wrappers.wrappers.faults.spells import Spells
 
 LONGEST_DELAY_S: Final = 10.0
 """What a line remembers, s."""
@@ -46,8 +46,7 @@ class Link:
     outage_length_s: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("delay_s", "jitter_s"):
-            object.__setattr__(self, name, non_negative(name, getattr(self, name), "s"))
+        check_fields(self, non_negative, ["delay_s", "jitter_s"], "s")
         if self.longest_s > LONGEST_DELAY_S:
             raise ConfigurationError(
                 f"a line remembers packets for {LONGEST_DELAY_S:g} s; got delays of up to {self.longest_s:g} s"
@@ -60,9 +59,7 @@ class Link:
                 "an outage needs both outage_between_s and outage_length_s, in s; got "
                 f"{self.outage_between_s!r} and {self.outage_length_s!r}"
             )
-        for name in ("outage_between_s", "outage_length_s"):
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, positive(name, getattr(self, name), "s"))
+        check_fields(self, positive, ["outage_between_s", "outage_length_s"], "s")
 
     @property
     def longest_s(self) -> float:
@@ -77,26 +74,13 @@ def link_from(name: str, given: Any) -> Link:
         ConfigurationError: None of these.
         UnknownNameError: A key that no link has.
     """
-    if isinstance(given, Link):
-        return given
-    if isinstance(given, Mapping):
-        known = [field.name for field in fields(Link)]
-        for key in given:
-            if key not in known:
-                raise UnknownNameError(f"{name} has no {key!r}; it has {', '.join(known)}")
-        return Link(**given)
     if isinstance(given, int | float) and not isinstance(given, bool):
         return Link(delay_s=given)
-    raise ConfigurationError(f"{name} is a Link, the dict of one, or a delay in s; got {given!r}")
-
-
-def link_data(link: Link) -> dict[str, Any]:
-    """The plain dict of a link."""
-    return asdict(link)
+    return settings_from(Link, given, name, ", or a delay in s")
 
 
 class Packet(NamedTuple):
-    """Something on its way; packets compare by their numbers.
+    """A packet; packets compare by their numbers.
 
     Attributes:
         sequence: Counts the packets of a line, from 0.
@@ -118,18 +102,26 @@ class Line:
 
     def __init__(self, link: Link, stream: str, slack_s: float) -> None:
         self._link, self._slack_s = link, slack_s
-        self._random = OwnRandom(stream)
+        self._random = WrapperRng(stream)
         outage = link.outage_between_s, link.outage_length_s
-        self._outages = None if outage[0] is None or outage[1] is None else Spells(outage[0], outage[1])
+        self._outages = None if outage[0] is None or outage[1] is None else OnOffProcess(outage[0], outage[1])
 
-    def reset(self, env: gym.Env[Any, Any], seed: int | None) -> None:
-        """Nothing is on its way; call it after the env's own reset."""
+    newest: Packet
+    """Of all that have arrived the one that was sent last."""
+    fresh: bool
+    """Whether it arrived at the last `receive`."""
+    late: int
+    """How many packets of the last `receive` were overtaken."""
+
+    def reset(self, env: gym.Env[Any, Any], seed: int | None, first: Any = None) -> None:
+        """Nothing is on its way, and `first` has arrived; call it after the env's own reset."""
         self._random.reset(env, seed)
         if self._outages is not None:
             self._outages.begin(self._random)
         self._coming: list[tuple[float, int, Any]] = []
         self._sent = 0
         self._latest_s = -math.inf
+        self.newest, self.fresh, self.late = Packet(-1, first), False, 0
 
     def send(self, load: Any, now_s: float) -> tuple[int, bool]:
         """Send something; its number, and whether it gets lost."""
@@ -139,7 +131,7 @@ class Line:
         jitter_s = self._random.draw.uniform(0.0, link.jitter_s) if link.jitter_s else 0.0
         lost = bool(link.loss and self._random.draw.random() < link.loss)
         if self._outages is not None:
-            lost |= self._outages.bad(now_s, self._random)
+            lost |= self._outages.is_on(now_s, self._random)
         if lost:
             return sequence, True
         due_s = now_s + link.delay_s + jitter_s
@@ -148,10 +140,14 @@ class Line:
         heapq.heappush(self._coming, (due_s, sequence, load))
         return sequence, False
 
-    def arrived(self, now_s: float) -> list[Packet]:
-        """What has arrived since it was last asked, in the order of arrival."""
-        found = []
+    def receive(self, now_s: float) -> list[Packet]:
+        """What has arrived since the last call, in the order of arrival."""
+        found: list[Packet] = []
         while self._coming and self._coming[0][0] <= now_s + self._slack_s:
             _, sequence, load = heapq.heappop(self._coming)
             found.append(Packet(sequence, load))
+        before = self.newest.sequence
+        self.newest = max([self.newest, *found], key=lambda packet: packet.sequence)
+        self.fresh = self.newest.sequence > before
+        self.late = len(found) - self.fresh
         return found

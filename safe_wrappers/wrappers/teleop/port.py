@@ -1,16 +1,16 @@
 """TeleopPort: where a channel meets the machine: which entries of action and observation are flow and effort."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import non_negative
-from safe_wrappers.plants.plant import wrappers_of
+from safe_wrappers.wrappers.common.plain_data import check_fields, settings_from
 
 Array = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ class TeleopPort:
             raise ConfigurationError(
                 f"a port has as many efforts as flows; got flow {list(self.flow)} and effort {list(self.effort)}"
             )
-        object.__setattr__(self, "feedthrough", non_negative("feedthrough", self.feedthrough, "N s/m"))
+        check_fields(self, non_negative, ["feedthrough"], "N s/m")
 
 
 def port_from(given: Any, env: gym.Env[Any, Any]) -> TeleopPort | None:
@@ -59,33 +59,18 @@ def port_from(given: Any, env: gym.Env[Any, Any]) -> TeleopPort | None:
         ConfigurationError: Neither of these, or indices that the spaces do not have.
         UnknownNameError: A key that no port has.
     """
-    if given is None:
-        if not env.has_wrapper_attr("port_flow"):
-            return None
+    if given is not None:
+        port = settings_from(TeleopPort, given, "port")
+    elif env.has_wrapper_attr("port_flow"):
         port = TeleopPort(
             list(env.get_wrapper_attr("port_flow")),
             list(env.get_wrapper_attr("port_effort_observed")),
             env.get_wrapper_attr("port_feedthrough"),
         )
-    elif isinstance(given, TeleopPort):
-        port = given
-    elif isinstance(given, Mapping):
-        known = [field.name for field in fields(TeleopPort)]
-        for key in given:
-            if key not in known:
-                raise UnknownNameError(f"a port has no {key!r}; it has {', '.join(known)}")
-        if not {"flow", "effort"} <= given.keys():
-            raise ConfigurationError(f"a port needs flow and effort, lists of indices; got {given!r}")
-        port = TeleopPort(**given)
     else:
-        raise ConfigurationError(f"port is a TeleopPort or the dict of one; got {given!r}")
+        return None
     _check_spaces(port, env)
     return port
-
-
-def port_data(given: Any) -> Any:
-    """The plain dict of a port."""
-    return asdict(given) if isinstance(given, TeleopPort) else given
 
 
 def _check_spaces(port: TeleopPort, env: gym.Env[Any, Any]) -> None:
@@ -104,7 +89,7 @@ def _check_spaces(port: TeleopPort, env: gym.Env[Any, Any]) -> None:
 
 
 class PortReading:
-    """What a port's effort was and will be, as far as the env says.
+    """The effort at a port: as observed, as foreseen, and as the env says that it acted.
 
     Args:
         env: What is wrapped.
@@ -113,8 +98,7 @@ class PortReading:
 
     def __init__(self, env: gym.Env[Any, Any], port: TeleopPort) -> None:
         self._env, self._port = env, port
-        owner = next((e for e in (*wrappers_of(env), env.unwrapped) if hasattr(e, "port_effort_acted")), None)
-        self._publishes = owner is not None
+        self._publishes = env.has_wrapper_attr("port_effort_acted")
 
     def reset(self, observation: Array) -> None:
         """At rest, the effort as observed."""

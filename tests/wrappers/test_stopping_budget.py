@@ -6,7 +6,7 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
-from braked_cart import BrakedCart, cart_plant, lease_by_bisection, read_cart
+from braked_cart import BrakedCart, cart_plant, lease, lease_by_bisection, read_cart
 from worlds import SpeedRow
 
 import safe_wrappers as sw
@@ -35,13 +35,15 @@ def test_a_clearance_on_a_mujoco_cart(reserve):
     margin, error = reserve
     env = sw.LeaseExpiry(
         gym.make("InvertedPendulum-v5"),
-        rail(margin=margin, state_error=error),
-        acceleration=20.0,
-        top_speed=3.0,
-        act_s=0.01,
-        margin=0.01,
-        localisation=0.005,
-        longest_s=5.0,
+        sw.StoppingBudget(
+            rail(margin=margin, state_error=error),
+            acceleration=20.0,
+            top_speed=3.0,
+            act_s=0.01,
+            margin=0.01,
+            localisation=0.005,
+        ),
+        max_lease_s=5.0,
         blend_time=0.0,
     )
     data = env.unwrapped.data
@@ -68,17 +70,17 @@ def test_a_clearance_on_a_mujoco_cart(reserve):
 
 
 def test_its_own_braking_unless_another_is_given():
-    def lease(**more):
+    def lease_of(**more):
         cart = BrakedCart(wall=5.0, v=2.0, drive=0.0)
         near = sw.Clearance([sw.Plane([5.0], [-1.0])], braking=1.0, position=[0], velocity=[1])
-        env = sw.LeaseExpiry(
-            cart, near, acceleration=0.0, plant=cart_plant(0.1), fallback="zero", longest_s=9.0, **more
+        env = lease(
+            cart, near, acceleration=0.0, plant=cart_plant(0.1), fallback="zero", max_lease_s=9.0, **more
         )
         env.reset()
         return granted(env, FULL)
 
-    assert lease() == pytest.approx((5.0 - 2.0) / 2.0, abs=1e-6)
-    assert lease(braking=4.0) == pytest.approx((5.0 - 0.5) / 2.0, abs=1e-6)
+    assert lease_of() == pytest.approx((5.0 - 2.0) / 2.0, abs=1e-6)
+    assert lease_of(braking=4.0) == pytest.approx((5.0 - 0.5) / 2.0, abs=1e-6)
 
 
 def test_a_delayed_plants_prediction_is_used_with_the_commands_in_flight():
@@ -88,7 +90,9 @@ def test_a_delayed_plants_prediction_is_used_with_the_commands_in_flight():
         plant = cart_plant(0.1)
         plant.delay_s = delay
         near = sw.Clearance([sw.Plane([9.0], [-1.0])], braking=4.0, position=[0], velocity=[1])
-        env = sw.LeaseExpiry(cart, near, acceleration=0.0, plant=plant, fallback="zero", longest_s=9.0)
+        env = sw.LeaseExpiry(
+            cart, sw.StoppingBudget(near, acceleration=0.0), plant=plant, fallback="zero", max_lease_s=9.0
+        )
         env.reset()
         for _ in range(3):
             found = granted(env, np.array([throttle, 0.0]))
@@ -118,12 +122,9 @@ def test_a_joint_position_limit_with_a_closing_speed(env_id):
     limit = sw.JointPositionLimit(-0.8, 0.8, [joint], margin=0.05)
     env = sw.LeaseExpiry(
         gym.make(env_id),
-        limit,
-        closing_speed=4.0,
+        sw.StoppingBudget(limit, closing_speed=4.0, margin=0.02, localisation=0.01),
         detect_s=0.015,
-        margin=0.02,
-        localisation=0.01,
-        longest_s=2.0,
+        max_lease_s=2.0,
     )
     again, plant = copy.deepcopy(limit), sw.MujocoPlant()
     plant.bind(env.env)
@@ -157,7 +158,9 @@ def at_hazard(robot):
 
 def test_a_heading_drive_brakes_by_its_own_backup():
     clearance = sw.HeadingDriveClearance(HAZARDS, margin=0.01)
-    env = sw.LeaseExpiry(gym.make("SafePointGoal1-v0"), clearance, closing_speed=4.0, longest_s=0.2)
+    env = sw.LeaseExpiry(
+        gym.make("SafePointGoal1-v0"), sw.StoppingBudget(clearance, closing_speed=4.0), max_lease_s=0.2
+    )
     again, plant = copy.deepcopy(clearance), sw.MujocoPlant()
     plant.bind(env.env)
     again = Asked(again, plant)
@@ -166,7 +169,7 @@ def test_a_heading_drive_brakes_by_its_own_backup():
     braked = 0
     for t in range(120):
         if t > 25:
-            env.deliver(None)
+            env.set_observation_time(None)
         plant.observe()
         wanted = again.backup()
         info = env.step(np.array([1.0, 0.0], np.float32))[4]
@@ -194,13 +197,17 @@ def test_a_heading_drive_never_violates_when_commands_stop():
                 fastest = max(fastest, (before - value) / 0.02)
             before = value
             bare.step(at_hazard(bare.unwrapped) if t % 60 < 40 else np.float32(rng.choice([-1.0, 1.0], 2)))
-    env = sw.LeaseExpiry(gym.make("SafePointGoal1-v0"), clearance, closing_speed=1.3 * fastest, longest_s=0.3)
+    env = sw.LeaseExpiry(
+        gym.make("SafePointGoal1-v0"),
+        sw.StoppingBudget(clearance, closing_speed=1.3 * fastest),
+        max_lease_s=0.3,
+    )
     braked, entered = 0, 0
     for seed in range(6):
         env.reset(seed=seed)
         for t in range(250):
             if t % 40 >= 20:
-                env.deliver(None)
+                env.set_observation_time(None)
             info = env.step(at_hazard(env.unwrapped))[4]
             braked += info["lease/braking"]
             entered += info["cost_hazards"] > 0.0
@@ -222,7 +229,11 @@ def test_a_value_of_nothing_near_is_no_limit(values, wanted):
     far = Far(1.0)
     far.values = values
     env = sw.LeaseExpiry(
-        BrakedCart(), far, closing_speed=1.0, longest_s=0.4, plant=cart_plant(0.1), fallback="zero"
+        BrakedCart(),
+        sw.StoppingBudget(far, closing_speed=1.0),
+        max_lease_s=0.4,
+        plant=cart_plant(0.1),
+        fallback="zero",
     )
     env.reset()
     got = granted(env, FULL)
@@ -232,7 +243,9 @@ def test_a_value_of_nothing_near_is_no_limit(values, wanted):
 def test_a_state_error_counts_for_values_too():
     def lease(error):
         clearance = sw.HeadingDriveClearance(HAZARDS, margin=0.01, state_error=error)
-        env = sw.LeaseExpiry(gym.make("SafePointGoal1-v0"), clearance, closing_speed=4.0, longest_s=5.0)
+        env = sw.LeaseExpiry(
+            gym.make("SafePointGoal1-v0"), sw.StoppingBudget(clearance, closing_speed=4.0), max_lease_s=5.0
+        )
         env.reset(seed=0, options={"layout": {"agent": [0.0, 0.0, 0.0], "hazards": [[1.0, 0.0]]}})
         return granted(env, np.zeros(2, np.float32))
 
@@ -248,7 +261,9 @@ def test_a_constraint_forgets_the_episode():
 
     counted = Counted(1.0)
     counted.values = [1.0]
-    env = sw.LeaseExpiry(BrakedCart(), counted, closing_speed=1.0, plant=cart_plant(0.1), fallback="zero")
+    env = sw.LeaseExpiry(
+        BrakedCart(), sw.StoppingBudget(counted, closing_speed=1.0), plant=cart_plant(0.1), fallback="zero"
+    )
     env.reset()
     env.reset()
     assert Counted.forgotten == 2
@@ -260,11 +275,9 @@ def test_a_constraint_forgets_the_episode():
 def told(answer, **more):
     env = sw.LeaseExpiry(
         BrakedCart(),
-        lambda env: answer,
-        braking=1.0,
-        acceleration=0.0,
+        sw.StoppingBudget(lambda env: answer, braking=1.0, acceleration=0.0),
         fallback="zero",
-        longest_s=2.0,
+        max_lease_s=2.0,
         **more,
     )
     env.reset()
@@ -308,7 +321,10 @@ def test_it_revokes_whatever_the_least_lease_is(bad):
     readings = [[9.0], [0.1]]
     inside = sw.CBFActionFilter(gym.make("InvertedPendulum-v5"), [rail()])
     env = sw.LeaseExpiry(
-        inside, lambda env: readings, braking=1.0, acceleration=1.0, least_s=0.04, longest_s=1.0
+        inside,
+        sw.StoppingBudget(lambda env: readings, braking=1.0, acceleration=1.0),
+        min_lease_s=0.04,
+        max_lease_s=1.0,
     )
     env.reset(seed=0)
     action = np.zeros(1, np.float32)
@@ -327,7 +343,7 @@ def test_it_revokes_whatever_the_least_lease_is(bad):
     ],
 )
 def test_a_mujoco_state_that_is_not_a_number_revokes_and_nothing_else_passes(clearance, more):
-    env = sw.LeaseExpiry(gym.make("InvertedPendulum-v5"), clearance, **more)
+    env = lease(gym.make("InvertedPendulum-v5"), clearance, **more)
     env.reset(seed=0)
     env.step(np.zeros(1, np.float32))
     env.unwrapped.data.qpos[0] = np.nan
@@ -347,14 +363,14 @@ def test_a_constraint_may_serve_the_filter_inside_and_a_second_env_too():
         if share:
             mine = mine[:1] * 3
         env = sw.CBFActionFilter(gym.make("SafePointGoal1-v0"), [mine[0]])
-        env = sw.LeaseExpiry(env, mine[1], closing_speed=4.0, longest_s=0.3)
-        other = sw.LeaseExpiry(gym.make("SafePointGoal1-v0"), mine[2], closing_speed=4.0)
+        env = sw.LeaseExpiry(env, sw.StoppingBudget(mine[1], closing_speed=4.0), max_lease_s=0.3)
+        other = sw.LeaseExpiry(gym.make("SafePointGoal1-v0"), sw.StoppingBudget(mine[2], closing_speed=4.0))
         env.reset(seed=0)
         other.reset(seed=5)
         seen = []
         for t in range(120):
             if t % 30 > 15:
-                env.deliver(None)
+                env.set_observation_time(None)
             info = env.step(at_hazard(env.unwrapped))[4]
             theirs = other.step(at_hazard(other.unwrapped))[4]
             seen.append(
@@ -369,37 +385,36 @@ def test_a_constraint_may_serve_the_filter_inside_and_a_second_env_too():
 
 
 def test_what_constraints_with_a_value_need():
-    def lease(constraint, **more):
-        return sw.LeaseExpiry(gym.make("Reacher-v5"), constraint, **more)
-
     limit = sw.JointPositionLimit(-1.0, 1.0, ["joint1"])
     with pytest.raises(ConfigurationError, match=r"JointPositionLimit does not say how fast.*closing_speed"):
-        lease(limit)
+        sw.LeaseExpiry(gym.make("Reacher-v5"), limit)
     for value in (0.0, -1.0, math.nan, math.inf, "fast"):
         with pytest.raises(ConfigurationError, match="closing_speed"):
-            lease(limit, closing_speed=value)
+            sw.StoppingBudget(limit, closing_speed=value)
     for name in ("braking", "acceleration", "top_speed"):
         with pytest.raises(ConfigurationError, match="closing_speed alone"):
-            lease(limit, closing_speed=1.0, **{name: 1.0})
+            sw.StoppingBudget(limit, closing_speed=1.0, **{name: 1.0})
     with pytest.raises(ConfigurationError, match="no value"):
-        lease(SpeedRow(1.0), closing_speed=1.0)
+        sw.StoppingBudget(SpeedRow(1.0), closing_speed=1.0)
 
 
 def test_a_clearance_still_needs_the_acceleration():
     with pytest.raises(ConfigurationError, match="acceleration is missing"):
         sw.LeaseExpiry(gym.make("InvertedPendulum-v5"), rail())
     with pytest.raises(ConfigurationError, match="closing_speed is for constraints"):
-        sw.LeaseExpiry(gym.make("InvertedPendulum-v5"), rail(), acceleration=1.0, closing_speed=1.0)
+        sw.LeaseExpiry(
+            gym.make("InvertedPendulum-v5"), sw.StoppingBudget(rail(), acceleration=1.0, closing_speed=1.0)
+        )
 
 
-def test_least_s_needs_a_filter_inside_and_no_more_than_longest_s():
-    with pytest.raises(ConfigurationError, match=r"least_s.*CBFActionFilter"):
-        told((1.0, 0.0), least_s=0.1)
+def test_least_s_needs_a_filter_inside_and_no_more_than_max_lease_s():
+    with pytest.raises(ConfigurationError, match=r"min_lease_s.*CBFActionFilter"):
+        told((1.0, 0.0), min_lease_s=0.1)
     inside = sw.CBFActionFilter(gym.make("InvertedPendulum-v5"), [rail()])
-    with pytest.raises(ConfigurationError, match="least_s"):
-        sw.LeaseExpiry(inside, rail(), acceleration=1.0, least_s=2.0)
-    with pytest.raises(ConfigurationError, match="least_s"):
-        sw.LeaseExpiry(inside, rail(), acceleration=1.0, least_s=-0.1)
+    with pytest.raises(ConfigurationError, match="min_lease_s"):
+        sw.LeaseExpiry(inside, sw.StoppingBudget(rail(), acceleration=1.0), min_lease_s=2.0)
+    with pytest.raises(ConfigurationError, match="min_lease_s"):
+        sw.LeaseExpiry(inside, sw.StoppingBudget(rail(), acceleration=1.0), min_lease_s=-0.1)
 
 
 def test_reading_is_of_the_env_that_it_wraps():
@@ -410,7 +425,7 @@ def test_reading_is_of_the_env_that_it_wraps():
         return read_cart(env)
 
     inner = gym.wrappers.TimeLimit(BrakedCart(), 100)
-    env = sw.LeaseExpiry(inner, look, braking=1.0, acceleration=1.0, fallback="zero")
+    env = sw.LeaseExpiry(inner, sw.StoppingBudget(look, braking=1.0, acceleration=1.0), fallback="zero")
     env.reset()
     env.step(FULL)
     assert seen == [inner]
@@ -432,7 +447,7 @@ class Checked:
 
 def test_what_only_a_state_can_show_is_refused_at_the_reset():
     cart = gym.make("InvertedPendulum-v5")
-    lease = sw.LeaseExpiry(cart, Checked(), closing_speed=1.0)
+    lease = sw.LeaseExpiry(cart, sw.StoppingBudget(Checked(), closing_speed=1.0))
     lease.reset(seed=0)
     cart.unwrapped.reset_model = lambda: cart.unwrapped.set_state(np.array([2.0, 0.0]), np.zeros(2))
     with pytest.raises(ConfigurationError, match="too far out"):

@@ -1,0 +1,101 @@
+"""Old names that keep working: each use gives one DeprecationWarning that says how to write it now."""
+
+import functools
+import inspect
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
+from typing import Any, TypeVar
+
+from safe_wrappers.errors import ConfigurationError
+
+T = TypeVar("T")
+
+
+def deprecated_parameters(
+    renamed: Mapping[str, str] | None = None,
+    moved: Mapping[str, type[Any]] | None = None,
+    positional: Sequence[str] = (),
+) -> Callable[[type[T]], type[T]]:
+    """Class decorator: the constructor goes on taking parameters that were renamed, or moved into a dataclass.
+
+    Args:
+        renamed: Old name to new name.
+        moved: Parameter to the dataclass that it takes now. The fields of the dataclass are accepted as keywords of
+            the constructor; an argument at the place of the parameter is then the dataclass's first field.
+        positional: Old names of positional arguments that follow those of today.
+
+    Raises:
+        ConfigurationError: On a call that gives the old and the new name of a parameter.
+    """
+    renames, moves = dict(renamed or {}), dict(moved or {})
+    homes = {field.name: parameter for parameter, kind in moves.items() for field in fields(kind)}
+
+    def decorate(kind: type[T]) -> type[T]:
+        untyped: Any = kind
+        init = untyped.__init__
+        signature = inspect.signature(init)
+        places = sum(p.kind is not p.KEYWORD_ONLY for p in signature.parameters.values())
+
+        @functools.wraps(init)
+        def accepting(*args: Any, **kwargs: Any) -> None:
+            old = dict(zip(positional, args[places:], strict=False))
+            old |= {name: kwargs.pop(name) for name in (*renames, *homes) if name in kwargs}
+            if not old or len(args) > places + len(positional):
+                init(*args, **kwargs)
+                return
+            bound = signature.bind_partial(*args[:places], **kwargs)
+            new: dict[str, Any] = {}
+            for name, value in old.items():
+                if name in homes:
+                    new.setdefault(homes[name], {})[name] = value
+                elif renames[name] in bound.arguments:
+                    raise ConfigurationError(
+                        f"{kind.__name__}: {name} is the old name of {renames[name]}; give one"
+                    )
+                else:
+                    new[renames[name]] = value
+            written = []
+            for parameter, value in new.items():
+                if parameter in moves:
+                    first = fields(moves[parameter])[0].name
+                    if parameter in bound.arguments:
+                        value = {first: bound.arguments[parameter], **value}
+                    value.setdefault(first, None)
+                    words = ", ".join(f"{name}=..." for name in value)
+                    written.append(f"{parameter}={moves[parameter].__name__}({words})")
+                    value = moves[parameter](**value)
+                else:
+                    written.append(f"{parameter}=...")
+                bound.arguments[parameter] = value
+            warnings.warn(
+                f"{kind.__name__}: {', '.join(old)} {'is' if len(old) == 1 else 'are'} deprecated; write "
+                f"{kind.__name__}(..., {', '.join(written)})",
+                DeprecationWarning,
+                stacklevel=2,
+            )
+            init(*bound.args, **bound.kwargs)
+
+        untyped.__init__ = accepting
+        untyped.__init__.deprecated_parameters = (*renames, *homes)
+        return kind
+
+    return decorate
+
+
+def deprecated_names(kind: type[Any]) -> tuple[str, ...]:
+    """Old names of parameters that a constructor still takes."""
+    return getattr(kind.__init__, "deprecated_parameters", ())
+
+
+def deprecated_method(old: str, new: str) -> Any:
+    """A method that calls the one of the new name."""
+
+    def method(self: Any, *args: Any, **kwargs: Any) -> Any:
+        warnings.warn(
+            f"{type(self).__name__}.{old} is deprecated; write {new}", DeprecationWarning, stacklevel=2
+        )
+        return getattr(self, new)(*args, **kwargs)
+
+    method.__doc__ = f"Old name of `{new}`."
+    return method

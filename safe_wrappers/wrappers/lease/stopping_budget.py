@@ -1,0 +1,273 @@
+"""StoppingBudget: what a stop inside a clearance takes, and how long any command may go on before it."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from safe_wrappers.constraints.clearance import Clearance
+from safe_wrappers.control.watchdog.leases import longest_lease, longest_lease_of_room, round_trip_ceiling
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint, non_negative, positive
+from safe_wrappers.plants.default import default_plant
+from safe_wrappers.plants.plant import Plant
+from safe_wrappers.serialize import constraint_from
+from safe_wrappers.wrappers.common.plain_data import check_fields, settings_from
+
+Array = NDArray[np.float64]
+
+ClearanceFunction = Callable[[gym.Env[Any, Any]], tuple[ArrayLike, ArrayLike]]
+"""Takes the env; returns clearances (m) and the approach speeds towards them (m/s), shapes (k,)."""
+
+_ROW_TOLERANCE = 1e-9
+"""Control units times normals: a row that is violated by less is kept."""
+
+
+@dataclass(frozen=True)
+class StoppingBudget:
+    """Clearance, bounds on the motion and reserves from which a stop is worked out; shared by lease and ceiling.
+
+    For an approach speed v, worked out at every reading:
+
+        way(time) + v'^2 / (2 braking) + localisation + margin <= clearance
+
+    with the way and the speed v' after the time that a command goes on, `act_s` included, at full `acceleration`.
+    Plain data if its clearance is.
+
+    Args:
+        clearance: A `Clearance` or the dict of one; any other constraint, with `closing_speed`; or a function of the
+            env that returns clearances in m and approach speeds in m/s, shapes (k,).
+        braking: Verified lower bound on the deceleration of the fallback, m/s^2; None takes the constraint's own.
+        acceleration: Largest approach acceleration that any command may cause, m/s^2; 0 for a machine that cruises.
+            The fallback's commands count too: braking a machine that recedes pushes it towards the obstacle.
+        closing_speed: For constraints other than Clearance: the fastest that their value may fall, in its unit per
+            second, stopping distance and all, under any command.
+        top_speed: Bound on the approach speed, m/s; None: none.
+        localisation: Bound on the error of the clearance, m; the constraint's own is added.
+        margin: Clearance to be kept at rest, m; the constraint's own is added.
+        act_s: T_act, until the full deceleration is there, s.
+
+    Raises:
+        ConfigurationError: A bound that is missing, negative or does not belong to the clearance.
+    """
+
+    clearance: Constraint | dict[str, Any] | ClearanceFunction
+    braking: float | None = None
+    acceleration: float | None = None
+    closing_speed: float | None = None
+    top_speed: float | None = None
+    localisation: float = 0.0
+    margin: float = 0.0
+    act_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        given: Any = self.clearance
+        if isinstance(given, dict | Constraint):
+            object.__setattr__(self, "clearance", constraint_from(given))
+        elif isinstance(given, type) or not callable(given):
+            raise ConfigurationError(
+                "clearance is a constraint, such as sw.Clearance(...), or a function of the env that returns the "
+                f"clearance in m and the approach speed in m/s; got {given!r}"
+            )
+        check_fields(self, non_negative, ["localisation", "margin"], "m")
+        check_fields(self, non_negative, ["act_s"], "s")
+        check_fields(self, non_negative, ["acceleration"], "m/s^2")
+        check_fields(self, positive, ["braking"], "m/s^2")
+        check_fields(self, positive, ["top_speed"], "m/s")
+        check_fields(self, positive, ["closing_speed"], "the constraint's unit per second")
+        if self.measures_approach:
+            self._check_bounds_on_approach()
+        else:
+            self._check_closing_speed()
+
+    @property
+    def measures_approach(self) -> bool:
+        """Whether approach speeds are measured, and not only bounded by `closing_speed`."""
+        return not isinstance(self.clearance, Constraint) or self.clearance.measures_approach
+
+    def _check_bounds_on_approach(self) -> None:
+        if self.braking is None and not isinstance(self.clearance, Clearance):
+            raise ConfigurationError(
+                "braking is missing: a verified lower bound on the deceleration of the fallback, in m/s^2"
+            )
+        if self.acceleration is None:
+            raise ConfigurationError(
+                "acceleration is missing: the largest approach acceleration that any command may cause, in m/s^2; "
+                "0 only for a machine that cruises at constant speed"
+            )
+        if self.closing_speed is not None:
+            raise ConfigurationError(
+                "closing_speed is for constraints whose value is all that is known; here the approach speed is "
+                "measured: give acceleration (and top_speed)"
+            )
+
+    def _check_closing_speed(self) -> None:
+        name = type(self.clearance).__name__
+        if self.closing_speed is None:
+            raise ConfigurationError(
+                f"{name} does not say how fast it is approached: give closing_speed, the fastest that its value may "
+                "fall, in its unit per second"
+            )
+        if any(given is not None for given in (self.braking, self.acceleration, self.top_speed)):
+            raise ConfigurationError(
+                f"the value of {name} counts braking already: give closing_speed alone, without braking, "
+                "acceleration and top_speed"
+            )
+
+
+def budget_from(given: Any) -> StoppingBudget:
+    """A budget itself, from the dict of one, or from a clearance that needs no more than itself."""
+    if isinstance(given, StoppingBudget) or (isinstance(given, Mapping) and "kind" not in given):
+        return settings_from(StoppingBudget, given, "budget")
+    return StoppingBudget(given)
+
+
+class BoundBudget:
+    """A budget that measures an env.
+
+    Args:
+        budget: What is measured, and what a stop takes.
+        env: What is wrapped.
+
+    Attributes:
+        constraint: The clearance, if it is a constraint: with the budget's own reserves, to be bound to the plant.
+    """
+
+    clearance: Array
+    """Clearances at the last `measure`, m, shape (k,); the values of a constraint that measures no approach."""
+    speed: Array
+    """Approach speeds, m/s, shape (k,)."""
+
+    def __init__(self, budget: StoppingBudget, env: gym.Env[Any, Any]) -> None:
+        self._budget, self._env = budget, env
+        self._measures_approach = budget.measures_approach
+        given: Any = budget.clearance
+        self.constraint: Constraint | None = given if isinstance(given, Constraint) else None
+        own = (0.0, 0.0) if self.constraint is None else (given.state_error, given.margin)
+        localisation, margin = budget.localisation + own[0], budget.margin + own[1]
+        self._reserves = {"localisation": localisation, "margin": margin}
+        self._stop: dict[str, Any] = dict(self._reserves)
+        if self._measures_approach:
+            braking = budget.braking if budget.braking is not None else float(given.braking)
+            self._stop["braking"] = braking
+            if isinstance(self.constraint, Clearance):
+                # Its rows are then those of this budget.
+                self.constraint = replace(
+                    self.constraint, braking=braking, margin=margin, state_error=localisation
+                )
+
+    def plant_of(self, plant: Plant | None) -> Plant | None:
+        """The plant given, else the env's MuJoCo model where the constraint needs one; to be bound before `bind`."""
+        return default_plant(self._env) if plant is None and self.constraint is not None else plant
+
+    def bind(self, plant: Plant | None, bound: BoundConstraint | None = None) -> None:
+        """Measure on a plant that is bound to the env.
+
+        Args:
+            plant: None if the clearance is a function.
+            bound: The constraint on it, if it has been bound already.
+
+        Raises:
+            ConfigurationError: A constraint without a value.
+        """
+        self._bound = bound
+        if bound is None and self.constraint is not None and plant is not None:
+            self._bound = self.constraint.bind(plant)
+        if self._bound is not None and not (self._measures_approach or self._bound.has_value):
+            name = type(self.constraint).__name__
+            raise ConfigurationError(f"{name} has no value that a lease could be worked out from")
+
+    def reset(self) -> None:
+        """Forget the episode, and let the constraint refuse what only a state can show."""
+        if self._bound is not None:
+            self._memory = self._bound.start()
+            self._observe(self._bound)
+            self._bound.check()
+
+    def _observe(self, bound: BoundConstraint) -> None:
+        bound.plant.observe()
+        bound.observe(self._memory)
+
+    def measure(self) -> None:
+        """Read clearances and approach speeds of the present state."""
+        if self._bound is None:
+            self.clearance, self.speed = self._of_function()
+            return
+        self._observe(self._bound)
+        approach = self._bound.approach()
+        if approach is not None:
+            self.clearance, self.speed = approach
+            return
+        value = np.asarray(self._bound.value(), dtype=np.float64)
+        self.clearance = value[value != np.inf]
+        self.speed = np.zeros(self.clearance.shape)
+
+    @property
+    def readable(self) -> bool:
+        """Whether all that was measured is finite."""
+        return bool(np.isfinite(self.clearance).all() and np.isfinite(self.speed).all())
+
+    def longest_time(self, delays_s: float = 0.0) -> float:
+        """The longest time that the worst command may go on from the measured state, s; zero or less: stop now.
+
+        NaN where the measurement is not finite; inf without obstacles near.
+
+        Args:
+            delays_s: All delays but `act_s` that pass besides, s.
+        """
+        if not self.readable:
+            return math.nan
+        budget, delays_s = self._budget, delays_s + self._budget.act_s
+        if self._measures_approach:
+            top_speed = math.inf if budget.top_speed is None else budget.top_speed
+            bounds: dict[str, Any] = {"acceleration": budget.acceleration, "top_speed": top_speed}
+            times = longest_lease(self.clearance, self.speed, delays_s=delays_s, **self._stop, **bounds)
+        else:
+            assert budget.closing_speed is not None
+            left = self.clearance - self._reserves["margin"] - self._reserves["localisation"]
+            times = longest_lease_of_room(left, budget.closing_speed, delays_s)
+        return float(times.min(initial=np.inf))
+
+    def longest_round_trip(self, video_s: float, human_s: float) -> float:
+        """The longest round trip from which an operator can stop in time, s; inf where nothing approaches."""
+        ceilings = round_trip_ceiling(
+            self.clearance,
+            self.speed,
+            video_s=video_s,
+            human_s=human_s,
+            act_s=self._budget.act_s,
+            **self._stop,
+        )
+        return float(ceilings[self.speed > 0.0].min(initial=math.inf))
+
+    def can_stop_after(self, command: Array, duration_s: float) -> bool:
+        """Whether the machine can stop by itself after a command of so many seconds.
+
+        First by the declared bounds, whatever the command is; else by the rows of a `Clearance`, which know how the
+        machine answers this command. With `act_s`, and with other clearances, there are no such rows: next to the
+        limit no command is admitted then, not even one that leads away.
+        """
+        if self.longest_time() >= duration_s:
+            return True
+        if not (isinstance(self.constraint, Clearance) and self._budget.act_s == 0.0 and self.readable):
+            return False
+        assert self._bound is not None
+        rows = self._bound.rows()
+        return bool((rows.normals @ command <= rows.offsets + _ROW_TOLERANCE).all())
+
+    def _of_function(self) -> tuple[Array, Array]:
+        function: Any = self._budget.clearance
+        answer = function(self._env)
+        try:
+            clearance, speed = (np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in answer)
+            clearance, speed = np.broadcast_arrays(clearance, speed)
+        except (TypeError, ValueError):
+            raise ConfigurationError(
+                "the clearance function must return two things of the same shape, clearances in m and approach "
+                f"speeds in m/s; got {answer!r}"
+            ) from None
+        return clearance, speed

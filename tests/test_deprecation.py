@@ -1,0 +1,154 @@
+"""Old names of parameters and methods: they work, warn once, and say the new ones."""
+
+import inspect
+import warnings
+from dataclasses import dataclass
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+
+import safe_wrappers as sw
+from safe_wrappers.deprecation import deprecated_names, deprecated_parameters
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.common.plain_data import plain_data
+from safe_wrappers.wrappers.lease.stopping_budget import budget_from
+
+
+@dataclass
+class Wheel:
+    radius: float
+    width: float = 1.0
+
+
+@deprecated_parameters(renamed={"colour": "paint"}, moved={"wheel": Wheel}, positional=("width",))
+class Cart:
+    """A cart."""
+
+    def __init__(self, name, wheel, *, paint="red"):
+        self.is_now = (name, wheel, paint)
+
+
+def warned(make):
+    """What is made, and the only warning."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        made = make()
+    (warning,) = [w for w in caught if w.category is DeprecationWarning]
+    assert warning.filename == __file__
+    return made, str(warning.message)
+
+
+@pytest.mark.parametrize(
+    ("make", "is_now", "says"),
+    [
+        (lambda: Cart("a", Wheel(1.0), colour="blue"), ("a", Wheel(1.0), "blue"), "Cart(..., paint=...)"),
+        (
+            lambda: Cart("a", 2.0, width=3.0),
+            ("a", Wheel(2.0, 3.0), "red"),
+            "wheel=Wheel(radius=..., width=...)",
+        ),
+        (lambda: Cart("a", 2.0, 3.0), ("a", Wheel(2.0, 3.0), "red"), "width is deprecated"),
+        (lambda: Cart("a", radius=2.0), ("a", Wheel(2.0), "red"), "wheel=Wheel(radius=...)"),
+        (
+            lambda: Cart("a", colour="blue", width=2.0, radius=1.0),
+            ("a", Wheel(1.0, 2.0), "blue"),
+            "colour, radius, width are deprecated",
+        ),
+    ],
+)
+def test_old_parameters_work_with_one_warning(make, is_now, says):
+    made, message = warned(make)
+    assert made.is_now == is_now and says in message
+
+
+def test_todays_parameters_give_no_warning_and_are_the_signature():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert Cart("a", Wheel(1.0), paint="blue").is_now == ("a", Wheel(1.0), "blue")
+    assert list(inspect.signature(Cart).parameters) == ["name", "wheel", "paint"]
+    assert deprecated_names(Cart) == ("colour", "radius", "width") and deprecated_names(Wheel) == ()
+
+
+def test_what_is_no_parameter_is_an_error_as_ever():
+    for wrong in (
+        lambda: Cart("a", 1.0, 2.0, 3.0),
+        lambda: Cart("a", Wheel(1.0), weight=1.0),
+        lambda: Cart("a"),
+    ):
+        with pytest.raises(TypeError):
+            wrong()
+    with pytest.raises(ConfigurationError, match="colour is the old name of paint"):
+        Cart("a", Wheel(1.0), colour="blue", paint="red")
+
+
+def rail():
+    return sw.Clearance([sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])], bodies=["cart"], braking=8.0)
+
+
+@pytest.mark.parametrize(
+    "old",
+    [
+        lambda env: sw.LeaseExpiry(env, rail(), acceleration=20.0, top_speed=3.0, margin=0.1, longest_s=0.4),
+        lambda env: sw.LeaseExpiry(env, rail(), None, 20.0, None, 3.0, margin=0.1, longest_s=0.4),
+        lambda env: sw.LeaseExpiry(
+            env, clearance=rail(), acceleration=20.0, top_speed=3.0, margin=0.1, longest_s=0.4
+        ),
+    ],
+)
+def test_a_lease_as_it_was_written_is_the_lease_of_today(old):
+    budget = sw.StoppingBudget(rail(), acceleration=20.0, top_speed=3.0, margin=0.1)
+    new = sw.LeaseExpiry(gym.make("InvertedPendulum-v5"), budget, max_lease_s=0.4)
+    was, message = warned(lambda: old(gym.make("InvertedPendulum-v5")))
+    assert was.spec.to_json() == new.spec.to_json()
+    assert "budget=StoppingBudget(clearance=..., " in message and "max_lease_s=..." in message
+    data = new.spec.additional_wrappers[-1].kwargs["budget"]
+    assert budget_from(data) == budget and plain_data(budget) == data
+
+
+def test_a_least_lease_and_a_rate_limit_by_their_old_names():
+    filtered = sw.CBFActionFilter(gym.make("InvertedPendulum-v5"), [rail()])
+    budget = sw.StoppingBudget(rail(), acceleration=20.0)
+    env, message = warned(lambda: sw.LeaseExpiry(filtered, budget, least_s=0.04))
+    assert message == "LeaseExpiry: least_s is deprecated; write LeaseExpiry(..., min_lease_s=...)"
+    assert env.spec.additional_wrappers[-1].kwargs["min_lease_s"] == 0.04
+    env, message = warned(lambda: sw.ChunkHandover(gym.make("Reacher-v5"), 4, 2, jerk_limit=5.0))
+    assert message == "ChunkHandover: jerk_limit is deprecated; write ChunkHandover(..., rate_limit=...)"
+    assert env.spec.additional_wrappers[-1].kwargs["rate_limit"] == 5.0
+
+
+def test_a_ceiling_as_it_was_written_is_the_ceiling_of_today():
+    new = sw.RoundTripCeiling(
+        sw.StoppingBudget(rail(), acceleration=55.0, top_speed=1.4, act_s=0.1), release=0.5
+    )
+    for old in (
+        lambda: sw.RoundTripCeiling(rail(), None, 55.0, 1.4, act_s=0.1, release=0.5),
+        lambda: sw.RoundTripCeiling(
+            clearance=plain_data(rail()), acceleration=55.0, top_speed=1.4, act_s=0.1, release=0.5
+        ),
+    ):
+        was, message = warned(old)
+        assert plain_data(was) == plain_data(new) and "budget=StoppingBudget(" in message
+    old = {"clearance": rail(), "acceleration": 30.0}
+    with pytest.warns(DeprecationWarning, match="RoundTripCeiling"):
+        sw.TeleopChannel(gym.make("InvertedPendulum-v5"), 0.1, 0.1, ceiling=old)
+
+
+def test_a_spec_that_was_written_before_is_built():
+    env = sw.LeaseExpiry(gym.make("InvertedPendulum-v5"), sw.StoppingBudget(rail(), acceleration=20.0))
+    arguments = env.spec.additional_wrappers[-1].kwargs
+    arguments |= {"clearance": plain_data(rail()), "acceleration": 20.0, "longest_s": 0.5}
+    del arguments["budget"], arguments["max_lease_s"]
+    with pytest.warns(DeprecationWarning, match="min_lease_s|max_lease_s"):
+        again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    again.reset(seed=0)
+    assert again.step(np.zeros(1, np.float32))[4]["lease/remaining_s"] > 0.0
+
+
+def test_deliver_is_the_old_name_of_set_observation_time():
+    env = sw.LeaseExpiry(gym.make("InvertedPendulum-v5"), sw.StoppingBudget(rail(), acceleration=20.0))
+    env.reset(seed=0)
+    message = warned(lambda: env.deliver(None))[1]
+    assert message == "LeaseExpiry.deliver is deprecated; write set_observation_time"
+    assert env.step(np.zeros(1, np.float32))[4]["lease/braking"]
