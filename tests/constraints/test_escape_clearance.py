@@ -24,14 +24,13 @@ def bound(obstacles, delay_s=0.0, horizon_s=2.5, margin=MARGIN, env=None):
     env.reset(seed=0)
     plant = sw.MujocoPlant(delay_s=delay_s)
     plant.bind(env)
-    clearance = sw.EscapeClearance("robot", obstacles, RADIUS, margin, horizon_s)
-    clearance = Asked(clearance, plant)
+    clearance = Asked(sw.EscapeClearance("robot", obstacles, RADIUS, margin, horizon_s), plant)
     return env.unwrapped, plant, clearance
 
 
 def anew(raw, plant, clearance, qpos, qvel):
     raw.set_state(np.asarray(qpos, dtype=float), np.asarray(qvel, dtype=float))
-    clearance.reset()
+    clearance.start()
     plant.observe()
 
 
@@ -117,9 +116,9 @@ def test_what_is_left_is_what_mujoco_leaves():
         if now.min() < MARGIN:
             continue
         expected = left(played, raw, qpos, qvel, control[:2], MARGIN)
-        shortfall = clearance.SHORTFALL(control)
+        slack = clearance.slack(control)
         if expected >= 0.0:  # where nothing is near it only says that there is room
-            assert shortfall <= -expected + 1e-7
+            assert slack >= expected - 1e-7
             agreed += 1
         else:
             # What the margin is there for: the best first control may use it up, and another one no more than that.
@@ -128,13 +127,13 @@ def test_what_is_left_is_what_mujoco_leaves():
             firsts = [played.brake(), [1, 0], [-1, 0], [0, 1], [0, -1]]
             best = max(left(played, raw, qpos, qvel, np.array(first), MARGIN) for first in firsts)
             needed = best if -MARGIN < best < 0.0 else 0.0
-            assert shortfall == pytest.approx(needed - expected, abs=1e-7)
+            assert slack == pytest.approx(expected - needed, abs=1e-7)
             refused += 1
-        assert clearance.admits(control) == (shortfall <= 1e-9)
+        assert clearance.admits(control) == (slack >= -1e-9)
     assert agreed > 8 and refused > 2, (agreed, refused)
 
 
-def test_suggestions_and_the_backup_are_admitted_and_the_nearest_comes_first():
+def test_candidates_and_the_backup_are_admitted_and_the_nearest_comes_first():
     raw, plant, clearance = bound([TRUE_CARS, PILLARS])
     tried = 0
     for qpos, qvel, control in random_states(300, seed=1):
@@ -142,9 +141,9 @@ def test_suggestions_and_the_backup_are_admitted_and_the_nearest_comes_first():
         if clearance.value().min() < MARGIN or clearance.admits(control):
             continue
         found = clearance.candidates(control)
-        for suggestion in found:
-            assert clearance.admits(suggestion) and suggestion[2] == control[2]
-            assert (np.abs(suggestion[:2]) <= np.maximum(1.0, np.abs(control[:2])) + 1e-12).all()
+        for candidate in found:
+            assert clearance.admits(candidate) and candidate[2] == control[2]
+            assert (np.abs(candidate[:2]) <= np.maximum(1.0, np.abs(control[:2])) + 1e-12).all()
         away = [np.linalg.norm(s - control) for s in found]
         assert away == sorted(away)
         if found:
@@ -186,8 +185,8 @@ def test_discs_that_move_go_straight_on_and_standing_ones_stay():
         env=Published(gym.make("OccludedCrossing-v0")),
     )
     anew(raw, plant, clearance, np.array([0, -0.7, 0, 9, 9, 9, 9, 9, 9]), np.zeros(9))
-    forward, aside = clearance.SHORTFALL([0, 1, 0]), clearance.SHORTFALL([1, 0, 0])
-    assert forward > aside  # it does not stand still: away to the side is the way
+    forward, aside = clearance.slack([0, 1, 0]), clearance.slack([1, 0, 0])
+    assert forward < aside  # it does not stand still: away to the side is the way
     with pytest.raises(ConfigurationError, match="3-dimensional obstacles cannot meet 2-dimensional points"):
         met(sw.Discs("balls", 0.3))  # a ball that stands somewhere in the air
 
@@ -356,10 +355,10 @@ def test_the_backup_stands_still_where_that_is_safe_and_goes_where_it_is_not():
     kinds = set()
     for x in np.arange(-1.5, -0.7, 0.05):  # in the lane, a car that comes nearer and nearer
         anew(raw, plant, clearance, [0.0, -0.8, 0.0, x, *away[1:]], speeds)
-        stays = clearance.SHORTFALL(np.zeros(3)) <= 0.0
+        stays = clearance.slack(np.zeros(3)) >= 0.0
         backup = clearance.backup()
         assert np.abs(backup[:2]).max() == (0.0 if stays else 1.0)
-        assert clearance.SHORTFALL(backup) <= clearance.SHORTFALL(np.zeros(3))
+        assert clearance.slack(backup) >= clearance.slack(np.zeros(3))
         kinds.add(stays)
     assert kinds == {True, False}
 

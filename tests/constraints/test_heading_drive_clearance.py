@@ -19,13 +19,13 @@ def filtered(layout=None, velocity=(0.0, 0.0, 0.0), **options):
     qvel = raw.data.qvel.copy()
     qvel[:3] = velocity
     raw.set_state(raw.data.qpos.copy(), qvel)
-    env.plant.observe()
+    env.filter.observe()
     return env
 
 
 def test_a_control_must_be_safe_for_every_corner_of_the_uncertainty():
     env = filtered({"agent": [-0.3, 0.0, 0.0]}, uncertainty=0.25)
-    (limit,), raw = env.constraints, env.unwrapped
+    (limit,), raw = env.filter.bound, env.unwrapped
     every, push = limit._models, np.array([0.05, 0.0])
     assert len(every) == 4
 
@@ -33,7 +33,7 @@ def test_a_control_must_be_safe_for_every_corner_of_the_uncertainty():
         qpos, qvel = raw.data.qpos.copy(), raw.data.qvel.copy()
         qpos[0], qvel[0] = x, 0.9
         raw.set_state(qpos, qvel)
-        env.plant.observe()
+        env.filter.observe()
         limit._models = models
         return not limit.admits(push)
 
@@ -47,7 +47,7 @@ def test_a_control_must_be_safe_for_every_corner_of_the_uncertainty():
 @pytest.mark.parametrize(("beside", "side"), [(0.05, -1.0), (-0.05, 1.0)])
 def test_a_disc_ahead_on_the_left_is_passed_on_the_right(beside, side):
     env = filtered({"hazards": [[0.26, beside]]}, detour=True)
-    (limit,) = env.constraints
+    (limit,) = env.filter.bound
     around, turn_only = limit.candidates(np.array([1.0, 0.1]))
     np.testing.assert_array_equal(around, [1.0, side])
     np.testing.assert_array_equal(turn_only, [0.0, side])
@@ -55,7 +55,7 @@ def test_a_disc_ahead_on_the_left_is_passed_on_the_right(beside, side):
 
 def test_no_detour_without_a_drive_or_without_a_disc_ahead():
     env = filtered({"hazards": [[0.26, 0.0]]}, detour=True)
-    (limit,) = env.constraints
+    (limit,) = env.filter.bound
     assert limit.candidates(np.array([0.0, 1.0])) == []
     assert limit.candidates(np.array([-1.0, 0.0])) == []
     env = filtered({"hazards": [[0.26, 0.0]]})
