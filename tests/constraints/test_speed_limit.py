@@ -116,7 +116,7 @@ def test_a_control_is_admitted_by_the_speed_it_leads_to(v, u, direction, average
     env = Scene(TWO.format(timestep=timestep), frame_skip=substeps)
     env.data.qvel[:] = v
     mujoco.mj_forward(env.model, env.data)
-    limit, plant = watching(
+    limit, _ = watching(
         env, limit=2.0, body=body, direction=direction, average=average, margin=margin, holds=1
     )
     both = velocities(v, u, timestep, substeps)
@@ -221,7 +221,7 @@ def test_a_speed_that_is_kept_only_to_be_exceeded_next_is_refused_now():
         env.model.opt.gravity[0] = 5.0
         env.data.qvel[0] = 0.6
         mujoco.mj_forward(env.model, env.data)
-        limit, plant = watching(env, limit=1.0, direction="+x", holds=holds)
+        limit, _ = watching(env, limit=1.0, direction="+x", holds=holds)
         admitted[holds] = [limit.admits(np.array([u])) for u in (-1.0, 1.0)]
     # The averages of the next steps, braking: 0.72, 0.92, 1.12; at full throttle: 0.78, 1.0 + ...
     assert admitted == {1: [True, True], 2: [True, False], 3: [False, False]}
