@@ -63,7 +63,9 @@ def test_it_admits_pushes_up_to_the_share_and_the_tolerance_and_less_by_the_marg
         assert limit.admits(control) is admitted
         inside = share * 0.8 - abs(part) * largest
         assert limit.insides(plant, control)[0] == pytest.approx(inside, abs=2e-3)
-        assert limit.SHORTFALL(control) == pytest.approx(margin - tolerance - min(inside, margin), abs=2e-3)
+        assert limit.SHORTFALL(control) == pytest.approx(
+            margin - tolerance - min(inside, margin), abs=2e-3
+        )
 
 
 def test_in_the_air_nothing_is_missed_whatever_the_margin():
