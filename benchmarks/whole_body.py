@@ -31,7 +31,6 @@ from typing import Any
 import gymnasium as gym
 import mujoco
 import numpy as np
-from asking import Asked
 
 import safe_wrappers as sw
 from safe_wrappers.appendix.legged.balance import support_margin, zmp_of_forces
@@ -215,13 +214,11 @@ def ask_programs(robot: str, policy: Callable[[Any], Any], episodes: int, limit:
     env = gym.make(f"{robot}-v5", max_episode_steps=limit)
     plant = sw.MujocoPlant()
     plant.bind(env)
-    forecast = sw.ContactFeasibility(SHARE, TOLERANCE)
+    forecast = sw.ContactFeasibility(SHARE, TOLERANCE).bind(plant)
     programs = {
-        "pyramids": sw.Stance(SHARE, joint_tolerance=None),
-        "exact cones": sw.Stance(SHARE, cone="exact", joint_tolerance=None),
+        "pyramids": sw.Stance(SHARE, joint_tolerance=None).bind(plant),
+        "exact cones": sw.Stance(SHARE, cone="exact", joint_tolerance=None).bind(plant),
     }
-    for constraint in (forecast, *programs.values()):
-        constraint = Asked(constraint, plant)
     for episode in range(episodes):
         observation, _ = env.reset(seed=episode)
         done = False
@@ -229,6 +226,8 @@ def ask_programs(robot: str, policy: Callable[[Any], Any], episodes: int, limit:
             action = policy(observation)
             proposed = np.asarray(action, dtype=np.float64)
             plant.observe()
+            for constraint in (forecast, *programs.values()):
+                constraint.observe(constraint.start())
             if not forecast.admits(proposed):
                 answers.refused += 1
                 for name, program in programs.items():

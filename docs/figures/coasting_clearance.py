@@ -39,15 +39,15 @@ def ways() -> tuple[Array, list[Array], Array]:
     """Where the car is in the last step before its full torque is refused: there, and its ways to rest."""
     env = sw.protect(gym.make("SafeCarGoal1-v0"), detour=False)
     env.reset(seed=0, options={"layout": LAYOUT})
-    constraint, plant = env.constraints[0], env.plant
+    constraint = env.filter.bound[0]
     while True:
-        plant.observe()
+        env.filter.observe()
         if not constraint.admits(np.ones(2)):
             break
         env.step(np.ones(2, dtype=np.float32))
     run = constraint._coasting.run
     controls = ([1.0, 1.0], [0.0, 0.0])
-    courses = [run(np.array(u), constraint.holds, 0.2).places for u in controls]
+    courses = [run(np.array(u), constraint.spec.holds, 0.2).places for u in controls]
     return env.unwrapped.agent_position, courses, np.array(HAZARD)
 
 

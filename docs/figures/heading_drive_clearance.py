@@ -28,13 +28,12 @@ def braking(detail: dict[str, Any]) -> tuple[Array, Any]:
     qvel = task.data.qvel.copy()
     qvel[:2] = SPEED, 0.0
     task.set_state(task.data.qpos.copy(), qvel)
-    plant, bound = filtered.plant, filtered.constraints[0]
-    plant.observe()
-    bound.value()
+    bound: Any = filtered.filter.bound[0]
+    filtered.filter.observe()
     area = bound._path
     where = [task.agent_position]
     for _ in range(150):
-        plant.observe()
+        filtered.filter.observe()
         env.step(bound.backup())
         where.append(task.agent_position)
     return np.array(where), area

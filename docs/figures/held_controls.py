@@ -7,16 +7,25 @@ import safe_wrappers as sw
 from _cart import Cart, run, wall
 from _style import FORBIDDEN, GRID, OFF, ON, panels
 from safe_wrappers.appendix.filtering.barriers import kinetic_row
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint
 
 WALL, GAMMA = 1.0, 2.0
 
 
-class ContinuousRow:
+class ContinuousRow(Constraint):
     """(a / v) (gamma h - v), the textbook's row, evaluated at the samples."""
 
-    def rows(self, plant: sw.Plant) -> sw.HalfSpaces:
+    def bind(self, plant: sw.Plant) -> BoundConstraint:
+        """On a plant."""
+        return BoundContinuousRow(self, plant)
+
+
+class BoundContinuousRow(BoundConstraint):
+    """ContinuousRow on a plant."""
+
+    def rows(self) -> sw.HalfSpaces:
         """One half-space on the acceleration; nothing at standstill."""
-        x, v = plant.state
+        x, v = self.plant.state
         limit = np.maximum(kinetic_row(WALL - x, v, 1.0, GAMMA), -1.0)
         return sw.HalfSpaces(np.array([[1.0]]), np.array([limit if np.isfinite(limit) else 1.0]))
 

@@ -9,6 +9,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 
 import safe_wrappers as sw
 from _style import FORBIDDEN, GRID, INK, OFF, ON, panels
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint
 from safe_wrappers.sb3 import ExecutedActionReplayBuffer
 
 PROPOSED, LIMIT, PENALTY = 0.75, 0.2, 0.4
@@ -31,10 +32,18 @@ class Line(gym.Env[Any, Any]):
         return (np.zeros(1, np.float32), 1.0 - abs(float(action[0]) - 0.5), False, False, {})
 
 
-class Limit:
+class Limit(Constraint):
     """u <= LIMIT."""
 
-    def rows(self, plant: sw.Plant) -> sw.HalfSpaces:
+    def bind(self, plant: sw.Plant) -> BoundConstraint:
+        """On a plant."""
+        return BoundLimit(self, plant)
+
+
+class BoundLimit(BoundConstraint):
+    """Limit on a plant."""
+
+    def rows(self) -> sw.HalfSpaces:
         """One row."""
         return sw.HalfSpaces(np.array([[1.0]]), np.array([LIMIT]))
 

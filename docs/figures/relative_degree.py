@@ -7,18 +7,26 @@ import safe_wrappers as sw
 from _cart import Cart, run, wall
 from _style import FORBIDDEN, GRID, OFF, ON, SAFE, panels
 from safe_wrappers.control.backup.stopping import held_stopping_distance
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint
 
 WALL = 2.0
 
 
-class NextPosition:
+class NextPosition(Constraint):
     """The naive rule: any control whose next position is still left of the wall."""
 
-    def rows(self, plant: sw.Plant) -> sw.HalfSpaces:
+    def bind(self, plant: sw.Plant) -> BoundConstraint:
+        """On a plant."""
+        return BoundNextPosition(self, plant)
+
+
+class BoundNextPosition(BoundConstraint):
+    """NextPosition on a plant."""
+
+    def rows(self) -> sw.HalfSpaces:
         """X + v hold + u hold^2 / 2 <= wall."""
-        x, v = plant.state
-        half = 0.5 * plant.hold_s**2
-        return sw.HalfSpaces(np.array([[half]]), np.array([WALL - x - v * plant.hold_s]))
+        (x, v), hold = self.plant.state, self.plant.hold_s
+        return sw.HalfSpaces(np.array([[0.5 * hold**2]]), np.array([WALL - x - v * hold]))
 
 
 def draw() -> Figure:

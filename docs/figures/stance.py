@@ -2,7 +2,6 @@
 
 import gymnasium as gym
 import numpy as np
-from asking import Asked
 from matplotlib.figure import Figure
 
 import safe_wrappers as sw
@@ -35,8 +34,8 @@ def draw() -> Figure:
     ):
         distances = []
         for share in SHARES:
-            stance = sw.Stance(float(share), joint_tolerance=None, **options)
-            stance = Asked(stance, plant)
+            stance = sw.Stance(float(share), joint_tolerance=None, **options).bind(plant)
+            stance.observe(stance.start())
             stance.admits(wanted)
             (answer,) = stance.candidates(wanted)
             distances.append(np.linalg.norm(answer - wanted) if stance.admits(answer) else np.nan)

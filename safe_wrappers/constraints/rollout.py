@@ -166,7 +166,7 @@ class BoundRollout(BoundSlacks):
 
     def _violation(self, value: Array) -> Array:
         """The present violations that a forecast starts from, <= 0, shape (n,)."""
-        return np.minimum(value - self.spec.margin, 0.0)
+        return np.asarray(np.minimum(value - self.spec.margin, 0.0))
 
     def slacks(self, control: Array) -> Array:
         """What is left of what is asked for along the forecast of a control, shape (k,); wanted >= 0."""

@@ -184,9 +184,7 @@ def test_several_points_and_obstacles_give_a_value_each(tmp_path):
     plant.observe()
     clear = sw.Clearance(DISCS, 1.5, bodies=["ball"], sites=["nose"])
     clear = Asked(clear, plant)
-    np.testing.assert_allclose(
-        clear.value()[[0, 4]], [np.hypot(1.0, 0.3) - 0.3, np.hypot(0.95, 0.3) - 0.3]
-    )
+    np.testing.assert_allclose(clear.value()[[0, 4]], [np.hypot(1.0, 0.3) - 0.3, np.hypot(0.95, 0.3) - 0.3])
     assert clear.value().shape == (8,)
 
 

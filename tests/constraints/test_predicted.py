@@ -47,11 +47,9 @@ def looking(scene, limit, qpos, qvel):
     """The limit, bound to a plant that has seen this state."""
     plant = sw.MujocoPlant()
     plant.bind(scene)
-    limit = Asked(limit, plant)
-    limit.reset()
     scene.data.qpos[:], scene.data.qvel[:] = qpos, qvel
     plant.observe()
-    return plant
+    return Asked(limit, plant)
 
 
 # What is asked ------------------------------------------------------------------------------------------------
@@ -67,7 +65,7 @@ def looking(scene, limit, qpos, qvel):
 )
 def test_a_control_is_admitted_by_where_it_leads(x, v, u, holds, margin):
     limit = sw.JointPositionLimit(-1.0, 1.0, holds=holds, margin=margin)
-    plant = looking(sliders(range_="-30 30"), limit, [x], [v])
+    limit = looking(sliders(range_="-30 30"), limit, [x], [v])
     beyond = np.abs(slider_path(x, v, u, holds, 30.0)) - (1.0 - margin)
     start = abs(x) - (1.0 - margin)
     if start <= 0.0:
@@ -78,7 +76,7 @@ def test_a_control_is_admitted_by_where_it_leads(x, v, u, holds, margin):
         missing = max(side.max() - start, side[-1] - start * np.exp(-holds * HOLD_S / 0.1), other.max())
     assume(abs(missing) > 1e-7 and abs(start) > 1e-9)
     assert limit.admits(np.array([u])) == (missing < 0.0)
-    assert limit.SHORTFALL(np.array([u])) == pytest.approx(missing, abs=1e-9)
+    assert limit.slack(np.array([u])) == pytest.approx(-missing, abs=1e-9)
     assert limit.value().min() == pytest.approx(1.0 - abs(x), abs=1e-12)
 
 
@@ -189,7 +187,7 @@ def test_a_broken_reach_is_warned_of_once_and_dropped(monkeypatch):
         for _ in range(20):
             filtered.step(np.array([0.0]))
     assert [str(w.message) for w in caught] == [
-        "JointPositionLimit: what is left of the limit fell by 0.15 rad or m within 4 control steps, farther than "
+        "JointPositionLimit: what is left of the limit fell by 0.15 rad or m within 3 control steps, farther than "
         "the declared reach of 0.12; from now on every control is forecast"
     ]
     assert calls[0] == 17  # three steps were taken for granted
@@ -218,8 +216,8 @@ def test_a_reset_is_not_taken_for_a_broken_reach():
 def test_a_model_that_breaks_down_in_the_forecast_is_not_admitted(tmp_path, monkeypatch):
     # MuJoCo resets it, and from the reset on all looks well.
     monkeypatch.chdir(tmp_path)  # it writes a log
-    limit = sw.JointPositionLimit(-1e6, 1e6)
-    plant = looking(sliders(actuator='motor gear="1000"', range_=None), limit, [0.0], [0.0])
+    scene = sliders(actuator='motor gear="1000"', range_=None)
+    limit = looking(scene, sw.JointPositionLimit(-1e6, 1e6), [0.0], [0.0])
     assert limit.admits(np.array([1.0]))
     assert not limit.admits(np.array([1e9]))
     assert limit.admits(np.array([2.0]))  # and the next one is a forecast again
@@ -248,10 +246,9 @@ def limit_left(kind, scene):
 @kinds
 def test_a_state_that_is_no_number_admits_nothing(kind, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    limit = LIMITS[kind]()
-    plant = looking(sliders(), limit, [np.nan], [0.0])
+    limit = looking(sliders(), LIMITS[kind](), [np.nan], [0.0])
     assert not limit.admits(np.zeros(1))
-    assert limit.SHORTFALL(np.zeros(1)) == np.inf
+    assert limit.slack(np.zeros(1)) == -np.inf
 
 
 @kinds

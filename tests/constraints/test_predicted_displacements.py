@@ -23,7 +23,7 @@ def protected(env_id, steps=1000):
 def to_the_corner(env, way, steps=9):
     for _ in range(steps):
         env.step(np.array(way, np.float32))
-    env.plant.observe()
+    env.filter.observe()
 
 
 def room(rows, control):
@@ -34,7 +34,7 @@ def room(rows, control):
 def test_rows_and_forecast_agree_about_braking():
     # In the table a displacement of zero comes out, but too slowly.
     env = protected("FetchPush-v4")
-    for constraint, slow in zip(env.constraints, (False, True), strict=True):
+    for constraint, slow in zip(env.filter.bound, (False, True), strict=True):
         assert constraint.value().min() < -0.003
         left = float(constraint.slacks(ZERO).min())
         assert (left < 0.0) == slow != constraint.admits(ZERO)
@@ -45,7 +45,7 @@ def test_rows_and_forecast_agree_about_braking():
 def test_rows_foretell_forecasts(way):
     env = protected("FetchReach-v4")
     to_the_corner(env, way)
-    box, plant = env.constraints[0], env.plant
+    box = env.filter.bound[0]
     rows = box.rows()
     rng = np.random.default_rng(0)
     broken = 0
@@ -61,18 +61,18 @@ def test_rows_foretell_forecasts(way):
 def test_a_cut_goes_through_its_forecast_and_aims_a_little_inward(monkeypatch):
     env = protected("FetchReach-v4")
     to_the_corner(env, [1.0, 1.0, 0.0, 0.0])
-    box, plant = env.constraints[0], env.plant
-    box.reset()  # no response of earlier steps
+    box = env.filter.bound[0]
+    box.observe(box.start())  # no response of earlier steps
     box.rows()
     control = np.array([0.5, 0.2, 0.0, 0.0])
     left = float(box.slacks(control).min())
-    cut = box.cut(control)
+    cut = box.linearize(control)
     assert left < -0.005
     assert room(cut, control) == pytest.approx(1.01 * left, rel=0.01)
     monkeypatch.setattr(predicted, "_RESOLUTION", 0.0)
-    box.reset()
+    box.observe(box.start())
     box.rows()
-    exact = box.cut(control)
+    exact = box.linearize(control)
     # Rounding a control to single precision moves it by less than 1e-7.
     inward = exact.offsets - cut.offsets
     assert np.allclose(inward, 1e-6 * np.abs(cut.normals).sum(axis=1), rtol=0.02)

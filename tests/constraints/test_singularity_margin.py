@@ -1,7 +1,5 @@
 """SingularityMargin: w against MuJoCo's Jacobians, its row against accelerations, loops that seek singularity."""
 
-import copy
-
 import gymnasium as gym
 import mujoco
 import numpy as np
@@ -33,10 +31,8 @@ DRIVEN = ["rail", "a", "b", "c"]
 def bound(env, limit, plant=None):
     plant = plant or sw.MujocoPlant()
     plant.bind(env)
-    limit = Asked(limit, plant)
-    limit.reset()
     plant.observe()
-    return plant
+    return Asked(limit, plant)
 
 
 def true_w(model, data, kind, name, joints, directions="xyz", rotations="", length=1.0, own=False):
@@ -82,8 +78,8 @@ TASKS = {
 def test_w_is_that_of_mujoco_s_jacobian_now_and_ahead(task):
     arguments, truth = TASKS[task]
     env, threshold = Scene(CHAIN), 1e-3
-    limit = sw.SingularityMargin(threshold, holds=2, **arguments)
-    plant = bound(env, limit)
+    limit = bound(env, sw.SingularityMargin(threshold, holds=2, **arguments))
+    plant = limit.plant
     kind = next(k for k in ("site", "body", "geom") if k in arguments)
     rng, still = np.random.default_rng(0), mujoco.MjData(env.model)
 
@@ -99,7 +95,7 @@ def test_w_is_that_of_mujoco_s_jacobian_now_and_ahead(task):
         plant.observe()
         assert limit.value() == pytest.approx(expected(env.data.qpos), rel=1e-9, abs=1e-9)
         forecast = plant.forecast(rng.uniform(-3.0, 3.0, 4), 2)
-        room = limit._room(plant, forecast)
+        room = limit._room(forecast)
         assert room.shape == (10, 1)
         for k in range(10):
             # Beyond a singular pose a square task counts as negative; the difference has a test of its own.
@@ -112,8 +108,8 @@ def test_w_is_that_of_mujoco_s_jacobian_now_and_ahead(task):
 def test_its_row_is_the_second_derivative_of_w_under_a_torque(task):
     arguments, _ = TASKS[task]
     env = Scene(CHAIN)
-    limit = sw.SingularityMargin(1e-2, margin=0.1, **arguments)
-    plant = bound(env, limit)
+    limit = bound(env, sw.SingularityMargin(1e-2, margin=0.1, **arguments))
+    plant = limit.plant
     rng, data = np.random.default_rng(1), mujoco.MjData(env.model)
     h, a, checked = 3e-5, 1.0 / (2.0 * plant.hold_s), 0
     for _ in range(12):
@@ -148,52 +144,49 @@ def test_an_arm_on_a_base_that_floats_has_no_row_and_one_that_is_moved_by_hand_i
     )
     floating = floating.replace('<motor joint="rail" ctrlrange="-50 50"/>', "")
     env = Scene(floating.replace('<geom size=".05"/>', '<freejoint/><geom size=".05"/>'))
-    limit = sw.SingularityMargin(1e-3, site="tip", directions="xy")
-    plant = bound(env, limit)
+    limit = bound(env, sw.SingularityMargin(1e-3, site="tip", directions="xy"))
     assert limit.rows().normals.shape == (0, 3)
     env.data.qpos[3:7] = np.array([0.5, 0.1, 0.7, 0.5])
     mujoco.mj_forward(env.model, env.data)
-    plant.observe()
+    limit.plant.observe()
     wanted = true_w(env.model, env.data, "site", "tip", ["a", "b", "c"], "xy")
     assert limit.value() == pytest.approx(wanted / 1e-3 - 1.0)
 
     env = Scene(floating.replace('<body name="base"', '<body name="base" mocap="true"'))
-    limit = sw.SingularityMargin(1e-3, site="tip", directions="xy")
-    plant = bound(env, limit)
+    limit = bound(env, sw.SingularityMargin(1e-3, site="tip", directions="xy"))
     env.data.mocap_quat[0] = [0.8, 0.0, 0.6, 0.0]
     env.data.qpos[:] = 0.4
     mujoco.mj_forward(env.model, env.data)
-    plant.observe()
+    limit.plant.observe()
     wanted = true_w(env.model, env.data, "site", "tip", ["a", "b", "c"], "xy")
     assert limit.value() == pytest.approx(wanted / 1e-3 - 1.0)
 
 
 def test_a_square_task_is_not_passed_through_its_singular_pose():
     env = gym.make("Reacher-v5")
-    limit = sw.SingularityMargin(0.003, body="fingertip", directions="xy")
+    spec = sw.SingularityMargin(0.003, body="fingertip", directions="xy")
     for side in (1.0, -1.0):
         env.reset(seed=0)
         env.unwrapped.set_state(
             np.array([0.3, side * 0.5, 0.1, -0.1]), np.array([0.0, -side * 40.0, 0.0, 0.0])
         )
-        plant = bound(env, limit)
+        limit = bound(env, spec)
         assert limit.value() == pytest.approx(0.011 * np.sin(0.5) / 0.003 - 1.0)
-        forecast = plant.forecast(np.zeros(2), 2)
+        forecast = limit.plant.forecast(np.zeros(2), 2)
         crossing = forecast.qpos[:, 1]
         assert (crossing * side).min() < -0.2  # it does pass through, to where w is large again
-        np.testing.assert_allclose(
-            limit._room(plant, forecast)[:, 0], side * 0.011 * np.sin(crossing) / 0.003 - 1.0
-        )
+        np.testing.assert_allclose(limit._room(forecast)[:, 0], side * 0.011 * np.sin(crossing) / 0.003 - 1.0)
         assert not limit.admits(np.zeros(2))
 
 
-def test_a_copy_has_kinematics_of_its_own():
-    env = Scene(CHAIN)
-    limit = sw.SingularityMargin(1e-3, site="tip")
-    plant = bound(env, limit)
-    twin = copy.deepcopy(limit)
+def test_every_plant_that_a_constraint_is_bound_to_has_kinematics_of_its_own():
+    env, spec = Scene(CHAIN), sw.SingularityMargin(1e-3, site="tip")
+    limit = bound(env, spec)
+    before = limit.value().copy()
     env.data.qpos[:] = [0.1, 0.5, -0.4, 0.3, 0.2]
-    plant.observe()
+    twin = bound(env, spec)
+    assert twin.value() != before and limit.value() == before
+    limit.plant.observe()
     assert twin.value() == limit.value()
 
 
@@ -202,9 +195,8 @@ def test_a_copy_has_kinematics_of_its_own():
 
 def test_a_validated_threshold_is_that_of_the_sampled_configurations():
     env = Scene(CHAIN)
-    limit = sw.SingularityMargin(site="tip", task_speed=0.1, rate_limit=2.0)
-    bound(env, limit)
-    found = limit.validated
+    limit = bound(env, sw.SingularityMargin(site="tip", task_speed=0.1, rate_limit=2.0))
+    found = limit.spec.validated
     assert found.samples == 2000 and 0 < found.exceeding < 2000 and found.above > 0
     # A second draw, by MuJoCo's Jacobians: what exceeds above the threshold is as rare as the sample says.
     rng, data, jacobians = np.random.default_rng(5), mujoco.MjData(env.model), []
@@ -220,9 +212,8 @@ def test_a_validated_threshold_is_that_of_the_sampled_configurations():
     w = np.prod(np.linalg.svd(jacobians, compute_uv=False), axis=1)
     need = 0.1 * np.linalg.norm(np.linalg.pinv(jacobians), axis=2).max(axis=1)
     assert ((w > found.threshold) & (need > 2.0)).mean() <= 2.0 * found.unseen(0.99)
-    given = sw.SingularityMargin(found.threshold, site="tip")
-    plant = bound(env, given)
-    assert given.validated is None and given.value() == limit.value()
+    given = bound(env, sw.SingularityMargin(found.threshold, site="tip"))
+    assert given.spec.validated is None and given.value() == limit.value()
 
 
 def test_no_threshold_that_keeps_the_rates_is_an_error():

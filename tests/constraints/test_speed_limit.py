@@ -25,14 +25,10 @@ averages = pytest.mark.parametrize("average", ["step", "substep"])
 
 def watching(env, **options):
     """A limit that follows an env by itself, and its plant."""
-    limit = sw.SpeedLimit(**{"limit": 50.0, "holds": 1, **options})
     plant = sw.MujocoPlant()
     plant.bind(env)
-    limit = Asked(limit, plant)
-    limit.reset()
     plant.observe()
-    limit.value()
-    return limit, plant
+    return Asked(sw.SpeedLimit(**{"limit": 50.0, "holds": 1, **options}), plant), plant
 
 
 # The speed that is meant --------------------------------------------------------------------------------------
@@ -55,15 +51,16 @@ def test_the_forecast_speed_is_the_one_that_the_task_judges(robot, version):
         if speeds and not plane:  # the step behind it is judged by the same measure
             assert 50.0 - present == pytest.approx(speeds[-1], abs=1e-12)
         forecast = plant.forecast(action)
-        ahead = 50.0 - limit._room(plant, forecast)
+        ahead = 50.0 - limit._room(forecast)
         assert ahead.shape == (1, 2)
-        assert limit.SHORTFALL(action) == pytest.approx(ahead.max() - 50.0, abs=1e-12)
+        assert limit.slack(action) == pytest.approx(50.0 - ahead.max(), abs=1e-12)
+        limit.executed(action)
         *_, terminated, _, info = env.step(action)
         wrong = np.maximum(wrong, np.abs(ahead[0] - info["speed"]))
         speeds.append(info["speed"])
         if terminated:
             env.reset()
-            limit.reset()
+            limit.start()
             speeds = []
     # Gymnasium reads Ant's and Humanoid's position from what MuJoCo has left behind, the others' from qpos.
     assert wrong[1 if plane else 0] < 1e-12
@@ -119,7 +116,7 @@ def test_a_control_is_admitted_by_the_speed_it_leads_to(v, u, direction, average
     env = Scene(TWO.format(timestep=timestep), frame_skip=substeps)
     env.data.qvel[:] = v
     mujoco.mj_forward(env.model, env.data)
-    limit, plant = watching(
+    limit, _ = watching(
         env, limit=2.0, body=body, direction=direction, average=average, margin=margin, holds=1
     )
     both = velocities(v, u, timestep, substeps)
@@ -131,7 +128,7 @@ def test_a_control_is_admitted_by_the_speed_it_leads_to(v, u, direction, average
     left = 2.0 - margin - MEASURES[direction](moving).max()
     assume(abs(left) > 1e-7)
     assert limit.admits(np.array(u)) == (left > 0.0)
-    assert limit.SHORTFALL(np.array(u)) == pytest.approx(-left, abs=1e-7)
+    assert limit.slack(np.array(u)) == pytest.approx(left, abs=1e-7)
     start = np.einsum("b,bi->i", np.asarray(weights), velocities(v, [0.0, 0.0], timestep, 1)[0])
     assert limit.value()[0] == pytest.approx(2.0 - MEASURES[direction](start), abs=1e-9)
 
@@ -161,9 +158,9 @@ def test_units_do_not_slip_between_speed_and_displacement(average, timestep, sub
 
 def _filtered_control(filtered, action):
     """What the filter would execute at the env's present state; it is set, not stepped."""
-    filtered.plant.observe()
-    filtered._margin()
-    decision = filtered._decider.decide(action, np.zeros(2))
+    filtered.filter.observe()
+    decision = filtered.filter.filter(action)
+    filtered.filter.executed(decision.control)
     filtered.unwrapped.data.ctrl[:] = decision.control
     return decision
 
@@ -224,7 +221,7 @@ def test_a_speed_that_is_kept_only_to_be_exceeded_next_is_refused_now():
         env.model.opt.gravity[0] = 5.0
         env.data.qvel[0] = 0.6
         mujoco.mj_forward(env.model, env.data)
-        limit, plant = watching(env, limit=1.0, direction="+x", holds=holds)
+        limit, _ = watching(env, limit=1.0, direction="+x", holds=holds)
         admitted[holds] = [limit.admits(np.array([u])) for u in (-1.0, 1.0)]
     # The averages of the next steps, braking: 0.72, 0.92, 1.12; at full throttle: 0.78, 1.0 + ...
     assert admitted == {1: [True, True], 2: [True, False], 3: [False, False]}
@@ -240,11 +237,10 @@ def test_under_a_delay_only_the_predicted_states_count():
     queue = [0.0, 0.0]
     for k in range(60):
         position = float(env.data.qpos[0])
-        plant.observe()
-        filtered._margin()
-        assert filtered.filter.bound[0]._room(plant, plant.forecast(np.zeros(1))).shape == (1, 1)
-        decision = filtered._decider.decide(np.array([20.0 * (-1.0) ** (k // 20)]), np.zeros(1))
-        plant.executed(decision.control)
+        filtered.filter.observe()
+        assert filtered.filter.bound[0]._room(plant.forecast(np.zeros(1))).shape == (1, 1)
+        decision = filtered.filter.filter(np.array([20.0 * (-1.0) ** (k // 20)]))
+        filtered.filter.executed(decision.control)
         queue.append(float(decision.control[0]))
         env.step(np.array([queue.pop(0)]))  # it acts 0.1 s after it was sent
         fastest = max(fastest, abs(env.data.qpos[0] - position) / 0.05)
@@ -324,7 +320,7 @@ def test_it_is_rebuilt_from_the_spec_and_from_json():
         "reach": 0.7,
     }
     assert constraint_from(data) == limit
-    assert limit.promise == "best effort" and limit.scale == 1.5
+    assert limit.promise == "best effort" and filtered.filter.bound[0].scale == 1.5
 
 
 @pytest.mark.parametrize(

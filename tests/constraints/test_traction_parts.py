@@ -256,12 +256,11 @@ def test_a_limit_that_shrinks_is_followed_as_fast_as_the_drives_can():
 def test_a_row_that_is_no_number_is_kept_and_fails():
     env = rover(friction=1e6)
     start(env, speed=1.0)
-    env.plant.observe()
-    traction = env.constraints[0]
-    traction.rows()
+    env.filter.observe()
+    traction = env.filter.bound[0]
     traction._window = tuple(np.nan * end for end in traction._window)
-    assert np.isnan(traction._bounds(env.plant).offsets).all()
-    assert traction._bounds(env.plant).offsets.shape == (8,)
+    assert np.isnan(traction._bounds().offsets).all()
+    assert traction._bounds().offsets.shape == (8,)
 
 
 # The report --------------------------------------------------------------------------------------------------------

@@ -18,10 +18,8 @@ from safe_wrappers.errors import ConfigurationError, UnknownNameError
 def bound(env, limit):
     plant = sw.MujocoPlant()
     plant.bind(env)
-    limit = Asked(limit, plant)
-    limit.reset()
     plant.observe()
-    return plant
+    return Asked(limit, plant)
 
 
 BOX = """<mujoco><option timestep="0.01"/><worldbody><body name="box"><freejoint/><geom type="box" size=".1 .2 .3"/>
@@ -42,9 +40,10 @@ def test_height_and_tilt_of_any_pose(height, turn):
     w, x, y, z = turn
     up = Rotation.from_quat([x, y, z, w]).apply([0.0, 0.0, 1.0])
     angle = np.arctan2(np.hypot(up[0], up[1]), up[2])
-    plant = bound(env, limit)
     # arccos of a cosine near one loses half of the digits
-    np.testing.assert_allclose(limit.value(), [height + 1.0, 2.0 - height, 0.5 - angle], atol=1e-7)
+    np.testing.assert_allclose(
+        bound(env, limit).value(), [height + 1.0, 2.0 - height, 0.5 - angle], atol=1e-7
+    )
 
 
 def test_only_what_is_given_counts():
@@ -58,7 +57,7 @@ def test_only_what_is_given_counts():
         ({"highest": 2.0, "tilt": 0.5}, [0.8, 0.1]),
     ):
         limit = sw.Upright("box", **arguments)
-        np.testing.assert_allclose(limit.value(bound(env, limit)), left, atol=1e-7)
+        np.testing.assert_allclose(bound(env, limit).value(), left, atol=1e-7)
 
 
 def test_the_forecast_is_followed_substep_by_substep():
@@ -66,9 +65,8 @@ def test_the_forecast_is_followed_substep_by_substep():
     env.data.qpos[:4] = [0.0, 0.0, 2.0, 1.0]
     env.data.qvel[3] = 2.0  # turning about x at 2 rad/s, and falling
     mujoco.mj_forward(env.model, env.data)
-    limit = sw.Upright("box", lowest=1.0, tilt=1.0, holds=4)
-    plant = bound(env, limit)
-    room = limit._room(plant, plant.forecast(np.zeros(1), 4))
+    limit = bound(env, sw.Upright("box", lowest=1.0, tilt=1.0, holds=4))
+    room = limit._room(limit.plant.forecast(np.zeros(1), 4))
     assert room.shape == (20, 2)
     data = mujoco.MjData(env.model)
     mujoco.mj_copyData(data, env.model, env.data)

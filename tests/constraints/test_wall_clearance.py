@@ -5,12 +5,14 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
+from asking import Asked
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from point_worlds import BLOCKS, RADIUS, PointWorld
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint
 from safe_wrappers.serialize import constraint_data, constraint_from
 
 MARGIN = 0.001
@@ -25,10 +27,10 @@ def filtered(world=None, more=(), **options):
 
 
 def placed(env, at, velocity=(0.0, 0.0)):
-    """Observe the ball somewhere; the constraint and the plant are returned."""
+    """The constraint, with the ball somewhere."""
     env.unwrapped.place(at, velocity)
     env.plant.observe()
-    return env.constraints[0], env.plant
+    return Asked(env.constraints[0], env.plant)
 
 
 ENVS = {
@@ -59,8 +61,8 @@ ACTIONS = st.lists(
 @settings(max_examples=60, deadline=None)
 @given(PLACES, SPEEDS, ACTIONS, st.integers(1, 5))
 def test_from_every_safe_state_any_actions_stay_clear_in_mujoco(world, at, velocity, actions, hold):
-    limit, plant = placed(world, at, velocity)
-    assume(limit.value()[0] >= limit.margin)
+    limit = placed(world, at, velocity)
+    assume(limit.value()[0] >= limit.spec.margin)
     for action in actions:
         for _ in range(hold):
             info = world.step(np.array(action, np.float32))[4]
@@ -68,61 +70,61 @@ def test_from_every_safe_state_any_actions_stay_clear_in_mujoco(world, at, veloc
             assert info["nearest"] >= MARGIN + 0.004 - 1e-6
             assert not (info["cbf/infeasible"] or info["cbf/fallback"] or info["cbf/unsafe"])
             world.plant.observe()
-            assert limit.value()[0] >= limit.margin - 1e-7
+            assert limit.value()[0] >= limit.spec.margin - 1e-7
 
 
 @settings(max_examples=100, deadline=None)
 @given(PLACES, SPEEDS)
 def test_the_backup_is_admitted_and_loses_nothing(world, at, velocity):
-    limit, plant = placed(world, at, velocity)
+    limit = placed(world, at, velocity)
     before = limit.value()[0]
-    assume(before >= limit.margin)
+    assume(before >= limit.spec.margin)
     backup = limit.backup()
     assert limit.admits(backup)
     world.unwrapped.step(backup)
-    plant.observe()
+    limit.plant.observe()
     assert limit.value()[0] >= before - 1e-9
 
 
 @settings(max_examples=60, deadline=None)
 @given(PLACES, SPEEDS, st.tuples(st.floats(-1, 1), st.floats(-0.8, 1)))
 def test_what_is_suggested_and_what_the_rows_allow_is_admitted(world, at, velocity, asked):
-    limit, plant = placed(world, at, velocity)
-    assume(limit.value()[0] >= limit.margin + 1e-6)
+    limit = placed(world, at, velocity)
+    assume(limit.value()[0] >= limit.spec.margin + 1e-6)
     asked = np.array(asked)
     for control in limit.candidates(asked):
         assert limit.admits(control)
     rows = limit.rows()
     assert (rows.normals @ limit.backup() <= rows.offsets + 1e-9).all()
-    if limit.velocity_clip is None:
+    if limit.spec.velocity_clip is None:
         # The rows are a part of what is admitted; where the clip is known, a few states have no such part.
-        control = sw.project(asked, rows.normals, rows.offsets, plant.lower, plant.upper).control
+        control = sw.project(asked, rows.normals, rows.offsets, limit.plant.lower, limit.plant.upper).control
         assert limit.admits(control)
 
 
 @pytest.mark.parametrize("options", [{"velocity_clip": 5.0}, {}])
 def test_corrections_leave_a_hair_for_rounding(options):
     env = filtered(PointWorld(clip=5.0), **options)
+    limit = Asked(env.constraints[0], env.plant)
     rng, corrected = np.random.default_rng(2), 0
     for k in range(1500):
         if k % 12 == 0:
             action = rng.choice([-1.0, 0.3, 1.0], 2) * [1.0, 0.8]
         env.plant.observe()
-        limit, plant = env.constraints[0], env.plant
         before = limit.value()[0]
         nearest = action if limit.admits(action) else limit.candidates(action)[0]
         env.unwrapped.step(nearest)  # in float64: nothing is rounded here
         env.plant.observe()
         if nearest is not action:
             corrected += 1
-            assert limit.value()[0] >= min(limit.margin + 0.4e-7, before - 1e-12)
+            assert limit.value()[0] >= min(limit.spec.margin + 0.4e-7, before - 1e-12)
     assert corrected > 300
 
 
 @pytest.mark.parametrize("options", [{"velocity_clip": 5.0}, {}])
 def test_a_hair_lost_to_rounding_is_no_reason_to_refuse_braking(options):
-    limit, plant = placed(filtered(**options), (2.0 - ROOM + 5e-8, -1.2), (0.0, 1.0))
-    assert limit.value()[0] < limit.margin
+    limit = placed(filtered(**options), (2.0 - ROOM + 5e-8, -1.2), (0.0, 1.0))
+    assert limit.value()[0] < limit.spec.margin
     assert limit.admits(limit.backup())
     assert limit.admits(np.array([0.0, 1.0]))  # along the wall
     assert limit.admits(np.array([-1.0, 0.0]))  # away from it
@@ -134,6 +136,7 @@ def test_a_hair_lost_to_rounding_is_no_reason_to_refuse_braking(options):
 def test_the_nearest_admitted_control_is_found():
     # Against every control of a fine grid, at states that a rough driver comes to.
     env = filtered(PointWorld(clip=5.0))
+    limit = Asked(env.constraints[0], env.plant)
     grid = np.array([(x, y) for x in np.linspace(-1, 1, 41) for y in np.linspace(-0.8, 1, 37)])
     rng = np.random.default_rng(0)
     checked = 0
@@ -141,7 +144,6 @@ def test_the_nearest_admitted_control_is_found():
         action = rng.choice([-1.0, 1.0], 2) * [1.0, 0.8]
         for _ in range(15):
             env.plant.observe()
-            limit, plant = env.constraints[0], env.plant
             if not limit.admits(action) and rng.random() < 0.2:
                 best = limit.candidates(action)[0]
                 distance = np.linalg.norm(grid - action, axis=1)
@@ -178,17 +180,19 @@ def test_it_stops_in_a_corner_and_leaves_it_freely():
 def test_knowing_the_clip_lets_it_pass_a_corner_that_it_would_stop_at():
     # Up and to the left past the upper right corner of the block at (1, 1), at 3.5 m/s along each axis.
     at, velocity, asked = (1.3, 1.0), (-3.5, 3.5), np.array([0.0, 1.0])
-    known, plant = placed(filtered(velocity_clip=5.0), at, velocity)
+    known = placed(filtered(velocity_clip=5.0), at, velocity)
     assert known.value()[0] > 0.05 and known.admits(asked)
-    unknown, plant = placed(filtered(), at, velocity)
+    unknown = placed(filtered(), at, velocity)
     assert unknown.value()[0] < 0.0
 
 
 def test_at_a_corner_the_rows_leave_each_axis_its_share():
     # The block's upper right corner is at (1, 1), the ball diagonally above it, a little farther away than needed.
-    limit, plant = placed(filtered(), (1.0 + 0.075, 1.0 + 0.075))
+    limit = placed(filtered(), (1.0 + 0.075, 1.0 + 0.075))
     rows = limit.rows()
-    towards = sw.project(np.array([-0.8, -0.8]), rows.normals, rows.offsets, plant.lower, plant.upper).control
+    towards = sw.project(
+        np.array([-0.8, -0.8]), rows.normals, rows.offsets, limit.plant.lower, limit.plant.upper
+    ).control
     assert rows.offsets.size == 2 and (towards > -0.5).all() and (towards < -0.1).all()
     assert limit.admits(towards)
 
@@ -203,9 +207,9 @@ def test_at_a_corner_the_rows_leave_each_axis_its_share():
 )
 def test_past_a_corner_a_correction_goes_as_far_as_the_path_allows(at, velocity, asked):
     # Up and to the left past the block's upper right corner.
-    limit, plant = placed(filtered(velocity_clip=5.0), at, velocity)
+    limit = placed(filtered(velocity_clip=5.0), at, velocity)
     asked = np.array(asked)
-    assert limit.value()[0] > limit.margin and not limit.admits(asked)
+    assert limit.value()[0] > limit.spec.margin and not limit.admits(asked)
     grid = [np.array([x, y]) for x in np.linspace(-1, 1, 41) for y in np.linspace(-0.8, 1, 37)]
     closest = min(np.linalg.norm(u - asked) for u in grid if limit.admits(u))
     assert np.linalg.norm(limit.candidates(asked)[0] - asked) < closest + 0.15
@@ -260,7 +264,7 @@ def test_from_outside_it_comes_back_and_stays(options, asked, gap, lost):
 
 def test_too_fast_to_stop_it_brakes_as_hard_as_it_can():
     env = filtered(velocity_clip=5.0)
-    limit, plant = placed(env, (1.6, -1.2), (5.0, 0.0))
+    limit = placed(env, (1.6, -1.2), (5.0, 0.0))
     assert limit.value()[0] < 0.0
     with pytest.warns(sw.UnsafeStateWarning):
         info = env.step(np.array([1.0, 0.4], np.float32))[4]
@@ -270,10 +274,16 @@ def test_too_fast_to_stop_it_brakes_as_hard_as_it_can():
 # Composition --------------------------------------------------------------------------------------------------
 
 
-class SlowAlongY:
+class SlowAlongY(Constraint):
     """Rows only: the speed along y stays below 0.5 m/s after the step."""
 
-    def rows(self, plant):
+    def bind(self, plant):
+        return BoundSlowAlongY(self, plant)
+
+
+class BoundSlowAlongY(BoundConstraint):
+    def rows(self):
+        plant = self.plant
         axis = plant.model.opt.timestep * 90.0 / (plant.model.body_mass[1] + 0.01)
         v = plant.qvel[0]
         return sw.HalfSpaces(np.array([[0.0, axis], [0.0, -axis]]), np.array([0.5 - v, 0.5 + v]))
@@ -307,24 +317,24 @@ def test_several_constraints_where_only_rows_can_agree():
 
 def test_a_plant_of_another_mass_is_read_anew():
     env = filtered()
-    limit, plant = placed(env, (1.2, -1.2), (2.0, 0.0))
+    limit = placed(env, (1.2, -1.2), (2.0, 0.0))
     before = limit.value()[0]
-    plant.perturb(mass=2.0)
-    plant.observe()
+    limit.plant.perturb(mass=2.0)
+    limit.plant.observe()
     assert limit.value()[0] < before - 0.05
 
 
 def test_a_delay_is_predicted():
     env = sw.CBFActionFilter(PointWorld(), [sw.WallClearance()], plant=sw.MujocoPlant(delay_s=0.05))
     env.reset(seed=0)
-    at_once, plant = placed(filtered(PointWorld()), (1.2, -1.2), (2.0, 0.0))
-    late, late_plant = placed(env, (1.2, -1.2), (2.0, 0.0))
+    at_once = placed(filtered(PointWorld()), (1.2, -1.2), (2.0, 0.0))
+    late = placed(env, (1.2, -1.2), (2.0, 0.0))
     assert late.value()[0] < at_once.value()[0] - 0.08
 
 
 def test_a_state_that_is_not_a_number_admits_nothing():
     env = filtered(velocity_clip=5.0)
-    limit, plant = placed(env, (np.nan, 0.0))
+    limit = placed(env, (np.nan, 0.0))
     assert np.isnan(limit.value()).all()
     assert not limit.admits(np.zeros(2))
     assert np.isfinite(limit.backup()).all()

@@ -15,10 +15,8 @@ from safe_wrappers.errors import ConfigurationError, UnknownNameError
 def bound(env, limit):
     plant = sw.MujocoPlant()
     plant.bind(env)
-    limit = Asked(limit, plant)
-    limit.reset()
     plant.observe()
-    return plant
+    return Asked(limit, plant)
 
 
 # Where the points are -----------------------------------------------------------------------------------------
@@ -49,8 +47,8 @@ def true_points(data):
 def test_bodies_sites_and_geoms_are_where_mujoco_has_them_now_and_ahead():
     env = Scene(ARM)
     names = {"bodies": ["lower", "upper"], "sites": ["tip"], "geoms": ["bone", "shin"]}
-    limit = sw.Workspace(low=[0.0, 0.0, 0.0], holds=2, **names)
-    plant = bound(env, limit)
+    limit = bound(env, sw.Workspace(low=[0.0, 0.0, 0.0], holds=2, **names))
+    plant = limit.plant
     rng = np.random.default_rng(0)
     truth = mujoco.MjData(env.model)
     for _ in range(10):
@@ -60,7 +58,7 @@ def test_bodies_sites_and_geoms_are_where_mujoco_has_them_now_and_ahead():
         mujoco.mj_forward(env.model, truth)
         np.testing.assert_allclose(limit.value().reshape(5, 3), true_points(truth), atol=1e-12)
         forecast = plant.forecast(rng.uniform(-1.0, 1.0, 2), 2)
-        room = limit._room(plant, forecast)
+        room = limit._room(forecast)
         assert room.shape == (10, 15)
         for k in range(10):
             truth.qpos[:] = forecast.qpos[k]
@@ -75,8 +73,7 @@ def test_every_bound_that_there_is_and_every_obstacle_counts_by_itself():
     (x, y, z), (p, q, r) = tip, bone = env.data.site("tip").xpos.copy(), env.data.geom("bone").xpos.copy()
 
     def left(**arguments):
-        limit = sw.Workspace(sites=["tip"], geoms=["bone"], **arguments)
-        return limit.value(bound(env, limit))
+        return bound(env, sw.Workspace(sites=["tip"], geoms=["bone"], **arguments)).value()
 
     np.testing.assert_allclose(left(low=[-1.0, None, None]), [x + 1.0, p + 1.0])
     np.testing.assert_allclose(
@@ -101,11 +98,10 @@ def test_every_bound_that_there_is_and_every_obstacle_counts_by_itself():
 
 def test_published_obstacles_are_taken_where_they_are():
     env = gym.make("SafePointGoal1-v0", disable_env_checker=True)
-    limit = sw.Workspace(keep_out=[sw.Discs("hazard_positions", 0.2)], bodies=["agent"])
-    plant = bound(env, limit)
+    limit = bound(env, sw.Workspace(keep_out=[sw.Discs("hazard_positions", 0.2)], bodies=["agent"]))
     for seed in (0, 1):
         env.reset(seed=seed)
-        plant.observe()
+        limit.plant.observe()
         raw = env.unwrapped
         away = np.linalg.norm(raw.hazard_positions - raw.data.body("agent").xpos[:2], axis=1) - 0.2
         np.testing.assert_allclose(limit.value(), away, atol=1e-12)
