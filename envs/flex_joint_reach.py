@@ -13,7 +13,7 @@ from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
 from safe_wrappers.errors import ActionError, ConfigurationError
-from safe_wrappers.info import COST, COST_SUBSTEP
+from safe_wrappers.info import COST, COST_SUBSTEP, IS_SUCCESS
 
 Array = NDArray[np.float64]
 
@@ -27,8 +27,6 @@ REWARD_DIST: Final = "reward_dist"
 """float64: the reward's share for the distance."""
 REWARD_CTRL: Final = "reward_ctrl"
 """float64: the reward's share for the torque."""
-IS_SUCCESS: Final = "is_success"
-"""bool: the fingertip is within `SUCCESS_RADIUS` of the target at the step's end."""
 
 SUCCESS_RADIUS: Final = 0.03
 """m."""

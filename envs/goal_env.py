@@ -12,7 +12,7 @@ from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
 from safe_wrappers.errors import ActionError, ConfigurationError
-from safe_wrappers.info import COST, COST_SUBSTEP
+from safe_wrappers.info import COST, COST_SUBSTEP, GOALS_REACHED
 
 from .layout import Layout, PartialLayout, parse_layout
 from .levels import (
@@ -32,8 +32,6 @@ COST_VASES: Final = "cost_vases"
 """float: 1 if a vase is touched or moves at the end of the step, else 0 (always 0 below level 2)."""
 GOAL_MET: Final = "goal_met"
 """bool: this step reached the goal (a new one stands already)."""
-GOALS_REACHED: Final = "goals_reached"
-"""int: goals reached in this episode so far."""
 
 _FRAME_SKIP: Final = 10
 _REWARD_LIMIT: Final = 10.0

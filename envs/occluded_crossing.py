@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers.control.estimation.tracks import Motion, Tracks
 from safe_wrappers.errors import ActionError, SafeWrappersError
-from safe_wrappers.info import COST, COST_SUBSTEP
+from safe_wrappers.info import COLLISIONS, COST, COST_SUBSTEP, GOALS_REACHED
 
 from .crossing_layout import (
     CARS,
@@ -28,7 +28,7 @@ from .crossing_layout import (
     sample_crossing_goal,
     sample_crossing_layout,
 )
-from .goal_env import GOAL_MET, GOALS_REACHED
+from .goal_env import GOAL_MET
 from .traffic import CAR_ACCELERATION_NOISE, CAR_MEAN_SPEED, CAR_SPEED_STD, CAR_TIME_CONSTANT_S, Traffic
 
 __all__ = [
@@ -48,8 +48,6 @@ CAR_BODIES: Final = tuple(f"car{i}" for i in range(CARS))
 """The cars' bodies and joints, in the order of every array of six: the first three drive towards +x."""
 CAR_RADIUS: Final = 0.4
 """m."""
-COLLISIONS: Final = "collisions"
-"""int: collisions that began in this step, one per car: contact now, none at the physics substep before."""
 
 _FRAME_SKIP: Final = 4
 _CARS: Final = slice(3, 3 + CARS)  # coordinates: robot x, y, heading, then the cars' x

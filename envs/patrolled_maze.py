@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers.control.estimation.tracks import Motion, Tracks
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.info import COST, COST_SUBSTEP
+from safe_wrappers.info import COLLISIONS, COST, COST_SUBSTEP
 
 from .markers import MarkingRenderer
 from .traffic import CAR_SPEED_STD, CAR_TIME_CONSTANT_S, Traffic
@@ -25,8 +25,6 @@ except ImportError as error:
 
 Array = NDArray[np.float64]
 
-COLLISIONS: Final = "collisions"
-"""int: collisions that began in this step, one per patrol: contact now, none at the end of the step before."""
 BALL_RADIUS: Final = 0.1
 PATROL_RADIUS: Final = 0.15
 """m."""

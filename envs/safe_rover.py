@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from safe_wrappers.control.vehicle.traction_curves import MagicFormula
 from safe_wrappers.errors import ActionError, SafeWrappersError, UnknownNameError
-from safe_wrappers.info import COST, COST_SUBSTEP
+from safe_wrappers.info import COST, COST_SUBSTEP, GOALS_REACHED, SPIN_OUT
 
-from .goal_env import GOAL_MET, GOALS_REACHED
+from .goal_env import GOAL_MET
 from .ground import Ground
 from .lidar import LIDAR_BINS, pseudo_lidar
 from .rover_layout import RoverLayout, parse_rover_layout, sample_rover_goal, sample_rover_layout
@@ -29,8 +29,6 @@ SLIP: Final = "slip"
 """float64, shape (4,): longitudinal slip of each wheel at the end of the step (`control.vehicle.slip.slip_ratio`)."""
 SLIP_MAX: Final = "slip_max"
 """float64: largest size of any loaded wheel's longitudinal slip at the ends of this step's physics substeps."""
-SPIN_OUT: Final = "spin_out"
-"""float64: 1 if a loaded wheel's slip was larger than `SPIN_OUT_SLIP` there, else 0."""
 YAW_RATE_ERROR: Final = "yaw_rate_error"
 """float64, rad/s: how far the yaw rate was at most from the one that steering angle and speed ask for."""
 

@@ -7,6 +7,10 @@ Importing registers the ids of our tasks and changes nothing else; it imports ne
 (`safe_wrappers.sb3` and `safe_wrappers.train` do).
 """
 
+import warnings as _warnings
+from typing import Any as _Any
+
+from safe_wrappers import info as _info
 from safe_wrappers.constraints import (
     Barrier,
     Box,
@@ -120,3 +124,14 @@ __all__ = [
 ]
 
 _register_envs()
+
+
+def __getattr__(name: str) -> _Any:
+    if name == "interventions":
+        _warnings.warn(
+            "safe_wrappers.interventions is deprecated; write safe_wrappers.info",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        return _info
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,201 +1,292 @@
-"""The one place that names the info keys: their dtypes, units and meaning.
+"""The registry of info keys: type, unit and meaning of each, and how it is merged, summed up and logged.
 
 Every wrapper writes its keys at every step with the dtype given here, so that `Monitor`, TensorBoard and
 Gymnasium's vector envs need no glue. No key holds a wall-clock value: `check_env` compares two runs exactly.
 """
 
-from typing import Final
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class InfoKey:
+    """What is known of one info key; the docstring of its constant says what it means.
+
+    Attributes:
+        name: The key.
+        dtype: Of NumPy; "dict" is no number.
+        shape: Of an array, such as "(3,)" or "(wheels,)"; "" is a number.
+        unit: SI, "action" or "reward"; "" without a unit.
+        chunk: What becomes of it in a step of many control steps (`ChunkHandover`).
+        where: A key: control steps at which that one is 0 or missing do not count for `chunk`. "" counts all.
+        log: `InterventionCallback` logs ``interventions/step_<log>``, the mean over steps and envs; "" is not logged.
+        entries: What `number` takes of an array, the largest size or the mean.
+    """
+
+    name: str
+    dtype: Literal["bool", "int64", "float64", "dict"]
+    shape: str = ""
+    unit: str = ""
+    chunk: Literal["last", "sum", "any", "max", "min", "mean"] = "last"
+    where: str = ""
+    log: str = ""
+    entries: Literal["max", "mean"] = "max"
+
+    def number(self, value: Any) -> float:
+        """The value of a step as one number."""
+        if not self.shape:
+            return float(value)
+        return float(np.abs(value).max() if self.entries == "max" else np.mean(value))
+
+
+@dataclass(frozen=True)
+class EpisodeFigure:
+    """One figure of an episode: in ``info["interventions"]`` and a column of `RecordInterventions`' CSV file.
+
+    Attributes:
+        name: Of the figure.
+        how: Made from the steps: "count" is the number of steps at which a key is above zero, or the sum of a key of
+            whole numbers; "onsets" counts the entries of an array that become True; "any" is whether it ever was.
+        of: The info keys that it is made from: all that are there for "count", else the first one that is.
+        running: The key with the figure of the episode so far; "" for none.
+    """
+
+    name: str
+    how: Literal["mean", "p95", "count", "sum", "min", "last", "any", "onsets"]
+    of: tuple[str, ...]
+    running: str = ""
+
+
+KEYS: Final[dict[str, InfoKey]] = {}
+"""By name."""
+
+
+def _key(name: str, dtype: Any, **more: Any) -> str:
+    KEYS[name] = InfoKey(name, dtype, **more)
+    return name
+
 
 # CBFActionFilter, every step ------------------------------------------------------------------------------
-CBF_INTERVENED: Final = "cbf/intervened"
-"""bool: the executed action is not the (boxed) proposed one."""
-CBF_INFEASIBLE: Final = "cbf/infeasible"
-"""bool: no action inside the actuator box satisfied every row at this step."""
-CBF_FALLBACK: Final = "cbf/fallback"
-"""bool: the fallback chose the executed action (infeasible, failed solve, non-finite proposal or state)."""
-CBF_NONFINITE: Final = "cbf/nonfinite"
-"""bool: the proposed action held a NaN or an infinity; it never reaches the env."""
-CBF_CORRECTION: Final = "cbf/correction"
-"""float64: L2 norm of executed minus proposed, in action units (boxing counts; 0 for a non-finite proposal's
-missing entries: those are compared as 0)."""
-CBF_CLIPPED: Final = "cbf/clipped"
-"""float64: L2 norm of boxed minus proposed, in action units: what the action space alone took away."""
-CBF_MARGIN: Final = "cbf/margin"
-"""float64: the smallest barrier value h over all constraints before the step, each in its own unit (m, rad/s,
-...), to the limit itself: a constraint's margin is not taken off. 0 when no constraint has a barrier, or nothing
-that it watches is there."""
-CBF_UNSAFE: Final = "cbf/unsafe"
-"""bool: some h was negative (by more than rounding, 1e-6) or not a number before the step."""
-CBF_REFUSED: Final = "cbf/refused"
-"""bool array, one per constraint in the order of the filter's `constraint_names`: it did not admit the boxed
-proposal. More than one may; all False when nothing was changed, or when the state or the proposal was not finite."""
-CBF_STAGE: Final = "cbf/stage"
-"""int64: which stage of the search found the executed action, a `safe_wrappers.filter.search.Stage`: 0 the proposal
-itself, 1 projection on rows, 2 a constraint's candidate, 3 projection on rows linearised anew, 4 an overshoot, 5 a
-blend, 6 a backup control, 7 the fallback, 8 the least violation."""
-EXECUTED_ACTION: Final = "executed_action"
-"""array: what the env was really given."""
-PROPOSED_ACTION: Final = "proposed_action"
-"""array: what the filter was given, before boxing."""
+CBF_INTERVENED: Final = _key("cbf/intervened", "bool", chunk="any", log="rate")
+"""The executed action is not the (boxed) proposed one."""
+CBF_INFEASIBLE: Final = _key("cbf/infeasible", "bool", chunk="any", log="infeasible")
+"""No action inside the actuator box satisfied every row at this step."""
+CBF_FALLBACK: Final = _key("cbf/fallback", "bool", chunk="any", log="fallback")
+"""The fallback chose the executed action (infeasible, failed solve, non-finite proposal or state)."""
+CBF_NONFINITE: Final = _key("cbf/nonfinite", "bool", chunk="any")
+"""The proposed action held a NaN or an infinity; it never reaches the env."""
+CBF_CORRECTION: Final = _key("cbf/correction", "float64", unit="action", chunk="max", log="correction")
+"""L2 norm of executed minus proposed (boxing counts; 0 for a non-finite proposal's missing entries: those are
+compared as 0)."""
+CBF_CLIPPED: Final = _key("cbf/clipped", "float64", unit="action", chunk="max")
+"""L2 norm of boxed minus proposed: what the action space alone took away."""
+CBF_MARGIN: Final = _key("cbf/margin", "float64", chunk="min")
+"""The smallest barrier value h over all constraints before the step, each in its own unit (m, rad/s, ...), to the
+limit itself: a constraint's margin is not taken off. 0 when no constraint has a barrier, or nothing that it watches
+is there."""
+CBF_UNSAFE: Final = _key("cbf/unsafe", "bool", chunk="any")
+"""Some h was negative (by more than rounding, 1e-6) or not a number before the step."""
+CBF_REFUSED: Final = _key("cbf/refused", "bool", shape="(constraints,)", chunk="any")
+"""One per constraint in the order of the filter's `constraint_names`: it did not admit the boxed proposal. More than
+one may; all False when nothing was changed, or when the state or the proposal was not finite."""
+CBF_STAGE: Final = _key("cbf/stage", "int64")
+"""Which stage of the search found the executed action, a `safe_wrappers.filter.search.Stage`: 0 the proposal itself,
+1 projection on rows, 2 a constraint's candidate, 3 projection on rows linearised anew, 4 an overshoot, 5 a blend, 6
+a backup control, 7 the fallback, 8 the least violation."""
+EXECUTED_ACTION: Final = _key("executed_action", "float64", shape="(m,)", unit="action")
+"""What the env was really given."""
+PROPOSED_ACTION: Final = _key("proposed_action", "float64", shape="(m,)", unit="action")
+"""What the filter was given, before boxing."""
 
-CBF_BOOLS: Final = (CBF_INTERVENED, CBF_INFEASIBLE, CBF_FALLBACK, CBF_NONFINITE, CBF_UNSAFE)
-CBF_FLOATS: Final = (CBF_CORRECTION, CBF_CLIPPED, CBF_MARGIN)
+_NUMBERS: Final = [key for key in KEYS.values() if not key.shape]
+CBF_BOOLS: Final = tuple(key.name for key in _NUMBERS if key.dtype == "bool")
+CBF_FLOATS: Final = tuple(key.name for key in _NUMBERS if key.dtype == "float64")
 
 # Traction in a filter, SlipLimiter: every step --------------------------------------------------------------------
-SLIP_RATIO: Final = "slip/ratio"
-"""float64 array, one per wheel in the order of `wheels`: normalised slip before the step."""
-SLIP_LIMITED: Final = "slip/limited"
-"""bool array, one per wheel: the filter changed a control that drives it."""
-SLIP_MU_ESTIMATE: Final = "slip/mu_estimate"
-"""float64 array, one per wheel: estimated peak friction coefficient of its ground, before the step."""
-SLIP_MU_STD: Final = "slip/mu_std"
-"""float64 array, one per wheel: the estimate's standard deviation (of its model; no error bound)."""
+SLIP_RATIO: Final = _key("slip/ratio", "float64", shape="(wheels,)", log="slip")
+"""One per wheel in the order of `wheels`: normalised slip before the step."""
+SLIP_LIMITED: Final = _key("slip/limited", "bool", shape="(wheels,)", chunk="any", log="slip_limited")
+"""The filter changed a control that drives this wheel."""
+SLIP_MU_ESTIMATE: Final = _key("slip/mu_estimate", "float64", shape="(wheels,)")
+"""Estimated peak friction coefficient of each wheel's ground, before the step."""
+SLIP_MU_STD: Final = _key("slip/mu_std", "float64", shape="(wheels,)")
+"""The estimate's standard deviation (of its model; no error bound)."""
 
 # ContactFeasibility and SupportMargin in a filter, WholeBodyFilter: every step -------------------------------------
-WHOLE_BODY_CONTACTS: Final = "whole_body/contacts"
-"""int64: contacts of the robot with the fixed world at the state before the step."""
-WHOLE_BODY_CONE_MARGIN: Final = "whole_body/cone_margin"
-"""float64: by how much the contact forces stay inside the narrowed friction cones at worst, forecast for the executed
-action over its control step, as a share of the robot's weight; negative outside, 0 where nothing touches."""
-WHOLE_BODY_ZMP_MARGIN: Final = "whole_body/zmp_margin"
-"""float64: m, least distance of the zero moment point from the edge of the support polygon, forecast for the executed
-action, while there is a polygon; 0 where there is none."""
-WHOLE_BODY_SUPPORTED: Final = "whole_body/supported"
-"""float64: share of the forecast's instants at which there is a polygon: three contact points of one plane."""
+WHOLE_BODY_CONTACTS: Final = _key("whole_body/contacts", "int64")
+"""Contacts of the robot with the fixed world at the state before the step."""
+WHOLE_BODY_CONE_MARGIN: Final = _key("whole_body/cone_margin", "float64")
+"""By how much the contact forces stay inside the narrowed friction cones at worst, forecast for the executed action
+over its control step, as a share of the robot's weight; negative outside, 0 where nothing touches."""
+WHOLE_BODY_ZMP_MARGIN: Final = _key("whole_body/zmp_margin", "float64", unit="m")
+"""Least distance of the zero moment point from the edge of the support polygon, forecast for the executed action,
+while there is a polygon; 0 where there is none."""
+WHOLE_BODY_SUPPORTED: Final = _key("whole_body/supported", "float64")
+"""Share of the forecast's instants at which there is a polygon: three contact points of one plane."""
 
 # Tasks, every step: the env's own truth, never the filter's plant ------------------------------------------
-COST: Final = "cost"
-"""float64: cost of this control step, judged at its end, as Safety-Gymnasium publishes it; `CostFunction` writes it
-for a task that reports none."""
-COST_SUBSTEP: Final = "cost_substep"
-"""float64: 1 if the constraint was violated at any physics substep of this control step, else 0."""
-SPIN_OUT: Final = "spin_out"
-"""float64: 1 if a loaded wheel spun or locked (slip above 0.5 in size) at any physics substep, else 0."""
-COLLISIONS: Final = "collisions"
-"""int64: collisions that began in this step."""
-
-# RecordInterventions ---------------------------------------------------------------------------------------
-EPISODE_SUMMARY: Final = "interventions"
-"""dict, at an episode's last step only, as RecordEpisodeStatistics adds `episode`."""
-RUNNING_PREFIX: Final = "interventions/"
-RUNNING: Final = (
-    "interventions/rate",
-    "interventions/correction_mean",
-    "interventions/infeasible",
-    "interventions/fallback",
-    "interventions/margin_min",
-    "interventions/cost",
-    "interventions/cost_substep",
-)
-"""float64, every step: the episode so far, NaN where the task or the stack does not report what it is made from.
-Monitor reads them at the terminal step (`info_keywords`)."""
+COST: Final = _key("cost", "float64", chunk="sum", log="cost")
+"""Cost of this control step, judged at its end, as Safety-Gymnasium publishes it; `CostFunction` writes it for a
+task that reports none."""
+COST_SUBSTEP: Final = _key("cost_substep", "float64", chunk="sum", log="cost_substep")
+"""1 if the constraint was violated at any physics substep of this control step, else 0."""
+SPIN_OUT: Final = _key("spin_out", "float64", chunk="max", log="spin_out")
+"""1 if a loaded wheel spun or locked (slip above 0.5 in size) at any physics substep, else 0."""
+COLLISIONS: Final = _key("collisions", "int64", chunk="sum")
+"""Collisions that began in this step, one per car or patrol."""
+GOALS_REACHED: Final = _key("goals_reached", "int64")
+"""Goals reached in this episode so far."""
+SUCCESS: Final = _key("success", "bool")
+"""Of PointMaze and tasks of others: the goal is reached."""
+IS_SUCCESS: Final = _key("is_success", "bool")
+"""Of `FlexJointReach-v0` and tasks of others: the goal is reached at the step's end."""
 
 # AdaptionPenalty, every step --------------------------------------------------------------------------------
-ADAPTION_PENALTY: Final = "adaption/penalty"
-"""float64: what was taken off this step's reward because the filter changed the action, in reward units; else 0."""
-ADAPTION_TASK_REWARD: Final = "adaption/task_reward"
-"""float64: the task's own reward of this step, before the penalty."""
+ADAPTION_PENALTY: Final = _key("adaption/penalty", "float64", unit="reward", chunk="sum", log="penalty")
+"""What was taken off this step's reward because the filter changed the action; else 0."""
+ADAPTION_TASK_REWARD: Final = _key("adaption/task_reward", "float64", unit="reward", chunk="sum")
+"""The task's own reward of this step, before the penalty."""
 
 # ChunkHandover, every step: of its chunk of control steps --------------------------------------------------------
-HANDOVER_SEAM_JUMP: Final = "handover/seam_jump"
-"""float64, shape (3,): the largest first, second and third difference of the executed commands over this step's
-seams, in action units: a difference counts if its newest command is one of the blend's or of the three after it."""
-HANDOVER_PEAK_JERK: Final = "handover/peak_jerk"
-"""float64: the largest difference of neighbouring executed commands over the control interval, of any component, seam
-or not, in action units per second."""
-HANDOVER_BLEND_TIME: Final = "handover/blend_time"
-"""float64: s, how long the longest blend takes that began in this step; 0 where none did."""
-HANDOVER_STARVED: Final = "handover/starved"
-"""int64: control steps of this step at which the queue was dry and the fallback gave the command."""
-HANDOVER_LIMITED: Final = "handover/limited"
-"""int64: control steps of this step at which a command was held back, beyond the blend, to keep `rate_limit`."""
-HANDOVER_REFUSED: Final = "handover/refused"
-"""bool: a chunk was refused: not finite, not newer than the one in force, too late, or out of reach."""
-HANDOVER_LATENCY: Final = "handover/latency"
-"""int64: control steps that went by between the observation and the takeover of the last chunk that took over in
-this step, as consumed; -1 where none did."""
-HANDOVER_STEPS: Final = "handover/steps"
-"""int64: control steps executed in this step (fewer than the execution horizon where the episode ended)."""
+HANDOVER_SEAM_JUMP: Final = _key("handover/seam_jump", "float64", shape="(3,)", unit="action")
+"""The largest first, second and third difference of the executed commands over this step's seams: a difference
+counts if its newest command is one of the blend's or of the three after it."""
+HANDOVER_PEAK_JERK: Final = _key("handover/peak_jerk", "float64", unit="action/s", log="peak_jerk")
+"""The largest difference of neighbouring executed commands over the control interval, of any component, seam or
+not."""
+HANDOVER_BLEND_TIME: Final = _key("handover/blend_time", "float64", unit="s", log="blend_time")
+"""How long the longest blend takes that began in this step; 0 where none did."""
+HANDOVER_STARVED: Final = _key("handover/starved", "int64", log="starved")
+"""Control steps of this step at which the queue was dry and the fallback gave the command."""
+HANDOVER_LIMITED: Final = _key("handover/limited", "int64", log="limited")
+"""Control steps of this step at which a command was held back, beyond the blend, to keep `rate_limit`."""
+HANDOVER_REFUSED: Final = _key("handover/refused", "bool")
+"""A chunk was refused: not finite, not newer than the one in force, too late, or out of reach."""
+HANDOVER_LATENCY: Final = _key("handover/latency", "int64")
+"""Control steps that went by between the observation and the takeover of the last chunk that took over in this step,
+as consumed; -1 where none did."""
+HANDOVER_STEPS: Final = _key("handover/steps", "int64")
+"""Control steps executed in this step (fewer than the execution horizon where the episode ended)."""
 
 # LeaseExpiry, every control step ---------------------------------------------------------------------------------
-LEASE_REMAINING_S: Final = "lease/remaining_s"
-"""float64: s that the lease in force has left after this control step; 0 where there is none."""
-LEASE_EXPIRED: Final = "lease/expired"
-"""bool: a lease ran out at this control step (once per lease)."""
-LEASE_REFUSED: Final = "lease/refused"
-"""bool: a command was refused: a fresh one was not granted a lease, or it was not finite, older than the one in
-force or from the future, or a chunk's end was out of reach."""
-LEASE_BRAKING: Final = "lease/braking"
-"""bool: the fallback acted at this control step."""
+LEASE_REMAINING_S: Final = _key("lease/remaining_s", "float64", unit="s")
+"""What the lease in force has left after this control step; 0 where there is none."""
+LEASE_EXPIRED: Final = _key("lease/expired", "bool", chunk="any", log="lease_expired")
+"""A lease ran out at this control step (once per lease)."""
+LEASE_REFUSED: Final = _key("lease/refused", "bool", chunk="any", log="lease_refused")
+"""A command was refused: a fresh one was not granted a lease, or it was not finite, older than the one in force or
+from the future, or a chunk's end was out of reach."""
+LEASE_BRAKING: Final = _key("lease/braking", "bool", chunk="any", log="lease_braking")
+"""The fallback acted at this control step."""
 
 # TeleopChannel, every control step --------------------------------------------------------------------------------
-TELEOP_ROUND_TRIP_S: Final = "teleop/round_trip_s"
-"""float64: s, age of the image that the command in force was made from; before the first one, since the reset."""
-TELEOP_CEILING_S: Final = "teleop/ceiling_s"
-"""float64: s, the longest admissible round trip when this step was decided on, within its `longest_s` of 0; inf
-without a ceiling."""
-TELEOP_CLEARANCE_M: Final = "teleop/clearance_m"
-"""float64: m, the smaller clearance, before or after the step; inf without a ceiling, or with nothing near."""
-TELEOP_REVOKED: Final = "teleop/revoked"
-"""bool: the operator had no authority, the local brake acted."""
-TELEOP_ENERGY_IN_J: Final = "teleop/energy_in_j"
-"""float64: J, net energy that went into the channel at the operator's port so far; 0 without a port."""
-TELEOP_ENERGY_OUT_J: Final = "teleop/energy_out_j"
-"""float64: J, net energy that came out at the machine's port so far; 0 without a port."""
-TELEOP_IN_FLIGHT_J: Final = "teleop/in_flight_j"
-"""float64: J, energy of the waves on their way; 0 with plain coding."""
-TELEOP_CREATED_J: Final = "teleop/created_j"
-"""float64: J, the most that came out, or was in flight, beyond what went in, at any time so far; 0: passive."""
-TELEOP_LOST: Final = "teleop/lost"
-"""int64: packets of this step, in both directions, that got lost; an action that is not finite, which is not sent, is
+TELEOP_ROUND_TRIP_S: Final = _key("teleop/round_trip_s", "float64", unit="s")
+"""Age of the image that the command in force was made from; before the first one, since the reset."""
+TELEOP_CEILING_S: Final = _key("teleop/ceiling_s", "float64", unit="s")
+"""The longest admissible round trip when this step was decided on, within its `longest_s` of 0; inf without a
+ceiling."""
+TELEOP_CLEARANCE_M: Final = _key("teleop/clearance_m", "float64", unit="m", chunk="min")
+"""The smaller clearance, before or after the step; inf without a ceiling, or with nothing near."""
+TELEOP_REVOKED: Final = _key("teleop/revoked", "bool", chunk="any")
+"""The operator had no authority, the local brake acted."""
+TELEOP_ENERGY_IN_J: Final = _key("teleop/energy_in_j", "float64", unit="J")
+"""Net energy that went into the channel at the operator's port so far; 0 without a port."""
+TELEOP_ENERGY_OUT_J: Final = _key("teleop/energy_out_j", "float64", unit="J")
+"""Net energy that came out at the machine's port so far; 0 without a port."""
+TELEOP_IN_FLIGHT_J: Final = _key("teleop/in_flight_j", "float64", unit="J")
+"""Energy of the waves on their way; 0 with plain coding."""
+TELEOP_CREATED_J: Final = _key("teleop/created_j", "float64", unit="J")
+"""The most that came out, or was in flight, beyond what went in, at any time so far; 0: passive."""
+TELEOP_LOST: Final = _key("teleop/lost", "int64", chunk="sum")
+"""Packets of this step, in both directions, that got lost; an action that is not finite, which is not sent, is
 one."""
-TELEOP_LATE: Final = "teleop/late"
-"""int64: commands that arrived in this step behind or together with a newer one."""
+TELEOP_LATE: Final = _key("teleop/late", "int64", chunk="sum")
+"""Commands that arrived in this step behind or together with a newer one."""
 
 # ContactMonitor, every step: of the watched contacts over the physics substeps of the control step -----------------
-CONTACT_PEAK_FORCE: Final = "contact/peak_force"
-"""float64: N, the largest normal force between two bodies, summed over their contacts."""
-CONTACT_IMPULSE: Final = "contact/impulse"
-"""float64: N s, the normal forces of all contacts, summed and integrated over the control step."""
-CONTACT_PENETRATION: Final = "contact/penetration"
-"""float64: m, the deepest."""
-CONTACT_RESIDUAL: Final = "contact/residual"
-"""float64: N m, the largest ``|gap * force|`` of a contact: what misses complementarity."""
-CONTACT_PARTIAL: Final = "contact/partial"
-"""bool: not every substep was seen; the others are of the contacts that the step left behind, for one substep."""
+CONTACT_PEAK_FORCE: Final = _key("contact/peak_force", "float64", unit="N", chunk="max", log="contact_force")
+"""The largest normal force between two bodies, summed over their contacts."""
+CONTACT_IMPULSE: Final = _key("contact/impulse", "float64", unit="N s", chunk="sum")
+"""The normal forces of all contacts, summed and integrated over the control step."""
+CONTACT_PENETRATION: Final = _key("contact/penetration", "float64", unit="m", chunk="max")
+"""The deepest."""
+CONTACT_RESIDUAL: Final = _key("contact/residual", "float64", unit="N m", chunk="max")
+"""The largest ``|gap * force|`` of a contact: what misses complementarity."""
+CONTACT_PARTIAL: Final = _key("contact/partial", "bool", chunk="any")
+"""Not every substep was seen; the others are of the contacts that the step left behind, for one substep."""
 
 # BalanceMonitor, every step: of the robot and its contacts with the fixed world ------------------------------------
-BALANCE_LINEAR_MOMENTUM: Final = "balance/linear_momentum"
-"""float64 array (3,): kg m/s, after the step."""
-BALANCE_ANGULAR_MOMENTUM: Final = "balance/angular_momentum"
-"""float64 array (3,): kg m^2/s about the centre of mass, after the step."""
-BALANCE_FRICTION_USED: Final = "balance/friction_used"
-"""float64: the largest ``|f_t| / (share mu f_n)`` of a contact that carries 1 % of the weight or more, over all
-evaluations of the physics."""
-BALANCE_ZMP_MARGIN: Final = "balance/zmp_margin"
-"""float64: m, least distance of the zero moment point from the edge of the support polygon minus the inset, over the
-evaluations with a polygon; 0 where there is none."""
-BALANCE_SUPPORTED: Final = "balance/supported"
-"""float64: share of the evaluations with a polygon: three contact points of one plane, not on a line."""
-BALANCE_AIRBORNE: Final = "balance/airborne"
-"""float64: share of the evaluations without a contact point."""
-BALANCE_PARTIAL: Final = "balance/partial"
-"""bool: not every evaluation was seen, and the others are of the contacts that the step left behind; or numbers were
-not finite, and are reported as 0."""
+BALANCE_LINEAR_MOMENTUM: Final = _key("balance/linear_momentum", "float64", shape="(3,)", unit="kg m/s")
+"""After the step."""
+BALANCE_ANGULAR_MOMENTUM: Final = _key("balance/angular_momentum", "float64", shape="(3,)", unit="kg m^2/s")
+"""About the centre of mass, after the step."""
+BALANCE_FRICTION_USED: Final = _key("balance/friction_used", "float64", chunk="max")
+"""The largest ``|f_t| / (share mu f_n)`` of a contact that carries 1 % of the weight or more, over all evaluations
+of the physics."""
+BALANCE_ZMP_MARGIN: Final = _key(
+    "balance/zmp_margin", "float64", unit="m", chunk="min", where="balance/supported"
+)
+"""Least distance of the zero moment point from the edge of the support polygon minus the inset, over the evaluations
+with a polygon; 0 where there is none."""
+BALANCE_SUPPORTED: Final = _key("balance/supported", "float64", chunk="mean")
+"""Share of the evaluations with a polygon: three contact points of one plane, not on a line."""
+BALANCE_AIRBORNE: Final = _key("balance/airborne", "float64", chunk="mean")
+"""Share of the evaluations without a contact point."""
+BALANCE_PARTIAL: Final = _key("balance/partial", "bool", chunk="any")
+"""Not every evaluation was seen, and the others are of the contacts that the step left behind; or numbers were not
+finite, and are reported as 0."""
 
 # OcclusionPenalty, every step: one entry per track, after the step ------------------------------------------------
-OCCLUSION_VISIBLE: Final = "occlusion/visible"
-"""bool array, one per track: it was measured at the end of this step (in sight, in range, and not dropped out)."""
-OCCLUSION_SIGMA: Final = "occlusion/sigma"
-"""float64 array, one per track: m, standard deviation of the estimated position where it is largest."""
-OCCLUSION_EXPIRED: Final = "occlusion/expired"
-"""bool array, one per track: `sigmas` standard deviations would cross the tolerance before the next step ends,
-if nothing is seen until then: no permission to rely on this track."""
-OCCLUSION_PENALTY: Final = "occlusion/penalty"
-"""float64: what was taken off this step's reward, in reward units."""
-OCCLUSION_TASK_REWARD: Final = "occlusion/task_reward"
-"""float64: the task's own reward of this step, before the penalty."""
+OCCLUSION_VISIBLE: Final = _key("occlusion/visible", "bool", shape="(tracks,)", log="seen", entries="mean")
+"""The track was measured at the end of this step (in sight, in range, and not dropped out)."""
+OCCLUSION_SIGMA: Final = _key("occlusion/sigma", "float64", shape="(tracks,)", unit="m", log="sigma")
+"""Standard deviation of the track's estimated position where it is largest."""
+OCCLUSION_EXPIRED: Final = _key(
+    "occlusion/expired", "bool", shape="(tracks,)", chunk="any", log="expired", entries="mean"
+)
+"""`sigmas` standard deviations would cross the tolerance before the next step ends, if nothing is seen until then:
+no permission to rely on this track."""
+OCCLUSION_PENALTY: Final = _key(
+    "occlusion/penalty", "float64", unit="reward", chunk="sum", log="occlusion_penalty"
+)
+"""What was taken off this step's reward."""
+OCCLUSION_TASK_REWARD: Final = _key("occlusion/task_reward", "float64", unit="reward", chunk="sum")
+"""The task's own reward of this step, before the penalty."""
 
 # The faults of safe_wrappers.wrappers.faults, every step --------------------------------------------------------
-FAULT_ACTIVE: Final = "fault/active"
-"""bool: what the policy gave at this step did not arrive as it was: it was lost, late, or replaced."""
+FAULT_ACTIVE: Final = _key("fault/active", "bool", chunk="any", log="fault")
+"""What the policy gave at this step did not arrive as it was: it was lost, late, or replaced."""
+
+# RecordInterventions ---------------------------------------------------------------------------------------
+RUNNING_PREFIX: Final = "interventions/"
+EPISODE: Final = (
+    EpisodeFigure("intervention_rate", "mean", (CBF_INTERVENED,), "interventions/rate"),
+    EpisodeFigure("correction_mean", "mean", (CBF_CORRECTION,), "interventions/correction_mean"),
+    EpisodeFigure("correction_p95", "p95", (CBF_CORRECTION,)),
+    EpisodeFigure("infeasible", "count", (CBF_INFEASIBLE,), "interventions/infeasible"),
+    EpisodeFigure("fallback", "count", (CBF_FALLBACK,), "interventions/fallback"),
+    EpisodeFigure("nonfinite", "count", (CBF_NONFINITE,)),
+    EpisodeFigure("unsafe", "count", (CBF_UNSAFE,)),
+    EpisodeFigure("lease_expired", "count", (LEASE_EXPIRED,)),
+    EpisodeFigure("lease_refused", "count", (LEASE_REFUSED,)),
+    EpisodeFigure("lease_braking", "count", (LEASE_BRAKING,)),
+    EpisodeFigure("margin_min", "min", (CBF_MARGIN,), "interventions/margin_min"),
+    EpisodeFigure("violations", "count", (COST, COST_SUBSTEP)),
+    EpisodeFigure("cost", "sum", (COST,), "interventions/cost"),
+    EpisodeFigure("cost_substep", "sum", (COST_SUBSTEP,), "interventions/cost_substep"),
+    EpisodeFigure("goals_reached", "last", (GOALS_REACHED,)),
+    EpisodeFigure("spin_outs", "count", (SPIN_OUT,)),
+    EpisodeFigure("success", "any", (SUCCESS, IS_SUCCESS)),
+    EpisodeFigure("collisions", "count", (COLLISIONS,)),
+    EpisodeFigure("seen", "mean", (OCCLUSION_VISIBLE,)),
+    EpisodeFigure("expiries", "onsets", (OCCLUSION_EXPIRED,)),
+)
+"""An episode's figures beside its length and return, in the order of the CSV file."""
+EPISODE_SUMMARY: Final = _key("interventions", "dict")
+"""At an episode's last step only, as RecordEpisodeStatistics adds `episode`: length, return, and the figures of
+`EPISODE` that the stack and the task report."""
+RUNNING: Final = tuple(_key(figure.running, "float64") for figure in EPISODE if figure.running)
+"""Every step: the episode so far, NaN where the task or the stack does not report what it is made from.
+Monitor reads them at the terminal step (`info_keywords`)."""

@@ -152,3 +152,10 @@ def test_deliver_is_the_old_name_of_set_observation_time():
     message = warned(lambda: env.deliver(None))[1]
     assert message == "LeaseExpiry.deliver is deprecated; write set_observation_time"
     assert env.step(np.zeros(1, np.float32))[4]["lease/braking"]
+
+
+def test_the_old_name_of_the_info_keys_module():
+    found, says = warned(lambda: sw.interventions)
+    assert found is sw.info and says.endswith("write safe_wrappers.info")
+    with pytest.raises(AttributeError, match="no attribute 'intervention'"):
+        sw.intervention  # noqa: B018

@@ -1,6 +1,4 @@
-"""The directive `info-keys`: a table of the info keys, from `safe_wrappers.info` and its docstrings."""
-
-import importlib
+"""The directives `info-keys` and `episode-figures`: tables of the registry in `safe_wrappers.info`."""
 
 from docutils import nodes
 from docutils.statemachine import StringList
@@ -8,36 +6,79 @@ from sphinx.application import Sphinx
 from sphinx.pycode import ModuleAnalyzer
 from sphinx.util.docutils import SphinxDirective
 
+from safe_wrappers import info
+
 _MODULE = "safe_wrappers.info"
 
 
-class InfoKeys(SphinxDirective):
-    """Key, type and meaning: a docstring there reads "type: meaning"."""
+class _Table(SphinxDirective):
+    """A table from rows of cells, the first row its head."""
+
+    widths: str
+
+    def rows(self) -> list[list[str]]:
+        """The cells, reStructuredText."""
+        raise NotImplementedError
 
     def run(self) -> list[nodes.Node]:
-        """One row per constant that names a key and has a docstring."""
-        module = importlib.import_module(_MODULE)
-        rows = ["key", "type", "meaning"], *self._rows(module)
-        text = [".. list-table::", "   :header-rows: 1", "   :widths: 32 18 50", ""]
-        for row in rows:
+        """The table."""
+        text = [
+            ".. list-table::",
+            "   :header-rows: 1",
+            f"   :widths: {self.widths}",
+            "",
+        ]
+        for row in self.rows():
             text += [
                 f"   {'*' if i == 0 else ' '} - {cell}" for i, cell in enumerate(row)
             ]
         return self.parse_text_to_nodes(StringList(text, _MODULE))
 
-    def _rows(self, module: object) -> list[list[str]]:
+
+class InfoKeys(_Table):
+    """One row per constant that names keys; its docstring is the meaning."""
+
+    widths = "30 14 8 16 32"
+
+    def rows(self) -> list[list[str]]:
+        """Key, type and unit, what it becomes in a chunk, its name in the logger, meaning."""
+        rows = [["key", "type, unit", "in a chunk", "logged as", "meaning"]]
         documented = ModuleAnalyzer.for_module(_MODULE).find_attr_docs()
-        rows = []
-        for (_, name), lines in documented.items():
-            text = " ".join(lines).strip()
-            kind, _, meaning = text.partition(": " if ": " in text else ", ")
-            value = getattr(module, name)
-            keys = [value] if isinstance(value, str) else list(value)
-            rows.append([" ".join(f"``{key}``" for key in keys), kind, meaning])
+        for (_, constant), lines in documented.items():
+            value = getattr(info, constant, None)
+            names = [value] if isinstance(value, str) else value
+            if isinstance(names, list | tuple) and set(names) <= set(info.KEYS):
+                key = info.KEYS[names[0]]
+                kind = f"{key.dtype} {key.shape}".rstrip()
+                rows.append(
+                    [
+                        " ".join(f"``{name}``" for name in names),
+                        f"{kind}, {key.unit}" if key.unit else kind,
+                        key.chunk,
+                        f"``step_{key.log}``" if key.log else "",
+                        " ".join(lines).strip(),
+                    ]
+                )
+        return rows
+
+
+class EpisodeFigures(_Table):
+    """One row per figure of an episode."""
+
+    widths = "25 10 35 30"
+
+    def rows(self) -> list[list[str]]:
+        """Figure, how it is made from which keys, and the running key."""
+        rows = [["figure", "how", "of", "so far, at every step"]]
+        for figure in info.EPISODE:
+            of = ", ".join(f"``{name}``" for name in figure.of)
+            running = f"``{figure.running}``" if figure.running else ""
+            rows.append([f"``{figure.name}``", figure.how, of, running])
         return rows
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Register the directive."""
+    """Register the directives."""
     app.add_directive("info-keys", InfoKeys)
+    app.add_directive("episode-figures", EpisodeFigures)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

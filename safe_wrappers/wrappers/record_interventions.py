@@ -17,55 +17,61 @@ from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.stack import Layer, refuse_order
 from safe_wrappers.wrappers.common.not_judged import NOT_JUDGED
 
-COLUMNS: Final = (
-    "length",
-    "return",
-    "intervention_rate",
-    "correction_mean",
-    "correction_p95",
-    "infeasible",
-    "fallback",
-    "nonfinite",
-    "unsafe",
-    "lease_expired",
-    "lease_refused",
-    "lease_braking",
-    "margin_min",
-    "violations",
-    "cost",
-    "cost_substep",
-    "goals_reached",
-    "spin_outs",
-    "success",
-    "collisions",
-    "seen",
-    "expiries",
-)
+COLUMNS: Final = ("length", "return", *(figure.name for figure in keys.EPISODE))
 """The CSV file's columns. Cells stay empty where the task or the stack does not report what they hold."""
 
 
-_FLAGS: Final = {
-    "intervened": keys.CBF_INTERVENED,
-    "infeasible": keys.CBF_INFEASIBLE,
-    "fallback": keys.CBF_FALLBACK,
-    "nonfinite": keys.CBF_NONFINITE,
-    "unsafe": keys.CBF_UNSAFE,
-    "lease_expired": keys.LEASE_EXPIRED,
-    "lease_refused": keys.LEASE_REFUSED,
-    "lease_braking": keys.LEASE_BRAKING,
-}
-"""Counted: steps at which a flag was up."""
-_OF_THE_TASK: Final = ("violations", keys.COST, keys.COST_SUBSTEP, "spin_outs", "collisions")
-_RUNNING_SOURCES: Final = (
-    keys.CBF_INTERVENED,
-    keys.CBF_CORRECTION,
-    keys.CBF_INFEASIBLE,
-    keys.CBF_FALLBACK,
-    keys.CBF_MARGIN,
-    keys.COST,
-    keys.COST_SUBSTEP,
-)
-"""Of each key of `interventions.RUNNING`, what it is made from."""
+class _Tally:
+    """A figure of the episode so far."""
+
+    def __init__(self, figure: keys.EpisodeFigure) -> None:
+        self.figure = figure
+        self._keys = [keys.KEYS[name] for name in figure.of]
+        self._reports = 0
+        self._total: int | float = 0
+        self._numbers: list[float] = []
+        self._before: Any = None
+
+    def reset(self, info: dict[str, Any]) -> None:
+        """Of entries that are True at the reset no onset is counted."""
+        self._before = info.get(self.figure.of[0])
+
+    def add(self, info: dict[str, Any]) -> None:
+        """Count a step."""
+        numbers = [key.number(info[key.name]) for key in self._keys if key.name in info]
+        numbers = [number for number in numbers if not math.isnan(number)]
+        how, key = self.figure.how, self._keys[0]
+        if not numbers or (how == "min" and not math.isfinite(numbers[0])):
+            return
+        self._reports += 1
+        match how:
+            case "count":
+                self._total += int(numbers[0]) if key.dtype == "int64" else max(numbers) > 0.0
+            case "sum" | "mean":
+                self._total += numbers[0]
+            case "min":
+                self._total = min(numbers[0], self._total) if self._reports > 1 else numbers[0]
+            case "last":
+                self._total = int(numbers[0])
+            case "any":
+                self._total = bool(self._total) or bool(numbers[0])
+            case "p95":
+                self._numbers.append(numbers[0])
+            case "onsets":
+                now = np.asarray(info[key.name])
+                self._total += 0 if self._before is None else int((now & ~self._before).sum())
+                self._before = now
+
+    def value(self, steps: int) -> int | float | None:
+        """The figure after so many steps; None if nobody reported it, or if not every step has a part in a 0."""
+        how = self.figure.how
+        if how in ("min", "last", "any"):
+            return self._total if self._reports else None
+        if self._reports < steps and (how == "p95" or not self._total):
+            return None
+        if how == "p95":
+            return float(np.percentile(self._numbers, 95))
+        return self._total / steps if how == "mean" else self._total
 
 
 class RecordInterventions(
@@ -82,23 +88,11 @@ class RecordInterventions(
     in the episode's summary, and an empty cell in the file. The same holds for a 0 that was not reported at every
     step; a count above 0 is given, as a lower bound. `CostFunction` gives a cost to a task that has none.
 
-    At every step `info` gains the keys of `safe_wrappers.info.RUNNING` (float64, the episode so
-    far), and at an episode's last step `info["interventions"]`, a dict:
-
-    - `length`, `return` (of the task: what an `OcclusionPenalty` or `AdaptionPenalty` inside has taken off is added
-      back);
-    - `intervention_rate`: intervened steps / length;
-    - `correction_mean`, `correction_p95`: over all steps of the episode, also those with no correction;
-    - `infeasible`, `fallback`, `nonfinite`, `unsafe`: numbers of steps;
-    - `lease_expired`, `lease_refused`, `lease_braking`: numbers of steps, with a `LeaseExpiry` inside;
-    - `margin_min`: the smallest finite `cbf/margin`;
-    - `violations`: steps with `cost` or `cost_substep` above 0;
-    - `cost`, `cost_substep`: sums;
-    - `spin_outs`: steps with `spin_out` above 0;
-    - `collisions`: how many began;
-    - `seen`: share of time that a tracked thing was seen, mean over the tracks, and `expiries`: how often the
-      permission to rely on one ran out, with an `OcclusionPenalty` inside;
-    - `goals_reached` and `success` when the task reports `goals_reached`, and `success` or `is_success`.
+    At every step `info` gains the keys of `safe_wrappers.info.RUNNING` (float64, the episode so far), and at an
+    episode's last step `info["interventions"]`, a dict: `length`, `return` (of the task: what an `OcclusionPenalty`
+    or `AdaptionPenalty` inside has taken off is added back), and the figures of `safe_wrappers.info.EPISODE`: rates,
+    corrections, costs, numbers of steps. A mean is over all steps of the episode, `margin_min` the smallest finite
+    `cbf/margin`.
 
     Args:
         env: The env to record.
@@ -123,9 +117,6 @@ class RecordInterventions(
     """
 
     layer: ClassVar = Layer.RECORDER
-
-    _expired: Any
-    """Permissions that had run out at the step before; None: nothing is tracked."""
 
     def __init__(self, env: gym.Env[Any, Any], path: str | os.PathLike[str] | None = None) -> None:
         refuse_order(env, self.layer, type(self).__name__)
@@ -157,18 +148,27 @@ class RecordInterventions(
         """
         self._clear()
         observation, info = self.env.reset(seed=seed, options=options)
-        self._expired = info.get(keys.OCCLUSION_EXPIRED)
-        sources = zip(keys.RUNNING, _RUNNING_SOURCES, strict=True)
-        info.update({key: 0.0 if source in info else NOT_JUDGED for key, source in sources})
+        for tally in self._tallies:
+            tally.reset(info)
+            if tally.figure.running:
+                info[tally.figure.running] = 0.0 if tally.figure.of[0] in info else NOT_JUDGED
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Steps the env and adds the running counts, and the summary at the episode's end, to its info."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self._count(float(reward), info)
-        info.update(self._running())
+        self._steps += 1
+        penalties = info.get(keys.OCCLUSION_PENALTY, 0.0) + info.get(keys.ADAPTION_PENALTY, 0.0)
+        self._return += float(reward) + float(penalties)
+        for tally in self._tallies:
+            tally.add(info)
+            if tally.figure.running:
+                value = tally.value(self._steps)
+                info[tally.figure.running] = NOT_JUDGED if value is None else float(value)
         if terminated or truncated:
-            summary = self._summary()
+            figures = {tally.figure.name: tally.value(self._steps) for tally in self._tallies}
+            summary = {"length": self._steps, "return": self._return}
+            summary |= {name: value for name, value in figures.items() if value is not None}
             info[keys.EPISODE_SUMMARY] = summary
             if self.path is not None:
                 _append_row(Path(self.path), summary)
@@ -177,97 +177,7 @@ class RecordInterventions(
     def _clear(self) -> None:
         self._steps = 0
         self._return = 0.0
-        self._corrections: list[float] = []
-        self._totals: dict[str, tuple[int | float, int]] = {}
-        self._margin_min = math.inf
-        self._task: dict[str, int | float | bool] = {}
-        self._seen = 0.0
-        self._expired = None
-
-    def _count(self, reward: float, info: dict[str, Any]) -> None:
-        self._steps += 1
-        penalties = info.get(keys.OCCLUSION_PENALTY, 0.0) + info.get(keys.ADAPTION_PENALTY, 0.0)
-        self._return += reward + float(penalties)
-        for name, key in _FLAGS.items():
-            if key in info:
-                self._add(name, bool(info[key]))
-        if keys.CBF_CORRECTION in info:
-            self._corrections.append(float(info[keys.CBF_CORRECTION]))
-            self._add("correction", self._corrections[-1])
-        margin = float(info.get(keys.CBF_MARGIN, math.inf))
-        if math.isfinite(margin):
-            self._margin_min = min(self._margin_min, margin)
-        costs = {name: float(info.get(name, math.nan)) for name in (keys.COST, keys.COST_SUBSTEP)}
-        costs = {name: cost for name, cost in costs.items() if not math.isnan(cost)}
-        for name, cost in costs.items():
-            self._add(name, cost)
-        if costs:
-            self._add("violations", max(costs.values()) > 0.0)
-        if keys.SPIN_OUT in info:
-            self._add("spin_outs", bool(info[keys.SPIN_OUT] > 0.0))
-        if keys.COLLISIONS in info:
-            self._add("collisions", int(info[keys.COLLISIONS]))
-        if "goals_reached" in info:
-            self._task["goals_reached"] = int(info["goals_reached"])
-        if keys.OCCLUSION_VISIBLE in info:
-            self._count_sight(info)
-        success = info.get("success", info.get("is_success"))
-        if success is not None:
-            self._task["success"] = self._task.get("success", False) or bool(success)
-
-    def _add(self, name: str, value: int | float) -> None:
-        total, reports = self._totals.get(name, (0, 0))
-        self._totals[name] = total + value, reports + 1
-
-    def _total(self, name: str) -> int | float | None:
-        """The episode's sum so far; None if it would be a 0 that was not reported at every step."""
-        total, reports = self._totals.get(name, (0, 0))
-        return total if total or reports == self._steps else None
-
-    def _mean(self, name: str) -> float | None:
-        total = self._total(name)
-        return None if total is None else total / self._steps
-
-    def _count_sight(self, info: dict[str, Any]) -> None:
-        self._seen += float(np.mean(info[keys.OCCLUSION_VISIBLE]))
-        self._task["seen"] = self._seen / self._steps
-        expired = np.asarray(info[keys.OCCLUSION_EXPIRED])
-        before: Any = expired if self._expired is None else self._expired
-        self._task["expiries"] = self._task.get("expiries", 0) + int((expired & ~before).sum())
-        self._expired = expired
-
-    def _running(self) -> dict[str, float]:
-        values = (
-            self._mean("intervened"),
-            self._mean("correction"),
-            self._total("infeasible"),
-            self._total("fallback"),
-            self._finite_margin(),
-            self._total(keys.COST),
-            self._total(keys.COST_SUBSTEP),
-        )
-        return {
-            key: NOT_JUDGED if value is None else float(value)
-            for key, value in zip(keys.RUNNING, values, strict=True)
-        }
-
-    def _summary(self) -> dict[str, int | float | bool]:
-        all_corrections = len(self._corrections) == self._steps
-        values = {
-            "length": self._steps,
-            "return": self._return,
-            "intervention_rate": self._mean("intervened"),
-            "correction_mean": self._mean("correction"),
-            "correction_p95": float(np.percentile(self._corrections, 95)) if all_corrections else None,
-            **{name: self._total(name) for name in _FLAGS if name != "intervened"},
-            "margin_min": self._finite_margin(),
-            **{name: self._total(name) for name in _OF_THE_TASK},
-            **self._task,
-        }
-        return {name: value for name, value in values.items() if value is not None}
-
-    def _finite_margin(self) -> float | None:
-        return self._margin_min if math.isfinite(self._margin_min) else None
+        self._tallies = [_Tally(figure) for figure in keys.EPISODE]
 
 
 def read_episodes(path: str | os.PathLike[str]) -> list[dict[str, float]]:

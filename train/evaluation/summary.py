@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
+from safe_wrappers.info import COST, EPISODE
+
 from ..atomic import write_json
 from ..config import ExperimentConfig, FilterConfig
 from ..tables import read_rows, write_rows
@@ -22,17 +24,7 @@ CONDITIONS: Final = {
     "filter_off": "Evaluation, filter off",
     "filter_on": "Evaluation, filter on",
 }
-TOTALS: Final = (
-    "violations",
-    "infeasible",
-    "fallback",
-    "unsafe",
-    "lease_braking",
-    "lease_expired",
-    "spin_outs",
-    "collisions",
-    "expiries",
-)
+TOTALS: Final = tuple(figure.name for figure in EPISODE if figure.how in ("count", "onsets"))
 METRICS: Final = {
     "return": "Return / episode",
     "length": "Steps / episode",
@@ -72,21 +64,18 @@ RATES: Final = {
 """Of a count, per so many steps. Episodes that end early have less time for violations: rates are over all steps,
 whatever the episodes."""
 
-OF_THE_FILTER: Final = (
-    "intervention_rate",
-    "correction_mean",
-    "correction_p95",
-    "infeasible",
-    "infeasible_per_1000",
-    "fallback",
-    "unsafe",
-)
+
+def _made_from(*names: str) -> tuple[str, ...]:
+    """The metrics that are made from info keys whose names begin with one of these."""
+    of = {figure.name: figure.of[0] for figure in EPISODE}
+    return tuple(m for m in METRICS if of.get(RATES.get(m, (m,))[0], "").startswith(names))
+
+
+OF_THE_FILTER: Final = _made_from("cbf/")
 """Left out where no filter is on: a zero there would say nothing."""
-
-OF_THE_LEASE: Final = ("lease_braking", "lease_expired")
+OF_THE_LEASE: Final = _made_from("lease/")
 """Left out where there is no lease."""
-
-OF_THE_JUDGE: Final = ("cost", "cost_substep", "violations", "violations_per_1000")
+OF_THE_JUDGE: Final = _made_from(COST)
 """Left out where nobody judged: a zero there would be a lie."""
 NOT_JUDGED: Final = "not judged"
 

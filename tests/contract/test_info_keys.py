@@ -1,0 +1,70 @@
+"""The registry of info keys against what the wrappers and tasks really write."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from test_wrapper_contract import CASES, actions, build, example, inside
+
+import safe_wrappers as sw
+from safe_wrappers import info as keys
+from safe_wrappers.wrappers.faults import DroppedRefreshes
+
+MORE = [
+    lambda: sw.RecordInterventions(DroppedRefreshes(gym.make("Pendulum-v1", max_episode_steps=20), 0.5)),
+    lambda: gym.make("FlexJointReach-v0"),
+    lambda: gym.make("SafeRover-v0"),
+    lambda: gym.make("PatrolledPointMaze-v0"),
+]
+"""What writes the keys that no exported wrapper writes on the tasks of the contract."""
+
+
+def infos(env):
+    yield env.reset(seed=0)[1]
+    for action in actions(env, 20):
+        *_, over, truncated, info = env.step(action)
+        yield info
+        if over or truncated:
+            return
+
+
+def check(key, value):
+    if key.dtype == "dict":
+        assert isinstance(value, dict), key
+        return
+    array = np.asarray(value)
+    assert array.dtype == np.dtype(key.dtype), (key, array.dtype)
+    assert array.ndim == (1 if key.shape else 0), (key, array.shape)
+    if key.shape == "(3,)":
+        assert array.shape == (3,), key
+
+
+@pytest.mark.filterwarnings("ignore:a control step of")
+def test_what_is_written_is_registered_as_it_is_and_what_is_registered_is_written():
+    written = set()
+    for name, case in CASES:
+        env = build(name, case)
+        bare = inside(name, gym.make(example(name, case)[0]))
+        of_the_task = {key for info in infos(bare) for key in info}
+        for info in infos(env):
+            assert set(info) - of_the_task <= set(keys.KEYS), name
+            for key in set(info) & set(keys.KEYS):
+                check(keys.KEYS[key], info[key])
+            written |= set(info)
+    for make in MORE:
+        env = make()
+        for info in infos(env):
+            for key in set(info) & set(keys.KEYS):
+                check(keys.KEYS[key], info[key])
+            written |= set(info)
+    assert set(keys.KEYS) - written == set()
+
+
+def test_the_constants_are_the_names_and_figures_are_made_of_registered_keys():
+    constants = {v for k, v in vars(keys).items() if k.isupper() and type(v) is str} - {keys.RUNNING_PREFIX}
+    assert constants | set(keys.RUNNING) == set(keys.KEYS)
+    assert all(key.name == name for name, key in keys.KEYS.items())
+    assert {name for figure in keys.EPISODE for name in figure.of} <= set(keys.KEYS)
+    assert {key.where for key in keys.KEYS.values()} - {""} <= set(keys.KEYS)
+    for of in (lambda key: key.log, lambda key: key.name):
+        named = [of(key) for key in keys.KEYS.values() if of(key)]
+        assert len(set(named)) == len(named)
