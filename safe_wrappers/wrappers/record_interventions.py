@@ -26,9 +26,11 @@ class _Tally:
 
     def __init__(self, figure: keys.EpisodeFigure) -> None:
         self.figure = figure
-        self._keys = [keys.KEYS[name] for name in figure.of]
+        of = [keys.KEYS[name] for name in figure.of]
+        self._read = [(key.name, key.number if key.shape else float) for key in of]
+        self._whole = of[0].dtype == "int64"
         self._reports = 0
-        self._total: int | float = 0
+        self._total: int | float = math.inf if figure.how == "min" else 0
         self._numbers: list[float] = []
         self._before: Any = None
 
@@ -37,35 +39,35 @@ class _Tally:
         self._before = info.get(self.figure.of[0])
 
     def add(self, info: dict[str, Any]) -> None:
-        """Count a step."""
-        numbers = [key.number(info[key.name]) for key in self._keys if key.name in info]
-        numbers = [number for number in numbers if not math.isnan(number)]
-        how, key = self.figure.how, self._keys[0]
-        if not numbers or (how == "min" and not math.isfinite(numbers[0])):
+        """Count a step; NaN is no report, and no `margin_min` is infinite."""
+        numbers = [n for name, read in self._read if name in info and (n := read(info[name])) == n]
+        if not numbers:
             return
+        number, how = numbers[0], self.figure.how
         self._reports += 1
-        match how:
-            case "count":
-                self._total += int(numbers[0]) if key.dtype == "int64" else max(numbers) > 0.0
-            case "sum" | "mean":
-                self._total += numbers[0]
-            case "min":
-                self._total = min(numbers[0], self._total) if self._reports > 1 else numbers[0]
-            case "last":
-                self._total = int(numbers[0])
-            case "any":
-                self._total = bool(self._total) or bool(numbers[0])
-            case "p95":
-                self._numbers.append(numbers[0])
-            case "onsets":
-                now = np.asarray(info[key.name])
-                self._total += 0 if self._before is None else int((now & ~self._before).sum())
-                self._before = now
+        if how == "count":
+            self._total += int(number) if self._whole else max(numbers) > 0.0
+        elif how in ("sum", "mean"):
+            self._total += number
+        elif how == "p95":
+            self._numbers.append(number)
+        elif how == "min":
+            self._total = min(number, self._total) if math.isfinite(number) else self._total
+        elif how == "last":
+            self._total = int(number)
+        elif how == "any":
+            self._total = bool(self._total or number)
+        else:
+            now = np.asarray(info[self.figure.of[0]])
+            self._total += 0 if self._before is None else int((now & ~self._before).sum())
+            self._before = now
 
     def value(self, steps: int) -> int | float | None:
-        """The figure after so many steps; None if nobody reported it, or if not every step has a part in a 0."""
+        """The figure after so many steps; None if nobody reported it, or for a 0 that is not of every step."""
         how = self.figure.how
-        if how in ("min", "last", "any"):
+        if how == "min":
+            return self._total if math.isfinite(self._total) else None
+        if how in ("last", "any"):
             return self._total if self._reports else None
         if self._reports < steps and (how == "p95" or not self._total):
             return None
