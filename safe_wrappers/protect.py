@@ -8,7 +8,7 @@ import mujoco
 
 from safe_wrappers.constraints.limits.joint_speed_limit import JointSpeedLimit
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.plants.plant import check_actions
+from safe_wrappers.plants.env_checks import check_actions
 from safe_wrappers.recipes import RECIPES
 from safe_wrappers.stack import refuse_order
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter

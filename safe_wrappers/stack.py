@@ -6,7 +6,7 @@ from typing import Any, Final
 import gymnasium as gym
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.plant import wrappers_of
+from safe_wrappers.plants.env_checks import wrappers_of
 
 
 class Layer(Enum):

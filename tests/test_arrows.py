@@ -21,12 +21,12 @@ ROOMS = {
     "envs": ROOT / "envs",
     "train": ROOT / "train",
 }
-COMMON = {"deprecation", "errors", "info"}
+COMMON = {"checks", "deprecation", "errors", "info"}
 """Single modules at the top that every room may use; `protect` and the package itself are the top."""
 BELOW_WRAPPERS = {"control", "plants", "filter", "constraints", "serialize", "stack", *COMMON}
 MAY_USE = {
-    "control": {"control", "errors"},
-    "appendix": {"appendix", "control", "plants", "errors"},
+    "control": {"control", "checks", "errors"},
+    "appendix": {"appendix", "control", "plants", "checks", "errors"},
     "plants": {"control", "plants", *COMMON},
     "filter": {"control", "plants", "filter", *COMMON},
     "constraints": {"control", "plants", "filter", "constraints", *COMMON},
@@ -103,7 +103,7 @@ def test_heavy_libraries_stay_in_their_rooms(room):
         assert not wrong, f"{path.relative_to(ROOT)} imports {sorted(wrong)}"
 
 
-@pytest.mark.parametrize("name", ["__init__", "errors", "info", "protect", "serialize", "stack"])
+@pytest.mark.parametrize("name", ["__init__", "checks", "errors", "info", "protect", "serialize", "stack"])
 def test_the_top_imports_no_torch_and_no_training(name):
     found = imports(ROOT / "safe_wrappers" / f"{name}.py", "safe_wrappers")
     assert not {n.split(".")[0] for n in found} & {"torch", "stable_baselines3"}

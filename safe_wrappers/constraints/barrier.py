@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.control.filtering.cbf import (
     acts,
     cbf_rows,
@@ -15,15 +16,7 @@ from safe_wrappers.control.filtering.cbf import (
     relative_degree,
 )
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import (
-    BoundConstraint,
-    Constraint,
-    HalfSpaces,
-    Memory,
-    Promise,
-    non_negative,
-    positive,
-)
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory, Promise
 from safe_wrappers.filter.linearize import linearize
 from safe_wrappers.filter.projection import keeps_rows
 from safe_wrappers.plants.plant import Plant

@@ -7,19 +7,12 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
 from safe_wrappers.constraints.obstacles.obstacles import Nearest
 from safe_wrappers.control.backup.stopping import sampled_acceleration_limit, sampled_inset
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import (
-    BoundConstraint,
-    Constraint,
-    HalfSpaces,
-    Memory,
-    Promise,
-    non_negative,
-    positive,
-)
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory, Promise
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.points import Points
 

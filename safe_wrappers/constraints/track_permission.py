@@ -7,15 +7,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.filter.constraint import (
-    BoundConstraint,
-    Constraint,
-    HalfSpaces,
-    Promise,
-    non_negative,
-    positive,
-)
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Promise
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 

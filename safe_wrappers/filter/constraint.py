@@ -164,26 +164,3 @@ class BoundConstraint:
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
         """The info keys of its own, always the same; None: nothing was judged yet, or the state is not a number."""
         return {}
-
-
-def positive(name: str, value: float, unit: str) -> float:
-    """A finite number above zero, or an error that names the parameter and its unit."""
-    number = _number(name, value, unit)
-    if not (np.isfinite(number) and number > 0.0):
-        raise ConfigurationError(f"{name} must be a finite number > 0 in {unit}, got {value!r}")
-    return number
-
-
-def non_negative(name: str, value: float, unit: str) -> float:
-    """A finite number of at least zero, or an error that names the parameter and its unit."""
-    number = _number(name, value, unit)
-    if not (np.isfinite(number) and number >= 0.0):
-        raise ConfigurationError(f"{name} must be a finite number >= 0 in {unit}, got {value!r}")
-    return number
-
-
-def _number(name: str, value: Any, unit: str) -> float:
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        raise ConfigurationError(f"{name} must be a number in {unit}, got {value!r}") from None

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.plant import (
-    Plant,
+from safe_wrappers.plants.env_checks import (
     check_delay,
     check_timing,
     read_attribute,
     refuse_second_env,
     seconds,
 )
+from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
 

@@ -5,14 +5,13 @@ violation is always the env, never the Plant.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.errors import UnsupportedEnvError
 
 Array = NDArray[np.float64]
 
@@ -101,121 +100,3 @@ class Plant(ABC):
         """Refuse a constraint whose rows say what a control does to accelerations where none is known."""
         if not self.has_acceleration:
             raise UnsupportedEnvError(f"{asker} needs the acceleration that a control causes")
-
-
-def read_attribute(env: gym.Env[Any, Any], name: str) -> Any:
-    """`env.get_wrapper_attr(name)` with an error that lists what the env publishes."""
-    try:
-        return env.get_wrapper_attr(name)
-    except AttributeError:
-        public = sorted(n for n in dir(env.unwrapped) if not n.startswith("_"))
-        raise UnknownNameError(
-            f"the env publishes no attribute {name!r}; it has: {', '.join(public)}"
-        ) from None
-
-
-def refuse_second_env(bound: gym.Env[Any, Any] | None, env: gym.Env[Any, Any]) -> None:
-    """A plant reads one env: shared between two filters, one of them would read the wrong machine."""
-    if bound is not None and bound.unwrapped is not env.unwrapped:
-        raise ConfigurationError(
-            "this plant is bound to another env already; give every filter a plant of its own (in a vector env, "
-            "make it inside the function that makes the env)"
-        )
-
-
-def wrappers_of(env: gym.Env[Any, Any]) -> Iterator[Any]:
-    """All wrappers of an env, the outermost first."""
-    inner: Any = env
-    while isinstance(inner, gym.Wrapper):
-        yield inner
-        inner = inner.env
-
-
-def name_of(env: gym.Env[Any, Any]) -> str:
-    """What to call an env in a message: its id, or what it says of itself."""
-    spec = env.unwrapped.spec
-    return spec.id if spec is not None else repr(env.unwrapped)
-
-
-_REPEATS = ("StickyAction", "MaxAndSkipObservation", "RepeatAction")
-
-
-def refuse_changed_actions(env: gym.Env[Any, Any]) -> None:
-    """Refuse wrappers inside the filter that change, repeat or drop the action it has checked."""
-    for inner in wrappers_of(env):
-        if isinstance(inner, gym.ActionWrapper) or type(inner).__name__ in _REPEATS:
-            raise ConfigurationError(
-                f"{type(inner).__name__} inside the filter changes the actions that the filter has checked; "
-                "put it outside (filter first, then this wrapper), so that the filter has the last word"
-            )
-
-
-def seconds(name: str, value: Any) -> float:
-    """A number of seconds, or an error that names the parameter."""
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        raise ConfigurationError(f"{name} is a time in seconds, got {value!r}") from None
-
-
-def check_delay(delay_s: float) -> None:
-    """Refuse a delay that is negative or not finite."""
-    if not (np.isfinite(delay_s) and delay_s >= 0.0):
-        raise ConfigurationError(f"delay_s is a time in seconds, >= 0; got {delay_s}")
-
-
-def check_timing(env: gym.Env[Any, Any], hold_s: float | None) -> float:
-    """How long one action is held, s: the env's `dt`, or `hold_s` where the env has none.
-
-    Raises:
-        ConfigurationError: Neither is there, or they disagree, or it is no time above 0.
-    """
-    try:
-        dt = float(env.get_wrapper_attr("dt"))
-    except (AttributeError, TypeError, ValueError):
-        dt = None
-    if hold_s is None and dt is None:
-        raise ConfigurationError(
-            f"{name_of(env)} does not say how long a step lasts (it has no attribute dt): pass hold_s, in seconds"
-        )
-    hold = seconds("hold_s", dt if hold_s is None else hold_s)
-    if not (np.isfinite(hold) and hold > 0.0):
-        whose = "the env's dt" if hold_s is None else "hold_s"
-        raise ConfigurationError(f"{whose} is the control interval in seconds, > 0; got {hold}")
-    if dt is not None and not np.isclose(dt, hold, rtol=1e-6):
-        raise ConfigurationError(
-            f"hold_s = {hold} s, but one step of this env lasts dt = {dt} s; a filter that looks ahead by "
-            "another interval than the env's promises nothing: pass hold_s equal to env.unwrapped.dt"
-        )
-    return hold
-
-
-def check_actions(env: gym.Env[Any, Any]) -> gym.spaces.Box:
-    """The env's action space, refused unless it is a one-dimensional, floating Box."""
-    space = env.action_space
-    discrete = [part for part in _parts(space) if not _is_floating(part)]
-    if discrete:
-        raise ConfigurationError(
-            f"expected a continuous Box action space, got {space}: for the discrete actions of {discrete[0]} there "
-            "is no closest safe action to project to"
-        )
-    if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
-        raise ConfigurationError(
-            f"expected actions of shape (m,), got {space}. Give the env one flat Box of its own, from this space: "
-            "`action_space = gymnasium.spaces.flatten_space(space)`, and in its step "
-            "`action = gymnasium.spaces.unflatten(space, action)`"
-        )
-    return space
-
-
-def _parts(space: gym.Space[Any]) -> Iterator[gym.Space[Any]]:
-    """What a Dict or Tuple is made of; any other space is its own part."""
-    if not isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
-        yield space
-        return
-    for part in space.values() if isinstance(space, gym.spaces.Dict) else space:
-        yield from _parts(part)
-
-
-def _is_floating(space: gym.Space[Any]) -> bool:
-    return isinstance(space, gym.spaces.Box) and np.issubdtype(space.dtype, np.floating)

@@ -5,8 +5,8 @@ from typing import Any, ClassVar, SupportsFloat
 import gymnasium as gym
 
 from safe_wrappers import info as keys
+from safe_wrappers.checks import non_negative
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import non_negative
 from safe_wrappers.stack import Layer, refuse_order
 from safe_wrappers.wrappers.cbf_action_filter import is_filtered
 

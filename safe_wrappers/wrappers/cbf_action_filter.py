@@ -12,15 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
+from safe_wrappers.checks import non_negative
 from safe_wrappers.errors import ActionError, ConfigurationError, UnsafeStateWarning
-from safe_wrappers.filter.constraint import Constraint, non_negative
+from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.engine import SafetyFilter
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.filter.projection import check_solver
 from safe_wrappers.filter.rounding import cast_inside
 from safe_wrappers.filter.search import Stage
 from safe_wrappers.plants.default import default_plant
-from safe_wrappers.plants.plant import Plant, check_actions, wrappers_of
+from safe_wrappers.plants.env_checks import check_actions, wrappers_of
+from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.template import PlantOfSpec, own_plant
 from safe_wrappers.serialize import constraint_data, constraint_from
 from safe_wrappers.stack import Layer, refuse_order

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
+from safe_wrappers.checks import non_negative
 from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ActionError, UnknownNameError
-from safe_wrappers.filter.constraint import non_negative
 from safe_wrappers.filter.fallback import FallbackFunction
-from safe_wrappers.plants.plant import Plant, check_actions, check_timing
+from safe_wrappers.plants.env_checks import check_actions, check_timing
+from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.template import PlantOfSpec, own_plant
 from safe_wrappers.stack import Layer, refuse_order
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController

@@ -10,13 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
+from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.control.handover.smoothstep import smoothstep
 from safe_wrappers.control.watchdog.leases import LeaseDelays
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Constraint, non_negative, positive
+from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.fallback import FallbackFunction
-from safe_wrappers.plants.plant import Plant, check_actions, check_timing, refuse_changed_actions
+from safe_wrappers.plants.env_checks import check_actions, check_timing, refuse_changed_actions
+from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.template import PlantOfSpec, own_plant
 from safe_wrappers.stack import Layer, refuse_order
 from safe_wrappers.wrappers.cbf_action_filter import is_filtered

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
+from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.control.estimation.covariance import blind_time
 from safe_wrappers.control.estimation.observability import linear_observability
 from safe_wrappers.control.estimation.tracks import Tracks, largest_deviation
 from safe_wrappers.control.numerics.spatial import from_sensor, lever_arm_velocity, to_sensor
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import non_negative, positive
+from safe_wrappers.plants.env_checks import read_attribute
 from safe_wrappers.plants.mujoco.plant import control_interval
-from safe_wrappers.plants.plant import read_attribute
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight
 from safe_wrappers.stack import Layer, refuse_order
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng

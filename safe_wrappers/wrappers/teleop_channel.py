@@ -13,7 +13,8 @@ from safe_wrappers import info as keys
 from safe_wrappers.control.teleop.wave_line import Rule
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.fallback import FallbackFunction
-from safe_wrappers.plants.plant import Plant, check_actions, check_timing, refuse_changed_actions
+from safe_wrappers.plants.env_checks import check_actions, check_timing, refuse_changed_actions
+from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.template import PlantOfSpec, own_plant
 from safe_wrappers.stack import Layer, refuse_order
 from safe_wrappers.wrappers.cbf_action_filter import is_filtered

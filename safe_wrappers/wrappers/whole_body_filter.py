@@ -6,13 +6,14 @@ from typing import Any
 import gymnasium as gym
 import mujoco
 
+from safe_wrappers.checks import non_negative
 from safe_wrappers.constraints.contact.contact_feasibility import ContactFeasibility
 from safe_wrappers.constraints.contact.stance import Stance
 from safe_wrappers.constraints.contact.support_margin import SupportMargin
 from safe_wrappers.constraints.limits.joint_position_limit import JointPositionLimit
 from safe_wrappers.constraints.limits.joints import refuse_uncovered_stops, stops
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import Constraint, non_negative
+from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.template import PlantOfSpec, own_plant

@@ -10,7 +10,7 @@ import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.envs.safe_rover import WHEELS
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.plant import wrappers_of
+from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.wrappers.faults import FAULTS
 
 STEPS = 40

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.appendix.contact.lemke import LcpStatus, solve_lcp
-from safe_wrappers.control.numerics.finite import finite_array
+from safe_wrappers.checks import finite_array
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]

@@ -6,8 +6,8 @@ Source: appendix "Rigid Body Contact Mechanics" and "Physical contact feasibilit
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from safe_wrappers.checks import finite_array, finite_arrays
 from safe_wrappers.control.contact.friction_cone import checked_friction, cone_excess, normal_and_tangential
-from safe_wrappers.control.numerics.finite import finite_array, finite_arrays
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]

@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.control.numerics.finite import finite_array
+from safe_wrappers.checks import finite_array
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]

@@ -17,6 +17,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from safe_wrappers.checks import finite_array
 from safe_wrappers.control.estimation.covariance import (
     checked_covariance,
     checked_noise,
@@ -27,7 +28,6 @@ from safe_wrappers.control.estimation.covariance import (
     refuse_overflow,
 )
 from safe_wrappers.control.numerics.block_exponentials import doublings_for, norm_or_one, short_exponential
-from safe_wrappers.control.numerics.finite import finite_array
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]

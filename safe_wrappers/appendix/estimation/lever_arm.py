@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.control.numerics.finite import finite_array, finite_arrays
+from safe_wrappers.checks import finite_array, finite_arrays
 from safe_wrappers.control.numerics.spatial import check_vectors, cross, finite_result
 from safe_wrappers.errors import ConfigurationError
 

@@ -18,7 +18,7 @@ inequality in d dimensions; Pukelsheim, "The Three Sigma Rule" (1994), for the u
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.control.numerics.finite import finite_array
+from safe_wrappers.checks import finite_array
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 
 Array = NDArray[np.float64]

@@ -7,12 +7,12 @@ conventions and caveats.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from safe_wrappers.checks import finite_array
 from safe_wrappers.control.filtering.manipulability import (
     checked_jacobian,
     pseudo_inverse,
     task_rows,
 )
-from safe_wrappers.control.numerics.finite import finite_array
 from safe_wrappers.control.numerics.spatial import cross
 from safe_wrappers.errors import ConfigurationError
 

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.appendix.handover.polynomials import bracketed_root
+from safe_wrappers.checks import finite_arrays
 from safe_wrappers.control.handover.smoothstep import ROUND_UP, check_positive, smoothstep
-from safe_wrappers.control.numerics.finite import finite_arrays
 
 Array = NDArray[np.float64]
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from safe_wrappers.checks import finite_array, finite_arrays
 from safe_wrappers.control.legged.support import (
     COPLANAR_M,
     COPLANAR_RAD,
@@ -16,7 +17,6 @@ from safe_wrappers.control.legged.support import (
     common_plane,
     support_polygon,
 )
-from safe_wrappers.control.numerics.finite import finite_array, finite_arrays
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]

@@ -6,8 +6,8 @@ Conventions as in `safe_wrappers.control.legged.centroidal`. Source: appendix "C
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from safe_wrappers.checks import finite_array, finite_arrays
 from safe_wrappers.control.legged.centroidal import checked_inertias, checked_masses
-from safe_wrappers.control.numerics.finite import finite_array, finite_arrays
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]

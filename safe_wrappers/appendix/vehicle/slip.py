@@ -6,7 +6,7 @@ Source: appendix "Wheel slip ratio and friction boundaries".
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.control.numerics.finite import finite_arrays
+from safe_wrappers.checks import finite_arrays
 from safe_wrappers.control.vehicle.slip import check_positive
 from safe_wrappers.errors import ConfigurationError
 

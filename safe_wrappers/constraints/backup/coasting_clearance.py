@@ -10,19 +10,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.constraints.backup.detour import Detour
 from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacle_from
 from safe_wrappers.constraints.obstacles.obstacles import Disc, Discs
 from safe_wrappers.control.numerics.outlines import convex_outline, distances_to_outline
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import (
-    BoundConstraint,
-    Constraint,
-    Memory,
-    Promise,
-    non_negative,
-    positive,
-)
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint, Memory, Promise
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.coasting import Coasting, Course

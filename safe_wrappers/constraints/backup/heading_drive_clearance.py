@@ -9,19 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import non_negative
 from safe_wrappers.constraints.backup.detour import Detour
 from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
 from safe_wrappers.constraints.obstacles.obstacles import Disc, Discs
 from safe_wrappers.control.backup.heading_drive import StoppingPath
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import (
-    BoundConstraint,
-    Constraint,
-    HalfSpaces,
-    Memory,
-    Promise,
-    non_negative,
-)
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory, Promise
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.planar_robot import PlanarFrame, heading_drive

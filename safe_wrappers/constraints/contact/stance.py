@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
+from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.constraints.limits.joints import refuse_uncovered_stops, stops
 from safe_wrappers.control.contact.friction_cone import cone_excess
 from safe_wrappers.control.legged.predicted_positions import predicted_position_rows
@@ -23,14 +24,7 @@ from safe_wrappers.control.legged.whole_body import (
     solve_pyramid,
 )
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import (
-    BoundConstraint,
-    Constraint,
-    Memory,
-    Promise,
-    non_negative,
-    positive,
-)
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint, Memory, Promise
 from safe_wrappers.plants.mujoco.contact_forecast import can_touch_the_world
 from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco

@@ -7,10 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
+from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.constraints.contact.contact_feasibility import require_contacts
 from safe_wrappers.constraints.rollout import BoundSlacks
 from safe_wrappers.control.legged.support_distances import support_distances
-from safe_wrappers.filter.constraint import Constraint, Memory, Promise, non_negative, positive
+from safe_wrappers.filter.constraint import Constraint, Memory, Promise
 from safe_wrappers.plants.mujoco.contact_forecast import ContactForecast
 from safe_wrappers.plants.plant import Plant
 

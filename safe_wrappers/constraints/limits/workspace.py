@@ -7,11 +7,12 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import non_negative
 from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacle_from
 from safe_wrappers.constraints.obstacles.obstacles import distances
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Promise, non_negative
+from safe_wrappers.filter.constraint import Promise
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 

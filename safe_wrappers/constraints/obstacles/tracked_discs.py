@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.constraints.obstacles.obstacles import Nearest
 from safe_wrappers.control.estimation.ellipsoids import ellipsoid_gap
 from safe_wrappers.control.estimation.tracks import Tracks
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import non_negative, positive
 from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]

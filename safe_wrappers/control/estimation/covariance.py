@@ -16,9 +16,9 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from safe_wrappers.checks import finite_array
 from safe_wrappers.control.estimation.first_crossing import first_crossing
 from safe_wrappers.control.numerics.block_exponentials import Discrete, integral, van_loan
-from safe_wrappers.control.numerics.finite import finite_array
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]

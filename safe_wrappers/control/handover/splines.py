@@ -15,7 +15,7 @@ Source: appendix "Smooth Trajectories and Bumpless Transfer".
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.control.numerics.finite import finite_arrays
+from safe_wrappers.checks import finite_arrays
 from safe_wrappers.control.numerics.polynomials import differentiate, value
 from safe_wrappers.errors import ConfigurationError
 

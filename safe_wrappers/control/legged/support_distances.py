@@ -9,9 +9,9 @@ minimum is taken over all pairs.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from safe_wrappers.checks import finite_arrays
 from safe_wrappers.control.contact.friction_cone import tangents
 from safe_wrappers.control.legged.support import COPLANAR_M, COPLANAR_RAD
-from safe_wrappers.control.numerics.finite import finite_arrays
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]

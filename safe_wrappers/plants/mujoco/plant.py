@@ -16,13 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.plants.mujoco.actuators import AffineActuators
-from safe_wrappers.plants.mujoco.contact_forecast import ContactForecast, ContactReader, forecast_contacts
-from safe_wrappers.plants.mujoco.displacement_step import moves_by_displacement
-from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
-from safe_wrappers.plants.mujoco.forecast import Forecast, Poses, Recorder
-from safe_wrappers.plants.plant import (
-    Plant,
+from safe_wrappers.plants.env_checks import (
     check_delay,
     check_timing,
     name_of,
@@ -31,6 +25,12 @@ from safe_wrappers.plants.plant import (
     refuse_second_env,
     seconds,
 )
+from safe_wrappers.plants.mujoco.actuators import AffineActuators
+from safe_wrappers.plants.mujoco.contact_forecast import ContactForecast, ContactReader, forecast_contacts
+from safe_wrappers.plants.mujoco.displacement_step import moves_by_displacement
+from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
+from safe_wrappers.plants.mujoco.forecast import Forecast, Poses, Recorder
+from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
 

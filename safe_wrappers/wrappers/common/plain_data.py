@@ -1,7 +1,7 @@
 """Dataclasses of settings as plain data, and back: for specs, configs and JSON."""
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar
 
@@ -39,17 +39,6 @@ def settings_from(kind: type[T], given: Any, name: str, also: str = "") -> T:
     if needed and not any(key in old for key in given):
         raise ConfigurationError(f"{name} needs {' and '.join(needed)}; got {dict(given)!r}")
     return kind(**given)
-
-
-def check_fields(
-    settings: Any, check: Callable[[str, float, str], float], names: Sequence[str], unit: str
-) -> None:
-    """Put fields of a frozen dataclass through `positive` or `non_negative`; None stays where it is the default."""
-    defaults = {field.name: field.default for field in fields(settings)}
-    for name in names:
-        value = getattr(settings, name)
-        if value is not None or defaults[name] is not None:
-            object.__setattr__(settings, name, check(name, value, unit))
 
 
 def plain_data(value: Any) -> Any:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers.deprecation import deprecated_method
 from safe_wrappers.errors import ActionError
-from safe_wrappers.plants.plant import wrappers_of
+from safe_wrappers.plants.env_checks import wrappers_of
 
 
 class CommandReceiver:

@@ -4,7 +4,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from safe_wrappers.filter.constraint import positive
+from safe_wrappers.checks import positive
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 from safe_wrappers.wrappers.faults.fault import Carried, Fault
 

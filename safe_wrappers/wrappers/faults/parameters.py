@@ -1,7 +1,7 @@
 """What the faults' parameters may be."""
 
+from safe_wrappers.checks import non_negative
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import non_negative
 
 
 def probability(name: str, value: float) -> float:

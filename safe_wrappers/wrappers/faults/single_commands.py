@@ -5,8 +5,8 @@ from typing import Any
 
 import gymnasium as gym
 
+from safe_wrappers.checks import positive
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import positive
 from safe_wrappers.wrappers.faults.fault import Carried, Fault
 from safe_wrappers.wrappers.faults.parameters import probability
 

@@ -1,12 +1,13 @@
 """The info of many control steps as the info of one step of a chunked policy."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from safe_wrappers.info import KEYS
 
-_MERGES = {"sum": np.sum, "any": np.any, "max": np.max, "min": np.min, "mean": np.mean}
+_MERGES: dict[str, Callable[..., Any]] = {"sum": np.sum, "any": np.any, "max": np.max, "min": np.min, "mean": np.mean}
 
 
 def macro_info(infos: list[dict[str, Any]]) -> dict[str, Any]:

@@ -8,9 +8,9 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import positive
 from safe_wrappers.control.handover.seams import BLENDS
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import positive
 from safe_wrappers.wrappers.handover.queue import BASELINES
 
 _WHOLE: Final = 1e-6

@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.control.estimation.covariance import checked_noise
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import non_negative, positive
 from safe_wrappers.wrappers.common.plain_numbers import plain_numbers
 
 Array = NDArray[np.float64]

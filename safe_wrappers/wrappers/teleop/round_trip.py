@@ -8,10 +8,10 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import check_fields, non_negative, positive
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Constraint, non_negative, positive
-from safe_wrappers.wrappers.common.plain_data import check_fields
+from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.wrappers.lease.stopping_budget import (
     BoundBudget,
     ClearanceFunction,

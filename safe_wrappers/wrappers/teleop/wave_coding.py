@@ -8,12 +8,12 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.control.teleop.passivity import effort_and_outgoing, to_waves
 from safe_wrappers.control.teleop.port_checks import port_energy
 from safe_wrappers.control.teleop.wave_line import Rule, WaveLine
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import non_negative, positive
-from safe_wrappers.plants.plant import refuse_changed_actions
+from safe_wrappers.plants.env_checks import refuse_changed_actions
 from safe_wrappers.wrappers.teleop.coding import Coding, Given, Order, PaidCoding, Passivity, PlainCoding, Up
 from safe_wrappers.wrappers.teleop.link import Packet
 from safe_wrappers.wrappers.teleop.port import PortReading, TeleopPort

@@ -1,0 +1,75 @@
+"""Checks of arguments: each returns what it was given in one type, or raises an error that names the parameter."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from safe_wrappers.errors import ConfigurationError
+
+Array = NDArray[np.float64]
+
+
+def positive(name: str, value: float, unit: str) -> float:
+    """A finite number above zero, or an error that names the parameter and its unit."""
+    number = _number(name, value, unit)
+    if not (np.isfinite(number) and number > 0.0):
+        raise ConfigurationError(f"{name} must be a finite number > 0 in {unit}, got {value!r}")
+    return number
+
+
+def non_negative(name: str, value: float, unit: str) -> float:
+    """A finite number of at least zero, or an error that names the parameter and its unit."""
+    number = _number(name, value, unit)
+    if not (np.isfinite(number) and number >= 0.0):
+        raise ConfigurationError(f"{name} must be a finite number >= 0 in {unit}, got {value!r}")
+    return number
+
+
+def _number(name: str, value: Any, unit: str) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise ConfigurationError(f"{name} must be a number in {unit}, got {value!r}") from None
+
+
+def check_fields(
+    settings: Any, check: Callable[[str, float, str], float], names: Sequence[str], unit: str
+) -> None:
+    """Put fields of a frozen dataclass through `positive` or `non_negative`; None stays where it is the default."""
+    defaults = {field.name: field.default for field in fields(settings)}
+    for name in names:
+        value = getattr(settings, name)
+        if value is not None or defaults[name] is not None:
+            object.__setattr__(settings, name, check(name, value, unit))
+
+
+def finite_array(name: str, value: ArrayLike) -> Array:
+    """One value as float64, any shape.
+
+    Raises:
+        ConfigurationError: What is no number, or not finite; it names the argument.
+    """
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ConfigurationError(f"{name} is a number or an array of numbers, got {value!r}") from None
+    if not np.isfinite(array).all():
+        raise ConfigurationError(f"{name} must be finite, got {array}")
+    return array
+
+
+def finite_arrays(**values: ArrayLike) -> list[Array]:
+    """The values as float64, broadcast together, in the order given.
+
+    Raises:
+        ConfigurationError: What is no number, or not finite, or shapes that do not broadcast.
+    """
+    arrays = [finite_array(name, value) for name, value in values.items()]
+    try:
+        return list(np.broadcast_arrays(*arrays))
+    except ValueError:
+        shapes = ", ".join(f"{name} {array.shape}" for name, array in zip(values, arrays, strict=True))
+        raise ConfigurationError(f"expected shapes that broadcast together, got {shapes}") from None
