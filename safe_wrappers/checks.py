@@ -1,5 +1,6 @@
 """Checks of arguments: each returns what it was given in one type, or raises an error that names the parameter."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from typing import Any
@@ -15,7 +16,7 @@ Array = NDArray[np.float64]
 def positive(name: str, value: float, unit: str) -> float:
     """A finite number above zero, or an error that names the parameter and its unit."""
     number = _number(name, value, unit)
-    if not (np.isfinite(number) and number > 0.0):
+    if not (math.isfinite(number) and number > 0.0):
         raise ConfigurationError(f"{name} must be a finite number > 0 in {unit}, got {value!r}")
     return number
 
@@ -23,7 +24,7 @@ def positive(name: str, value: float, unit: str) -> float:
 def non_negative(name: str, value: float, unit: str) -> float:
     """A finite number of at least zero, or an error that names the parameter and its unit."""
     number = _number(name, value, unit)
-    if not (np.isfinite(number) and number >= 0.0):
+    if not (math.isfinite(number) and number >= 0.0):
         raise ConfigurationError(f"{name} must be a finite number >= 0 in {unit}, got {value!r}")
     return number
 
@@ -33,6 +34,22 @@ def _number(name: str, value: Any, unit: str) -> float:
         return float(value)
     except (TypeError, ValueError):
         raise ConfigurationError(f"{name} must be a number in {unit}, got {value!r}") from None
+
+
+def whole_number(name: str, value: Any, least: int, of: str = "") -> int:
+    """A whole number, no float, or an error that names the parameter and what it counts."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        counted = f" of {of}" if of else ""
+        raise ConfigurationError(f"{name} is a whole number{counted}, at least {least}; got {value!r}")
+    return int(value)
+
+
+def name_list(name: str, given: Any, of: str = "names", also: str = "", least: int = 1) -> list[str]:
+    """A list of at least so many names, or an error that names the parameter and what else (`also`) it may be."""
+    listed = isinstance(given, Sequence | np.ndarray) and not isinstance(given, str) and len(given) >= least
+    if not (listed and all(isinstance(one, str) for one in given)):
+        raise ConfigurationError(f"{name} is a list of {of}{', or ' + also if also else ''}; got {given!r}")
+    return list(given)
 
 
 def check_fields(

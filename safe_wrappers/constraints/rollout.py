@@ -7,8 +7,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import positive
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.checks import positive, whole_number
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.filter.linearize import linearize, tangent_rows
 from safe_wrappers.plants.mujoco.forecast import Forecast
@@ -52,12 +51,9 @@ class RolloutConstraint(Constraint):
     unit: ClassVar[str] = "units of the value"
 
     def _check_shared(self) -> None:
-        whole = isinstance(self.holds, int | float | np.number) and not isinstance(self.holds, bool)
-        if not (whole and np.isfinite(self.holds) and self.holds == int(self.holds) and self.holds >= 1):
-            raise ConfigurationError(
-                f"holds is a whole number of control intervals to look ahead, >= 1; got {self.holds!r}"
-            )
-        self.holds = int(self.holds)
+        whole = isinstance(self.holds, float | np.floating) and float(self.holds).is_integer()
+        holds = int(self.holds) if whole else self.holds
+        self.holds = whole_number("holds", holds, 1, "control intervals to look ahead")
         if self.reach is not None:
             self.reach = positive("reach", self.reach, self.unit)
 

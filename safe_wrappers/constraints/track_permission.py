@@ -7,8 +7,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import non_negative, positive
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.checks import name_list, non_negative, positive
+from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Promise
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
@@ -51,11 +51,7 @@ class TrackPermission(Constraint):
         self.braking = positive("braking", self.braking, "m/s^2")
         self.creep = non_negative("creep", self.creep, "m/s")
         if self.tracks is not None:
-            if isinstance(self.tracks, str) or not self.tracks:
-                raise ConfigurationError(
-                    f"tracks is a list of names with at least one, or None for all; got {self.tracks!r}"
-                )
-            self.tracks = list(self.tracks)
+            self.tracks = name_list("tracks", self.tracks, also="None for all")
 
     def bind(self, plant: Plant) -> "BoundTrackPermission":
         """On a plant."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.checks import name_list, non_negative, positive
 from safe_wrappers.control.vehicle.friction_estimate import FrictionEstimate
 from safe_wrappers.control.vehicle.slip import slip_ratio, slip_window
 from safe_wrappers.errors import ConfigurationError
@@ -109,10 +109,7 @@ class Traction(Constraint):
     promise: Promise = field(default="best effort", init=False)
 
     def __post_init__(self) -> None:
-        named = isinstance(self.wheels, Sequence) and not isinstance(self.wheels, str)
-        if not (named and all(isinstance(name, str) for name in self.wheels)):
-            raise ConfigurationError(f"wheels is a list of joint names, got {self.wheels!r}")
-        self.wheels = list(self.wheels)
+        self.wheels = name_list("wheels", self.wheels, "joint names", least=0)
         self.max_slip = positive("max_slip", self.max_slip, "slip, in (0, 1)")
         slip_window(0.0, self.max_slip, 1.0)  # refuses a slip outside (0, 1)
         if self.friction is not None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.checks import name_list, non_negative, positive
 from safe_wrappers.control.contact.friction_cone import normal_and_tangential
 from safe_wrappers.control.legged.support_distances import support_distances
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
@@ -214,8 +214,7 @@ def _trees(model: mujoco.MjModel, roots: Sequence[str] | None) -> NDArray[np.boo
     """Which bodies are, or hang from, the named ones, shape (nbody,); None is all."""
     if roots is None:
         return np.ones(model.nbody, dtype=bool)
-    if isinstance(roots, str) or not isinstance(roots, Sequence) or not len(roots):
-        raise ConfigurationError(f"bodies is a list of names of bodies, or None for all; got {roots!r}")
+    roots = name_list("bodies", roots, "names of bodies", "None for all")
     names = [model.body(i).name for i in range(model.nbody)]
     for name in roots:
         if name not in names:

@@ -560,9 +560,9 @@ REACHER = {"bodies": ["fingertip"], "against": ["sideE"]}
         (
             {"bodies": "fingertip"},
             ConfigurationError,
-            "bodies is a list of names of bodies or geoms, got 'fing",
+            "bodies is a list of names of bodies or geoms; got 'fing",
         ),
-        ({"bodies": []}, ConfigurationError, r"bodies is a list of names of bodies or geoms, got \[\]"),
+        ({"bodies": []}, ConfigurationError, r"bodies is a list of names of bodies or geoms; got \[\]"),
         ({"against": "sideE"}, ConfigurationError, "against is a list of names"),
         ({"bodies": ["hand"]}, UnknownNameError, "no body or geom 'hand'; bodies: world, body0.*fingertip"),
         ({"against": ["wall"]}, UnknownNameError, "no body or geom 'wall'; bodies: .*; geoms: ground, sideS"),

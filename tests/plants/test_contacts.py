@@ -105,7 +105,7 @@ def test_what_is_flexible_counts_as_everything_and_has_no_name():
     [
         ({"bodies": ["ball", "bal"]}, UnknownNameError, "bodies: .* no body 'bal'; it has: world, ball, box"),
         ({"against": ["wall"]}, UnknownNameError, "against: .* no body 'wall'"),
-        ({"bodies": [3]}, UnknownNameError, "no body 3"),
+        ({"bodies": [3]}, ConfigurationError, "bodies is a list of names"),
         ({"bodies": "ball"}, ConfigurationError, "bodies is a list of names"),
         ({"bodies": 3}, ConfigurationError, "bodies is a list of names"),
         ({"against": []}, ConfigurationError, "against is a list of names"),

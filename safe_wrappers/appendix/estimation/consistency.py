@@ -6,6 +6,7 @@ Source: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking a
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import whole_number
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -40,8 +41,7 @@ def chi_square_band(n: int, runs: int, confidence: float = 0.95) -> tuple[float,
         ConfigurationError: For n or runs below 1, or a confidence outside (0, 1).
     """
     for name, count in (("n", n), ("runs", runs)):
-        if not isinstance(count, int | np.integer) or count < 1:
-            raise ConfigurationError(f"{name} must be a whole number of at least 1, got {count!r}")
+        whole_number(name, count, 1)
     if not 0.0 < confidence < 1.0:
         raise ConfigurationError(f"confidence must lie between 0 and 1, both excluded, got {confidence!r}")
     outside = 0.5 * (1.0 - confidence)

@@ -18,7 +18,7 @@ inequality in d dimensions; Pukelsheim, "The Three Sigma Rule" (1994), for the u
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.checks import finite_array
+from safe_wrappers.checks import finite_array, whole_number
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 
 Array = NDArray[np.float64]
@@ -100,7 +100,7 @@ def sigmas_for(probability: ArrayLike, dimensions: int = 1, assume: str = "gauss
     p = finite_array("probability", probability)
     if not ((p > 0.0) & (p < 1.0)).all():
         raise ConfigurationError(f"probability must lie between 0 and 1, both excluded, got {probability!r}")
-    d = _dimensions(dimensions)
+    d = whole_number("dimensions", dimensions, 1)
     if assume == "gaussian":
         from scipy.special import gammainccinv  # here: SciPy takes a while to import
 
@@ -120,10 +120,4 @@ def _checked(sigmas: ArrayLike, dimensions: int) -> tuple[Array, int]:
     k = finite_array("sigmas", sigmas)
     if (k < 0.0).any():
         raise ConfigurationError(f"sigmas must be at least 0, got {sigmas!r}")
-    return k, _dimensions(dimensions)
-
-
-def _dimensions(dimensions: int) -> int:
-    if not isinstance(dimensions, int | np.integer) or dimensions < 1:
-        raise ConfigurationError(f"dimensions must be a whole number of at least 1, got {dimensions!r}")
-    return int(dimensions)
+    return k, whole_number("dimensions", dimensions, 1)

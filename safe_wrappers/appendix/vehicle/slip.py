@@ -6,8 +6,7 @@ Source: appendix "Wheel slip ratio and friction boundaries".
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.checks import finite_arrays
-from safe_wrappers.control.vehicle.slip import check_positive
+from safe_wrappers.checks import finite_arrays, positive
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -61,8 +60,8 @@ def wheel_acceleration(
         ConfigurationError: A number out of its range.
     """
     tau, force, rate = finite_arrays(torque=torque, traction=traction, wheel_rate=wheel_rate)
-    check_positive("radius", radius, "m")
-    check_positive("inertia", inertia, "kg m^2")
+    positive("radius", radius, "m")
+    positive("inertia", inertia, "kg m^2")
     return np.asarray((tau - radius * force - damping * rate) / inertia)
 
 

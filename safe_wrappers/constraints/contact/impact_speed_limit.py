@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.checks import name_list, non_negative, positive
 from safe_wrappers.constraints.contact.geom_gaps import GeomGaps
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.control.contact.body_regions import body_region
@@ -84,10 +84,7 @@ class ImpactSpeedLimit(RolloutConstraint):
 
     def __post_init__(self) -> None:
         for name in ("bodies", "against"):
-            given = getattr(self, name)
-            if isinstance(given, str) or not isinstance(given, Sequence) or not given:
-                raise ConfigurationError(f"{name} is a list of names of bodies or geoms, got {given!r}")
-            setattr(self, name, list(given))
+            setattr(self, name, name_list(name, getattr(self, name), "names of bodies or geoms"))
         for name, unit in (("force_limit", "N"), ("stiffness", "N/m"), ("effective_mass", "kg")):
             if getattr(self, name) is not None:
                 setattr(self, name, positive(name, getattr(self, name), unit))

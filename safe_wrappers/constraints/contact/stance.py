@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.checks import non_negative, positive, whole_number
 from safe_wrappers.constraints.limits.joints import refuse_uncovered_stops, stops
 from safe_wrappers.control.contact.friction_cone import cone_excess
 from safe_wrappers.control.legged.predicted_positions import predicted_position_rows
@@ -79,8 +79,7 @@ class Stance(Constraint):
             raise ConfigurationError(f"friction_share is in (0, 1], got {self.friction_share}")
         if self.cone not in ("pyramid", "exact"):
             raise ConfigurationError(f'cone is "pyramid" or "exact", got {self.cone!r}')
-        if not isinstance(self.edges, int | np.integer) or isinstance(self.edges, bool) or self.edges < 3:
-            raise ConfigurationError(f"edges is a whole number of at least 3, got {self.edges!r}")
+        self.edges = whole_number("edges", self.edges, 3)
         if self.joint_tolerance is not None:
             self.joint_tolerance = non_negative("joint_tolerance", self.joint_tolerance, "rad or m")
         if self.zmp_inset is not None:

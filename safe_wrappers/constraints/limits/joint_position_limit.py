@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import non_negative
+from safe_wrappers.checks import name_list, non_negative
 from safe_wrappers.constraints.limits.joints import scalar_joints
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.errors import ConfigurationError
@@ -58,11 +58,7 @@ class JointPositionLimit(RolloutConstraint):
         for name in ("lower", "upper"):
             setattr(self, name, _positions(name, getattr(self, name)))
         if self.joints is not None:
-            if isinstance(self.joints, str):
-                raise ConfigurationError(f"joints is a list of names, got the string {self.joints!r}")
-            self.joints = list(self.joints)
-            if not self.joints:
-                raise ConfigurationError("joints is a list of names, or None for every driven joint; got []")
+            self.joints = name_list("joints", self.joints, also="None for every driven joint")
         self._check_shared()
 
     def bind(self, plant: Plant) -> "BoundJointPositionLimit":

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.checks import name_list, non_negative, positive
 from safe_wrappers.constraints.limits.joints import scalar_joints
 from safe_wrappers.constraints.rollout import RECOVERY_S, BoundRollout, RolloutConstraint
 from safe_wrappers.errors import ConfigurationError
@@ -57,11 +57,7 @@ class JointSpeedLimit(RolloutConstraint):
         limits = list(self.limit) if isinstance(self.limit, Sequence | np.ndarray) else [self.limit]
         checked = [positive("limit", one, "rad/s or m/s") for one in limits]
         if self.joints is not None:
-            if isinstance(self.joints, str):
-                raise ConfigurationError(f"joints is a list of names, got the string {self.joints!r}")
-            self.joints = list(self.joints)
-            if not self.joints:
-                raise ConfigurationError("joints is a list of names, or None for every driven joint; got []")
+            self.joints = name_list("joints", self.joints, also="None for every driven joint")
         if not checked:
             raise ConfigurationError("limit is one number, or a list with one per joint; got []")
         self.limit = checked if many else checked[0]

@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.checks import name_list, non_negative, positive
 from safe_wrappers.constraints.limits.serial_chain import FrameKind, SerialChain
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.control.filtering.manipulability import (
@@ -131,11 +131,7 @@ class SingularityMargin(RolloutConstraint):
         if self.frame not in ("world", "own"):
             raise ConfigurationError(f'frame is "world" or "own", got {self.frame!r}')
         if self.joints is not None:
-            if isinstance(self.joints, str):
-                raise ConfigurationError(f"joints is a list of names, got the string {self.joints!r}")
-            self.joints = list(self.joints)
-            if not self.joints:
-                raise ConfigurationError("joints is a list of names, or None for every driven joint; got []")
+            self.joints = name_list("joints", self.joints, also="None for every driven joint")
         self._rows, self._weights = task_rows(self.directions, self.rotations, self.length)
         self._check_shared()
 

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import non_negative
+from safe_wrappers.checks import name_list, non_negative
 from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacle_from
 from safe_wrappers.constraints.obstacles.obstacles import distances
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
@@ -68,9 +68,7 @@ class Workspace(RolloutConstraint):
             raise ConfigurationError(f"keep_out is a list of obstacles, got {self.keep_out!r}")
         self.keep_out = [obstacle_from(o) for o in self.keep_out]
         for name in ("bodies", "sites", "geoms"):
-            if isinstance(getattr(self, name), str):
-                raise ConfigurationError(f"{name} is a list of names, got the string {getattr(self, name)!r}")
-            setattr(self, name, list(getattr(self, name)))
+            setattr(self, name, name_list(name, getattr(self, name), least=0))
         self._low, self._high = _bounds(self.low, -np.inf), _bounds(self.high, np.inf)
         bounded = bool(np.isfinite(self._low).any() or np.isfinite(self._high).any())
         if not (bounded or self.keep_out):

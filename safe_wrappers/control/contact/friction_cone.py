@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.checks import finite_array, finite_arrays
+from safe_wrappers.checks import finite_array, finite_arrays, whole_number
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -86,8 +86,7 @@ def friction_pyramid(
         Shape (..., edges + 1, 3): one row for each side, then `-normal`, which asks that the ground does not pull.
         (The sides ask for it too, unless mu is 0.)
     """
-    if not isinstance(edges, int | np.integer) or edges < 3:
-        raise ConfigurationError(f"edges is a whole number, 3 or more, got {edges!r}")
+    edges = whole_number("edges", edges, 3)
     n, mu = _unit(normals), checked_friction(friction)
     frame = tangents(n, first)
     middle = (np.arange(edges) + 0.5) * (2.0 * math.pi / edges)

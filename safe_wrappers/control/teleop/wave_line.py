@@ -27,6 +27,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from safe_wrappers.checks import whole_number
 from safe_wrappers.control.numerics.running_sum import RunningSum
 from safe_wrappers.control.teleop.port_checks import port_energy, port_vector, positive
 from safe_wrappers.errors import ConfigurationError
@@ -54,10 +55,8 @@ class WaveLine:
         self._time = positive("time_s", time_s)
         if rule not in get_args(Rule):
             raise ConfigurationError(f"rule must be one of {', '.join(get_args(Rule))}, got {rule!r}")
-        if not (isinstance(components, (int, np.integer)) and components >= 1):
-            raise ConfigurationError(f"components must be a whole number of at least 1, got {components!r}")
         self.rule: Rule = rule
-        self._components = int(components)
+        self._components = whole_number("components", components, 1)
         self._last_sent = -1
         self._flying: dict[int, float] = {}
         self._in_flight = RunningSum()

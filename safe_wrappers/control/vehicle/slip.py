@@ -9,12 +9,10 @@ the faster of the two speeds, so 1 is a wheel that spins on the spot and -1 a lo
 is in `safe_wrappers.appendix.vehicle.slip`.
 """
 
-import math
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.checks import finite_arrays
+from safe_wrappers.checks import finite_arrays, positive
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -35,7 +33,7 @@ def slip_ratio(wheel_speed: ArrayLike, ground_speed: ArrayLike, regularization: 
         ConfigurationError: Numbers that are not finite, or a regularization that is not positive.
     """
     wheel, ground = finite_arrays(wheel_speed=wheel_speed, ground_speed=ground_speed)
-    check_positive("regularization", regularization, "m/s")
+    positive("regularization", regularization, "m/s")
     return np.asarray(
         (wheel - ground) / np.maximum(np.maximum(np.abs(wheel), np.abs(ground)), regularization)
     )
@@ -56,7 +54,7 @@ def slip_window(ground_speed: ArrayLike, max_slip: ArrayLike, regularization: fl
         ConfigurationError: A number out of its range.
     """
     ground, slip = finite_arrays(ground_speed=ground_speed, max_slip=max_slip)
-    check_positive("regularization", regularization, "m/s")
+    positive("regularization", regularization, "m/s")
     if not ((slip > 0.0) & (slip < 1.0)).all():
         raise ConfigurationError(
             "max_slip is a normalised slip ratio in (0, 1), where 1 is a wheel that spins on the spot; got "
@@ -68,13 +66,3 @@ def slip_window(ground_speed: ArrayLike, max_slip: ArrayLike, regularization: fl
 def _fastest(ground: Array, slip: Array, floor: float) -> Array:
     braking_or_slow = ground + slip * np.maximum(np.abs(ground), floor)
     return np.asarray(np.where(ground > floor * (1.0 - slip), ground / (1.0 - slip), braking_or_slow))
-
-
-def check_positive(name: str, value: float, unit: str) -> None:
-    """Refuse a number that is not finite and > 0.
-
-    Raises:
-        ConfigurationError: It names the argument and its unit.
-    """
-    if not (math.isfinite(value) and value > 0.0):
-        raise ConfigurationError(f"{name} must be a finite number > 0 in {unit}, got {value!r}")

@@ -6,7 +6,8 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.checks import name_list
+from safe_wrappers.errors import UnknownNameError
 
 
 class NormalContact(NamedTuple):
@@ -73,8 +74,7 @@ def _chosen(model: mujoco.MjModel, argument: str, names: Sequence[str] | None) -
     """Which bodies are named, shape (nbody + 1,); the last stands for what is flexible, which has no name."""
     if names is None:
         return np.ones(model.nbody + 1, dtype=bool)
-    if isinstance(names, str) or not isinstance(names, Sequence) or not len(names):
-        raise ConfigurationError(f"{argument} is a list of names of bodies, or None for all; got {names!r}")
+    names = name_list(argument, names, "names of bodies", "None for all")
     known = {model.body(i).name: i for i in range(model.nbody)}
     unknown = [name for name in names if name not in known]
     if unknown:

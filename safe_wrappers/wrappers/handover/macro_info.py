@@ -7,7 +7,13 @@ import numpy as np
 
 from safe_wrappers.info import KEYS
 
-_MERGES: dict[str, Callable[..., Any]] = {"sum": np.sum, "any": np.any, "max": np.max, "min": np.min, "mean": np.mean}
+_MERGES: dict[str, Callable[..., Any]] = {
+    "sum": np.sum,
+    "any": np.any,
+    "max": np.max,
+    "min": np.min,
+    "mean": np.mean,
+}
 
 
 def macro_info(infos: list[dict[str, Any]]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import positive
+from safe_wrappers.checks import positive, whole_number
 from safe_wrappers.control.handover.seams import BLENDS
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.handover.queue import BASELINES
@@ -42,10 +42,10 @@ class ChunkSizes(NamedTuple):
     ) -> "ChunkSizes":
         """The sizes as the user gave them, or an error that says what would fit."""
         entries, horizon = (
-            _count("chunk_size", chunk_size, 1),
-            _count("execution_horizon", execution_horizon, 1),
+            whole_number("chunk_size", chunk_size, 1, "control steps"),
+            whole_number("execution_horizon", execution_horizon, 1, "control steps"),
         )
-        apart = _count("steps_per_entry", steps_per_entry, 1)
+        apart = whole_number("steps_per_entry", steps_per_entry, 1, "control steps")
         if entries == 1 and apart > 1:
             raise ConfigurationError(
                 f"steps_per_entry = {apart}, but one entry leads to no other: choose a longer chunk_size"
@@ -130,16 +130,10 @@ def _size(entries: int, apart: int, letter: str) -> str:
     return f"chunk_size {entries} at {apart} control steps per entry, H = {(entries - 1) * apart + 1} control steps"
 
 
-def _count(name: str, value: Any, least: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise ConfigurationError(f"{name} is a number of control steps, at least {least}; got {value!r}")
-    return int(value)
-
-
 def _delay(value: Any) -> tuple[int, int]:
     if not isinstance(value, list | tuple):
-        return (_count("inference_delay", value, 0),) * 2
-    counts = [_count("inference_delay", delay, 0) for delay in value]
+        return (whole_number("inference_delay", value, 0, "control steps"),) * 2
+    counts = [whole_number("inference_delay", delay, 0, "control steps") for delay in value]
     if len(counts) != 2 or counts[0] > counts[1]:
         raise ConfigurationError(f"inference_delay is d control steps or [least, most], got {value!r}")
     return counts[0], counts[1]
