@@ -1,16 +1,19 @@
 """Checks of arguments: each returns what it was given in one type, or raises an error that names the parameter."""
 
+import inspect
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.deprecation import deprecated_names
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
 
 Array = NDArray[np.float64]
+T = TypeVar("T")
 
 
 def positive(name: str, value: float, unit: str) -> float:
@@ -50,6 +53,34 @@ def name_list(name: str, given: Any, of: str = "names", also: str = "", least: i
     if not (listed and all(isinstance(one, str) for one in given)):
         raise ConfigurationError(f"{name} is a list of {of}{', or ' + also if also else ''}; got {given!r}")
     return list(given)
+
+
+def settings_from(kind: type[T], given: Any, name: str, also: str = "") -> T:
+    """An instance of a dataclass itself, or made from the dict of its fields.
+
+    Args:
+        kind: The dataclass.
+        given: The instance or the dict.
+        name: Of the parameter, for messages.
+        also: What else the parameter takes, for messages.
+
+    Raises:
+        ConfigurationError: Neither, or a field without a default is missing.
+        UnknownNameError: A key that is no field.
+    """
+    if isinstance(given, kind):
+        return given
+    if not isinstance(given, Mapping):
+        raise ConfigurationError(f"{name} is a {kind.__name__}, the dict of one{also}; got {given!r}")
+    parameters = inspect.signature(kind).parameters
+    old = deprecated_names(kind)
+    for key in given:
+        if key not in parameters and key not in old:
+            raise UnknownNameError(f"{name} has no {key!r}; it has {', '.join(parameters)}")
+    needed = [key for key, p in parameters.items() if p.default is p.empty and key not in given]
+    if needed and not any(key in old for key in given):
+        raise ConfigurationError(f"{name} needs {' and '.join(needed)}; got {dict(given)!r}")
+    return kind(**given)
 
 
 def check_fields(

@@ -12,7 +12,7 @@ from gymnasium.envs.registration import EnvSpec
 import safe_wrappers as sw
 from safe_wrappers.deprecation import deprecated_names, deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.common.plain_data import plain_data
+from safe_wrappers.serialize import plain_data
 from safe_wrappers.wrappers.lease.stopping_budget import budget_from
 
 

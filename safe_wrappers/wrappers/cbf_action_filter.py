@@ -24,7 +24,7 @@ from safe_wrappers.plants.default import default_plant
 from safe_wrappers.plants.env_checks import check_actions, wrappers_of
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.template import PlantOfSpec, own_plant
-from safe_wrappers.serialize import constraint_data, constraint_from
+from safe_wrappers.serialize import constraint_from, plain_data
 from safe_wrappers.stack import Layer, refuse_order
 
 Array = NDArray[np.float64]
@@ -100,7 +100,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         check_solver(solver)
         gym.utils.RecordConstructorArgs.__init__(
             self,
-            constraints=[constraint_data(c) for c in own],
+            constraints=[plain_data(c) for c in own],
             plant=None if plant is None else PlantOfSpec(plant),
             fallback=fallback,
             solver=solver,

@@ -18,10 +18,9 @@ from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.env_checks import check_actions, check_timing
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.template import PlantOfSpec, own_plant
+from safe_wrappers.serialize import plain_numbers, recorded
 from safe_wrappers.stack import Layer, refuse_order
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.plain_data import recorded
-from safe_wrappers.wrappers.common.plain_numbers import plain_numbers
 from safe_wrappers.wrappers.common.receiver import CommandReceiver, receiver_inside
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 from safe_wrappers.wrappers.handover.macro_info import macro_info

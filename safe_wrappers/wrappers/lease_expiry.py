@@ -20,10 +20,10 @@ from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.env_checks import check_actions, check_timing, refuse_changed_actions
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.template import PlantOfSpec, own_plant
+from safe_wrappers.serialize import plain_data, recorded
 from safe_wrappers.stack import Layer, refuse_order
 from safe_wrappers.wrappers.cbf_action_filter import is_filtered
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.plain_data import plain_data, recorded
 from safe_wrappers.wrappers.common.receiver import CommandReceiver, action_array
 from safe_wrappers.wrappers.lease.admission import Admission, Measured
 from safe_wrappers.wrappers.lease.stopping_budget import (

@@ -11,7 +11,7 @@ from asking import Asked
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnsafeStateWarning, UnsupportedEnvError
-from safe_wrappers.serialize import constraint_data, constraint_from
+from safe_wrappers.serialize import constraint_from, plain_data
 
 FULL = np.array([1.0, 1.0])
 BACK = -FULL
@@ -179,7 +179,7 @@ def test_plain_data_rebuilds_it():
         outline=SQUARE,
         reach=0.1,
     )
-    assert constraint_from(json.loads(json.dumps(constraint_data(constraint)))) == constraint
+    assert constraint_from(json.loads(json.dumps(plain_data(constraint)))) == constraint
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from judged_loops import Scene, flagged
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.serialize import constraint_data, constraint_from
+from safe_wrappers.serialize import constraint_from, plain_data
 
 ROUNDING = 1e-6
 """Executed actions are rounded to float32, and a robot in contact makes more of it."""
@@ -151,7 +151,7 @@ def test_what_it_cannot_watch_is_refused_when_it_is_bound():
 
 def test_it_is_plain_data():
     limit = sw.ContactFeasibility(0.6, 0.02, ["torso"], 0.01)
-    again = constraint_from(json.loads(json.dumps(constraint_data(limit))))
+    again = constraint_from(json.loads(json.dumps(plain_data(limit))))
     assert again == limit and again.promise == "best effort"
 
 

@@ -11,7 +11,7 @@ from asking import Asked
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.serialize import constraint_data, constraint_from
+from safe_wrappers.serialize import constraint_from, plain_data
 
 HOLD, RADIUS, CAR, PILLAR, MARGIN = 0.04, 0.2, 0.4, 0.35, 0.05
 TRUE_CARS = sw.TrackedDiscs(CAR, 0.0, attribute="car_tracks")
@@ -288,7 +288,7 @@ def test_from_outside_the_way_back_is_asked_for_and_taken():
 
 def test_it_is_plain_data():
     given = sw.EscapeClearance("robot", [TRUE_CARS, PILLARS, sw.Plane([0, 0], [0, 1])], RADIUS, 0.1, 2.0)
-    again = constraint_from(json.loads(json.dumps(constraint_data(given))))
+    again = constraint_from(json.loads(json.dumps(plain_data(given))))
     assert again == given and again.promise == "best effort"
     env = sw.protect(gym.make("OccludedCrossing-v0"), cars="true")
     rebuilt = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))

@@ -16,7 +16,7 @@ from judged_loops import Scene, flagged, sliders
 import safe_wrappers as sw
 from safe_wrappers.envs.speed_limits import SPEED_LIMITS
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.serialize import constraint_data, constraint_from
+from safe_wrappers.serialize import constraint_from, plain_data
 
 PLANAR = ("Ant", "Humanoid")
 robots = pytest.mark.parametrize("robot", SPEED_LIMITS)
@@ -308,7 +308,7 @@ def test_it_is_rebuilt_from_the_spec_and_from_json():
     for spec in (filtered.spec, EnvSpec.from_json(filtered.spec.to_json())):
         again = gym.make(spec)
         assert type(again.constraints[0]) is sw.SpeedLimit and again.constraints == [limit]
-    data = json.loads(json.dumps(constraint_data(limit)))
+    data = json.loads(json.dumps(plain_data(limit)))
     assert data == {
         "kind": "SpeedLimit",
         "limit": 1.5,

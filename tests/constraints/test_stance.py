@@ -14,7 +14,7 @@ from scipy.sparse import csc_matrix
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import BoundConstraint
-from safe_wrappers.serialize import constraint_data, constraint_from
+from safe_wrappers.serialize import constraint_from, plain_data
 
 LEGS = [(x, y) for x in (-0.3, 0.3) for y in (-0.2, 0.2)]
 FRICTION = 0.8
@@ -365,4 +365,4 @@ def test_plants_that_it_cannot_read_are_refused():
 
 def test_it_is_plain_data():
     stance = sw.Stance(0.6, "exact", 6, None, 0.02, 0.1)
-    assert constraint_from(json.loads(json.dumps(constraint_data(stance)))) == stance
+    assert constraint_from(json.loads(json.dumps(plain_data(stance)))) == stance

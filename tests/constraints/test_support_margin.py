@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 import safe_wrappers as sw
 from safe_wrappers.constraints.contact.support_margin import edge_distances
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.serialize import constraint_data, constraint_from
+from safe_wrappers.serialize import constraint_from, plain_data
 
 HALF, HEIGHT, MASS = 0.2, 0.5, 5.0
 WEIGHT = MASS * 9.81
@@ -175,4 +175,4 @@ def test_bad_arguments_are_refused(arguments):
 
 def test_it_is_plain_data():
     limit = sw.SupportMargin(0.02, 0.01)
-    assert constraint_from(json.loads(json.dumps(constraint_data(limit)))) == limit
+    assert constraint_from(json.loads(json.dumps(plain_data(limit)))) == limit

@@ -8,7 +8,7 @@ import pytest
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.serialize import constraint_data, constraint_from
+from safe_wrappers.serialize import constraint_from, plain_data
 
 NOTHING_SEEN = sw.Sensor("eye", range_m=0.01)
 FAR_CARS = {"layout": {"cars": [[-9.0 - i, 0.0] for i in range(6)], "agent": [0.0, 1.0, 0.0]}}
@@ -120,5 +120,5 @@ def test_what_it_is_given_is_checked():
 
 def test_it_is_plain_data():
     given = sw.TrackPermission("robot", 3.0, creep=0.1, tracks=("car0",))
-    data = json.loads(json.dumps(constraint_data(given)))
+    data = json.loads(json.dumps(plain_data(given)))
     assert constraint_from(data) == given and data["kind"] == "TrackPermission"

@@ -9,10 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacle_data, obstacle_from
+from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacle_from
 from safe_wrappers.control.estimation.tracks import Motion, Tracks
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.constraint import Constraint
+from safe_wrappers.serialize import plain_data
 
 RADIUS = 0.4
 
@@ -156,7 +157,7 @@ def test_estimates_that_are_no_numbers_are_told_as_such():
 
 def test_it_is_plain_data_and_what_is_wrong_is_refused():
     given = sw.TrackedDiscs(0.3, 2.0, 0.5, "car_tracks")
-    assert obstacle_from(json.loads(json.dumps(obstacle_data(given)))) == given
+    assert obstacle_from(json.loads(json.dumps(plain_data(given)))) == given
     for words, bad in (
         ("radius", {"radius": 0.0}),
         ("sigmas", {"radius": 1.0, "sigmas": -1}),

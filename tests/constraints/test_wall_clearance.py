@@ -13,7 +13,7 @@ from point_worlds import BLOCKS, RADIUS, PointWorld
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint
-from safe_wrappers.serialize import constraint_data, constraint_from
+from safe_wrappers.serialize import constraint_from, plain_data
 
 MARGIN = 0.001
 ROOM = RADIUS + 2 * 0.002 + MARGIN
@@ -343,7 +343,7 @@ def test_a_state_that_is_not_a_number_admits_nothing():
 
 def test_as_plain_data_it_is_the_same():
     limit = sw.WallClearance(margin=0.02, velocity_clip=4.0)
-    data = constraint_data(limit)
+    data = plain_data(limit)
     assert data == {"kind": "WallClearance", "margin": 0.02, "velocity_clip": 4.0}
     assert constraint_from(data) == limit
     assert limit.promise == "proved"

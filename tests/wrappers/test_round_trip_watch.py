@@ -8,8 +8,9 @@ import pytest
 from teleop_worlds import ceiling, place
 
 import safe_wrappers as sw
+from safe_wrappers.checks import settings_from
 from safe_wrappers.envs.teleop_contact import CLAMP_Y, TOOL_RADIUS
-from safe_wrappers.wrappers.common.plain_data import plain_data, settings_from
+from safe_wrappers.serialize import plain_data
 from safe_wrappers.wrappers.teleop.round_trip import RoundTripWatch
 
 ROOM = CLAMP_Y - TOOL_RADIUS

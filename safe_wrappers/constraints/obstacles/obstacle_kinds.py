@@ -1,9 +1,9 @@
 """Obstacles as plain data, so that a constraint that holds them can be recorded and rebuilt."""
 
 from collections.abc import Sequence
-from dataclasses import fields
 from typing import Any
 
+from safe_wrappers.checks import settings_from
 from safe_wrappers.constraints.obstacles.obstacles import Box, Disc, Discs, Obstacle, Plane, Sphere
 from safe_wrappers.constraints.obstacles.tracked_discs import TrackedDiscs
 from safe_wrappers.errors import ConfigurationError
@@ -24,7 +24,8 @@ def obstacle_from(data: Any) -> Obstacle:
         raise ConfigurationError(
             f"unknown obstacle kind {data.get('kind')!r}; the kinds are {', '.join(KINDS)}"
         )
-    return kind(**{k: v for k, v in data.items() if k != "kind"})  # type: ignore[no-any-return]
+    obstacle: Obstacle = settings_from(kind, {k: v for k, v in data.items() if k != "kind"}, kind.__name__)
+    return obstacle
 
 
 def obstacles_from(given: Any) -> list[Obstacle]:
@@ -32,11 +33,3 @@ def obstacles_from(given: Any) -> list[Obstacle]:
     if isinstance(given, dict) or not isinstance(given, Sequence) or not given:
         raise ConfigurationError(f"obstacles is a list with at least one obstacle, got {given!r}")
     return [obstacle_from(o) for o in given]
-
-
-def obstacle_data(obstacle: Any) -> Any:
-    """The plain dict of an obstacle of ours, or a foreign obstacle as it is."""
-    kind = KINDS.get(type(obstacle).__name__)
-    if kind is not type(obstacle):
-        return obstacle
-    return {"kind": kind.__name__, **{f.name: getattr(obstacle, f.name) for f in fields(kind)}}

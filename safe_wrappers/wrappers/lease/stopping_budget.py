@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.checks import check_fields, non_negative, positive
+from safe_wrappers.checks import check_fields, non_negative, positive, settings_from
 from safe_wrappers.constraints.clearance import Clearance
 from safe_wrappers.control.watchdog.leases import longest_lease, longest_lease_of_room, round_trip_ceiling
 from safe_wrappers.errors import ConfigurationError
@@ -17,7 +17,6 @@ from safe_wrappers.filter.constraint import BoundConstraint, Constraint
 from safe_wrappers.plants.default import default_plant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import constraint_from
-from safe_wrappers.wrappers.common.plain_data import settings_from
 
 Array = NDArray[np.float64]
 

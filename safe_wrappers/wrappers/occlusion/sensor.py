@@ -8,10 +8,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.checks import non_negative, positive, settings_from
 from safe_wrappers.control.estimation.covariance import checked_noise
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.common.plain_numbers import plain_numbers
+from safe_wrappers.serialize import plain_numbers
 
 Array = NDArray[np.float64]
 
@@ -123,14 +123,8 @@ def _noise(name: str, given: Any, coordinates: int) -> Array:
 
 def sensor_from(given: Any) -> Sensor:
     """A sensor itself, the name of a camera, or the dict of a recorded one."""
-    if isinstance(given, Sensor):
-        return given
     if isinstance(given, str):
         return Sensor(camera=given)
-    if isinstance(given, dict):
-        known = Sensor.__dataclass_fields__
-        for key in given:
-            if key not in known:
-                raise ConfigurationError(f"a sensor has no {key!r}; it has {', '.join(known)}")
-        return Sensor(**given)
+    if isinstance(given, Sensor | dict):
+        return settings_from(Sensor, given, "a sensor")
     raise ConfigurationError(f"sensor is a Sensor(...), or the name of a camera of the model; got {given!r}")

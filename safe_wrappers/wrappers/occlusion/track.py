@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.checks import non_negative, positive, settings_from
 from safe_wrappers.control.estimation.covariance import checked_covariance
 from safe_wrappers.control.estimation.tracks import Motion
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.common.plain_numbers import plain_numbers
+from safe_wrappers.serialize import plain_numbers
 
 Array = NDArray[np.float64]
 
@@ -122,14 +122,8 @@ def _intensity(given: Any, coordinates: int) -> Array:
 
 def track_from(given: Any) -> Track:
     """A track itself, or rebuilt from the dict of a recorded one."""
-    if isinstance(given, Track):
-        return given
-    if isinstance(given, dict):
-        known = Track.__dataclass_fields__
-        for key in given:
-            if key not in known:
-                raise ConfigurationError(f"a track has no {key!r}; it has {', '.join(known)}")
-        return Track(**given)
+    if isinstance(given, Track | dict):
+        return settings_from(Track, given, "a track")
     raise ConfigurationError(
         f"expected a Track, such as sw.Track({given!r}, acceleration_noise=0.1) with the intensity in m^2/s^3: a "
         f"name alone does not say how it moves; got {given!r}"

@@ -7,9 +7,8 @@ from typing import Any, Final, NamedTuple
 
 import gymnasium as gym
 
-from safe_wrappers.checks import check_fields, non_negative, positive
+from safe_wrappers.checks import check_fields, non_negative, positive, settings_from
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.common.plain_data import settings_from
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 from safe_wrappers.wrappers.faults.on_off import OnOffProcess
 from safe_wrappers.wrappers.faults.parameters import probability

@@ -8,9 +8,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import check_fields, non_negative
+from safe_wrappers.checks import check_fields, non_negative, settings_from
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.common.plain_data import settings_from
 
 Array = NDArray[np.float64]
 
