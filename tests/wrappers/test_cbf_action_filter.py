@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
-from worlds import Cart, Raw, SpeedRow, cart_plant, drift, push, read, wall
+from worlds import BoundRaw, Cart, Raw, SpeedRow, cart_plant, drift, push, read, wall
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
@@ -43,7 +43,7 @@ def check_info(info, size):
         assert np.isfinite(info[key]), key
     for key in (keys.PROPOSED_ACTION, keys.EXECUTED_ACTION):
         assert info[key].dtype == np.float64 and info[key].shape == (size,)
-    assert {k for k in info if k.startswith("cbf/")} == BOOLS | FLOATS | {keys.CBF_REFUSED}
+    assert {k for k in info if k.startswith("cbf/")} == BOOLS | FLOATS | {keys.CBF_REFUSED, keys.CBF_STAGE}
 
 
 # What reaches the env -----------------------------------------------------------------------------------------
@@ -246,7 +246,7 @@ def test_unknown_names_and_bad_margins_are_refused(options, error, message):
 @pytest.mark.parametrize(
     ("constraint", "message"),
     [
-        (lambda: "fast", r"object with rows\(plant\)"),
+        (lambda: "fast", r"a constraint \(a sw.Constraint\)"),
         (
             lambda: {"kind": "Clearence"},
             "unknown constraint kind 'Clearence'; the kinds are Barrier, Clearance",
@@ -487,8 +487,13 @@ class Switch(Raw):
     def __init__(self):
         super().__init__([[1.0], [-1.0]], [-0.2, -0.4])
 
-    def rows(self, plant):
-        return super().rows() if self.on else sw.HalfSpaces.none(1)
+    def bind(self, plant):
+        return BoundSwitch(self, plant)
+
+
+class BoundSwitch(BoundRaw):
+    def rows(self):
+        return super().rows() if self.spec.on else sw.HalfSpaces.none(1)
 
 
 CONTRADICTION = Raw([[1.0], [-1.0]], [-0.2, -0.4])  # u <= -0.2 and u >= 0.4
@@ -633,13 +638,8 @@ def test_several_constraints_are_one_projection():
 
 
 def test_certifying_and_plain_constraints_hold_together():
-    limit = sw.JointSpeedLimit(3.0, margin=0.01)
-
-    class Less:
-        def rows(self, plant):
-            return sw.HalfSpaces(np.array([[1.0, 1.0]]), np.array([0.1]))
-
-    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [limit, Less()])
+    limits = [sw.JointSpeedLimit(3.0, margin=0.01), Raw([[1.0, 1.0]], [0.1])]
+    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), limits)
     filtered.reset(seed=0)
     rng = np.random.default_rng(0)
     intervened = 0
