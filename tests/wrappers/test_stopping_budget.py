@@ -6,11 +6,18 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
+<<<<<<< HEAD:tests/wrappers/test_stopping_budget.py
 from braked_cart import BrakedCart, cart_plant, lease, lease_by_bisection, read_cart
 from worlds import SpeedRow
+=======
+from asking import Asked
+from braked_cart import BrakedCart, cart_plant, lease_by_bisection, read_cart
+from worlds import BoundSpeedRow, SpeedRow
+>>>>>>> heads/t2:tests/wrappers/test_room.py
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import BoundConstraint
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 RAIL = [sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])]
@@ -217,8 +224,13 @@ def test_a_heading_drive_never_violates_when_commands_stop():
 class Far(SpeedRow):
     """Whose value says that nothing is near, or that nothing can be read."""
 
-    def value(self, plant):
-        return np.array(self.values)
+    def bind(self, plant):
+        return BoundFar(self, plant)
+
+
+class BoundFar(BoundSpeedRow):
+    def value(self):
+        return np.array(self.spec.values)
 
 
 @pytest.mark.parametrize(
@@ -431,17 +443,22 @@ def test_reading_is_of_the_env_that_it_wraps():
     assert seen == [inner]
 
 
-class Checked:
+class Checked(sw.Constraint):
     """A constraint that only a state can show to be wrong."""
 
-    def rows(self, plant):
+    def bind(self, plant):
+        return BoundChecked(self, plant)
+
+
+class BoundChecked(BoundConstraint):
+    def rows(self):
         raise AssertionError("a lease needs no rows")
 
-    def value(self, plant):
+    def value(self):
         return np.ones(1)
 
-    def check(self, plant):
-        if plant.qpos[0] > 1.0:
+    def check(self):
+        if self.plant.qpos[0] > 1.0:
             raise ConfigurationError("too far out")
 
 
