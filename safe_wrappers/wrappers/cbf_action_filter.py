@@ -1,4 +1,4 @@
-"""CBFActionFilter: the executed action is the closest one to the policy's that every constraint admits."""
+"""CBFActionFilter: executes the policy's action, or one near it that every constraint admits, or a fallback."""
 
 import copy
 import math
@@ -59,9 +59,10 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
 
     Info, at every step (see `safe_wrappers.info`): ``cbf/intervened``, ``cbf/infeasible``,
     ``cbf/fallback``, ``cbf/nonfinite``, ``cbf/unsafe`` (bool); ``cbf/correction``, ``cbf/clipped``,
-    ``cbf/margin`` (float); ``cbf/refused``, ``proposed_action``, ``executed_action`` (arrays).
+    ``cbf/margin`` (float); ``cbf/stage`` (int); ``cbf/refused``, ``proposed_action``, ``executed_action`` (arrays).
 
     Attributes:
+        filter: The `SafetyFilter` that decides; `filter.bound` are the constraints on the plant.
         constraint_names: Of the constraints, in the order of ``cbf/refused``: their kinds, numbered if repeated.
         filter_seconds: Wall time spent filtering so far; `filter_calls` says over how many steps.
 
