@@ -55,7 +55,9 @@ def _lease(given: Any) -> Any:
         check_name(name, valid)
     budget = (given or {}).get("budget")
     if not isinstance(budget, Mapping | None):
-        raise ConfigurationError(f"lease.budget: expected a mapping of a StoppingBudget's fields, got {budget!r}")
+        raise ConfigurationError(
+            f"lease.budget: expected a mapping of a StoppingBudget's fields, got {budget!r}"
+        )
     for name in budget or ():
         check_name(name, [field.name for field in fields(StoppingBudget)], "budget")
     return given
