@@ -10,15 +10,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.constraints.backup.detour import Detour
-from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacle_from
+from safe_wrappers.constraints.backup.base import BoundDetourClearance, Detour
+from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
 from safe_wrappers.constraints.obstacles.obstacles import Disc, Discs
 from safe_wrappers.control.numerics.outlines import convex_outline, distances_to_outline
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import (
-    BoundConstraint,
     Constraint,
-    Memory,
     Promise,
     non_negative,
     positive,
@@ -39,8 +37,6 @@ _RECOVERED = 0.5
 """The share of the best way out that a control has to take from inside an obstacle."""
 _AROUND = ((1.0, 0.5), (1.0, 0.0), (1.0, -1.0), (-0.5, -1.0))
 """Shares of the drive for the outer and the inner actuator of a detour, as they are tried."""
-_DETOUR_MEMORY = 25
-"""Control steps for which a detour keeps its side after it was last needed, so that it cannot dither."""
 
 
 @dataclass
@@ -95,23 +91,15 @@ class CoastingClearance(Constraint):
 
     def __post_init__(self) -> None:
         for name in ("keep_out", "untouched"):
-            given = getattr(self, name)
-            if isinstance(given, dict | str) or not isinstance(given, Sequence):
-                raise ConfigurationError(f"{name} is a list of Disc and Discs, got {given!r}")
-            obstacles = [obstacle_from(o) for o in given]
-            for obstacle in obstacles:
-                if not isinstance(obstacle, Disc | Discs):
-                    raise ConfigurationError(f"{name} holds Disc and Discs, got {type(obstacle).__name__}")
-                if getattr(obstacle, "velocity_attribute", None) is not None:
-                    raise ConfigurationError(
-                        f"{name}: the way to rest is forecast past discs that stand still"
-                    )
-            setattr(self, name, obstacles)
+            found = obstacles_from(getattr(self, name), name, kinds=(Disc, Discs), optional=True)
+            if any(getattr(obstacle, "velocity_attribute", None) is not None for obstacle in found):
+                raise ConfigurationError(f"{name}: the way to rest is forecast past discs that stand still")
+            setattr(self, name, found)
         if not (self.keep_out or self.untouched):
             raise ConfigurationError(
                 "give obstacles in keep_out (for the origin) or untouched (for the outline)"
             )
-        self.outline, self._corners = _outline(self.outline, needed=bool(self.untouched))
+        self.outline = _checked_outline(self.outline, needed=bool(self.untouched))
         self.margin = non_negative("margin", self.margin, "m")
         if isinstance(self.holds, bool) or self.holds != int(self.holds) or self.holds < 2:
             raise ConfigurationError(f"holds is a whole number of control intervals >= 2, got {self.holds!r}")
@@ -119,58 +107,52 @@ class CoastingClearance(Constraint):
         if self.reach is not None:
             self.reach = positive("reach", self.reach, "m")
         self.reach_s = non_negative("reach_s", self.reach_s, "m per m/s")
-        self._radius = float(np.sqrt((self._corners**2).sum(axis=1)).max(initial=0.0))
 
     def bind(self, plant: Plant) -> "BoundCoastingClearance":
         """On a plant."""
         return BoundCoastingClearance(self, plant)
 
 
-class BoundCoastingClearance(BoundConstraint):
+class BoundCoastingClearance(BoundDetourClearance):
     """CoastingClearance on a plant."""
 
-    predicts: bool = True
+    detour_steps = 25
     spec: CoastingClearance
     plant: MujocoPlant
 
     def __init__(self, spec: CoastingClearance, plant: Plant) -> None:
         hint = "CoastingClearance needs a MujocoPlant: it forecasts with the machine's model"
         super().__init__(spec, require_mujoco(plant, hint))
-        alone = None if self.spec.alone is None else self.plant.attribute(self.spec.alone)
+        alone = None if spec.alone is None else plant.attribute(spec.alone)
         if alone is not None and not isinstance(alone, mujoco.MjModel):
             raise ConfigurationError(
-                f"alone names an attribute that holds an MjModel; {self.spec.alone!r} is {alone!r}"
+                f"alone names an attribute that holds an MjModel; {spec.alone!r} is {alone!r}"
             )
-        self._coasting = Coasting(self.plant, self.spec.body, alone)
+        self._coasting = Coasting(self.plant, spec.body, alone)
         self._still = np.zeros(self.plant.model.nu)
-        self._reach = self.spec.reach
+        outline = np.reshape(spec.outline, (-1, 2))
+        self._corners = convex_outline(outline) if len(outline) else outline
+        self._radius = float(np.sqrt((self._corners**2).sum(axis=1)).max(initial=0.0))
+        self._reach = spec.reach
         self._first_turns_left: bool | None = None
         self._seen = np.zeros(0)
         self._known: dict[bytes, _Outcome] = {}
 
-    def start(self) -> Memory:
-        """No detour is being made."""
+    def start(self) -> Detour:
+        """No detour is being made, and no forecast is known."""
         self._seen = np.zeros(0)
         return Detour()
 
-    def executed(self, control: Array) -> Memory:
-        """The detour that is being made."""
-        return self._detour
-
-    def observe(self, memory: Detour) -> None:
-        """Take the state: what is left now, and which discs may come into play."""
-        self._detour = Detour(memory.side, memory.steps - 1)
-        self._look()
-
-    def _look(self) -> None:
+    def clearance(self) -> Array:
+        """Of the present place from the nearest disc, margin not taken off, m, shape (1,): not along the way."""
         self._low, self._high = self.plant.acting_range
         here = self._coasting.start()
         self._here = here.places[0]
         reach = math.inf
         if self._reach is not None:
-            reach = self._reach + self.spec.reach_s * self._coasting.speed(self.spec._radius)
+            reach = self._reach + self.spec.reach_s * self._coasting.speed(self._radius)
         self._origin = _Group(self.spec.keep_out, self.plant, None)
-        self._body = _Group(self.spec.untouched, self.plant, self.spec._corners)
+        self._body = _Group(self.spec.untouched, self.plant, self._corners)
         self._least = min(group.keep(here, self.spec.margin + reach) for group in (self._origin, self._body))
         self._within = reach
         # Rollouts are kept while nothing moves.
@@ -178,9 +160,6 @@ class BoundCoastingClearance(BoundConstraint):
         seen = np.concatenate([[self.plant.revision], self._coasting.state(), discs])
         if not (seen.shape == self._seen.shape and (np.abs(seen - self._seen) <= _STILL).all()):
             self._seen, self._known = seen, {}
-
-    def value(self) -> Array:
-        """What is left at the present place to the nearest disc, margin not taken off, m, shape (1,)."""
         return np.array([self._least])
 
     def _after(self, control: Array) -> "_Outcome":
@@ -188,42 +167,31 @@ class BoundCoastingClearance(BoundConstraint):
         acting = np.minimum(np.maximum(control, self._low), self._high) + 0.0  # no -0.0: its bytes differ
         key = acting.tobytes()
         if key not in self._known:
-            course = self._coasting.run(acting, self.spec.holds, self.spec._radius)
+            course = self._coasting.run(acting, self.spec.holds, self._radius)
             outcome, fallen = self._outcome(course)
             if fallen > self._within + _SAME_M:
-                self._forecast_always(fallen)
-                self._detour, self._seen = Detour(), np.zeros(0)
-                self._look()
+                warnings.warn(
+                    f"CoastingClearance: the clearance fell by {fallen:.3g} m until rest, farther than the declared "
+                    f"reach of {self._within:.3g} m; from now on every control is forecast",
+                    stacklevel=2,
+                )
+                self._reach, self._memory, self._seen = None, Detour(), np.zeros(0)
+                self.clearance()
                 outcome, _ = self._outcome(course)
             self._known[key] = outcome
         return self._known[key]
 
     def _outcome(self, course: Course) -> tuple["_Outcome", float]:
         """What a course leads to, and by how much a clearance falls on it, m."""
-        left = [group.along(course) for group in (self._origin, self._body)]
-        least, end = min(x.least for x in left), min(x.end for x in left)
+        least, end, fallen = zip(*(group.along(course) for group in (self._origin, self._body)), strict=True)
         (ax, ay), (bx, by) = course.ahead[0].tolist(), course.ahead[-1].tolist()
         way, turn = course.places[-1] - self._here, math.atan2(ax * by - ay * bx, ax * bx + ay * by)
-        outcome = _Outcome(least if course.rests else -math.inf, end, way, turn)
-        return outcome, max(x.fallen for x in left)
-
-    def _forecast_always(self, fallen: float) -> None:
-        self._reach = None
-        warnings.warn(
-            f"CoastingClearance: the clearance fell by {fallen:.3g} m until rest, farther than the declared reach of "
-            f"{self._within:.3g} m; from now on every control is forecast",
-            stacklevel=2,
-        )
-
-    @property
-    def _free(self) -> bool:
-        """Whether no disc can come into play, whatever is done."""
-        return not (self._origin.near or self._body.near)
+        return _Outcome(min(least) if course.rests else -math.inf, min(end), way, turn), max(fallen)
 
     def admits(self, control: Array) -> bool:
         """Whether a control leads to rest with the margin kept (or, where rest alone does not, to a way out)."""
-        if self._free:
-            return True
+        if not (self._origin.near or self._body.near):
+            return True  # no disc can come into play, whatever is done
         if self._least < 0.0:
             return self._leads_out(control)
         after = self._after(control)
@@ -270,13 +238,14 @@ class BoundCoastingClearance(BoundConstraint):
         drive = float(acting[np.abs(acting).argmax()])
         if float(acting.sum()) * drive <= 0.0:
             return []  # turning on the spot, or no drive at all
-        side = self._detour.side
-        if self._detour.steps <= 0:
+
+        def beside_the_nearest() -> float:
             way = self._after(acting).way
             x, y = self._nearest() - self._here
             # What is to the left of the way is passed on its right.
-            side = -1.0 if way[0] * y - way[1] * x > 0.0 else 1.0
-        self._detour = Detour(side, _DETOUR_MEMORY)
+            return -1.0 if way[0] * y - way[1] * x > 0.0 else 1.0
+
+        side = self._side(beside_the_nearest)
         if self._first_turns_left is None:
             first, second = (self._after(u).turn for u in (np.array([drive, 0.0]), np.array([0.0, drive])))
             self._first_turns_left = (first - second) * drive > 0.0
@@ -303,14 +272,6 @@ class _Outcome(NamedTuple):
     end: float
     way: Array
     turn: float
-
-
-class _Left(NamedTuple):
-    """Of a group of discs along a course: least clearance, that at its end, and the most that one of them fell; m."""
-
-    least: float
-    end: float
-    fallen: float
 
 
 class _Group:
@@ -343,13 +304,12 @@ class _Group:
         self.near = bool(close.any())
         return float(now.min(initial=np.inf))
 
-    def along(self, course: Course) -> "_Left":
-        """What a course leaves."""
+    def along(self, course: Course) -> tuple[float, float, float]:
+        """Along a course: least clearance, that at its end, and the most that one of them fell, m."""
         if not self.near:
-            return _Left(math.inf, math.inf, 0.0)
+            return math.inf, math.inf, 0.0
         left = self._left(course)
-        fallen = float((self.now - left.min(axis=0)).max())
-        return _Left(float(left.min()), float(left[-1].min()), fallen)
+        return float(left.min()), float(left[-1].min()), float((self.now - left.min(axis=0)).max())
 
     def nearest(self) -> Array:
         """Centre of the disc with the least room, shape (2,), m."""
@@ -367,21 +327,22 @@ class _Group:
         return np.asarray(distances_to_outline(self._outline, local) - self._radii)
 
 
-def _outline(given: Any, needed: bool) -> tuple[list[list[float]], Array]:
-    """The outline as plain data, and its corners."""
+def _checked_outline(given: Any, needed: bool) -> list[list[float]]:
+    """The outline as plain data."""
     try:
         points = np.array(given, dtype=np.float64).reshape(-1, 2)
     except (TypeError, ValueError):
         points = np.full((1, 2), np.nan)
     if not np.isfinite(points).all():
         raise ConfigurationError(f"outline is a list of points [x, y] in m, got {given!r}")
-    if not len(points):
-        if needed:
-            raise ConfigurationError(
-                "untouched needs the machine's outline: [[x, y], ...] in its body's frame, m"
-            )
-        return [], points
-    try:
-        return points.tolist(), convex_outline(points)
-    except ValueError as error:
-        raise ConfigurationError(f"outline: {error}") from None
+    if len(points):
+        try:
+            convex_outline(points)
+        except ValueError as error:
+            raise ConfigurationError(f"outline: {error}") from None
+    elif needed:
+        raise ConfigurationError(
+            "untouched needs the machine's outline: [[x, y], ...] in its body's frame, m"
+        )
+    found: list[list[float]] = points.tolist()
+    return found

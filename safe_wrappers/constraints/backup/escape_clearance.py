@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.constraints.backup.base import BoundBackupClearance
 from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
 from safe_wrappers.constraints.obstacles.obstacles import Discs, distances
 from safe_wrappers.constraints.obstacles.tracked_discs import TrackedDiscs
 from safe_wrappers.control.backup.evasive_maneuvers import EvasiveManeuvers, Maneuver
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import (
-    BoundConstraint,
     Constraint,
     Memory,
     Promise,
@@ -31,7 +31,6 @@ from safe_wrappers.plants.queries.planar_point import planar_point
 
 Array = NDArray[np.float64]
 
-_ROUNDING = 1e-9
 _EVERY = 2
 """Holds between the instants at which ways are checked."""
 _GOING_S = (0.3, 0.8)
@@ -101,32 +100,34 @@ class EscapeClearance(Constraint):
                 raise ConfigurationError(
                     f"obstacles are seen from above: in {obstacle!r} give two coordinates, x and y"
                 )
-        self._moving: list[Any] = [o for o in self.obstacles if _moves(o)]
-        self._fixed = [o for o in self.obstacles if not _moves(o)]
 
     def bind(self, plant: Plant) -> "BoundEscapeClearance":
         """On a plant."""
         return BoundEscapeClearance(self, plant)
 
 
-class BoundEscapeClearance(BoundConstraint):
+class BoundEscapeClearance(BoundBackupClearance):
     """EscapeClearance on a plant."""
 
-    predicts: bool = True
-    tolerance: float = _ROUNDING
+    tolerance: float = 1e-9
     spec: EscapeClearance
     plant: MujocoPlant
+    _memory: int | None
+    """The manoeuvre that was open after the last control."""
 
     def __init__(self, spec: EscapeClearance, plant: Plant) -> None:
-        hint = "EscapeClearance needs a MujocoPlant: it reads the point from the model"
-        super().__init__(spec, require_mujoco(plant, hint))
-        for obstacle in self.spec._moving:
+        machine = require_mujoco(
+            plant, "EscapeClearance needs a MujocoPlant: it reads the point from the model"
+        )
+        self._moving: list[Any] = [o for o in spec.obstacles if _moves(o)]
+        self._fixed = [o for o in spec.obstacles if not _moves(o)]
+        for obstacle in self._moving:
             if isinstance(obstacle, TrackedDiscs):
-                obstacle.tracks(self.plant)
-        self._read_constants()
+                obstacle.tracks(machine)
+        super().__init__(spec, machine)
 
-    def _read_constants(self) -> None:
-        self._revision = self.plant.revision
+    def read_constants(self) -> None:
+        """The point's motion, and the manoeuvres that it can make."""
         self._point = point = planar_point(self.plant, np.inf, self.spec.body)
         # What one hold makes of a state; x and y.
         self._hold = np.array([(a.low, a.high, a.drift, a.shift, a.keep, a.add) for a in point.axes]).T
@@ -154,34 +155,36 @@ class BoundEscapeClearance(BoundConstraint):
         best = np.concatenate([b for _, b in self._asked])
         return int(best[((led_to - velocity) ** 2).sum(axis=1).argmin()])
 
-    def observe(self, memory: int | None) -> None:
-        """Take the state, and where everything may be later on."""
+    def clearance(self) -> Array:
+        """Distance now from every obstacle, or from the bound of where it may be, m, shape (n,).
+
+        Not along a manoeuvre: with a way out, one may be close for a moment.
+        """
         self._asked: list[tuple[Array, NDArray[np.intp]]] = []
-        if self.plant.revision != self._revision:
-            self._read_constants()
-        self._open = self._with_going_on(memory)
+        self._open = self._with_going_on(self._memory)
         joints = list(self._point.joints)
         self._position = self.plant.qpos[joints] + np.asarray(self._point.origin)
         self._velocity = self.plant.qvel[joints]
         # A way after a held control begins one hold from now.
         times = self.plant.hold_s * np.concatenate([[0.0], 1.0 + self._escapes.instants])
-        parts = [self._expected(o, self.plant, times) for o in self.spec._moving]
+        parts = [self._expected(o, self.plant, times) for o in self._moving]
         none = np.zeros((times.size, 0, 2))
         centers = np.concatenate([none, *(c for c, _ in parts)], axis=1)
         halves = np.concatenate([none, *(h for _, h in parts)], axis=1)
-        radii = [np.full(c.shape[1], o.radius) for (c, _), o in zip(parts, self.spec._moving, strict=True)]
+        radii = [np.full(c.shape[1], o.radius) for (c, _), o in zip(parts, self._moving, strict=True)]
         here = self._position[None]
-        fixed = [distances(o, here, self.plant)[0] for o in self.spec._fixed]
+        fixed = [distances(o, here, self.plant)[0] for o in self._fixed]
         moving = _box_distances(here[:, 0], here[:, 1], centers[:1], halves[:1])[0]
         self._near_fixed = [float(f.min(initial=np.inf)) for f in fixed]
         self._sizes = np.concatenate([*radii, np.zeros(0)]) + self.spec.radius
-        self._now = np.concatenate([moving - self._sizes, *(f - self.spec.radius for f in fixed)])
+        now = np.concatenate([moving - self._sizes, *(f - self.spec.radius for f in fixed)])
         self._boxes = centers[1:], halves[1:]
         self._lowest, self._highest = (centers - halves).min(axis=0), (centers + halves).max(axis=0)
         # From outside, the violation must shrink along the way.
-        outside = min(float(self._now.min(initial=np.inf)) - self.spec.margin, 0.0)
+        outside = min(float(now.min(initial=np.inf)) - self.spec.margin, 0.0)
         self._wanted = self.spec.margin + outside * np.exp(-times[1:] / _RECOVERY_S)
         self._best: float | None = None
+        return np.asarray(now)
 
     def _with_going_on(self, going_on: int | None) -> NDArray[np.intp]:
         """The manoeuvres to look at: the usual ones, and the one that was open after the last control."""
@@ -229,19 +232,19 @@ class BoundEscapeClearance(BoundConstraint):
             np.minimum(nearest, gap - self._sizes[i], out=nearest)
         here_x, here_y = self._position
         reach = float(np.hypot(max(right - here_x, here_x - left), max(high - here_y, here_y - low)))
-        for obstacle, now in zip(self.spec._fixed, self._near_fixed, strict=True):
+        for obstacle, now in zip(self._fixed, self._near_fixed, strict=True):
             if now - reach <= self.spec.radius + self.spec.margin:
                 points = np.stack([x.ravel(), y.ravel()], axis=1)
                 gap = distances(obstacle, points, self.plant).min(axis=1, initial=np.inf).reshape(x.shape)
                 np.minimum(nearest, gap - self.spec.radius, out=nearest)
         return nearest
 
-    def value(self) -> Array:
-        """Distance now from every obstacle, or from the bound of where it may be, m, shape (n,)."""
-        return self._now
-
     def _driven(self, control: Array) -> Array:
         return np.asarray(control)[list(self._point.actuators)]
+
+    def admits(self, control: Array) -> bool:
+        """Whether a held control leaves a way out."""
+        return self.slack(control) >= -self.tolerance
 
     def slack(self, control: Array) -> float:
         """What the best way out after a held control leaves of what is asked for, m."""

@@ -18,13 +18,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.constraints.backup.base import BoundBackupClearance
 from safe_wrappers.control.backup.point_among_walls import PointAmongWalls, PointMotion
 from safe_wrappers.control.numerics.rectangles import Rectangle, gaps, nearest
 from safe_wrappers.filter.constraint import (
-    BoundConstraint,
     Constraint,
     HalfSpaces,
-    Memory,
     Promise,
     non_negative,
     positive,
@@ -98,33 +97,32 @@ class WallClearance(Constraint):
         return BoundWallClearance(self, plant)
 
 
-class BoundWallClearance(BoundConstraint):
+class BoundWallClearance(BoundBackupClearance):
     """WallClearance on a plant."""
 
-    predicts: bool = True
     spec: WallClearance
     plant: MujocoPlant
 
     def __init__(self, spec: WallClearance, plant: Plant) -> None:
-        hint = "use Clearance(obstacles=[Box(...)], position=[0, 1], velocity=[2, 3], braking=...)"
         needed = (
             "WallClearance needs a MujocoPlant: it reads point and walls from the model. On an AnalyticPlant"
         )
+        hint = "use Clearance(obstacles=[Box(...)], position=[0, 1], velocity=[2, 3], braking=...)"
         super().__init__(spec, require_mujoco(plant, f"{needed} {hint}"))
-        self._read_constants()
 
-    def _read_constants(self) -> None:
-        self._revision = self.plant.revision
+    def read_constants(self) -> None:
+        """The point's motion, and the walls."""
         clip = self.spec.velocity_clip if self.spec.velocity_clip is not None else math.inf
         self._point = point = planar_point(self.plant, clip)
         around, reach = walls(self.plant.model, point.body)
         self._among = PointAmongWalls(*point.axes, around, self.spec.velocity_clip is not None)
         self._room = reach + self.spec.margin
 
-    def observe(self, memory: Memory) -> None:
-        """Take the state."""
-        if self.plant.revision != self._revision:
-            self._read_constants()
+    def clearance(self) -> Array:
+        """Distance of the braking path from touching the nearest wall, margin not taken off, m, shape (1,).
+
+        No walls, no value: shape (0,).
+        """
         (i, j), (x, y), q, v = self._point.joints, self._point.origin, self.plant.qpos, self.plant.qvel
         motion = PointMotion(float(q[i]) + x, float(q[j]) + y, float(v[i]), float(v[j]))
         self._motion = self._among.clipped(motion)
@@ -134,17 +132,7 @@ class BoundWallClearance(BoundConstraint):
         else:
             self._least = math.nan
         self._inside = self._least >= -_HAIR_M
-
-    def value(self) -> Array:
-        """Distance of the braking path from touching the nearest wall, margin not taken off, m, shape (1,).
-
-        No walls, no value: shape (0,).
-        """
         return np.array([self._least + self.spec.margin] if self._among.walls else [])
-
-    def slack(self, control: Array) -> float:
-        """Not measured: whether a control is admitted is all that is known."""
-        return 0.0 if self.admits(control) else -math.inf
 
     def admits(self, control: Array) -> bool:
         """Whether a held control, and braking after it, keeps its distance from every wall."""
