@@ -7,6 +7,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.constraints.name_lists import name_list
 from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
 from safe_wrappers.constraints.obstacles.obstacles import Nearest
 from safe_wrappers.control.backup.stopping import sampled_acceleration_limit, sampled_inset
@@ -87,9 +88,7 @@ class Clearance(Constraint):
         for name in ("radius", "margin", "state_error"):
             setattr(self, name, non_negative(name, getattr(self, name), "m"))
         for name in ("bodies", "sites", "geoms"):
-            if isinstance(getattr(self, name), str):
-                raise ConfigurationError(f"{name} is a list of names, got the string {getattr(self, name)!r}")
-            setattr(self, name, list(getattr(self, name)))
+            setattr(self, name, name_list(name, getattr(self, name)))
         self.position, self.velocity = list(self.position), list(self.velocity)
         if len(self.position) != len(self.velocity) or len(self.position) > 3:
             raise ConfigurationError(

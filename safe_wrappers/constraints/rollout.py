@@ -8,7 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory, positive
+from safe_wrappers.filter.constraint import (
+    BoundConstraint,
+    Constraint,
+    HalfSpaces,
+    Memory,
+    non_negative,
+    positive,
+)
 from safe_wrappers.filter.linearize import linearize, tangent_rows
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
@@ -51,6 +58,7 @@ class RolloutConstraint(Constraint):
     unit: ClassVar[str] = "units of the value"
 
     def _check_shared(self) -> None:
+        self.margin = non_negative("margin", self.margin, self.unit)
         whole = isinstance(self.holds, int | float | np.number) and not isinstance(self.holds, bool)
         if not (whole and np.isfinite(self.holds) and self.holds == int(self.holds) and self.holds >= 1):
             raise ConfigurationError(

@@ -7,7 +7,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.constraints.name_lists import name_list
+from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.filter.constraint import (
     BoundConstraint,
     Constraint,
@@ -57,11 +58,7 @@ class TrackPermission(Constraint):
         self.braking = positive("braking", self.braking, "m/s^2")
         self.creep = non_negative("creep", self.creep, "m/s")
         if self.tracks is not None:
-            if isinstance(self.tracks, str) or not self.tracks:
-                raise ConfigurationError(
-                    f"tracks is a list of names with at least one, or None for all; got {self.tracks!r}"
-                )
-            self.tracks = list(self.tracks)
+            self.tracks = name_list("tracks", self.tracks, " with at least one, or None for all")
 
     def bind(self, plant: Plant) -> "BoundTrackPermission":
         """On a plant."""

@@ -206,11 +206,15 @@ def test_it_is_rebuilt_from_the_spec_and_from_json():
             "nothing is left of the range of joint 'joint0': -1 to 1 with a margin of 1 at both ends",
         ),
         ({"margin": -1.0}, ConfigurationError, "margin must be a finite number >= 0 in rad or m, got -1.0"),
-        ({"joints": "joint0"}, ConfigurationError, "joints is a list of names, got the string 'joint0'"),
+        (
+            {"joints": "joint0"},
+            ConfigurationError,
+            "joints is a list of names, or None for every driven joint, got 'joint0'",
+        ),
         (
             {"joints": []},
             ConfigurationError,
-            r"joints is a list of names, or None for every driven joint; got \[\]",
+            r"joints is a list of names, or None for every driven joint, got \[\]",
         ),
         ({"joints": ["elbow"]}, UnknownNameError, "no joint 'elbow'; it has: joint0, joint1"),
         (

@@ -175,7 +175,10 @@ def site_driven():
         ({"limit": []}, "limit is one number, or a list with one per joint"),
         ({"limit": 4.0, "margin": -0.1}, "margin must be a finite number >= 0 in rad/s or m/s, got -0.1"),
         ({"limit": 4.0, "margin": 4.0}, "the margin 4.0 leaves nothing of the limit 4.0"),
-        ({"limit": 4.0, "joints": "joint0"}, "joints is a list of names, got the string 'joint0'"),
+        (
+            {"limit": 4.0, "joints": "joint0"},
+            "joints is a list of names, or None for every driven joint, got 'joint0'",
+        ),
         ({"limit": 4.0, "joints": []}, "joints is a list of names, or None"),
     ],
 )

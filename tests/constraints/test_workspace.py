@@ -302,7 +302,7 @@ FINGER = {"bodies": ["fingertip"]}
         (
             {"bodies": "fingertip", "low": [0.0] * 3},
             ConfigurationError,
-            "bodies is a list of names, got the string",
+            "bodies is a list of names, got",
         ),
         ({"bodies": ["hand"], "low": [0.0] * 3}, UnknownNameError, "no body 'hand'; it has: world, body0"),
         ({"sites": ["tip"], "low": [0.0] * 3}, UnknownNameError, "no site 'tip'; it has: "),

@@ -290,9 +290,7 @@ class _Group:
 
     def __init__(self, obstacles: Sequence[Any], plant: MujocoPlant, outline: Array | None) -> None:
         self._outline = outline
-        where = [
-            (o.centers(plant)[:, :2] if isinstance(o, Discs) else np.array([o.center])) for o in obstacles
-        ]
+        where = [o.centers(plant)[:, :2] for o in obstacles]
         self.centers = self._centers = np.concatenate([np.zeros((0, 2)), *where])
         self._radii = np.repeat([o.radius for o in obstacles], [len(w) for w in where])
 

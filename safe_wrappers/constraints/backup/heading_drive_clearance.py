@@ -129,11 +129,8 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         bounds: list[tuple[float, _Circle]] = []
         best = math.inf
         for obstacle in self.spec.obstacles:
-            if isinstance(obstacle, Discs):
-                where, room = obstacle.centers(self.plant).tolist(), obstacle.radius + reserve
-            else:
-                where, room = [obstacle.center], obstacle.radius + reserve
-            for center in where:
+            room = obstacle.radius + reserve
+            for center in obstacle.centers(self.plant).tolist():
                 cx, cy = center[0], center[1]
                 bound = math.hypot(cx - x, cy - y) - room - kept
                 bounds.append((bound, (cx, cy, room)))

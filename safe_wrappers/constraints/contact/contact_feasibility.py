@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
+from safe_wrappers.constraints.name_lists import name_list
 from safe_wrappers.constraints.rollout import BoundSlacks
 from safe_wrappers.control.contact.friction_cone import normal_and_tangential
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
@@ -65,12 +66,7 @@ class ContactFeasibility(Constraint):
         self.tolerance = non_negative("tolerance", self.tolerance, "shares of the weight")
         self.margin = non_negative("margin", self.margin, "shares of the weight")
         if self.bodies is not None:
-            listed = isinstance(self.bodies, Sequence) and not isinstance(self.bodies, str)
-            if not (listed and self.bodies and all(isinstance(name, str) for name in self.bodies)):
-                raise ConfigurationError(
-                    f"bodies is a list of names, or None for every body; got {self.bodies!r}"
-                )
-            self.bodies = list(self.bodies)
+            self.bodies = name_list("bodies", self.bodies, ", or None for every body")
 
     def bind(self, plant: Plant) -> "BoundContactFeasibility":
         """On a plant."""

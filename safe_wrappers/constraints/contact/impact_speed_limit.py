@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.constraints.contact.geom_gaps import GeomGaps
+from safe_wrappers.constraints.name_lists import name_list
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.control.contact.body_regions import body_region
 from safe_wrappers.control.contact.stiffness import series_stiffness
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Promise, non_negative, positive
+from safe_wrappers.filter.constraint import Promise, positive
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 
@@ -82,23 +83,19 @@ class ImpactSpeedLimit(RolloutConstraint):
     unit: ClassVar[str] = "N"
 
     def __post_init__(self) -> None:
+        self._check_shared()
         for name in ("bodies", "against"):
-            given = getattr(self, name)
-            if isinstance(given, str) or not isinstance(given, Sequence) or not given:
-                raise ConfigurationError(f"{name} is a list of names of bodies or geoms, got {given!r}")
-            setattr(self, name, list(given))
+            setattr(self, name, name_list(name, getattr(self, name), " of bodies or geoms"))
         for name, unit in (("force_limit", "N"), ("stiffness", "N/m"), ("effective_mass", "kg")):
             if getattr(self, name) is not None:
                 setattr(self, name, positive(name, getattr(self, name), unit))
         if self.braking is not None:
             self.braking = positive("braking", self.braking, "m/s^2")
-        self.margin = non_negative("margin", self.margin, "N")
         self._force, self._stiffness, self._other_mass = self._interface()
         if self.margin >= self._force:
             raise ConfigurationError(
                 f"the margin {self.margin} N leaves nothing of the limit {self._force} N"
             )
-        self._check_shared()
 
     def _interface(self) -> tuple[float, float, float]:
         """Force limit in N, stiffness in N/m, and mass in kg of what is hit."""

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.constraints.limits.joints import scalar_joints
+from safe_wrappers.constraints.name_lists import name_list
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Promise, non_negative
+from safe_wrappers.filter.constraint import Promise
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 
@@ -53,16 +54,11 @@ class JointPositionLimit(RolloutConstraint):
     unit: ClassVar[str] = "rad or m"
 
     def __post_init__(self) -> None:
-        self.margin = non_negative("margin", self.margin, "rad or m")
+        self._check_shared()
         for name in ("lower", "upper"):
             setattr(self, name, _positions(name, getattr(self, name)))
         if self.joints is not None:
-            if isinstance(self.joints, str):
-                raise ConfigurationError(f"joints is a list of names, got the string {self.joints!r}")
-            self.joints = list(self.joints)
-            if not self.joints:
-                raise ConfigurationError("joints is a list of names, or None for every driven joint; got []")
-        self._check_shared()
+            self.joints = name_list("joints", self.joints, ", or None for every driven joint")
 
     def bind(self, plant: Plant) -> "BoundJointPositionLimit":
         """On a plant."""

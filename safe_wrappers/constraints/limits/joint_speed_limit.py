@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.constraints.limits.joints import scalar_joints
+from safe_wrappers.constraints.name_lists import name_list
 from safe_wrappers.constraints.rollout import RECOVERY_S, BoundRollout, RolloutConstraint
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import HalfSpaces, Promise, non_negative, positive
+from safe_wrappers.filter.constraint import HalfSpaces, Promise, positive
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.mujoco.plant import require_mujoco
 from safe_wrappers.plants.plant import Plant
@@ -51,22 +52,17 @@ class JointSpeedLimit(RolloutConstraint):
     unit: ClassVar[str] = "rad/s or m/s"
 
     def __post_init__(self) -> None:
-        self.margin = non_negative("margin", self.margin, "rad/s or m/s")
+        self._check_shared()
         many = isinstance(self.limit, Sequence | np.ndarray)
         limits = list(self.limit) if isinstance(self.limit, Sequence | np.ndarray) else [self.limit]
         checked = [positive("limit", one, "rad/s or m/s") for one in limits]
         if self.joints is not None:
-            if isinstance(self.joints, str):
-                raise ConfigurationError(f"joints is a list of names, got the string {self.joints!r}")
-            self.joints = list(self.joints)
-            if not self.joints:
-                raise ConfigurationError("joints is a list of names, or None for every driven joint; got []")
+            self.joints = name_list("joints", self.joints, ", or None for every driven joint")
         if not checked:
             raise ConfigurationError("limit is one number, or a list with one per joint; got []")
         self.limit = checked if many else checked[0]
         if min(checked) <= self.margin:
             raise ConfigurationError(f"the margin {self.margin} leaves nothing of the limit {self.limit}")
-        self._check_shared()
 
     def bind(self, plant: Plant) -> "BoundJointSpeedLimit":
         """On a plant."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.constraints.limits.serial_chain import FrameKind, SerialChain
+from safe_wrappers.constraints.name_lists import name_list
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.control.filtering.manipulability import (
     ValidatedThreshold,
@@ -18,7 +19,7 @@ from safe_wrappers.control.filtering.manipulability import (
     validated_threshold,
 )
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import HalfSpaces, Promise, non_negative, positive
+from safe_wrappers.filter.constraint import HalfSpaces, Promise, positive
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 
@@ -106,6 +107,7 @@ class SingularityMargin(RolloutConstraint):
     unit: ClassVar[str] = "shares of the threshold"
 
     def __post_init__(self) -> None:
+        self._check_shared()
         speed, limit = self.task_speed, self.rate_limit
         given, validated = self.threshold is not None, speed is not None and limit is not None
         if given is validated or (given and (speed is not None or limit is not None)):
@@ -118,7 +120,6 @@ class SingularityMargin(RolloutConstraint):
         if speed is not None and limit is not None:
             self.task_speed = positive("task_speed", speed, "task units per second")
             self.rate_limit = positive("rate_limit", limit, "rad/s or m/s")
-        self.margin = non_negative("margin", self.margin, self.unit)
         kinds: tuple[FrameKind, ...] = ("site", "body", "geom")
         named = [kind for kind in kinds if getattr(self, kind) is not None]
         if len(named) != 1 or not isinstance(getattr(self, named[0]), str):
@@ -130,13 +131,8 @@ class SingularityMargin(RolloutConstraint):
         if self.frame not in ("world", "own"):
             raise ConfigurationError(f'frame is "world" or "own", got {self.frame!r}')
         if self.joints is not None:
-            if isinstance(self.joints, str):
-                raise ConfigurationError(f"joints is a list of names, got the string {self.joints!r}")
-            self.joints = list(self.joints)
-            if not self.joints:
-                raise ConfigurationError("joints is a list of names, or None for every driven joint; got []")
+            self.joints = name_list("joints", self.joints, ", or None for every driven joint")
         self._rows, self._weights = task_rows(self.directions, self.rotations, self.length)
-        self._check_shared()
 
     def bind(self, plant: Plant) -> "BoundSingularityMargin":
         """On a plant."""

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint, RolloutMemory
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.filter.constraint import Memory, Promise, non_negative, positive
+from safe_wrappers.filter.constraint import Memory, Promise, positive
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 
@@ -57,15 +57,14 @@ class SpeedLimit(RolloutConstraint):
     unit: ClassVar[str] = "m/s"
 
     def __post_init__(self) -> None:
+        self._check_shared()
         self.limit = positive("limit", self.limit, "m/s")
-        self.margin = non_negative("margin", self.margin, "m/s")
         if self.margin >= self.limit:
             raise ConfigurationError(f"the margin {self.margin} leaves nothing of the limit {self.limit}")
         if self.direction not in DIRECTIONS:
             raise UnknownNameError(f"no direction {self.direction!r}; choose {', '.join(DIRECTIONS)}")
         if self.average not in ("step", "substep"):
             raise UnknownNameError(f"no average {self.average!r}; choose step or substep")
-        self._check_shared()
         self._axes = ["xyz".index(letter) for letter in self.direction.strip("+-")]
         self._sign = {"+": 1.0, "-": -1.0}.get(self.direction[0])
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Promise, non_negative, positive
+from safe_wrappers.filter.constraint import Promise, positive
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 
@@ -48,7 +48,7 @@ class Upright(RolloutConstraint):
     unit: ClassVar[str] = "m or rad"
 
     def __post_init__(self) -> None:
-        self.margin = non_negative("margin", self.margin, "m and rad")
+        self._check_shared()
         if self.lowest is None and self.highest is None and self.tilt is None:
             raise ConfigurationError("give at least one of lowest (m), highest (m) and tilt (rad)")
         for name in ("lowest", "highest"):
@@ -67,7 +67,6 @@ class Upright(RolloutConstraint):
                 f"nothing is left between lowest = {self.lowest} m and highest = {self.highest} m with a margin "
                 f"of {self.margin} m at both ends"
             )
-        self._check_shared()
 
     def _heights(self) -> tuple[float, float]:
         low = -math.inf if self.lowest is None else self.lowest

@@ -7,7 +7,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacle_from
+from safe_wrappers.constraints.name_lists import name_list
+from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
 from safe_wrappers.constraints.obstacles.obstacles import distances
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.errors import ConfigurationError
@@ -60,16 +61,12 @@ class Workspace(RolloutConstraint):
     unit: ClassVar[str] = "m"
 
     def __post_init__(self) -> None:
+        self._check_shared()
         self.radius = non_negative("radius", self.radius, "m")
-        self.margin = non_negative("margin", self.margin, "m")
         self.low, self.high = _corner("low", self.low), _corner("high", self.high)
-        if isinstance(self.keep_out, dict | str) or not isinstance(self.keep_out, Sequence):
-            raise ConfigurationError(f"keep_out is a list of obstacles, got {self.keep_out!r}")
-        self.keep_out = [obstacle_from(o) for o in self.keep_out]
+        self.keep_out = obstacles_from(self.keep_out, "keep_out", optional=True)
         for name in ("bodies", "sites", "geoms"):
-            if isinstance(getattr(self, name), str):
-                raise ConfigurationError(f"{name} is a list of names, got the string {getattr(self, name)!r}")
-            setattr(self, name, list(getattr(self, name)))
+            setattr(self, name, name_list(name, getattr(self, name)))
         self._low, self._high = _bounds(self.low, -np.inf), _bounds(self.high, np.inf)
         bounded = bool(np.isfinite(self._low).any() or np.isfinite(self._high).any())
         if not (bounded or self.keep_out):
@@ -79,7 +76,6 @@ class Workspace(RolloutConstraint):
                 f"nothing is left of the box from {self.low} to {self.high} m with a radius of {self.radius} m "
                 f"and a margin of {self.margin} m on each side"
             )
-        self._check_shared()
 
     def bind(self, plant: Plant) -> "BoundWorkspace":
         """On a plant."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.constraints.obstacles.obstacles import Nearest
+from safe_wrappers.constraints.obstacles.obstacles import Nearest, refuse_more_dimensions
 from safe_wrappers.control.estimation.ellipsoids import ellipsoid_gap
 from safe_wrappers.control.estimation.tracks import Tracks
 from safe_wrappers.errors import ConfigurationError
@@ -65,8 +65,7 @@ class TrackedDiscs:
         """One surface per track."""
         tracks = self.tracks(plant)
         d, n = tracks.coordinates, len(tracks.mean)
-        if d > point.size:
-            raise ConfigurationError(f"{d}-dimensional tracks cannot meet a {point.size}-dimensional point")
+        refuse_more_dimensions(d, point.size, "tracks")
         normal, velocity = np.zeros((n, point.size)), np.zeros((n, point.size))
         nothing = np.zeros((n, point.size))
         offset = point[:d] - tracks.positions
