@@ -1,4 +1,4 @@
-"""CoastingClearance: keep a machine that rolls to rest without drive clear, by forecasting it until it stands."""
+"""CoastingClearance: keep a machine that coasts to rest out of discs, by a rollout until it rests."""
 
 import math
 import warnings
@@ -28,52 +28,49 @@ from safe_wrappers.plants.queries.coasting import Coasting, Course
 Array = NDArray[np.float64]
 
 _SAME_M = 1e-6
-"""What counts as no loss of clearance: rounding of a forecast."""
+"""Rounding of a rollout: a smaller loss of clearance is none."""
 _STILL = 1e-9
-"""Two states (m, rad, m/s, rad/s) and two places of a disc that differ by less are the same."""
+"""States (m, rad, m/s, rad/s) and places of discs that differ by less are the same."""
 _WAY_OUT_M = 1e-3
-"""What a control has to gain by its end where rest alone leaves less than the margin."""
+"""Clearance that a control has to gain at its end where zero control leaves less than the margin."""
 _RECOVERED = 0.5
-"""The share of the best way out that a control has to take from inside an obstacle."""
+"""Share of the best gain of clearance that a control has to reach from inside an obstacle."""
 _AROUND = ((1.0, 0.5), (1.0, 0.0), (1.0, -1.0), (-0.5, -1.0))
 """Shares of the drive for the outer and the inner actuator of a detour, as they are tried."""
 
 
 @dataclass
 class CoastingClearance(Constraint):
-    """Keep a free-moving machine out of discs, counting all of its way until it rests without any control.
+    """Keep a free-moving machine out of discs, counting its whole way until it rests without control.
 
-    For machines that their own friction and damping stop within a few steps, on wheels for instance. Every control
-    is forecast, substep by substep, on the machine's own model: held for one control interval, then no control at
-    all, until it rests. It is admitted if it rests within `holds` control intervals and if along all of that way
-    the body's origin stays out of `keep_out` and the outline out of `untouched`, each by `margin`. The rest of that
-    forecast is what no control does in the next step, so no control is then admissible: it is the stopping control
-    that the filter tries before any fallback.
+    For machines that friction and damping stop within a few steps, for example on wheels. The backup manoeuvre is
+    zero control. A control is rolled out on the machine's model, substep by substep: held for one control interval,
+    then zero, until rest. It is admitted if the machine rests within `holds` control intervals, and if on the whole
+    way the body's origin stays out of `keep_out` and the outline out of `untouched`, each by `margin`.
 
-    What it promises: proved, for obstacles that stand still and as far as the margin covers what the forecast misses
-    of the env's own motion. From a state whose way to rest is clear there is always an admissible control, and every
-    physics substep is clear. It is a proof by forecast, not by formula: as right as the plant's model. With
-    Safety-Gymnasium's car the forecast misses the next step by 0.2 mm at most, rest by 0.8 mm, and a tilted outline
-    reaches out by 1.5 mm (measured): a margin of 5 mm covers them twice.
+    What it promises: proved, for obstacles that stand still, and as far as `margin` covers the rollout's error. From
+    a state whose way to rest is clear there is always an admissible control, and every physics substep is clear. With
+    Safety-Gymnasium's car the next step is predicted to 0.2 mm, rest to 0.8 mm, and a tilted outline reaches out by
+    1.5 mm (measured): a margin of 5 mm is twice their sum.
 
-    From inside an obstacle (an unsafe start) controls are admitted that take at least half of the best way out that
-    full drive offers.
+    From inside an obstacle (an unsafe start) controls are admitted that gain at least half of the clearance that full
+    drive gains at best.
 
     Args:
         keep_out: `Disc` and `Discs` for the body's origin.
         untouched: `Disc` and `Discs` for the outline.
-        outline: Points [x, y] of the body's frame around which the outline goes, m; its convex hull is meant.
+        outline: Points [x, y] in the body's frame, m; the outline is their convex hull.
         body: Name of the machine's body, on a free joint.
-        alone: Name of an attribute of the env that holds a model of the machine alone, to forecast with; None takes
-            the plant's own model with all that stands around.
-        margin: Kept free, m: covers what the forecast misses, and the tilt of the outline.
-        holds: Control intervals within which it has to rest.
-        reach: The farthest that the origin or a corner of the outline moves until rest, m, whatever control is held
-            for one interval from rest; a state with more room is not forecast. Checked at every forecast, and
-            dropped with a warning when broken. None forecasts always.
+        alone: Name of an attribute of the env that holds a model of the machine alone, for the rollouts; None takes
+            the plant's model.
+        margin: Kept free, m: covers the rollout's error and the tilt of the outline.
+        holds: Control intervals within which the machine has to rest.
+        reach: Bound on the way of the origin or a corner of the outline until rest, m, for any control held for one
+            interval from rest; states with more clearance need no rollout. Checked at every rollout, and dropped
+            with a warning when broken. None: always roll out.
         reach_s: What the speed of the origin or a corner adds to that, m per m/s.
         detour: When a driving action of a machine with two actuators is refused, first try to turn while driving, or
-            to back out while turning, to the side that leads around what is in the way. It is no safety measure.
+            to reverse while turning, around the obstacle. No safety measure.
     """
 
     keep_out: Sequence[Any] = ()
@@ -200,8 +197,7 @@ class BoundCoastingClearance(BoundDetourClearance):
         rest = self._after(self._still)
         if after is rest:
             return rest.least >= 0.0
-        # Rest alone leaves less than the margin: what the forecasts missed has used it up. No less on the way then,
-        # and more at its end.
+        # The rollouts' errors have used up the margin: no less than rest leaves on the way, and more at its end.
         kept = after.least >= max(rest.least - _SAME_M, 0.0) and after.end >= rest.end + _WAY_OUT_M
         return rest.least < self.spec.margin and kept
 

@@ -1,8 +1,8 @@
-"""EscapeClearance: keep a way out clear of what moves, for a point mass that is pushed along two axes.
+"""EscapeClearance: keep an escape manoeuvre clear of moving obstacles, for a point mass on two axes.
 
-A machine in front of something that comes towards it is not safe by standing still. So a control is admitted if, held
-for one control step, it leaves at least one manoeuvre (go off in some direction, brake, stay) whose whole way keeps
-clear of where everything may be by then.
+Standing still is not safe in front of something that approaches. So a control is admitted if, held for one control
+step, it leaves at least one manoeuvre (go in some direction, brake, stay) whose whole way keeps clear of where the
+obstacles may be by then.
 """
 
 from collections.abc import Sequence
@@ -53,12 +53,11 @@ class EscapeClearance(Constraint):
     (`Discs` at constant velocity), `TrackedDiscs` anywhere inside the bound of their estimate as it grows if nothing
     more is seen, boxed in along x and y. So the less is known, the earlier the machine keeps off.
 
-    What it promises: from a state with a way out, the executed control leaves one, or the step is flagged. While
-    everything stays inside its declared bound, following the manoeuvre that was open keeps clear for the rest of the
-    horizon. Best effort: a way out is looked for among nine manoeuvres and the one that was open before; what was
-    clear may not be clear when more is seen (an estimate moves; up to `margin` of that is borne without a flag); ways
-    are checked at every second control step (for a relative speed v and steps of h, `(v h)^2 / 2` over the distance
-    lies between); nothing is seen beyond the horizon.
+    What it promises: from a state with a clear manoeuvre, the executed control leaves one, or the step is flagged.
+    While every obstacle stays inside its declared bound, that manoeuvre keeps clear for the rest of the horizon. Best
+    effort: nine manoeuvres are tried, and the one that was clear before; estimates move (up to `margin` of that is
+    not flagged); ways are checked at every second control step (for a relative speed v and steps of h, they miss
+    `(v h)^2 / 2` over the distance); obstacles count up to the horizon.
 
     Args:
         body: Name of the body on its two slides along x and y, each with a force actuator of its own. What else the
@@ -256,8 +255,7 @@ class BoundEscapeClearance(BoundBackupClearance):
     def _needed(self) -> float:
         """What a way out must leave: 0, or the best that there is while that still uses up only the margin.
 
-        What has been seen since the last step moves what was clear by a hair. The way out is then followed, and not
-        given up for it.
+        New estimates move what was clear a little; the manoeuvre is then followed all the same.
         """
         if self._best is None:
             self._best = float(self._slacks(self._firsts()).max())

@@ -1,4 +1,4 @@
-"""HeadingDriveClearance: keep a robot that is driven along its heading clear, counting its whole stopping path."""
+"""HeadingDriveClearance: keep the stopping path of a robot that is driven along its heading out of discs."""
 
 import functools
 import math
@@ -35,9 +35,9 @@ _DECAY_PER_HOLD = 0.5
 _ROW_SLACK = 0.02
 """The share of the needed clearance that prediction may miss of what the linear rows aimed at."""
 _HAIR_M = 1e-7
-"""Between two discs at rest the rows of both meet at one control; this much room lets a solver find it."""
+"""Between two discs at rest the rows of both meet at one control; this much slack lets a solver find it."""
 _RESERVE_M = 0.001
-"""Kept free in front of the boundary for what the closed form leaves out; only the backup may draw on it."""
+"""Kept free before the boundary for what the closed form leaves out; only the backup may use it."""
 
 
 @dataclass
@@ -45,17 +45,16 @@ class HeadingDriveClearance(Constraint):
     """Keep the stopping path of a planar robot out of every disc.
 
     The robot slides on two joints with equal damping, turns on a hinge, and its drive pushes along the heading
-    only: nothing brakes it sideways. So the clearance is counted from the area that the backup manoeuvre (brake
-    along the heading, hold the heading) sweeps until rest, see `control/backup/heading_drive.py`. The backup never
-    shrinks that clearance; a control is admitted if, holding it for one control step uses up at most half of
-    that clearance.
+    only: nothing brakes it sideways. The backup manoeuvre brakes along the heading and holds it; clearance is counted
+    from the area that it sweeps until rest (`control/backup/heading_drive.py`), and never shrinks under it. A control
+    is admitted if one control step of it uses up at most half of the clearance.
 
     What it promises: proved, up to what `margin` covers. From a safe state the backup is admissible, for any
     number of discs, and the discs stay clear at every physics substep, while mass and damping are right to
     within `uncertainty`, the measured position is right to within `state_error`, discs stand still and nothing
-    hits the robot. `margin` covers what the closed form leaves out: the bend of the path within a step and the
-    turning servo's chatter, together under 2 mm for the Point robot (measured, `tests/control`); a vase that
-    the robot pushes adds a tenth of a millimetre a step.
+    hits the robot. `margin` covers what the closed form leaves out: the curvature of the path within a step and the
+    turning servo's chatter, under 2 mm for the Point robot (measured, `tests/control`); a pushed vase adds 0.1 mm
+    a step.
 
     Args:
         obstacles: `Disc` and `Discs`; they stand still.
@@ -63,10 +62,10 @@ class HeadingDriveClearance(Constraint):
         margin: Fixed protective distance, m.
         state_error: Bound on the error of the measured position, m.
         uncertainty: Relative uncertainty of mass and of damping, in [0, 1).
+        brake: False: the backup coasts along the heading, too; it needs no drive, and more room.
         detour: When a driving action is refused, first try the same drive while turning towards the nearer
-            tangent of the disc in the way, then turning alone; both only if admitted. It is no safety measure:
-            it keeps a driver that is blind to the discs from standing in front of one for good.
-        brake: False counts the path that coasts along the heading as well: needs no drive to stop, costs more.
+            tangent of the disc in the way, then turning alone; both only if admitted. No safety measure: a driver
+            that does not see the discs gets around them.
     """
 
     obstacles: Sequence[Any]

@@ -1,13 +1,9 @@
 """WallClearance: keep a point mass on two axes out of walls, counting its whole braking path.
 
-Everything is counted from one manoeuvre: brake each axis for itself, fully, and in its last hold just to rest
-(`control/backup/point_among_walls.py`). A state is inside the safe set if the manoeuvre's path keeps its distance
-from every wall; `value` is that distance.
-
-Why an admissible control always exists. A control is admitted if its own hold and the manoeuvre after it are clear,
-so every admitted control leads back inside. From inside, braking is admitted: after one hold of it the manoeuvre
-is the rest of the one that was clear before. At rest the braking control is zero. By induction the point never
-touches a wall, whatever drives it, for any number of walls at once.
+The backup manoeuvre brakes each axis by itself, fully, and in its last hold just to rest
+(`control/backup/point_among_walls.py`). From a safe state braking is admitted: after one hold of it the manoeuvre is
+the rest of the one that was clear before. At rest the braking control is zero. By induction the point never touches
+a wall, for any number of walls at once.
 
 Source: appendix "Relative degree and kinetic stopping insets", in two dimensions with box walls.
 """
@@ -39,10 +35,9 @@ _Control = tuple[float, float]
 """Along x and along y, in the actuators' units."""
 
 _HAIR_M = 1e-7
-"""Corrections stay this much farther away than needed, so that rounding them to float32 loses nothing; and only
-what is lost beyond it counts as outside."""
+"""Extra distance of corrections, for rounding to float32; a state that has lost no more of it is inside."""
 _NOISE_M = 1e-12
-"""What float64 may lose between a path and the rest of it."""
+"""Rounding of float64 between a path and the rest of it."""
 _RECOVERY_S = 0.1
 """Time constant, s, with which a violation must shrink from outside; less where the backup cannot."""
 _TURNS = 4
@@ -56,14 +51,14 @@ class WallClearance(Constraint):
     """Keep a point mass that is pushed along two axes out of every wall of a maze (PointMaze).
 
     Walls and point are found in the MuJoCo model: the body on its two slides, and every fixed box, along x and y,
-    that MuJoCo would collide it with. A control is admitted if, held for one control step and followed by
-    braking, it keeps the point clear of them. What is refused is replaced by a control that slides along the wall.
+    that it can collide with. A control is admitted if, held for one control step and followed by braking, it
+    keeps the point clear of them. A refused one is replaced by a control that slides along the wall.
 
-    What it promises: proved. From a safe state the point never touches a wall, at any substep or in between, for
-    any number of walls: braking is always admissible. That takes a plant whose mass, damping and gears are the
-    machine's (they are measured on its model, and one that moves otherwise is refused), walls that stand still, and
-    `velocity_clip` as the env has it. `margin` covers rounding (under a micrometre) and the position error that
-    you expect. Under a plant's `delay_s` the state is predicted without the clip: proved up to that speed.
+    What it promises: proved. From a safe state the point never touches a wall, at any substep or in between. The
+    plant's mass, damping and gears must be the machine's (they are measured on its model; one that moves otherwise is
+    refused), walls stand still, and `velocity_clip` is the env's. `margin` covers rounding (under a micrometre) and
+    the expected position error. Under a plant's `delay_s` the state is predicted without the clip: proved up to that
+    speed.
 
     Args:
         margin: Fixed protective distance, beyond that at which MuJoCo reports a contact, m.

@@ -28,9 +28,8 @@ class JointSpeedLimit(RolloutConstraint):
     substep, contacts and joint limits included.
 
     What it promises: an executed control that is not flagged infeasible or fallback keeps the limit at every
-    substep of its step, exactly, for a plant that is right. That there always is such a control cannot be
-    promised: gravity, coupling, contacts or joint stops can be stronger than the actuators. Hence best effort;
-    then the step is counted infeasible and the fallback runs.
+    substep of its step, exactly, for a plant that is right. Gravity, coupling, contacts or joint stops can be
+    stronger than the actuators: then the step is infeasible and the fallback runs. Hence best effort.
 
     Args:
         limit: In rad/s for hinges, m/s for slides; one number, or one per named joint.

@@ -23,20 +23,19 @@ class SpeedLimit(RolloutConstraint):
 
     Speed is displacement over time, as Gymnasium's `x_velocity` is: over one control step, or over one physics
     substep. The action is held through the forecast's first control step, contacts included, and the actuated
-    joints are braked in the others (`holds`): a speed that is kept now only to be exceeded next is refused now.
+    joints are braked in the others (`holds`), so that the next step can keep the limit, too.
 
     What it promises: the first control step of an executed control that is not flagged keeps the limit, exactly,
-    for a plant that is right. That such a control exists cannot be promised: in flight no actuator changes the
-    momentum, and contact forces have one sign. Hence best effort; then the step is counted infeasible and
-    the control that was found to exceed the limit least is executed.
+    for a plant that is right. Such a control need not exist: in flight no actuator changes the momentum, and contact
+    forces have one sign. Then the step is infeasible, and the control that exceeds the limit least is executed. Hence
+    best effort.
 
-    Over one control step both displacements count that are in use: from state to state, and the one that MuJoCo's
-    `data.xpos` shows, which belongs to the last point that the integrator evaluated (Gymnasium reads Ant's and
-    Humanoid's speed from it).
+    Over one control step two displacements count: from state to state, and that of MuJoCo's `data.xpos`, which
+    belongs to the last point that the integrator evaluated (Gymnasium reads Ant's and Humanoid's speed from it).
 
     Args:
         limit: m/s.
-        body: Name of the body whose frame origin is meant; None is the whole machine's centre of mass.
+        body: Name of the body whose frame origin counts; None: the whole machine's centre of mass.
         direction: "+x" and so on limit one sign, "x" both, "xy" and "xyz" the length of the vector.
         average: "step" over a control step, "substep" over a physics substep (instantaneous).
         margin: Kept free below the limit, m/s.

@@ -22,7 +22,7 @@ class Upright(RolloutConstraint):
 
     What it promises: an executed control that is not flagged keeps both at every physics substep of its step,
     for a plant that is right. It looks `holds` control steps ahead, with the actuated joints braked after the
-    first: that refuses controls whose fall is near, and balances nobody. A robot on legs can be past saving
+    first: that refuses controls shortly before a fall, and does not balance. A robot on legs can be unrecoverable
     long before it falls. Hence best effort.
 
     Args:

@@ -29,16 +29,15 @@ class Workspace(RolloutConstraint):
 
     What it promises: an executed control that is not flagged keeps the workspace at every substep of its step,
     for a plant that is right, and as long as braking takes no more than `holds` steps leaves one that stops in
-    time. Near a singular pose, or under loads stronger than the actuators, braking joints can still carry a
-    point on. Hence best effort.
+    time. Near a singular pose, or under loads stronger than the actuators, a point can move on. Hence best effort.
 
     Args:
         low: Smallest x, y, z, m; None is no bound, for all or for one: `[None, -0.5, None]`.
         high: Largest, likewise.
         keep_out: `Disc`, `Sphere`, `Box`, `Plane`, `Discs`.
-        bodies: Names of bodies whose frame origins are meant.
+        bodies: Names of bodies; their frame origins are the points.
         sites: Names of sites, likewise.
-        geoms: Names of geoms: their centres, likewise.
+        geoms: Names of geoms: their centres.
         radius: Of the machine around each point, m.
         margin: Kept free, m.
         holds: Control steps to look ahead; cover the time that braking takes.
