@@ -1,4 +1,4 @@
-"""CBFActionFilter: the executed action is the closest one to the policy's that every constraint admits."""
+"""CBFActionFilter: executes the policy's action, or one near it that every constraint admits, or a fallback."""
 
 import copy
 import math
@@ -59,9 +59,10 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
 
     Info, at every step (see `safe_wrappers.info`): ``cbf/intervened``, ``cbf/infeasible``,
     ``cbf/fallback``, ``cbf/nonfinite``, ``cbf/unsafe`` (bool); ``cbf/correction``, ``cbf/clipped``,
-    ``cbf/margin`` (float); ``cbf/refused``, ``proposed_action``, ``executed_action`` (arrays).
+    ``cbf/margin`` (float); ``cbf/stage`` (int); ``cbf/refused``, ``proposed_action``, ``executed_action`` (arrays).
 
     Attributes:
+        filter: The `SafetyFilter` that decides; `filter.bound` are the constraints on the plant.
         constraint_names: Of the constraints, in the order of ``cbf/refused``: their kinds, numbered if repeated.
         filter_seconds: Wall time spent filtering so far; `filter_calls` says over how many steps.
 
@@ -93,7 +94,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         plant = own_plant(plant)
         if isinstance(constraints, str | dict) or not isinstance(constraints, Sequence) or not constraints:
             raise ConfigurationError(f"constraints is a list with at least one, got {constraints!r}")
-        own = [copy.deepcopy(constraint_from(c)) for c in constraints]
+        own = [copy.deepcopy(c) for c in [*map(constraint_from, constraints)]]
         margin = non_negative("margin", margin, "the constraints' own units")
         check_solver(solver)
         gym.utils.RecordConstructorArgs.__init__(
