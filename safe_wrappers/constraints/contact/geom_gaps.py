@@ -144,9 +144,7 @@ def _distance(model: mujoco.MjModel, data: mujoco.MjData, a: int, b: int, segmen
     for beside in _BESIDE:
         data.geom_xpos[a] = place + beside
         answers.append((float(mujoco.mj_geomDistance(model, data, a, b, _FAR, None)), beside))
-    there = (
-        sorted((answer for answer in answers if answer[0] != 0.0), key=lambda answer: answer[0]) or answers
-    )
+    there = sorted((a for a in answers if a[0] != 0.0), key=lambda a: a[0]) or answers
     gap, beside = there[len(there) // 2]
     if segment is not None:
         data.geom_xpos[a] = place + beside

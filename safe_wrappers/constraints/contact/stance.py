@@ -138,9 +138,8 @@ class BoundStance(BoundConstraint):
         data = self.plant.under(control)
         motion = equations_of_motion(self.plant.model, data, self.plant.actuators)
         found = motion.contacts
-        within = bool(
-            (np.abs(self.plant.state) < mujoco.mjMAXVAL).all()
-        )  # else MuJoCo resets the state in its step
+        # Beyond this MuJoCo resets the state in its step.
+        within = bool((np.abs(self.plant.state) < mujoco.mjMAXVAL).all())
         if not (within and np.isfinite(motion.bias).all() and np.isfinite(found.forces).all()):
             return  # nothing can be said
         ground = fixed_bodies(self.plant.model)[found.pushed_by]

@@ -115,9 +115,8 @@ class BoundJointSpeedLimit(BoundRollout):
         v = self.plant.qvel[self._dofs]
         a0, a = drift[self._dofs], effect[self._dofs]
         strongest = np.maximum(np.abs(self.plant.lower), np.abs(self.plant.upper))
-        pushes = np.abs(a) * np.where(
-            a == 0.0, 0.0, strongest
-        )  # no push, however strong the actuator may get
+        # No push, not NaN, where an actuator without effect is infinitely strong.
+        pushes = np.abs(a) * np.where(a == 0.0, 0.0, strongest)
         reach = np.abs(v) + self.plant.hold_s * (np.abs(a0) + pushes.sum(axis=1))
         near = reach > self._bound
         normals = np.vstack([a[near], -a[near]])

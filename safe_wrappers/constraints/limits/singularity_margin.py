@@ -153,10 +153,8 @@ class BoundSingularityMargin(BoundRollout):
                 "leave it out"
             )
         self._columns = [c for c, does_nothing in zip(self._columns, idle, strict=True) if not does_nothing]
-        task, count = (
-            f"directions={self.spec.directions!r}, rotations={self.spec.rotations!r}",
-            len(self._columns),
-        )
+        task = f"directions={self.spec.directions!r}, rotations={self.spec.rotations!r}"
+        count = len(self._columns)
         if count < len(self.spec._rows):
             raise ConfigurationError(
                 f"{count} joints cannot move the {self.spec._kind} {name!r} in {len(self.spec._rows)} directions at "

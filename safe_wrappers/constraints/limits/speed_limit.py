@@ -64,8 +64,6 @@ class SpeedLimit(RolloutConstraint):
             raise UnknownNameError(f"no direction {self.direction!r}; choose {', '.join(DIRECTIONS)}")
         if self.average not in ("step", "substep"):
             raise UnknownNameError(f"no average {self.average!r}; choose step or substep")
-        self._axes = ["xyz".index(letter) for letter in self.direction.strip("+-")]
-        self._sign = {"+": 1.0, "-": -1.0}.get(self.direction[0])
 
     def bind(self, plant: Plant) -> "BoundSpeedLimit":
         """On a plant."""
@@ -97,6 +95,8 @@ class BoundSpeedLimit(BoundRollout):
     def __init__(self, spec: SpeedLimit, plant: Plant) -> None:
         super().__init__(spec, plant)
         self._body = None if self.spec.body is None else self.plant.named("body", self.spec.body)
+        self._axes = ["xyz".index(letter) for letter in spec.direction.strip("+-")]
+        self._sign = {"+": 1.0, "-": -1.0}.get(spec.direction[0])
         self._revision = self.plant.revision
         self._weigh()
         self._window = self.plant.substeps if self.spec.average == "step" else 1
@@ -120,8 +120,8 @@ class BoundSpeedLimit(BoundRollout):
 
     def _point(self, frames: Array, centres: Array) -> Array:
         if self._body is None:
-            return np.asarray((self._shares @ centres)[..., self.spec._axes])
-        return np.asarray(frames[..., self._body, :][..., self.spec._axes])
+            return np.asarray((self._shares @ centres)[..., self._axes])
+        return np.asarray(frames[..., self._body, :][..., self._axes])
 
     def _now(self) -> Array:
         if self._revision != self.plant.revision:
@@ -140,8 +140,8 @@ class BoundSpeedLimit(BoundRollout):
 
     def _left(self, displacements: Array, substeps: int) -> Array:
         velocity = displacements / (substeps * self.plant.hold_s / self.plant.substeps)
-        if self.spec._sign is not None:
-            return self.spec.limit - self.spec._sign * velocity[:, 0]
+        if self._sign is not None:
+            return self.spec.limit - self._sign * velocity[:, 0]
         return np.asarray(self.spec.limit - np.sqrt((velocity * velocity).sum(axis=1)))
 
     def _violation(self, value: Array) -> Array:

@@ -66,7 +66,8 @@ class Workspace(RolloutConstraint):
         self.keep_out = obstacles_from(self.keep_out, "keep_out", optional=True)
         for name in ("bodies", "sites", "geoms"):
             setattr(self, name, name_list(name, getattr(self, name)))
-        self._low, self._high = _bounds(self.low, -np.inf), _bounds(self.high, np.inf)
+        self._low = np.array([-np.inf if v is None else v for v in self.low or [None] * 3])
+        self._high = np.array([np.inf if v is None else v for v in self.high or [None] * 3])
         bounded = bool(np.isfinite(self._low).any() or np.isfinite(self._high).any())
         if not (bounded or self.keep_out):
             raise ConfigurationError("give a bound in low or high (m), or something to keep_out of")
@@ -141,8 +142,3 @@ def _corner(name: str, given: Sequence[float | None] | None) -> list[float | Non
     if len(corner) != 3 or any(v is not None and not np.isfinite(v) for v in corner):
         raise ConfigurationError(f"{name} is [x, y, z] in m, None where there is no bound; got {given!r}")
     return corner
-
-
-def _bounds(corner: Sequence[float | None] | None, missing: float) -> Array:
-    values = [None, None, None] if corner is None else corner
-    return np.array([missing if v is None else v for v in values])
