@@ -1,5 +1,6 @@
 """Safety requirements: each turns a plant into half-spaces on the control."""
 
+from safe_wrappers.constraints.backup.base import BoundBackupClearance
 from safe_wrappers.constraints.backup.coasting_clearance import CoastingClearance
 from safe_wrappers.constraints.backup.escape_clearance import EscapeClearance
 from safe_wrappers.constraints.backup.heading_drive_clearance import HeadingDriveClearance
@@ -24,6 +25,7 @@ from safe_wrappers.filter.constraint import Constraint, HalfSpaces
 
 __all__ = [
     "Barrier",
+    "BoundBackupClearance",
     "Box",
     "Clearance",
     "CoastingClearance",

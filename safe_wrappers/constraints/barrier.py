@@ -24,10 +24,10 @@ from safe_wrappers.plants.plant import Plant
 Array = NDArray[np.float64]
 
 _ROUNDING = 1e-9
-"""Less is round-off, as a share of h's size: of its value and its gradient together."""
+"""Round-off, as a share of h's size: of its value and its gradient together."""
 _NO_EFFECT = 1e-7
-"""A control that acts on h' by less, as a share of h's size and of the control's effect on the state, is looked at
-more closely: differences leave as much."""
+"""Error of differences, as a share of h's size and of the control's effect on the state: a smaller effect on h' may
+be none."""
 
 
 @dataclass
@@ -35,13 +35,12 @@ class Barrier(Constraint):
     """Keep `h(x) >= 0` by `Lf h + Lg h u >= -alpha (h - margin) + curvature * hold / 2`.
 
     What it promises: in continuous time the set `h >= margin` is invariant while the row is feasible. A held
-    control is checked by prediction as well: h must not be negative at the half and at the end of the hold
-    (AnalyticPlant; the end by Runge-Kutta and by one Euler step), or at every physics substep (MujocoPlant);
-    where it is, the constraint is linearised anew about the refused control. So a control that is not flagged
-    keeps h at those instants, for a plant and an integration that are right; `margin` covers what is not (state
-    error, another integrator). `curvature`, a bound on -h'' under a held control, adds that reserve to the row
-    itself. Feasibility depends on your h and your actuators: infeasible steps are counted and the fallback
-    runs. Hence best effort.
+    control is predicted as well: h must not be negative at the half and at the end of the hold (AnalyticPlant; the
+    end by Runge-Kutta and by one Euler step), or at every physics substep (MujocoPlant); else the constraint is
+    linearised about the refused control. So a control that is not flagged keeps h at those instants, for a plant
+    and an integration that are right; `margin` covers errors of both and of the state. `curvature` adds a reserve to
+    the row. Feasibility depends on h and the actuators: infeasible steps are counted and the fallback runs. Hence
+    best effort.
 
     Args:
         h: Takes the plant's state (n,), returns a number, positive inside the safe set. Its relative degree

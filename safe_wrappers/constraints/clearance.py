@@ -39,10 +39,9 @@ class Clearance(Constraint):
     predicted over it.
 
     What it promises: in one dimension, and head on, the bound is exact for the declared `braking`. Elsewhere
-    the direction to the obstacle turns within a hold and the drift changes, which `margin` must cover; and
-    several obstacles at once, or joint limits, can ask for more than the actuators have. Hence best effort:
-    infeasible steps are counted and the fallback runs. A machine that cannot brake in every direction (a
-    heading drive) needs `HeadingDriveClearance`.
+    `margin` must cover that the direction to the obstacle and the drift change within a hold; and several obstacles,
+    or joint limits, can ask for more than the actuators have. Hence best effort: infeasible steps are counted and
+    the fallback runs. A machine that cannot brake in every direction needs `HeadingDriveClearance`.
 
     Args:
         obstacles: `Disc`, `Sphere`, `Box`, `Plane`, `Discs`.

@@ -1,4 +1,4 @@
-"""RolloutConstraint: the base of constraints that are judged on a rollout of the machine instead of on rows."""
+"""RolloutConstraint: the base of constraints that are judged on a rollout of the machine."""
 
 import warnings
 from abc import abstractmethod
@@ -7,7 +7,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import positive, whole_number
+from safe_wrappers.checks import non_negative, positive, whole_number
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.filter.linearize import linearize, tangent_rows
 from safe_wrappers.plants.mujoco.forecast import Forecast
@@ -19,15 +19,15 @@ Array = NDArray[np.float64]
 _STEP = 1e-4
 """Width of the differences about braking, as a share of the control's range."""
 _INSTANTS = (1, 2, 3, 5, 8, 13, 21, 34, 55)
-"""Instants of a control interval that rows are made of, beside its last; forecasts are judged at all of them."""
+"""Instants of a control interval that get rows, beside its last; forecasts are judged at all instants."""
 _KEPT = 10
-"""Control steps for which a response is kept: it is a guess that forecasts check, and differences cost one each."""
+"""Control steps for which a response is kept: it is a guess that forecasts check, and costs a forecast a control."""
 _SAME_RESPONSE = 1
-"""Linearisations of one step that take the kept response for theirs."""
+"""Linearisations of one step that use the kept response."""
 _RESOLUTION = 1e-6
-"""Of controls, as a share of half their range: aimed farther inward by what rounding them may change."""
+"""Rounding of controls, as a share of half their range, for which rows are tightened."""
 RECOVERY_S = 0.1
-"""Time constant, s, in which a state outside has to come back."""
+"""Time constant of recovery from a violation, s."""
 
 
 def mujoco_rollouts(plant: Plant, asker: str) -> MujocoPlant:
@@ -39,7 +39,7 @@ def mujoco_rollouts(plant: Plant, asker: str) -> MujocoPlant:
 
 
 class RolloutConstraint(Constraint):
-    """A requirement on the machine's way: the held control first, braking after it.
+    """A requirement along a rollout: the held control first, braking after it.
 
     Attributes of a subclass (dataclass fields): `margin` (units of the value), `holds` (control intervals to
     look ahead), `reach` (units of the value, or None: always forecast).
@@ -51,6 +51,7 @@ class RolloutConstraint(Constraint):
     unit: ClassVar[str] = "units of the value"
 
     def _check_shared(self) -> None:
+        self.margin = non_negative("margin", self.margin, self.unit)
         whole = isinstance(self.holds, float | np.floating) and float(self.holds).is_integer()
         holds = int(self.holds) if whole else self.holds
         self.holds = whole_number("holds", holds, 1, "control intervals to look ahead")
@@ -103,9 +104,9 @@ class BoundRollout(BoundSlacks):
     This class decides from it (`admits`), linearises about a refused control (`linearize`) and says what a control
     leaves (`slack`).
 
-    A forecast costs at least what a step of the env costs. So `reach` may declare how far `value` can fall at most
-    within the forecast, whatever the controls do: a state with more than that left is admitted without one. The
-    declaration is checked at every step, and dropped with a warning when broken.
+    A forecast costs at least as much as a step of the env. So `reach` may declare how far `value` can fall at most
+    within the forecast, for any control: a state with more than that left needs none. The declaration is checked at
+    every step, and dropped with a warning when broken.
     """
 
     spec: Any
@@ -129,7 +130,7 @@ class BoundRollout(BoundSlacks):
         return RolloutMemory()
 
     def observe(self, memory: RolloutMemory) -> None:
-        """Take what is left at the present state, and whether it is so much that nothing need be forecast."""
+        """Take what is left at the present state, and whether a forecast is needed."""
         self._value = self._now()
         self._linear: HalfSpaces | None = None
         self._linearized = 0
@@ -191,10 +192,10 @@ class BoundRollout(BoundSlacks):
         return self._instants(control)
 
     def rows(self) -> HalfSpaces:
-        """None: what counts is the forecast, linearised where a control has been refused.
+        """None: the forecast is linearised about a refused control.
 
-        Where controls are no forces: the forecast linearised about braking, instant by instant. A displacement that
-        is refused may press the machine against something, and says little about one that does not.
+        Where controls are displacements: the forecast linearised about braking, instant by instant. A refused
+        displacement may press the machine against something, and then says little about others.
         """
         if self.plant.has_acceleration or self._far:
             return super().rows()

@@ -1,4 +1,4 @@
-"""TrackPermission: stop while something that the machine relies on knowing may no longer be relied on."""
+"""TrackPermission: stop while the permission of a track has expired."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -22,12 +22,11 @@ class TrackPermission(Constraint):
 
     An `OcclusionPenalty` inside the filter says which tracks may be relied on. The rows bound the speed along an axis
     at the end of the control step: it falls by `braking` times the control interval, shared as the velocity is, down
-    to `creep`. With all permissions in force it asks for nothing, and the policy's action passes.
+    to `creep`. With all permissions in force there are no rows.
 
-    What it promises: executed controls brake as declared, or the step is flagged infeasible. It stops the machine,
-    not what comes to meet it: where standing still is no safe state, keep out of the way (`Clearance` with
-    `TrackedDiscs`), too. Best effort: the drift changes within a held step, and another constraint may ask for the
-    opposite.
+    What it promises: executed controls brake as declared, or the step is flagged infeasible. Where standing still is
+    not safe, add `Clearance` with `TrackedDiscs`. Best effort: the drift changes within a held step, and another
+    constraint may ask for the opposite.
 
     Args:
         body: Name of the body whose frame origin is stopped.

@@ -116,7 +116,7 @@ def test_a_reach_that_is_broken_is_dropped_with_a_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert not constraint.admits(FULL)
-    assert constraint._reach is None and not constraint._free
+    assert constraint._reach is None
 
 
 def test_what_stands_still_is_forecast_once():

@@ -101,7 +101,7 @@ def test_what_it_is_given_is_checked():
         ("braking.*m/s", {"braking": 0.0}),
         ("creep", {"braking": 1.0, "creep": -1}),
         ("list of names", {"braking": 1.0, "tracks": "car0"}),
-        ("at least one", {"braking": 1.0, "tracks": []}),
+        ("tracks is a list of names, or None for all", {"braking": 1.0, "tracks": []}),
     ):
         with pytest.raises(ConfigurationError, match=words):
             sw.TrackPermission("robot", **given)

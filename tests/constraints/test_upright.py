@@ -191,7 +191,7 @@ def test_it_is_rebuilt_from_the_spec_and_from_json():
         (
             {"tilt": 0.1, "margin": -0.1},
             ConfigurationError,
-            "margin must be a finite number >= 0 in m and rad",
+            "margin must be a finite number >= 0 in m or rad",
         ),
         ({"body": "head", "tilt": 1.0}, UnknownNameError, "no body 'head'; it has: world, torso"),
     ],

@@ -62,3 +62,12 @@ def test_blocks_share_their_names_and_stop_where_asked(tmp_path):
     names = PAGES["run"](str(page), until="b")
     assert names["b"] == 2 and "c" not in names
     assert [block.line for block in PAGES["blocks"](str(page))] == [2, 6, 13]
+
+
+@pytest.mark.parametrize("page", ["own-constraint", "own-backup-manoeuvre"])
+def test_a_constraint_of_ones_own_takes_at_most_forty_lines(page):
+    written = [
+        block.code for block in PAGES["blocks"](f"tutorial/{page}.md") if "sw.Constraint" in block.code
+    ]
+    assert written
+    assert all(len([line for line in code.splitlines() if line.strip()]) <= 40 for code in written)

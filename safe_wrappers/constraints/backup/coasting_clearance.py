@@ -1,4 +1,4 @@
-"""CoastingClearance: keep a machine that rolls to rest without drive clear, by forecasting it until it stands."""
+"""CoastingClearance: keep a machine that coasts to rest out of discs, by a rollout until it rests."""
 
 import math
 import warnings
@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import non_negative, positive
-from safe_wrappers.constraints.backup.detour import Detour
-from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacle_from
+from safe_wrappers.constraints.backup.base import BoundDetourClearance, Detour
+from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
 from safe_wrappers.constraints.obstacles.obstacles import Disc, Discs
 from safe_wrappers.control.numerics.outlines import convex_outline, distances_to_outline
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, Memory, Promise
+from safe_wrappers.filter.constraint import Constraint, Promise
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.coasting import Coasting, Course
@@ -24,54 +24,49 @@ from safe_wrappers.plants.queries.coasting import Coasting, Course
 Array = NDArray[np.float64]
 
 _SAME_M = 1e-6
-"""What counts as no loss of clearance: rounding of a forecast."""
+"""Rounding of a rollout: a smaller loss of clearance is none."""
 _STILL = 1e-9
-"""Two states (m, rad, m/s, rad/s) and two places of a disc that differ by less are the same."""
+"""States (m, rad, m/s, rad/s) and places of discs that differ by less are the same."""
 _WAY_OUT_M = 1e-3
-"""What a control has to gain by its end where rest alone leaves less than the margin."""
+"""Clearance that a control has to gain at its end where zero control leaves less than the margin."""
 _RECOVERED = 0.5
-"""The share of the best way out that a control has to take from inside an obstacle."""
+"""Share of the best gain of clearance that a control has to reach from inside an obstacle."""
 _AROUND = ((1.0, 0.5), (1.0, 0.0), (1.0, -1.0), (-0.5, -1.0))
 """Shares of the drive for the outer and the inner actuator of a detour, as they are tried."""
-_DETOUR_MEMORY = 25
-"""Control steps for which a detour keeps its side after it was last needed, so that it cannot dither."""
 
 
 @dataclass
 class CoastingClearance(Constraint):
-    """Keep a free-moving machine out of discs, counting all of its way until it rests without any control.
+    """Keep a free-moving machine out of discs, counting its whole way until it rests without control.
 
-    For machines that their own friction and damping stop within a few steps, on wheels for instance. Every control
-    is forecast, substep by substep, on the machine's own model: held for one control interval, then no control at
-    all, until it rests. It is admitted if it rests within `holds` control intervals and if along all of that way
-    the body's origin stays out of `keep_out` and the outline out of `untouched`, each by `margin`. The rest of that
-    forecast is what no control does in the next step, so no control is then admissible: it is the stopping control
-    that the filter tries before any fallback.
+    For machines that friction and damping stop within a few steps, for example on wheels. The backup manoeuvre is
+    zero control. A control is rolled out on the machine's model, substep by substep: held for one control interval,
+    then zero, until rest. It is admitted if the machine rests within `holds` control intervals, and if on the whole
+    way the body's origin stays out of `keep_out` and the outline out of `untouched`, each by `margin`.
 
-    What it promises: proved, for obstacles that stand still and as far as the margin covers what the forecast misses
-    of the env's own motion. From a state whose way to rest is clear there is always an admissible control, and every
-    physics substep is clear. It is a proof by forecast, not by formula: as right as the plant's model. With
-    Safety-Gymnasium's car the forecast misses the next step by 0.2 mm at most, rest by 0.8 mm, and a tilted outline
-    reaches out by 1.5 mm (measured): a margin of 5 mm covers them twice.
+    What it promises: proved, for obstacles that stand still, and as far as `margin` covers the rollout's error. From
+    a state whose way to rest is clear there is always an admissible control, and every physics substep is clear. With
+    Safety-Gymnasium's car the next step is predicted to 0.2 mm, rest to 0.8 mm, and a tilted outline reaches out by
+    1.5 mm (measured): a margin of 5 mm is twice their sum.
 
-    From inside an obstacle (an unsafe start) controls are admitted that take at least half of the best way out that
-    full drive offers.
+    From inside an obstacle (an unsafe start) controls are admitted that gain at least half of the clearance that full
+    drive gains at best.
 
     Args:
         keep_out: `Disc` and `Discs` for the body's origin.
         untouched: `Disc` and `Discs` for the outline.
-        outline: Points [x, y] of the body's frame around which the outline goes, m; its convex hull is meant.
+        outline: Points [x, y] in the body's frame, m; the outline is their convex hull.
         body: Name of the machine's body, on a free joint.
-        alone: Name of an attribute of the env that holds a model of the machine alone, to forecast with; None takes
-            the plant's own model with all that stands around.
-        margin: Kept free, m: covers what the forecast misses, and the tilt of the outline.
-        holds: Control intervals within which it has to rest.
-        reach: The farthest that the origin or a corner of the outline moves until rest, m, whatever control is held
-            for one interval from rest; a state with more room is not forecast. Checked at every forecast, and
-            dropped with a warning when broken. None forecasts always.
+        alone: Name of an attribute of the env that holds a model of the machine alone, for the rollouts; None takes
+            the plant's model.
+        margin: Kept free, m: covers the rollout's error and the tilt of the outline.
+        holds: Control intervals within which the machine has to rest.
+        reach: Bound on the way of the origin or a corner of the outline until rest, m, for any control held for one
+            interval from rest; states with more clearance need no rollout. Checked at every rollout, and dropped
+            with a warning when broken. None: always roll out.
         reach_s: What the speed of the origin or a corner adds to that, m per m/s.
         detour: When a driving action of a machine with two actuators is refused, first try to turn while driving, or
-            to back out while turning, to the side that leads around what is in the way. It is no safety measure.
+            to reverse while turning, around the obstacle. No safety measure.
     """
 
     keep_out: Sequence[Any] = ()
@@ -89,23 +84,15 @@ class CoastingClearance(Constraint):
 
     def __post_init__(self) -> None:
         for name in ("keep_out", "untouched"):
-            given = getattr(self, name)
-            if isinstance(given, dict | str) or not isinstance(given, Sequence):
-                raise ConfigurationError(f"{name} is a list of Disc and Discs, got {given!r}")
-            obstacles = [obstacle_from(o) for o in given]
-            for obstacle in obstacles:
-                if not isinstance(obstacle, Disc | Discs):
-                    raise ConfigurationError(f"{name} holds Disc and Discs, got {type(obstacle).__name__}")
-                if getattr(obstacle, "velocity_attribute", None) is not None:
-                    raise ConfigurationError(
-                        f"{name}: the way to rest is forecast past discs that stand still"
-                    )
-            setattr(self, name, obstacles)
+            found = obstacles_from(getattr(self, name), name, kinds=(Disc, Discs), optional=True)
+            if any(getattr(obstacle, "velocity_attribute", None) is not None for obstacle in found):
+                raise ConfigurationError(f"{name}: the way to rest is forecast past discs that stand still")
+            setattr(self, name, found)
         if not (self.keep_out or self.untouched):
             raise ConfigurationError(
                 "give obstacles in keep_out (for the origin) or untouched (for the outline)"
             )
-        self.outline, self._corners = _outline(self.outline, needed=bool(self.untouched))
+        self.outline = _checked_outline(self.outline, needed=bool(self.untouched))
         self.margin = non_negative("margin", self.margin, "m")
         if isinstance(self.holds, bool) or self.holds != int(self.holds) or self.holds < 2:
             raise ConfigurationError(f"holds is a whole number of control intervals >= 2, got {self.holds!r}")
@@ -113,58 +100,52 @@ class CoastingClearance(Constraint):
         if self.reach is not None:
             self.reach = positive("reach", self.reach, "m")
         self.reach_s = non_negative("reach_s", self.reach_s, "m per m/s")
-        self._radius = float(np.sqrt((self._corners**2).sum(axis=1)).max(initial=0.0))
 
     def bind(self, plant: Plant) -> "BoundCoastingClearance":
         """On a plant."""
         return BoundCoastingClearance(self, plant)
 
 
-class BoundCoastingClearance(BoundConstraint):
+class BoundCoastingClearance(BoundDetourClearance):
     """CoastingClearance on a plant."""
 
-    predicts: bool = True
+    detour_steps = 25
     spec: CoastingClearance
     plant: MujocoPlant
 
     def __init__(self, spec: CoastingClearance, plant: Plant) -> None:
         hint = "CoastingClearance needs a MujocoPlant: it forecasts with the machine's model"
         super().__init__(spec, require_mujoco(plant, hint))
-        alone = None if self.spec.alone is None else self.plant.attribute(self.spec.alone)
+        alone = None if spec.alone is None else plant.attribute(spec.alone)
         if alone is not None and not isinstance(alone, mujoco.MjModel):
             raise ConfigurationError(
-                f"alone names an attribute that holds an MjModel; {self.spec.alone!r} is {alone!r}"
+                f"alone names an attribute that holds an MjModel; {spec.alone!r} is {alone!r}"
             )
-        self._coasting = Coasting(self.plant, self.spec.body, alone)
+        self._coasting = Coasting(self.plant, spec.body, alone)
         self._still = np.zeros(self.plant.model.nu)
-        self._reach = self.spec.reach
+        outline = np.reshape(spec.outline, (-1, 2))
+        self._corners = convex_outline(outline) if len(outline) else outline
+        self._radius = float(np.sqrt((self._corners**2).sum(axis=1)).max(initial=0.0))
+        self._reach = spec.reach
         self._first_turns_left: bool | None = None
         self._seen = np.zeros(0)
         self._known: dict[bytes, _Outcome] = {}
 
-    def start(self) -> Memory:
-        """No detour is being made."""
+    def start(self) -> Detour:
+        """No detour is being made, and no forecast is known."""
         self._seen = np.zeros(0)
         return Detour()
 
-    def executed(self, control: Array) -> Memory:
-        """The detour that is being made."""
-        return self._detour
-
-    def observe(self, memory: Detour) -> None:
-        """Take the state: what is left now, and which discs may come into play."""
-        self._detour = Detour(memory.side, memory.steps - 1)
-        self._look()
-
-    def _look(self) -> None:
+    def clearance(self) -> Array:
+        """Of the present place from the nearest disc, margin not taken off, m, shape (1,): not along the way."""
         self._low, self._high = self.plant.acting_range
         here = self._coasting.start()
         self._here = here.places[0]
         reach = math.inf
         if self._reach is not None:
-            reach = self._reach + self.spec.reach_s * self._coasting.speed(self.spec._radius)
+            reach = self._reach + self.spec.reach_s * self._coasting.speed(self._radius)
         self._origin = _Group(self.spec.keep_out, self.plant, None)
-        self._body = _Group(self.spec.untouched, self.plant, self.spec._corners)
+        self._body = _Group(self.spec.untouched, self.plant, self._corners)
         self._least = min(group.keep(here, self.spec.margin + reach) for group in (self._origin, self._body))
         self._within = reach
         # Rollouts are kept while nothing moves.
@@ -172,9 +153,6 @@ class BoundCoastingClearance(BoundConstraint):
         seen = np.concatenate([[self.plant.revision], self._coasting.state(), discs])
         if not (seen.shape == self._seen.shape and (np.abs(seen - self._seen) <= _STILL).all()):
             self._seen, self._known = seen, {}
-
-    def value(self) -> Array:
-        """What is left at the present place to the nearest disc, margin not taken off, m, shape (1,)."""
         return np.array([self._least])
 
     def _after(self, control: Array) -> "_Outcome":
@@ -182,42 +160,31 @@ class BoundCoastingClearance(BoundConstraint):
         acting = np.minimum(np.maximum(control, self._low), self._high) + 0.0  # no -0.0: its bytes differ
         key = acting.tobytes()
         if key not in self._known:
-            course = self._coasting.run(acting, self.spec.holds, self.spec._radius)
+            course = self._coasting.run(acting, self.spec.holds, self._radius)
             outcome, fallen = self._outcome(course)
             if fallen > self._within + _SAME_M:
-                self._forecast_always(fallen)
-                self._detour, self._seen = Detour(), np.zeros(0)
-                self._look()
+                warnings.warn(
+                    f"CoastingClearance: the clearance fell by {fallen:.3g} m until rest, farther than the declared "
+                    f"reach of {self._within:.3g} m; from now on every control is forecast",
+                    stacklevel=2,
+                )
+                self._reach, self._memory, self._seen = None, Detour(), np.zeros(0)
+                self.clearance()
                 outcome, _ = self._outcome(course)
             self._known[key] = outcome
         return self._known[key]
 
     def _outcome(self, course: Course) -> tuple["_Outcome", float]:
         """What a course leads to, and by how much a clearance falls on it, m."""
-        left = [group.along(course) for group in (self._origin, self._body)]
-        least, end = min(x.least for x in left), min(x.end for x in left)
+        least, end, fallen = zip(*(group.along(course) for group in (self._origin, self._body)), strict=True)
         (ax, ay), (bx, by) = course.ahead[0].tolist(), course.ahead[-1].tolist()
         way, turn = course.places[-1] - self._here, math.atan2(ax * by - ay * bx, ax * bx + ay * by)
-        outcome = _Outcome(least if course.rests else -math.inf, end, way, turn)
-        return outcome, max(x.fallen for x in left)
-
-    def _forecast_always(self, fallen: float) -> None:
-        self._reach = None
-        warnings.warn(
-            f"CoastingClearance: the clearance fell by {fallen:.3g} m until rest, farther than the declared reach of "
-            f"{self._within:.3g} m; from now on every control is forecast",
-            stacklevel=2,
-        )
-
-    @property
-    def _free(self) -> bool:
-        """Whether no disc can come into play, whatever is done."""
-        return not (self._origin.near or self._body.near)
+        return _Outcome(min(least) if course.rests else -math.inf, min(end), way, turn), max(fallen)
 
     def admits(self, control: Array) -> bool:
         """Whether a control leads to rest with the margin kept (or, where rest alone does not, to a way out)."""
-        if self._free:
-            return True
+        if not (self._origin.near or self._body.near):
+            return True  # no disc can come into play, whatever is done
         if self._least < 0.0:
             return self._leads_out(control)
         after = self._after(control)
@@ -226,8 +193,7 @@ class BoundCoastingClearance(BoundConstraint):
         rest = self._after(self._still)
         if after is rest:
             return rest.least >= 0.0
-        # Rest alone leaves less than the margin: what the forecasts missed has used it up. No less on the way then,
-        # and more at its end.
+        # The rollouts' errors have used up the margin: no less than rest leaves on the way, and more at its end.
         kept = after.least >= max(rest.least - _SAME_M, 0.0) and after.end >= rest.end + _WAY_OUT_M
         return rest.least < self.spec.margin and kept
 
@@ -264,13 +230,14 @@ class BoundCoastingClearance(BoundConstraint):
         drive = float(acting[np.abs(acting).argmax()])
         if float(acting.sum()) * drive <= 0.0:
             return []  # turning on the spot, or no drive at all
-        side = self._detour.side
-        if self._detour.steps <= 0:
+
+        def beside_the_nearest() -> float:
             way = self._after(acting).way
             x, y = self._nearest() - self._here
             # What is to the left of the way is passed on its right.
-            side = -1.0 if way[0] * y - way[1] * x > 0.0 else 1.0
-        self._detour = Detour(side, _DETOUR_MEMORY)
+            return -1.0 if way[0] * y - way[1] * x > 0.0 else 1.0
+
+        side = self._side(beside_the_nearest)
         if self._first_turns_left is None:
             first, second = (self._after(u).turn for u in (np.array([drive, 0.0]), np.array([0.0, drive])))
             self._first_turns_left = (first - second) * drive > 0.0
@@ -299,14 +266,6 @@ class _Outcome(NamedTuple):
     turn: float
 
 
-class _Left(NamedTuple):
-    """Of a group of discs along a course: least clearance, that at its end, and the most that one of them fell; m."""
-
-    least: float
-    end: float
-    fallen: float
-
-
 class _Group:
     """Discs that one part of the machine keeps clear of.
 
@@ -323,9 +282,7 @@ class _Group:
 
     def __init__(self, obstacles: Sequence[Any], plant: MujocoPlant, outline: Array | None) -> None:
         self._outline = outline
-        where = [
-            (o.centers(plant)[:, :2] if isinstance(o, Discs) else np.array([o.center])) for o in obstacles
-        ]
+        where = [o.centers(plant)[:, :2] for o in obstacles]
         self.centers = self._centers = np.concatenate([np.zeros((0, 2)), *where])
         self._radii = np.repeat([o.radius for o in obstacles], [len(w) for w in where])
 
@@ -337,13 +294,12 @@ class _Group:
         self.near = bool(close.any())
         return float(now.min(initial=np.inf))
 
-    def along(self, course: Course) -> "_Left":
-        """What a course leaves."""
+    def along(self, course: Course) -> tuple[float, float, float]:
+        """Along a course: least clearance, that at its end, and the most that one of them fell, m."""
         if not self.near:
-            return _Left(math.inf, math.inf, 0.0)
+            return math.inf, math.inf, 0.0
         left = self._left(course)
-        fallen = float((self.now - left.min(axis=0)).max())
-        return _Left(float(left.min()), float(left[-1].min()), fallen)
+        return float(left.min()), float(left[-1].min()), float((self.now - left.min(axis=0)).max())
 
     def nearest(self) -> Array:
         """Centre of the disc with the least room, shape (2,), m."""
@@ -361,21 +317,22 @@ class _Group:
         return np.asarray(distances_to_outline(self._outline, local) - self._radii)
 
 
-def _outline(given: Any, needed: bool) -> tuple[list[list[float]], Array]:
-    """The outline as plain data, and its corners."""
+def _checked_outline(given: Any, needed: bool) -> list[list[float]]:
+    """The outline as plain data."""
     try:
         points = np.array(given, dtype=np.float64).reshape(-1, 2)
     except (TypeError, ValueError):
         points = np.full((1, 2), np.nan)
     if not np.isfinite(points).all():
         raise ConfigurationError(f"outline is a list of points [x, y] in m, got {given!r}")
-    if not len(points):
-        if needed:
-            raise ConfigurationError(
-                "untouched needs the machine's outline: [[x, y], ...] in its body's frame, m"
-            )
-        return [], points
-    try:
-        return points.tolist(), convex_outline(points)
-    except ValueError as error:
-        raise ConfigurationError(f"outline: {error}") from None
+    if len(points):
+        try:
+            convex_outline(points)
+        except ValueError as error:
+            raise ConfigurationError(f"outline: {error}") from None
+    elif needed:
+        raise ConfigurationError(
+            "untouched needs the machine's outline: [[x, y], ...] in its body's frame, m"
+        )
+    found: list[list[float]] = points.tolist()
+    return found

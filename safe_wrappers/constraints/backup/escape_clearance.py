@@ -1,8 +1,8 @@
-"""EscapeClearance: keep a way out clear of what moves, for a point mass that is pushed along two axes.
+"""EscapeClearance: keep an escape manoeuvre clear of moving obstacles, for a point mass on two axes.
 
-A machine in front of something that comes towards it is not safe by standing still. So a control is admitted if, held
-for one control step, it leaves at least one manoeuvre (go off in some direction, brake, stay) whose whole way keeps
-clear of where everything may be by then.
+Standing still is not safe in front of something that approaches. So a control is admitted if, held for one control
+step, it leaves at least one manoeuvre (go in some direction, brake, stay) whose whole way keeps clear of where the
+obstacles may be by then.
 """
 
 from collections.abc import Sequence
@@ -13,19 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.constraints.backup.base import BoundBackupClearance
 from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
 from safe_wrappers.constraints.obstacles.obstacles import Discs, distances
 from safe_wrappers.constraints.obstacles.tracked_discs import TrackedDiscs
 from safe_wrappers.control.backup.evasive_maneuvers import EvasiveManeuvers, Maneuver
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, Memory, Promise
+from safe_wrappers.filter.constraint import Constraint, Memory, Promise
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.planar_point import planar_point
 
 Array = NDArray[np.float64]
 
-_ROUNDING = 1e-9
 _EVERY = 2
 """Holds between the instants at which ways are checked."""
 _GOING_S = (0.3, 0.8)
@@ -48,12 +48,11 @@ class EscapeClearance(Constraint):
     (`Discs` at constant velocity), `TrackedDiscs` anywhere inside the bound of their estimate as it grows if nothing
     more is seen, boxed in along x and y. So the less is known, the earlier the machine keeps off.
 
-    What it promises: from a state with a way out, the executed control leaves one, or the step is flagged. While
-    everything stays inside its declared bound, following the manoeuvre that was open keeps clear for the rest of the
-    horizon. Best effort: a way out is looked for among nine manoeuvres and the one that was open before; what was
-    clear may not be clear when more is seen (an estimate moves; up to `margin` of that is borne without a flag); ways
-    are checked at every second control step (for a relative speed v and steps of h, `(v h)^2 / 2` over the distance
-    lies between); nothing is seen beyond the horizon.
+    What it promises: from a state with a clear manoeuvre, the executed control leaves one, or the step is flagged.
+    While every obstacle stays inside its declared bound, that manoeuvre keeps clear for the rest of the horizon. Best
+    effort: nine manoeuvres are tried, and the one that was clear before; estimates move (up to `margin` of that is
+    not flagged); ways are checked at every second control step (for a relative speed v and steps of h, they miss
+    `(v h)^2 / 2` over the distance); obstacles count up to the horizon.
 
     Args:
         body: Name of the body on its two slides along x and y, each with a force actuator of its own. What else the
@@ -95,32 +94,34 @@ class EscapeClearance(Constraint):
                 raise ConfigurationError(
                     f"obstacles are seen from above: in {obstacle!r} give two coordinates, x and y"
                 )
-        self._moving: list[Any] = [o for o in self.obstacles if _moves(o)]
-        self._fixed = [o for o in self.obstacles if not _moves(o)]
 
     def bind(self, plant: Plant) -> "BoundEscapeClearance":
         """On a plant."""
         return BoundEscapeClearance(self, plant)
 
 
-class BoundEscapeClearance(BoundConstraint):
+class BoundEscapeClearance(BoundBackupClearance):
     """EscapeClearance on a plant."""
 
-    predicts: bool = True
-    tolerance: float = _ROUNDING
+    tolerance: float = 1e-9
     spec: EscapeClearance
     plant: MujocoPlant
+    _memory: int | None
+    """The manoeuvre that was open after the last control."""
 
     def __init__(self, spec: EscapeClearance, plant: Plant) -> None:
-        hint = "EscapeClearance needs a MujocoPlant: it reads the point from the model"
-        super().__init__(spec, require_mujoco(plant, hint))
-        for obstacle in self.spec._moving:
+        machine = require_mujoco(
+            plant, "EscapeClearance needs a MujocoPlant: it reads the point from the model"
+        )
+        self._moving: list[Any] = [o for o in spec.obstacles if _moves(o)]
+        self._fixed = [o for o in spec.obstacles if not _moves(o)]
+        for obstacle in self._moving:
             if isinstance(obstacle, TrackedDiscs):
-                obstacle.tracks(self.plant)
-        self._read_constants()
+                obstacle.tracks(machine)
+        super().__init__(spec, machine)
 
-    def _read_constants(self) -> None:
-        self._revision = self.plant.revision
+    def read_constants(self) -> None:
+        """The point's motion, and the manoeuvres that it can make."""
         self._point = point = planar_point(self.plant, np.inf, self.spec.body)
         # What one hold makes of a state; x and y.
         self._hold = np.array([(a.low, a.high, a.drift, a.shift, a.keep, a.add) for a in point.axes]).T
@@ -148,34 +149,36 @@ class BoundEscapeClearance(BoundConstraint):
         best = np.concatenate([b for _, b in self._asked])
         return int(best[((led_to - velocity) ** 2).sum(axis=1).argmin()])
 
-    def observe(self, memory: int | None) -> None:
-        """Take the state, and where everything may be later on."""
+    def clearance(self) -> Array:
+        """Distance now from every obstacle, or from the bound of where it may be, m, shape (n,).
+
+        Not along a manoeuvre: with a way out, one may be close for a moment.
+        """
         self._asked: list[tuple[Array, NDArray[np.intp]]] = []
-        if self.plant.revision != self._revision:
-            self._read_constants()
-        self._open = self._with_going_on(memory)
+        self._open = self._with_going_on(self._memory)
         joints = list(self._point.joints)
         self._position = self.plant.qpos[joints] + np.asarray(self._point.origin)
         self._velocity = self.plant.qvel[joints]
         # A way after a held control begins one hold from now.
         times = self.plant.hold_s * np.concatenate([[0.0], 1.0 + self._escapes.instants])
-        parts = [self._expected(o, self.plant, times) for o in self.spec._moving]
+        parts = [self._expected(o, self.plant, times) for o in self._moving]
         none = np.zeros((times.size, 0, 2))
         centers = np.concatenate([none, *(c for c, _ in parts)], axis=1)
         halves = np.concatenate([none, *(h for _, h in parts)], axis=1)
-        radii = [np.full(c.shape[1], o.radius) for (c, _), o in zip(parts, self.spec._moving, strict=True)]
+        radii = [np.full(c.shape[1], o.radius) for (c, _), o in zip(parts, self._moving, strict=True)]
         here = self._position[None]
-        fixed = [distances(o, here, self.plant)[0] for o in self.spec._fixed]
+        fixed = [distances(o, here, self.plant)[0] for o in self._fixed]
         moving = _box_distances(here[:, 0], here[:, 1], centers[:1], halves[:1])[0]
         self._near_fixed = [float(f.min(initial=np.inf)) for f in fixed]
         self._sizes = np.concatenate([*radii, np.zeros(0)]) + self.spec.radius
-        self._now = np.concatenate([moving - self._sizes, *(f - self.spec.radius for f in fixed)])
+        now = np.concatenate([moving - self._sizes, *(f - self.spec.radius for f in fixed)])
         self._boxes = centers[1:], halves[1:]
         self._lowest, self._highest = (centers - halves).min(axis=0), (centers + halves).max(axis=0)
         # From outside, the violation must shrink along the way.
-        outside = min(float(self._now.min(initial=np.inf)) - self.spec.margin, 0.0)
+        outside = min(float(now.min(initial=np.inf)) - self.spec.margin, 0.0)
         self._wanted = self.spec.margin + outside * np.exp(-times[1:] / _RECOVERY_S)
         self._best: float | None = None
+        return np.asarray(now)
 
     def _with_going_on(self, going_on: int | None) -> NDArray[np.intp]:
         """The manoeuvres to look at: the usual ones, and the one that was open after the last control."""
@@ -223,19 +226,19 @@ class BoundEscapeClearance(BoundConstraint):
             np.minimum(nearest, gap - self._sizes[i], out=nearest)
         here_x, here_y = self._position
         reach = float(np.hypot(max(right - here_x, here_x - left), max(high - here_y, here_y - low)))
-        for obstacle, now in zip(self.spec._fixed, self._near_fixed, strict=True):
+        for obstacle, now in zip(self._fixed, self._near_fixed, strict=True):
             if now - reach <= self.spec.radius + self.spec.margin:
                 points = np.stack([x.ravel(), y.ravel()], axis=1)
                 gap = distances(obstacle, points, self.plant).min(axis=1, initial=np.inf).reshape(x.shape)
                 np.minimum(nearest, gap - self.spec.radius, out=nearest)
         return nearest
 
-    def value(self) -> Array:
-        """Distance now from every obstacle, or from the bound of where it may be, m, shape (n,)."""
-        return self._now
-
     def _driven(self, control: Array) -> Array:
         return np.asarray(control)[list(self._point.actuators)]
+
+    def admits(self, control: Array) -> bool:
+        """Whether a held control leaves a way out."""
+        return self.slack(control) >= -self.tolerance
 
     def slack(self, control: Array) -> float:
         """What the best way out after a held control leaves of what is asked for, m."""
@@ -247,8 +250,7 @@ class BoundEscapeClearance(BoundConstraint):
     def _needed(self) -> float:
         """What a way out must leave: 0, or the best that there is while that still uses up only the margin.
 
-        What has been seen since the last step moves what was clear by a hair. The way out is then followed, and not
-        given up for it.
+        New estimates move what was clear a little; the manoeuvre is then followed all the same.
         """
         if self._best is None:
             self._best = float(self._slacks(self._firsts()).max())

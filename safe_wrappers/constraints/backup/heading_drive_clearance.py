@@ -1,4 +1,4 @@
-"""HeadingDriveClearance: keep a robot that is driven along its heading clear, counting its whole stopping path."""
+"""HeadingDriveClearance: keep the stopping path of a robot that is driven along its heading out of discs."""
 
 import functools
 import math
@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import non_negative
-from safe_wrappers.constraints.backup.detour import Detour
+from safe_wrappers.constraints.backup.base import BoundDetourClearance
 from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
 from safe_wrappers.constraints.obstacles.obstacles import Disc, Discs
 from safe_wrappers.control.backup.heading_drive import StoppingPath
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory, Promise
+from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Promise
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.planar_robot import PlanarFrame, heading_drive
@@ -28,14 +28,12 @@ _RECOVERY_RATE = 1.0
 """1/s: an unsafe start must shrink its violation at least this fast, where the drive can."""
 _DECAY_PER_HOLD = 0.5
 """The share of the clearance that one hold may use up: the discrete class-K decay, alpha times the hold."""
-_DETOUR_MEMORY = 50
-"""Control steps for which a detour keeps its side after it was last needed, so that it cannot dither."""
 _ROW_SLACK = 0.02
 """The share of the needed clearance that prediction may miss of what the linear rows aimed at."""
 _HAIR_M = 1e-7
-"""Between two discs at rest the rows of both meet at one control; this much room lets a solver find it."""
+"""Between two discs at rest the rows of both meet at one control; this much slack lets a solver find it."""
 _RESERVE_M = 0.001
-"""Kept free in front of the boundary for what the closed form leaves out; only the backup may draw on it."""
+"""Kept free before the boundary for what the closed form leaves out; only the backup may use it."""
 
 
 @dataclass
@@ -43,17 +41,16 @@ class HeadingDriveClearance(Constraint):
     """Keep the stopping path of a planar robot out of every disc.
 
     The robot slides on two joints with equal damping, turns on a hinge, and its drive pushes along the heading
-    only: nothing brakes it sideways. So the clearance is counted from the area that the backup manoeuvre (brake
-    along the heading, hold the heading) sweeps until rest, see `control/backup/heading_drive.py`. The backup never
-    shrinks that clearance; a control is admitted if, holding it for one control step uses up at most half of
-    that clearance.
+    only: nothing brakes it sideways. The backup manoeuvre brakes along the heading and holds it; clearance is counted
+    from the area that it sweeps until rest (`control/backup/heading_drive.py`), and never shrinks under it. A control
+    is admitted if one control step of it uses up at most half of the clearance.
 
     What it promises: proved, up to what `margin` covers. From a safe state the backup is admissible, for any
     number of discs, and the discs stay clear at every physics substep, while mass and damping are right to
     within `uncertainty`, the measured position is right to within `state_error`, discs stand still and nothing
-    hits the robot. `margin` covers what the closed form leaves out: the bend of the path within a step and the
-    turning servo's chatter, together under 2 mm for the Point robot (measured, `tests/control`); a vase that
-    the robot pushes adds a tenth of a millimetre a step.
+    hits the robot. `margin` covers what the closed form leaves out: the curvature of the path within a step and the
+    turning servo's chatter, under 2 mm for the Point robot (measured, `tests/control`); a pushed vase adds 0.1 mm
+    a step.
 
     Args:
         obstacles: `Disc` and `Discs`; they stand still.
@@ -61,10 +58,10 @@ class HeadingDriveClearance(Constraint):
         margin: Fixed protective distance, m.
         state_error: Bound on the error of the measured position, m.
         uncertainty: Relative uncertainty of mass and of damping, in [0, 1).
+        brake: False: the backup coasts along the heading, too; it needs no drive, and more room.
         detour: When a driving action is refused, first try the same drive while turning towards the nearer
-            tangent of the disc in the way, then turning alone; both only if admitted. It is no safety measure:
-            it keeps a driver that is blind to the discs from standing in front of one for good.
-        brake: False counts the path that coasts along the heading as well: needs no drive to stop, costs more.
+            tangent of the disc in the way, then turning alone; both only if admitted. No safety measure: a driver
+            that does not see the discs gets around them.
     """
 
     obstacles: Sequence[Any]
@@ -78,12 +75,7 @@ class HeadingDriveClearance(Constraint):
     promise: Promise = field(default="proved", init=False)
 
     def __post_init__(self) -> None:
-        self.obstacles = obstacles_from(self.obstacles)
-        for obstacle in self.obstacles:
-            if not isinstance(obstacle, Disc | Discs):
-                raise ConfigurationError(
-                    f"HeadingDriveClearance keeps clear of Disc and Discs, got {type(obstacle).__name__}"
-                )
+        self.obstacles = obstacles_from(self.obstacles, kinds=(Disc, Discs))
         self.margin = non_negative("margin", self.margin, "m")
         self.state_error = non_negative("state_error", self.state_error, "m")
         self.uncertainty = non_negative("uncertainty", self.uncertainty, "a fraction")
@@ -95,59 +87,45 @@ class HeadingDriveClearance(Constraint):
         return BoundHeadingDriveClearance(self, plant)
 
 
-class BoundHeadingDriveClearance(BoundConstraint):
+class BoundHeadingDriveClearance(BoundDetourClearance):
     """HeadingDriveClearance on a plant."""
 
-    predicts: bool = True
+    detour_steps = 50
     spec: HeadingDriveClearance
     plant: MujocoPlant
 
     def __init__(self, spec: HeadingDriveClearance, plant: Plant) -> None:
-        hint = "HeadingDriveClearance needs a MujocoPlant: it reads the robot's model"
-        super().__init__(spec, require_mujoco(plant, hint))
-        self._frame = PlanarFrame(self.plant, self.spec.body)
-        self._read_constants()
+        machine = require_mujoco(
+            plant, "HeadingDriveClearance needs a MujocoPlant: it reads the robot's model"
+        )
+        self._frame = PlanarFrame(machine, spec.body)
+        super().__init__(spec, machine)
 
-    def _read_constants(self) -> None:
-        self._revision = self.plant.revision
+    def read_constants(self) -> None:
+        """The drive, and what one control interval can change."""
         self.drive = drive = heading_drive(self.plant, self.spec.body, self.spec.uncertainty)
         # Predictions are made for the corners of the uncertainty: each must keep what is needed.
         self._models = drive.corners()
         self._swivel = 2.0 * abs(drive.com_offset)
         # The most that one hold's drive can add to the path; a turn and the way travelled depend on the speed.
         self._push = drive.fastest_change * (drive.hold_s + drive.coast_time)
-        self._turn = drive.hold_s * min(
-            drive.yaw_limit / max(drive.yaw_damping, 1e-12), math.pi / drive.hold_s
-        )
+        turn = drive.hold_s * min(drive.yaw_limit / max(drive.yaw_damping, 1e-12), math.pi / drive.hold_s)
+        self._per_speed = drive.hold_s + turn * drive.coast_time
 
-    def start(self) -> Memory:
-        """No detour is being made."""
-        return Detour()
-
-    def executed(self, control: Array) -> Memory:
-        """The detour that is being made."""
-        return self._detour
-
-    def observe(self, memory: Detour) -> None:
-        """Take the state, and the detour that is being made."""
-        self._detour = Detour(memory.side, memory.steps - 1)
-        if self.plant.revision != self._revision:
-            self._read_constants()
+    def clearance(self) -> Array:
+        """Of the stopping path from the nearest disc, margin and state error not taken off, m, shape (1,)."""
         self._motion = motion = self._frame.motion(self.plant)
         self._path = path = self.drive.stopping_path(motion, self.spec.brake)
         self._backup: list[StoppingPath] = []
         speed = math.hypot(motion.vx, motion.vy) + abs(self.drive.com_offset * motion.yaw_rate)
-        self._loss = self._push + speed * (self.drive.hold_s + self._turn * self.drive.coast_time)
+        self._loss = self._push + speed * self._per_speed
         x, y, reserve = motion.x, motion.y, self.spec.margin + self.spec.state_error
         kept = path.radius + self._swivel
         bounds: list[tuple[float, _Circle]] = []
         best = math.inf
         for obstacle in self.spec.obstacles:
-            if isinstance(obstacle, Discs):
-                where, room = obstacle.centers(self.plant).tolist(), obstacle.radius + reserve
-            else:
-                where, room = [obstacle.center], obstacle.radius + reserve
-            for center in where:
+            room = obstacle.radius + reserve
+            for center in obstacle.centers(self.plant).tolist():
                 cx, cy = center[0], center[1]
                 bound = math.hypot(cx - x, cy - y) - room - kept
                 bounds.append((bound, (cx, cy, room)))
@@ -157,28 +135,25 @@ class BoundHeadingDriveClearance(BoundConstraint):
         for bound, disc in bounds:
             if not bound < best:
                 break
-            best = min(best, self._clearance(path, disc))
+            best = min(best, self._to_disc(path, disc))
         self._least = best
         # Farther discs cannot come into play within one hold, whatever the control.
         cutoff = 2.0 * (self._loss + _RESERVE_M)
         self._close = [disc for bound, disc in bounds if bound < cutoff] if best < cutoff else []
+        return np.array([best + self.spec.margin + self.spec.state_error])
 
-    def _clearance(self, path: StoppingPath, disc: _Circle) -> float:
+    def _to_disc(self, path: StoppingPath, disc: _Circle) -> float:
         x, y, room = disc
         if path.spread:  # it may come to rest anywhere in the area
             return path.distance(x, y) - self._swivel - room
         return min(path.distance(x, y), path.end_distance(x, y) - self._swivel) - room
 
-    def value(self) -> Array:
-        """Clearance of the stopping path from the nearest disc, margin and state error not taken off, m, (1,)."""
-        return np.array([self._least + self.spec.margin + self.spec.state_error])
-
     def _needed(self, disc: _Circle, backup: StoppingPath) -> float:
         """The clearance that a control must leave of a disc, from inside the safe set: a share of today's."""
-        now = max(self._clearance(self._path, disc), 0.0)
+        now = max(self._to_disc(self._path, disc), 0.0)
         target = _RESERVE_M + (1.0 - _DECAY_PER_HOLD) * max(0.0, now - _RESERVE_M)
         # Never more than the backup manoeuvre leaves: it is what makes the constraint always feasible.
-        return min(target, self._clearance(backup, disc))
+        return min(target, self._to_disc(backup, disc))
 
     def _needed_outside(self, backup: StoppingPath) -> float:
         """The least clearance of all discs that a control must leave, once one of them is lost."""
@@ -188,7 +163,7 @@ class BoundHeadingDriveClearance(BoundConstraint):
         return min(self._least * (1.0 - _RECOVERY_RATE * self.drive.hold_s), best)
 
     def _least_of(self, path: StoppingPath) -> float:
-        return min(self._clearance(path, disc) for disc in self._close)
+        return min(self._to_disc(path, disc) for disc in self._close)
 
     def _least_after(self, drive: float) -> float:
         return min(self._least_of(path) for path in self._after(drive, 0.0))
@@ -203,10 +178,6 @@ class BoundHeadingDriveClearance(BoundConstraint):
         path, motion, brake = self.drive.stopping_path, self._motion, self.spec.brake
         return [path(model.predict(motion, drive, turn), brake) for model in self._models]
 
-    def slack(self, control: Array) -> float:
-        """Not measured: whether a control is admitted is all that is known."""
-        return 0.0 if self.admits(control) else -math.inf
-
     def admits(self, control: Array) -> bool:
         """Predict the held control step; its end must still have a safe stopping path."""
         if not self._close:
@@ -218,7 +189,7 @@ class BoundHeadingDriveClearance(BoundConstraint):
                     return False
                 continue
             for disc in self._close:
-                left = self._clearance(path, disc)
+                left = self._to_disc(path, disc)
                 if left < self._loss and left < self._needed(disc, backup) * (1.0 - _ROW_SLACK):
                     return False
         return True
@@ -251,8 +222,7 @@ class BoundHeadingDriveClearance(BoundConstraint):
         if self._least < 0.0:
             return [(self._least_of, self._needed_outside(backup))]
         return [
-            (functools.partial(self._clearance, disc=disc), self._needed(disc, backup))
-            for disc in self._close
+            (functools.partial(self._to_disc, disc=disc), self._needed(disc, backup)) for disc in self._close
         ]
 
     def _ends(self) -> tuple[float, float]:
@@ -278,15 +248,15 @@ class BoundHeadingDriveClearance(BoundConstraint):
         in_front = [d for d in self._close if (d[0] - m.x) * ahead + (d[1] - m.y) * beside > 0.0]
         if not in_front:
             return []  # driving away from all of them: nothing to go around
-        side = self._detour.side
-        if self._detour.steps <= 0:
+
+        def beside_the_nearest() -> float:
             path = self._after(drive, float(control[t]))[0]
-            x, y, _ = min(in_front, key=lambda disc: self._clearance(path, disc))
+            x, y, _ = min(in_front, key=lambda disc: self._to_disc(path, disc))
             # A disc to the right of the drive is passed on the left.
-            side = 1.0 if ahead * (y - m.y) - beside * (x - m.x) <= 0.0 else -1.0
-        self._detour = Detour(side, _DETOUR_MEMORY)
+            return 1.0 if ahead * (y - m.y) - beside * (x - m.x) <= 0.0 else -1.0
+
         around = np.array(control)
-        around[t] = side
+        around[t] = self._side(beside_the_nearest)
         turn_only = np.array(around)
         turn_only[k] = 0.0
         return [around, turn_only]

@@ -1,13 +1,9 @@
 """WallClearance: keep a point mass on two axes out of walls, counting its whole braking path.
 
-Everything is counted from one manoeuvre: brake each axis for itself, fully, and in its last hold just to rest
-(`control/backup/point_among_walls.py`). A state is inside the safe set if the manoeuvre's path keeps its distance
-from every wall; `value` is that distance.
-
-Why an admissible control always exists. A control is admitted if its own hold and the manoeuvre after it are clear,
-so every admitted control leads back inside. From inside, braking is admitted: after one hold of it the manoeuvre
-is the rest of the one that was clear before. At rest the braking control is zero. By induction the point never
-touches a wall, whatever drives it, for any number of walls at once.
+The backup manoeuvre brakes each axis by itself, fully, and in its last hold just to rest
+(`control/backup/point_among_walls.py`). From a safe state braking is admitted: after one hold of it the manoeuvre is
+the rest of the one that was clear before. At rest the braking control is zero. By induction the point never touches
+a wall, for any number of walls at once.
 
 Source: appendix "Relative degree and kinetic stopping insets", in two dimensions with box walls.
 """
@@ -19,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.constraints.backup.base import BoundBackupClearance
 from safe_wrappers.control.backup.point_among_walls import PointAmongWalls, PointMotion
 from safe_wrappers.control.numerics.rectangles import Rectangle, gaps, nearest
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory, Promise
+from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Promise
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.planar_point import planar_point
@@ -33,10 +30,9 @@ _Control = tuple[float, float]
 """Along x and along y, in the actuators' units."""
 
 _HAIR_M = 1e-7
-"""Corrections stay this much farther away than needed, so that rounding them to float32 loses nothing; and only
-what is lost beyond it counts as outside."""
+"""Extra distance of corrections, for rounding to float32; a state that has lost no more of it is inside."""
 _NOISE_M = 1e-12
-"""What float64 may lose between a path and the rest of it."""
+"""Rounding of float64 between a path and the rest of it."""
 _RECOVERY_S = 0.1
 """Time constant, s, with which a violation must shrink from outside; less where the backup cannot."""
 _TURNS = 4
@@ -50,14 +46,14 @@ class WallClearance(Constraint):
     """Keep a point mass that is pushed along two axes out of every wall of a maze (PointMaze).
 
     Walls and point are found in the MuJoCo model: the body on its two slides, and every fixed box, along x and y,
-    that MuJoCo would collide it with. A control is admitted if, held for one control step and followed by
-    braking, it keeps the point clear of them. What is refused is replaced by a control that slides along the wall.
+    that it can collide with. A control is admitted if, held for one control step and followed by braking, it
+    keeps the point clear of them. A refused one is replaced by a control that slides along the wall.
 
-    What it promises: proved. From a safe state the point never touches a wall, at any substep or in between, for
-    any number of walls: braking is always admissible. That takes a plant whose mass, damping and gears are the
-    machine's (they are measured on its model, and one that moves otherwise is refused), walls that stand still, and
-    `velocity_clip` as the env has it. `margin` covers rounding (under a micrometre) and the position error that
-    you expect. Under a plant's `delay_s` the state is predicted without the clip: proved up to that speed.
+    What it promises: proved. From a safe state the point never touches a wall, at any substep or in between. The
+    plant's mass, damping and gears must be the machine's (they are measured on its model; one that moves otherwise is
+    refused), walls stand still, and `velocity_clip` is the env's. `margin` covers rounding (under a micrometre) and
+    the expected position error. Under a plant's `delay_s` the state is predicted without the clip: proved up to that
+    speed.
 
     Args:
         margin: Fixed protective distance, beyond that at which MuJoCo reports a contact, m.
@@ -91,33 +87,32 @@ class WallClearance(Constraint):
         return BoundWallClearance(self, plant)
 
 
-class BoundWallClearance(BoundConstraint):
+class BoundWallClearance(BoundBackupClearance):
     """WallClearance on a plant."""
 
-    predicts: bool = True
     spec: WallClearance
     plant: MujocoPlant
 
     def __init__(self, spec: WallClearance, plant: Plant) -> None:
-        hint = "use Clearance(obstacles=[Box(...)], position=[0, 1], velocity=[2, 3], braking=...)"
         needed = (
             "WallClearance needs a MujocoPlant: it reads point and walls from the model. On an AnalyticPlant"
         )
+        hint = "use Clearance(obstacles=[Box(...)], position=[0, 1], velocity=[2, 3], braking=...)"
         super().__init__(spec, require_mujoco(plant, f"{needed} {hint}"))
-        self._read_constants()
 
-    def _read_constants(self) -> None:
-        self._revision = self.plant.revision
+    def read_constants(self) -> None:
+        """The point's motion, and the walls."""
         clip = self.spec.velocity_clip if self.spec.velocity_clip is not None else math.inf
         self._point = point = planar_point(self.plant, clip)
         around, reach = walls(self.plant.model, point.body)
         self._among = PointAmongWalls(*point.axes, around, self.spec.velocity_clip is not None)
         self._room = reach + self.spec.margin
 
-    def observe(self, memory: Memory) -> None:
-        """Take the state."""
-        if self.plant.revision != self._revision:
-            self._read_constants()
+    def clearance(self) -> Array:
+        """Distance of the braking path from touching the nearest wall, margin not taken off, m, shape (1,).
+
+        No walls, no value: shape (0,).
+        """
         (i, j), (x, y), q, v = self._point.joints, self._point.origin, self.plant.qpos, self.plant.qvel
         motion = PointMotion(float(q[i]) + x, float(q[j]) + y, float(v[i]), float(v[j]))
         self._motion = self._among.clipped(motion)
@@ -127,17 +122,7 @@ class BoundWallClearance(BoundConstraint):
         else:
             self._least = math.nan
         self._inside = self._least >= -_HAIR_M
-
-    def value(self) -> Array:
-        """Distance of the braking path from touching the nearest wall, margin not taken off, m, shape (1,).
-
-        No walls, no value: shape (0,).
-        """
         return np.array([self._least + self.spec.margin] if self._among.walls else [])
-
-    def slack(self, control: Array) -> float:
-        """Not measured: whether a control is admitted is all that is known."""
-        return 0.0 if self.admits(control) else -math.inf
 
     def admits(self, control: Array) -> bool:
         """Whether a held control, and braking after it, keeps its distance from every wall."""

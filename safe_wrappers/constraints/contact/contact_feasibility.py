@@ -25,18 +25,16 @@ Array = NDArray[np.float64]
 class ContactFeasibility(Constraint):
     """Keep every contact force of the robot with the fixed world inside a narrower friction cone: `|f_t| <= mu f_n`.
 
-    In a simulator forces are inside the model's cone by construction; a foot whose force has reached it slides. So
-    the cone that is asked for is narrower, by `friction_share`: the friction that one is ready to count on. That the
-    ground does not pull is part of it.
+    In a simulator forces are inside the model's cone by construction, and a foot whose force is on the cone slides.
+    So the required cone is narrower by `friction_share`. Forces that pull are outside.
 
     MuJoCo's default cones are pyramids inside the round one: in some directions a foot slides at 0.71 of the
     friction. A share of 0.7 is below that in every direction; with a larger one a foot may slide within its share.
 
     What it promises: for a plant that is right, an executed control that is not flagged keeps every contact force
-    of its control step, at every evaluation of the physics, within the cone and the tolerance. That there is such a
-    control cannot be promised: a foot that comes down sideways slides, whatever the torques. Nor does it look beyond
-    the step: the state that the step leads to may have no such control. A robot that stands on feet that do not slide
-    may fall over, and one that slides need not. Hence best effort.
+    of its control step, at every evaluation of the physics, within the cone and the tolerance. Such a control need
+    not exist, now (a foot that lands sideways slides) or in the next step. It is no balance: a robot may fall over on
+    feet that do not slide. Hence best effort.
 
     Args:
         friction_share: Of the model's friction coefficient, in (0, 1].

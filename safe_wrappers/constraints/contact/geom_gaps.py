@@ -1,4 +1,4 @@
-"""Which geoms of the machine can meet which of the world, how far apart they are, and when a forecast joins them."""
+"""Pairs of geoms of machine and world: their distances, and when they touch along a forecast."""
 
 from collections.abc import Iterator, Sequence
 
@@ -13,17 +13,17 @@ from safe_wrappers.plants.mujoco.plant import MujocoPlant
 Array = NDArray[np.float64]
 
 _FAR = 1e6
-"""m: beyond it distances are not told apart."""
+"""Largest distance that is measured, m."""
 _BESIDE = 1e-7 * np.array(
     [[0.0, 0.0, 0.0], [1.0, 0.3, 0.2], [-0.3, 1.0, -0.5], [0.4, -0.6, 1.0], [-1.0, -0.7, -0.4]]
 )
-"""m: where a geom is asked about again."""
+"""Offsets at which a distance is measured again, m."""
 _ROUND = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
 """Up to it: planes, height fields, spheres, capsules."""
 _NUDGE = 1e-6
-"""m: by which a geom is moved to find a normal."""
+"""Width of the differences that give a normal, m."""
 _NORMAL = 1e-9
-"""m: closer to the surface than this no normal can be read from the nearest points."""
+"""Distance below which the nearest points give no normal, m."""
 
 
 class GeomGaps:
@@ -99,10 +99,9 @@ class GeomGaps:
     ) -> Iterator[int]:
         """The instants of a forecast at which a contact has to be judged, in time.
 
-        In contact: the first of every contact, the last of every control step, and the first of every approach that
-        follows a rebound without letting go. In between the control is held, and what
-        the approach can come to was known when it began. Nothing is skipped that could touch: the next instant
-        looked at is the first by which the geoms could have covered the distance.
+        These are the first instant of every contact, the last of every control step, and the first of every approach
+        after a rebound in contact; in between the control is held, and the approach was judged when it began.
+        Instants are skipped only while the geoms cannot have covered their distance.
 
         Args:
             plant: Whose forecast it is.
@@ -115,10 +114,7 @@ class GeomGaps:
         steps = _farthest(m, a, centres, axes) + _farthest(m, b, other, others)
         way = np.concatenate([[0.0], np.cumsum(steps)])
         k, touch, instant = len(centres), self.touch[pair], 0
-        before, back = (
-            np.inf,
-            False,
-        )  # distance at the instant before, if that was in contact; whether it grew
+        before, back = np.inf, False  # distance at the instant before, if in contact; whether it grew
         while instant < k:
             data.geom_xpos[a], data.geom_xmat[a] = centres[instant], axes[instant].ravel()
             data.geom_xpos[b], data.geom_xmat[b] = other[instant], others[instant].ravel()
@@ -137,10 +133,9 @@ class GeomGaps:
 def _distance(model: mujoco.MjModel, data: mujoco.MjData, a: int, b: int, segment: Array | None) -> float:
     """MuJoCo's distance of two geoms, m, and the nearest points into `segment`.
 
-    Of about one in thirty pairs of boxes that are apart MuJoCo says that they touch: exactly 0, or the distance with
-    the wrong sign (seen with 3.11). Another rounding is mostly enough to make it right. So whoever seems to touch is
-    asked about again a hair's breadth beside, and of what is not exactly 0 the answer in the middle counts. Where a
-    plane, a sphere or a capsule is one of the two this has not been seen.
+    For about one in thirty pairs of boxes that are apart MuJoCo 3.11 returns exactly 0, or the wrong sign.
+    Another rounding mostly gives the right one. So a pair that seems to touch is measured again at small
+    offsets, and the median of the results other than 0 counts. Planes, spheres and capsules do not need it.
     """
     gap = mujoco.mj_geomDistance(model, data, a, b, _FAR, segment)
     if gap > 0.0 or model.geom_type[a] <= _ROUND or model.geom_type[b] <= _ROUND:
@@ -149,9 +144,7 @@ def _distance(model: mujoco.MjModel, data: mujoco.MjData, a: int, b: int, segmen
     for beside in _BESIDE:
         data.geom_xpos[a] = place + beside
         answers.append((float(mujoco.mj_geomDistance(model, data, a, b, _FAR, None)), beside))
-    there = (
-        sorted((answer for answer in answers if answer[0] != 0.0), key=lambda answer: answer[0]) or answers
-    )
+    there = sorted((a for a in answers if a[0] != 0.0), key=lambda a: a[0]) or answers
     gap, beside = there[len(there) // 2]
     if segment is not None:
         data.geom_xpos[a] = place + beside

@@ -1,4 +1,4 @@
-"""ImpactSpeedLimit: what is declared may be touched only so slowly that the contact's peak force is bearable."""
+"""ImpactSpeedLimit: bound the peak force of contacts by the approach speed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import name_list, non_negative, positive
+from safe_wrappers.checks import name_list, positive
 from safe_wrappers.constraints.contact.geom_gaps import GeomGaps
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.control.contact.body_regions import body_region
@@ -21,30 +21,28 @@ from safe_wrappers.plants.plant import Plant
 Array = NDArray[np.float64]
 
 _FIXED = 1e-12
-"""1/kg: whose mobility along the normal is less cannot run into anything."""
+"""Mobility along the normal, 1/kg, below which a geom cannot move into contact."""
 
 
 @dataclass
 class ImpactSpeedLimit(RolloutConstraint):
     """Keep the approach speed at every contact so low that its peak force stays below a limit.
 
-    A mass m that meets a spring k at the speed v, and is pushed on by F_p, presses with at most
-    `F_p + sqrt(F_p^2 + k m v^2)`. So the speed allowed at the first touch is `sqrt(F (F - 2 F_p) / (k m))`, with the
-    push F_p towards the obstacle counted (motors, gravity, centrifugal forces) and a pull *not*: braking after
-    contact comes too late (`appendix.contact.impact.attenuation_after_delay`). m is the machine's effective mass at
-    the very point and along the very normal, by the model's Jacobian and inertia, so it changes with the pose.
+    A mass m that meets a spring k at the speed v, under a push F_p, presses with at most
+    `F_p + sqrt(F_p^2 + k m v^2)`. So the speed allowed at the first touch is `sqrt(F (F - 2 F_p) / (k m))`. F_p is
+    the push towards the obstacle (motors, gravity, centrifugal forces); a pull does not count: braking after contact
+    comes too late (`appendix.contact.impact.attenuation_after_delay`). m is the machine's effective mass at the
+    contact point and along its normal, by the model's Jacobian and inertia.
 
-    The speed is reduced before contact: the plant's model is stepped through the held action, and then with the
-    actuated joints braking, for `holds` control steps in all. Wherever that touches, it has to touch slowly enough.
-    In contact already, the deflection that the model shows counts as energy stored. Distances are MuJoCo's, between
-    the declared geoms, at every physics substep.
+    The plant's model is stepped through the held action, and then with the actuated joints braking, for `holds`
+    control steps in all; every contact on the way has to be slow enough. In contact already, the deflection that the
+    model shows counts as stored energy. Distances are MuJoCo's, between the declared geoms, at every physics substep.
 
     What it promises: along the held step of an executed control that is not flagged every first touch keeps the
     limit, for a plant that is right, a contact that is a linear spring of the declared stiffness, and one pair of
-    geoms at a time; friction, and forces through other contacts and joint stops, are not counted. That braking
-    always can keep it afterwards holds as long as it takes no more than `holds` control steps, or `braking` is true.
-    Obstacles are taken where they are; who walks into the robot is not slowed down. The physics step should be short
-    against the contact (a tenth of `appendix.contact.impact.time_to_peak`, say). Hence best effort.
+    geoms at a time; friction, and forces through other contacts and joint stops, are not counted. Braking can keep it
+    afterwards if it takes no more than `holds` control steps, or if `braking` is true. Obstacles are taken where they
+    are. The physics step should be at most a tenth of `appendix.contact.impact.time_to_peak`. Hence best effort.
 
     `value`, N: the limit less the peak that a contact at the present speed would have. Before contact, without
     `braking`, it is not below zero, since the machine may still slow down; with it, the speed counts that this
@@ -52,8 +50,8 @@ class ImpactSpeedLimit(RolloutConstraint):
 
     Args:
         bodies: Names of the machine's bodies (all their geoms that can collide, or all if none can) or geoms.
-        against: Names of bodies or geoms of the world: walls, people. Moving ones (mocap, free) are taken at their
-            present place; the speed of free ones counts.
+        against: Names of bodies or geoms of the world. Moving ones (mocap, free) are taken at their present place;
+            the speed of free ones counts.
         force_limit: Largest peak force, N, of each pair of geoms. None takes the region's.
         region: Of a human body (`control.contact.body_regions`, ISO/TS 15066:2016, to be checked against its text):
             its spring, its effective mass, and its transient force limit.
@@ -83,6 +81,7 @@ class ImpactSpeedLimit(RolloutConstraint):
     unit: ClassVar[str] = "N"
 
     def __post_init__(self) -> None:
+        self._check_shared()
         for name in ("bodies", "against"):
             setattr(self, name, name_list(name, getattr(self, name), "names of bodies or geoms"))
         for name, unit in (("force_limit", "N"), ("stiffness", "N/m"), ("effective_mass", "kg")):
@@ -90,13 +89,11 @@ class ImpactSpeedLimit(RolloutConstraint):
                 setattr(self, name, positive(name, getattr(self, name), unit))
         if self.braking is not None:
             self.braking = positive("braking", self.braking, "m/s^2")
-        self.margin = non_negative("margin", self.margin, "N")
         self._force, self._stiffness, self._other_mass = self._interface()
         if self.margin >= self._force:
             raise ConfigurationError(
                 f"the margin {self.margin} N leaves nothing of the limit {self._force} N"
             )
-        self._check_shared()
 
     def _interface(self) -> tuple[float, float, float]:
         """Force limit in N, stiffness in N/m, and mass in kg of what is hit."""
@@ -264,7 +261,7 @@ class BoundImpactSpeedLimit(BoundRollout):
     def _room(self, forecast: Forecast) -> Array:
         k, pairs = len(forecast.qpos), len(self._gaps.pairs)
         if not np.isfinite(forecast.qpos[-1]).all():
-            return np.full((k, pairs), np.nan)  # MuJoCo gave up: nobody knows
+            return np.full((k, pairs), np.nan)  # MuJoCo's simulation has diverged
         touched: dict[int, list[int]] = {}
         for pair in range(pairs):
             for instant in self._gaps.touched(self.plant, forecast, self._probe, pair):

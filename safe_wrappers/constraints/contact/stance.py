@@ -1,4 +1,4 @@
-"""Stance: the whole-body program as a constraint: torques that contacts which stay could answer with real forces."""
+"""Stance: the whole-body program as a constraint on torques."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -34,22 +34,21 @@ from safe_wrappers.plants.queries.floating_base import equations_of_motion
 Array = NDArray[np.float64]
 
 _SAME = 1e-9
-"""How far a control may be from the program's own answer and still be it, control units."""
+"""Distance from the program's answer that is rounding, control units."""
 
 
 @dataclass
 class Stance(Constraint):
-    """Keep to torques under which the feet that stand could stay: the whole-body program at one instant.
+    """Keep to torques under which standing feet could stay: the whole-body program at one instant.
 
     The contacts with the fixed world that carry force under the policy's torques are to come to rest and stay; those
     that carry none open. A control is admitted if forces inside the narrowed friction cones can hold the former, with
     the driven joints predicted to stay in range at a constant acceleration until the control step ends. Else the
     closest such control is the answer of a quadratic program (pyramids) or of a second-order cone program.
 
-    What it promises: at this instant, for rigid contacts and a plant that is right, such forces exist. It does not
-    look at the control step: feet that come down, contacts that give way as a simulator's do, or torques held for
-    longer than the configuration lasts are not in it (`ContactFeasibility` forecasts them). Where no control is
-    admitted the step is infeasible. Hence best effort.
+    What it promises: at this instant, for rigid contacts and a plant that is right, such forces exist. Landing feet,
+    soft contacts and changes of the configuration within the control step are not in it (`ContactFeasibility`
+    forecasts them). Where no control is admitted the step is infeasible. Hence best effort.
 
     Args:
         friction_share: Of the model's friction coefficient, in (0, 1].
@@ -132,9 +131,8 @@ class BoundStance(BoundConstraint):
         data = self.plant.under(control)
         motion = equations_of_motion(self.plant.model, data, self.plant.actuators)
         found = motion.contacts
-        within = bool(
-            (np.abs(self.plant.state) < mujoco.mjMAXVAL).all()
-        )  # else MuJoCo resets the state in its step
+        # Beyond this MuJoCo resets the state in its step.
+        within = bool((np.abs(self.plant.state) < mujoco.mjMAXVAL).all())
         if not (within and np.isfinite(motion.bias).all() and np.isfinite(found.forces).all()):
             return  # nothing can be said
         ground = fixed_bodies(self.plant.model)[found.pushed_by]

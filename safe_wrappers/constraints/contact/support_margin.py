@@ -22,19 +22,18 @@ Array = NDArray[np.float64]
 class SupportMargin(Constraint):
     """Keep the zero moment point of the contact forces inside the hull of the contact points, by an inset.
 
-    It speaks only while the model behind it holds: at least three contact points of one plane that are not on a line.
-    Then the robot starts to tip about an edge where the point reaches it. On two point feet, in the air, or on
-    contacts at several heights there is no polygon, and nothing is asked for: it does not keep a robot on its feet.
+    It applies while there are at least three contact points in one plane that are not on a line; the robot starts to
+    tip about an edge where the point reaches it. On two point feet, in the air, or on contacts at several heights
+    there is no polygon and no requirement.
 
     What it promises: for a plant that is right, an executed control that is not flagged keeps the inset at every
-    evaluation of the physics of its control step at which there is a polygon. That there is such a control cannot be
-    promised, nor that the next step has one; and crossing an edge predicts no particular fall. Hence best effort.
+    evaluation of the physics of its control step at which there is a polygon. Such a control need not exist, now or
+    in the next step; and crossing an edge predicts no particular fall. Hence best effort.
 
     Args:
-        inset: m, positive: forces that push keep the point inside the hull by themselves, and on its edge while the
-            robot tips. A foot that leaves the ground between two evaluations takes the polygon along, so an inset of
-            millimetres can be jumped; and how far a control is beyond the edge cannot be seen, so that the answer
-            may be the fallback, checked, where a closer one exists.
+        inset: m, positive: pushing forces alone keep the point inside the hull, and on its edge while the robot tips.
+            An inset of millimetres can be crossed between two evaluations; and beyond the edge the distance does not
+            grow, so the answer may be the fallback where a closer one exists.
         margin: Kept free inside the inset, m.
 
     Source: appendix "Physical contact feasibility constraints", third condition and footnote 8.

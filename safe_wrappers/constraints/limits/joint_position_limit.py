@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import name_list, non_negative
+from safe_wrappers.checks import name_list
 from safe_wrappers.constraints.limits.joints import scalar_joints
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.errors import ConfigurationError
@@ -54,12 +54,11 @@ class JointPositionLimit(RolloutConstraint):
     unit: ClassVar[str] = "rad or m"
 
     def __post_init__(self) -> None:
-        self.margin = non_negative("margin", self.margin, "rad or m")
+        self._check_shared()
         for name in ("lower", "upper"):
             setattr(self, name, _positions(name, getattr(self, name)))
         if self.joints is not None:
             self.joints = name_list("joints", self.joints, also="None for every driven joint")
-        self._check_shared()
 
     def bind(self, plant: Plant) -> "BoundJointPositionLimit":
         """On a plant."""

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import name_list, non_negative, positive
+from safe_wrappers.checks import name_list, positive
 from safe_wrappers.constraints.limits.joints import scalar_joints
 from safe_wrappers.constraints.rollout import RECOVERY_S, BoundRollout, RolloutConstraint
 from safe_wrappers.errors import ConfigurationError
@@ -28,9 +28,8 @@ class JointSpeedLimit(RolloutConstraint):
     substep, contacts and joint limits included.
 
     What it promises: an executed control that is not flagged infeasible or fallback keeps the limit at every
-    substep of its step, exactly, for a plant that is right. That there always is such a control cannot be
-    promised: gravity, coupling, contacts or joint stops can be stronger than the actuators. Hence best effort;
-    then the step is counted infeasible and the fallback runs.
+    substep of its step, exactly, for a plant that is right. Gravity, coupling, contacts or joint stops can be
+    stronger than the actuators: then the step is infeasible and the fallback runs. Hence best effort.
 
     Args:
         limit: In rad/s for hinges, m/s for slides; one number, or one per named joint.
@@ -52,7 +51,7 @@ class JointSpeedLimit(RolloutConstraint):
     unit: ClassVar[str] = "rad/s or m/s"
 
     def __post_init__(self) -> None:
-        self.margin = non_negative("margin", self.margin, "rad/s or m/s")
+        self._check_shared()
         many = isinstance(self.limit, Sequence | np.ndarray)
         limits = list(self.limit) if isinstance(self.limit, Sequence | np.ndarray) else [self.limit]
         checked = [positive("limit", one, "rad/s or m/s") for one in limits]
@@ -63,7 +62,6 @@ class JointSpeedLimit(RolloutConstraint):
         self.limit = checked if many else checked[0]
         if min(checked) <= self.margin:
             raise ConfigurationError(f"the margin {self.margin} leaves nothing of the limit {self.limit}")
-        self._check_shared()
 
     def bind(self, plant: Plant) -> "BoundJointSpeedLimit":
         """On a plant."""
@@ -117,9 +115,8 @@ class BoundJointSpeedLimit(BoundRollout):
         v = self.plant.qvel[self._dofs]
         a0, a = drift[self._dofs], effect[self._dofs]
         strongest = np.maximum(np.abs(self.plant.lower), np.abs(self.plant.upper))
-        pushes = np.abs(a) * np.where(
-            a == 0.0, 0.0, strongest
-        )  # no push, however strong the actuator may get
+        # No push, not NaN, where an actuator without effect is infinitely strong.
+        pushes = np.abs(a) * np.where(a == 0.0, 0.0, strongest)
         reach = np.abs(v) + self.plant.hold_s * (np.abs(a0) + pushes.sum(axis=1))
         near = reach > self._bound
         normals = np.vstack([a[near], -a[near]])

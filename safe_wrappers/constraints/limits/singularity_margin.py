@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import name_list, non_negative, positive
+from safe_wrappers.checks import name_list, positive
 from safe_wrappers.constraints.limits.serial_chain import FrameKind, SerialChain
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.control.filtering.manipulability import (
@@ -28,40 +28,36 @@ Array = NDArray[np.float64]
 _SAMPLES = 2000
 """Configurations that say which manipulability can be reached."""
 _STILL = 1e-9
-"""m or rad per rad: a column of less moves nothing."""
+"""Columns with a smaller norm are zero, m or rad per rad."""
 _DECAY_HOLDS = 2.0
 """Time constant of the rows, control intervals: longer brakes early, shorter is refused by the forecast."""
 _ALONG_S = 1e-5
-"""Of motion, for the difference that gives the curvature of w along it."""
+"""Width of the difference for the curvature of w along the motion, s."""
 
 
 @dataclass
 class SingularityMargin(RolloutConstraint):
     """Keep the manipulability `w = sqrt(det(J J'))` of a frame, for declared task directions, above a threshold.
 
-    Near a singular pose a Cartesian command needs joint rates without bound. w says how near it is; but w by itself
-    bounds no joint rate, so a threshold has to be *validated* for the machine. Given `task_speed` and `rate_limit`
-    instead of a threshold, it is the smallest w above which none of 2,000 sampled configurations needs more than the
-    limit at that speed in any direction; `control.filtering.manipulability.validated_threshold` says what that proves
-    and what not, and does the same for other samples.
+    Near a singular pose a Cartesian command needs unbounded joint rates. w by itself bounds no joint rate, so a
+    threshold has to be *validated* for the machine. Given `task_speed` and `rate_limit` instead of a threshold, it is
+    the smallest w above which none of 2,000 sampled configurations needs more than the limit at that speed in any
+    direction; `control.filtering.manipulability.validated_threshold` says what that proves, and does it for other
+    samples.
 
     A torque changes w through two integrations. So the forecast goes on after the held control, braking every
-    actuated joint, for `holds` control steps in all; w has to stay at every physics substep of it. Rows
-    `w'' + 2 a w' + a^2 (w - threshold) >= 0` are the first guess where controls are forces; what counts is
-    the forecast. With as many joints as directions the determinant's sign is watched too: an arm
-    does not pass through the singular pose between two substeps.
+    actuated joint, for `holds` control steps in all; w has to stay at every physics substep of it. Where controls are
+    forces, rows `w'' + 2 a w' + a^2 (w - threshold) >= 0` are the first guess. With as many joints as directions the
+    determinant's sign counts, too: an arm does not pass through the singular pose between two substeps.
 
     What it promises: an executed control that is not flagged keeps the threshold at every substep of its step, for a
-    plant that is right, and as long as braking takes no more than `holds` steps leaves one that stops in time. Joints
-    that are pushed by gravity, contacts or each other harder than their actuators can brake go on. Hence best effort.
-    It keeps away from one kind of failure of an inverse: it limits neither joint rates (`JointSpeedLimit`) nor
-    torques, and what a drive does at its own limits is the drive's.
+    plant that is right, and as long as braking takes no more than `holds` steps leaves one that stops in time.
+    Gravity, contacts and coupling can be stronger than the actuators. Hence best effort. It limits neither joint
+    rates (`JointSpeedLimit`) nor torques.
 
-    `value`, and so `cbf/margin`, is w over the threshold, less 1: -1 is singular. w itself has no fixed scale (it is
-    0.01 m^2 at most for Reacher, 0.003 m^6 for Fetch's hand), and tolerances need one.
-
-    A start below the threshold (Reacher's and Pusher's arms begin stretched) counts as `cbf/unsafe`; the filter
-    brings w up again. Whatever task needs the poses below loses them.
+    `value`, and so `cbf/margin`, is w over the threshold, less 1: -1 is singular. w itself has no fixed scale (at
+    most 0.01 m^2 for Reacher, 0.003 m^6 for Fetch's hand). A start below the threshold (Reacher's and Pusher's arms
+    begin stretched) counts as `cbf/unsafe`; the filter brings w up again.
 
     Args:
         threshold: Smallest w, in m^k for k translations and hinges (times `length` to the number of rotations). None
@@ -71,13 +67,12 @@ class SingularityMargin(RolloutConstraint):
         geom: of a geom, meaning its centre.
         directions: Of translation, some of "xyz".
         rotations: About these axes, some of "xyz".
-        length: By which a rotation counts as a translation, m; needed if there are both: m and rad do not add up.
-        frame: Whose axes directions and rotations mean: the "world"'s or the frame's "own". Of all three, or none,
-            w is the same in both.
+        length: Length that weighs a rotation against a translation, m; needed if there are both.
+        frame: Axes of directions and rotations: the "world"'s or the frame's "own".
         joints: Names of the joints that do the task. None takes those that an actuator drives directly, if they move
             the frame. Where none does (Fetch's arm is pulled by its hand) name them.
-        task_speed: That has to be possible in every direction, m/s (rad/s if the task is of rotations alone).
-        rate_limit: Largest rate of each joint that this may take, rad/s for hinges, m/s for slides.
+        task_speed: Speed that has to be possible in every direction, m/s (rad/s for rotations alone).
+        rate_limit: Largest rate of each joint at that speed, rad/s for hinges, m/s for slides.
         margin: Kept free above the threshold, as a share of it.
         holds: Control steps to look ahead; cover the time that braking takes.
         reach: The most that w can fall within `holds` control steps in the declared envelope, in shares of the
@@ -107,6 +102,7 @@ class SingularityMargin(RolloutConstraint):
     unit: ClassVar[str] = "shares of the threshold"
 
     def __post_init__(self) -> None:
+        self._check_shared()
         speed, limit = self.task_speed, self.rate_limit
         given, validated = self.threshold is not None, speed is not None and limit is not None
         if given is validated or (given and (speed is not None or limit is not None)):
@@ -119,7 +115,6 @@ class SingularityMargin(RolloutConstraint):
         if speed is not None and limit is not None:
             self.task_speed = positive("task_speed", speed, "task units per second")
             self.rate_limit = positive("rate_limit", limit, "rad/s or m/s")
-        self.margin = non_negative("margin", self.margin, self.unit)
         kinds: tuple[FrameKind, ...] = ("site", "body", "geom")
         named = [kind for kind in kinds if getattr(self, kind) is not None]
         if len(named) != 1 or not isinstance(getattr(self, named[0]), str):
@@ -133,7 +128,6 @@ class SingularityMargin(RolloutConstraint):
         if self.joints is not None:
             self.joints = name_list("joints", self.joints, also="None for every driven joint")
         self._rows, self._weights = task_rows(self.directions, self.rotations, self.length)
-        self._check_shared()
 
     def bind(self, plant: Plant) -> "BoundSingularityMargin":
         """On a plant."""
@@ -159,10 +153,8 @@ class BoundSingularityMargin(BoundRollout):
                 "leave it out"
             )
         self._columns = [c for c, does_nothing in zip(self._columns, idle, strict=True) if not does_nothing]
-        task, count = (
-            f"directions={self.spec.directions!r}, rotations={self.spec.rotations!r}",
-            len(self._columns),
-        )
+        task = f"directions={self.spec.directions!r}, rotations={self.spec.rotations!r}"
+        count = len(self._columns)
         if count < len(self.spec._rows):
             raise ConfigurationError(
                 f"{count} joints cannot move the {self.spec._kind} {name!r} in {len(self.spec._rows)} directions at "

@@ -6,7 +6,7 @@ from typing import ClassVar, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.checks import positive
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint, RolloutMemory
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.constraint import Memory, Promise
@@ -24,20 +24,19 @@ class SpeedLimit(RolloutConstraint):
 
     Speed is displacement over time, as Gymnasium's `x_velocity` is: over one control step, or over one physics
     substep. The action is held through the forecast's first control step, contacts included, and the actuated
-    joints are braked in the others (`holds`): a speed that is kept now only to be exceeded next is refused now.
+    joints are braked in the others (`holds`), so that the next step can keep the limit, too.
 
     What it promises: the first control step of an executed control that is not flagged keeps the limit, exactly,
-    for a plant that is right. That such a control exists cannot be promised: in flight no actuator changes the
-    momentum, and contact forces have one sign. Hence best effort; then the step is counted infeasible and
-    the control that was found to exceed the limit least is executed.
+    for a plant that is right. Such a control need not exist: in flight no actuator changes the momentum, and contact
+    forces have one sign. Then the step is infeasible, and the control that exceeds the limit least is executed. Hence
+    best effort.
 
-    Over one control step both displacements count that are in use: from state to state, and the one that MuJoCo's
-    `data.xpos` shows, which belongs to the last point that the integrator evaluated (Gymnasium reads Ant's and
-    Humanoid's speed from it).
+    Over one control step two displacements count: from state to state, and that of MuJoCo's `data.xpos`, which
+    belongs to the last point that the integrator evaluated (Gymnasium reads Ant's and Humanoid's speed from it).
 
     Args:
         limit: m/s.
-        body: Name of the body whose frame origin is meant; None is the whole machine's centre of mass.
+        body: Name of the body whose frame origin counts; None: the whole machine's centre of mass.
         direction: "+x" and so on limit one sign, "x" both, "xy" and "xyz" the length of the vector.
         average: "step" over a control step, "substep" over a physics substep (instantaneous).
         margin: Kept free below the limit, m/s.
@@ -58,17 +57,14 @@ class SpeedLimit(RolloutConstraint):
     unit: ClassVar[str] = "m/s"
 
     def __post_init__(self) -> None:
+        self._check_shared()
         self.limit = positive("limit", self.limit, "m/s")
-        self.margin = non_negative("margin", self.margin, "m/s")
         if self.margin >= self.limit:
             raise ConfigurationError(f"the margin {self.margin} leaves nothing of the limit {self.limit}")
         if self.direction not in DIRECTIONS:
             raise UnknownNameError(f"no direction {self.direction!r}; choose {', '.join(DIRECTIONS)}")
         if self.average not in ("step", "substep"):
             raise UnknownNameError(f"no average {self.average!r}; choose step or substep")
-        self._check_shared()
-        self._axes = ["xyz".index(letter) for letter in self.direction.strip("+-")]
-        self._sign = {"+": 1.0, "-": -1.0}.get(self.direction[0])
 
     def bind(self, plant: Plant) -> "BoundSpeedLimit":
         """On a plant."""
@@ -100,6 +96,8 @@ class BoundSpeedLimit(BoundRollout):
     def __init__(self, spec: SpeedLimit, plant: Plant) -> None:
         super().__init__(spec, plant)
         self._body = None if self.spec.body is None else self.plant.named("body", self.spec.body)
+        self._axes = ["xyz".index(letter) for letter in spec.direction.strip("+-")]
+        self._sign = {"+": 1.0, "-": -1.0}.get(spec.direction[0])
         self._revision = self.plant.revision
         self._weigh()
         self._window = self.plant.substeps if self.spec.average == "step" else 1
@@ -123,8 +121,8 @@ class BoundSpeedLimit(BoundRollout):
 
     def _point(self, frames: Array, centres: Array) -> Array:
         if self._body is None:
-            return np.asarray((self._shares @ centres)[..., self.spec._axes])
-        return np.asarray(frames[..., self._body, :][..., self.spec._axes])
+            return np.asarray((self._shares @ centres)[..., self._axes])
+        return np.asarray(frames[..., self._body, :][..., self._axes])
 
     def _now(self) -> Array:
         if self._revision != self.plant.revision:
@@ -143,8 +141,8 @@ class BoundSpeedLimit(BoundRollout):
 
     def _left(self, displacements: Array, substeps: int) -> Array:
         velocity = displacements / (substeps * self.plant.hold_s / self.plant.substeps)
-        if self.spec._sign is not None:
-            return self.spec.limit - self.spec._sign * velocity[:, 0]
+        if self._sign is not None:
+            return self.spec.limit - self._sign * velocity[:, 0]
         return np.asarray(self.spec.limit - np.sqrt((velocity * velocity).sum(axis=1)))
 
     def _violation(self, value: Array) -> Array:

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.checks import positive
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Promise
@@ -23,7 +23,7 @@ class Upright(RolloutConstraint):
 
     What it promises: an executed control that is not flagged keeps both at every physics substep of its step,
     for a plant that is right. It looks `holds` control steps ahead, with the actuated joints braked after the
-    first: that refuses controls whose fall is near, and balances nobody. A robot on legs can be past saving
+    first: that refuses controls shortly before a fall, and does not balance. A robot on legs can be unrecoverable
     long before it falls. Hence best effort.
 
     Args:
@@ -49,7 +49,7 @@ class Upright(RolloutConstraint):
     unit: ClassVar[str] = "m or rad"
 
     def __post_init__(self) -> None:
-        self.margin = non_negative("margin", self.margin, "m and rad")
+        self._check_shared()
         if self.lowest is None and self.highest is None and self.tilt is None:
             raise ConfigurationError("give at least one of lowest (m), highest (m) and tilt (rad)")
         for name in ("lowest", "highest"):
@@ -68,7 +68,6 @@ class Upright(RolloutConstraint):
                 f"nothing is left between lowest = {self.lowest} m and highest = {self.highest} m with a margin "
                 f"of {self.margin} m at both ends"
             )
-        self._check_shared()
 
     def _heights(self) -> tuple[float, float]:
         low = -math.inf if self.lowest is None else self.lowest

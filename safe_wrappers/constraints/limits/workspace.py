@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import name_list, non_negative
-from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacle_from
+from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
 from safe_wrappers.constraints.obstacles.obstacles import distances
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.errors import ConfigurationError
@@ -29,16 +29,15 @@ class Workspace(RolloutConstraint):
 
     What it promises: an executed control that is not flagged keeps the workspace at every substep of its step,
     for a plant that is right, and as long as braking takes no more than `holds` steps leaves one that stops in
-    time. Near a singular pose, or under loads stronger than the actuators, braking joints can still carry a
-    point on. Hence best effort.
+    time. Near a singular pose, or under loads stronger than the actuators, a point can move on. Hence best effort.
 
     Args:
         low: Smallest x, y, z, m; None is no bound, for all or for one: `[None, -0.5, None]`.
         high: Largest, likewise.
         keep_out: `Disc`, `Sphere`, `Box`, `Plane`, `Discs`.
-        bodies: Names of bodies whose frame origins are meant.
+        bodies: Names of bodies; their frame origins are the points.
         sites: Names of sites, likewise.
-        geoms: Names of geoms: their centres, likewise.
+        geoms: Names of geoms: their centres.
         radius: Of the machine around each point, m.
         margin: Kept free, m.
         holds: Control steps to look ahead; cover the time that braking takes.
@@ -61,15 +60,14 @@ class Workspace(RolloutConstraint):
     unit: ClassVar[str] = "m"
 
     def __post_init__(self) -> None:
+        self._check_shared()
         self.radius = non_negative("radius", self.radius, "m")
-        self.margin = non_negative("margin", self.margin, "m")
         self.low, self.high = _corner("low", self.low), _corner("high", self.high)
-        if isinstance(self.keep_out, dict | str) or not isinstance(self.keep_out, Sequence):
-            raise ConfigurationError(f"keep_out is a list of obstacles, got {self.keep_out!r}")
-        self.keep_out = [obstacle_from(o) for o in self.keep_out]
+        self.keep_out = obstacles_from(self.keep_out, "keep_out", optional=True)
         for name in ("bodies", "sites", "geoms"):
             setattr(self, name, name_list(name, getattr(self, name), least=0))
-        self._low, self._high = _bounds(self.low, -np.inf), _bounds(self.high, np.inf)
+        self._low = np.array([-np.inf if v is None else v for v in self.low or [None] * 3])
+        self._high = np.array([np.inf if v is None else v for v in self.high or [None] * 3])
         bounded = bool(np.isfinite(self._low).any() or np.isfinite(self._high).any())
         if not (bounded or self.keep_out):
             raise ConfigurationError("give a bound in low or high (m), or something to keep_out of")
@@ -78,7 +76,6 @@ class Workspace(RolloutConstraint):
                 f"nothing is left of the box from {self.low} to {self.high} m with a radius of {self.radius} m "
                 f"and a margin of {self.margin} m on each side"
             )
-        self._check_shared()
 
     def bind(self, plant: Plant) -> "BoundWorkspace":
         """On a plant."""
@@ -145,8 +142,3 @@ def _corner(name: str, given: Sequence[float | None] | None) -> list[float | Non
     if len(corner) != 3 or any(v is not None and not np.isfinite(v) for v in corner):
         raise ConfigurationError(f"{name} is [x, y, z] in m, None where there is no bound; got {given!r}")
     return corner
-
-
-def _bounds(corner: Sequence[float | None] | None, missing: float) -> Array:
-    values = [None, None, None] if corner is None else corner
-    return np.array([missing if v is None else v for v in values])

@@ -28,8 +28,26 @@ def obstacle_from(data: Any) -> Obstacle:
     return obstacle
 
 
-def obstacles_from(given: Any) -> list[Obstacle]:
-    """At least one obstacle, each itself or as its dict."""
-    if isinstance(given, dict) or not isinstance(given, Sequence) or not given:
-        raise ConfigurationError(f"obstacles is a list with at least one obstacle, got {given!r}")
-    return [obstacle_from(o) for o in given]
+def obstacles_from(
+    given: Any, name: str = "obstacles", kinds: tuple[type[Any], ...] = (), optional: bool = False
+) -> list[Any]:
+    """A list of obstacles, each itself or as its dict.
+
+    Args:
+        given: What the user gave.
+        name: Of the parameter, for messages.
+        kinds: Of obstacles that fit; none: all.
+        optional: Whether the list may be empty.
+
+    Raises:
+        ConfigurationError: It is no such list.
+    """
+    fitting = " and ".join(kind.__name__ for kind in kinds) or "obstacles"
+    if isinstance(given, dict | str) or not isinstance(given, Sequence) or not (given or optional):
+        wanted = f"list of {fitting}" if optional else "list with at least one obstacle"
+        raise ConfigurationError(f"{name} is a {wanted}, got {given!r}")
+    found = [obstacle_from(o) for o in given]
+    for obstacle in found:
+        if kinds and not isinstance(obstacle, kinds):
+            raise ConfigurationError(f"{name} holds {fitting}, got {type(obstacle).__name__}")
+    return found

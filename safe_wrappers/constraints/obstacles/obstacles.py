@@ -50,14 +50,10 @@ def distances(obstacle: Obstacle, points: Array, plant: Plant) -> Array:
     return np.stack([obstacle.nearest(point, plant).distance for point in points])
 
 
-def _to_centers(points: Array, centers: Array, radius: float) -> Array:
-    d = centers.shape[1]
-    if d > points.shape[1]:
-        raise ConfigurationError(
-            f"{d}-dimensional obstacles cannot meet {points.shape[1]}-dimensional points"
-        )
-    offsets = points[:, None, :d] - centers
-    return np.asarray(np.sqrt(np.einsum("kni,kni->kn", offsets, offsets)) - radius)
+def refuse_more_dimensions(obstacle: int, point: int, kind: str = "obstacles") -> None:
+    """Refuse an obstacle of more dimensions than the point that is kept clear of it."""
+    if obstacle > point:
+        raise ConfigurationError(f"{obstacle}-dimensional {kind} cannot meet a {point}-dimensional point")
 
 
 def _vector(name: str, values: Sequence[float], sizes: tuple[int, ...]) -> list[float]:
@@ -72,26 +68,46 @@ def _vector(name: str, values: Sequence[float], sizes: tuple[int, ...]) -> list[
     return vector
 
 
-def _round(point: Array, centers: Array, radius: float, velocity: Array) -> Nearest:
-    """Discs and spheres; a disc seen from three dimensions is an upright cylinder."""
-    d = centers.shape[1]
-    if d > point.size:
-        raise ConfigurationError(f"a {d}-dimensional obstacle cannot meet a {point.size}-dimensional point")
-    offset = point[:d] - centers
-    length = np.sqrt(np.einsum("ij,ij->i", offset, offset))
-    apart = np.where(length > 1e-12, length, 1.0)
-    normal = np.zeros((len(centers), point.size))
-    normal[:, :d] = offset / apart[:, None]
-    normal[length <= 1e-12, 0] = 1.0  # at the very centre every way out is as good
-    moving = np.zeros_like(normal)
-    moving[:, :d] = velocity
-    curvature = np.zeros_like(normal)
-    curvature[:, :d] = 1.0 / np.maximum(length, 1e-9)[:, None]
-    return Nearest(length - radius, normal, moving, curvature)
+class _Round:
+    """Discs and spheres of one radius; a disc seen from three dimensions is an upright cylinder."""
+
+    radius: float
+
+    def centers(self, plant: Plant) -> Array:
+        """Where they are now, shape (k, d), m."""
+        raise NotImplementedError
+
+    def _velocities(self, plant: Plant) -> Array | float:
+        return 0.0
+
+    def nearest(self, point: Array, plant: Plant) -> Nearest:
+        """One surface per centre."""
+        centers = self.centers(plant)
+        d = centers.shape[1]
+        refuse_more_dimensions(d, point.size)
+        offset = point[:d] - centers
+        length = np.sqrt(np.einsum("ij,ij->i", offset, offset))
+        apart = np.where(length > 1e-12, length, 1.0)
+        normal = np.zeros((len(centers), point.size))
+        normal[:, :d] = offset / apart[:, None]
+        normal[length <= 1e-12, 0] = 1.0  # at the very centre every way out is as good
+        moving = np.zeros_like(normal)
+        moving[:, :d] = self._velocities(plant)
+        curvature = np.zeros_like(normal)
+        curvature[:, :d] = 1.0 / np.maximum(length, 1e-9)[:, None]
+        return Nearest(length - self.radius, normal, moving, curvature)
+
+    def distances(self, points: Array, plant: Plant) -> Array:
+        """Shape (k, n), m."""
+        centers = self.centers(plant)
+        d = centers.shape[1]
+        refuse_more_dimensions(d, points.shape[1])
+        offsets = points[:, None, :d] - centers
+        return np.asarray(np.sqrt(np.einsum("kni,kni->kn", offsets, offsets)) - self.radius)
 
 
 @dataclass
-class Disc:
+class Disc(_Round):
     """An upright cylinder: a disc of `radius` (m) in the plane at `center` (x, y). It stands still."""
 
     center: Sequence[float]
@@ -101,17 +117,13 @@ class Disc:
         self.center = _vector("center", self.center, (2,))
         self.radius = positive("radius", self.radius, "m")
 
-    def nearest(self, point: Array, plant: Plant) -> Nearest:
-        """One surface."""
-        return _round(point, np.array([self.center]), self.radius, np.zeros((1, len(self.center))))
-
-    def distances(self, points: Array, plant: Plant) -> Array:
-        """Shape (k, 1), m."""
-        return _to_centers(points, np.array([self.center]), self.radius)
+    def centers(self, plant: Plant) -> Array:
+        """The centre, shape (1, 2), m."""
+        return np.array([self.center])
 
 
 @dataclass
-class Sphere:
+class Sphere(_Round):
     """A ball of `radius` (m) at `center` (x, y, z). It stands still."""
 
     center: Sequence[float]
@@ -121,13 +133,9 @@ class Sphere:
         self.center = _vector("center", self.center, (3,))
         self.radius = positive("radius", self.radius, "m")
 
-    def nearest(self, point: Array, plant: Plant) -> Nearest:
-        """One surface."""
-        return _round(point, np.array([self.center]), self.radius, np.zeros((1, len(self.center))))
-
-    def distances(self, points: Array, plant: Plant) -> Array:
-        """Shape (k, 1), m."""
-        return _to_centers(points, np.array([self.center]), self.radius)
+    def centers(self, plant: Plant) -> Array:
+        """The centre, shape (1, 3), m."""
+        return np.array([self.center])
 
 
 @dataclass
@@ -148,8 +156,7 @@ class Plane:
     def nearest(self, point: Array, plant: Plant) -> Nearest:
         """One surface."""
         d = len(self.point)
-        if d > point.size:
-            raise ConfigurationError(f"a {d}-dimensional plane cannot meet a {point.size}-dimensional point")
+        refuse_more_dimensions(d, point.size)
         normal = np.zeros((1, point.size))
         normal[0, :d] = self.normal
         distance = normal[0, :d] @ (point[:d] - np.asarray(self.point))
@@ -177,8 +184,7 @@ class Box:
     def nearest(self, point: Array, plant: Plant) -> Nearest:
         """One surface: a face, an edge or a corner."""
         d = len(self.center)
-        if d > point.size:
-            raise ConfigurationError(f"a {d}-dimensional box cannot meet a {point.size}-dimensional point")
+        refuse_more_dimensions(d, point.size)
         offset = point[:d] - np.asarray(self.center)
         beyond = np.abs(offset) - np.asarray(self.half_size)
         side = np.where(offset < 0.0, -1.0, 1.0)
@@ -205,7 +211,7 @@ class Box:
 
 
 @dataclass
-class Discs:
+class Discs(_Round):
     """Discs (or spheres) whose centres the env publishes, for example `hazard_positions`.
 
     Args:
@@ -230,14 +236,7 @@ class Discs:
             )
         return where
 
-    def nearest(self, point: Array, plant: Plant) -> Nearest:
-        """One surface per centre."""
-        centers = self.centers(plant)
-        velocity = np.zeros_like(centers)
-        if self.velocity_attribute is not None:
-            velocity = np.asarray(plant.attribute(self.velocity_attribute), dtype=np.float64)
-        return _round(point, centers, self.radius, velocity)
-
-    def distances(self, points: Array, plant: Plant) -> Array:
-        """Shape (k, n), m."""
-        return _to_centers(points, self.centers(plant), self.radius)
+    def _velocities(self, plant: Plant) -> Array | float:
+        if self.velocity_attribute is None:
+            return 0.0
+        return np.asarray(plant.attribute(self.velocity_attribute), dtype=np.float64)

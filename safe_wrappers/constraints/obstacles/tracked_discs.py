@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import non_negative, positive
-from safe_wrappers.constraints.obstacles.obstacles import Nearest
+from safe_wrappers.constraints.obstacles.obstacles import Nearest, refuse_more_dimensions
 from safe_wrappers.control.estimation.ellipsoids import ellipsoid_gap
 from safe_wrappers.control.estimation.tracks import Tracks
 from safe_wrappers.errors import ConfigurationError
@@ -22,15 +22,14 @@ _SHARES = (1e-4, 0.1, 0.25, 0.5, 1.0)
 class TrackedDiscs:
     """Discs (or balls) that an `OcclusionPenalty` inside the filter tracks.
 
-    Each stands for every place at which its centre may be: the ellipsoid of `sigmas` standard deviations about the
-    estimate. The state error of the clearance is therefore k sigma in the direction that counts, and no more: what is
-    sure to stay in its lane is only uncertain along it. The surface moves with the estimated velocity, and grows: its
-    speed towards the machine is the fastest at which the bound comes nearer within `horizon_s` if nothing is seen.
+    Each is the ellipsoid of `sigmas` standard deviations about its estimate: uncertainty counts in the direction of
+    the machine only. The surface moves with the estimated velocity, and grows: its speed towards the machine is the
+    fastest at which the bound comes nearer within `horizon_s` without further measurements.
 
     What it promises: a centre leaves its ellipsoid with the probability of the tail of `sigmas` (for Gaussian noise
-    and a true motion model: 32 %, 4.6 % and 0.27 % of the time for 1, 2 and 3 where the error lies along one line,
-    61 %, 14 % and 1.1 % in the plane), for each obstacle at each moment; moments are not independent. It is no hard
-    bound. What does not move at `nearest` (as `Workspace` asks) has no growth.
+    and a true motion model: 32 %, 4.6 % and 0.27 % of the time for 1, 2 and 3 in one dimension, 61 %, 14 % and 1.1 %
+    in the plane), for each obstacle at each moment; moments are not independent. It is no hard bound. `Workspace`
+    uses the distances alone, without growth.
 
     Args:
         radius: m; the machine's own radius is the constraint's business.
@@ -65,8 +64,7 @@ class TrackedDiscs:
         """One surface per track."""
         tracks = self.tracks(plant)
         d, n = tracks.coordinates, len(tracks.mean)
-        if d > point.size:
-            raise ConfigurationError(f"{d}-dimensional tracks cannot meet a {point.size}-dimensional point")
+        refuse_more_dimensions(d, point.size, "tracks")
         normal, velocity = np.zeros((n, point.size)), np.zeros((n, point.size))
         nothing = np.zeros((n, point.size))
         offset = point[:d] - tracks.positions

@@ -1,0 +1,117 @@
+"""The base of clearances that are counted along a backup manoeuvre."""
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.filter.constraint import BoundConstraint, Memory
+from safe_wrappers.plants.plant import Plant
+
+Array = NDArray[np.float64]
+
+
+class BoundBackupClearance(BoundConstraint):
+    """A clearance along a backup manoeuvre, on a plant.
+
+    A backup manoeuvre leads to a state that may last, for example full braking until rest. A state is safe if the
+    manoeuvre from there keeps the clearance. A control is admitted if the held control, and the manoeuvre after it,
+    keep the clearance. So from a safe state the first control of the manoeuvre is always admitted, for any number of
+    obstacles at once.
+
+    A subclass overrides `clearance`, `clearance_after` and `backup`. It may override `read_constants`, `candidates`
+    and `rows`; `admits` instead of `clearance_after` where that costs less; `slack` where it can measure it. The
+    specification has a `margin`, m.
+
+    Args:
+        spec: The specification.
+        plant: Bound to its env.
+    """
+
+    predicts: bool = True
+
+    def __init__(self, spec: Any, plant: Plant) -> None:
+        super().__init__(spec, plant)
+        self._revision = plant.revision
+        self.read_constants()
+
+    def read_constants(self) -> None:
+        """Read the constants of the plant's model: at binding, and whenever the model has changed."""
+
+    @abstractmethod
+    def clearance(self) -> Array:
+        """Read the plant's state: what the manoeuvre from there leaves, margin not taken off, m, shape (k,).
+
+        Called once in every control step. k may be 0: there is nothing to keep clear of.
+        """
+
+    @abstractmethod
+    def backup(self) -> Array:
+        """The first control of the manoeuvre, shape (m,)."""
+
+    def clearance_after(self, control: Array) -> Array:
+        """What is left if a control, shape (m,), is held for one control interval before the manoeuvre.
+
+        Margin not taken off, m, shape (k,); the way of the held control counts.
+        """
+        raise NotImplementedError(f"{type(self).__name__} overrides neither clearance_after nor admits")
+
+    def observe(self, memory: Memory) -> None:
+        """Take the state and the memory."""
+        self._memory = memory
+        if self.plant.revision != self._revision:
+            self._revision = self.plant.revision
+            self.read_constants()
+        self._value = self.clearance()
+
+    def value(self) -> Array:
+        """The clearance along the manoeuvre, margin not taken off, m, shape (k,)."""
+        return self._value
+
+    def admits(self, control: Array) -> bool:
+        """Whether a held control leaves the margin, or at least as much as the backup leaves."""
+        left = self.clearance_after(control)
+        if (left >= self.spec.margin).all():
+            return True
+        return bool(left.min() >= self.clearance_after(self.backup()).min())
+
+    def slack(self, control: Array) -> float:
+        """Not measured: 0 for a control that is admitted, else minus infinity."""
+        return 0.0 if self.admits(control) else -math.inf
+
+
+class Detour(NamedTuple):
+    """On which side an obstacle is being passed: the memory of a clearance with detours.
+
+    Attributes:
+        side: 1.0 is the left one, -1.0 the right one.
+        steps: Control steps for which the side is kept.
+    """
+
+    side: float = 0.0
+    steps: int = 0
+
+
+class BoundDetourClearance(BoundBackupClearance):
+    """A backup clearance whose candidates lead around an obstacle, and keep to one side of it."""
+
+    detour_steps: ClassVar[int]
+    """Control steps for which a side is kept after it was last needed, so that candidates do not alternate."""
+    _memory: Detour
+
+    def start(self) -> Memory:
+        """No detour is being made."""
+        return Detour()
+
+    def executed(self, control: Array) -> Memory:
+        """The detour that is being made."""
+        return Detour(self._memory.side, self._memory.steps - 1)
+
+    def _side(self, choose: Callable[[], float]) -> float:
+        """The side of the present detour, or of a new one."""
+        side = self._memory.side if self._memory.steps > 0 else choose()
+        self._memory = Detour(side, self.detour_steps)
+        return side

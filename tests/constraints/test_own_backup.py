@@ -1,0 +1,134 @@
+"""A backup manoeuvre of one's own: what BoundBackupClearance makes of three methods."""
+
+from dataclasses import dataclass
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import safe_wrappers as sw
+from safe_wrappers.constraints import BoundBackupClearance
+
+WALL, BRAKE, DT = 10.0, 2.0, 0.1
+
+
+@dataclass
+class StopBefore(sw.Constraint):
+    """A point of 1 kg that brakes with `brake` N before a wall."""
+
+    margin: float = 0.01
+    brake: float = BRAKE
+
+    def bind(self, plant):
+        return BoundStopBefore(self, plant)
+
+
+class BoundStopBefore(BoundBackupClearance):
+    constants = 0
+
+    def read_constants(self):
+        self.constants += 1
+
+    def clearance(self):
+        return np.array([self._left(*self.plant.state)])
+
+    def clearance_after(self, control):
+        x, v = self.plant.state
+        # A step that turns back reaches farthest on its way.
+        turned = v**2 / (-2.0 * control[0]) if v > 0.0 and v + DT * control[0] < 0.0 else 0.0
+        ends = x + DT * v + 0.5 * DT**2 * control[0], v + DT * control[0]
+        return np.array([min(self._left(*ends), WALL - x - turned)])
+
+    def backup(self):
+        return np.array([-min(self.spec.brake, max(self.plant.state[1], 0.0) / DT)])
+
+    def _left(self, x, v):
+        # In its last step the point brakes just to rest: up to an eighth of a step's change of speed longer.
+        return WALL - x - max(v, 0.0) ** 2 / (2.0 * self.spec.brake) - 0.125 * BRAKE * DT**2 * (v > 0.0)
+
+
+class Point(gym.Env):
+    dt = DT
+    action_space = gym.spaces.Box(-4.0, 4.0, (1,))
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state = np.array([0.0, 0.0] if options is None else options["state"])
+        return self.state, {}
+
+    def step(self, action):
+        x, v = self.state
+        ways = [x + t * v + 0.5 * t * t * action[0] for t in np.linspace(0.0, DT, 21)]
+        self.state = np.array([ways[-1], v + DT * action[0]])
+        return self.state, 0.0, False, False, {"cost": float(max(ways) > WALL)}
+
+
+def filtered(state=None, **fields):
+    plant = sw.AnalyticPlant(
+        f=lambda s: np.array([s[1], 0.0]),
+        g=lambda s: np.array([[0.0], [1.0]]),
+        state=lambda env: env.state,
+        hold_s=DT,
+    )
+    env = sw.CBFActionFilter(Point(), [StopBefore(**fields)], plant)
+    env.reset(seed=0, options=None if state is None else {"state": state})
+    return env, env.filter.bound[0]
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_nothing_is_violated_and_nothing_flagged_whatever_drives(seed):
+    env, _ = filtered()
+    rng, farthest, force = np.random.default_rng(seed), 0.0, 4.0
+    for k in range(400):
+        if seed and k % 7 == 0:
+            force = rng.choice([4.0, 4.0, -4.0])
+        info = env.step(np.array([force], np.float32))[4]
+        assert not (info["cost"] or info["cbf/infeasible"] or info["cbf/fallback"] or info["cbf/unsafe"])
+        farthest = max(farthest, env.unwrapped.state[0])
+    assert farthest > WALL - 0.1
+
+
+def test_the_value_is_the_clearance_along_the_manoeuvre():
+    env, bound = filtered((4.0, 2.0))
+    assert bound.has_value and bound.has_backup and bound.predicts
+    np.testing.assert_allclose(bound.value(), [WALL - 4.0 - 1.0 - 0.0025])
+    assert env.step(np.zeros(1, np.float32))[4]["cbf/margin"] == pytest.approx(4.9975)
+
+
+def test_only_admission_is_known_of_a_slack():
+    _, bound = filtered((8.99, 2.0))
+    assert not bound.admits(np.array([4.0])) and bound.slack(np.array([4.0])) == -np.inf
+    assert bound.admits(np.array([-4.0])) and bound.slack(np.array([-4.0])) == 0.0
+
+
+def test_what_loses_no_more_than_the_backup_is_admitted_where_the_margin_is_lost():
+    with pytest.warns(sw.UnsafeStateWarning):
+        _, bound = filtered((9.5, 2.0))
+    backup = bound.backup()
+    assert bound.value()[0] < 0.0
+    assert bound.admits(backup) and bound.admits(backup - 1.0) and not bound.admits(backup + 0.1)
+
+
+def test_what_is_not_a_number_is_not_admitted():
+    _, bound = filtered()
+    assert not bound.admits(np.array([np.nan]))
+
+
+def test_constants_are_read_at_binding_and_when_the_model_has_changed():
+    env, bound = filtered()
+    env.step(np.zeros(1, np.float32))
+    assert bound.constants == 1
+    env.plant.revision += 1
+    env.step(np.zeros(1, np.float32))
+    env.step(np.zeros(1, np.float32))
+    assert bound.constants == 2
+
+
+def test_one_that_says_neither_how_much_is_left_nor_what_is_admitted_is_refused():
+    class Half(BoundStopBefore):
+        clearance_after = BoundBackupClearance.clearance_after
+
+    _, bound = filtered()
+    with pytest.raises(NotImplementedError, match="Half overrides neither clearance_after nor admits"):
+        Half(StopBefore(), bound.plant).admits(np.zeros(1))
