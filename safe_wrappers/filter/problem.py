@@ -6,7 +6,7 @@ What is small is a share of the problem's own size, so that a control in N and o
 import functools
 import math
 from enum import StrEnum
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,6 +112,18 @@ def residual_scales(u: Array, a: Array, b: Array, length: Array, box: BoxSize) -
         return reach
     values = length * max(map(abs, u.tolist())) + np.abs(b)
     return np.array([*map(residual_scale, reach.tolist(), length.tolist(), values.tolist())])
+
+
+def batch_residual_scales(u: Array, a: Array, b: Array, length: Array, lo: Array, hi: Array) -> Array:
+    """`residual_scales` of B problems, shape (B, k); the box has shape (B, m)."""
+    half = np.minimum(np.maximum(0.5 * hi - 0.5 * lo, _NARROWEST * np.maximum(hi, -lo)), UNBOUNDED)
+    widest = half.max(axis=1, keepdims=True, initial=0.0)
+    reach = cast(Array, np.sqrt(np.einsum("bkm,bm->bk", a * a, half * half)))
+    if bool((widest <= ORDINARY_BOX).all()):
+        return reach
+    values = length * np.abs(u).max(axis=1, keepdims=True) + np.abs(b)
+    open_box = np.where(reach >= NO_BOUND * length, values, np.minimum(reach, np.maximum(values, length)))
+    return cast(Array, np.where(widest <= ORDINARY_BOX, reach, open_box))
 
 
 def control_unit(box: BoxSize, u: Array, excess: Array, length: Array) -> float:

@@ -42,6 +42,8 @@ __all__ = [
 
 _SHORTEST = 1e-6
 """Rows shorter than this, or longer than its inverse, are looked at one by one before a solver sees them."""
+_OVERFLOWING = 1e300
+"""Where a sum is not finite, numbers from here on are taken as infinite."""
 
 
 def project(
@@ -220,10 +222,10 @@ def _careful(
 def _finite_rows_only(
     u: Array, a: Array, b: Array, length: Array, lo: Array, hi: Array, solver: str
 ) -> Projection:
-    """A row whose length or offset is not finite cannot be checked: respect the others, say failed."""
+    """A row whose length or offset is not finite, or too large, cannot be checked: respect the others, say failed."""
     # An offset of +inf asks for nothing; everything else that is not finite is a failed constraint.
-    harmless = np.isfinite(length) & (b == np.inf)
-    fine = np.isfinite(length) & np.isfinite(b)
+    harmless = (length < _OVERFLOWING) & (b >= _OVERFLOWING)
+    fine = (length < _OVERFLOWING) & (np.abs(b) < _OVERFLOWING)
     part = project_unchecked(u, a[fine], b[fine], lo, hi, solver)
     status = part.status if bool((harmless | fine).all()) else Status.FAILED
     multipliers = np.zeros(b.size)

@@ -17,7 +17,7 @@ from safe_wrappers.control.estimation.tracks import Tracks, largest_deviation
 from safe_wrappers.control.numerics.spatial import from_sensor, lever_arm_velocity, to_sensor
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import non_negative, positive
-from safe_wrappers.plants.mujoco.plant import control_interval
+from safe_wrappers.plants.mujoco.timing import control_interval
 from safe_wrappers.plants.plant import read_attribute
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight
 from safe_wrappers.stack import Layer, refuse_order

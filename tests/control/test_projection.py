@@ -354,6 +354,13 @@ def test_a_row_too_large_to_square_is_never_inactive(rows):
     assert (answer.control[:rows] < 0.0).all() or answer.status in ("failed", "infeasible")
 
 
+@pytest.mark.filterwarnings("ignore:overflow")
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_offsets_whose_sum_overflows(sign):
+    answer = project([0.3, 0.3], np.eye(2), [sign * 1e308] * 2, -ONES, ONES)
+    assert answer.status == ("inactive" if sign > 0.0 else "failed")
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("where", ["normal", "offset"])
 @pytest.mark.parametrize("others", [0, 1, 2])
