@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 
-from .ground import GROUNDS, Patch
-from .layout import layout_option, numbers, points
-from .placement import Kind, place_objects, place_one
+from ..goal.layout import layout_option, numbers, points
+from ..goal.placement import Kind, place_objects, place_one
+from ..ground import GROUNDS, Patch
 
 Array = NDArray[np.float64]
 
