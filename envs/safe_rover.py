@@ -18,9 +18,9 @@ from safe_wrappers.info import COST, COST_SUBSTEP
 from .goal.lidar import LIDAR_BINS, pseudo_lidar
 from .goal_env import GOAL_MET, GOALS_REACHED
 from .ground import Ground
-from .rover.layout import RoverLayout, parse_rover_layout, sample_rover_goal, sample_rover_layout
+from .rover.layout import RoverLayout, parse_rover_layout, sample_rover_goal, sample_rover_layout, start_state
 from .rover.scene import Scene
-from .rover.tyres import UPRIGHT, Tyres
+from .rover.tyres import Tyres, rolled_over
 
 Array = NDArray[np.float64]
 
@@ -252,7 +252,7 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
             raise SafeWrappersError(_NOT_FINITE)
         if self.render_mode == "human":
             self.render()  # type: ignore[no-untyped-call]
-        return observation, reward, self._rolled_over(), False, self._get_reset_info()
+        return observation, reward, rolled_over(self.data.qpos[3:7]), False, self._get_reset_info()
 
     def observe(self) -> Array:
         """Observation of the state as it is now: also right after `set_state`."""
@@ -324,10 +324,6 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
         qpos = self.data.qpos
         return 0.5 * float(qpos[left] + qpos[right])
 
-    def _rolled_over(self) -> bool:
-        _, x, y, _ = self.data.qpos[3:7].tolist()
-        return bool(1.0 - 2.0 * (x * x + y * y) < UPRIGHT)
-
     # Scenario ----------------------------------------------------------------------------------------------
 
     def _apply(self, layout: RoverLayout) -> None:
@@ -340,11 +336,7 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
         self._grounds = Ground(layout.ground, layout.patches)
         self.place_goal(layout.goal)
         self._scene.show(self.model, self.data, layout)
-        x, y, heading = layout.agent.tolist()
-        qpos, qvel = self.init_qpos.copy(), np.zeros(self.model.nv)
-        qpos[:2] = x, y
-        qpos[3:7] = math.cos(0.5 * heading), 0.0, 0.0, math.sin(0.5 * heading)
-        qvel[:2] = layout.speed * math.cos(heading), layout.speed * math.sin(heading)
+        qpos, qvel = start_state(layout, self.init_qpos, self.model.nv)
         qvel[self._rates] = layout.speed / self.wheel_radius
         self.set_state(qpos, qvel)
 

@@ -5,6 +5,8 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 import mujoco
+import numpy as np
+from numpy.typing import NDArray
 
 from safe_wrappers.control.vehicle.traction_curves import TractionCurve
 
@@ -12,6 +14,12 @@ from ..tyre import tyre_force
 
 UPRIGHT: Final = 0.5
 """Cosine of the tilt from which on the chassis has rolled over, and a wheel does not roll."""
+
+
+def rolled_over(quaternion: NDArray[np.float64]) -> bool:
+    """Whether a chassis with this orientation, shape (4,), lies on its side or its back."""
+    _, x, y, _ = quaternion.tolist()
+    return bool(1.0 - 2.0 * (x * x + y * y) < UPRIGHT)
 
 
 class Tyres:

@@ -132,13 +132,13 @@ def _without_solver(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> tuple
     )
     slack = FEASIBILITY_TOLERANCE * batch_residual_scales(u, a, b, length, lo, hi)
     within = inside[left]
-    near = within & (excess <= (1.0 - _CLEAR) * slack).all(axis=1)
-    maybe = within & (excess <= (1.0 + _CLEAR) * slack).all(axis=1)
+    near: Mask = within & np.asarray(excess <= (1.0 - _CLEAR) * slack).all(axis=1)
+    maybe: Mask = within & np.asarray(excess <= (1.0 + _CLEAR) * slack).all(axis=1)
     each = np.arange(left.size)
     worst = np.where(length > 0.0, excess / length, np.where(excess > 0.0, np.inf, -np.inf)).argmax(axis=1)
     control, multiplier = _on_one_row(u, a[each, worst], b[each, worst], lo, hi, slack[each, worst])
     residual = np.einsum("bkm,bm->bk", a, control) - b
-    kept = residual <= -_SPARE * slack
+    kept: Mask = np.asarray(residual <= -_SPARE * slack)
     kept[each, worst] = residual[each, worst] <= EXACT_SHARE * slack[each, worst]
     projected = ~maybe & kept.all(axis=1)
     beyond = residual[each, worst] > (1.0 + _CLEAR) * 10.0 * slack[each, worst]

@@ -13,7 +13,7 @@ from safe_wrappers import info as keys
 from safe_wrappers.control.estimation.covariance import blind_time
 from safe_wrappers.control.estimation.observability import linear_observability
 from safe_wrappers.control.estimation.tracks import Tracks, largest_deviation
-from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnsupportedEnvError
+from safe_wrappers.errors import ConfigurationError, SafeWrappersError
 from safe_wrappers.filter.constraint import non_negative, positive
 from safe_wrappers.plants.mujoco.timing import control_interval
 from safe_wrappers.plants.plant import read_attribute
@@ -22,7 +22,7 @@ from safe_wrappers.stack import Layer, refuse_order
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 from safe_wrappers.wrappers.occlusion.measured import measured
 from safe_wrappers.wrappers.occlusion.sensor import Sensor, sensor_from
-from safe_wrappers.wrappers.occlusion.things import tracked_things, with_tracks
+from safe_wrappers.wrappers.occlusion.things import check_env, tracked_things, with_tracks
 from safe_wrappers.wrappers.occlusion.track import Track, track_from
 
 Array = NDArray[np.float64]
@@ -115,7 +115,7 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         observe: bool = True,
     ) -> None:
         raw: Any = env.unwrapped
-        _check_env(env)
+        check_env(env)
         refuse_order(env, self.layer, type(self).__name__)
         if isinstance(tracks, str | dict) or not isinstance(tracks, Sequence) or not tracks:
             raise ConfigurationError(f"tracks is a list with at least one Track, got {tracks!r}")
@@ -342,18 +342,9 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         if not self.observe:
             return observation
         body = self._sight.data.xpos[self._sight.body, : self._d]
-        tracking, d = self.tracking, self._d
+        tracking = self.tracking
         deviations = np.sqrt(np.diagonal(tracking.position_covariances, axis1=1, axis2=2))
-        estimates = np.concatenate([tracking.positions - body, tracking.velocities, deviations], axis=1)
-        flat = estimates.reshape(3 * d * len(estimates))
+        flat = np.concatenate([tracking.positions - body, tracking.velocities, deviations], axis=1).ravel()
         if isinstance(observation, dict):
             return observation | {"tracks": flat}
         return np.concatenate([observation, flat.astype(observation.dtype)])
-
-
-def _check_env(env: gym.Env[Any, Any]) -> None:
-    raw: Any = env.unwrapped
-    if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
-        raise UnsupportedEnvError(
-            f"OcclusionPenalty casts rays in MuJoCo: it needs an env with .model and .data; {raw} has none"
-        )

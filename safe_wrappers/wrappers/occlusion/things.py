@@ -59,3 +59,12 @@ def with_tracks(space: gym.Space[Any], size: int) -> gym.Space[Any]:
         f"with observe=True the observation must be a flat Box of floats or a Dict, got {space}; flatten it inside, "
         "or pass observe=False"
     )
+
+
+def check_env(env: gym.Env[Any, Any]) -> None:
+    """Refuse an env without a MuJoCo model."""
+    raw: Any = env.unwrapped
+    if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
+        raise UnsupportedEnvError(
+            f"OcclusionPenalty casts rays in MuJoCo: it needs an env with .model and .data; {raw} has none"
+        )
