@@ -108,10 +108,10 @@ def _without_solver(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> tuple
     count, k = b.shape
     status = np.full(count, Status.INACTIVE, dtype="<U10")
     answer = BatchProjection(u, status, np.zeros(count), np.zeros((count, k)))
-    inside = ((u >= lo) & (u <= hi)).all(axis=1)
+    inside: Mask = np.asarray(((u >= lo) & (u <= hi)).all(axis=1))
     if k == 0:
         status[~inside] = Status.PROJECTED
-        np.clip(u, lo, hi, out=u)
+        u[~inside] = np.clip(u, lo, hi)[~inside]
         return answer, np.ones(count, dtype=bool)
     length = np.sqrt(np.einsum("bkm,bkm->bk", a, a))
     excess = np.einsum("bkm,bm->bk", a, u) - b
@@ -132,13 +132,13 @@ def _without_solver(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> tuple
     )
     slack = FEASIBILITY_TOLERANCE * batch_residual_scales(u, a, b, length, lo, hi)
     within = inside[left]
-    near: Mask = within & np.asarray(excess <= (1.0 - _CLEAR) * slack).all(axis=1)
-    maybe: Mask = within & np.asarray(excess <= (1.0 + _CLEAR) * slack).all(axis=1)
+    near = within & (excess <= (1.0 - _CLEAR) * slack).all(axis=1)
+    maybe = within & (excess <= (1.0 + _CLEAR) * slack).all(axis=1)
     each = np.arange(left.size)
     worst = np.where(length > 0.0, excess / length, np.where(excess > 0.0, np.inf, -np.inf)).argmax(axis=1)
     control, multiplier = _on_one_row(u, a[each, worst], b[each, worst], lo, hi, slack[each, worst])
     residual = np.einsum("bkm,bm->bk", a, control) - b
-    kept: Mask = np.asarray(residual <= -_SPARE * slack)
+    kept = residual <= -_SPARE * slack
     kept[each, worst] = residual[each, worst] <= EXACT_SHARE * slack[each, worst]
     projected = ~maybe & kept.all(axis=1)
     beyond = residual[each, worst] > (1.0 + _CLEAR) * 10.0 * slack[each, worst]

@@ -62,7 +62,7 @@ def compare(problems):
     return answer
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=300, deadline=None)
 @given(batches())
 def test_every_answer_is_that_of_project(problems):
     compare(problems)
