@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 import safe_wrappers as sw
-from safe_wrappers.envs.markers import MarkingRenderer
+from safe_wrappers.envs.crossing.markers import MarkingRenderer
 
 ROOT = Path(__file__).parents[1]
 FILM, COUNTS = (

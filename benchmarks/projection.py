@@ -1,4 +1,4 @@
-"""One projection: ours beside qpsolvers' backends on the same problems, in one run.
+"""One projection beside qpsolvers' backends on the same problems, and batches beside single calls, in one run.
 
 python -m benchmarks.projection
 """
@@ -11,10 +11,13 @@ import numpy as np
 import qpsolvers
 
 from benchmarks.timing import paired_us
-from safe_wrappers import project
+from safe_wrappers import project, project_batch
 
 SIZES = ((2, 1), (2, 8), (6, 12), (17, 40))
 """Controls and rows: a point robot, several discs, a runner, a humanoid."""
+
+BATCHES = (16, 256)
+"""Problems at once: as many as a vector env has envs."""
 
 
 def problems(m: int, k: int, count: int = 200) -> list[tuple[np.ndarray, ...]]:
@@ -29,6 +32,12 @@ def problems(m: int, k: int, count: int = 200) -> list[tuple[np.ndarray, ...]]:
         if (normals @ nominal > offsets).any():
             found.append((nominal, normals, offsets, -np.ones(m), np.ones(m)))
     return found
+
+
+def half_inactive(m: int, k: int, count: int) -> list[tuple[np.ndarray, ...]]:
+    """Problems of which every second one has a nominal that keeps every row."""
+    found = problems(m, k, count)
+    return [(u, a, np.maximum(b, a @ u) if i % 2 else b, lo, hi) for i, (u, a, b, lo, hi) in enumerate(found)]
 
 
 def cycling(call: Callable[..., Any], items: list[tuple[np.ndarray, ...]]) -> Callable[[], Any]:
@@ -71,6 +80,25 @@ def main() -> None:
             f"| {m} x {k} | {us['ours']:.1f} | {us['daqp']:.1f} | {us['daqp'] / us['ours']:.1f} "
             f"| {us['clarabel']:.0f} | {us['clarabel'] / us['ours']:.0f} |"
         )
+    print()
+    print("| batch of | controls x rows | single calls (us) | project_batch (us) | ratio |")
+    print("|---|---|---|---|---|")
+    for count in BATCHES:
+        for m, k in SIZES:
+            items = half_inactive(m, k, count)
+            arrays = [np.stack(part) for part in zip(*items, strict=True)]
+            us = paired_us(
+                {
+                    "single": lambda items=items: [project(*item) for item in items],
+                    "batch": lambda arrays=arrays: project_batch(*arrays),
+                },
+                rounds=9,
+                batch=5,
+            )
+            print(
+                f"| {count} | {m} x {k} | {us['single']:.0f} | {us['batch']:.0f} "
+                f"| {us['single'] / us['batch']:.1f} |"
+            )
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from typing import Any
 
 from gymnasium.utils import EzPickle
 
-from .car import CAR
+from .goal.car import CAR
 from .goal_env import SafeGoalEnv
 
 

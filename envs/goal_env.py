@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 from safe_wrappers.errors import ActionError, ConfigurationError
 from safe_wrappers.info import COST, COST_SUBSTEP, GOALS_REACHED
 
-from .layout import Layout, PartialLayout, parse_layout
-from .levels import (
+from .goal.layout import Layout, PartialLayout, parse_layout
+from .goal.levels import (
     GOAL_RADIUS,
     HAZARD_RADIUS,
     LEVELS,
     VASE_HALF_SIZE,
     VASE_SPEED_LIMIT,
 )
-from .lidar import LIDAR_BINS, pseudo_lidar
-from .placement import sample_goal, sample_layout
-from .robot import Robot
+from .goal.lidar import LIDAR_BINS, pseudo_lidar
+from .goal.placement import sample_goal, sample_layout
+from .goal.robot import Robot
 
 COST_HAZARDS: Final = "cost_hazards"
 """float: 1 if the robot's centre is inside a hazard's disc at the end of the step, else 0."""

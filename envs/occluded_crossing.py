@@ -15,7 +15,7 @@ from safe_wrappers.control.estimation.tracks import Motion, Tracks
 from safe_wrappers.errors import ActionError, SafeWrappersError
 from safe_wrappers.info import COLLISIONS, COST, COST_SUBSTEP, GOALS_REACHED
 
-from .crossing_layout import (
+from .crossing.layout import (
     CARS,
     CARS_PER_LANE,
     CROSSING_GOAL_RADIUS,

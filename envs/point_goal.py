@@ -4,8 +4,8 @@ from typing import Any
 
 from gymnasium.utils import EzPickle
 
+from .goal.robot import POINT
 from .goal_env import SafeGoalEnv
-from .robot import POINT
 
 
 class SafePointGoalEnv(SafeGoalEnv):

@@ -15,11 +15,12 @@ from safe_wrappers.control.vehicle.traction_curves import MagicFormula
 from safe_wrappers.errors import ActionError, SafeWrappersError, UnknownNameError
 from safe_wrappers.info import COST, COST_SUBSTEP, GOALS_REACHED, SPIN_OUT
 
+from .goal.lidar import LIDAR_BINS, pseudo_lidar
 from .goal_env import GOAL_MET
 from .ground import Ground
-from .lidar import LIDAR_BINS, pseudo_lidar
-from .rover_layout import RoverLayout, parse_rover_layout, sample_rover_goal, sample_rover_layout
-from .tyre import tyre_force
+from .rover.layout import RoverLayout, parse_rover_layout, sample_rover_goal, sample_rover_layout, start_state
+from .rover.scene import Scene
+from .rover.tyres import Tyres, rolled_over
 
 Array = NDArray[np.float64]
 
@@ -43,17 +44,7 @@ WHEELBASE: Final = 0.5
 
 _FRAME_SKIP: Final = 5
 _LIDAR_RANGE: Final = 12.0  # m: across the field
-_PARKED: Final = 1000.0  # m: farther than the rover gets in an episode
-_UPRIGHT: Final = (
-    0.5  # cosine of the tilt from which on the chassis has rolled over, and a wheel does not roll
-)
 _SETTLING: Final = 12  # rounds until loads and tyre forces agree: each leaves a quarter of the difference
-_COLOURS: Final = {
-    "dry": (0.55, 0.5, 0.45, 0.6),
-    "wet": (0.25, 0.35, 0.45, 0.6),
-    "snow": (1.0, 1.0, 1.0, 0.9),
-    "ice": (0.65, 0.9, 1.0, 0.9),
-}
 _ASSET: Final = Path(__file__).parent / "assets" / "safe_rover.xml"
 _CAMERA: Final = {"distance": 11.0, "elevation": -55.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.4, 0.0])}
 _NOT_FINITE: Final = "the rover's state is not finite: a state that was set, or a changed model, broke it"
@@ -124,16 +115,10 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
         MujocoEnv.__init__(self, str(_ASSET), _FRAME_SKIP, Box(low, high, dtype=np.float64), **kwargs)
         model = self.model
         self.wheel_radius = float(model.geom(WHEELS[0]).size[0])
-        self._bodies = [int(model.body(wheel).id) for wheel in WHEELS]
-        self._joints = [int(model.joint(wheel).id) for wheel in WHEELS]
+        self._tyres = Tyres(model, WHEELS)
         self._rates = [int(model.joint(wheel).dofadr[0]) for wheel in WHEELS]
         self._steer = [int(model.joint(f"steer_{side}").qposadr[0]) for side in ("left", "right")]
-        self._floor = int(model.geom("floor").id)
-        self._floor_colour = model.geom_rgba[self._floor].copy()
-        self._patch_geoms = [g for g in range(model.ngeom) if model.geom(g).name.startswith("patch")]
-        self._n_bodies = max(self._bodies) + 1
-        self._forces = [[0.0] * 6 for _ in range(self._n_bodies)]
-        self._slips = [0.0] * 4
+        self._scene = Scene(model)
         self._grounds = Ground("dry", ())
         self._goal_met = False
         self._goals_reached = 0
@@ -198,7 +183,7 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
     def _contact(self, wheel: str) -> list[float]:
         if wheel not in WHEELS:
             raise UnknownNameError(f"unknown wheel {wheel!r}: valid wheels are {', '.join(WHEELS)}")
-        position: list[float] = self.data.xpos[self._bodies[WHEELS.index(wheel)], :2].tolist()
+        position: list[float] = self.data.xpos[self._tyres.bodies[WHEELS.index(wheel)], :2].tolist()
         return position
 
     # Gymnasium ---------------------------------------------------------------------------------------------
@@ -232,7 +217,7 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
         super().set_state(qpos, qvel)  # type: ignore[no-untyped-call]
         for _ in range(_SETTLING):
             data.userdata[:] = data.sensordata[:4]
-            self._apply_tyre_forces()
+            self._tyres.apply(data, self._grounds.curve_at)
             mujoco.mj_forwardSkip(model, data, mujoco.mjtStage.mjSTAGE_VEL, 0)
         data.userdata[:] = data.sensordata[:4]
         self._begin_judging()
@@ -265,7 +250,7 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
             raise SafeWrappersError(_NOT_FINITE)
         if self.render_mode == "human":
             self.render()  # type: ignore[no-untyped-call]
-        return observation, reward, self._rolled_over(), False, self._get_reset_info()
+        return observation, reward, rolled_over(self.data.qpos[3:7]), False, self._get_reset_info()
 
     def observe(self) -> Array:
         """Observation of the state as it is now: also right after `set_state`."""
@@ -283,7 +268,7 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
         return {
             COST: cost,
             COST_SUBSTEP: cost,
-            SLIP: np.array(self._slips),
+            SLIP: np.array(self._tyres.slips),
             SLIP_MAX: self._slip_max,
             SPIN_OUT: float(self._slip_max > SPIN_OUT_SLIP),
             YAW_RATE_ERROR: self._yaw_rate_error,
@@ -301,50 +286,17 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
         self._begin_judging()
         for k in range(n_frames):
             mujoco.mj_step1(model, data)
-            self._apply_tyre_forces()
+            self._tyres.apply(data, self._grounds.curve_at)
             if k:  # the first substep's start was judged as the end of the control step before
                 self._judge()
             mujoco.mj_step2(model, data)
             data.userdata[:] = loads
         # Sensors and loads of the state reached.
         mujoco.mj_step1(model, data)
-        self._apply_tyre_forces()
+        self._tyres.apply(data, self._grounds.curve_at)
         self._judge()
         mujoco.mj_forwardSkip(model, data, mujoco.mjtStage.mjSTAGE_VEL, 0)
         data.userdata[:] = loads
-
-    def _apply_tyre_forces(self) -> None:
-        """Put every tyre's force on its wheel at the contact point, and keep the slips.
-
-        Needs the kinematics of the present state (`mj_step1`). With z upwards, the contact point lies `r z` under the
-        wheel's centre; its speed against the ground is the centre's plus that of the whole rotation of the wheel, the
-        chassis's share included.
-        """
-        data, r = self.data, self.wheel_radius
-        com_x, com_y, com_z = data.subtree_com[1].tolist()
-        axes, centres = data.xaxis.tolist(), data.xanchor.tolist()
-        velocities = data.cvel[: self._n_bodies].tolist()
-        loads = data.userdata.tolist()
-        curve_at, forces, slips = self._grounds.curve_at, self._forces, self._slips
-        for i, (body, joint) in enumerate(zip(self._bodies, self._joints, strict=True)):
-            left_x, left_y, _ = axes[joint]
-            level = math.hypot(left_x, left_y)
-            if level < _UPRIGHT:  # it lies on its side: no heading, and no tread on the ground
-                slips[i], forces[body] = 0.0, [0.0] * 6
-                continue
-            left_x, left_y = left_x / level, left_y / level
-            x, y, z = centres[joint]
-            wx, wy, wz, vx, vy, _ = velocities[body]  # as if it moved along at the whole's centre of mass
-            vx += wy * (z - com_z) - wz * (y - com_y)
-            vy += wz * (x - com_x) - wx * (z - com_z)
-            rim = r * (wx * left_x + wy * left_y)
-            forward = vx * left_y - vy * left_x
-            sideways = vx * left_x + vy * left_y + r * (wx * left_y - wy * left_x)
-            along, across, slips[i] = tyre_force(rim, forward, sideways, loads[i], curve_at(x, y))
-            fx = along * left_y + across * left_x
-            fy = across * left_y - along * left_x
-            forces[body] = [fx, fy, 0.0, r * fy, -r * fx, 0.0]
-        data.xfrc_applied[: self._n_bodies] = forces
 
     def _begin_judging(self) -> None:
         self._violated = False
@@ -356,7 +308,7 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
         for hx, hy in self._hazards:
             if (x - hx) ** 2 + (y - hy) ** 2 <= ROVER_HAZARD_RADIUS**2:
                 self._violated = True
-        for slip, load in zip(self._slips, self.data.userdata.tolist(), strict=True):
+        for slip, load in zip(self._tyres.slips, self.data.userdata.tolist(), strict=True):
             if load > 0.0:
                 self._slip_max = max(self._slip_max, abs(slip))
         vx, vy, _, _, _, yaw_rate = self.data.qvel[:6].tolist()
@@ -370,10 +322,6 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
         qpos = self.data.qpos
         return 0.5 * float(qpos[left] + qpos[right])
 
-    def _rolled_over(self) -> bool:
-        _, x, y, _ = self.data.qpos[3:7].tolist()
-        return bool(1.0 - 2.0 * (x * x + y * y) < _UPRIGHT)
-
     # Scenario ----------------------------------------------------------------------------------------------
 
     def _apply(self, layout: RoverLayout) -> None:
@@ -384,29 +332,11 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
         self._groups = np.repeat([0, 1], [1, len(layout.hazards)])
         self._hazards = layout.hazards.tolist()
         self._grounds = Ground(layout.ground, layout.patches)
-        self._show(layout)
-        x, y, heading = layout.agent.tolist()
-        qpos, qvel = self.init_qpos.copy(), np.zeros(self.model.nv)
-        qpos[:2] = x, y
-        qpos[3:7] = math.cos(0.5 * heading), 0.0, 0.0, math.sin(0.5 * heading)
-        qvel[:2] = layout.speed * math.cos(heading), layout.speed * math.sin(heading)
+        self.place_goal(layout.goal)
+        self._scene.show(self.model, self.data, layout)
+        qpos, qvel = start_state(layout, self.init_qpos, self.model.nv)
         qvel[self._rates] = layout.speed / self.wheel_radius
         self.set_state(qpos, qvel)
-
-    def _show(self, layout: RoverLayout) -> None:
-        """Move what marks the scenario; none of it touches anything."""
-        model, mocap = self.model, self.data.mocap_pos
-        self.place_goal(layout.goal)
-        mocap[1:, :2] = _PARKED
-        n = len(layout.hazards)
-        mocap[1 : 1 + n, :2] = layout.hazards
-        first = len(mocap) - len(self._patch_geoms)
-        for i, (patch, geom) in enumerate(zip(layout.patches, self._patch_geoms, strict=False)):
-            mocap[first + i, :2] = patch.center
-            model.geom_size[geom, 0] = model.geom_rbound[geom] = patch.radius
-            model.geom_rgba[geom] = _COLOURS[patch.ground]
-        bare = layout.ground == "dry"
-        model.geom_rgba[self._floor] = self._floor_colour if bare else (*_COLOURS[layout.ground][:3], 1.0)
 
     def place_goal(self, goal: Array) -> None:
         """Move the goal to a centre, shape (2,), m; the next step's reward counts from there."""

@@ -40,6 +40,7 @@ from safe_wrappers.constraints import (
 )
 from safe_wrappers.envs import register_envs as _register_envs
 from safe_wrappers.errors import SafeWrappersError, UnsafeStateWarning
+from safe_wrappers.filter.batch import BatchProjection, project_batch
 from safe_wrappers.filter.constraint import BoundConstraint, HalfSpaces
 from safe_wrappers.filter.projection import Projection, project
 from safe_wrappers.plants.analytic import AnalyticPlant
@@ -71,6 +72,7 @@ __all__ = [
     "AnalyticPlant",
     "BalanceMonitor",
     "Barrier",
+    "BatchProjection",
     "BoundConstraint",
     "Box",
     "CBFActionFilter",
@@ -120,6 +122,7 @@ __all__ = [
     "WholeBodyFilter",
     "Workspace",
     "project",
+    "project_batch",
     "protect",
 ]
 

@@ -23,9 +23,9 @@ from safe_wrappers.constraints import (
     Workspace,
 )
 from safe_wrappers.control.numerics.rectangles import merged
-from safe_wrappers.envs.car import CAR
-from safe_wrappers.envs.speed_limits import SPEED_LIMITS
+from safe_wrappers.envs.goal.car import CAR
 from safe_wrappers.envs.teleop_contact import CLAMP_Y, TELEOP_BRAKING, TOOL_RADIUS
+from safe_wrappers.envs.velocity.speed_limits import SPEED_LIMITS
 from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.filter.constraint import Constraint
 

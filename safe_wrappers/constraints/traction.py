@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import name_list, non_negative, positive
+from safe_wrappers.constraints.traction_memory import TractionMemory
 from safe_wrappers.control.vehicle.friction_estimate import FrictionEstimate
 from safe_wrappers.control.vehicle.slip import slip_ratio, slip_window
 from safe_wrappers.errors import ConfigurationError
@@ -122,40 +123,6 @@ class Traction(Constraint):
     def bind(self, plant: Plant) -> "BoundTraction":
         """On a plant."""
         return BoundTraction(self, plant)
-
-
-class TractionMemory(NamedTuple):
-    """What Traction remembers of an episode; arrays of shape (wheels,), before the last control.
-
-    Attributes:
-        estimate: Of the ground's friction.
-        rate: Turning rates, rad/s; None: nothing was measured.
-        time: s.
-        ground: Speeds of the ground below, m/s.
-        slip: Slip ratios along the heading.
-        across: And across it.
-        load: Forces on the ground, N.
-        most_load: The largest so far, N.
-        faster: Recent error of the predicted ground speed, upwards, m/s.
-        slower: Downwards, m/s.
-        ahead: By how much the ground speed is predicted to change, m/s.
-        traction: Force of the ground in the last control step, N.
-        present: Of the ground at its end, N.
-    """
-
-    estimate: FrictionEstimate
-    rate: Array | None
-    time: float
-    ground: Array
-    slip: Array
-    across: Array
-    load: Array
-    most_load: Array
-    faster: Array
-    slower: Array
-    ahead: Array
-    traction: Array
-    present: Array
 
 
 class BoundTraction(BoundConstraint):

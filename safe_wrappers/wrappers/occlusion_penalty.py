@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from fnmatch import fnmatchcase
 from typing import Any, ClassVar, SupportsFloat
 
 import gymnasium as gym
@@ -15,14 +14,15 @@ from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.control.estimation.covariance import blind_time
 from safe_wrappers.control.estimation.observability import linear_observability
 from safe_wrappers.control.estimation.tracks import Tracks, largest_deviation
-from safe_wrappers.control.numerics.spatial import from_sensor, lever_arm_velocity, to_sensor
-from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.errors import ConfigurationError, SafeWrappersError
 from safe_wrappers.plants.env_checks import read_attribute
-from safe_wrappers.plants.mujoco.plant import control_interval
+from safe_wrappers.plants.mujoco.timing import control_interval
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight
 from safe_wrappers.stack import Layer, refuse_order
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
+from safe_wrappers.wrappers.occlusion.measured import measured
 from safe_wrappers.wrappers.occlusion.sensor import Sensor, sensor_from
+from safe_wrappers.wrappers.occlusion.things import check_env, tracked_things, with_tracks
 from safe_wrappers.wrappers.occlusion.track import Track, track_from
 
 Array = NDArray[np.float64]
@@ -115,7 +115,7 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         observe: bool = True,
     ) -> None:
         raw: Any = env.unwrapped
-        _check_env(env)
+        check_env(env)
         refuse_order(env, self.layer, type(self).__name__)
         if isinstance(tracks, str | dict) or not isinstance(tracks, Sequence) or not tracks:
             raise ConfigurationError(f"tracks is a list with at least one Track, got {tracks!r}")
@@ -158,7 +158,7 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         self.permitted = np.zeros(len(self.track_names), dtype=bool)
         self.observe = bool(observe)
         if observe:
-            self.observation_space = _with_tracks(env.observation_space, 3 * self._d * len(self.track_names))
+            self.observation_space = with_tracks(env.observation_space, 3 * self._d * len(self.track_names))
 
     # What is tracked, and from where --------------------------------------------------------------------------
 
@@ -167,24 +167,8 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         s = self.sensor
         range_m = math.inf if s.range_m is None else s.range_m
         self._sight = LineOfSight(model, s.camera, s.site, s.view_deg, range_m, s.occluder_groups)
-        self._counted: list[tuple[Track, int]] = []
-        bodies: list[int] = []
-        self.track_names: list[str] = []
-        for track in self.tracks:
-            if track.bodies is not None:
-                there = {model.body(b).name: b for b in range(1, model.nbody) if model.body(b).name}
-                found = [b for name, b in there.items() if fnmatchcase(name, track.bodies)]
-                if not found:
-                    listed = ", ".join(there) or "none"
-                    raise UnknownNameError(f"the model has no body {track.bodies!r}; it has: {listed}")
-                bodies += found
-                self.track_names += [model.body(b).name for b in found]
-                self._counted.append((track, len(found)))
-            else:
-                count = len(self._published(track))
-                bodies += [-1] * count
-                self.track_names += [f"{track.published}[{i}]" for i in range(count)]
-                self._counted.append((track, count))
+        bodies, self.track_names, counts = tracked_things(model, self.tracks, self._published)
+        self._counted = list(zip(self.tracks, counts, strict=True))
         if len(set(self.track_names)) < len(self.track_names):
             twice = sorted({n for n in self.track_names if self.track_names.count(n) > 1})
             raise ConfigurationError(f"each thing is tracked once; these are named twice: {', '.join(twice)}")
@@ -329,34 +313,16 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
             seen &= self._random.draw.random(n) >= self.sensor.dropout
         which = np.flatnonzero(seen)
         if which.size:
-            measured = self._measured(truth[which], None if velocities is None else velocities[which])
-            measured += noise[which]
-            self.tracking.see(which, measured, self._matrix, self._noise)
+            among = None if velocities is None else velocities[which]
+            measurements = measured(self.sensor, self._sight, d, truth[which], among)
+            measurements += noise[which]
+            self.tracking.see(which, measurements, self._matrix, self._noise)
             if self.sensor.position_std is not None:
-                self.last_seen_positions[which] = measured[:, :d]
+                self.last_seen_positions[which] = measurements[:, :d]
         self._visible = seen
         self._sigma = largest_deviation(self.tracking.position_covariances)
         soon = largest_deviation(self.tracking.ahead([self._hold_s])[1][0])
         self.permitted = self.sigmas * np.maximum(self._sigma, soon) <= self.tolerance
-
-    def _measured(self, truth: Array, velocities: Array | None) -> Array:
-        """What the estimator makes of the measurements, noise aside: world axes, shape (k, m).
-
-        The sensor measures in its own axes; how that becomes a position in the world depends on where the estimator
-        takes it to sit.
-        """
-        sight, d, s = self._sight, self._d, self.sensor
-        body = np.array(sight.data.xpos[sight.body])
-        eye, axes = sight.position, sight.rotation
-        believed = eye if s.lever_arm else body
-        parts = []
-        if s.position_std is not None:
-            parts.append(from_sensor(to_sensor(truth, axes, eye), axes, believed)[:, :d])
-        if velocities is not None:
-            linear, angular = sight.velocity(sight.body)
-            apparent = velocities - lever_arm_velocity(linear, angular, eye - body)[:d]
-            parts.append(apparent + lever_arm_velocity(linear, angular, believed - body)[:d])
-        return np.concatenate(parts, axis=1)
 
     def _uncertainty(self) -> float:
         """Mean share of the tolerated variance that is used up, over the tracks within range."""
@@ -376,42 +342,9 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         if not self.observe:
             return observation
         body = self._sight.data.xpos[self._sight.body, : self._d]
-        tracking, d = self.tracking, self._d
+        tracking = self.tracking
         deviations = np.sqrt(np.diagonal(tracking.position_covariances, axis1=1, axis2=2))
-        estimates = np.concatenate([tracking.positions - body, tracking.velocities, deviations], axis=1)
-        flat = estimates.reshape(3 * d * len(estimates))
+        flat = np.concatenate([tracking.positions - body, tracking.velocities, deviations], axis=1).ravel()
         if isinstance(observation, dict):
             return observation | {"tracks": flat}
         return np.concatenate([observation, flat.astype(observation.dtype)])
-
-
-def _check_env(env: gym.Env[Any, Any]) -> None:
-    raw: Any = env.unwrapped
-    if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
-        raise UnsupportedEnvError(
-            f"OcclusionPenalty casts rays in MuJoCo: it needs an env with .model and .data; {raw} has none"
-        )
-
-
-def _with_tracks(space: gym.Space[Any], size: int) -> gym.Space[Any]:
-    """The observation space with so many numbers more."""
-    if isinstance(space, gym.spaces.Dict):
-        if "tracks" in space.spaces:
-            raise UnsupportedEnvError(
-                "the observation has an entry 'tracks' already, which the estimates would replace; rename it inside, "
-                "or pass observe=False"
-            )
-        more = gym.spaces.Box(-np.inf, np.inf, (size,), dtype=np.float64)
-        return gym.spaces.Dict({**space.spaces, "tracks": more})
-    if (
-        isinstance(space, gym.spaces.Box)
-        and len(space.shape) == 1
-        and np.issubdtype(space.dtype, np.floating)
-    ):
-        bound = np.full(size, np.inf)
-        low, high = np.concatenate([space.low, -bound]), np.concatenate([space.high, bound])
-        return gym.spaces.Box(low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype.type)
-    raise UnsupportedEnvError(
-        f"with observe=True the observation must be a flat Box of floats or a Dict, got {space}; flatten it inside, "
-        "or pass observe=False"
-    )

@@ -2,6 +2,7 @@
 
 import math
 
+import daqp
 import numpy as np
 import pytest
 import qpsolvers
@@ -12,8 +13,7 @@ from scipy.optimize import lsq_linear, minimize
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.filter import projection as module
-from safe_wrappers.filter.projection import Status, project
+from safe_wrappers.filter.projection import Status, box_least_squares, project
 
 pytestmark = pytest.mark.filterwarnings("ignore::qpsolvers.warnings.SparseConversionWarning")
 
@@ -135,7 +135,7 @@ def test_inactive_calls_no_solver(monkeypatch, solver):
     def refuse(*_, **__):
         raise AssertionError("a solver was called")
 
-    monkeypatch.setattr(module.daqp, "solve", refuse)
+    monkeypatch.setattr(daqp, "solve", refuse)
     monkeypatch.setattr(qpsolvers, "solve_problem", refuse)
     assert (
         project([0.1, 0.2], [[1.0, 0.0], [0.0, 1.0]], [0.5, 0.5], -1, 1, solver=solver).status == "inactive"
@@ -354,6 +354,13 @@ def test_a_row_too_large_to_square_is_never_inactive(rows):
     assert (answer.control[:rows] < 0.0).all() or answer.status in ("failed", "infeasible")
 
 
+@pytest.mark.filterwarnings("ignore:overflow")
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_offsets_whose_sum_overflows(sign):
+    answer = project([0.3, 0.3], np.eye(2), [sign * 1e308] * 2, -ONES, ONES)
+    assert answer.status == ("inactive" if sign > 0.0 else "failed")
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("where", ["normal", "offset"])
 @pytest.mark.parametrize("others", [0, 1, 2])
@@ -451,7 +458,7 @@ def test_when_every_backend_lies_the_status_says_failed(monkeypatch, flag, x):
         raise RuntimeError("Maximum number of iterations reached.")
 
     with monkeypatch.context() as patch:
-        patch.setattr(module.daqp, "solve", solve)
+        patch.setattr(daqp, "solve", solve)
         if (
             flag < 1 or np.isnan(x).any()
         ):  # least squares help where there is no answer to judge feasibility by
@@ -528,7 +535,7 @@ def test_box_least_squares_agrees_with_scipy(n, more, seed):
     a, b = rng.normal(size=(n + more, n)), 3.0 * rng.normal(size=n + more)
     a += np.vstack([np.eye(n), np.zeros((more, n))])
     low, high = -rng.random(n) - 0.01, rng.random(n) + 0.01
-    ours = module.box_least_squares(a, b, low, high)
+    ours = box_least_squares(a, b, low, high)
     truth = lsq_linear(a, b, (low, high), tol=1e-12).x
     assert np.linalg.norm(a @ ours - b) <= np.linalg.norm(a @ truth - b) + 1e-6
     assert ((ours >= low) & (ours <= high)).all()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from safe_wrappers.envs.car import CAR
+from safe_wrappers.envs.goal.car import CAR
 
 EMPTY = {"hazards": [], "vases": []}
 

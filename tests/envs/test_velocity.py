@@ -17,8 +17,8 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 from safe_wrappers.envs import VELOCITY_IDS
-from safe_wrappers.envs.speed_limits import SPEED_LIMITS
 from safe_wrappers.envs.velocity import make_velocity_env
+from safe_wrappers.envs.velocity.speed_limits import SPEED_LIMITS
 from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.mujoco.replay import evaluations
@@ -327,7 +327,7 @@ def test_copies_are_the_same_task(robot, version):
 def test_a_plant_finds_the_machine(robot, version):
     env = make(robot, version)
     bare = env.unwrapped
-    module = importlib.import_module(f"safe_wrappers.envs.velocity_{version}")
+    module = importlib.import_module(f"safe_wrappers.envs.velocity.{version}")
     assert type(bare) is getattr(module, f"Safe{robot}VelocityEnv")
     plant = MujocoPlant()
     plant.bind(env)

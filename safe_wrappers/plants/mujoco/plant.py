@@ -4,10 +4,8 @@ The plant owns a copy of the model and its own data. It never writes to the env'
 to be wrong on purpose (`plant.perturb(mass=1.2)`).
 """
 
-import copy
 from collections import deque
 from collections.abc import Iterator
-from fnmatch import fnmatchcase
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -15,32 +13,30 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import (
     check_delay,
     check_timing,
-    name_of,
     read_attribute,
     refuse_changed_actions,
     refuse_second_env,
     seconds,
 )
 from safe_wrappers.plants.mujoco.actuators import AffineActuators
+from safe_wrappers.plants.mujoco.binding import check_action_space, control_range, own_model
 from safe_wrappers.plants.mujoco.contact_forecast import ContactForecast, ContactReader, forecast_contacts
-from safe_wrappers.plants.mujoco.displacement_step import moves_by_displacement
 from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
 from safe_wrappers.plants.mujoco.forecast import Forecast, Poses, Recorder
+from safe_wrappers.plants.mujoco.linear_model import drift_and_effect, inertia_diagonal, position_rate
+from safe_wrappers.plants.mujoco.named import frame, named, names
+from safe_wrappers.plants.mujoco.state import MujocoState
+from safe_wrappers.plants.mujoco.timing import control_interval, physics_steps
 from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
 
-_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
-_FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
-_LAST_INTEGRATOR = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
-_QUADRATIC = int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC)
 
-
-class MujocoPlant(Plant):
+class MujocoPlant(MujocoState):
     """`x = (qpos, qvel)`, `x' = f + g u`, through the actuators and the active constraints.
 
     The drift and the control matrix hold at the present set of active contacts and limits; a contact that
@@ -62,61 +58,29 @@ class MujocoPlant(Plant):
     def __init__(self, model: mujoco.MjModel | None = None, delay_s: float = 0.0) -> None:
         self._given = model
         self.delay_s = seconds("delay_s", delay_s)
-        self._pending: deque[Array] = deque()
+        self._pending = deque()
         self._factors = (1.0, 1.0)
-        self._raw: Any = None
+        self._raw = None
         self.stamp = self.revision = 0
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
         """Attach to an env and copy its model."""
         raw: Any = env.unwrapped
         refuse_second_env(self._raw, env)
-        if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
-            raise UnsupportedEnvError(
-                f"{raw} has no MuJoCo .model and .data; describe it with "
-                "AnalyticPlant(f=..., g=..., state=...) instead"
-            )
-        self._raw = raw
-        self._env = env
-        self.model: mujoco.MjModel = copy.copy(self._given if self._given is not None else raw.model)
-        if (self.model.nq, self.model.nv, self.model.nu) != (raw.model.nq, raw.model.nv, raw.model.nu):
-            raise ConfigurationError(
-                "the plant's model must have the env's joints and actuators: expected (nq, nv, nu) = "
-                f"{(raw.model.nq, raw.model.nv, raw.model.nu)}, "
-                f"got {(self.model.nq, self.model.nv, self.model.nu)}"
-            )
-        expected, timestep = raw.model.opt.timestep, self.model.opt.timestep
-        if not np.isclose(timestep, expected, rtol=1e-9):
-            raise ConfigurationError(
-                f"the plant's model must take the env's physics steps: expected a timestep of {expected} s, "
-                f"got {timestep} s"
-            )
-        if self.model.opt.integrator > _LAST_INTEGRATOR:
-            raise UnsupportedEnvError(
-                "the model's integrator is 'discrete' (MuJoCo 3.13 and later), whose accelerations are those of a "
-                "whole step, which MujocoPlant's g is not; it handles: Euler, RK4, implicit, implicitfast. Use "
-                "AnalyticPlant with your own f and g."
-            )
+        self.model = own_model(raw, self._given)
+        self._raw, self._env = raw, env
         self.data = mujoco.MjData(self.model)
-        self._nq, self._nv = int(self.model.nq), int(self.model.nv)
         self.actuators = AffineActuators(self.model)
         self._clamped = bool(self.model.actuator_forcelimited.any())
-        limited = self.model.actuator_ctrllimited.astype(bool)
-        self._lower = np.where(limited, self.model.actuator_ctrlrange[:, 0], -np.inf)
-        self._upper = np.where(limited, self.model.actuator_ctrlrange[:, 1], np.inf)
+        self._lower, self._upper = control_range(self.model)
         refuse_changed_actions(env)
         self._check_action_space(env)
         self.substeps = physics_steps(raw)
         self.hold_s = check_timing(env, control_interval(raw))
         check_delay(self.delay_s)
-        self._delay_steps = int(np.ceil(self.delay_s / self.model.opt.timestep - 1e-9))
-        self._pending = deque(maxlen=max(1, -(-self._delay_steps // self.substeps)))
+        self._start()
         self._recorder = self._new_recorder()
-        self._forecasts: dict[bytes, Forecast] = {}
-        self._contact_forecasts: dict[bytes, ContactForecast] = {}
         self._contact_reader = ContactReader(self.model)
-        self._snapshot = np.zeros(mujoco.mj_stateSize(self.model, int(_STATE)))
-        self._loaded = self._forwarded = False
         if self._factors != (1.0, 1.0):
             self.perturb(*self._factors)
 
@@ -124,30 +88,7 @@ class MujocoPlant(Plant):
         return Recorder(self.model, self.substeps)
 
     def _check_action_space(self, env: gym.Env[Any, Any]) -> None:
-        space = env.action_space
-        assert isinstance(space, gym.spaces.Box)  # the filter has refused every other space
-        limited = self.model.actuator_ctrllimited.astype(bool)
-        rounding = 0.5e-6 * (self._upper - self._lower)[limited]
-        fits = space.shape == (self.model.nu,) and (
-            np.allclose(space.low[limited], self._lower[limited], atol=rounding)
-            and np.allclose(space.high[limited], self._upper[limited], atol=rounding)
-        )
-        if fits:
-            return
-        ranges = f"the action space is {space}, the model's control range {self._lower} to {self._upper}"
-        if space != env.unwrapped.action_space:
-            raise UnsupportedEnvError(
-                f"a wrapper of {name_of(env)} changes its action space; the filter must be inside of that wrapper: "
-                + ranges
-            )
-        if moves_by_displacement(env.unwrapped):
-            raise UnsupportedEnvError(
-                f"{name_of(env)} moves its gripper by displacements: take DisplacementPlant(), or leave plant out"
-            )
-        raise UnsupportedEnvError(
-            f"{name_of(env)} rescales or limits actions in its own step; filters on such an env are not supported "
-            f"yet, except with an AnalyticPlant(f=..., g=..., state=...) of your own: {ranges}"
-        )
+        check_action_space(env, self._lower, self._upper)
 
     def perturb(self, mass: float = 1.0, damping: float = 1.0) -> None:
         """Scale the masses (and inertias) and joint damping of the plant's own model, now or once it has one."""
@@ -166,50 +107,6 @@ class MujocoPlant(Plant):
         self._forecasts.clear()
         self._contact_forecasts.clear()
 
-    def observe(self) -> None:
-        """Take the env's present state; nothing is computed until it is asked for."""
-        mujoco.mj_getState(self._raw.model, self._raw.data, self._snapshot, int(_STATE))
-        self._loaded = self._forwarded = False
-        self._forecasts.clear()
-        self._contact_forecasts.clear()
-        self.stamp += 1
-        # MuJoCo resets a state that is not a number, which a prediction would hide.
-        if self._delay_steps and bool(np.isfinite(self._snapshot).all()):
-            self._predict_over_delay()
-
-    def executed(self, control: Array | None) -> None:
-        """Remember a sent command for the delay."""
-        if control is None:
-            self._pending.clear()
-        elif self._delay_steps:
-            self._pending.append(np.array(control))
-
-    def _predict_over_delay(self) -> None:
-        self._load()
-        # The oldest command has acted in part already; before the first one the env's own control acts.
-        early = self._delay_steps - self.substeps * len(self._pending)
-        if early > 0:
-            mujoco.mj_step(self.model, self.data, early)
-        for i, control in enumerate(self._pending):
-            self.data.ctrl[:] = control
-            mujoco.mj_step(self.model, self.data, self.substeps + (min(early, 0) if i == 0 else 0))
-        self._keep()
-
-    def _keep(self) -> None:
-        """Take the data's state as the present one."""
-        mujoco.mj_getState(self.model, self.data, self._snapshot, int(_STATE))
-        self._loaded = False
-
-    def _load(self) -> None:
-        if not self._loaded:
-            mujoco.mj_setState(self.model, self.data, self._snapshot, int(_STATE))
-            self._loaded, self._forwarded = True, False
-
-    def _load_to_step(self) -> None:
-        """The data at the present state, about to leave it."""
-        self._load()
-        self._loaded = False
-
     def forward(self) -> mujoco.MjData:
         """The plant's data with every derived quantity up to date at the present state.
 
@@ -220,7 +117,7 @@ class MujocoPlant(Plant):
             if self.model.nu:
                 self.data.ctrl[:] = self._reference()
             mujoco.mj_forward(self.model, self.data)
-            self._derive()
+            self._drift, self._effect = drift_and_effect(self.model, self.data, self.actuators)
             self._forwarded = True
         return self.data
 
@@ -228,65 +125,11 @@ class MujocoPlant(Plant):
         """The control about which contact forces are linearised: zero, or the nearest the actuator has."""
         return np.asarray(np.clip(0.0, self._lower, self._upper))
 
-    def _derive(self) -> None:
-        d = self.data
-        gain, _ = self.actuators.gain_and_bias(d.actuator_length, d.actuator_velocity)
-        least, most = self.actuators.acting_range(d.actuator_length, d.actuator_velocity)
-        moment = self.actuators.moment(d)
-        force_per_control = moment * gain[:, None]
-        saturated = most <= least
-        effect = self._solve_inertia(force_per_control).T
-        self._effect = np.where(saturated, 0.0, effect)
-        self._drift = d.qacc - self._effect @ np.where(saturated, 0.0, np.clip(d.ctrl, least, most))
-
-    def _solve_inertia(self, rows: Array) -> Array:
-        """`rows @ inv(M + J_a' D_a J_a)`: accelerations per generalised force with the active constraints."""
-        m, d = self.model, self.data
-        out = np.zeros_like(rows)
-        active = d.efc_state == _QUADRATIC if d.nefc else np.zeros(0, bool)
-        if not active.any():
-            mujoco.mj_solveM(m, d, out, np.ascontiguousarray(rows))
-            return out
-        jacobian = self._constraint_jacobian()[active]
-        inertia = np.empty((m.nv, m.nv))
-        for i, unit in enumerate(np.eye(m.nv)):
-            mujoco.mj_mulM(m, d, inertia[i], unit)
-        stiff = inertia + jacobian.T @ (d.efc_D[active][:, None] * jacobian)
-        return np.asarray(np.linalg.solve(stiff, rows.T).T)
-
-    def _constraint_jacobian(self) -> Array:
-        m, d = self.model, self.data
-        if not mujoco.mj_isSparse(m):
-            return np.array(d.efc_J.reshape(d.nefc, m.nv))
-        dense = np.zeros((d.nefc, m.nv))
-        mujoco.mju_sparse2dense(dense, d.efc_J, d.efc_J_rownnz, d.efc_J_rowadr, d.efc_J_colind)
-        return dense
-
-    @property
-    def time(self) -> float:
-        """Of the present state, s; under a delay the predicted one."""
-        return float(self._snapshot[0])
-
-    @property
-    def qpos(self) -> Array:
-        """Positions, shape (nq,): m, rad, or quaternions."""
-        return self._snapshot[1 : 1 + self._nq]
-
-    @property
-    def qvel(self) -> Array:
-        """Velocities, shape (nv,): m/s or rad/s."""
-        return self._snapshot[1 + self._nq : 1 + self._nq + self._nv]
-
-    @property
-    def state(self) -> Array:
-        """(qpos, qvel), shape (nq + nv,)."""
-        return self._snapshot[1 : 1 + self._nq + self._nv]
-
     @property
     def f(self) -> Array:
         """Drift of (qpos, qvel), shape (nq + nv,): at zero control, with bias forces and active constraints."""
         self.forward()
-        return np.concatenate([self._position_rate(), self._drift])
+        return np.concatenate([position_rate(self.model, self.qpos, self.qvel), self._drift])
 
     @property
     def g(self) -> Array:
@@ -299,25 +142,6 @@ class MujocoPlant(Plant):
         """`qacc = drift + effect @ u`: shapes (nv,) and (nv, nu)."""
         self.forward()
         return self._drift, self._effect
-
-    def _position_rate(self) -> Array:
-        if self.model.nq == self.model.nv:
-            return self.qvel.copy()
-        rate = np.zeros(self.model.nq)
-        for j in range(self.model.njnt):
-            q, v = int(self.model.jnt_qposadr[j]), int(self.model.jnt_dofadr[j])
-            kind = self.model.jnt_type[j]
-            if kind == _FREE:
-                rate[q : q + 3] = self.qvel[v : v + 3]
-                q, v = q + 3, v + 3
-            if kind in (_FREE, _BALL):
-                # Angular velocities of these joints are in the body's frame; mju_derivQuat wants the world's.
-                turn = np.zeros(4)
-                mujoco.mju_mulQuatAxis(turn, self.qpos[q : q + 4].copy(), self.qvel[v : v + 3].copy())
-                rate[q : q + 4] = 0.5 * turn
-            else:
-                rate[q] = self.qvel[v]
-        return rate
 
     @property
     def lower(self) -> Array:
@@ -345,12 +169,7 @@ class MujocoPlant(Plant):
 
     def inertia_diagonal(self) -> Array:
         """Diagonal of the joint-space inertia, shape (nv,), kg or kg m^2."""
-        self.forward()
-        diagonal, column = np.empty(self.model.nv), np.empty(self.model.nv)
-        for i, unit in enumerate(np.eye(self.model.nv)):
-            mujoco.mj_mulM(self.model, self.data, column, unit)
-            diagonal[i] = column[i]
-        return diagonal
+        return inertia_diagonal(self.model, self.forward())
 
     def rollout(self, control: Array) -> Iterator[mujoco.MjData]:
         """Hold a control for one control interval on the plant's own model, substep by substep.
@@ -455,16 +274,10 @@ class MujocoPlant(Plant):
         m, d = self.model, self.pose()
         if not self._forwarded:
             mujoco.mj_comPos(m, d)  # the Jacobian's points of reference
-        body, p = self._frame(d, kind, name)
+        body, p = frame(m, d, kind, name)
         jac = np.zeros((3, m.nv))
         mujoco.mj_jac(m, d, jac, None, p, body)
         return p.copy(), jac @ self.qvel
-
-    def _frame(self, data: mujoco.MjData, kind: str, name: str) -> tuple[int, Array]:
-        """The body that carries a named frame, and the frame's origin."""
-        handle = self.named(kind, name)
-        body = handle if kind == "body" else int(getattr(self.model, f"{kind}_bodyid")[handle])
-        return body, getattr(data, {"body": "xpos", "site": "site_xpos", "geom": "geom_xpos"}[kind])[handle]
 
     def point(self, kind: str, name: str) -> tuple[Array, Array, Array, Array]:
         """Motion of a named frame's origin: position, velocity, drift and control matrix of its acceleration.
@@ -477,7 +290,7 @@ class MujocoPlant(Plant):
             p (3,) in m, v (3,) in m/s, a0 (3,) in m/s^2 and A (3, nu): `acceleration = a0 + A @ u`.
         """
         m, d = self.model, self.forward()
-        body, p = self._frame(d, kind, name)
+        body, p = frame(m, d, kind, name)
         jac, jac_dot = np.zeros((3, m.nv)), np.zeros((3, m.nv))
         mujoco.mj_jac(m, d, jac, None, p, body)
         mujoco.mj_jacDot(m, d, jac_dot, None, p, body)
@@ -486,16 +299,11 @@ class MujocoPlant(Plant):
 
     def named(self, kind: str, name: str) -> int:
         """The id of a body, site, geom, joint or actuator; an unknown name is refused with the list."""
-        found = mujoco.mj_name2id(self.model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
-        if found < 0:
-            raise UnknownNameError(f"the model has no {kind} {name!r}; it has: {', '.join(self.names(kind))}")
-        return int(found)
+        return named(self.model, kind, name)
 
     def names(self, kind: str, pattern: str = "*") -> list[str]:
         """All names of a kind that match a shell pattern."""
-        count = {"body": "nbody", "joint": "njnt", "actuator": "nu"}.get(kind, f"n{kind}")
-        every = (getattr(self.model, kind)(i).name for i in range(getattr(self.model, count)))
-        return [n for n in every if n and fnmatchcase(n, pattern)]
+        return names(self.model, kind, pattern)
 
     def attribute(self, name: str) -> Any:
         """Read a published fact of the env."""
@@ -508,29 +316,3 @@ def require_mujoco(plant: Plant, message: str) -> MujocoPlant:
     if not isinstance(plant, MujocoPlant):
         raise UnsupportedEnvError(message)
     return plant
-
-
-def control_interval(raw: Any) -> float:
-    """How long an unwrapped MuJoCo env holds one action, s."""
-    return physics_steps(raw) * float(raw.model.opt.timestep)
-
-
-def physics_steps(raw: Any) -> int:
-    """How many physics substeps an unwrapped MuJoCo env takes with one action."""
-    env = _stepped(raw)
-    named = getattr(env, "frame_skip", getattr(env, "n_substeps", None))
-    if named is not None:
-        return int(named)
-    if not hasattr(env, "dt"):
-        raise UnsupportedEnvError(
-            f"{raw} does not say how long a step lasts: give it an attribute dt (s) or frame_skip (physics steps)"
-        )
-    return round(float(env.dt) / float(raw.model.opt.timestep))
-
-
-def _stepped(raw: Any) -> Any:
-    """The env that steps the physics: this one, or one that it holds over the same data (a maze holds its robot)."""
-    if hasattr(raw, "frame_skip"):
-        return raw
-    held = (e for e in vars(raw).values() if isinstance(e, gym.Env) and getattr(e, "data", None) is raw.data)
-    return next(held, raw)

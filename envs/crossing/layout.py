@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError
 
-from .layout import layout_option, numbers
-from .traffic import CAR_MEAN_SPEED, CAR_SPEED_STD
+from ..goal.layout import layout_option, numbers
+from ..traffic import CAR_MEAN_SPEED, CAR_SPEED_STD
 
 Array = NDArray[np.float64]
 

@@ -1,5 +1,6 @@
 """Where everything stands when the rover's episode starts, and how a user asks for it."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
@@ -9,9 +10,9 @@ from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 
-from .ground import GROUNDS, Patch
-from .layout import layout_option, numbers, points
-from .placement import Kind, place_objects, place_one
+from ..goal.layout import layout_option, numbers, points
+from ..goal.placement import Kind, place_objects, place_one
+from ..ground import GROUNDS, Patch
 
 Array = NDArray[np.float64]
 
@@ -182,3 +183,13 @@ def _ground(value: Any) -> str:
     if not (isinstance(value, str) and value in GROUNDS):
         raise UnknownNameError(f"unknown ground {value!r}: valid grounds are {', '.join(GROUNDS)}")
     return value
+
+
+def start_state(layout: RoverLayout, rest: Array, velocities: int) -> tuple[Array, Array]:
+    """Positions and velocities of the chassis, from the positions at rest; the wheels' are left as they are."""
+    x, y, heading = layout.agent.tolist()
+    qpos, qvel = rest.copy(), np.zeros(velocities)
+    qpos[:2] = x, y
+    qpos[3:7] = math.cos(0.5 * heading), 0.0, 0.0, math.sin(0.5 * heading)
+    qvel[:2] = layout.speed * math.cos(heading), layout.speed * math.sin(heading)
+    return qpos, qvel

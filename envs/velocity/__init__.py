@@ -96,7 +96,7 @@ def make_velocity_env(robot: str, version: str = "v5", **kwargs: Any) -> SafeVel
     for name, value, known in (("robot", robot, tuple(SPEED_LIMITS)), ("version", version, VERSIONS)):
         if value not in known:
             raise UnknownNameError(f"{name} must be one of {', '.join(map(repr, known))}; got {value!r}")
-    module = importlib.import_module(f".velocity_{version}", __package__)
+    module = importlib.import_module(f".{version}", __package__)
     env: SafeVelocityEnv = getattr(module, f"Safe{robot}VelocityEnv")(**kwargs)
     return env
 

@@ -7,8 +7,8 @@ from gymnasium.envs.mujoco.humanoid_v5 import HumanoidEnv
 from gymnasium.envs.mujoco.swimmer_v5 import SwimmerEnv
 from gymnasium.envs.mujoco.walker2d_v5 import Walker2dEnv
 
+from . import SafePlanarVelocityEnv, SafeVelocityEnv
 from .speed_limits import SPEED_LIMITS
-from .velocity import SafePlanarVelocityEnv, SafeVelocityEnv
 
 
 class SafeHalfCheetahVelocityEnv(SafeVelocityEnv, HalfCheetahEnv):

@@ -1,0 +1,1 @@
+"""Parts of the crossing and of the patrolled maze."""

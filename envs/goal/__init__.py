@@ -1,0 +1,1 @@
+"""Parts of the goal tasks: robots, levels, layouts, what the lidar sees."""
