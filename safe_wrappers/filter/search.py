@@ -101,11 +101,13 @@ class SafeActionSearch:
         self._predicting = [c for c in constraints if c.predicts]
         self._rows_only = [c for c in constraints if not c.predicts]
         self._narrower = not plant.bounds_are_action_space
+        self._none = np.zeros((0, low.size)), np.zeros(0)
+        self._tried: list[Array] = []
 
     def decide(self, boxed: Array, last: Array) -> Decision:
         """The executed control for a proposal inside the box; `last` is what was executed before."""
         proposal = np.clip(boxed, self._plant.lower, self._plant.upper) if self._narrower else boxed
-        self._tried: list[Array] = []
+        self._tried = []
         decision = self._decide(proposal, last)
         if decision.changed:
             decision.refused = np.array([not c.admits(proposal) for c in self._constraints], dtype=bool)
@@ -115,7 +117,7 @@ class SafeActionSearch:
 
     def _decide(self, proposal: Array, last: Array) -> Decision:
         refused = bool(self._predicting) and not self._admitted(proposal)
-        strict = self._rows(self._rows_only) if self._rows_only else _NO_ROWS
+        strict = self._rows(self._rows_only) if self._rows_only else self._none
         if not refused:
             if not strict[1].size:
                 return Decision(proposal, Stage.PROPOSAL, changed=False)
@@ -280,7 +282,7 @@ class SafeActionSearch:
         if len(parts) == 1:
             return parts[0].normals, parts[0].offsets
         if not parts:
-            return np.zeros((0, self._low.size)), np.zeros(0)
+            return self._none
         return np.concatenate([p.normals for p in parts]), np.concatenate([p.offsets for p in parts])
 
     def _project(self, boxed: Array, normals: Array, offsets: Array) -> tuple[Projection, Array]:
