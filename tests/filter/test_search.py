@@ -61,10 +61,12 @@ def test_the_first_stage_that_finds_an_admitted_control_answers(first):
 def test_an_admitted_proposal_is_executed_bit_for_bit():
     proposal = np.array([0.1, -0.2])
     decision = search(Predicting(lambda u: 1.0), LEFT, Rows(((1.0, 1.0), 1.0))).decide(proposal, LAST)
-    assert decision.control is not proposal and decision.stage is Stage.ROWS  # it leaves LEFT
+    keeps(decision, 0.0, -0.2)
+    assert decision.stage is Stage.ROWS
     proposal = np.array([-0.1, -0.2])
     decision = search(Predicting(lambda u: 1.0), LEFT, Rows(((1.0, 1.0), 1.0))).decide(proposal, LAST)
-    assert decision.control is proposal and decision.stage is Stage.PROPOSAL
+    np.testing.assert_array_equal(decision.control, proposal)
+    assert decision.stage is Stage.PROPOSAL and not decision.changed and decision.refused is None
 
 
 def test_rows_alone_are_projected_on():
@@ -87,7 +89,9 @@ def test_rows_that_a_prediction_admits_are_not_guessed_at():
 
 
 def test_refused_names_those_that_do_not_admit_the_proposal():
-    decision = decide((1.0, 1.0), LEFT, Rows(((0.0, 1.0), 2.0)), Predicting(lambda u: 0.5 - u[1]), Predicting(sum))
+    decision = decide(
+        (1.0, 1.0), LEFT, Rows(((0.0, 1.0), 2.0)), Predicting(lambda u: 0.5 - u[1]), Predicting(sum)
+    )
     assert decision.refused.tolist() == [True, False, True, False]
 
 
@@ -103,13 +107,17 @@ def test_a_plants_own_bounds_hold_before_anything_is_asked():
 def test_a_candidate_keeps_the_rows_and_every_prediction():
     candidates = [(0.5, 0.0), (-0.5, 0.9), (-0.2, 0.0), (-0.1, 0.0)]
     first = Predicting(lambda u: 0.8 - max(u), candidates=candidates)
-    found = search(first, Predicting(lambda u: 0.5 - u[1])).candidate(np.ones(2), (np.array([[1.0, 0.0]]), np.zeros(1)))
+    found = search(first, Predicting(lambda u: 0.5 - u[1])).candidate(
+        np.ones(2), (np.array([[1.0, 0.0]]), np.zeros(1))
+    )
     np.testing.assert_array_equal(found, [-0.2, 0.0])
     assert search(Predicting(only(), candidates=candidates)).candidate(np.ones(2), NONE) is None
 
 
 def test_any_constraint_may_have_the_candidate():
-    decision = decide((1.0, 1.0), Predicting(lambda u: 0.5 - u[0]), Predicting(lambda u: 1.0, candidates=[(0.2, 1.0)]))
+    decision = decide(
+        (1.0, 1.0), Predicting(lambda u: 0.5 - u[0]), Predicting(lambda u: 1.0, candidates=[(0.2, 1.0)])
+    )
     keeps(decision, 0.2, 1.0)
     assert decision.stage is Stage.CANDIDATE
 
@@ -127,7 +135,9 @@ def test_a_refused_control_is_linearised_up_to_six_times(steps):
     decision = decide((1.0, 0.5), creeping(lambda u: 1.0001 - 0.1 * steps - u[0]))
     keeps(decision, 1.0 - 0.1 * steps, 0.5)
     assert decision.stage is Stage.RELINEARIZED
-    assert len(decision.rows[1]) == (steps if steps < 6 else 0)  # the last answer has no rows to be rounded by
+    assert len(decision.rows[1]) == (
+        steps if steps < 6 else 0
+    )  # the last answer has no rows to be rounded by
 
 
 def test_and_not_seven_times():
@@ -135,7 +145,7 @@ def test_and_not_seven_times():
     admitted, control, rows = search(found).relinearize(np.ones(2), np.ones(2), NONE, NONE)
     assert not admitted and len(rows[1]) == 6
     np.testing.assert_allclose(control, [0.4, 1.0])
-    assert decide((1.0, 0.5), found).stage is Stage.OVERSHOOT
+    assert decide((1.0, 0.5), found).infeasible
 
 
 def test_what_cannot_be_linearised_ends_it():
@@ -168,17 +178,21 @@ def contradicting(at_least):
 def test_tangents_against_rows_let_nothing_through_that_breaks_the_rows(before):
     asked = iter([0.1] * before + [0.5] * 9)
     least = search(contradicting(lambda: next(asked)), LEFT)
-    admitted, control, _ = least.relinearize(np.zeros(2), np.zeros(2), *[(np.array([[1.0, 0.0]]), np.zeros(1))] * 2)
+    admitted, control, _ = least.relinearize(
+        np.zeros(2), np.zeros(2), *[(np.array([[1.0, 0.0]]), np.zeros(1))] * 2
+    )
     assert control[0] == pytest.approx(0.25, abs=0.03)
     assert not admitted
     asked = iter([0.1] * before + [0.5] * 9)
-    decision = decide((0.0, 0.0), contradicting(lambda: next(asked)), LEFT)
-    assert decision.infeasible and decision.fallback
-    assert decision.control[0] <= 1e-9
+    decision = decide((0.0, 0.0), contradicting(lambda: next(asked)), LEFT, fallback="zero")
+    assert decision.stage is Stage.FALLBACK and decision.infeasible and decision.fallback
+    keeps(decision, 0.0, 0.0)
 
 
 def test_a_guess_against_rows_is_dropped():
-    guessing = Predicting(lambda u: -0.2 - u[0], guess=[((-1.0, 0.0), -0.5)], tangents=lambda u: [((1.0, 0.0), -0.3)])
+    guessing = Predicting(
+        lambda u: -0.2 - u[0], guess=[((-1.0, 0.0), -0.5)], tangents=lambda u: [((1.0, 0.0), -0.3)]
+    )
     decision = decide((1.0, 0.5), guessing, LEFT)
     keeps(decision, -0.3, 0.5)
     assert decision.stage is Stage.RELINEARIZED
@@ -228,7 +242,10 @@ def test_overshoot_gives_up():
 
 
 def test_backup_is_the_first_one_that_keeps_everything():
-    some = [Predicting(lambda u: 1.0, control=c) for c in ((0.5, 0.0), None, (-0.5, 0.9), (-9.0, 0.1), (-0.3, 0.0))]
+    some = [
+        Predicting(lambda u: 1.0, control=c)
+        for c in ((0.5, 0.0), None, (-0.5, 0.9), (-9.0, 0.1), (-0.3, 0.0))
+    ]
     found = search(*some, Predicting(lambda u: 0.5 - u[1])).backup((np.array([[1.0, 0.0]]), np.zeros(1)))
     np.testing.assert_array_equal(found, [-1.0, 0.1])  # clipped to the box
     assert search(Predicting(only(), control=(0.0, 0.0))).backup(NONE) is None
@@ -256,7 +273,7 @@ def test_blend_keeps_the_rows():
 # The fallback and the least violation -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("at", "infeasible"), [(0.0, False), (0.5, True)])
+@pytest.mark.parametrize(("at", "infeasible"), [(0.0, False), (0.3, True)])
 def test_a_fallback_that_is_admitted_is_not_infeasible(at, infeasible):
     decision = decide((1.0, 1.0), Predicting(only((at, at))), fallback="zero")
     keeps(decision, 0.0, 0.0)
@@ -270,12 +287,19 @@ def opposed(scale, fallback="brake"):
 
 
 @pytest.mark.parametrize(
-    ("scale", "stage", "at"), [(100.0, Stage.LEAST_VIOLATION, 1.0), (1.0, Stage.FALLBACK, 0.0)]
+    ("scale", "at"),
+    [(100.0, 1.0), (1.0, -0.1)],  # the proposal; the farthest that was tried
 )
-def test_the_least_violation_is_judged_in_shares_of_the_scales(scale, stage, at):
+def test_the_least_violation_is_judged_in_shares_of_the_scales(scale, at):
     decision = opposed(scale)
     keeps(decision, at, 0.0)
-    assert decision.stage is stage and decision.infeasible and decision.fallback
+    assert decision.stage is Stage.LEAST_VIOLATION and decision.infeasible and decision.fallback
+
+
+def test_the_fallback_may_violate_least_itself():
+    decision = decide((1.0, 0.0), Predicting(lambda u: -1.0 - abs(u[0]), guess=[((1.0, 0.0), 0.0)]))
+    keeps(decision, 0.0, 0.0)
+    assert decision.stage is Stage.FALLBACK and decision.infeasible and decision.fallback
 
 
 def test_a_fallback_that_was_chosen_is_executed_whatever_it_violates():
