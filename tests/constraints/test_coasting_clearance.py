@@ -10,6 +10,7 @@ import pytest
 from asking import Asked
 
 import safe_wrappers as sw
+from safe_wrappers.constraints.backup.detour import Detour
 from safe_wrappers.errors import ConfigurationError, UnsafeStateWarning, UnsupportedEnvError
 from safe_wrappers.serialize import constraint_data, constraint_from
 
@@ -170,6 +171,28 @@ def test_a_detour_leads_around():
             env.step(np.clip(0.02 * np.array([1 + 2 * bearing, 1 - 2 * bearing]), 0, 1).astype(np.float32))
         reached[detour] = env.unwrapped.agent_position[0]
     assert reached[False] < 0.62 and reached[True] > 1.2
+
+
+def test_a_detour_keeps_its_side_for_25_steps_after_it_was_last_needed():
+    _, constraint, _ = bound([[0.28, 0.02]], detour=True)
+    limit = constraint.bound
+
+    def turns(memory):
+        """The first way around: which way it turns."""
+        limit.observe(memory)
+        first, second = limit.candidates(FULL)[0]
+        return float(np.sign(first - second))
+
+    first_turns = {memory.side: turns(memory) for memory in (Detour(1.0, 2), Detour(-1.0, 2))}
+    assert first_turns[1.0] == -first_turns[-1.0] != 0.0  # what is being made goes on
+    assert turns(Detour()) == first_turns[-1.0]  # what is on the left is passed on the right
+    assert (
+        turns(Detour(1.0, 1)) == first_turns[-1.0]
+    )  # so is it when the other side has not been needed for long
+    assert limit.executed(FULL) == Detour(-1.0, 25)
+    limit.observe(Detour(-1.0, 25))  # not needed in this step
+    assert limit.executed(FULL) == Detour(-1.0, 24)
+    assert limit.start() == Detour(0.0, 0)
 
 
 def test_plain_data_rebuilds_it():
