@@ -1,4 +1,7 @@
-"""From the hyperparameters of a config, texts and numbers, to what the constructors of the algorithms take."""
+"""From the hyperparameters of a config, texts and numbers, to what the constructors of the algorithms take.
+
+Checkpoints name `LinearFall` by this module's path.
+"""
 
 from __future__ import annotations
 

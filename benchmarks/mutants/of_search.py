@@ -68,8 +68,8 @@ SEARCH = Room(
         Mutant("decision.changed |= bool((proposal != boxed).any())", "pass"),
         Mutant("self._fallback(self._plant, last, self._low, self._high, None, readable=False)", "last"),
         Mutant(
-            "self._none = np.zeros((0, low.size)), np.zeros(0)",
-            "self._none = _NO_ROWS",
+            "self._no_rows: Rows = np.zeros((0, low.size)), np.zeros(0)",
+            "self._no_rows: Rows = _NO_ROWS",
             tests=("tests/constraints/test_heading_drive_clearance.py",),
         ),
         Mutant(

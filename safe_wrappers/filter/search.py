@@ -100,8 +100,8 @@ class SafeActionSearch:
         self._constraints = list(constraints)
         self._predicting = [c for c in constraints if c.predicts]
         self._rows_only = [c for c in constraints if not c.predicts]
+        self._no_rows: Rows = np.zeros((0, low.size)), np.zeros(0)
         self._narrower = not plant.bounds_are_action_space
-        self._none = np.zeros((0, low.size)), np.zeros(0)
         self._tried: list[Array] = []
 
     def decide(self, boxed: Array, last: Array) -> Decision:
@@ -117,7 +117,7 @@ class SafeActionSearch:
 
     def _decide(self, proposal: Array, last: Array) -> Decision:
         refused = bool(self._predicting) and not self._admitted(proposal)
-        strict = self._rows(self._rows_only) if self._rows_only else self._none
+        strict = self._rows(self._rows_only) if self._rows_only else self._no_rows
         if not refused:
             if not strict[1].size:
                 return Decision(proposal, Stage.PROPOSAL, changed=False)
@@ -282,7 +282,7 @@ class SafeActionSearch:
         if len(parts) == 1:
             return parts[0].normals, parts[0].offsets
         if not parts:
-            return self._none
+            return self._no_rows
         return np.concatenate([p.normals for p in parts]), np.concatenate([p.offsets for p in parts])
 
     def _project(self, boxed: Array, normals: Array, offsets: Array) -> tuple[Projection, Array]:

@@ -93,7 +93,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         plant = own_plant(plant)
         if isinstance(constraints, str | dict) or not isinstance(constraints, Sequence) or not constraints:
             raise ConfigurationError(f"constraints is a list with at least one, got {constraints!r}")
-        own = [copy.deepcopy(constraint_from(c)) for c in constraints]
+        own = [copy.deepcopy(c) for c in [*map(constraint_from, constraints)]]
         margin = non_negative("margin", margin, "the constraints' own units")
         check_solver(solver)
         gym.utils.RecordConstructorArgs.__init__(

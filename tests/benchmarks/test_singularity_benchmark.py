@@ -8,6 +8,7 @@ import pytest
 import safe_wrappers as sw
 from benchmarks import singularity as benchmark
 from benchmarks.arms import ARMS, Truth, watch
+from safe_wrappers.constraints.limits.singularity_margin import BoundSingularityMargin
 
 
 def made(name):
@@ -82,9 +83,9 @@ def test_a_constraint_that_admits_everything_is_seen():
     good = benchmark.attack(job)
     assert good["unflagged"] == 0 and good["changed"] > 0
     # Bends the arm as it should at first, and then looks away.
-    own = sw.SingularityMargin.admits
+    own = BoundSingularityMargin.admits
     blind = mock.patch.object(
-        sw.SingularityMargin, "admits", lambda self, plant, u: plant.time > 0.5 or own(self, plant, u)
+        BoundSingularityMargin, "admits", lambda self, u: self.plant.time > 0.5 or own(self, u)
     )
     with blind:
         bad = benchmark.attack(job)

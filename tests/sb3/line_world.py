@@ -1,10 +1,13 @@
 """A point on a line, pushed left and right, and a filter that is known in closed form."""
 
+from dataclasses import dataclass
+
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.monitor import Monitor
 
 import safe_wrappers as sw
+from safe_wrappers.filter.constraint import BoundConstraint
 
 HOLD, WALL, PENALTY, PER_CORRECTION = 0.1, -0.3, 5.0, 0.5
 
@@ -36,14 +39,20 @@ class Line(gym.Env):
         return self.observed(), reward, self.x < -1.0, self.steps >= 9, info
 
 
-class BehindTheWall:
+@dataclass
+class BehindTheWall(sw.Constraint):
     """x <= wall at the end of the hold, which is u <= (wall - x) / hold."""
 
-    def __init__(self, wall):
-        self.wall = wall
+    wall: float
 
-    def rows(self, plant):
-        return sw.HalfSpaces(np.array([[plant.hold_s]]), np.array([self.wall - plant.state[0]]))
+    def bind(self, plant):
+        return BoundBehindTheWall(self, plant)
+
+
+class BoundBehindTheWall(BoundConstraint):
+    def rows(self):
+        left = self.spec.wall - self.plant.state[0]
+        return sw.HalfSpaces(np.array([[self.plant.hold_s]]), np.array([left]))
 
 
 class AsDict(gym.ObservationWrapper):

@@ -11,6 +11,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
+from safe_wrappers.filter.constraint import BoundConstraint
 from safe_wrappers.train.config import EnvConfig, FilterConfig, parse_experiment
 from safe_wrappers.train.evaluation.evaluate import evaluate_run
 from safe_wrappers.train.evaluation.summary import summarize, write_summary
@@ -45,11 +46,11 @@ def slow_pendulum(env, delay_s=0.0):
     return sw.CBFActionFilter(env, [sw.Barrier(lambda x: 4.0 - x[1] ** 2, alpha=2.0)], plant=plant)
 
 
-class RowsOnly:
+class RowsOnly(sw.Constraint):
     """A constraint without an h."""
 
-    def rows(self, plant):
-        return sw.HalfSpaces.none(2)
+    def bind(self, plant):
+        return BoundConstraint(self, plant)
 
 
 def without_h(env):

@@ -13,6 +13,7 @@ from test_run import Reports, run_killed_after
 import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.filter.constraint import BoundConstraint
 from safe_wrappers.sb3 import ExecutedActionReplayBuffer
 from safe_wrappers.train.config import NAIVE, EvaluationConfig, FilterConfig, LearnerConfig
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
@@ -28,11 +29,16 @@ PENALTY = 1000.0
 """An episode of the fake task returns less than 5, so that one penalty in a return would show."""
 
 
-class BehindTheWall:
+class BehindTheWall(sw.Constraint):
     """Ends no step right of the wall."""
 
-    def rows(self, plant):
-        return sw.HalfSpaces(np.array([[plant.hold_s, 0.0]]), np.array([WALL - plant.state[0]]))
+    def bind(self, plant):
+        return BoundBehindTheWall(self, plant)
+
+
+class BoundBehindTheWall(BoundConstraint):
+    def rows(self):
+        return sw.HalfSpaces(np.array([[self.plant.hold_s, 0.0]]), np.array([WALL - self.plant.state[0]]))
 
 
 def drift(x):

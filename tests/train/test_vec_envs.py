@@ -177,7 +177,8 @@ def test_no_process_outlives_the_command(tmp_path, by):
     mark = f"MARK={uuid.uuid4()}"
     key, _, value = mark.partition("=")
     command = [sys.executable, "-m", "safe_wrappers.train.cli", "train", str(config)]
-    process = subprocess.Popen(command, env={**os.environ, key: value}, stdout=subprocess.DEVNULL)
+    here = Path(__file__).parent  # where the fake task lies
+    process = subprocess.Popen(command, env={**os.environ, key: value}, stdout=subprocess.DEVNULL, cwd=here)
     try:
         if by is not None:
             rows = tmp_path / "three" / "a" / "seed_0" / "episodes.csv"

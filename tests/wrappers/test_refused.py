@@ -1,5 +1,8 @@
 """Which constraint refused, what fails least where all fail, and what counts as an intervention."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import gymnasium as gym
 import mujoco
 import numpy as np
@@ -7,6 +10,7 @@ import pytest
 from worlds import Cart, Raw, SpeedRow, cart_plant, wall
 
 import safe_wrappers as sw
+from safe_wrappers.filter.constraint import BoundConstraint
 
 pytestmark = pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning")
 
@@ -139,7 +143,7 @@ def too_fast():
 
 
 def failing(env, control):
-    """The filter's own measure: the largest shortfall in shares of the constraint's scale."""
+    """The filter's own measure: the largest violation in shares of the constraint's scale."""
     return max(-c.slack(control) / c.scale for c in env.filter.bound)
 
 
@@ -180,26 +184,35 @@ def test_what_is_executed_fails_no_more_than_the_brake_and_the_proposal(make, mo
     assert (failed[:, 0] < failed[:, 1] - 1e-3).any()
 
 
-class Refusing:
-    """Admits nothing; how much a control misses is given."""
+@dataclass
+class Refusing(sw.Constraint):
+    """Admits nothing; what a control leaves is given."""
 
-    def __init__(self, shortfall, scale):
-        self._shortfall, self.scale = shortfall, scale
+    slack: Callable[[float], float]
+    scale: float
 
-    def rows(self, plant):
-        return sw.HalfSpaces.none(1)
+    def bind(self, plant):
+        return BoundRefusing(self, plant)
 
-    def admits(self, plant, control):
+
+class BoundRefusing(BoundConstraint):
+    predicts = True
+
+    @property
+    def scale(self):
+        return self.spec.scale
+
+    def admits(self, control):
         return False
 
-    def shortfall(self, plant, control):
-        return self._shortfall(control[0])
+    def slack(self, control):
+        return self.spec.slack(control[0])
 
 
 @pytest.mark.parametrize(("scale", "executed"), [(100.0, 1.0), (1.0, 0.0)])
 def test_what_fails_least_is_judged_in_shares_of_the_scales(scale, executed):
     # More control is worse for the first and better for the second: the scale says which counts.
-    limits = [Refusing(lambda u: 10.0 * (1.0 + u), scale), Refusing(lambda u: 1.0 - 0.5 * u, 1.0)]
+    limits = [Refusing(lambda u: -10.0 * (1.0 + u), scale), Refusing(lambda u: 0.5 * u - 1.0, 1.0)]
     env = made("InvertedPendulum-v5", limits)
     env.reset(seed=0)
     info = env.step(np.array([1.0], np.float32))[4]
@@ -208,15 +221,15 @@ def test_what_fails_least_is_judged_in_shares_of_the_scales(scale, executed):
 
 
 def test_scales_are_the_limits_where_there_is_one():
-    scales = {
-        "SpeedLimit": (sw.SpeedLimit(2.5), 2.5),
-        "JointSpeedLimit": (sw.JointSpeedLimit([4.0, 3.0]), 3.0),
-        "JointPositionLimit": (sw.JointPositionLimit(-1.0, 1.0), 1.0),
-        "Workspace": (sw.Workspace([0.0] * 3, bodies=["fingertip"]), 1.0),
-        "Upright": (sw.Upright(tilt=0.5, body="fingertip"), 1.0),
-    }
-    env = sw.CBFActionFilter(gym.make("Reacher-v5"), [limit for limit, _ in scales.values()])
-    assert [c.scale for c in env.filter.bound] == [scale for _, scale in scales.values()]
+    limits = [
+        sw.SpeedLimit(2.5),
+        sw.JointSpeedLimit([4.0, 3.0]),
+        sw.JointPositionLimit(-1.0, 1.0, ["joint1"]),
+        sw.Workspace([0.0] * 3, bodies=["fingertip"]),
+        sw.Upright("body0", tilt=0.5),
+    ]
+    env = made("Reacher-v5", limits)
+    assert [limit.scale for limit in env.filter.bound] == [2.5, 3.0, 1.0, 1.0, 1.0]
 
 
 @pytest.mark.parametrize(

@@ -6,11 +6,13 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
+from asking import Asked
 from braked_cart import BrakedCart, cart_plant, lease, lease_by_bisection, read_cart
-from worlds import SpeedRow
+from worlds import BoundSpeedRow, SpeedRow
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import BoundConstraint
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 RAIL = [sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])]
@@ -217,8 +219,13 @@ def test_a_heading_drive_never_violates_when_commands_stop():
 class Far(SpeedRow):
     """Whose value says that nothing is near, or that nothing can be read."""
 
-    def value(self, plant):
-        return np.array(self.values)
+    def bind(self, plant):
+        return BoundFar(self, plant)
+
+
+class BoundFar(BoundSpeedRow):
+    def value(self):
+        return np.array(self.spec.values)
 
 
 @pytest.mark.parametrize(
@@ -253,20 +260,30 @@ def test_a_state_error_counts_for_values_too():
 
 
 def test_a_constraint_forgets_the_episode():
-    class Counted(Far):
-        forgotten = 0
+    begun = []
 
-        def reset(self):
-            Counted.forgotten += 1
+    class Counted(Far):
+        def bind(self, plant):
+            return BoundCounted(self, plant)
+
+    class BoundCounted(BoundFar):
+        def start(self):
+            begun.append(len(begun))
+            return begun[-1]
+
+        def observe(self, memory):
+            assert memory == begun[-1]
 
     counted = Counted(1.0)
     counted.values = [1.0]
     env = sw.LeaseExpiry(
         BrakedCart(), sw.StoppingBudget(counted, closing_speed=1.0), plant=cart_plant(0.1), fallback="zero"
     )
-    env.reset()
-    env.reset()
-    assert Counted.forgotten == 2
+    for _ in range(2):
+        before = len(begun)
+        env.reset()
+        assert len(begun) > before
+        env.step(np.zeros(2, np.float32))
 
 
 # Functions ----------------------------------------------------------------------------------------------------
@@ -394,8 +411,9 @@ def test_what_constraints_with_a_value_need():
     for name in ("braking", "acceleration", "top_speed"):
         with pytest.raises(ConfigurationError, match="closing_speed alone"):
             sw.StoppingBudget(limit, closing_speed=1.0, **{name: 1.0})
-    with pytest.raises(ConfigurationError, match="no value"):
-        sw.StoppingBudget(SpeedRow(1.0), closing_speed=1.0)
+    with pytest.raises(ConfigurationError, match="SpeedRow has no value"):
+        budget = sw.StoppingBudget(SpeedRow(1.0), closing_speed=1.0)
+        sw.LeaseExpiry(BrakedCart(), budget, plant=cart_plant(0.1), fallback="zero")
 
 
 def test_a_clearance_still_needs_the_acceleration():
@@ -431,17 +449,22 @@ def test_reading_is_of_the_env_that_it_wraps():
     assert seen == [inner]
 
 
-class Checked:
+class Checked(sw.Constraint):
     """A constraint that only a state can show to be wrong."""
 
-    def rows(self, plant):
+    def bind(self, plant):
+        return BoundChecked(self, plant)
+
+
+class BoundChecked(BoundConstraint):
+    def rows(self):
         raise AssertionError("a lease needs no rows")
 
-    def value(self, plant):
+    def value(self):
         return np.ones(1)
 
-    def check(self, plant):
-        if plant.qpos[0] > 1.0:
+    def check(self):
+        if self.plant.qpos[0] > 1.0:
             raise ConfigurationError("too far out")
 
 

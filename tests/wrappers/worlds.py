@@ -1,11 +1,13 @@
 """Small worlds whose motion is known exactly: a cart on a line, pushed by a bounded acceleration."""
 
+from dataclasses import dataclass
 from typing import ClassVar
 
 import gymnasium as gym
 import numpy as np
 
 import safe_wrappers as sw
+from safe_wrappers.filter.constraint import BoundConstraint
 
 
 class Cart(gym.Env):
@@ -62,21 +64,32 @@ def wall(at, **more):
     return sw.Clearance([sw.Plane([at], [-1.0])], braking=1.0, position=[0], velocity=[1], **more)
 
 
-class SpeedRow:
+@dataclass
+class SpeedRow(sw.Constraint):
     """v <= limit at the end of the hold, by the plainest possible constraint: rows alone, no h."""
 
-    def __init__(self, limit):
-        self.limit = limit
+    limit: float
 
-    def rows(self, plant):
-        return sw.HalfSpaces(np.array([[plant.hold_s]]), np.array([self.limit - plant.state[1]]))
+    def bind(self, plant):
+        return BoundSpeedRow(self, plant)
 
 
-class Raw:
+class BoundSpeedRow(BoundConstraint):
+    def rows(self):
+        left = self.spec.limit - self.plant.state[1]
+        return sw.HalfSpaces(np.array([[self.plant.hold_s]]), np.array([left]))
+
+
+class Raw(sw.Constraint):
     """Fixed rows, whatever the state."""
 
     def __init__(self, normals, offsets):
-        self.normals, self.offsets = np.array(normals, float), np.array(offsets, float)
+        self.half_spaces = sw.HalfSpaces(np.array(normals, float), np.array(offsets, float))
 
-    def rows(self, plant):
-        return sw.HalfSpaces(self.normals, self.offsets)
+    def bind(self, plant):
+        return BoundRaw(self, plant)
+
+
+class BoundRaw(BoundConstraint):
+    def rows(self):
+        return self.spec.half_spaces

@@ -54,7 +54,9 @@ def _lease(given: Any) -> Any:
     for name in given or {}:
         check_name(name, valid)
     budget = (given or {}).get("budget")
-    for name in budget if isinstance(budget, Mapping) else ():
+    if not isinstance(budget, Mapping | None):
+        raise ConfigurationError(f"lease.budget: expected a mapping of a StoppingBudget's fields, got {budget!r}")
+    for name in budget or ():
         check_name(name, [field.name for field in fields(StoppingBudget)], "budget")
     return given
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.default import default_plant
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.filter.engine import SafetyFilter
+from safe_wrappers.plants.default import plant_of_the_present
 from safe_wrappers.wrappers.cost_function import refuse_own_cost
 
 _TOLERANCE: Final = 1e-6
@@ -29,30 +29,28 @@ class ConstraintJudge(gym.Wrapper[Any, Any, Any, Any]):
         judging: The filter around the same task, whose constraints are used; it is never stepped.
 
     Raises:
-        ConfigurationError: The filter has no `constraints` and `plant`, one of them has no h (`value`), or the filter
+        ConfigurationError: It is no CBFActionFilter, one of them has no h (`value`), or the filter
             has a plant of the user's own with a delay, which does not see the present state.
     """
 
     def __init__(self, task: gym.Env[Any, Any], judging: gym.Env[Any, Any]) -> None:
         super().__init__(task)
-        if not (judging.has_wrapper_attr("constraints") and judging.has_wrapper_attr("plant")):
+        if not judging.has_wrapper_attr("filter"):
             raise ConfigurationError(
                 "env.judge: the filter has no constraints and plant that could judge (a CBFActionFilter has); use "
                 "env.cost: module:function"
             )
-        self._constraints = list(judging.get_wrapper_attr("constraints"))
-        for constraint in self._constraints:
-            if not callable(getattr(constraint, "value", None)):
+        its_filter: SafetyFilter = judging.get_wrapper_attr("filter")
+        for constraint in its_filter.bound:
+            if not constraint.has_value:
                 raise ConfigurationError(
-                    f"env.judge: {type(constraint).__name__} has no h (`value`) and cannot judge; use env.cost: "
+                    f"env.judge: {type(constraint.spec).__name__} has no h (`value`) and cannot judge; use env.cost: "
                     "module:function"
                 )
-        self._plant = judging.get_wrapper_attr("plant")
-        if isinstance(self._plant, MujocoPlant):
-            self._plant = default_plant(task)
-            self._plant.bind(task)
-            for constraint in self._constraints:
-                getattr(constraint, "bind", lambda plant: None)(self._plant)
+        self._plant = plant_of_the_present(its_filter.plant, task)
+        self._constraints = its_filter.bound
+        if self._plant is not its_filter.plant:
+            self._constraints = [constraint.spec.bind(self._plant) for constraint in its_filter.bound]
         elif self._plant.delay_s:
             raise ConfigurationError(
                 f"env.judge: the filter's plant looks {self._plant.delay_s} s ahead and does not see the present "
@@ -65,8 +63,7 @@ class ConstraintJudge(gym.Wrapper[Any, Any, Any, Any]):
         """Resets the env; info has the cost of the state in which the episode starts."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._plant.executed(None)
-        for constraint in self._constraints:
-            getattr(constraint, "reset", lambda: None)()
+        self._memories = [constraint.start() for constraint in self._constraints]
         self._judge(info)
         return observation, info
 
@@ -79,6 +76,10 @@ class ConstraintJudge(gym.Wrapper[Any, Any, Any, Any]):
     def _judge(self, info: dict[str, Any]) -> None:
         refuse_own_cost(self.unwrapped, info)
         self._plant.observe()
-        barriers = [np.asarray(constraint.value(self._plant)) for constraint in self._constraints]
-        # Not >=, so that an h that is no number is a violation.
-        info[keys.COST] = float(not all((h >= -_TOLERANCE).all() for h in barriers))
+        cost, still = 0.0, np.zeros(self._plant.lower.size)
+        for i, constraint in enumerate(self._constraints):
+            constraint.observe(self._memories[i])
+            # Negated, so that an h that is not a number is a violation.
+            cost = max(cost, float(not (constraint.value() >= -_TOLERANCE).all()))
+            self._memories[i] = constraint.executed(still)
+        info[keys.COST] = cost
