@@ -8,14 +8,17 @@ that change behaviour are killed.
 """
 
 import argparse
+import importlib
+import multiprocessing
 import os
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
 from pathlib import Path
+
+import pytest
 
 from benchmarks.mutants.room import Mutant, Room
 from benchmarks.mutants.rooms import ROOMS
@@ -24,6 +27,8 @@ ROOT = Path(__file__).parents[2]
 NEEDED = 0.9
 """Share of the mutants that change behaviour."""
 TIMEOUT_S = 120.0
+NOT_THE_COPY = 99
+OUTPUT = "output.txt"
 
 
 def copied(into: Path) -> Path:
@@ -39,37 +44,50 @@ def copied(into: Path) -> Path:
     return package
 
 
-def python(where: Path, *words: str) -> "subprocess.CompletedProcess[str]":
-    """Python in the copy, with the copied package instead of the installed one."""
-    settings = {"PYTHONPATH": str(where), "MUJOCO_GL": "disabled", "OMP_NUM_THREADS": "1"}
-    return subprocess.run(
-        [sys.executable, *words],
-        cwd=where,
-        env=os.environ | settings,
-        capture_output=True,
-        text=True,
-        timeout=TIMEOUT_S,
-    )
+def tests(where: Path, words: tuple[str, ...]) -> int:
+    """Pytest's exit status on the copy, in a process that has the copied package instead of the installed one."""
+    process = multiprocessing.get_context("fork").Process(target=_tests, args=(where, words))
+    process.start()
+    process.join(TIMEOUT_S)
+    if process.is_alive():
+        process.kill()
+        process.join()
+    status = process.exitcode
+    if status == NOT_THE_COPY:
+        sys.exit(f"the tests import another package than the copy in {where}")
+    assert status is not None
+    return status
 
 
-def tests(where: Path, *words: str) -> "subprocess.CompletedProcess[str]":
-    return python(where, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *words)
+def _tests(where: Path, words: tuple[str, ...]) -> None:
+    os.chdir(where)
+    sys.path[:] = [str(where), *(p for p in sys.path if p not in ("", str(ROOT)))]
+    with (where / OUTPUT).open("w") as output:
+        os.dup2(output.fileno(), 1)
+        os.dup2(output.fileno(), 2)
+    import safe_wrappers.envs as envs
+    from safe_wrappers.filter import search
+
+    for module in (envs, search):
+        if not Path(str(module.__file__)).is_relative_to(where):
+            os._exit(NOT_THE_COPY)
+    os._exit(int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", *words])))
 
 
-def check_copy(where: Path, rooms: dict[str, Room]) -> None:
-    """Stop if another package than the copy is tested, or if a test fails without any mistake."""
-    answer = python(
-        where, "-c", "import safe_wrappers.envs as e, safe_wrappers as s; print(s.__file__, e.__file__)"
-    )
-    files = answer.stdout.split()
-    if len(files) != 2 or not all(Path(f).is_relative_to(where) for f in files):
-        sys.exit(f"the tests would import {files}, not the copy in {where}: {answer.stderr}")
-    for name, room in rooms.items():
-        answer = tests(where, *room.tests)
-        if answer.returncode:
-            sys.exit(
-                f"{name}: the tests fail without a mutant\n{answer.stdout[-3000:]}{answer.stderr[-1000:]}"
-            )
+def preload() -> None:
+    """Import here what takes long, once for all the processes that run tests."""
+    os.environ |= {"MUJOCO_GL": "disabled", "OMP_NUM_THREADS": "1"}
+    for name in ("daqp", "gymnasium", "hypothesis", "mujoco", "numpy", "scipy.optimize", "scipy.spatial"):
+        importlib.import_module(name)
+
+
+def check_tests(where: Path, rooms: dict[str, Room]) -> None:
+    """Stop if a test fails without any mistake."""
+    for words in dict.fromkeys(
+        w for room in rooms.values() for w in (room.tests, *(m.tests for m in room.mutants))
+    ):
+        if words and tests(where, words):
+            sys.exit(f"{' '.join(words)} fail without a mutant\n{(where / OUTPUT).read_text()[-3000:]}")
 
 
 def place(package: Path, room: Room, mutant: Mutant) -> Path:
@@ -84,13 +102,13 @@ def place(package: Path, room: Room, mutant: Mutant) -> Path:
 def survives(where: Path, file: Path, room: Room, mutant: Mutant, number: int) -> bool:
     """Whether all tests pass with the mistake."""
     text = file.read_text()
+    mistaken = text.replace(mutant.old, mutant.new)
+    compile(mistaken, file, "exec")  # what is no Python says nothing about the tests
     try:
-        file.write_text(text.replace(mutant.old, mutant.new))
+        file.write_text(mistaken)
         # Bytecode is kept by size and second of change.
         os.utime(file, (number, number))
-        return tests(where, *(mutant.tests or room.tests)).returncode == 0
-    except subprocess.TimeoutExpired:
-        return False
+        return tests(where, mutant.tests or room.tests) == 0
     finally:
         file.write_text(text)
 
@@ -108,7 +126,8 @@ def main() -> None:
         if arguments.find:
             print(f"{len(jobs)} mutants")
             return
-        check_copy(where, rooms)
+        preload()
+        check_tests(where, rooms)
         counts: dict[str, Counter[str]] = {name: Counter() for name in rooms}
         for number, (name, room, mutant, file) in enumerate(jobs, start=1):
             began = time.perf_counter()

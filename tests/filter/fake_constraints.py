@@ -25,8 +25,16 @@ class Still(gym.Env):
         return np.zeros(1), 0.0, False, False, {}
 
 
-def still_plant(**bounds):
-    return sw.AnalyticPlant(lambda x: 0.0 * x, lambda x: np.zeros((1, 2)), lambda env: np.zeros(1), **bounds)
+class StillPlant(sw.AnalyticPlant):
+    """Its state never changes; controls act between `acting`, or all between the bounds."""
+
+    acting_range = None
+
+
+def still_plant(acting=None, **bounds):
+    plant = StillPlant(lambda x: 0.0 * x, lambda x: np.zeros((1, 2)), lambda env: np.zeros(1), **bounds)
+    plant.acting_range = acting and tuple(map(np.array, acting))
+    return plant
 
 
 def half_spaces(*rows):

@@ -88,6 +88,13 @@ def test_rows_that_a_prediction_admits_are_not_guessed_at():
     assert decision.stage is Stage.ROWS and decision.refused.tolist() == [True, True]
 
 
+def test_what_rows_make_of_an_admitted_proposal_is_asked_about_too():
+    balance = Predicting(lambda u: sum(u) - 0.5, guess=[((-1.0, -1.0), -0.5)])
+    decision = decide((1.0, 0.2), LEFT, balance)  # by LEFT alone (0, 0.2)
+    keeps(decision, 0.0, 0.5)
+    assert decision.stage is Stage.ROWS and decision.refused.tolist() == [True, False]
+
+
 def test_refused_names_those_that_do_not_admit_the_proposal():
     decision = decide(
         (1.0, 1.0), LEFT, Rows(((0.0, 1.0), 2.0)), Predicting(lambda u: 0.5 - u[1]), Predicting(sum)
@@ -99,6 +106,15 @@ def test_a_plants_own_bounds_hold_before_anything_is_asked():
     decision = decide((1.0, 0.5), Predicting(lambda u: 1.0), lower=-0.4, upper=0.4)
     keeps(decision, 0.4, 0.4)
     assert decision.stage is Stage.PROPOSAL and decision.changed
+
+
+def test_changes_are_counted_in_shares_of_what_acts():
+    # The first control saturates at 0.5: in shares of what acts it costs twice as much to change.
+    decision = decide((1.0, 1.0), Rows(((1.0, 1.0), 0.5)), acting=((-0.5, -1.0), (0.5, 1.0)))
+    keeps(decision, 0.3, 0.2)
+    # What saturates as the proposal did stays the proposal's.
+    decision = decide((1.0, 1.0), Rows(((0.0, 1.0), 0.5)), acting=((-0.5, -1.0), (0.5, 1.0)))
+    keeps(decision, 1.0, 0.5)
 
 
 # Candidates -------------------------------------------------------------------------------------------------------
@@ -161,9 +177,12 @@ def test_only_those_that_refuse_are_linearised():
 
 
 def test_tangents_that_are_no_numbers_end_it():
-    broken = Predicting(lambda u: 0.5 - u[0], tangents=lambda u: [((np.nan, 0.0), 0.3)], control=(-1.0, 0.5))
+    # The other row is kept, and the answer would be admitted; it is not taken for the answer of a projection.
+    tangents = [((np.nan, 0.0), 0.3), ((1.0, 0.0), 0.3)]
+    broken = Predicting(lambda u: 0.5 - u[0], tangents=lambda u: tangents, control=(-1.0, 0.5))
     decision = decide((1.0, 0.5), broken)
-    assert decision.stage is Stage.BLEND and decision.control[0] <= 0.5
+    keeps(decision, 0.17, 0.5)  # blended with the backup
+    assert decision.stage is Stage.BLEND
 
 
 # Rows that contradict each other ----------------------------------------------------------------------------------
@@ -187,6 +206,12 @@ def test_tangents_against_rows_let_nothing_through_that_breaks_the_rows(before):
     decision = decide((0.0, 0.0), contradicting(lambda: next(asked)), LEFT, fallback="zero")
     assert decision.stage is Stage.FALLBACK and decision.infeasible and decision.fallback
     keeps(decision, 0.0, 0.0)
+
+
+def test_tangents_that_contradict_each_other_are_only_guesses():
+    tangents = [((1.0, 0.0), 0.0), ((-1.0, 0.0), -0.5)]
+    decision = decide((1.0, 0.5), Predicting(lambda u: 0.3 - u[0], tangents=lambda u: tangents))
+    assert decision.stage is Stage.RELINEARIZED and decision.control[0] == pytest.approx(0.25)
 
 
 def test_a_guess_against_rows_is_dropped():
