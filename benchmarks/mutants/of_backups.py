@@ -33,7 +33,7 @@ HEADING_DRIVE = Room(
 
 COASTING = Room(
     "constraints/backup/coasting_clearance.py",
-    ("tests/constraints/test_coasting_clearance.py",),
+    ("tests/constraints/test_coasting_clearance.py", "tests/wrappers/test_closed_loop_car_goal.py"),
     (
         Mutant(_FORGOTTEN, "Detour()"),
         Mutant(_FORGOTTEN, "memory"),
@@ -64,7 +64,7 @@ COASTING = Room(
 
 ESCAPE = Room(
     "constraints/backup/escape_clearance.py",
-    ("tests/constraints/test_escape_clearance.py",),
+    ("tests/constraints/test_escape_clearance.py", "tests/wrappers/test_closed_loop_occlusion.py"),
     (
         Mutant("shorter = going_on - 1 if", "shorter = going_on if"),
         Mutant("        if going_on is not None:", "        if False:"),

@@ -173,6 +173,25 @@ def test_a_detour_leads_around():
     assert reached[False] < 0.62 and reached[True] > 1.2
 
 
+def test_less_of_the_same_and_none_are_tried_for_a_refused_control():
+    _, constraint, plant = bound([[0.28, 0.02]])
+    np.testing.assert_array_equal(constraint.candidates(FULL), [0.5 * plant.acting_range[1], NONE])
+
+
+def test_from_inside_the_best_way_out_is_admitted_and_the_way_in_is_not():
+    _, constraint, _ = bound([[0.12, 0.05]])
+    (out,) = constraint.candidates(FULL)
+    assert constraint.admits(out) and constraint.admits(0.99 * out)
+    assert not constraint.admits(-out) and not constraint.admits(NONE)
+    assert constraint.slack(out) > constraint.value()
+
+
+def test_the_slack_is_the_least_on_the_way_and_not_what_is_left_at_its_end():
+    _, constraint, _ = bound([[0.25, 0.0]])
+    assert constraint.slack(BACK) <= constraint.value() + 1e-6
+    assert constraint.slack(FULL) < constraint.value()
+
+
 def test_a_detour_keeps_its_side_for_25_steps_after_it_was_last_needed():
     _, constraint, _ = bound([[0.28, 0.02]], detour=True)
     limit = constraint.bound

@@ -73,6 +73,20 @@ def test_a_detour_keeps_its_side_for_fifty_steps_after_it_was_last_needed():
     assert limit.start() == Detour(0.0, 0)
 
 
+def test_a_position_that_is_no_number_leaves_no_clearance_that_is_one():
+    env = filtered()
+    env.unwrapped._hazards[:] = np.nan
+    env.filter.observe()
+    assert np.isnan(env.filter.bound[0].value()).all()
+
+
+def test_without_brakes_the_backup_rolls_out():
+    backups = [
+        filtered(velocity=(1.0, 0.0, 0.0), brake=brake).filter.bound[0].backup() for brake in (True, False)
+    ]
+    assert backups[0][0] < 0.0 and backups[1].tolist() == [0.0, 0.0]
+
+
 def test_no_detour_without_a_drive_or_without_a_disc_ahead():
     env = filtered({"hazards": [[0.26, 0.0]]}, detour=True)
     (limit,) = env.filter.bound

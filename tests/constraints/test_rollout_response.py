@@ -1,4 +1,4 @@
-"""For how long a rollout constraint keeps the response of its forecasts, on a plant that is one line of arithmetic."""
+"""For how long a rollout constraint keeps the response of its forecasts, on a plant of one line of arithmetic."""
 
 from types import SimpleNamespace
 
