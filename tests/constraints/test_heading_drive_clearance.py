@@ -82,7 +82,8 @@ def test_a_position_that_is_no_number_leaves_no_clearance_that_is_one():
 
 def test_without_brakes_the_backup_rolls_out():
     backups = [
-        filtered(velocity=(1.0, 0.0, 0.0), brake=brake).filter.bound[0].backup() for brake in (True, False)
+        filtered({"hazards": [[9.0, 9.0]]}, (1.0, 0.0, 0.0), brake=brake).filter.bound[0].backup()
+        for brake in (True, False)
     ]
     assert backups[0][0] < 0.0 and backups[1].tolist() == [0.0, 0.0]
 
