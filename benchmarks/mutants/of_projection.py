@@ -20,7 +20,11 @@ PROJECTION = Room(
         Mutant("lam += (value - limit) / falling", "lam = (value - limit) / falling"),
         Mutant("x = bottom if x < bottom else top", "x = top"),
         Mutant("if excess > slack and falling > 0.0:", "if False:"),
-        Mutant("hopeless = bool((lowest > b + slack).any())", "hopeless = False"),
+        Mutant(
+            "hopeless = bool((lowest > b + slack).any())",
+            "hopeless = False",
+            equal="only saves time: rows that no corner of the box meets have no projection, which the solver finds too",
+        ),
         Mutant("hopeless = bool((lowest > b + slack).any())", "hopeless = True"),
         Mutant(
             "np.where(a > 0.0, a * hi, np.where(a < 0.0, a * lo, 0.0))",
@@ -43,7 +47,11 @@ PROJECTION = Room(
         Mutant("unit = 1.0 if box.ordinary else _unit(box, u, excess, length)", "unit = 1.0"),
         Mutant("answer[1] * (unit * unit)", "answer[1]"),
         Mutant("weights * unit / norm", "weights"),
-        Mutant('if answer is None and solver != "daqp":', "if False:"),
+        Mutant(
+            'if answer is None and solver != "daqp":',
+            "if False:",
+            equal="another way to the same answer: by distance, where a named solver and its least violation fail",
+        ),
         Mutant(
             'np.maximum(info["lam"][n:], 0.0)',
             'info["lam"][n:]',

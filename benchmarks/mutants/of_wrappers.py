@@ -4,7 +4,11 @@ from benchmarks.mutants.room import Mutant, Room
 
 LEASE = Room(
     "wrappers/lease*/**/*.py",
-    ("tests/wrappers/test_admission.py", "tests/wrappers/test_stopping_budget.py"),
+    (
+        "tests/wrappers/test_admission.py",
+        "tests/wrappers/test_stopping_budget.py",
+        "tests/wrappers/test_teleop_revocation.py",
+    ),
     (
         Mutant(
             "return bool(admits(end, position, velocity, duration_s, v_max, a_max, jerk, acceleration).all())",
