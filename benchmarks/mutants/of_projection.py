@@ -23,7 +23,7 @@ PROJECTION = Room(
         Mutant(
             "hopeless = bool((lowest > b + slack).any())",
             "hopeless = False",
-            equal="only saves time: rows that no corner of the box meets have no projection, which the solver finds too",
+            equal="only saves time: what no corner of the box meets has no projection, as the solver finds",
         ),
         Mutant("hopeless = bool((lowest > b + slack).any())", "hopeless = True"),
         Mutant(

@@ -106,7 +106,11 @@ LEASE_EXPIRY = Room(
         Mutant(
             "max(min(longest_s, self._max_lease_s), self._min_lease_s)", "min(longest_s, self._max_lease_s)"
         ),
-        Mutant("granted = not math.isnan(longest_s) and lease", "granted = lease"),
+        Mutant(
+            "granted = not math.isnan(longest_s) and lease",
+            "granted = lease",
+            equal="NaN passes through min and max as their first argument, and is not as long as a step",
+        ),
         Mutant(
             "self._until_s = now + lease if granted else -math.inf",
             "self._until_s = now + lease if granted else self._until_s",
