@@ -65,7 +65,7 @@ LEASE = Room(
 
 LEASE_EXPIRY = Room(
     "wrappers/lease_expiry.py",
-    ("tests/wrappers/test_lease_expiry.py",),
+    ("tests/wrappers/test_lease_expiry.py", "tests/wrappers/test_authority_stack.py"),
     (
         Mutant("refused |= not self._grant(now)", "self._grant(now)"),
         Mutant(
