@@ -3,7 +3,7 @@ BIN := .venv/bin
 # One BLAS thread: the matrices are tiny and the runs are parallel processes.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test test-library test-slow fuzz lint check bench figures docs clean
+.PHONY: demo test test-library test-slow mutants fuzz lint check bench figures docs clean
 
 # Tests draw nothing; the demo tries which GL can.
 test test-library test-slow fuzz: export MUJOCO_GL ?= disabled
@@ -30,6 +30,10 @@ test-library:
 
 test-slow: .venv/installed
 	$(BIN)/python -m pytest -n 2 -m slow
+
+# Small mistakes in the filter, the backups, leases and the handover, one at a time in a copy: do the tests notice them?
+mutants: .venv/installed
+	$(BIN)/python -m benchmarks.mutants
 
 # Property tests with random examples, again and again until the time is up, once at least; what fails becomes an
 # explicit example of its test. What is neither passed nor failed (interrupted, not collected) ends it at once.

@@ -10,6 +10,7 @@ import pytest
 from asking import Asked
 
 import safe_wrappers as sw
+from safe_wrappers.constraints.backup.detour import Detour
 from safe_wrappers.errors import ConfigurationError, UnsafeStateWarning, UnsupportedEnvError
 from safe_wrappers.serialize import constraint_from, plain_data
 
@@ -170,6 +171,47 @@ def test_a_detour_leads_around():
             env.step(np.clip(0.02 * np.array([1 + 2 * bearing, 1 - 2 * bearing]), 0, 1).astype(np.float32))
         reached[detour] = env.unwrapped.agent_position[0]
     assert reached[False] < 0.62 and reached[True] > 1.2
+
+
+def test_less_of_the_same_and_none_are_tried_for_a_refused_control():
+    _, constraint, plant = bound([[0.28, 0.02]])
+    np.testing.assert_array_equal(constraint.candidates(FULL), [0.5 * plant.acting_range[1], NONE])
+
+
+def test_from_inside_the_best_way_out_is_admitted_and_the_way_in_is_not():
+    _, constraint, _ = bound([[0.12, 0.05]])
+    (out,) = constraint.candidates(FULL)
+    assert constraint.admits(out) and constraint.admits(0.99 * out)
+    assert not constraint.admits(-out) and not constraint.admits(NONE)
+    assert constraint.slack(out) > constraint.value()
+
+
+def test_the_slack_is_the_least_on_the_way_and_not_what_is_left_at_its_end():
+    _, constraint, _ = bound([[0.25, 0.0]])
+    assert constraint.slack(BACK) <= constraint.value() + 1e-6
+    assert constraint.slack(FULL) < constraint.value()
+
+
+def test_a_detour_keeps_its_side_for_25_steps_after_it_was_last_needed():
+    _, constraint, _ = bound([[0.28, 0.02]], detour=True)
+    limit = constraint.bound
+
+    def turns(memory):
+        """The first way around: which way it turns."""
+        limit.observe(memory)
+        first, second = limit.candidates(FULL)[0]
+        return float(np.sign(first - second))
+
+    first_turns = {memory.side: turns(memory) for memory in (Detour(1.0, 2), Detour(-1.0, 2))}
+    assert first_turns[1.0] == -first_turns[-1.0] != 0.0  # what is being made goes on
+    assert turns(Detour()) == first_turns[-1.0]  # what is on the left is passed on the right
+    assert (
+        turns(Detour(1.0, 1)) == first_turns[-1.0]
+    )  # so is it when the other side has not been needed for long
+    assert limit.executed(FULL) == Detour(-1.0, 25)
+    limit.observe(Detour(-1.0, 25))  # not needed in this step
+    assert limit.executed(FULL) == Detour(-1.0, 24)
+    assert limit.start() == Detour(0.0, 0)
 
 
 def test_plain_data_rebuilds_it():

@@ -191,6 +191,52 @@ def test_discs_that_move_go_straight_on_and_standing_ones_stay():
         met(sw.Discs("balls", 0.3))  # a ball that stands somewhere in the air
 
 
+def test_what_rolls_towards_it_leaves_less_than_what_rolls_away():
+    class Rolling(gym.Wrapper):
+        discs, velocities = np.array([[0.0, 0.0]]), np.array([[0.0, 0.0]])
+
+    left = {}
+    for speed in (-1.0, 0.0, 1.0):
+        env = Rolling(gym.make("OccludedCrossing-v0"))
+        env.velocities = np.array([[0.0, speed]])
+        raw, plant, clearance = bound([sw.Discs("discs", 0.3, velocity_attribute="velocities")], env=env)
+        anew(raw, plant, clearance, np.array([0, -1.0, 0, 9, 9, 9, 9, 9, 9]), np.zeros(9))
+        left[speed] = clearance.slack(np.zeros(3))
+    assert left[-1.0] < left[0.0] - 0.05 and left[-1.0] < left[1.0] - 0.05
+
+
+def test_the_way_that_is_open_is_remembered_and_gets_shorter():
+    raw, plant, clearance = bound([TRUE_CARS, PILLARS])
+    several = 0
+    for qpos, qvel, _ in random_states(40, seed=3):
+        led = []
+        controls = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+        for control in controls:  # asked about alone
+            anew(raw, plant, clearance, qpos, qvel)
+            clearance.slack(control)
+            led.append(clearance.bound.executed(control))
+        anew(raw, plant, clearance, qpos, qvel)
+        for control in controls:
+            clearance.slack(control)
+        assert [clearance.bound.executed(control) for control in controls] == led
+        several += len(set(led)) > 1
+    assert several > 3
+    clearance.bound.observe(7)
+    assert {6, 7} <= set(clearance.bound._open.tolist())
+    clearance.bound.observe(1)  # one hold to go: braking is what follows
+    assert 0 in clearance.bound._open
+
+
+def test_deep_outside_a_fast_way_back_is_admitted():
+    raw, plant, clearance = bound([sw.Plane([0.0, 0.0], [0.0, -1.0])])
+    qvel = np.zeros(9)
+    qvel[1] = -1.0  # 2 cm inside the wall, and leaving it
+    anew(raw, plant, clearance, np.array([0, 0.02 - RADIUS, 0, 9, 9, 9, 9, 9, 9]), qvel)
+    assert clearance.value().min() == pytest.approx(-0.02)
+    assert clearance.admits(np.array([0.0, -1.0, 0.0]))
+    assert clearance.slack(np.array([0.0, 1.0, 0.0])) < clearance.slack(np.array([0.0, -1.0, 0.0]))
+
+
 def test_walls_alone_and_cars_alone():
     wall = sw.Plane([0.0, 0.0], [0.0, -1.0])
     raw, plant, clearance = bound([wall])

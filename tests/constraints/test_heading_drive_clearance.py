@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
+from safe_wrappers.constraints.backup.detour import Detour
 
 LAYOUT = {"agent": [0.0, 0.0, 0.0], "goal": [1.2, 1.2], "hazards": [[0.6, 0.0]], "vases": []}
 
@@ -51,6 +52,40 @@ def test_a_disc_ahead_on_the_left_is_passed_on_the_right(beside, side):
     around, turn_only = limit.candidates(np.array([1.0, 0.1]))
     np.testing.assert_array_equal(around, [1.0, side])
     np.testing.assert_array_equal(turn_only, [0.0, side])
+
+
+def test_a_detour_keeps_its_side_for_fifty_steps_after_it_was_last_needed():
+    env = filtered({"hazards": [[0.26, 0.05]]}, detour=True)
+    (limit,) = env.filter.bound
+    drive = np.array([1.0, 0.1])
+
+    def side(memory):
+        limit.observe(memory)
+        return limit.candidates(drive)[0][1]
+
+    assert side(Detour()) == -1.0  # on the left: passed on the right
+    assert side(Detour(1.0, 2)) == 1.0  # but a detour on the left goes on
+    assert limit.executed(drive) == Detour(1.0, 50)
+    assert side(Detour(1.0, 1)) == -1.0  # until it has not been needed for long
+    assert limit.executed(drive) == Detour(-1.0, 50)
+    limit.observe(Detour(-1.0, 50))  # not needed in this step
+    assert limit.executed(drive) == Detour(-1.0, 49)
+    assert limit.start() == Detour(0.0, 0)
+
+
+def test_a_position_that_is_no_number_leaves_no_clearance_that_is_one():
+    env = filtered()
+    env.unwrapped._hazards[:] = np.nan
+    env.filter.observe()
+    assert np.isnan(env.filter.bound[0].value()).all()
+
+
+def test_without_brakes_the_backup_rolls_out():
+    backups = [
+        filtered({"hazards": [[9.0, 9.0]]}, (1.0, 0.0, 0.0), brake=brake).filter.bound[0].backup()
+        for brake in (True, False)
+    ]
+    assert backups[0][0] < 0.0 and backups[1].tolist() == [0.0, 0.0]
 
 
 def test_no_detour_without_a_drive_or_without_a_disc_ahead():

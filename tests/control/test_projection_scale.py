@@ -128,6 +128,22 @@ def test_entries_of_very_different_size_in_one_row():
     np.testing.assert_allclose(answer.control, [-0.1, 0.0065, exact], rtol=1e-9)
 
 
+def test_what_rounding_leaves_of_one_row_is_taken_up_by_what_can_still_move():
+    u, slope = np.array([0.01172586897845124, -618.5426038380589]), np.array([[846.8203579383486, -0.00035567]])
+    upper = np.array([0.023554409701342264, 1020.4451077247508])
+    answer = project(u, slope, [-19.95259653062522], -upper, upper)
+    assert answer.status == "projected"
+    assert answer.violation <= 1e-9 * 0.00035567 * 1020.0
+    assert answer.control[0] == -upper[0] and -upper[1] < answer.control[1] < upper[1]
+
+
+def test_rows_are_kept_as_closely_as_answers_are():
+    row, bound = np.array([[2.0, 0.0]]), np.array([0.0])
+    for beyond, kept in ((9e-9, True), (1.1e-8, False)):  # of a box that is 2 wide
+        control = np.array([beyond, 0.5])
+        assert keeps_rows(control, row, bound, -np.ones(2), np.ones(2)) == kept
+
+
 # Thin feasible sets -------------------------------------------------------------------------------------------
 
 
@@ -183,3 +199,13 @@ def test_box_least_squares_in_any_unit(n, more, seed, scale):
     ours = box_least_squares(a, b * scale, low * scale, high * scale) / scale
     truth = lsq_linear(a, b, (low, high), tol=1e-12).x
     assert np.linalg.norm(a @ ours - b) <= np.linalg.norm(a @ truth - b) + 1e-6
+
+
+@pytest.mark.parametrize("angle", [1e-3, 1e-5, 1e-7])
+def test_the_multipliers_of_a_thin_wedge_lead_to_its_apex(angle):
+    normals = np.array([[1.0, 0.0], [-math.cos(angle), -math.sin(angle)]])
+    u, tip = np.array([0.3, -0.4]), np.array([0.2, -0.1])
+    answer = project(u, normals, normals @ tip, -np.ones(2), np.ones(2))
+    assert answer.status == "projected"
+    np.testing.assert_allclose(answer.control, u - answer.multipliers @ normals, atol=1e-6)
+    np.testing.assert_allclose(answer.control, tip, atol=1e-6)

@@ -191,3 +191,9 @@ def test_penalties_for_not_seeing_explain_a_chunk_s_reward_and_no_expiry_inside_
         lost += int((expired & ~last[-1]["occlusion/expired"]).sum())
         assert info["occlusion/visible"].tolist() == last[-1]["occlusion/visible"].tolist()
     assert lost > 0, "a last step alone would have lost some"
+
+
+def test_the_zero_moment_points_margin_is_of_steps_that_have_one():
+    inside = {"balance/zmp_margin": 0.2, "balance/supported": 1.0}
+    airborne = {"balance/zmp_margin": 0.0, "balance/supported": 0.0}
+    assert macro_info([airborne, dict(inside)])["balance/zmp_margin"] == 0.2

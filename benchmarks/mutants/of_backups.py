@@ -1,0 +1,142 @@
+"""Mutants of the four clearances that have a backup manoeuvre."""
+
+from benchmarks.mutants.room import Mutant, Room
+
+_FORGOTTEN = "Detour(memory.side, memory.steps - 1)"
+
+HEADING_DRIVE = Room(
+    "constraints/backup/heading_drive_clearance.py",
+    ("tests/constraints/test_heading_drive_clearance.py", "tests/wrappers/test_closed_loop_point_goal.py"),
+    (
+        Mutant(_FORGOTTEN, "Detour()"),
+        Mutant(_FORGOTTEN, "memory"),
+        Mutant("_DETOUR_MEMORY = 50", "_DETOUR_MEMORY = 0"),
+        Mutant("beside * (x - m.x) <= 0.0 else -1.0", "beside * (x - m.x) > 0.0 else -1.0"),
+        Mutant("if self._detour.steps <= 0:", "if True:"),
+        Mutant("        if not in_front:\n            return []", "        if False:\n            return []"),
+        Mutant("return min(target, self._clearance(backup, disc))", "return target"),
+        Mutant("_DECAY_PER_HOLD = 0.5", "_DECAY_PER_HOLD = 2.0"),
+        Mutant("self._models = drive.corners()", "self._models = [drive]"),
+        Mutant("drive = max((drive, full, -full), key=lambda d: self._least_after(d))", "pass"),
+        Mutant("0.25 * self._needed_outside(backup) + 0.75 * self._least", "self._least"),
+        Mutant("path.end_distance(x, y) - self._swivel) - room", "path.end_distance(x, y)) - room"),
+        Mutant("        bounds.sort()\n", ""),
+        Mutant("best = best if bound == bound else math.nan", "pass"),
+        Mutant("bound < cutoff] if best < cutoff else []", "bound < 0.5 * cutoff] if best < cutoff else []"),
+        Mutant("normal[k], normal[t] = -by_drive, -by_turn", "normal[k], normal[t] = -by_drive, by_turn"),
+        Mutant(
+            "braking = self.drive.brake_control(ahead) if self.spec.brake else 0.0",
+            "braking = self.drive.brake_control(ahead)",
+        ),
+    ),
+)
+
+COASTING = Room(
+    "constraints/backup/coasting_clearance.py",
+    ("tests/constraints/test_coasting_clearance.py", "tests/wrappers/test_closed_loop_car_goal.py"),
+    (
+        Mutant(_FORGOTTEN, "Detour()"),
+        Mutant(_FORGOTTEN, "memory"),
+        Mutant("_DETOUR_MEMORY = 25", "_DETOUR_MEMORY = 0"),
+        Mutant("side = -1.0 if way[0] * y", "side = 1.0 if way[0] * y"),
+        Mutant("pairs if outer_is_first else pairs[:, ::-1]", "pairs"),
+        Mutant("if after.least >= self.spec.margin:", "if after.least >= 0.0:"),
+        Mutant("least if course.rests else -math.inf", "least"),
+        Mutant("if fallen > self._within + _SAME_M:", "if False:"),
+        Mutant("[*around, 0.5 * acting, self._still]", "around"),
+        Mutant("return rest.least < self.spec.margin and kept", "return kept"),
+        Mutant("return rest.least < self.spec.margin and kept", "return False"),
+        Mutant("            return rest.least >= 0.0", "            return True"),
+        Mutant("(np.abs(seen - self._seen) <= _STILL).all()", "True"),
+        Mutant("best = max(self._after(drive).end", "best = min(self._after(drive).end"),
+        Mutant("_RECOVERED = 0.5", "_RECOVERED = 1.1"),
+        Mutant("sorted(self._drives(), key=lambda u: -self._after(u).end)[:1]", "self._drives()[:1]"),
+        Mutant("close = now < room", "close = now < 0.5 * room"),
+        Mutant("offsets[..., 1] * x - offsets[..., 0] * y", "offsets[..., 1] * x + offsets[..., 0] * y"),
+        Mutant(
+            "np.minimum(np.maximum(control, self._low), self._high) + 0.0",
+            "np.minimum(np.maximum(control, self._low), self._high)",
+            equal="minus zero is forecast once more, with the same outcome; only the cache is larger",
+        ),
+        Mutant("return after.end if self._least < 0.0 else after.least", "return after.end"),
+    ),
+)
+
+ESCAPE = Room(
+    "constraints/backup/escape_clearance.py",
+    ("tests/constraints/test_escape_clearance.py", "tests/wrappers/test_closed_loop_occlusion.py"),
+    (
+        Mutant("shorter = going_on - 1 if", "shorter = going_on if"),
+        Mutant("        if going_on is not None:", "        if False:"),
+        Mutant(
+            "self._wanted = self.spec.margin + outside * np.exp(-times[1:] / _RECOVERY_S)",
+            "self._wanted = self.spec.margin + 0.0 * times[1:]",
+        ),
+        Mutant("if -self.spec.margin < self._best < 0.0 else 0.0", "if self._best < 0.0 else 0.0"),
+        Mutant("if -self.spec.margin < self._best < 0.0 else 0.0", "if False else 0.0"),
+        Mutant("firsts[0 if left[0] >= 0.0 else int(left.argmax())]", "firsts[0]"),
+        Mutant(
+            "moved = centers + late[:, None, None] * velocity",
+            "moved = centers + 0.0 * late[:, None, None] * velocity",
+        ),
+        Mutant("_nearest_first(np.concatenate([good, closer]), asked)", "np.concatenate([good, closer])"),
+        Mutant("            closer = closer[self._slacks(closer).max(axis=1) >= 0.0]\n", ""),
+        Mutant(
+            "np.concatenate([*radii, np.zeros(0)]) + self.spec.radius",
+            "np.concatenate([*radii, np.zeros(0)])",
+        ),
+        Mutant("    np.maximum(along, 0.0, out=along)\n", ""),
+        Mutant(
+            "times = self.plant.hold_s * np.concatenate([[0.0], 1.0 + self._escapes.instants])",
+            "times = self.plant.hold_s * np.concatenate([[0.0], self._escapes.instants])",
+        ),
+        Mutant(
+            "((led_to - velocity) ** 2).sum(axis=1).argmin()",
+            "((led_to - velocity) ** 2).sum(axis=1).argmax()",
+        ),
+        Mutant(
+            "if now - reach <= self.spec.radius + self.spec.margin:",
+            "if now <= self.spec.radius + self.spec.margin:",
+        ),
+        Mutant("gap - self.spec.radius, out=nearest", "gap, out=nearest"),
+        Mutant("_GOING_S = (0.3, 0.8)", "_GOING_S = (0.3,)"),
+        Mutant(
+            "return left - self._needed() if left == left else -np.inf",
+            "return left if left == left else -np.inf",
+        ),
+    ),
+)
+
+WALL = Room(
+    "constraints/backup/wall_clearance.py",
+    ("tests/constraints/test_wall_clearance.py",),
+    (
+        Mutant("return self._left_after(control) >= self._recovery() - _NOISE_M", "return True"),
+        Mutant("min(0.0, self._least) - _NOISE_M", "0.0"),
+        Mutant("if across >= along:", "if across < along:"),
+        Mutant("_TURNS = 4", "_TURNS = 0"),
+        Mutant("self._needed = min(target, self._left_after(self._backup()))", "self._needed = target"),
+        Mutant("math.sqrt(max(room**2 - other**2, 0.0))", "room"),
+        Mutant("        found.sort(key=lambda c: math.dist(c, asked))\n", ""),
+        Mutant("for axes in ((0, 1), (1, 0))]", "for axes in ((0, 1),)]"),
+        Mutant(
+            "share = min(1.0, room / math.hypot(*gap)) if corner else 0.0", "share = 0.5 if corner else 0.0"
+        ),
+        Mutant("offsets.append(max(sign * limit, sign * backup[axis]))", "offsets.append(sign * limit)"),
+        Mutant(
+            "return max(constants.low, min(constants.control_to_rest_at(x, v, target), constants.high))",
+            "return constants.control_to_rest_at(x, v, target)",
+        ),
+        Mutant("self._room = reach + self.spec.margin", "self._room = reach"),
+        Mutant(
+            "target = wall[2 * axis] - gap if before else wall[2 * axis + 1] + gap",
+            "target = wall[2 * axis] - gap",
+        ),
+        Mutant("self._motion = self._among.clipped(motion)", "self._motion = motion"),
+        Mutant("self._least = math.nan", "self._least = 0.0"),
+        Mutant(
+            "low, high = (middle, high) if self._admitted(at(middle), _HAIR_M) else (low, middle)",
+            "low = middle",
+        ),
+    ),
+)

@@ -1,0 +1,21 @@
+"""All rooms, by name."""
+
+from benchmarks.mutants.of_backups import COASTING, ESCAPE, HEADING_DRIVE, WALL
+from benchmarks.mutants.of_projection import PROJECTION
+from benchmarks.mutants.of_search import ROLLOUT, SEARCH
+from benchmarks.mutants.of_wrappers import CHUNK_HANDOVER, HANDOVER, LEASE, LEASE_EXPIRY
+from benchmarks.mutants.room import Room
+
+ROOMS: dict[str, Room] = {
+    "search": SEARCH,
+    "projection": PROJECTION,
+    "rollout": ROLLOUT,
+    "heading drive": HEADING_DRIVE,
+    "coasting": COASTING,
+    "escape": ESCAPE,
+    "wall": WALL,
+    "lease": LEASE,
+    "lease expiry": LEASE_EXPIRY,
+    "handover": HANDOVER,
+    "chunk handover": CHUNK_HANDOVER,
+}
