@@ -66,11 +66,11 @@ class Arm:
             gym.register_envs(gymnasium_robotics)
         return gym.make(self.env_id, max_episode_steps=10**9, disable_env_checker=True)
 
-    def margin(self, **more: Any) -> sw.SingularityMargin:
+    def margin(self, **more: Any) -> sw.constraints.SingularityMargin:
         """The constraint, its threshold validated when it is bound."""
         named = {self.kind: self.frame, "joints": list(self.joints), **self.task}
         chosen = {"task_speed": self.task_speed, "rate_limit": self.rate_limit, "holds": self.holds}
-        return sw.SingularityMargin(**(named | chosen | more))
+        return sw.constraints.SingularityMargin(**(named | chosen | more))
 
 
 ARMS = {

@@ -23,15 +23,15 @@ def reserve(env: sw.CBFActionFilter) -> str:
 
 def _phrase(constraint: Any) -> str:
     match constraint:
-        case sw.JointSpeedLimit():
+        case sw.constraints.JointSpeedLimit():
             return f"joint speeds below {constraint.limit:g} rad/s"
-        case sw.JointPositionLimit():
+        case sw.constraints.JointPositionLimit():
             where = ", ".join(constraint.joints or ["driven joints"])
             return f"{where} between {constraint.lower} and {constraint.upper}"
-        case sw.SpeedLimit():
+        case sw.constraints.SpeedLimit():
             point = constraint.body or "centre of mass"
             return f"speed of the {point} ({constraint.direction}) below {constraint.limit:g} m/s"
-        case sw.Workspace():
+        case sw.constraints.Workspace():
             parts = []
             if constraint.low is not None or constraint.high is not None:
                 parts.append(f"inside {_numbers(constraint.low)} to {_numbers(constraint.high)} m")
@@ -39,23 +39,27 @@ def _phrase(constraint: Any) -> str:
                 room = f"{constraint.radius:g} m " if constraint.radius else ""
                 parts.append(f"{room}clear of {_obstacles(constraint.keep_out)}")
             return f"{_points(constraint)} {' and '.join(parts)}"
-        case sw.Clearance():
+        case sw.constraints.Clearance():
             return f"{_points(constraint)} clear of {_obstacles(constraint.obstacles)}, with room to brake"
-        case sw.HeadingDriveClearance():
+        case sw.constraints.HeadingDriveClearance():
             return f"stopping path clear of {_obstacles(constraint.obstacles)}"
-        case sw.CoastingClearance():
+        case sw.constraints.CoastingClearance():
             parts = []
             if constraint.keep_out:
                 parts.append(f"centre clear of {_obstacles(constraint.keep_out)}")
             if constraint.untouched:
                 parts.append(f"outline clear of {_obstacles(constraint.untouched)}")
             return f"on all the way to rest, {' and '.join(parts)}"
-        case sw.EscapeClearance():
-            moving = [o for o in constraint.obstacles if isinstance(o, sw.TrackedDiscs | sw.Discs)]
+        case sw.constraints.EscapeClearance():
+            moving = [
+                o
+                for o in constraint.obstacles
+                if isinstance(o, sw.constraints.TrackedDiscs | sw.constraints.Discs)
+            ]
             return f"a way out clear of {_obstacles(moving)}"
-        case sw.WallClearance():
+        case sw.constraints.WallClearance():
             return "braking path clear of the walls"
-        case sw.Traction():
+        case sw.constraints.Traction():
             return f"slip of {len(constraint.wheels)} wheels within {constraint.max_slip:g}"
     return type(constraint).__name__
 
@@ -63,11 +67,11 @@ def _phrase(constraint: Any) -> str:
 def _margin(constraint: Any) -> str:
     margin = float(getattr(constraint, "margin", 0.0))
     match constraint:
-        case sw.JointSpeedLimit():
+        case sw.constraints.JointSpeedLimit():
             return f"{margin:g} rad/s"
-        case sw.SpeedLimit():
+        case sw.constraints.SpeedLimit():
             return f"{margin:g} m/s"
-        case sw.Traction():
+        case sw.constraints.Traction():
             return f"{margin:g}"
     return f"{1e3 * margin:g} mm"
 
@@ -93,12 +97,12 @@ def _obstacles(obstacles: Any) -> str:
 
 def _obstacle(obstacle: Any) -> str:
     match obstacle:
-        case sw.Discs():
+        case sw.constraints.Discs():
             return f"{obstacle.attribute} ({obstacle.radius:g} m)"
-        case sw.TrackedDiscs():
+        case sw.constraints.TrackedDiscs():
             return f"{obstacle.attribute} ({obstacle.radius:g} m and {obstacle.sigmas:g} sigma)"
-        case sw.Disc():
+        case sw.constraints.Disc():
             return f"a disc of {obstacle.radius:g} m at {_numbers(obstacle.center)} m"
-        case sw.Plane():
+        case sw.constraints.Plane():
             return f"the end at {_numbers(obstacle.point).strip('()')} m"
     return f"a {type(obstacle).__name__.lower()}"

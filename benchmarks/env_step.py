@@ -47,7 +47,7 @@ def slower(limit: float) -> Filter:
 
     def protect(env: gym.Env[Any, Any]) -> sw.CBFActionFilter:
         (speed,) = sw.protect(env).constraints
-        assert isinstance(speed, sw.SpeedLimit)
+        assert isinstance(speed, sw.constraints.SpeedLimit)
         return sw.CBFActionFilter(env, [dataclasses.replace(speed, limit=limit)])
 
     return protect

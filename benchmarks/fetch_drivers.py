@@ -114,10 +114,10 @@ def margin_reading(ball: bool) -> Maker:
     return make
 
 
-def obstacles(env: Any) -> list[sw.Sphere]:
+def obstacles(env: Any) -> list[sw.constraints.Sphere]:
     """The ball, as the filter is told of it."""
     centre, radius = ball_of(env)
-    return [sw.Sphere(centre.tolist(), radius)]
+    return [sw.constraints.Sphere(centre.tolist(), radius)]
 
 
 def drivers(ball: bool) -> dict[str, Maker]:

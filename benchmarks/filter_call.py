@@ -67,7 +67,7 @@ def main() -> None:
     plant = sw.AnalyticPlant(
         f=lambda x: np.array([x[1], 0.0]), g=lambda x: effect, state=lambda e: e.x, hold_s=0.02
     )
-    barrier = sw.Barrier(
+    barrier = sw.constraints.Barrier(
         lambda x: WALL - x[0] - x[1] ** 2 / (2.0 * BRAKE),
         gradient=lambda x: np.array([-1.0, -x[1] / BRAKE]),
         alpha=ALPHA,

@@ -89,11 +89,14 @@ def _stance() -> gym.Env[Any, Any]:
 
 
 def _teleop() -> gym.Env[Any, Any]:
-    link = sw.Link(delay_s=0.02, jitter_s=0.004, loss=0.05)
-    clamp = sw.Clearance(
-        [sw.Plane([0.0, CLAMP_Y], [0.0, -1.0])], TELEOP_BRAKING, bodies=["tool"], radius=TOOL_RADIUS
+    link = sw.teleop.Link(delay_s=0.02, jitter_s=0.004, loss=0.05)
+    clamp = sw.constraints.Clearance(
+        [sw.constraints.Plane([0.0, CLAMP_Y], [0.0, -1.0])],
+        TELEOP_BRAKING,
+        bodies=["tool"],
+        radius=TOOL_RADIUS,
     )
-    ceiling = sw.RoundTripCeiling(
+    ceiling = sw.teleop.RoundTripCeiling(
         sw.StoppingBudget(clamp, acceleration=TELEOP_ACCELERATION, top_speed=TELEOP_TOP_SPEED)
     )
     env = gym.make("TeleopContact-v0")
@@ -101,19 +104,23 @@ def _teleop() -> gym.Env[Any, Any]:
 
 
 def _lease_alone() -> gym.Env[Any, Any]:
-    rail = sw.Clearance([sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])], bodies=["cart"], braking=8.0)
+    rail = sw.constraints.Clearance(
+        [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])], bodies=["cart"], braking=8.0
+    )
     env = sw.LeaseExpiry(
         gym.make("InvertedPendulum-v5"), sw.StoppingBudget(rail, acceleration=20.0), max_lease_s=0.12
     )
     return Outages(sw.RecordInterventions(env), 0.12, 0.3)
 
 
-_POINT = sw.HeadingDriveClearance([sw.Discs("hazard_positions", radius=0.2)], margin=0.004)
+_POINT = sw.constraints.HeadingDriveClearance(
+    [sw.constraints.Discs("hazard_positions", radius=0.2)], margin=0.004
+)
 _STACKS: dict[str, Make] = {
     "SafePointGoal1, late commands": _late_commands("SafePointGoal1-v0", _POINT, 40.0, closing_speed=4.0),
     "Reacher, late commands": _late_commands(
         "Reacher-v5",
-        sw.JointPositionLimit(-1.5, 1.5, ["joint1"]),
+        sw.constraints.JointPositionLimit(-1.5, 1.5, ["joint1"]),
         40.0,
         closing_speed=10.0,
     ),

@@ -211,7 +211,7 @@ def env_of(kind: Machine, limited: bool) -> Any:
     env = ArmAndWall(kind.stiffness, kind.payload)
     if not limited:
         return env
-    limit = sw.ImpactSpeedLimit(
+    limit = sw.constraints.ImpactSpeedLimit(
         ["fingertip"],
         ["wall"],
         force_limit=kind.force,

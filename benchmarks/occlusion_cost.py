@@ -32,7 +32,7 @@ def make(count: int) -> sw.OcclusionPenalty:
     """The crossing with so many points over the road tracked instead of its cars."""
     env = gym.make(ENV_ID)
     env.unwrapped.points = spread(count)  # type: ignore[attr-defined]
-    track = sw.Track(published="points", acceleration_noise=0.0225, reversion_s=2.0)
+    track = sw.occlusion.Track(published="points", acceleration_noise=0.0225, reversion_s=2.0)
     return sw.OcclusionPenalty(
         env, [track], CROSSING["sensor"] | {"view_deg": 360}, tolerance=0.5, weight=0.05
     )

@@ -208,7 +208,7 @@ DRIVERS: dict[str, Callable[[Maze, np.random.Generator], Driver]] = {
 FILTERS: dict[str, Callable[[Any], Any]] = {
     "off": lambda env: env,
     "protect": sw.protect,
-    "clip not known": lambda env: sw.CBFActionFilter(env, [sw.WallClearance()]),
+    "clip not known": lambda env: sw.CBFActionFilter(env, [sw.constraints.WallClearance()]),
 }
 
 

@@ -180,7 +180,7 @@ class PathJob:
 
 def constraints(arm: Arm, mode: str) -> list[Any]:
     """Of a mode."""
-    speeds = sw.JointSpeedLimit(arm.rate_limit, list(arm.joints), margin=0.01 * arm.rate_limit)
+    speeds = sw.constraints.JointSpeedLimit(arm.rate_limit, list(arm.joints), margin=0.01 * arm.rate_limit)
     chosen = {"speeds": [speeds], "margin": [arm.margin()], "both": [speeds, arm.margin()]}
     return chosen.get(mode, [])
 
@@ -323,7 +323,7 @@ def attack(job: AttackJob) -> dict[str, Any]:
     threshold = sw.CBFActionFilter(arm.make(), [arm.margin()]).constraints[0].validated.threshold
     if job.filtered:
         # From full speed Reacher's arm takes longer to brake than any sensible look-ahead.
-        speeds = [sw.JointSpeedLimit(10.0, margin=0.1)] if job.arm == "Reacher" else []
+        speeds = [sw.constraints.JointSpeedLimit(10.0, margin=0.1)] if job.arm == "Reacher" else []
         env = sw.CBFActionFilter(env, [*speeds, arm.margin()])
     attacker = Attacker(job, truth, env)
     count = dict.fromkeys(("changed", "infeasible", "unsafe", "below", "unflagged"), 0)

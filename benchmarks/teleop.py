@@ -79,12 +79,12 @@ class Job:
     steps: int = 6000
 
 
-def link(network: str, delay_s: float) -> sw.Link:
+def link(network: str, delay_s: float) -> sw.teleop.Link:
     """One direction."""
     if network == "steady":
-        return sw.Link(delay_s)
+        return sw.teleop.Link(delay_s)
     silent = (OUTAGE_BETWEEN_S, OUTAGE_LENGTH_S) if network == "outages" else (None, None)
-    return sw.Link(delay_s, JITTER * delay_s, LOSS, False, *silent)
+    return sw.teleop.Link(delay_s, JITTER * delay_s, LOSS, False, *silent)
 
 
 def reading(env: gym.Env[Any, Any]) -> tuple[list[float], list[float]]:
@@ -95,7 +95,7 @@ def reading(env: gym.Env[Any, Any]) -> tuple[list[float], list[float]]:
 
 def channel(job: Job) -> sw.TeleopChannel:
     """The env behind its channel."""
-    ceiling = sw.RoundTripCeiling(
+    ceiling = sw.teleop.RoundTripCeiling(
         sw.StoppingBudget(
             reading, braking=TELEOP_BRAKING, acceleration=TELEOP_ACCELERATION, top_speed=TELEOP_TOP_SPEED
         )

@@ -214,10 +214,10 @@ def ask_programs(robot: str, policy: Callable[[Any], Any], episodes: int, limit:
     env = gym.make(f"{robot}-v5", max_episode_steps=limit)
     plant = sw.MujocoPlant()
     plant.bind(env)
-    forecast = sw.ContactFeasibility(SHARE, TOLERANCE).bind(plant)
+    forecast = sw.constraints.ContactFeasibility(SHARE, TOLERANCE).bind(plant)
     programs = {
-        "pyramids": sw.Stance(SHARE, joint_tolerance=None).bind(plant),
-        "exact cones": sw.Stance(SHARE, cone="exact", joint_tolerance=None).bind(plant),
+        "pyramids": sw.constraints.Stance(SHARE, joint_tolerance=None).bind(plant),
+        "exact cones": sw.constraints.Stance(SHARE, cone="exact", joint_tolerance=None).bind(plant),
     }
     for episode in range(episodes):
         observation, _ = env.reset(seed=episode)

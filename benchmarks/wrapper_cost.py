@@ -19,7 +19,7 @@ from safe_wrappers.wrappers.faults import Outages
 
 Wrap = Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]
 
-RAIL = [sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])]
+RAIL = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
 SIZE, HORIZON, BATCH = 16, 8, 64
 
 
@@ -46,7 +46,7 @@ def bounded(blend: str) -> Wrap:
 
 def protected_lease(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
     """A lease from a Clearance, read from the MuJoCo model."""
-    clearance = sw.Clearance(RAIL, bodies=["cart"], braking=8.0)
+    clearance = sw.constraints.Clearance(RAIL, bodies=["cart"], braking=8.0)
     return sw.LeaseExpiry(env, sw.StoppingBudget(clearance, acceleration=1.0))
 
 

@@ -7,47 +7,19 @@ Importing registers the ids of our tasks and changes nothing else; it imports ne
 (`safe_wrappers.sb3` and `safe_wrappers.train` do).
 """
 
+import importlib as _importlib
 import warnings as _warnings
 from typing import Any as _Any
 
-from safe_wrappers import info as _info
-from safe_wrappers.constraints import (
-    Barrier,
-    Box,
-    Clearance,
-    CoastingClearance,
-    Constraint,
-    ContactFeasibility,
-    Disc,
-    Discs,
-    EscapeClearance,
-    HeadingDriveClearance,
-    ImpactSpeedLimit,
-    JointPositionLimit,
-    JointSpeedLimit,
-    Plane,
-    SingularityMargin,
-    SpeedLimit,
-    Sphere,
-    Stance,
-    SupportMargin,
-    TrackedDiscs,
-    TrackPermission,
-    Traction,
-    Upright,
-    WallClearance,
-    Workspace,
-)
+from safe_wrappers import constraints, plants
 from safe_wrappers.envs import register_envs as _register_envs
 from safe_wrappers.errors import SafeWrappersError, UnsafeStateWarning
-from safe_wrappers.filter.batch import BatchProjection, project_batch
-from safe_wrappers.filter.constraint import BoundConstraint, HalfSpaces
-from safe_wrappers.filter.projection import Projection, project
-from safe_wrappers.plants.analytic import AnalyticPlant
-from safe_wrappers.plants.displacement import DisplacementPlant
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
-from safe_wrappers.plants.plant import Plant
+from safe_wrappers.filter.batch import project_batch
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces
+from safe_wrappers.filter.projection import project
+from safe_wrappers.plants import AnalyticPlant, MujocoPlant, Plant
 from safe_wrappers.protect import protect
+from safe_wrappers.wrappers import faults, occlusion, teleop
 from safe_wrappers.wrappers.adaption_penalty import AdaptionPenalty
 from safe_wrappers.wrappers.balance_monitor import BalanceMonitor
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
@@ -56,14 +28,9 @@ from safe_wrappers.wrappers.contact_monitor import ContactMonitor
 from safe_wrappers.wrappers.cost_function import CostFunction
 from safe_wrappers.wrappers.lease.stopping_budget import StoppingBudget
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
-from safe_wrappers.wrappers.occlusion.sensor import Sensor
-from safe_wrappers.wrappers.occlusion.track import Track
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
 from safe_wrappers.wrappers.slip_limiter import SlipLimiter
-from safe_wrappers.wrappers.teleop.link import Link
-from safe_wrappers.wrappers.teleop.port import TeleopPort
-from safe_wrappers.wrappers.teleop.round_trip import RoundTripCeiling
 from safe_wrappers.wrappers.teleop_channel import TeleopChannel
 from safe_wrappers.wrappers.whole_body_filter import WholeBodyFilter
 
@@ -71,70 +38,57 @@ __all__ = [
     "AdaptionPenalty",
     "AnalyticPlant",
     "BalanceMonitor",
-    "Barrier",
-    "BatchProjection",
     "BoundConstraint",
-    "Box",
     "CBFActionFilter",
     "ChunkHandover",
-    "Clearance",
-    "CoastingClearance",
     "Constraint",
-    "ContactFeasibility",
     "ContactMonitor",
     "CostFunction",
-    "Disc",
-    "Discs",
-    "DisplacementPlant",
-    "EscapeClearance",
     "HalfSpaces",
-    "HeadingDriveClearance",
-    "ImpactSpeedLimit",
-    "JointPositionLimit",
-    "JointSpeedLimit",
     "LeaseExpiry",
-    "Link",
     "MujocoPlant",
     "OcclusionPenalty",
-    "Plane",
     "Plant",
-    "Projection",
     "RecordInterventions",
-    "RoundTripCeiling",
     "SafeWrappersError",
-    "Sensor",
-    "SingularityMargin",
     "SlipLimiter",
-    "SpeedLimit",
-    "Sphere",
-    "Stance",
     "StoppingBudget",
-    "SupportMargin",
     "TeleopChannel",
-    "TeleopPort",
-    "Track",
-    "TrackPermission",
-    "TrackedDiscs",
-    "Traction",
     "UnsafeStateWarning",
-    "Upright",
-    "WallClearance",
     "WholeBodyFilter",
-    "Workspace",
+    "constraints",
+    "faults",
+    "occlusion",
+    "plants",
     "project",
     "project_batch",
     "protect",
+    "teleop",
 ]
 
-_register_envs()
+_MOVED = {
+    **dict.fromkeys(constraints.__all__, "constraints"),
+    **dict.fromkeys(teleop.__all__, "wrappers.teleop"),
+    **dict.fromkeys(occlusion.__all__, "wrappers.occlusion"),
+    "DisplacementPlant": "plants",
+    "Projection": "filter.projection",
+}
+"""Names that were at the top once, and the module that has them."""
 
 
 def __getattr__(name: str) -> _Any:
+    """Old names, with a warning that says the new one."""
     if name == "interventions":
-        _warnings.warn(
-            "safe_wrappers.interventions is deprecated; write safe_wrappers.info",
-            DeprecationWarning,
-            stacklevel=2,
-        )
-        return _info
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        new, found = "info", _importlib.import_module("safe_wrappers.info")
+    elif name in _MOVED:
+        new = f"{_MOVED[name].removeprefix('wrappers.')}.{name}"
+        found = getattr(_importlib.import_module(f"safe_wrappers.{_MOVED[name]}"), name)
+    else:
+        raise AttributeError(f"module 'safe_wrappers' has no attribute {name!r}")
+    _warnings.warn(
+        f"safe_wrappers.{name} is deprecated; write safe_wrappers.{new}", DeprecationWarning, stacklevel=2
+    )
+    return found
+
+
+_register_envs()

@@ -79,7 +79,7 @@ def _by_hand(env: gym.Env[Any, Any]) -> str:
         f"by h(x){'' if named else ', and say with hold_s how long a step lasts, in s'}; then it is three lines:\n"
         "    import safe_wrappers as sw\n"
         f"    plant = sw.AnalyticPlant(f, g, state{'' if named else ', hold_s=hold_s'})\n"
-        "    env = sw.CBFActionFilter(env, [sw.Barrier(h)], plant=plant)"
+        "    env = sw.CBFActionFilter(env, [sw.constraints.Barrier(h)], plant=plant)"
     )
 
 
@@ -98,7 +98,7 @@ def _limiting_joints(env: gym.Env[Any, Any], model: mujoco.MjModel) -> str:
     return (
         "By hand it is three lines:\n"
         "    import safe_wrappers as sw\n"
-        f"    limit = sw.JointSpeedLimit(limit=4.0{joints})  # rad/s, m/s; or another constraint\n"
+        f"    limit = sw.constraints.JointSpeedLimit(limit=4.0{joints})  # rad/s, m/s; or another constraint\n"
         "    env = sw.CBFActionFilter(env, [limit])"
     )
 

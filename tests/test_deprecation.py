@@ -84,7 +84,9 @@ def test_what_is_no_parameter_is_an_error_as_ever():
 
 
 def rail():
-    return sw.Clearance([sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])], bodies=["cart"], braking=8.0)
+    return sw.constraints.Clearance(
+        [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])], bodies=["cart"], braking=8.0
+    )
 
 
 @pytest.mark.parametrize(
@@ -119,12 +121,12 @@ def test_a_least_lease_and_a_rate_limit_by_their_old_names():
 
 
 def test_a_ceiling_as_it_was_written_is_the_ceiling_of_today():
-    new = sw.RoundTripCeiling(
+    new = sw.teleop.RoundTripCeiling(
         sw.StoppingBudget(rail(), acceleration=55.0, top_speed=1.4, act_s=0.1), release=0.5
     )
     for old in (
-        lambda: sw.RoundTripCeiling(rail(), None, 55.0, 1.4, act_s=0.1, release=0.5),
-        lambda: sw.RoundTripCeiling(
+        lambda: sw.teleop.RoundTripCeiling(rail(), None, 55.0, 1.4, act_s=0.1, release=0.5),
+        lambda: sw.teleop.RoundTripCeiling(
             clearance=plain_data(rail()), acceleration=55.0, top_speed=1.4, act_s=0.1, release=0.5
         ),
     ):

@@ -21,28 +21,28 @@ from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsafeSta
 
 RUNNERS = ["HalfCheetah", "Hopper", "Walker2d", "Swimmer", "Ant", "Humanoid"]
 KNOWN = {
-    "SafePointGoal1-v0": [sw.HeadingDriveClearance],
-    "SafePointGoal2-v0": [sw.HeadingDriveClearance],
-    "SafeCarGoal1-v0": [sw.CoastingClearance],
-    "SafeCarGoal2-v0": [sw.CoastingClearance],
-    "InvertedPendulum-v5": [sw.Clearance],
-    "InvertedDoublePendulum-v5": [sw.Clearance, sw.JointPositionLimit],
-    "Reacher-v5": [sw.JointSpeedLimit],
-    "FlexJointReach-v0": [sw.JointSpeedLimit],
-    "Pusher-v5": [sw.JointSpeedLimit, sw.Workspace],
-    "HumanoidStandup-v5": [sw.JointSpeedLimit],
-    "SafeRover-v0": [sw.Traction],
-    "TeleopContact-v0": [sw.Clearance],
-    "OccludedCrossing-v0": [sw.EscapeClearance],
-    "PointMaze_UMaze-v3": [sw.WallClearance],
-    "PatrolledPointMaze-v0": [sw.WallClearance, sw.EscapeClearance],
-    "AntMaze_UMaze-v5": [sw.Workspace],
+    "SafePointGoal1-v0": [sw.constraints.HeadingDriveClearance],
+    "SafePointGoal2-v0": [sw.constraints.HeadingDriveClearance],
+    "SafeCarGoal1-v0": [sw.constraints.CoastingClearance],
+    "SafeCarGoal2-v0": [sw.constraints.CoastingClearance],
+    "InvertedPendulum-v5": [sw.constraints.Clearance],
+    "InvertedDoublePendulum-v5": [sw.constraints.Clearance, sw.constraints.JointPositionLimit],
+    "Reacher-v5": [sw.constraints.JointSpeedLimit],
+    "FlexJointReach-v0": [sw.constraints.JointSpeedLimit],
+    "Pusher-v5": [sw.constraints.JointSpeedLimit, sw.constraints.Workspace],
+    "HumanoidStandup-v5": [sw.constraints.JointSpeedLimit],
+    "SafeRover-v0": [sw.constraints.Traction],
+    "TeleopContact-v0": [sw.constraints.Clearance],
+    "OccludedCrossing-v0": [sw.constraints.EscapeClearance],
+    "PointMaze_UMaze-v3": [sw.constraints.WallClearance],
+    "PatrolledPointMaze-v0": [sw.constraints.WallClearance, sw.constraints.EscapeClearance],
+    "AntMaze_UMaze-v5": [sw.constraints.Workspace],
     **{
-        f"Fetch{task}-v4": [sw.Workspace, sw.Workspace]
+        f"Fetch{task}-v4": [sw.constraints.Workspace, sw.constraints.Workspace]
         for task in ("Reach", "Push", "Slide", "PickAndPlaceDense")
     },
-    **{f"{robot}-{version}": [sw.SpeedLimit] for robot in RUNNERS for version in ("v4", "v5")},
-    **{f"Safe{robot}Velocity-v0": [sw.SpeedLimit] for robot in RUNNERS},
+    **{f"{robot}-{version}": [sw.constraints.SpeedLimit] for robot in RUNNERS for version in ("v4", "v5")},
+    **{f"Safe{robot}Velocity-v0": [sw.constraints.SpeedLimit] for robot in RUNNERS},
 }
 TOUCHING = ("FetchPush", "FetchSlide")
 """Their own resets put the fingers 3 mm into the table."""
@@ -129,11 +129,11 @@ def test_the_version_does_not_matter(version):
         env = gym.make(f"Reacher-{version}")
     except Exception as missing:
         pytest.skip(f"this Gymnasium makes no Reacher-{version}: {missing}")
-    assert isinstance(sw.protect(env).constraints[0], sw.JointSpeedLimit)
+    assert isinstance(sw.protect(env).constraints[0], sw.constraints.JointSpeedLimit)
 
 
 def test_what_a_fetch_arm_keeps_can_be_chosen():
-    ball = sw.Sphere([1.4, 0.8, 0.6], 0.05)
+    ball = sw.constraints.Sphere([1.4, 0.8, 0.6], 0.05)
     box, clear = sw.protect(make("FetchReach-v4"), low=[1.2, None, 0.45], keep_out=[ball]).constraints
     assert box.low == [1.2, None, 0.45] and len(box.high) == 3
     assert len(clear.keep_out) == 2 and clear.keep_out[1] == ball
@@ -153,7 +153,9 @@ def test_the_fingers_are_inside_the_radius_that_the_recipe_gives_them():
 def test_a_namespace_does_not_matter():
     gym.register("lab/Reacher-v7", entry_point="gymnasium.envs.mujoco.reacher_v5:ReacherEnv")
     try:
-        assert isinstance(sw.protect(gym.make("lab/Reacher-v7")).constraints[0], sw.JointSpeedLimit)
+        assert isinstance(
+            sw.protect(gym.make("lab/Reacher-v7")).constraints[0], sw.constraints.JointSpeedLimit
+        )
     finally:
         gym.registry.pop("lab/Reacher-v7")
 
@@ -352,7 +354,10 @@ def test_envs_that_rescale_in_their_own_step_are_named_and_not_blamed_on_wrapper
     says = (
         rf"{env_id} rescales or limits actions in its own step; filters on such an env are not supported yet"
     )
-    for refused in (lambda: sw.protect(env), lambda: sw.CBFActionFilter(env, [sw.SpeedLimit(1.0)])):
+    for refused in (
+        lambda: sw.protect(env),
+        lambda: sw.CBFActionFilter(env, [sw.constraints.SpeedLimit(1.0)]),
+    ):
         with pytest.raises(UnsupportedEnvError, match=says) as caught:
             refused()
         assert "wrapper" not in str(caught.value)
@@ -360,7 +365,7 @@ def test_envs_that_rescale_in_their_own_step_are_named_and_not_blamed_on_wrapper
     hold_s = None if env.has_wrapper_attr("dt") else 0.1
     plant = sw.AnalyticPlant(np.zeros_like, lambda x: effect, lambda env: np.zeros(1), hold_s=hold_s)
     filtered = sw.CBFActionFilter(
-        env, [sw.Barrier(lambda x: 1.0 - x[0])], plant=plant
+        env, [sw.constraints.Barrier(lambda x: 1.0 - x[0])], plant=plant
     )  # what the message suggests
     filtered.reset(seed=0)
     filtered.step(env.action_space.sample())
@@ -368,7 +373,7 @@ def test_envs_that_rescale_in_their_own_step_are_named_and_not_blamed_on_wrapper
 
 def test_a_fetch_arm_with_the_wrong_plant_is_told_the_right_one():
     gym.register_envs(pytest.importorskip("gymnasium_robotics"))
-    limit = sw.Workspace([None, None, 0.3], [None, None, 1.0], sites=["robot0:grip"])
+    limit = sw.constraints.Workspace([None, None, 0.3], [None, None, 1.0], sites=["robot0:grip"])
     with pytest.raises(UnsupportedEnvError, match=r"take DisplacementPlant\(\), or leave plant out"):
         sw.CBFActionFilter(gym.make("FetchReach-v4"), [limit], plant=sw.MujocoPlant())
     sw.CBFActionFilter(gym.make("FetchReach-v4"), [limit], plant=sw.DisplacementPlant())

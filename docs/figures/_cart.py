@@ -66,9 +66,11 @@ def plant(env: Cart, delay_s: float = 0.0) -> sw.AnalyticPlant:
     )
 
 
-def wall(at: float, braking: float = 1.0, **more: Any) -> sw.Clearance:
+def wall(at: float, braking: float = 1.0, **more: Any) -> sw.constraints.Clearance:
     """Stay left of a wall."""
-    return sw.Clearance([sw.Plane([at], [-1.0])], braking=braking, position=[0], velocity=[1], **more)
+    return sw.constraints.Clearance(
+        [sw.constraints.Plane([at], [-1.0])], braking=braking, position=[0], velocity=[1], **more
+    )
 
 
 def run(

@@ -14,15 +14,15 @@ from _style import FORBIDDEN, GRID, INK, OFF, bare
 from safe_wrappers.envs.traffic import CAR_ACCELERATION_NOISE, CAR_TIME_CONSTANT_S
 
 STEP_S = 0.04
-EYE = sw.Sensor(camera="eye", view_deg=100, range_m=9, position_std=0.05)
+EYE = sw.occlusion.Sensor(camera="eye", view_deg=100, range_m=9, position_std=0.05)
 SHADOW_M = 12.0
 
 
-def car_tracks(*bodies: str) -> list[sw.Track]:
+def car_tracks(*bodies: str) -> list[sw.occlusion.Track]:
     """The cars' true motion; without names, all of them. The first three drive towards +x."""
     named = bodies or ("car[012]", "car[345]")
     return [
-        sw.Track(
+        sw.occlusion.Track(
             name,
             acceleration_noise=[CAR_ACCELERATION_NOISE, 0.0],
             reversion_s=CAR_TIME_CONSTANT_S,
@@ -34,7 +34,7 @@ def car_tracks(*bodies: str) -> list[sw.Track]:
     ]
 
 
-def tracked(tracks: Sequence[sw.Track] | None = None, sensor: Any = EYE, **more: Any) -> Any:
+def tracked(tracks: Sequence[sw.occlusion.Track] | None = None, sensor: Any = EYE, **more: Any) -> Any:
     """The env with its cars tracked."""
     given: dict[str, Any] = {"tolerance": 0.5} | more
     return sw.OcclusionPenalty(gym.make("OccludedCrossing-v0"), tracks or car_tracks(), sensor, **given)

@@ -18,11 +18,13 @@ from safe_wrappers.envs.teleop_operator import TeleopOperator
 STEP_S = 0.001
 
 
-def ceiling() -> sw.RoundTripCeiling:
+def ceiling() -> sw.teleop.RoundTripCeiling:
     """Over the clearance to the clamp."""
-    face = sw.Plane([0.0, CLAMP_Y], [0.0, -1.0])
-    clamp = sw.Clearance([face], TELEOP_BRAKING, bodies=["tool"], radius=TOOL_RADIUS, margin=0.001)
-    return sw.RoundTripCeiling(
+    face = sw.constraints.Plane([0.0, CLAMP_Y], [0.0, -1.0])
+    clamp = sw.constraints.Clearance(
+        [face], TELEOP_BRAKING, bodies=["tool"], radius=TOOL_RADIUS, margin=0.001
+    )
+    return sw.teleop.RoundTripCeiling(
         sw.StoppingBudget(clamp, acceleration=TELEOP_ACCELERATION, top_speed=TELEOP_TOP_SPEED)
     )
 

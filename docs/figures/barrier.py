@@ -18,7 +18,7 @@ def draw() -> Figure:
     for alpha, color in ALPHAS.items():
         admitted = np.clip(alpha * (LIMIT - speed), -1.0, 1.0)
         row.plot(speed, admitted, color=color, label=f"alpha = {alpha:g}/s")
-        limit = sw.Barrier(lambda x: LIMIT - x[1], alpha=alpha)
+        limit = sw.constraints.Barrier(lambda x: LIMIT - x[1], alpha=alpha)
         driven = run(Cart((0.0, 0.0), dt=0.1), 50, [limit])
         loop.plot(driven.t, driven.v, color=color)
     row.fill_between(speed, -1.0, np.clip(2.0 * (LIMIT - speed), -1.0, 1.0), color=SAFE, alpha=0.15, lw=0)

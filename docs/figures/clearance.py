@@ -74,8 +74,13 @@ def draw() -> Figure:
         state=lambda env: env.state,
         hold_s=0.05,
     )
-    disc = sw.Clearance(
-        [sw.Disc(CENTER, RADIUS)], braking=2.5, position=[0, 1], velocity=[2, 3], radius=0.1, margin=0.01
+    disc = sw.constraints.Clearance(
+        [sw.constraints.Disc(CENTER, RADIUS)],
+        braking=2.5,
+        position=[0, 1],
+        velocity=[2, 3],
+        radius=0.1,
+        margin=0.01,
     )
     chart.plot(*drive(raw).T, color=OFF)
     chart.plot(*drive(sw.CBFActionFilter(raw, [disc], plant=plant)).T, color=ON)

@@ -16,7 +16,7 @@ def draw() -> Figure:
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     for ax, color, title, wrap in (
         (left, OFF, "filter off", lambda env: env),
-        (right, ON, "filter on", lambda env: sw.CBFActionFilter(env, [sw.ContactFeasibility()])),
+        (right, ON, "filter on", lambda env: sw.CBFActionFilter(env, [sw.constraints.ContactFeasibility()])),
     ):
         forces, infos, _ = walk(wrap, STEPS)
         for found, info in zip(forces, infos, strict=True):

@@ -22,7 +22,7 @@ def draw() -> Figure:
     for name, color in (("filter off", OFF), ("filter on", ON)):
         env = sw.CostFunction(gym.make("Reacher-v5"), too_fast)
         if name == "filter on":
-            env = sw.CBFActionFilter(env, [sw.JointSpeedLimit(LIMIT)])
+            env = sw.CBFActionFilter(env, [sw.constraints.JointSpeedLimit(LIMIT)])
         env = sw.RecordInterventions(env)
         env.reset(seed=0)
         speeds, costs = [], []

@@ -36,7 +36,7 @@ def draw() -> Figure:
     figure, ax = panels(height=4.2)
     road(ax, env)
     raw: Any = env.unwrapped
-    discs = sw.TrackedDiscs(raw.car_radius)
+    discs = sw.constraints.TrackedDiscs(raw.car_radius)
     centers, halves = discs.boxes(plant, np.array(SHOWN_S))
     for late in range(len(SHOWN_S)):
         for center, half in zip(centers[late], halves[late], strict=True):

@@ -22,7 +22,7 @@ def braking(detail: dict[str, Any]) -> tuple[Array, Any]:
     """The robot slides along x with its nose turned; the backup runs until it rests: positions and the area."""
     env = gym.make("SafePointGoal1-v0")
     task: Any = env.unwrapped
-    constraint = sw.HeadingDriveClearance([sw.Disc((5.0, 5.0), 0.2)], **detail)
+    constraint = sw.constraints.HeadingDriveClearance([sw.constraints.Disc((5.0, 5.0), 0.2)], **detail)
     filtered = sw.CBFActionFilter(env, [constraint])
     filtered.reset(seed=0, options={"layout": {"agent": [0.0, 0.0, HEADING], "hazards": [], "vases": []}})
     qvel = task.data.qvel.copy()

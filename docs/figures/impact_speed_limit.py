@@ -72,7 +72,7 @@ def run(env: gym.Env[Any, Any], reacts: bool = False) -> Array:
 def draw() -> Figure:
     """Left: speed against distance. Right: force in time."""
     figure, (way, force) = panels(2, height=3.0)
-    limit = sw.ImpactSpeedLimit(
+    limit = sw.constraints.ImpactSpeedLimit(
         ["cart"], ["wall"], force_limit=LIMIT, stiffness=STIFFNESS, margin=2.0, holds=8
     )
     runs = {

@@ -16,7 +16,7 @@ def draw() -> Figure:
     figure, axes = panels(2, height=2.8, sharey=True)
     raw = gym.make("Reacher-v5").unwrapped
     limited = sw.CBFActionFilter(
-        gym.make("Reacher-v5").unwrapped, [sw.JointSpeedLimit(limit=LIMIT, margin=0.01)]
+        gym.make("Reacher-v5").unwrapped, [sw.constraints.JointSpeedLimit(limit=LIMIT, margin=0.01)]
     )
     for env, color, name in ((raw, OFF, "unfiltered"), (limited, ON, "filtered")):
         speeds, _ = drive(env, bang_bang(0.12, 0.05, seed=1), 250, lambda raw, info: raw.data.qvel[:2].copy())

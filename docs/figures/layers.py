@@ -51,7 +51,7 @@ def names(env: gym.Env[Any, Any]) -> list[str]:
 
 def stack() -> list[str]:
     """All layers that go together, in an order that nothing refuses."""
-    cars = sw.Track(
+    cars = sw.occlusion.Track(
         "car*", acceleration_noise=[0.03, 0], start_position_std=[0.3, 0], start_velocity_std=[1.2, 0]
     )
     env: Any = sw.CostFunction(gym.make("OccludedCrossing-v0"), lambda task: np.abs(task.data.qvel).max() > 3)
@@ -65,7 +65,7 @@ def stack() -> list[str]:
 
 def remote() -> list[str]:
     """The same with a network in the lease's place."""
-    env = sw.TeleopChannel(sw.protect(gym.make("TeleopContact-v0")), sw.Link(0.1), sw.Link(0.1))
+    env = sw.TeleopChannel(sw.protect(gym.make("TeleopContact-v0")), sw.teleop.Link(0.1), sw.teleop.Link(0.1))
     return names(faults.Outages(sw.RecordInterventions(env), mean_between_s=2.0, mean_length_s=0.5))
 
 

@@ -23,8 +23,8 @@ LAYOUT = {
 
 def run(lever_arm: bool) -> tuple[Any, Any]:
     """Estimated minus true position, shape (steps, 2), and its sigma."""
-    eye = sw.Sensor(camera="eye", view_deg=360, position_std=0.02, lever_arm=lever_arm)
-    walker = sw.Track("car0", acceleration_noise=0.5, start_position_std=0.05)
+    eye = sw.occlusion.Sensor(camera="eye", view_deg=360, position_std=0.02, lever_arm=lever_arm)
+    walker = sw.occlusion.Track("car0", acceleration_noise=0.5, start_position_std=0.05)
     env = tracked([walker], eye)
     env.reset(seed=0, options={"layout": LAYOUT})
     errors, sigmas = [], []

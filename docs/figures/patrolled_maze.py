@@ -21,14 +21,14 @@ STEPS = 400
 
 def tracked() -> Any:
     """The env with its patrols tracked."""
-    track = sw.Track(
+    track = sw.occlusion.Track(
         published="patrol_positions",
         acceleration_noise=[NOISE, 0],
         reversion_s=2.0,
         start_position_std=[0.1, 0],
         start_velocity_std=[0.55, 0],
     )
-    sensor = sw.Sensor(site="particle_site", position_std=0.02)
+    sensor = sw.occlusion.Sensor(site="particle_site", position_std=0.02)
     return sw.OcclusionPenalty(gym.make("PatrolledPointMaze-v0"), [track], sensor, tolerance=0.5)
 
 

@@ -14,7 +14,7 @@ LIMIT = 0.6
 def draw() -> Figure:
     """Speed over the control step; steps that were flagged infeasible are marked."""
     figure, ax = panels(height=2.8)
-    limit = sw.SpeedLimit(LIMIT, body="torso", direction="+x", margin=0.02)
+    limit = sw.constraints.SpeedLimit(LIMIT, body="torso", direction="+x", margin=0.02)
     raw = gym.make("HalfCheetah-v5")
     limited = sw.CBFActionFilter(gym.make("HalfCheetah-v5"), [limit])
     for env, color, name in ((raw, OFF, "unfiltered"), (limited, ON, "filtered")):

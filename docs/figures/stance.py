@@ -34,7 +34,7 @@ def draw() -> Figure:
     ):
         distances = []
         for share in SHARES:
-            stance = sw.Stance(float(share), joint_tolerance=None, **options).bind(plant)
+            stance = sw.constraints.Stance(float(share), joint_tolerance=None, **options).bind(plant)
             stance.observe(stance.start())
             stance.admits(wanted)
             (answer,) = stance.candidates(wanted)

@@ -18,7 +18,7 @@ STEPS, INSET = 100, 0.1
 def run(filtered: bool) -> tuple[NDArray[np.float64], list[bool]]:
     """Least distance of each step, m, not a number where there is no polygon; and whether it was changed."""
     bare = gym.make("Ant-v5", healthy_z_range=(0.1, 2.0))
-    env: Any = sw.CBFActionFilter(bare, [sw.SupportMargin(INSET)]) if filtered else bare
+    env: Any = sw.CBFActionFilter(bare, [sw.constraints.SupportMargin(INSET)]) if filtered else bare
     env.reset(seed=0)
     plant = sw.MujocoPlant()
     plant.bind(bare)

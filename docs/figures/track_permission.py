@@ -26,7 +26,7 @@ LAYOUT = {
 def draw() -> Figure:
     """Top: what is seen, three sigma and the tolerance. Bottom: asked and driven speed."""
     env = tracked(car_tracks("car0"), tolerance=TOLERANCE)
-    env = sw.CBFActionFilter(env, [sw.TrackPermission("robot", braking=3.0)])
+    env = sw.CBFActionFilter(env, [sw.constraints.TrackPermission("robot", braking=3.0)])
     env.reset(seed=1, options={"layout": LAYOUT})
     sigmas, seen, expired, speeds = [], [], [], []
     for k in range(STEPS):

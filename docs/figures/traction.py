@@ -16,7 +16,10 @@ def draw() -> Figure:
     """Left: slip of a wheel. Right: its speed."""
     env = gym.make("SafeRover-v0", max_episode_steps=STEPS)
     wheels = list(env.unwrapped.wheels)
-    limits = [sw.Traction(wheels, max_slip=SLIP), sw.JointSpeedLimit(SPEED, joints=wheels, margin=1.0)]
+    limits = [
+        sw.constraints.Traction(wheels, max_slip=SLIP),
+        sw.constraints.JointSpeedLimit(SPEED, joints=wheels, margin=1.0),
+    ]
     filtered = sw.CBFActionFilter(env, limits)
     filtered.reset(seed=0, options={"layout": OPEN | {"ground": "snow"}})
     rate = filtered.unwrapped.data.joint(wheels[0])

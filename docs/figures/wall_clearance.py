@@ -41,7 +41,8 @@ def draw() -> Figure:
     figure, axes = panels(2, height=3.2)
     raw = gym.make("PointMaze_UMaze-v3", max_episode_steps=1000)
     filtered = sw.CBFActionFilter(
-        gym.make("PointMaze_UMaze-v3", max_episode_steps=1000), [sw.WallClearance(velocity_clip=5.0)]
+        gym.make("PointMaze_UMaze-v3", max_episode_steps=1000),
+        [sw.constraints.WallClearance(velocity_clip=5.0)],
     )
     for ax, env, color, name in zip(
         axes, (raw, filtered), (OFF, ON), ("unfiltered", "filtered"), strict=True

@@ -15,10 +15,10 @@ DISC, RADIUS = (0.06, -0.1), 0.05
 def draw() -> Figure:
     """Left: unfiltered. Right: filtered."""
     figure, axes = panels(2, height=3.0)
-    inside = sw.Workspace(
+    inside = sw.constraints.Workspace(
         low=[*LOW, None],
         high=[*HIGH, None],
-        keep_out=[sw.Disc(DISC, RADIUS)],
+        keep_out=[sw.constraints.Disc(DISC, RADIUS)],
         bodies=["fingertip"],
         margin=0.003,
         holds=8,

@@ -21,7 +21,6 @@ from safe_wrappers.constraints.obstacles.obstacles import Box, Disc, Discs, Plan
 from safe_wrappers.constraints.obstacles.tracked_discs import TrackedDiscs
 from safe_wrappers.constraints.track_permission import TrackPermission
 from safe_wrappers.constraints.traction import Traction
-from safe_wrappers.filter.constraint import Constraint, HalfSpaces
 
 __all__ = [
     "Barrier",
@@ -29,12 +28,10 @@ __all__ = [
     "Box",
     "Clearance",
     "CoastingClearance",
-    "Constraint",
     "ContactFeasibility",
     "Disc",
     "Discs",
     "EscapeClearance",
-    "HalfSpaces",
     "HeadingDriveClearance",
     "ImpactSpeedLimit",
     "JointPositionLimit",

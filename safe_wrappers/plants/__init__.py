@@ -1,1 +1,8 @@
-"""What a filter may know of the machine: state, control bounds, f and g, hold interval, delay."""
+"""What the filter knows of a machine: its dynamics, read from an env at every step."""
+
+from safe_wrappers.plants.analytic import AnalyticPlant
+from safe_wrappers.plants.displacement import DisplacementPlant
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.plants.plant import Plant
+
+__all__ = ["AnalyticPlant", "DisplacementPlant", "MujocoPlant", "Plant"]

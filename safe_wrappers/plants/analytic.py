@@ -43,7 +43,7 @@ class AnalyticPlant(Plant):
         ...     f=lambda x: np.array([x[1], 2.43 * np.sin(x[0])]),  # a pendulum on the Moon: its motor is
         ...     g=lambda x: np.array([[0.0], [3.0]]),               # stronger than gravity at every angle
         ...     state=lambda env: env.state)
-        >>> slow = sw.Barrier(lambda x: 4.0 - x[1] ** 2, alpha=2.0)
+        >>> slow = sw.constraints.Barrier(lambda x: 4.0 - x[1] ** 2, alpha=2.0)
         >>> env = sw.CBFActionFilter(gym.make("Pendulum-v1", g=1.62), [slow], plant=plant)
     """
 

@@ -48,7 +48,7 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         >>> import gymnasium as gym, safe_wrappers as sw
         >>> from stable_baselines3 import SAC
         >>> from safe_wrappers.sb3 import ExecutedActionReplayBuffer
-        >>> env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(limit=4.0)])
+        >>> env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(limit=4.0)])
         >>> env = sw.AdaptionPenalty(env, penalty=0.1)
         >>> model = SAC(
         ...     "MlpPolicy",

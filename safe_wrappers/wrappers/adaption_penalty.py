@@ -46,7 +46,7 @@ class AdaptionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
-        >>> env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(limit=4.0)])
+        >>> env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(limit=4.0)])
         >>> env = sw.AdaptionPenalty(env, penalty=0.1)
         >>> _ = env.reset(seed=0)
         >>> _, reward, _, _, info = env.step(env.action_space.sample())

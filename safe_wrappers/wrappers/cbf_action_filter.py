@@ -73,7 +73,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
-        >>> env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(limit=4.0)])
+        >>> env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(limit=4.0)])
         >>> _ = env.reset(seed=0)
         >>> info = env.step(env.action_space.sample())[4]
         >>> info["cbf/margin"] > 0.0

@@ -105,8 +105,8 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
-        >>> rail = [sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])]
-        >>> clearance = sw.Clearance(rail, bodies=["cart"], braking=8.0)
+        >>> rail = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
+        >>> clearance = sw.constraints.Clearance(rail, bodies=["cart"], braking=8.0)
         >>> budget = sw.StoppingBudget(clearance, acceleration=30.0)
         >>> env = sw.LeaseExpiry(gym.make("InvertedPendulum-v5"), budget)
         >>> _ = env.reset(seed=0)

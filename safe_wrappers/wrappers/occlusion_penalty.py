@@ -88,7 +88,7 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
         >>> env = gym.make("OccludedCrossing-v0")
-        >>> cars = [sw.Track("car*", acceleration_noise=[0.03, 0], start_position_std=[0.3, 0])]
+        >>> cars = [sw.occlusion.Track("car*", acceleration_noise=[0.03, 0], start_position_std=[0.3, 0])]
         >>> env = sw.OcclusionPenalty(env, cars, "eye", tolerance=1.0, weight=0.05)
         >>> _ = env.reset(seed=0)
         >>> info = env.step(env.action_space.sample())[4]

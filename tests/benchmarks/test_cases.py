@@ -37,27 +37,27 @@ def test_the_judge_means_the_limit_that_the_filter_keeps(name):
     for constraint, bound in zip(env.constraints, env.filter.bound, strict=True):
         judge = case.judge(raw)
         match constraint:
-            case sw.SpeedLimit():
+            case sw.constraints.SpeedLimit():
                 assert isinstance(judge, Reported)
                 info = {"x_velocity": constraint.limit, "y_velocity": 0.0}
                 assert judge.after(np.zeros(1), info) == 0.0
                 plane = judge.after(np.zeros(1), {"x_velocity": 0.0, "y_velocity": constraint.limit})
                 assert (plane == 0.0) == (constraint.direction == "xy")
-            case sw.JointSpeedLimit():
+            case sw.constraints.JointSpeedLimit():
                 raw.data.qvel[raw.model.jnt_dofadr[raw.model.actuator_trnid[:, 0]]] = constraint.limit
                 assert judge.start() == pytest.approx(0.0, abs=1e-12)
                 raw.data.qvel[:] = 0.0
-            case sw.Clearance():
+            case sw.constraints.Clearance():
                 for plane in constraint.obstacles:
                     (axis,) = np.flatnonzero(plane.normal)
                     raw.data.qpos[axis] = plane.point[axis] + constraint.radius * plane.normal[axis]
                     assert judge.start() == pytest.approx(0.0, abs=1e-12)
                 assert len(constraint.obstacles) == (1 if "Teleop" in name else 2)
-            case sw.JointPositionLimit():
+            case sw.constraints.JointPositionLimit():
                 for end in (constraint.lower, constraint.upper):
                     raw.data.qpos[0] = end
                     assert judge.start() == pytest.approx(0.0, abs=1e-12)
-            case sw.Workspace():
+            case sw.constraints.Workspace():
                 # Somewhere along random poses: what the constraint calls negative, the judge calls missed.
                 seen = set()
                 rng = np.random.default_rng(0)
@@ -80,21 +80,21 @@ def test_the_judge_means_the_limit_that_the_filter_keeps(name):
                         assert h == pytest.approx(-missed, abs=1e-9)
                     seen.add(h < 0.0)
                 assert seen == {True, False}
-            case sw.Traction():
+            case sw.constraints.Traction():
                 assert isinstance(judge, Reported)
                 slips = {
                     missed: judge.after(np.zeros(1), {"slip_max": missed}) for missed in (0.15, 0.2, 0.5)
                 }
                 # Looser than the limit: an edge is overshot, and a slip of a third more is no spin-out yet.
                 assert slips[constraint.max_slip] < slips[0.2] == 0.0 < slips[0.5]
-            case sw.EscapeClearance():
+            case sw.constraints.EscapeClearance():
                 touched, clear = ({"cost_substep": cost} for cost in (1.0, 0.0))
                 if isinstance(judge, Worst):  # of a step in which no wall was touched
                     judge.before()
                     env.unwrapped.step(np.zeros(2))
                 assert judge.after(np.zeros(raw.model.nu), touched) > 0.0
                 assert judge.after(np.zeros(raw.model.nu), clear) < 0.0
-            case sw.WallClearance():
+            case sw.constraints.WallClearance():
                 pass  # both read the walls from the model; tests/benchmarks/test_judges.py places the ball
             case _:
                 raise AssertionError(f"no check for {constraint}")

@@ -63,7 +63,7 @@ def test_with_the_constraint_nothing_exceeds_the_limit_and_without_most_does():
 
 @pytest.mark.slow
 def test_a_constraint_that_believes_in_a_softer_wall_is_seen(monkeypatch):
-    honest = sw.ImpactSpeedLimit
+    honest = sw.constraints.ImpactSpeedLimit
 
     def softer(*args, stiffness, **more):
         return honest(*args, stiffness=stiffness / 4.0, **more)

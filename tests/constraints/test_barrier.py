@@ -55,8 +55,10 @@ def h(x):
 @pytest.mark.parametrize("x", [-0.8, -0.1, 0.3, 0.9])
 def test_row_is_the_barrier_condition(x):
     plant = observed([x])
-    given = sw.Barrier(h, gradient=lambda x: np.array([-2.0 * x[0]]), alpha=3.0, margin=0.05, curvature=0.7)
-    by_differences = sw.Barrier(h, alpha=3.0, margin=0.05, curvature=0.7)
+    given = sw.constraints.Barrier(
+        h, gradient=lambda x: np.array([-2.0 * x[0]]), alpha=3.0, margin=0.05, curvature=0.7
+    )
+    by_differences = sw.constraints.Barrier(h, alpha=3.0, margin=0.05, curvature=0.7)
     for barrier in (given, by_differences):
         barrier = Asked(barrier, plant)
         rows = barrier.rows()
@@ -71,9 +73,9 @@ def test_row_is_the_barrier_condition(x):
 
 def test_a_class_k_function_is_used_as_given():
     plant = observed([0.5])
-    barrier = sw.Barrier(h, alpha=lambda value: 2.0 * value**3)
+    barrier = sw.constraints.Barrier(h, alpha=lambda value: 2.0 * value**3)
     barrier = Asked(barrier, plant)
-    linear = sw.Barrier(h, alpha=2.0)
+    linear = sw.constraints.Barrier(h, alpha=2.0)
     linear = Asked(linear, plant)
     difference = linear.rows().offsets[0] - barrier.rows().offsets[0]
     assert difference == pytest.approx(2.0 * 0.75 - 2.0 * 0.75**3)
@@ -88,7 +90,7 @@ def test_the_curvature_reserve_holds_between_samples(dt, policy):
     second = 2 * rate**2 + 2 * xs * (-2 * xs + us) * rate
     bound = float(second.max())
     env = Spring(dt)
-    barrier = sw.Barrier(h, alpha=0.5 / dt, curvature=bound)
+    barrier = sw.constraints.Barrier(h, alpha=0.5 / dt, curvature=bound)
     filtered = sw.CBFActionFilter(env, [barrier], plant=spring_plant(dt))
     filtered.reset(seed=0)
     intervened = 0
@@ -102,7 +104,9 @@ def test_the_curvature_reserve_holds_between_samples(dt, policy):
 
 def test_margin_is_kept_free():
     env = Spring(0.02)
-    filtered = sw.CBFActionFilter(env, [sw.Barrier(h, alpha=5.0, margin=0.2)], plant=spring_plant(0.02))
+    filtered = sw.CBFActionFilter(
+        env, [sw.constraints.Barrier(h, alpha=5.0, margin=0.2)], plant=spring_plant(0.02)
+    )
     filtered.reset(seed=0)
     for _ in range(400):
         filtered.step(np.array([1.0]))
@@ -133,33 +137,35 @@ def test_a_position_under_a_force_is_refused_with_the_remedy():
     with pytest.raises(
         ConfigurationError, match=r"its relative degree is 2.*put the braking distance into h.*Clearance"
     ):
-        filtered = cart_filter(sw.Barrier(lambda x: 1.0 - x[0]))
+        filtered = cart_filter(sw.constraints.Barrier(lambda x: 1.0 - x[0]))
         filtered.reset(seed=0)
         filtered.step(np.array([0.5]))
 
 
 def test_the_relative_degree_is_checked_at_the_first_reset():
-    filtered = cart_filter(sw.Barrier(lambda x: 1.0 - x[0]))
+    filtered = cart_filter(sw.constraints.Barrier(lambda x: 1.0 - x[0]))
     with pytest.raises(ConfigurationError, match="relative degree"):
         filtered.reset(seed=0)
 
 
 def test_an_h_that_no_control_acts_on_is_refused():
     with pytest.raises(ConfigurationError, match="no control acts on it"):
-        filtered = cart_filter(sw.Barrier(lambda x: 1.0))
+        filtered = cart_filter(sw.constraints.Barrier(lambda x: 1.0))
         filtered.reset(seed=0)
         filtered.step(np.array([0.5]))
 
 
 def test_a_gradient_that_vanishes_here_is_not_refused():
-    filtered = cart_filter(sw.Barrier(lambda x: 1.0 - x[1] ** 2))  # at rest its gradient is zero
+    filtered = cart_filter(sw.constraints.Barrier(lambda x: 1.0 - x[1] ** 2))  # at rest its gradient is zero
     filtered.reset(seed=0)
     info = filtered.step(np.array([0.5]))[4]
     assert not info["cbf/intervened"]
 
 
 def test_braking_distance_in_h_is_the_remedy():
-    barrier = sw.Barrier(lambda x: 1.0 - x[0] - max(x[1], 0.0) ** 2 / 2.0 - 0.1 * max(x[1], 0.0), alpha=2.0)
+    barrier = sw.constraints.Barrier(
+        lambda x: 1.0 - x[0] - max(x[1], 0.0) ** 2 / 2.0 - 0.1 * max(x[1], 0.0), alpha=2.0
+    )
     filtered = cart_filter(barrier)
     filtered.reset(seed=0)
     filtered.step(np.array([0.5]))
@@ -174,7 +180,7 @@ def driven(unit, gradient):
     """What is executed, and h in its unit, under a policy that heads for a speed beyond the limit."""
     of_h = lambda x: unit * (0.25 - x[1] ** 2)  # noqa: E731
     dh = (lambda x: unit * np.array([0.0, -2.0 * x[1]])) if gradient else None
-    filtered = cart_filter(sw.Barrier(of_h, gradient=dh, alpha=2.0))
+    filtered = cart_filter(sw.constraints.Barrier(of_h, gradient=dh, alpha=2.0))
     filtered.reset(seed=0)
     seen = []
     for _ in range(20):
@@ -199,12 +205,14 @@ def test_an_h_that_no_control_acts_on_is_refused_in_every_unit(unit):
         (lambda x: unit * (1.0 - x[0]), "relative degree is 2"),
     ):
         with pytest.raises(ConfigurationError, match=message):
-            cart_filter(sw.Barrier(barrier)).reset(seed=0)
+            cart_filter(sw.constraints.Barrier(barrier)).reset(seed=0)
 
 
 @pytest.mark.parametrize("unit", UNITS)
 def test_a_wrong_gradient_is_refused_in_every_unit(unit):
-    wrong = sw.Barrier(lambda x: unit * (1.0 - x[1]), gradient=lambda x: unit * np.array([0.0, 1.0]))
+    wrong = sw.constraints.Barrier(
+        lambda x: unit * (1.0 - x[1]), gradient=lambda x: unit * np.array([0.0, 1.0])
+    )
     with pytest.raises(ConfigurationError, match="gradient does not fit h"):
         cart_filter(wrong).reset(seed=0)
 
@@ -230,20 +238,20 @@ def test_a_wrong_gradient_is_refused_in_every_unit(unit):
 )
 def test_constructor_refuses_nonsense(arguments, message):
     with pytest.raises(ConfigurationError, match=message):
-        sw.Barrier(**{"h": h, **arguments})
+        sw.constraints.Barrier(**{"h": h, **arguments})
 
 
 def test_a_decay_that_outruns_the_hold_is_refused():
-    sw.Barrier(h, alpha=10.0).bind(observed([0.0]))
+    sw.constraints.Barrier(h, alpha=10.0).bind(observed([0.0]))
     with pytest.raises(
         ConfigurationError, match=r"alpha = 10.1/s lets h cross zero within one hold of 0.1 s; .* 10/s"
     ):
-        sw.Barrier(h, alpha=10.1).bind(observed([0.0]))
+        sw.constraints.Barrier(h, alpha=10.1).bind(observed([0.0]))
 
 
 def test_a_gradient_of_the_wrong_shape_is_refused():
     plant = observed([0.5])
-    barrier = sw.Barrier(h, gradient=lambda x: [1.0, 2.0])
+    barrier = sw.constraints.Barrier(h, gradient=lambda x: [1.0, 2.0])
     barrier = Asked(barrier, plant)
     with pytest.raises(
         ConfigurationError, match=r"gradient must return the shape of the state \(1,\), got \(2,\)"

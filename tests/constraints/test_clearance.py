@@ -47,10 +47,10 @@ class PointMass(MujocoEnv):
 
 
 DISCS = [
-    sw.Disc([1.0, 0.3], 0.3),
-    sw.Disc([1.0, -0.9], 0.4),
-    sw.Disc([-1.2, 0.0], 0.5),
-    sw.Disc([0.0, 1.4], 0.3),
+    sw.constraints.Disc([1.0, 0.3], 0.3),
+    sw.constraints.Disc([1.0, -0.9], 0.4),
+    sw.constraints.Disc([-1.2, 0.0], 0.5),
+    sw.constraints.Disc([0.0, 1.4], 0.3),
 ]
 
 
@@ -66,7 +66,7 @@ def test_rows_are_the_second_derivative_of_the_distance(tmp_path, kind):
     plant = sw.MujocoPlant()
     plant.bind(env)
     name, offset = {"bodies": ("ball", 0.0), "sites": ("nose", 0.05)}[kind]
-    clear = sw.Clearance([DISCS[0]], braking=1.5, **{kind: [name]})
+    clear = sw.constraints.Clearance([DISCS[0]], braking=1.5, **{kind: [name]})
     clear = Asked(clear, plant)
     rng = np.random.default_rng(0)
     asked = 0
@@ -123,7 +123,7 @@ def test_a_mujoco_point_mass_never_enters_a_disc(tmp_path, driver, frame_skip):
     # 2 N along any direction is 2 m/s^2 at least; braking is declared below it. The margin is for the turn of
     # the direction within a hold.
     env = PointMass(tmp_path, frame_skip=frame_skip)
-    clear = sw.Clearance(DISCS, braking=1.5, bodies=["ball"], margin=0.01)
+    clear = sw.constraints.Clearance(DISCS, braking=1.5, bodies=["ball"], margin=0.01)
     filtered = sw.CBFActionFilter(env, [clear])
     rng = np.random.default_rng(0)
     closest, infeasible, intervened = np.inf, 0, 0
@@ -153,8 +153,10 @@ def test_without_the_filter_they_do(tmp_path):
 @pytest.mark.parametrize("state_error", [0.0, 0.02])
 def test_radius_margin_and_state_error_add_up(tmp_path, radius, state_error):
     env = PointMass(tmp_path)
-    wall = sw.Plane([1.0], [-1.0])
-    clear = sw.Clearance([wall], 1.5, bodies=["ball"], radius=radius, margin=0.03, state_error=state_error)
+    wall = sw.constraints.Plane([1.0], [-1.0])
+    clear = sw.constraints.Clearance(
+        [wall], 1.5, bodies=["ball"], radius=radius, margin=0.03, state_error=state_error
+    )
     filtered = sw.CBFActionFilter(env, [clear])
     filtered.reset(seed=0)
     for _ in range(300):
@@ -170,7 +172,7 @@ def test_far_away_no_rows_are_asked_for(tmp_path):
     plant = sw.MujocoPlant()
     plant.bind(env)
     plant.observe()
-    clear = sw.Clearance([sw.Disc([50.0, 0.0], 0.3)], 1.5, bodies=["ball"])
+    clear = sw.constraints.Clearance([sw.constraints.Disc([50.0, 0.0], 0.3)], 1.5, bodies=["ball"])
     clear = Asked(clear, plant)
     rows = clear.rows()
     assert rows.normals.shape == (0, 2) and rows.offsets.shape == (0,)
@@ -182,7 +184,7 @@ def test_several_points_and_obstacles_give_a_value_each(tmp_path):
     plant = sw.MujocoPlant()
     plant.bind(env)
     plant.observe()
-    clear = sw.Clearance(DISCS, 1.5, bodies=["ball"], sites=["nose"])
+    clear = sw.constraints.Clearance(DISCS, 1.5, bodies=["ball"], sites=["nose"])
     clear = Asked(clear, plant)
     np.testing.assert_allclose(clear.value()[[0, 4]], [np.hypot(1.0, 0.3) - 0.3, np.hypot(0.95, 0.3) - 0.3])
     assert clear.value().shape == (8,)
@@ -191,9 +193,12 @@ def test_several_points_and_obstacles_give_a_value_each(tmp_path):
 def test_spheres_and_boxes_around_an_arm():
     # Reacher's fingertip against a pillar: best effort, so the truth is only asked not to get worse than the
     # unfiltered arm, and the infeasible steps to be told.
-    pillar = sw.Box([0.12, 0.12], [0.03, 0.03])
-    clear = sw.Clearance(
-        [pillar, sw.Sphere([-0.15, 0.0, 0.01], 0.04)], braking=3.0, bodies=["fingertip"], margin=0.01
+    pillar = sw.constraints.Box([0.12, 0.12], [0.03, 0.03])
+    clear = sw.constraints.Clearance(
+        [pillar, sw.constraints.Sphere([-0.15, 0.0, 0.01], 0.04)],
+        braking=3.0,
+        bodies=["fingertip"],
+        margin=0.01,
     )
 
     def deepest(env, filtered):
@@ -223,7 +228,7 @@ def test_spheres_and_boxes_around_an_arm():
     ("arguments", "message"),
     [
         ({"obstacles": []}, "obstacles is a list with at least one obstacle"),
-        ({"obstacles": sw.Disc([0, 0], 1)}, "obstacles is a list with at least one obstacle"),
+        ({"obstacles": sw.constraints.Disc([0, 0], 1)}, "obstacles is a list with at least one obstacle"),
         ({"obstacles": {"kind": "Disc"}}, "obstacles is a list with at least one obstacle"),
         ({"braking": 0.0}, r"braking must be a finite number > 0 in m/s\^2, got 0.0"),
         ({"braking": -2}, r"braking must be a finite number > 0 in m/s\^2, got -2"),
@@ -239,7 +244,9 @@ def test_spheres_and_boxes_around_an_arm():
 )
 def test_constructor_refuses_nonsense(arguments, message):
     with pytest.raises(ConfigurationError, match=message):
-        sw.Clearance(**{"obstacles": [sw.Disc([0, 0], 1)], "braking": 1.0, **arguments})
+        sw.constraints.Clearance(
+            **{"obstacles": [sw.constraints.Disc([0, 0], 1)], "braking": 1.0, **arguments}
+        )
 
 
 def test_on_an_analytic_plant_the_indices_are_asked_for():
@@ -248,7 +255,7 @@ def test_on_an_analytic_plant_the_indices_are_asked_for():
     )
     plant.bind(gym.make("Pendulum-v1"))
     with pytest.raises(ConfigurationError, match=r"say where the point is in the state: position=\[0, 1\]"):
-        sw.Clearance([sw.Plane([1.0], [-1.0])], 1.0).bind(plant)
+        sw.constraints.Clearance([sw.constraints.Plane([1.0], [-1.0])], 1.0).bind(plant)
 
 
 @pytest.mark.parametrize("frame", [{"bodies": ["ball"]}, {"sites": ["nose"], "geoms": []}])
@@ -256,7 +263,9 @@ def test_approach_is_what_the_barrier_counts_the_stopping_distance_from(tmp_path
     env = PointMass(tmp_path)
     plant = sw.MujocoPlant()
     plant.bind(env)
-    clearance = sw.Clearance(DISCS, braking=2.0, radius=0.05, margin=0.3, state_error=0.1, **frame)
+    clearance = sw.constraints.Clearance(
+        DISCS, braking=2.0, radius=0.05, margin=0.3, state_error=0.1, **frame
+    )
     clearance = Asked(clearance, plant)
     env.reset(seed=0)
     env.set_state(np.array([0.2, -0.1]), np.array([0.7, -0.4]))

@@ -22,8 +22,10 @@ SQUARE = [[0.16, 0.18], [0.16, -0.18], [-0.16, 0.18], [-0.16, -0.18]]
 
 def bound(hazards, level=1, vases=(), heading=0.0, speed_up=0, **options):
     """A filtered car at the origin after `speed_up` steps of full drive without the filter, and its constraint."""
-    options = {"keep_out": [sw.Discs("hazard_positions", 0.2)], "alone": "robot_model"} | options
-    env = sw.CBFActionFilter(gym.make(f"SafeCarGoal{level}-v0"), [sw.CoastingClearance(**options)])
+    options = {"keep_out": [sw.constraints.Discs("hazard_positions", 0.2)], "alone": "robot_model"} | options
+    env = sw.CBFActionFilter(
+        gym.make(f"SafeCarGoal{level}-v0"), [sw.constraints.CoastingClearance(**options)]
+    )
     layout = {"agent": [0.0, 0.0, heading], "goal": [9.0, 9.0], "hazards": hazards, "vases": list(vases)}
     env.reset(seed=0, options={"layout": layout})
     for _ in range(speed_up):
@@ -93,12 +95,12 @@ def test_far_from_everything_nothing_is_forecast():
 def test_the_outline_counts_where_it_should():
     """Beside a vase that its front corner would touch, the car may not turn to it; its origin is far enough."""
     vases = [[0.18, 0.16 + 0.1415 + 0.008]]
-    outlined = {"untouched": [sw.Discs("vase_positions", 0.1415)], "outline": SQUARE}
+    outlined = {"untouched": [sw.constraints.Discs("vase_positions", 0.1415)], "outline": SQUARE}
     _, constraint, _ = bound([], 2, vases, **outlined)
     assert constraint.value() == pytest.approx(0.008, abs=1e-6)
     assert constraint.admits(NONE)
     assert [constraint.admits(np.array([s, -s])) for s in (1.0, -1.0)] == [False, True]
-    _, bare, _ = bound([], 2, vases, keep_out=[sw.Discs("vase_positions", 0.1415)])
+    _, bare, _ = bound([], 2, vases, keep_out=[sw.constraints.Discs("vase_positions", 0.1415)])
     assert all(bare.admits(np.array([s, -s])) for s in (1.0, -1.0))
 
 
@@ -139,8 +141,8 @@ def test_what_stands_still_is_forecast_once():
 
 
 def test_from_inside_it_drives_out():
-    options = {"keep_out": [sw.Discs("hazard_positions", 0.2)], "alone": "robot_model"}
-    env = sw.CBFActionFilter(gym.make("SafeCarGoal1-v0"), [sw.CoastingClearance(**options)])
+    options = {"keep_out": [sw.constraints.Discs("hazard_positions", 0.2)], "alone": "robot_model"}
+    env = sw.CBFActionFilter(gym.make("SafeCarGoal1-v0"), [sw.constraints.CoastingClearance(**options)])
     layout = {"agent": [0.0, 0.0, 0.0], "goal": [9.0, 9.0], "hazards": [[0.12, 0.05]], "vases": []}
     with pytest.warns(UnsafeStateWarning):
         info = env.reset(seed=0, options={"layout": layout})[1]
@@ -215,9 +217,9 @@ def test_a_detour_keeps_its_side_for_25_steps_after_it_was_last_needed():
 
 
 def test_plain_data_rebuilds_it():
-    constraint = sw.CoastingClearance(
-        keep_out=[sw.Disc([1.0, 2.0], 0.2)],
-        untouched=[sw.Discs("vase_positions", 0.1)],
+    constraint = sw.constraints.CoastingClearance(
+        keep_out=[sw.constraints.Disc([1.0, 2.0], 0.2)],
+        untouched=[sw.constraints.Discs("vase_positions", 0.1)],
         outline=SQUARE,
         reach=0.1,
     )
@@ -228,21 +230,24 @@ def test_plain_data_rebuilds_it():
     ("options", "message"),
     [
         ({}, "keep_out .* or untouched"),
-        ({"keep_out": sw.Disc([0, 0], 1)}, "keep_out is a list"),
-        ({"keep_out": [sw.Plane([0.0], [1.0])]}, "keep_out holds Disc and Discs, got Plane"),
-        ({"keep_out": [sw.Discs("a", 0.1, "v")]}, "discs that stand still"),
-        ({"untouched": [sw.Disc([0, 0], 1)]}, "needs the machine's outline"),
-        ({"untouched": [sw.Disc([0, 0], 1)], "outline": [[0, 0], [1, 1]]}, "outline: .*not on one line"),
-        ({"keep_out": [sw.Disc([0, 0], 1)], "outline": [[0, "x"]]}, "list of points"),
-        ({"keep_out": [sw.Disc([0, 0], 1)], "holds": 1}, "holds is a whole number"),
-        ({"keep_out": [sw.Disc([0, 0], 1)], "reach": -1.0}, "reach must be"),
-        ({"keep_out": [sw.Disc([0, 0], 1)], "reach_s": -1.0}, "reach_s must be"),
-        ({"keep_out": [sw.Disc([0, 0], 1)], "margin": -0.1}, "margin must be"),
+        ({"keep_out": sw.constraints.Disc([0, 0], 1)}, "keep_out is a list"),
+        ({"keep_out": [sw.constraints.Plane([0.0], [1.0])]}, "keep_out holds Disc and Discs, got Plane"),
+        ({"keep_out": [sw.constraints.Discs("a", 0.1, "v")]}, "discs that stand still"),
+        ({"untouched": [sw.constraints.Disc([0, 0], 1)]}, "needs the machine's outline"),
+        (
+            {"untouched": [sw.constraints.Disc([0, 0], 1)], "outline": [[0, 0], [1, 1]]},
+            "outline: .*not on one line",
+        ),
+        ({"keep_out": [sw.constraints.Disc([0, 0], 1)], "outline": [[0, "x"]]}, "list of points"),
+        ({"keep_out": [sw.constraints.Disc([0, 0], 1)], "holds": 1}, "holds is a whole number"),
+        ({"keep_out": [sw.constraints.Disc([0, 0], 1)], "reach": -1.0}, "reach must be"),
+        ({"keep_out": [sw.constraints.Disc([0, 0], 1)], "reach_s": -1.0}, "reach_s must be"),
+        ({"keep_out": [sw.constraints.Disc([0, 0], 1)], "margin": -0.1}, "margin must be"),
     ],
 )
 def test_bad_arguments_are_refused_when_it_is_made(options, message):
     with pytest.raises(ConfigurationError, match=message):
-        sw.CoastingClearance(**options)
+        sw.constraints.CoastingClearance(**options)
 
 
 def test_an_attribute_that_holds_no_model_is_refused():
@@ -253,4 +258,4 @@ def test_an_attribute_that_holds_no_model_is_refused():
 def test_a_plant_without_a_model_is_refused():
     plant = sw.AnalyticPlant(f=lambda x: -x, g=lambda x: np.eye(1), state=lambda env: np.zeros(1))
     with pytest.raises(UnsupportedEnvError, match="needs a MujocoPlant"):
-        sw.CoastingClearance(keep_out=[sw.Disc([0, 0], 1)]).bind(plant)
+        sw.constraints.CoastingClearance(keep_out=[sw.constraints.Disc([0, 0], 1)]).bind(plant)

@@ -54,7 +54,7 @@ def test_it_admits_pushes_up_to_the_share_and_the_tolerance_and_less_by_the_marg
     # One ball, one contact: its pressure is the weight, and what holds it is what pushes it.
     largest = share * 0.8 + tolerance - margin  # of the weight
     weight = 2.0 * 9.81
-    spec = sw.ContactFeasibility(share, tolerance, margin=margin)
+    spec = sw.constraints.ContactFeasibility(share, tolerance, margin=margin)
     for part, admitted in ((0.99, True), (1.01, False), (-0.99, True), (-1.01, False)):
         control = np.array([part * largest * weight / 50.0])
         limit = settled(pushed_balls(cone=cone), spec, control)
@@ -68,7 +68,7 @@ def test_it_admits_pushes_up_to_the_share_and_the_tolerance_and_less_by_the_marg
 def test_in_the_air_nothing_is_missed_whatever_the_margin():
     env = pushed_balls(("left", "right"))
     env.start = np.array([0.0, 3.0, 0.0, 3.0]), np.zeros(4)
-    limit = settled(env, sw.ContactFeasibility(0.7, 0.0, margin=0.3), np.zeros(2))
+    limit = settled(env, sw.constraints.ContactFeasibility(0.7, 0.0, margin=0.3), np.zeros(2))
     env.reset()
     limit.plant.observe()
     control = np.array([1.0, -1.0])
@@ -79,20 +79,22 @@ def test_in_the_air_nothing_is_missed_whatever_the_margin():
 def test_a_contact_without_friction_has_no_cone_to_leave():
     ball = '<body name="b" pos="5 5 .1"><freejoint/><geom condim="3" size=".1"/></body>'
     env = pushed_balls(condim=1, more=ball)
-    limit = settled(env, sw.ContactFeasibility(0.7, 0.0), np.ones(1))
+    limit = settled(env, sw.constraints.ContactFeasibility(0.7, 0.0), np.ones(1))
     assert limit.admits(np.ones(1)) and limit.slacks(np.ones(1)).size == 1
 
 
 def test_only_the_named_bodies_count():
     control = np.array([0.0, 0.3])  # 15 N on 11 N: only the second ball slides
     for bodies, admitted in ((None, False), (["left"], True), (["right"], False), (("left", "right"), False)):
-        limit = settled(pushed_balls(("left", "right")), sw.ContactFeasibility(0.7, 0.0, bodies), control)
+        limit = settled(
+            pushed_balls(("left", "right")), sw.constraints.ContactFeasibility(0.7, 0.0, bodies), control
+        )
         assert limit.admits(control) is admitted
         assert limit.slacks(control).size == (1 if bodies and len(bodies) == 1 else 2)
 
 
 def test_the_linearization_of_a_refused_push_is_where_the_ball_would_slide():
-    limit = settled(pushed_balls(), sw.ContactFeasibility(0.7, 0.0), np.array([0.2]))
+    limit = settled(pushed_balls(), sw.constraints.ContactFeasibility(0.7, 0.0), np.array([0.2]))
     for control in (np.array([0.25]), np.array([-0.25])):
         rows = limit.linearize(control)
         border = rows.offsets[0] / rows.normals[0, 0]
@@ -121,14 +123,14 @@ def test_the_linearization_of_a_refused_push_is_where_the_ball_would_slide():
 )
 def test_bad_arguments_are_refused_in_words(arguments, words):
     with pytest.raises(ConfigurationError, match=words):
-        sw.ContactFeasibility(**arguments)
+        sw.constraints.ContactFeasibility(**arguments)
 
 
 def test_what_it_cannot_watch_is_refused_when_it_is_bound():
     def bound(env, **arguments):
         plant = sw.MujocoPlant()
         plant.bind(env)
-        sw.ContactFeasibility(**arguments).bind(plant)
+        sw.constraints.ContactFeasibility(**arguments).bind(plant)
 
     still = '<body name="block" pos="3 3 0"><geom type="box" size=".1 .1 .1"/></body>'
     slick = '<body name="slick" pos="3 -3 1"><freejoint/><geom size=".1" contype="0" conaffinity="0"/></body>'
@@ -146,11 +148,11 @@ def test_what_it_cannot_watch_is_refused_when_it_is_bound():
         bound(gym.make("Reacher-v5"))
     plant = sw.AnalyticPlant(f=lambda x: x, g=lambda x: np.ones((1, 1)), state=lambda e: e.state, hold_s=0.1)
     with pytest.raises(UnsupportedEnvError, match="AnalyticPlant"):
-        sw.ContactFeasibility().bind(plant)
+        sw.constraints.ContactFeasibility().bind(plant)
 
 
 def test_it_is_plain_data():
-    limit = sw.ContactFeasibility(0.6, 0.02, ["torso"], 0.01)
+    limit = sw.constraints.ContactFeasibility(0.6, 0.02, ["torso"], 0.01)
     again = constraint_from(json.loads(json.dumps(plain_data(limit))))
     assert again == limit and again.promise == "best effort"
 
@@ -173,7 +175,7 @@ LONG = [
 
 
 def filtered(env_id, plant=None, **arguments):
-    return sw.CBFActionFilter(gym.make(env_id), [sw.ContactFeasibility(**arguments)], plant=plant)
+    return sw.CBFActionFilter(gym.make(env_id), [sw.constraints.ContactFeasibility(**arguments)], plant=plant)
 
 
 def loop(env, driver, steps, share=0.7, tolerance=0.01, bodies=None, seed=1):
@@ -235,7 +237,7 @@ def test_share_tolerance_and_margin_hold_in_closed_loop(arguments):
 
 
 def test_the_filters_margin_counts_too():
-    env = sw.CBFActionFilter(gym.make("HalfCheetah-v5"), [sw.ContactFeasibility()], margin=0.006)
+    env = sw.CBFActionFilter(gym.make("HalfCheetah-v5"), [sw.constraints.ContactFeasibility()], margin=0.006)
     assert env.constraints[0].margin == 0.006
     assert loop(env, "noisy", 30, tolerance=0.004)["unflagged"] == 0
 

@@ -14,8 +14,8 @@ from safe_wrappers.errors import ConfigurationError, UnknownNameError, Unsupport
 from safe_wrappers.serialize import constraint_from, plain_data
 
 HOLD, RADIUS, CAR, PILLAR, MARGIN = 0.04, 0.2, 0.4, 0.35, 0.05
-TRUE_CARS = sw.TrackedDiscs(CAR, 0.0, attribute="car_tracks")
-PILLARS = sw.Discs("pillar_positions", PILLAR)
+TRUE_CARS = sw.constraints.TrackedDiscs(CAR, 0.0, attribute="car_tracks")
+PILLARS = sw.constraints.Discs("pillar_positions", PILLAR)
 WAYS = [(0, 0, 0), *((x, y, n) for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)) for n in (8, 20))]
 
 
@@ -24,7 +24,7 @@ def bound(obstacles, delay_s=0.0, horizon_s=2.5, margin=MARGIN, env=None):
     env.reset(seed=0)
     plant = sw.MujocoPlant(delay_s=delay_s)
     plant.bind(env)
-    clearance = Asked(sw.EscapeClearance("robot", obstacles, RADIUS, margin, horizon_s), plant)
+    clearance = Asked(sw.constraints.EscapeClearance("robot", obstacles, RADIUS, margin, horizon_s), plant)
     return env.unwrapped, plant, clearance
 
 
@@ -178,17 +178,17 @@ def test_discs_that_move_go_straight_on_and_standing_ones_stay():
         anew(raw, plant, clearance, np.array([0, -2.0, 0, 9, 9, 9, 9, 9, 9]), np.zeros(9))
         return clearance.value()[0], clearance.admits(np.zeros(3))
 
-    distance, admitted = met(sw.Discs("balls", 0.3, velocity_attribute="rolling"))
+    distance, admitted = met(sw.constraints.Discs("balls", 0.3, velocity_attribute="rolling"))
     assert distance == pytest.approx(2.0 - 0.3 - RADIUS) and admitted
     raw, plant, clearance = bound(
-        [sw.Discs("balls", 0.3, velocity_attribute="rolling")],
+        [sw.constraints.Discs("balls", 0.3, velocity_attribute="rolling")],
         env=Published(gym.make("OccludedCrossing-v0")),
     )
     anew(raw, plant, clearance, np.array([0, -0.7, 0, 9, 9, 9, 9, 9, 9]), np.zeros(9))
     forward, aside = clearance.slack([0, 1, 0]), clearance.slack([1, 0, 0])
     assert forward < aside  # it does not stand still: away to the side is the way
     with pytest.raises(ConfigurationError, match="3-dimensional obstacles cannot meet a 2-dimensional point"):
-        met(sw.Discs("balls", 0.3))  # a ball that stands somewhere in the air
+        met(sw.constraints.Discs("balls", 0.3))  # a ball that stands somewhere in the air
 
 
 def test_what_rolls_towards_it_leaves_less_than_what_rolls_away():
@@ -199,7 +199,9 @@ def test_what_rolls_towards_it_leaves_less_than_what_rolls_away():
     for speed in (-1.0, 0.0, 1.0):
         env = Rolling(gym.make("OccludedCrossing-v0"))
         env.velocities = np.array([[0.0, speed]])
-        raw, plant, clearance = bound([sw.Discs("discs", 0.3, velocity_attribute="velocities")], env=env)
+        raw, plant, clearance = bound(
+            [sw.constraints.Discs("discs", 0.3, velocity_attribute="velocities")], env=env
+        )
         anew(raw, plant, clearance, np.array([0, -1.0, 0, 9, 9, 9, 9, 9, 9]), np.zeros(9))
         left[speed] = clearance.slack(np.zeros(3))
     assert left[-1.0] < left[0.0] - 0.05 and left[-1.0] < left[1.0] - 0.05
@@ -228,7 +230,7 @@ def test_the_way_that_is_open_is_remembered_and_gets_shorter():
 
 
 def test_deep_outside_a_fast_way_back_is_admitted():
-    raw, plant, clearance = bound([sw.Plane([0.0, 0.0], [0.0, -1.0])])
+    raw, plant, clearance = bound([sw.constraints.Plane([0.0, 0.0], [0.0, -1.0])])
     qvel = np.zeros(9)
     qvel[1] = -1.0  # 2 cm inside the wall, and leaving it
     anew(raw, plant, clearance, np.array([0, 0.02 - RADIUS, 0, 9, 9, 9, 9, 9, 9]), qvel)
@@ -238,7 +240,7 @@ def test_deep_outside_a_fast_way_back_is_admitted():
 
 
 def test_walls_alone_and_cars_alone():
-    wall = sw.Plane([0.0, 0.0], [0.0, -1.0])
+    wall = sw.constraints.Plane([0.0, 0.0], [0.0, -1.0])
     raw, plant, clearance = bound([wall])
     for y, vy, control, admitted in (
         (-1.0, 0.0, 1.0, True),
@@ -264,7 +266,9 @@ def test_more_margin_refuses_more():
 
     assert refused(0.3) > refused(0.0) > 0
     env = sw.CBFActionFilter(
-        gym.make("OccludedCrossing-v0"), [sw.EscapeClearance("robot", [TRUE_CARS], margin=0.1)], margin=0.2
+        gym.make("OccludedCrossing-v0"),
+        [sw.constraints.EscapeClearance("robot", [TRUE_CARS], margin=0.1)],
+        margin=0.2,
     )
     assert env.constraints[0].margin == pytest.approx(0.3)
 
@@ -272,7 +276,7 @@ def test_more_margin_refuses_more():
 def test_what_is_less_known_keeps_it_farther_away():
     refused = []
     for sigmas in (0.0, 3.0, 9.0):
-        cars = sw.TrackedDiscs(CAR, sigmas, attribute="car_tracks")  # sure now, less so later
+        cars = sw.constraints.TrackedDiscs(CAR, sigmas, attribute="car_tracks")  # sure now, less so later
         raw, plant, clearance = bound([cars])
         count = 0
         for qpos, qvel, control in random_states(150, seed=3):
@@ -287,12 +291,16 @@ def test_tracks_in_space_are_seen_from_above():
         sw.CBFActionFilter(
             sw.OcclusionPenalty(
                 gym.make("OccludedCrossing-v0"),
-                [sw.Track("car*", acceleration_noise=0.1, start_position_std=1e-9, start_velocity_std=0.1)],
-                sw.Sensor("eye", range_m=0.01),
+                [
+                    sw.occlusion.Track(
+                        "car*", acceleration_noise=0.1, start_position_std=1e-9, start_velocity_std=0.1
+                    )
+                ],
+                sw.occlusion.Sensor("eye", range_m=0.01),
                 1.0,
                 axes=axes,
             ),
-            [sw.EscapeClearance("robot", [sw.TrackedDiscs(CAR)], RADIUS)],
+            [sw.constraints.EscapeClearance("robot", [sw.constraints.TrackedDiscs(CAR)], RADIUS)],
         )
         for axes in ("xy", "xyz")
     )
@@ -333,7 +341,9 @@ def test_from_outside_the_way_back_is_asked_for_and_taken():
 
 
 def test_it_is_plain_data():
-    given = sw.EscapeClearance("robot", [TRUE_CARS, PILLARS, sw.Plane([0, 0], [0, 1])], RADIUS, 0.1, 2.0)
+    given = sw.constraints.EscapeClearance(
+        "robot", [TRUE_CARS, PILLARS, sw.constraints.Plane([0, 0], [0, 1])], RADIUS, 0.1, 2.0
+    )
     again = constraint_from(json.loads(json.dumps(plain_data(given))))
     assert again == given and again.promise == "best effort"
     env = sw.protect(gym.make("OccludedCrossing-v0"), cars="true")
@@ -351,9 +361,9 @@ def test_it_is_plain_data():
         ({"obstacles": []}, "at least one obstacle"),
         ({"obstacles": {"kind": "Disc"}}, "list with at least one"),
         ({"obstacles": ["car"]}, "expected an obstacle"),
-        ({"obstacles": [sw.Sphere([0, 0, 0], 1.0)]}, "from above.*x and y"),
-        ({"obstacles": [sw.Box([0, 0, 0], [1, 1, 1])]}, "from above"),
-        ({"obstacles": [sw.Plane([0, 0, 0], [0, 0, 1])]}, "from above"),
+        ({"obstacles": [sw.constraints.Sphere([0, 0, 0], 1.0)]}, "from above.*x and y"),
+        ({"obstacles": [sw.constraints.Box([0, 0, 0], [1, 1, 1])]}, "from above"),
+        ({"obstacles": [sw.constraints.Plane([0, 0, 0], [0, 0, 1])]}, "from above"),
         ({"radius": -0.1}, "radius"),
         ({"margin": np.nan}, "margin"),
         ({"horizon_s": 0.0}, "horizon_s"),
@@ -362,7 +372,7 @@ def test_it_is_plain_data():
 )
 def test_what_is_wrong_is_refused_at_once(given, words):
     with pytest.raises(ConfigurationError, match=words):
-        sw.EscapeClearance(**{"body": "robot", "obstacles": [TRUE_CARS]} | given)
+        sw.constraints.EscapeClearance(**{"body": "robot", "obstacles": [TRUE_CARS]} | given)
 
 
 def test_what_does_not_fit_the_env_is_refused_at_binding():
@@ -370,22 +380,26 @@ def test_what_does_not_fit_the_env_is_refused_at_binding():
         return sw.CBFActionFilter(gym.make(env), [constraint], **options)
 
     with pytest.raises(UnknownNameError, match=r"robo.*robot, car0"):
-        filtered(sw.EscapeClearance("robo", [TRUE_CARS]))
+        filtered(sw.constraints.EscapeClearance("robo", [TRUE_CARS]))
     with pytest.raises(UnsupportedEnvError, match="two slides"):
-        filtered(sw.EscapeClearance("car0", [TRUE_CARS]))
+        filtered(sw.constraints.EscapeClearance("car0", [TRUE_CARS]))
     with pytest.raises(UnknownNameError, match="no attribute 'tracking'"):
-        filtered(sw.EscapeClearance("robot", [sw.TrackedDiscs(CAR)]))
+        filtered(sw.constraints.EscapeClearance("robot", [sw.constraints.TrackedDiscs(CAR)]))
     with pytest.raises(ConfigurationError, match="OcclusionPenalty inside"):
-        filtered(sw.EscapeClearance("robot", [sw.TrackedDiscs(CAR, attribute="car_radius")]))
+        filtered(
+            sw.constraints.EscapeClearance(
+                "robot", [sw.constraints.TrackedDiscs(CAR, attribute="car_radius")]
+            )
+        )
     plant = sw.AnalyticPlant(
         f=lambda x: x, g=lambda x: np.ones((3, 1)), state=lambda env: env.state, hold_s=0.05
     )
     with pytest.raises(UnsupportedEnvError, match="MujocoPlant"):
-        filtered(sw.EscapeClearance("robot", [TRUE_CARS]), "Pendulum-v1", plant=plant)
+        filtered(sw.constraints.EscapeClearance("robot", [TRUE_CARS]), "Pendulum-v1", plant=plant)
     slow = gym.make("OccludedCrossing-v0")
     slow.unwrapped.frame_skip = 100
     with pytest.raises(ConfigurationError, match="too short for control steps of 1 s"):
-        sw.CBFActionFilter(slow, [sw.EscapeClearance("robot", [TRUE_CARS], horizon_s=0.9)])
+        sw.CBFActionFilter(slow, [sw.constraints.EscapeClearance("robot", [TRUE_CARS], horizon_s=0.9)])
 
 
 def test_the_backup_stands_still_where_that_is_safe_and_goes_where_it_is_not():

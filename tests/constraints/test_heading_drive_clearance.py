@@ -13,7 +13,7 @@ LAYOUT = {"agent": [0.0, 0.0, 0.0], "goal": [1.2, 1.2], "hazards": [[0.6, 0.0]],
 def filtered(layout=None, velocity=(0.0, 0.0, 0.0), **options):
     env = sw.CBFActionFilter(
         gym.make("SafePointGoal1-v0"),
-        [sw.HeadingDriveClearance([sw.Discs("hazard_positions", 0.2)], **options)],
+        [sw.constraints.HeadingDriveClearance([sw.constraints.Discs("hazard_positions", 0.2)], **options)],
     )
     env.reset(seed=0, options={"layout": LAYOUT | (layout or {})})
     raw = env.unwrapped

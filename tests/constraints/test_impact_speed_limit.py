@@ -51,7 +51,7 @@ def slide(
 
 
 def limit(**arguments):
-    return sw.ImpactSpeedLimit(
+    return sw.constraints.ImpactSpeedLimit(
         **{"bodies": ["cart"], "against": ["wall"], "force_limit": LIMIT, "stiffness": K, **arguments}
     )
 
@@ -171,7 +171,9 @@ def closing(model, qpos, qvel, normal, point):
 def test_speed_mass_and_push_are_those_of_the_moving_arm(seed):
     env, rng = Scene(ARM), np.random.default_rng(seed)
     env.data.qpos[:3], env.data.qvel[:3] = rng.uniform(-0.8, 0.8, 3), rng.uniform(-3.0, 3.0, 3)
-    constraint = ready(env, sw.ImpactSpeedLimit(["hand"], ["wall"], force_limit=100.0, stiffness=1e4))
+    constraint = ready(
+        env, sw.constraints.ImpactSpeedLimit(["hand"], ["wall"], force_limit=100.0, stiffness=1e4)
+    )
     m, data, control = env.model, mujoco.MjData(env.model), rng.uniform(-1.0, 1.0, 3)
     constraint.value()
     qpos, qvel = env.data.qpos.copy(), env.data.qvel.copy()
@@ -217,7 +219,9 @@ def test_speed_mass_and_push_are_those_of_the_moving_arm(seed):
 
 def test_some_of_those_pushes_come_from_the_motion_and_some_from_rest():
     env, more = Scene(ARM), {True: 0, False: 0}
-    constraint = ready(env, sw.ImpactSpeedLimit(["hand"], ["wall"], force_limit=100.0, stiffness=1e4))
+    constraint = ready(
+        env, sw.constraints.ImpactSpeedLimit(["hand"], ["wall"], force_limit=100.0, stiffness=1e4)
+    )
     rng = np.random.default_rng(0)
     constraint.value()
     for _ in range(30):
@@ -435,7 +439,7 @@ def test_falling_counts():
 
 def test_it_composes_with_others_in_one_filter():
     env = sw.CBFActionFilter(
-        slide(), [sw.JointSpeedLimit(0.8, margin=0.01), limit(margin=2.0, holds=10)], margin=0.0
+        slide(), [sw.constraints.JointSpeedLimit(0.8, margin=0.01), limit(margin=2.0, holds=10)], margin=0.0
     )
     speeds = []
 
@@ -503,7 +507,7 @@ class Reaching(gym.Wrapper):
 
 
 def test_it_is_rebuilt_from_the_spec_and_from_json():
-    given = sw.ImpactSpeedLimit(
+    given = sw.constraints.ImpactSpeedLimit(
         ["fingertip", "body1"],
         ["sideE", "sideN"],
         region="hands and fingers",
@@ -517,7 +521,7 @@ def test_it_is_rebuilt_from_the_spec_and_from_json():
     filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [given])
     for spec in (filtered.spec, EnvSpec.from_json(filtered.spec.to_json())):
         again = gym.make(spec).constraints
-        assert again == [given] and type(again[0]) is sw.ImpactSpeedLimit
+        assert again == [given] and type(again[0]) is sw.constraints.ImpactSpeedLimit
     wider = sw.CBFActionFilter(gym.make("Reacher-v5"), [given], margin=2.0)
     assert wider.constraints[0].margin == 3.0
     assert given.promise == "best effort" and filtered.filter.bound[0].scale == 140.0
@@ -572,7 +576,9 @@ REACHER = {"bodies": ["fingertip"], "against": ["sideE"]}
 )
 def test_nonsense_is_refused(arguments, error, message):
     with pytest.raises(error, match=message):
-        sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.ImpactSpeedLimit(**{**REACHER, **PLAIN, **arguments})])
+        sw.CBFActionFilter(
+            gym.make("Reacher-v5"), [sw.constraints.ImpactSpeedLimit(**{**REACHER, **PLAIN, **arguments})]
+        )
 
 
 def test_an_env_without_a_mujoco_model_is_refused():

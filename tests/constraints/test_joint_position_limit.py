@@ -13,9 +13,19 @@ from safe_wrappers.errors import ConfigurationError, UnknownNameError
 PUSHER_LOW = np.array([-2.2854, -0.5236, -1.5, -2.3213, -1.5, -1.094, -1.5])
 PUSHER_HIGH = np.array([1.714602, 1.3963, 1.7, 0.0, 1.5, 0.0, 1.5])
 CASES = {
-    "Reacher-v5": (sw.JointPositionLimit(-1.5, 1.5, ["joint0", "joint1"], holds=10), [0, 1], -1.5, 1.5),
-    "InvertedPendulum-v5": (sw.JointPositionLimit(-0.2, 0.2, ["slider"], holds=8), [0], -0.2, 0.2),
-    "Pusher-v5": (sw.JointPositionLimit(holds=6), np.arange(7), PUSHER_LOW, PUSHER_HIGH),
+    "Reacher-v5": (
+        sw.constraints.JointPositionLimit(-1.5, 1.5, ["joint0", "joint1"], holds=10),
+        [0, 1],
+        -1.5,
+        1.5,
+    ),
+    "InvertedPendulum-v5": (
+        sw.constraints.JointPositionLimit(-0.2, 0.2, ["slider"], holds=8),
+        [0],
+        -0.2,
+        0.2,
+    ),
+    "Pusher-v5": (sw.constraints.JointPositionLimit(holds=6), np.arange(7), PUSHER_LOW, PUSHER_HIGH),
 }
 
 
@@ -59,7 +69,7 @@ def test_without_the_filter_the_range_is_left():
 
 
 def test_a_margin_covers_a_wrong_mass():
-    limit = sw.JointPositionLimit(-1.5, 1.5, joints=["joint0", "joint1"], margin=0.1, holds=10)
+    limit = sw.constraints.JointPositionLimit(-1.5, 1.5, joints=["joint0", "joint1"], margin=0.1, holds=10)
     filtered = sw.CBFActionFilter(gym.make("Reacher-v5", disable_env_checker=True), [limit])
     filtered.plant.perturb(mass=1.2, damping=0.8)
     judge = Judge(filtered, room_of([0, 1], -1.5, 1.5))
@@ -72,7 +82,9 @@ def test_a_margin_covers_a_wrong_mass():
 
 def test_far_inside_the_actions_pass_bit_for_bit():
     bare = gym.make("Reacher-v5")
-    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointPositionLimit(-20.0, 20.0, ["joint0"])])
+    filtered = sw.CBFActionFilter(
+        gym.make("Reacher-v5"), [sw.constraints.JointPositionLimit(-20.0, 20.0, ["joint0"])]
+    )
     rng = np.random.default_rng(0)
     a, b = bare.reset(seed=3)[0], filtered.reset(seed=3)[0]
     for _ in range(50):
@@ -86,7 +98,8 @@ def test_far_inside_the_actions_pass_bit_for_bit():
 @pytest.mark.parametrize("start", [[1.7, 0.5], [-1.7, -1.65]])
 def test_from_outside_it_goes_inwards(start):
     filtered = sw.CBFActionFilter(
-        gym.make("Reacher-v5"), [sw.JointPositionLimit(-1.5, 1.5, joints=["joint0", "joint1"], holds=10)]
+        gym.make("Reacher-v5"),
+        [sw.constraints.JointPositionLimit(-1.5, 1.5, joints=["joint0", "joint1"], holds=10)],
     )
     filtered.reset(seed=0)
     raw = filtered.unwrapped
@@ -123,18 +136,22 @@ def test_one_value_per_bound_that_there_is():
     env.reset(seed=0)
     at = [0.5, -1.0]
     # joint0 turns without end, joint1 from -3 to 3
-    np.testing.assert_allclose(value(env, sw.JointPositionLimit(), at), [2.0, 4.0], atol=1e-12)
-    np.testing.assert_allclose(value(env, sw.JointPositionLimit(upper=2.0), at), [2.0, 1.5, 3.0], atol=1e-12)
-    np.testing.assert_allclose(value(env, sw.JointPositionLimit(-2.0, 1.0), at), [2.5, 1.0, 0.5, 2.0])
-    each = sw.JointPositionLimit([-3.0, -1.0], [0.0, np.inf], joints=["joint1", "joint0"])
+    np.testing.assert_allclose(value(env, sw.constraints.JointPositionLimit(), at), [2.0, 4.0], atol=1e-12)
+    np.testing.assert_allclose(
+        value(env, sw.constraints.JointPositionLimit(upper=2.0), at), [2.0, 1.5, 3.0], atol=1e-12
+    )
+    np.testing.assert_allclose(
+        value(env, sw.constraints.JointPositionLimit(-2.0, 1.0), at), [2.5, 1.0, 0.5, 2.0]
+    )
+    each = sw.constraints.JointPositionLimit([-3.0, -1.0], [0.0, np.inf], joints=["joint1", "joint0"])
     np.testing.assert_allclose(value(env, each, at), [2.0, 1.5, 1.0])
-    one_sided = sw.JointPositionLimit(-np.inf, 2.0, joints=["joint0"])
+    one_sided = sw.constraints.JointPositionLimit(-np.inf, 2.0, joints=["joint0"])
     np.testing.assert_allclose(value(env, one_sided, at), [1.5])
 
 
 def test_a_joint_without_a_range_does_not_spoil_the_others():
     # The linearisation about a refused control must not see its infinities.
-    limit = sw.JointPositionLimit(upper=[np.inf, 1.5], holds=10)
+    limit = sw.constraints.JointPositionLimit(upper=[np.inf, 1.5], holds=10)
     filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [limit])
     judge = Judge(filtered, room_of([1], -3.0, 1.5))
     filtered.reset(seed=0)
@@ -150,7 +167,7 @@ def test_a_joint_without_a_range_does_not_spoil_the_others():
 
 def test_the_filters_margin_comes_on_top_of_its_own():
     env = gym.make("InvertedPendulum-v5")
-    limit = sw.JointPositionLimit(-0.5, 0.5, joints=["slider"], margin=0.1, holds=8)
+    limit = sw.constraints.JointPositionLimit(-0.5, 0.5, joints=["slider"], margin=0.1, holds=8)
     filtered = sw.CBFActionFilter(env, [limit], margin=0.1)
     assert limit.margin == 0.1 and filtered.constraints[0].margin == 0.2
     filtered.reset(seed=0)
@@ -160,8 +177,8 @@ def test_the_filters_margin_comes_on_top_of_its_own():
 
 
 def test_conflicting_limits_are_infeasible_and_the_action_stays_sound():
-    left = sw.JointPositionLimit(-2.0, -0.5, joints=["joint0"])
-    right = sw.JointPositionLimit(0.5, 2.0, joints=["joint0"])
+    left = sw.constraints.JointPositionLimit(-2.0, -0.5, joints=["joint0"])
+    right = sw.constraints.JointPositionLimit(0.5, 2.0, joints=["joint0"])
     filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [left, right])
     with pytest.warns(sw.UnsafeStateWarning):
         filtered.reset(seed=0)
@@ -174,13 +191,13 @@ def test_conflicting_limits_are_infeasible_and_the_action_stays_sound():
 
 
 def test_it_is_rebuilt_from_the_spec_and_from_json():
-    limit = sw.JointPositionLimit(
+    limit = sw.constraints.JointPositionLimit(
         [-1.0, -np.inf], 2, joints=["joint1", "joint0"], margin=0.1, holds=7, reach=0.5
     )
     filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [limit])
     for spec in (filtered.spec, EnvSpec.from_json(filtered.spec.to_json())):
         again = gym.make(spec).constraints
-        assert again == [limit] and type(again[0]) is sw.JointPositionLimit
+        assert again == [limit] and type(again[0]) is sw.constraints.JointPositionLimit
     assert limit.promise == "best effort"
 
 
@@ -226,16 +243,16 @@ def test_it_is_rebuilt_from_the_spec_and_from_json():
 )
 def test_nonsense_is_refused(arguments, error, message):
     with pytest.raises(error, match=message):
-        sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointPositionLimit(**arguments)])
+        sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointPositionLimit(**arguments)])
 
 
 def test_a_free_joint_is_refused_by_name():
     with pytest.raises(ConfigurationError, match="joint 'root' is neither a hinge nor a slide"):
-        sw.CBFActionFilter(gym.make("Ant-v5"), [sw.JointPositionLimit(joints=["root"])])
+        sw.CBFActionFilter(gym.make("Ant-v5"), [sw.constraints.JointPositionLimit(joints=["root"])])
 
 
 def test_a_slide_is_measured_in_metres_and_a_machine_without_ranges_asks_for_them():
     with pytest.raises(ConfigurationError, match="none of these joints has a range in the model"):
-        sw.CBFActionFilter(sliders(), [sw.JointPositionLimit()])
+        sw.CBFActionFilter(sliders(), [sw.constraints.JointPositionLimit()])
     env = sliders()
-    assert value(env, sw.JointPositionLimit(-1.0, 2.0), [0.5]).tolist() == [1.5, 1.5]
+    assert value(env, sw.constraints.JointPositionLimit(-1.0, 2.0), [0.5]).tolist() == [1.5, 1.5]

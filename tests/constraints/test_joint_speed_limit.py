@@ -58,7 +58,7 @@ CASES = {"Reacher-v5": ([0, 1], 4.0, 400), "InvertedPendulum-v5": ([0], 0.5, 250
 @pytest.mark.parametrize("env_id", CASES)
 def test_no_substep_is_too_fast(monkeypatch, env_id, driver):
     dofs, limit, steps = CASES[env_id]
-    filtered = sw.CBFActionFilter(gym.make(env_id), [sw.JointSpeedLimit(limit)])
+    filtered = sw.CBFActionFilter(gym.make(env_id), [sw.constraints.JointSpeedLimit(limit)])
     judge = Judge(monkeypatch, filtered, dofs)
     rng = np.random.default_rng(0)
     intervened = infeasible = 0
@@ -88,7 +88,7 @@ def test_without_the_filter_it_is_too_fast(monkeypatch):
 
 def test_a_margin_is_kept_free_and_covers_a_wrong_mass(monkeypatch):
     env = gym.make("Reacher-v5")
-    filtered = sw.CBFActionFilter(env, [sw.JointSpeedLimit(4.0, margin=0.5)])
+    filtered = sw.CBFActionFilter(env, [sw.constraints.JointSpeedLimit(4.0, margin=0.5)])
     filtered.plant.perturb(mass=1.2, damping=0.8)
     judge = Judge(monkeypatch, filtered, [0, 1])
     rng = np.random.default_rng(0)
@@ -101,7 +101,7 @@ def test_a_margin_is_kept_free_and_covers_a_wrong_mass(monkeypatch):
 
 def test_each_joint_has_its_own_limit(monkeypatch):
     filtered = sw.CBFActionFilter(
-        gym.make("Reacher-v5"), [sw.JointSpeedLimit([2.0, 6.0], joints=["joint1", "joint0"])]
+        gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit([2.0, 6.0], joints=["joint1", "joint0"])]
     )
     judge = Judge(monkeypatch, filtered, [0, 1])
     filtered.reset(seed=0)
@@ -112,7 +112,7 @@ def test_each_joint_has_its_own_limit(monkeypatch):
 
 
 def test_a_start_that_is_too_fast_slows_down():
-    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(4.0)])
+    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(4.0)])
     filtered.reset(seed=0)
     raw = filtered.unwrapped
     raw.set_state(raw.data.qpos.copy(), np.array([9.0, -7.0, 0.0, 0.0]))
@@ -131,7 +131,7 @@ def test_value_and_rows_against_the_plants_own_prediction():
     env.unwrapped.set_state(env.unwrapped.data.qpos.copy(), np.array([3.5, -3.0, 0.0, 0.0]))
     plant = sw.MujocoPlant()
     plant.bind(env)
-    limit = sw.JointSpeedLimit(4.0, margin=0.1)
+    limit = sw.constraints.JointSpeedLimit(4.0, margin=0.1)
     limit = Asked(limit, plant)
     plant.observe()
     np.testing.assert_allclose(limit.value(), [0.5, 1.0])
@@ -145,15 +145,15 @@ def test_value_and_rows_against_the_plants_own_prediction():
 
 
 def test_a_free_or_undriven_model_asks_for_names():
-    filtered = sw.CBFActionFilter(gym.make("Ant-v5"), [sw.JointSpeedLimit(4.0)])
+    filtered = sw.CBFActionFilter(gym.make("Ant-v5"), [sw.constraints.JointSpeedLimit(4.0)])
     filtered.reset(seed=0)
     assert len(filtered.filter.bound[0].value()) == 8  # the driven ones, not the free root
     with pytest.raises(ConfigurationError, match="joint 'root' is neither a hinge nor a slide"):
-        sw.CBFActionFilter(gym.make("Ant-v5"), [sw.JointSpeedLimit(4.0, joints=["root"])])
+        sw.CBFActionFilter(gym.make("Ant-v5"), [sw.constraints.JointSpeedLimit(4.0, joints=["root"])])
     with pytest.raises(
         ConfigurationError, match=r"no actuator drives a hinge or slide directly: name the joints.*: x, y, z"
     ):
-        filtered = sw.CBFActionFilter(site_driven(), [sw.JointSpeedLimit(4.0)])
+        filtered = sw.CBFActionFilter(site_driven(), [sw.constraints.JointSpeedLimit(4.0)])
 
 
 def site_driven():
@@ -184,17 +184,17 @@ def site_driven():
 )
 def test_constructor_refuses_nonsense(arguments, message):
     with pytest.raises(ConfigurationError, match=message):
-        limit = sw.JointSpeedLimit(**arguments)
+        limit = sw.constraints.JointSpeedLimit(**arguments)
         sw.CBFActionFilter(gym.make("Reacher-v5"), [limit])
 
 
 def test_as_many_limits_as_joints():
     with pytest.raises(ConfigurationError, match=r"expected one limit or 2, got \[1.0, 2.0, 3.0\]"):
-        sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit([1.0, 2.0, 3.0])])
+        sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit([1.0, 2.0, 3.0])])
 
 
 def test_at_the_limit_the_actions_rounding_is_not_called_unsafe():
-    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(4.0)])
+    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(4.0)])
     filtered.reset(seed=0)
     infos = [filtered.step(full(filtered, k, None).astype(np.float32))[4] for k in range(400)]
     assert not any(i["cbf/unsafe"] for i in infos)

@@ -12,8 +12,8 @@ import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError
 
 LIMITS = {
-    "JointSpeedLimit": lambda **more: sw.JointSpeedLimit(3.0, **more),
-    "JointPositionLimit": lambda **more: sw.JointPositionLimit(-7.0, 7.0, holds=1, **more),
+    "JointSpeedLimit": lambda **more: sw.constraints.JointSpeedLimit(3.0, **more),
+    "JointPositionLimit": lambda **more: sw.constraints.JointPositionLimit(-7.0, 7.0, holds=1, **more),
 }
 
 
@@ -51,7 +51,7 @@ def test_named_the_arm_keeps_its_limit():
         ]
         fingers = ["robot0:l_gripper_finger_joint", "robot0:r_gripper_finger_joint"]
         env = sw.CBFActionFilter(
-            env, [sw.JointSpeedLimit(3.0, joints=arm if named else fingers, margin=0.02)]
+            env, [sw.constraints.JointSpeedLimit(3.0, joints=arm if named else fingers, margin=0.02)]
         )
         env.reset(seed=0)
         dofs = [int(model.joint(name).dofadr[0]) for name in arm]
@@ -76,13 +76,13 @@ def test_named_the_arm_keeps_its_limit():
 )
 def test_sites_and_tendons_move_joints_too(env_id, covered, rest):
     with pytest.raises(ConfigurationError) as caught:
-        sw.CBFActionFilter(gym.make(env_id), [sw.JointSpeedLimit(3.0)])
+        sw.CBFActionFilter(gym.make(env_id), [sw.constraints.JointSpeedLimit(3.0)])
     assert [set(names) for names in listed(caught)] == [covered, rest]
 
 
 def test_passive_joints_of_a_machine_driven_at_its_joints_need_no_names():
     for env_id, driven in (("InvertedDoublePendulum-v5", 1), ("Pusher-v5", 7), ("Ant-v5", 8)):
-        filtered = sw.CBFActionFilter(gym.make(env_id), [sw.JointSpeedLimit(3.0)])
+        filtered = sw.CBFActionFilter(gym.make(env_id), [sw.constraints.JointSpeedLimit(3.0)])
         filtered.reset(seed=0)
         assert filtered.filter.bound[0].value().size == driven
 
@@ -131,10 +131,10 @@ def test_stops_that_would_not_be_guarded_are_refused(tmp_path, kind, contacts):
     assert listed(caught) == [["hip"], ["ankle"]]
     sw.WholeBodyFilter(Leg(path), contacts=contacts, joint_tolerance=None)
     with pytest.raises(ConfigurationError, match="leaves all joints alone"):
-        sw.CBFActionFilter(Leg(path), [sw.Stance()])
-    sw.CBFActionFilter(Leg(path), [sw.Stance(joint_tolerance=None)])
+        sw.CBFActionFilter(Leg(path), [sw.constraints.Stance()])
+    sw.CBFActionFilter(Leg(path), [sw.constraints.Stance(joint_tolerance=None)])
     with pytest.raises(ConfigurationError, match="Name those that you mean") as caught:
-        sw.CBFActionFilter(Leg(path), [sw.JointSpeedLimit(3.0)])
+        sw.CBFActionFilter(Leg(path), [sw.constraints.JointSpeedLimit(3.0)])
     assert listed(caught) == [["hip"], ["ankle"]]
 
 
@@ -142,7 +142,9 @@ def test_a_finger_is_not_the_whole_arm_of_a_singularity_margin():
     env = fetch("FetchPickAndPlace-v4")
     finger = {"body": "robot0:r_gripper_finger_link", "threshold": 1e-6}
     with pytest.raises(ConfigurationError, match="Name those that do the task: joints=") as caught:
-        sw.CBFActionFilter(env, [sw.SingularityMargin(**finger)])
+        sw.CBFActionFilter(env, [sw.constraints.SingularityMargin(**finger)])
     arm = [name for name in listed(caught)[1] if "_joint" in name and "torso" not in name]
     assert len(arm) == 7
-    sw.CBFActionFilter(fetch("FetchPickAndPlace-v4"), [sw.SingularityMargin(**finger, joints=arm)])
+    sw.CBFActionFilter(
+        fetch("FetchPickAndPlace-v4"), [sw.constraints.SingularityMargin(**finger, joints=arm)]
+    )

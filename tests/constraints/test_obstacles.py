@@ -12,12 +12,12 @@ from safe_wrappers.errors import ConfigurationError
 
 COORDINATE = st.floats(-2, 2).map(lambda v: round(v, 4))
 SHAPES = {
-    "disc": sw.Disc([0.2, -0.1], 0.5),
-    "sphere": sw.Sphere([0.2, -0.1, 0.3], 0.5),
-    "box": sw.Box([0.1, 0.2], [0.4, 0.7]),
-    "box in space": sw.Box([0.1, 0.2, -0.3], [0.4, 0.7, 0.2]),
-    "wall": sw.Plane([0.3, 0.1], [1.0, 2.0]),
-    "floor": sw.Plane([0.3, 0.1, 0.2], [0.0, -1.0, 2.0]),
+    "disc": sw.constraints.Disc([0.2, -0.1], 0.5),
+    "sphere": sw.constraints.Sphere([0.2, -0.1, 0.3], 0.5),
+    "box": sw.constraints.Box([0.1, 0.2], [0.4, 0.7]),
+    "box in space": sw.constraints.Box([0.1, 0.2, -0.3], [0.4, 0.7, 0.2]),
+    "wall": sw.constraints.Plane([0.3, 0.1], [1.0, 2.0]),
+    "floor": sw.constraints.Plane([0.3, 0.1, 0.2], [0.0, -1.0, 2.0]),
 }
 DIMENSIONS = {
     "disc": (2, 3),
@@ -39,11 +39,11 @@ def truth(obstacle, point):
     """Distance to the surface by sampling it (negative inside), with no use of the library's formulas."""
     d = len(getattr(obstacle, "center", getattr(obstacle, "point", None)))
     p = np.asarray(point)[:d]
-    if isinstance(obstacle, sw.Plane):
+    if isinstance(obstacle, sw.constraints.Plane):
         n = np.array(obstacle.normal) / np.linalg.norm(obstacle.normal)
         return (p - obstacle.point) @ n
     offset = p - obstacle.center
-    if isinstance(obstacle, sw.Box):
+    if isinstance(obstacle, sw.constraints.Box):
         half = np.array(obstacle.half_size)
         closest = np.clip(offset, -half, half)
         if (closest != offset).any():
@@ -97,7 +97,11 @@ def test_curvature_is_what_sideways_motion_gains(name, size):
 
 
 def test_the_very_centre_still_has_a_way_out():
-    for obstacle in (sw.Disc([1, 2], 0.5), sw.Sphere([1, 2, 3], 0.5), sw.Box([1, 2], [0.3, 0.4])):
+    for obstacle in (
+        sw.constraints.Disc([1, 2], 0.5),
+        sw.constraints.Sphere([1, 2, 3], 0.5),
+        sw.constraints.Box([1, 2], [0.3, 0.4]),
+    ):
         near = obstacle.nearest(np.array(obstacle.center), None)
         assert np.linalg.norm(near.normal[0]) == pytest.approx(1.0) and near.distance[0] < 0.0
         assert np.isfinite(near.curvature).all()
@@ -115,43 +119,48 @@ class Facts:
 
 def test_published_discs_are_read_afresh():
     facts = Facts(where=np.array([[0.0, 0.0], [3.0, 0.0]]), speed=np.array([[1.0, 0.0], [0.0, 0.0]]))
-    discs = sw.Discs("where", 0.5, velocity_attribute="speed")
+    discs = sw.constraints.Discs("where", 0.5, velocity_attribute="speed")
     near = discs.nearest(np.array([2.0, 0.0]), facts)
     np.testing.assert_allclose(near.distance, [1.5, 0.5])
     np.testing.assert_allclose(near.normal, [[1, 0], [-1, 0]])
     np.testing.assert_allclose(near.velocity, [[1, 0], [0, 0]])
     facts.facts["where"] = np.array([[2.0, 1.0]])
-    np.testing.assert_allclose(sw.Discs("where", 0.5).nearest(np.array([2.0, 0.0]), facts).distance, [0.5])
+    np.testing.assert_allclose(
+        sw.constraints.Discs("where", 0.5).nearest(np.array([2.0, 0.0]), facts).distance, [0.5]
+    )
     facts.facts["where"] = np.zeros((0, 2))
-    assert sw.Discs("where", 0.5).nearest(np.array([2.0, 0.0]), facts).distance.shape == (0,)
+    assert sw.constraints.Discs("where", 0.5).nearest(np.array([2.0, 0.0]), facts).distance.shape == (0,)
     facts.facts["where"] = np.zeros(3)
     with pytest.raises(ConfigurationError, match=r"where must have shape \(k, 2\) or \(k, 3\), got \(3,\)"):
-        sw.Discs("where", 0.5).nearest(np.array([2.0, 0.0]), facts)
+        sw.constraints.Discs("where", 0.5).nearest(np.array([2.0, 0.0]), facts)
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: sw.Disc([0, 0], -1), "radius must be a finite number > 0 in m, got -1"),
-        (lambda: sw.Disc([0, 0], 0), "radius must be a finite number > 0 in m, got 0"),
-        (lambda: sw.Disc([0, 0], np.nan), "radius must be a finite number > 0"),
-        (lambda: sw.Disc([0, 0], "big"), "radius must be a number in m, got 'big'"),
-        (lambda: sw.Disc([0, 0, 0], 1), "center must be 2 finite numbers, got"),
-        (lambda: sw.Disc([0, np.inf], 1), "center must be 2 finite numbers"),
-        (lambda: sw.Disc(5.0, 1), "center must be a list of numbers, got 5.0"),
-        (lambda: sw.Sphere([0, 0], 1), "center must be 3 finite numbers"),
-        (lambda: sw.Box([0, 0], [1, 1, 1]), "half_size must be 2 finite numbers"),
-        (lambda: sw.Box([0, 0], [1, -1]), "half_size must be a finite number > 0 in m, got -1"),
-        (lambda: sw.Box([0], [1]), "center must be 2 or 3 finite numbers"),
-        (lambda: sw.Plane([0, 0], [0, 0]), "normal must not be zero"),
-        (lambda: sw.Plane([0, 0], [1]), "normal must be 2 finite numbers"),
-        (lambda: sw.Plane([0, 0, 0, 0], [1, 0, 0, 0]), "point must be 1 or 2 or 3 finite numbers"),
-        (lambda: sw.Discs("hazards", 0), "radius must be a finite number > 0"),
+        (lambda: sw.constraints.Disc([0, 0], -1), "radius must be a finite number > 0 in m, got -1"),
+        (lambda: sw.constraints.Disc([0, 0], 0), "radius must be a finite number > 0 in m, got 0"),
+        (lambda: sw.constraints.Disc([0, 0], np.nan), "radius must be a finite number > 0"),
+        (lambda: sw.constraints.Disc([0, 0], "big"), "radius must be a number in m, got 'big'"),
+        (lambda: sw.constraints.Disc([0, 0, 0], 1), "center must be 2 finite numbers, got"),
+        (lambda: sw.constraints.Disc([0, np.inf], 1), "center must be 2 finite numbers"),
+        (lambda: sw.constraints.Disc(5.0, 1), "center must be a list of numbers, got 5.0"),
+        (lambda: sw.constraints.Sphere([0, 0], 1), "center must be 3 finite numbers"),
+        (lambda: sw.constraints.Box([0, 0], [1, 1, 1]), "half_size must be 2 finite numbers"),
+        (lambda: sw.constraints.Box([0, 0], [1, -1]), "half_size must be a finite number > 0 in m, got -1"),
+        (lambda: sw.constraints.Box([0], [1]), "center must be 2 or 3 finite numbers"),
+        (lambda: sw.constraints.Plane([0, 0], [0, 0]), "normal must not be zero"),
+        (lambda: sw.constraints.Plane([0, 0], [1]), "normal must be 2 finite numbers"),
         (
-            lambda: sw.Clearance([{"kind": "Disk"}], braking=1),
+            lambda: sw.constraints.Plane([0, 0, 0, 0], [1, 0, 0, 0]),
+            "point must be 1 or 2 or 3 finite numbers",
+        ),
+        (lambda: sw.constraints.Discs("hazards", 0), "radius must be a finite number > 0"),
+        (
+            lambda: sw.constraints.Clearance([{"kind": "Disk"}], braking=1),
             "unknown obstacle kind 'Disk'; the kinds are Disc",
         ),
-        (lambda: sw.Clearance(["wall"], braking=1), "expected an obstacle .* got 'wall'"),
+        (lambda: sw.constraints.Clearance(["wall"], braking=1), "expected an obstacle .* got 'wall'"),
     ],
 )
 def test_constructors_refuse_nonsense(make, message):
@@ -160,7 +169,12 @@ def test_constructors_refuse_nonsense(make, message):
 
 
 @pytest.mark.parametrize(
-    "obstacle", [sw.Sphere([0, 0, 1], 0.1), sw.Box([0, 0, 1], [1, 1, 1]), sw.Plane([0, 0, 0], [0, 0, 1])]
+    "obstacle",
+    [
+        sw.constraints.Sphere([0, 0, 1], 0.1),
+        sw.constraints.Box([0, 0, 1], [1, 1, 1]),
+        sw.constraints.Plane([0, 0, 0], [0, 0, 1]),
+    ],
 )
 def test_an_obstacle_of_more_dimensions_than_the_point_is_refused(obstacle):
     with pytest.raises(ConfigurationError, match="cannot meet a 2-dimensional point"):
@@ -168,7 +182,7 @@ def test_an_obstacle_of_more_dimensions_than_the_point_is_refused(obstacle):
 
 
 def test_a_planes_normal_is_normalised():
-    assert sw.Plane([0, 0], [3.0, 4.0]).normal == pytest.approx([0.6, 0.8])
+    assert sw.constraints.Plane([0, 0], [3.0, 4.0]).normal == pytest.approx([0.6, 0.8])
 
 
 # Moving obstacles ---------------------------------------------------------------------------------------------
@@ -213,7 +227,7 @@ def chase(obstacle, policy, delay_s=0.0):
         hold_s=0.1,
         delay_s=delay_s,
     )
-    clear = sw.Clearance([obstacle], braking=1.0, position=[0, 1], velocity=[2, 3], margin=1e-3)
+    clear = sw.constraints.Clearance([obstacle], braking=1.0, position=[0, 1], velocity=[2, 3], margin=1e-3)
     env = sw.CBFActionFilter(Chaser(round(delay_s / 0.1)), [clear], plant=plant)
     env.reset(seed=0)
     for _ in range(80):
@@ -223,24 +237,26 @@ def chase(obstacle, policy, delay_s=0.0):
 
 @pytest.mark.parametrize("policy", [1.0, 0.0])
 def test_a_published_moving_disc_is_evaded(policy):
-    closest = chase(sw.Discs("discs", 0.5, velocity_attribute="speeds"), policy)
+    closest = chase(sw.constraints.Discs("discs", 0.5, velocity_attribute="speeds"), policy)
     assert 0.0 <= closest < 0.05
-    blind = chase(sw.Discs("discs", 0.5), policy)
+    blind = chase(sw.constraints.Discs("discs", 0.5), policy)
     assert blind < 0.0  # taken for standing still it runs the cart over: the test has teeth
 
 
 def test_a_moving_disc_is_predicted_over_the_delay_too():
-    assert 0.0 <= chase(sw.Discs("discs", 0.5, velocity_attribute="speeds"), 1.0, delay_s=0.3) < 0.05
+    assert (
+        0.0 <= chase(sw.constraints.Discs("discs", 0.5, velocity_attribute="speeds"), 1.0, delay_s=0.3) < 0.05
+    )
 
 
 OBSTACLES = [
-    sw.Disc([0.3, -0.2], 0.4),
-    sw.Sphere([0.3, -0.2, 0.1], 0.4),
-    sw.Plane([0.1, 0.0, 0.0], [1.0, 2.0, 0.5]),
-    sw.Plane([0.1], [1.0]),
-    sw.Box([0.0, 0.1], [0.5, 0.3]),
-    sw.Box([0.0, 0.1, 0.2], [0.5, 0.3, 0.1]),
-    sw.Discs("centers", 0.3),
+    sw.constraints.Disc([0.3, -0.2], 0.4),
+    sw.constraints.Sphere([0.3, -0.2, 0.1], 0.4),
+    sw.constraints.Plane([0.1, 0.0, 0.0], [1.0, 2.0, 0.5]),
+    sw.constraints.Plane([0.1], [1.0]),
+    sw.constraints.Box([0.0, 0.1], [0.5, 0.3]),
+    sw.constraints.Box([0.0, 0.1, 0.2], [0.5, 0.3, 0.1]),
+    sw.constraints.Discs("centers", 0.3),
 ]
 
 
@@ -260,9 +276,9 @@ def test_distances_of_many_points_are_those_of_each(obstacle):
 def test_distances_of_a_foreign_obstacle_come_from_its_nearest():
     class Foreign:
         def nearest(self, point, plant):
-            return sw.Disc([0.0, 0.0], 0.5).nearest(point, plant)
+            return sw.constraints.Disc([0.0, 0.0], 0.5).nearest(point, plant)
 
     points = np.random.default_rng(0).uniform(-1.0, 1.0, size=(20, 3))
     np.testing.assert_allclose(
-        distances(Foreign(), points, None), distances(sw.Disc([0.0, 0.0], 0.5), points, None)
+        distances(Foreign(), points, None), distances(sw.constraints.Disc([0.0, 0.0], 0.5), points, None)
     )

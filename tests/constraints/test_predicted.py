@@ -17,11 +17,13 @@ from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 
 HOLD_S = 0.05
 LIMITS = {
-    "speed": lambda **more: sw.SpeedLimit(0.8, "b0", "x", "substep", **more),
-    "joint position": lambda **more: sw.JointPositionLimit(-1.0, 1.0, **more),
-    "joint speed": lambda **more: sw.JointSpeedLimit(0.8, **more),
-    "workspace": lambda **more: sw.Workspace([-1.0, None, None], [1.0, None, None], bodies=["b0"], **more),
-    "upright": lambda **more: sw.Upright("b0", lowest=-1.0, **more),
+    "speed": lambda **more: sw.constraints.SpeedLimit(0.8, "b0", "x", "substep", **more),
+    "joint position": lambda **more: sw.constraints.JointPositionLimit(-1.0, 1.0, **more),
+    "joint speed": lambda **more: sw.constraints.JointSpeedLimit(0.8, **more),
+    "workspace": lambda **more: sw.constraints.Workspace(
+        [-1.0, None, None], [1.0, None, None], bodies=["b0"], **more
+    ),
+    "upright": lambda **more: sw.constraints.Upright("b0", lowest=-1.0, **more),
 }
 kinds = pytest.mark.parametrize("kind", LIMITS)
 
@@ -64,7 +66,7 @@ def looking(scene, limit, qpos, qvel):
     margin=st.sampled_from([0.0, 0.2]),
 )
 def test_a_control_is_admitted_by_where_it_leads(x, v, u, holds, margin):
-    limit = sw.JointPositionLimit(-1.0, 1.0, holds=holds, margin=margin)
+    limit = sw.constraints.JointPositionLimit(-1.0, 1.0, holds=holds, margin=margin)
     limit = looking(sliders(range_="-30 30"), limit, [x], [v])
     beyond = np.abs(slider_path(x, v, u, holds, 30.0)) - (1.0 - margin)
     start = abs(x) - (1.0 - margin)
@@ -83,7 +85,7 @@ def test_a_control_is_admitted_by_where_it_leads(x, v, u, holds, margin):
 def test_outside_it_comes_back_and_stays_whatever_the_policy_does():
     scene = sliders(range_="-100 100")
     scene.start = [1.4], [0.0]
-    filtered = sw.CBFActionFilter(scene, [sw.JointPositionLimit(-1.0, 1.0)])
+    filtered = sw.CBFActionFilter(scene, [sw.constraints.JointPositionLimit(-1.0, 1.0)])
     judge = Judge(filtered, lambda model, data: 1.0 - np.abs(data.qpos))
     with pytest.warns(sw.UnsafeStateWarning):
         filtered.reset(seed=0)
@@ -101,7 +103,7 @@ def test_outside_it_comes_back_and_stays_whatever_the_policy_does():
 def test_a_bound_that_holds_is_not_given_up_while_another_comes_back():
     scene = sliders(count=2, range_="-100 100")
     scene.start = [1.4, 0.98], [0.0, 0.0]
-    filtered = sw.CBFActionFilter(scene, [sw.JointPositionLimit(-1.0, 1.0, joints=["x0", "x1"])])
+    filtered = sw.CBFActionFilter(scene, [sw.constraints.JointPositionLimit(-1.0, 1.0, joints=["x0", "x1"])])
     with pytest.warns(sw.UnsafeStateWarning):
         filtered.reset(seed=0)
     farthest, unflagged = 0.0, 0
@@ -117,7 +119,7 @@ def test_a_bound_that_holds_is_not_given_up_while_another_comes_back():
 def test_a_start_too_far_out_for_the_actuators_is_infeasible_and_still_driven_inwards():
     scene = sliders(range_="-1 1")
     scene.start = [1.4], [0.0]
-    filtered = sw.CBFActionFilter(scene, [sw.JointPositionLimit(-1.0, 1.0, holds=8)])
+    filtered = sw.CBFActionFilter(scene, [sw.constraints.JointPositionLimit(-1.0, 1.0, holds=8)])
     with pytest.warns(sw.UnsafeStateWarning):
         filtered.reset(seed=0)
     infos = [filtered.step(np.array([1.0]))[4] for _ in range(12)]
@@ -145,7 +147,7 @@ def test_a_reach_spares_forecasts_and_changes_nothing_else(monkeypatch):
     actions = np.repeat(np.random.default_rng(0).choice([-1.0, 1.0], (40, 1)), 12, axis=0)
     seen, spent = {}, {}
     for reach in (None, 0.5):  # the fastest is 2 m/s, four control steps are 0.2 s
-        limit = sw.JointPositionLimit(-1.0, 1.0, holds=4, reach=reach)
+        limit = sw.constraints.JointPositionLimit(-1.0, 1.0, holds=4, reach=reach)
         filtered = sw.CBFActionFilter(sliders(range_="-10 10"), [limit])
         filtered.reset(seed=0)
         calls[0] = 0
@@ -162,7 +164,7 @@ def test_far_from_the_limit_nothing_is_simulated(monkeypatch):
     simulated = []
     step = mujoco.mj_step
     filtered = sw.CBFActionFilter(
-        gym.make("Reacher-v5"), [sw.JointPositionLimit(-9.0, 9.0, ["joint0"], reach=2.0)]
+        gym.make("Reacher-v5"), [sw.constraints.JointPositionLimit(-9.0, 9.0, ["joint0"], reach=2.0)]
     )
     filtered.reset(seed=0)
 
@@ -180,7 +182,7 @@ def test_a_broken_reach_is_warned_of_once_and_dropped(monkeypatch):
     calls = count_forecasts(monkeypatch)
     scene = sliders(range_="-1 1")
     scene.start = [-0.9], [1.0]  # 5 cm in a control step
-    limit = sw.JointPositionLimit(None, 2.0, joints=["x0"], holds=4, reach=0.12)
+    limit = sw.constraints.JointPositionLimit(None, 2.0, joints=["x0"], holds=4, reach=0.12)
     filtered = sw.CBFActionFilter(scene, [limit])
     filtered.reset(seed=0)
     with pytest.warns(UserWarning) as caught:
@@ -200,7 +202,7 @@ def test_a_broken_reach_is_warned_of_once_and_dropped(monkeypatch):
 
 def test_a_reset_is_not_taken_for_a_broken_reach():
     scene = sliders(range_="-1 1")
-    filtered = sw.CBFActionFilter(scene, [sw.JointPositionLimit(-1.0, 1.0, holds=4, reach=0.5)])
+    filtered = sw.CBFActionFilter(scene, [sw.constraints.JointPositionLimit(-1.0, 1.0, holds=4, reach=0.5)])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for start in (0.0, 0.9, -0.2, 0.99):
@@ -217,7 +219,7 @@ def test_a_model_that_breaks_down_in_the_forecast_is_not_admitted(tmp_path, monk
     # MuJoCo resets it, and from the reset on all looks well.
     monkeypatch.chdir(tmp_path)  # it writes a log
     scene = sliders(actuator='motor gear="1000"', range_=None)
-    limit = looking(scene, sw.JointPositionLimit(-1e6, 1e6), [0.0], [0.0])
+    limit = looking(scene, sw.constraints.JointPositionLimit(-1e6, 1e6), [0.0], [0.0])
     assert limit.admits(np.array([1.0]))
     assert not limit.admits(np.array([1e9]))
     assert limit.admits(np.array([2.0]))  # and the next one is a forecast again

@@ -78,7 +78,7 @@ TASKS = {
 def test_w_is_that_of_mujoco_s_jacobian_now_and_ahead(task):
     arguments, truth = TASKS[task]
     env, threshold = Scene(CHAIN), 1e-3
-    limit = bound(env, sw.SingularityMargin(threshold, holds=2, **arguments))
+    limit = bound(env, sw.constraints.SingularityMargin(threshold, holds=2, **arguments))
     plant = limit.plant
     kind = next(k for k in ("site", "body", "geom") if k in arguments)
     rng, still = np.random.default_rng(0), mujoco.MjData(env.model)
@@ -108,7 +108,7 @@ def test_w_is_that_of_mujoco_s_jacobian_now_and_ahead(task):
 def test_its_row_is_the_second_derivative_of_w_under_a_torque(task):
     arguments, _ = TASKS[task]
     env = Scene(CHAIN)
-    limit = bound(env, sw.SingularityMargin(1e-2, margin=0.1, **arguments))
+    limit = bound(env, sw.constraints.SingularityMargin(1e-2, margin=0.1, **arguments))
     plant = limit.plant
     rng, data = np.random.default_rng(1), mujoco.MjData(env.model)
     h, a, checked = 3e-5, 1.0 / (2.0 * plant.hold_s), 0
@@ -144,7 +144,7 @@ def test_an_arm_on_a_base_that_floats_has_no_row_and_one_that_is_moved_by_hand_i
     )
     floating = floating.replace('<motor joint="rail" ctrlrange="-50 50"/>', "")
     env = Scene(floating.replace('<geom size=".05"/>', '<freejoint/><geom size=".05"/>'))
-    limit = bound(env, sw.SingularityMargin(1e-3, site="tip", directions="xy"))
+    limit = bound(env, sw.constraints.SingularityMargin(1e-3, site="tip", directions="xy"))
     assert limit.rows().normals.shape == (0, 3)
     env.data.qpos[3:7] = np.array([0.5, 0.1, 0.7, 0.5])
     mujoco.mj_forward(env.model, env.data)
@@ -153,7 +153,7 @@ def test_an_arm_on_a_base_that_floats_has_no_row_and_one_that_is_moved_by_hand_i
     assert limit.value() == pytest.approx(wanted / 1e-3 - 1.0)
 
     env = Scene(floating.replace('<body name="base"', '<body name="base" mocap="true"'))
-    limit = bound(env, sw.SingularityMargin(1e-3, site="tip", directions="xy"))
+    limit = bound(env, sw.constraints.SingularityMargin(1e-3, site="tip", directions="xy"))
     env.data.mocap_quat[0] = [0.8, 0.0, 0.6, 0.0]
     env.data.qpos[:] = 0.4
     mujoco.mj_forward(env.model, env.data)
@@ -164,7 +164,7 @@ def test_an_arm_on_a_base_that_floats_has_no_row_and_one_that_is_moved_by_hand_i
 
 def test_a_square_task_is_not_passed_through_its_singular_pose():
     env = gym.make("Reacher-v5")
-    spec = sw.SingularityMargin(0.003, body="fingertip", directions="xy")
+    spec = sw.constraints.SingularityMargin(0.003, body="fingertip", directions="xy")
     for side in (1.0, -1.0):
         env.reset(seed=0)
         env.unwrapped.set_state(
@@ -180,7 +180,7 @@ def test_a_square_task_is_not_passed_through_its_singular_pose():
 
 
 def test_every_plant_that_a_constraint_is_bound_to_has_kinematics_of_its_own():
-    env, spec = Scene(CHAIN), sw.SingularityMargin(1e-3, site="tip")
+    env, spec = Scene(CHAIN), sw.constraints.SingularityMargin(1e-3, site="tip")
     limit = bound(env, spec)
     before = limit.value().copy()
     env.data.qpos[:] = [0.1, 0.5, -0.4, 0.3, 0.2]
@@ -195,7 +195,7 @@ def test_every_plant_that_a_constraint_is_bound_to_has_kinematics_of_its_own():
 
 def test_a_validated_threshold_is_that_of_the_sampled_configurations():
     env = Scene(CHAIN)
-    limit = bound(env, sw.SingularityMargin(site="tip", task_speed=0.1, rate_limit=2.0))
+    limit = bound(env, sw.constraints.SingularityMargin(site="tip", task_speed=0.1, rate_limit=2.0))
     found = limit.spec.validated
     assert found.samples == 2000 and 0 < found.exceeding < 2000 and found.above > 0
     # A second draw, by MuJoCo's Jacobians: what exceeds above the threshold is as rare as the sample says.
@@ -212,13 +212,13 @@ def test_a_validated_threshold_is_that_of_the_sampled_configurations():
     w = np.prod(np.linalg.svd(jacobians, compute_uv=False), axis=1)
     need = 0.1 * np.linalg.norm(np.linalg.pinv(jacobians), axis=2).max(axis=1)
     assert ((w > found.threshold) & (need > 2.0)).mean() <= 2.0 * found.unseen(0.99)
-    given = bound(env, sw.SingularityMargin(found.threshold, site="tip"))
+    given = bound(env, sw.constraints.SingularityMargin(found.threshold, site="tip"))
     assert given.spec.validated is None and given.value() == limit.value()
 
 
 def test_no_threshold_that_keeps_the_rates_is_an_error():
     with pytest.raises(ConfigurationError, match="no threshold on w keeps the rate limit"):
-        bound(Scene(CHAIN), sw.SingularityMargin(site="tip", task_speed=5.0, rate_limit=0.1))
+        bound(Scene(CHAIN), sw.constraints.SingularityMargin(site="tip", task_speed=5.0, rate_limit=0.1))
 
 
 # Closed loops -------------------------------------------------------------------------------------------------
@@ -242,8 +242,8 @@ CASES = {
 def filtered(case, plant=None, **more):
     env_id, threshold, arguments, _ = CASES[case]
     # Braking from full speed takes Reacher's arm far longer than any sensible look-ahead.
-    speeds = [sw.JointSpeedLimit(10.0, margin=0.01)] if case == "Reacher" else []
-    limit = sw.SingularityMargin(threshold, **arguments, **more)
+    speeds = [sw.constraints.JointSpeedLimit(10.0, margin=0.01)] if case == "Reacher" else []
+    limit = sw.constraints.SingularityMargin(threshold, **arguments, **more)
     return sw.CBFActionFilter(gym.make(env_id, disable_env_checker=True), [*speeds, limit], plant)
 
 
@@ -300,7 +300,8 @@ def test_far_above_the_threshold_the_actions_pass_bit_for_bit():
     start = np.array([0.0, 1.5, 0.1, -0.1]), np.zeros(4)
     bare = gym.make("Reacher-v5").unwrapped
     env = sw.CBFActionFilter(
-        gym.make("Reacher-v5").unwrapped, [sw.SingularityMargin(1e-4, body="fingertip", directions="xy")]
+        gym.make("Reacher-v5").unwrapped,
+        [sw.constraints.SingularityMargin(1e-4, body="fingertip", directions="xy")],
     )
     rng = np.random.default_rng(0)
     bare.reset(seed=3)
@@ -314,8 +315,8 @@ def test_far_above_the_threshold_the_actions_pass_bit_for_bit():
 
 
 def test_what_cannot_be_is_infeasible_and_the_action_stays_sound():
-    straight = sw.JointPositionLimit(-0.1, 0.1, joints=["joint1"])
-    bent = sw.SingularityMargin(0.0033, body="fingertip", directions="xy")
+    straight = sw.constraints.JointPositionLimit(-0.1, 0.1, joints=["joint1"])
+    bent = sw.constraints.SingularityMargin(0.0033, body="fingertip", directions="xy")
     env = sw.CBFActionFilter(gym.make("Reacher-v5"), [straight, bent])
     rng = np.random.default_rng(0)
     with pytest.warns(sw.UnsafeStateWarning):
@@ -339,7 +340,7 @@ def fetch(env_id, limited=True, plant=None, margin=0.0):
     env = gym.make(env_id, max_episode_steps=1000, disable_env_checker=True)
     seen = watch(env, LENGTH)
     if limited:
-        limit = sw.SingularityMargin(FETCH_THRESHOLD, holds=5, margin=margin, **GRIP)
+        limit = sw.constraints.SingularityMargin(FETCH_THRESHOLD, holds=5, margin=margin, **GRIP)
         env = sw.CBFActionFilter(env, [limit], plant)
     return env, seen
 
@@ -395,7 +396,7 @@ def test_no_actuator_moves_fetch_s_arm_so_its_joints_have_to_be_named():
     with pytest.raises(
         ConfigurationError, match=r"no actuator drives .*name the joints .*shoulder_pan_joint"
     ):
-        sw.CBFActionFilter(env, [sw.SingularityMargin(1e-3, site="robot0:grip")])
+        sw.CBFActionFilter(env, [sw.constraints.SingularityMargin(1e-3, site="robot0:grip")])
 
 
 # Plain data, and what is refused ------------------------------------------------------------------------------
@@ -403,17 +404,17 @@ def test_no_actuator_moves_fetch_s_arm_so_its_joints_have_to_be_named():
 
 def test_it_is_rebuilt_from_the_spec_and_from_json():
     limits = [
-        sw.SingularityMargin(
+        sw.constraints.SingularityMargin(
             0.003, body="fingertip", directions="xy", joints=["joint0", "joint1"], margin=0.1
         ),
-        sw.SingularityMargin(
+        sw.constraints.SingularityMargin(
             geom="fingertip", directions="xy", frame="own", task_speed=0.1, rate_limit=6.0, holds=7, reach=2.0
         ),
     ]
     env = sw.CBFActionFilter(gym.make("Reacher-v5"), limits)
     for spec in (env.spec, EnvSpec.from_json(env.spec.to_json())):
         again = gym.make(spec)
-        assert again.constraints == limits and type(again.constraints[0]) is sw.SingularityMargin
+        assert again.constraints == limits and type(again.constraints[0]) is sw.constraints.SingularityMargin
         assert again.constraints[1].validated == env.constraints[1].validated is not None
     assert limits[0].promise == "best effort"
 
@@ -421,7 +422,7 @@ def test_it_is_rebuilt_from_the_spec_and_from_json():
 def test_an_analytic_plant_is_refused():
     plant = sw.AnalyticPlant(f=lambda x: x, g=lambda x: np.eye(2), state=lambda env: np.zeros(2))
     with pytest.raises(UnsupportedEnvError, match="SingularityMargin forecasts with a MuJoCo model"):
-        sw.SingularityMargin(1e-3, body="hand").bind(plant)
+        sw.constraints.SingularityMargin(1e-3, body="hand").bind(plant)
 
 
 TIP = {"body": "fingertip", "directions": "xy"}
@@ -517,4 +518,4 @@ TIP = {"body": "fingertip", "directions": "xy"}
 )
 def test_nonsense_is_refused(arguments, error, message):
     with pytest.raises(error, match=message):
-        sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.SingularityMargin(**arguments)])
+        sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.SingularityMargin(**arguments)])

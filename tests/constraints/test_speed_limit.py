@@ -28,7 +28,7 @@ def watching(env, **options):
     plant = sw.MujocoPlant()
     plant.bind(env)
     plant.observe()
-    return Asked(sw.SpeedLimit(**{"limit": 50.0, "holds": 1, **options}), plant), plant
+    return Asked(sw.constraints.SpeedLimit(**{"limit": 50.0, "holds": 1, **options}), plant), plant
 
 
 # The speed that is meant --------------------------------------------------------------------------------------
@@ -137,7 +137,7 @@ def test_a_control_is_admitted_by_the_speed_it_leads_to(v, u, direction, average
 @averages
 def test_units_do_not_slip_between_speed_and_displacement(average, timestep, substeps):
     env = Scene(TWO.format(timestep=timestep), frame_skip=substeps)
-    limit = sw.SpeedLimit(1.5, body="b0", direction="x", average=average)
+    limit = sw.constraints.SpeedLimit(1.5, body="b0", direction="x", average=average)
     filtered = sw.CBFActionFilter(env, [limit])
     filtered.reset(seed=0)
     position, fastest = 0.0, 0.0
@@ -170,7 +170,7 @@ def _filtered_control(filtered, action):
 def test_a_reset_shows_the_speed_it_starts_with(average, start):
     env = sliders(range_="-20 20")
     env.start = [0.4], [start]
-    filtered = sw.CBFActionFilter(env, [sw.SpeedLimit(1.0, direction="+x", average=average)])
+    filtered = sw.CBFActionFilter(env, [sw.constraints.SpeedLimit(1.0, direction="+x", average=average)])
     if start > 1.0:
         with pytest.warns(sw.UnsafeStateWarning):
             info = filtered.reset(seed=0)[1]
@@ -184,7 +184,7 @@ def test_a_reset_shows_the_speed_it_starts_with(average, start):
 
 def test_an_episode_does_not_know_where_the_last_one_ended():
     env = sliders(range_="-20 20")
-    filtered = sw.CBFActionFilter(env, [sw.SpeedLimit(1.0, direction="x")])
+    filtered = sw.CBFActionFilter(env, [sw.constraints.SpeedLimit(1.0, direction="x")])
     for start in (0.0, 50.0, -70.0):
         env.start = [start], [0.2]
         assert filtered.reset(seed=0)[1]["cbf/margin"] == pytest.approx(0.8, abs=1e-9)
@@ -201,7 +201,7 @@ def test_a_broken_limit_shows_in_the_margin(average):
     plant = sw.MujocoPlant()
     plant.perturb(mass=10.0)
     filtered = sw.CBFActionFilter(
-        env, [sw.SpeedLimit(0.8, direction="x", average=average)], plant=plant, fallback="zero"
+        env, [sw.constraints.SpeedLimit(0.8, direction="x", average=average)], plant=plant, fallback="zero"
     )
     filtered.reset(seed=0)
     filtered.step(np.array([10.0]))  # 1 m/s at its end, 0.55 m/s on average
@@ -230,7 +230,7 @@ def test_a_speed_that_is_kept_only_to_be_exceeded_next_is_refused_now():
 def test_under_a_delay_only_the_predicted_states_count():
     env = sliders(range_="-20 20")
     plant = sw.MujocoPlant(delay_s=0.1)
-    limit = sw.SpeedLimit(1.0, direction="x", holds=1)
+    limit = sw.constraints.SpeedLimit(1.0, direction="x", holds=1)
     filtered = sw.CBFActionFilter(env, [limit], plant=plant)
     filtered.reset(seed=0)
     fastest = 0.0
@@ -255,7 +255,7 @@ def launched(robot, speed, **options):
     """A task whose robot already runs, in the filter of the recipe's limit."""
     env = gym.make(f"Safe{robot}Velocity-v0", disable_env_checker=True)
     limit = {"limit": SPEED_LIMITS[robot], "body": "torso", "direction": "+x", "margin": 0.02, **options}
-    filtered = sw.CBFActionFilter(env, [sw.SpeedLimit(**limit)])
+    filtered = sw.CBFActionFilter(env, [sw.constraints.SpeedLimit(**limit)])
     filtered.reset(seed=0)
     env.unwrapped.data.qvel[0] = speed
     return filtered
@@ -292,7 +292,9 @@ def test_a_reach_spares_the_forecasts_far_from_the_limit(monkeypatch):
         assert calls[0] == spent
     env = sliders(range_="-20 20")
     env.start = [0.0], [0.4]
-    filtered = sw.CBFActionFilter(env, [sw.SpeedLimit(1.0, direction="+x", margin=0.2, holds=1, reach=0.4)])
+    filtered = sw.CBFActionFilter(
+        env, [sw.constraints.SpeedLimit(1.0, direction="+x", margin=0.2, holds=1, reach=0.4)]
+    )
     filtered.reset(seed=0)
     calls[0] = 0
     filtered.step(np.array([0.0]))
@@ -303,11 +305,11 @@ def test_a_reach_spares_the_forecasts_far_from_the_limit(monkeypatch):
 
 
 def test_it_is_rebuilt_from_the_spec_and_from_json():
-    limit = sw.SpeedLimit(1.5, "torso", "-x", average="substep", margin=0.1, holds=4, reach=0.7)
+    limit = sw.constraints.SpeedLimit(1.5, "torso", "-x", average="substep", margin=0.1, holds=4, reach=0.7)
     filtered = sw.CBFActionFilter(gym.make("HalfCheetah-v5"), [limit])
     for spec in (filtered.spec, EnvSpec.from_json(filtered.spec.to_json())):
         again = gym.make(spec)
-        assert type(again.constraints[0]) is sw.SpeedLimit and again.constraints == [limit]
+        assert type(again.constraints[0]) is sw.constraints.SpeedLimit and again.constraints == [limit]
     data = json.loads(json.dumps(plain_data(limit)))
     assert data == {
         "kind": "SpeedLimit",
@@ -345,9 +347,11 @@ def test_it_is_rebuilt_from_the_spec_and_from_json():
 )
 def test_nonsense_is_refused_with_the_options(arguments, error, message):
     with pytest.raises(error, match=message):
-        sw.CBFActionFilter(gym.make("HalfCheetah-v5"), [sw.SpeedLimit(**arguments)])
+        sw.CBFActionFilter(gym.make("HalfCheetah-v5"), [sw.constraints.SpeedLimit(**arguments)])
 
 
 def test_a_margin_of_the_filter_that_leaves_nothing_is_refused():
     with pytest.raises(ConfigurationError, match=r"the margin 1.2\d* leaves nothing of the limit 1.0"):
-        sw.CBFActionFilter(gym.make("HalfCheetah-v5"), [sw.SpeedLimit(1.0, margin=0.2)], margin=1.0)
+        sw.CBFActionFilter(
+            gym.make("HalfCheetah-v5"), [sw.constraints.SpeedLimit(1.0, margin=0.2)], margin=1.0
+        )

@@ -109,7 +109,7 @@ PUSHES = [(1.0, 1.0, -1.0, -1.0), (0.9, -0.7, 0.8, 0.2), (1.0, 1.0, 1.0, 1.0), (
 def test_its_answer_is_that_of_the_whole_program(share, cone):
     changed = 0
     env = table()
-    stance = settled(env, sw.Stance(share, cone, **STANCE))
+    stance = settled(env, sw.constraints.Stance(share, cone, **STANCE))
     for push in map(np.array, PUSHES):
         stance.plant.observe()
         admitted = stance.admits(push)
@@ -131,7 +131,7 @@ def test_its_answer_is_that_of_the_whole_program(share, cone):
 
 def test_at_rest_the_admitted_torques_are_those_with_the_solvers_forces_in_the_cone():
     # Legs that push outwards against each other: MuJoCo's own forces, after they have settled, are the program's.
-    env, spec = table(), sw.Stance(0.7, "exact", **STANCE)
+    env, spec = table(), sw.constraints.Stance(0.7, "exact", **STANCE)
     for push in (0.0, 0.2, 0.5, 0.9):
         control = push * np.array([1.0, 1.0, -1.0, -1.0])
         stance = settled(env, spec, control)
@@ -155,7 +155,7 @@ def test_what_the_pyramid_admits_the_cone_admits():
     pushes = rng.uniform(-0.15, 0.15, (40, 4))
     admitted = {}
     for name, options in {"4": {"edges": 4}, "8": {"edges": 8}, "exact": {"cone": "exact"}}.items():
-        stance = settled(env, sw.Stance(0.4, **options, **STANCE))
+        stance = settled(env, sw.constraints.Stance(0.4, **options, **STANCE))
         admitted[name] = []
         for push in pushes:
             stance.plant.observe()
@@ -169,7 +169,7 @@ def test_contacts_that_the_torques_lift_open():
     # Two legs on one side pull up with all they have, and stand beside a floor that falls away: no force, no demand.
     env = table(gravity="0 0 -1")
     env.start = np.r_[0, 0, 0.33, 1, 0, 0, 0, 0, 0, 0, 0], np.r_[0, 0, 0.4, np.zeros(7)]
-    stance = settled(env, sw.Stance(0.7, **STANCE), steps=0)
+    stance = settled(env, sw.constraints.Stance(0.7, **STANCE), steps=0)
     env.reset()
     env.data.qvel[2] = 0.4  # the whole robot on its way up
     stance.plant.observe()
@@ -184,7 +184,7 @@ def test_contacts_that_the_torques_lift_open():
 def test_where_no_torques_will_do_it_says_so_and_stays_finite(cone, hopeless):
     env = table(gravity="0 4 -9", friction=0.05) if hopeless == "slope" else table()
     more = {"zmp_inset": 0.5} if hopeless == "inset" else {}
-    filtered = sw.CBFActionFilter(env, [sw.Stance(0.7, cone, **STANCE, **more)])
+    filtered = sw.CBFActionFilter(env, [sw.constraints.Stance(0.7, cone, **STANCE, **more)])
     filtered.reset()
     standing = 0
     for _ in range(25):
@@ -204,7 +204,7 @@ def test_an_inset_of_the_zero_moment_point_is_kept_by_the_forces():
     env = table(gravity=f"{9.81 * np.sin(tilt)} 0 {-9.81 * np.cos(tilt)}", friction=2.0)
     verdicts = []
     for inset in (0.3 - 0.34 * np.tan(tilt) - 0.1, 0.3 - 0.2 * np.tan(tilt)):
-        stance = settled(env, sw.Stance(1.0, zmp_inset=inset, **STANCE), steps=60)
+        stance = settled(env, sw.constraints.Stance(1.0, zmp_inset=inset, **STANCE), steps=60)
         verdicts.append(stance.admits(STILL))
         assert stance._problem.force_rows is not None
     assert verdicts == [True, False]
@@ -212,7 +212,7 @@ def test_an_inset_of_the_zero_moment_point_is_kept_by_the_forces():
 
 def test_joints_are_predicted_to_stay_in_range():
     env = table(range_='limited="true" range="-.1 .1"')
-    inside, alone = sw.Stance(1.0, joint_tolerance=0.0), sw.Stance(1.0, **STANCE)
+    inside, alone = sw.constraints.Stance(1.0, joint_tolerance=0.0), sw.constraints.Stance(1.0, **STANCE)
     env.start = np.r_[0, 0, 3, 1, 0, 0, 0, np.zeros(4)], np.zeros(10)
     for speed, fits in ((0.5, True), (30.0, False)):
         answers = []
@@ -230,7 +230,7 @@ def test_other_contacts_count_as_the_forces_that_they_are():
     heavy, light = table(more=load), table()
     pressures = []
     for env in (light, heavy):
-        stance = settled(env, sw.Stance(0.5, "exact", **STANCE), STILL, 200)
+        stance = settled(env, sw.constraints.Stance(0.5, "exact", **STANCE), STILL, 200)
         assert stance.admits(STILL)
         pressures.append(stance._solve(stance._problem).forces[:, 2].sum())
         assert pressures[-1] == pytest.approx(stance.plant.weight_n, rel=0.02)
@@ -240,8 +240,10 @@ def test_other_contacts_count_as_the_forces_that_they_are():
 
 def test_asked_second_it_still_answers_the_proposal():
     env = table()
-    alone = sw.CBFActionFilter(env, [sw.Stance(0.3, **STANCE)])
-    both = sw.CBFActionFilter(table(), [sw.JointSpeedLimit(1e3, holds=1), sw.Stance(0.3, **STANCE)])
+    alone = sw.CBFActionFilter(env, [sw.constraints.Stance(0.3, **STANCE)])
+    both = sw.CBFActionFilter(
+        table(), [sw.constraints.JointSpeedLimit(1e3, holds=1), sw.constraints.Stance(0.3, **STANCE)]
+    )
     executed = []
     for filtered in (alone, both):
         filtered.reset()
@@ -268,7 +270,7 @@ class BoundRefusing(BoundConstraint):
 def test_behind_a_constraint_that_refuses_first_it_offers_the_programs_answer():
     env = table()
     env.reset()
-    filtered = sw.CBFActionFilter(env, [Refusing(), sw.Stance(0.3, **STANCE)])
+    filtered = sw.CBFActionFilter(env, [Refusing(), sw.constraints.Stance(0.3, **STANCE)])
     filtered.reset()
     for _ in range(60):
         filtered.step(np.zeros(4))
@@ -281,7 +283,7 @@ def test_behind_a_constraint_that_refuses_first_it_offers_the_programs_answer():
 @pytest.mark.parametrize("env_id", ["Humanoid-v5", "Ant-v5", "HalfCheetah-v5"])
 @pytest.mark.parametrize("cone", ["pyramid", "exact"])
 def test_robots_unflagged_steps_have_forces_at_the_first_instant(env_id, cone):
-    env = sw.CBFActionFilter(gym.make(env_id), [sw.Stance(0.7, cone, joint_tolerance=0.1)])
+    env = sw.CBFActionFilter(gym.make(env_id), [sw.constraints.Stance(0.7, cone, joint_tolerance=0.1)])
     rng = np.random.default_rng(0)
     env.reset(seed=0)
     stance, counts = env.filter.bound[0], {"flagged": 0, "changed": 0, "same": 0}
@@ -319,7 +321,7 @@ class Witness(gym.Wrapper):
 def test_inactive_is_bit_for_bit_at_bounds_that_float32_rounds_outwards():
     # 0.4 as float32 is more than the model's 0.4.
     witness = Witness(gym.make("Humanoid-v5"))
-    env = sw.CBFActionFilter(witness, [sw.Stance(1.0, joint_tolerance=9.0)])
+    env = sw.CBFActionFilter(witness, [sw.constraints.Stance(1.0, joint_tolerance=9.0)])
     assert float(env.action_space.high[0]) > env.plant.upper[0]
     env.reset(seed=0)
     silent = 0
@@ -350,19 +352,19 @@ def test_inactive_is_bit_for_bit_at_bounds_that_float32_rounds_outwards():
 )
 def test_bad_arguments_are_refused_in_words(arguments, words):
     with pytest.raises(ConfigurationError, match=words):
-        sw.Stance(**arguments)
+        sw.constraints.Stance(**arguments)
 
 
 def test_plants_that_it_cannot_read_are_refused():
     plant = sw.AnalyticPlant(f=lambda x: x, g=lambda x: np.ones((1, 1)), state=lambda e: e.state, hold_s=0.1)
     with pytest.raises(UnsupportedEnvError, match="MujocoPlant"):
-        sw.Stance().bind(plant)
+        sw.constraints.Stance().bind(plant)
     reacher = sw.MujocoPlant()
     reacher.bind(gym.make("Reacher-v5"))
     with pytest.raises(UnsupportedEnvError, match="nothing to stand on"):
-        sw.Stance().bind(reacher)
+        sw.constraints.Stance().bind(reacher)
 
 
 def test_it_is_plain_data():
-    stance = sw.Stance(0.6, "exact", 6, None, 0.02, 0.1)
+    stance = sw.constraints.Stance(0.6, "exact", 6, None, 0.02, 0.1)
     assert constraint_from(json.loads(json.dumps(plain_data(stance)))) == stance

@@ -54,7 +54,7 @@ def test_it_admits_pushes_up_to_where_the_table_tips_about_the_inset_edge(inset,
     # A push F at the height h moves the zero moment point by F h / W; farther than the edge it cannot go.
     tips = WEIGHT * (HALF - inset - margin) / HEIGHT / 50.0
     for way in (-1.0, 1.0):
-        limit = settled(table(), sw.SupportMargin(inset, margin), np.array([0.97 * way * tips]))
+        limit = settled(table(), sw.constraints.SupportMargin(inset, margin), np.array([0.97 * way * tips]))
         assert limit.admits(np.array([0.97 * way * tips]))
         assert not limit.admits(np.array([1.04 * way * tips]))
         assert limit.slack(np.array([9.0 * way * tips])) >= -(inset + margin + 1e-9)
@@ -62,7 +62,7 @@ def test_it_admits_pushes_up_to_where_the_table_tips_about_the_inset_edge(inset,
 
 def test_the_distance_is_that_of_the_moments():
     for push in (-0.3, 0.0, 0.25):
-        limit = settled(table(), sw.SupportMargin(0.01), np.array([push]))
+        limit = settled(table(), sw.constraints.SupportMargin(0.01), np.array([push]))
         expected = HALF - abs(push) * 50.0 * HEIGHT / WEIGHT
         assert limit.slacks(np.array([push]))[0] == pytest.approx(expected - 0.01, abs=2e-3)
         assert limit.info(None, None) == {
@@ -118,7 +118,7 @@ def test_at_every_evaluation_it_is_the_distance_to_the_hull_of_all_contact_point
     ],
 )
 def test_where_there_is_no_polygon_nothing_is_asked(env):
-    limit = settled(env, sw.SupportMargin(0.1), np.zeros(1), 20)
+    limit = settled(env, sw.constraints.SupportMargin(0.1), np.zeros(1), 20)
     for push in (-1.0, 0.0, 1.0):
         assert limit.admits(np.array([push]))
         assert limit.info(np.zeros(1), np.array([push])) == {
@@ -140,7 +140,7 @@ def closed_loop(env, pushes):
 def test_a_table_that_is_pushed_over_stays_up_and_keeps_its_inset():
     rng = np.random.default_rng(0)
     pushes = [*[0.0] * 10, *rng.uniform(-1.0, 1.0, 30), *[1.0] * 15, *[-1.0] * 15]
-    env = sw.CBFActionFilter(table(), [sw.SupportMargin(0.05)])
+    env = sw.CBFActionFilter(table(), [sw.constraints.SupportMargin(0.05)])
     changed = silent = 0
     for info, least in closed_loop(env, pushes):
         changed += info["cbf/intervened"]
@@ -157,7 +157,7 @@ def test_a_table_that_is_pushed_over_stays_up_and_keeps_its_inset():
 
 
 def test_an_inset_larger_than_the_polygon_is_infeasible_and_flagged():
-    env = sw.CBFActionFilter(table(), [sw.SupportMargin(0.25)])
+    env = sw.CBFActionFilter(table(), [sw.constraints.SupportMargin(0.25)])
     for info, _ in list(closed_loop(env, [0.0] * 12))[5:]:
         assert info["cbf/infeasible"] and info["cbf/fallback"]
         assert np.isfinite(info["executed_action"]).all()
@@ -170,9 +170,9 @@ def test_an_inset_larger_than_the_polygon_is_infeasible_and_flagged():
 )
 def test_bad_arguments_are_refused(arguments):
     with pytest.raises(ConfigurationError, match=r"inset|margin"):
-        sw.SupportMargin(**arguments)
+        sw.constraints.SupportMargin(**arguments)
 
 
 def test_it_is_plain_data():
-    limit = sw.SupportMargin(0.02, 0.01)
+    limit = sw.constraints.SupportMargin(0.02, 0.01)
     assert constraint_from(json.loads(json.dumps(plain_data(limit)))) == limit

@@ -10,17 +10,21 @@ import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.serialize import constraint_from, plain_data
 
-NOTHING_SEEN = sw.Sensor("eye", range_m=0.01)
+NOTHING_SEEN = sw.occlusion.Sensor("eye", range_m=0.01)
 FAR_CARS = {"layout": {"cars": [[-9.0 - i, 0.0] for i in range(6)], "agent": [0.0, 1.0, 0.0]}}
 
 
 def tracked(tolerance, sensor=NOTHING_SEEN, noise=0.1, start=0.1):
-    cars = sw.Track("car*", acceleration_noise=noise, start_position_std=start, start_velocity_std=0.0)
+    cars = sw.occlusion.Track(
+        "car*", acceleration_noise=noise, start_position_std=start, start_velocity_std=0.0
+    )
     return sw.OcclusionPenalty(gym.make("OccludedCrossing-v0"), [cars], sensor, tolerance)
 
 
 def stopping(tolerance, braking=3.0, **options):
-    return sw.CBFActionFilter(tracked(tolerance), [sw.TrackPermission("robot", braking, **options)])
+    return sw.CBFActionFilter(
+        tracked(tolerance), [sw.constraints.TrackPermission("robot", braking, **options)]
+    )
 
 
 def test_while_permissions_are_in_force_the_action_passes_bit_for_bit():
@@ -68,12 +72,14 @@ def test_the_bound_never_crosses_the_tolerance_while_a_permission_is_in_force():
 
 def test_only_the_tracks_that_count_stop_it():
     def env(tracks):
-        unsure = sw.Track("car0", acceleration_noise=1.0, start_position_std=2.0)
-        sure = sw.Track("car[1-5]", acceleration_noise=0.0, start_position_std=0.01, start_velocity_std=0.0)
+        unsure = sw.occlusion.Track("car0", acceleration_noise=1.0, start_position_std=2.0)
+        sure = sw.occlusion.Track(
+            "car[1-5]", acceleration_noise=0.0, start_position_std=0.01, start_velocity_std=0.0
+        )
         inside = sw.OcclusionPenalty(
             gym.make("OccludedCrossing-v0"), [unsure, sure], NOTHING_SEEN, tolerance=0.5
         )
-        return sw.CBFActionFilter(inside, [sw.TrackPermission("robot", 3.0, tracks=tracks)])
+        return sw.CBFActionFilter(inside, [sw.constraints.TrackPermission("robot", 3.0, tracks=tracks)])
 
     for tracks, stops in ((["car1", "car4"], False), (["car0"], True), (None, True)):
         filtered = env(tracks)
@@ -85,9 +91,11 @@ def test_only_the_tracks_that_count_stop_it():
 
 
 def test_two_that_want_opposite_things_are_infeasible_and_said_to_be():
-    fast = sw.Barrier(lambda x: x[10] - 1.0, alpha=5.0)  # faster than 1 m/s along y: state is (qpos, qvel)
+    fast = sw.constraints.Barrier(
+        lambda x: x[10] - 1.0, alpha=5.0
+    )  # faster than 1 m/s along y: state is (qpos, qvel)
     env = sw.CBFActionFilter(
-        tracked(0.4, start=1.0), [sw.TrackPermission("robot", 8.0), fast], fallback="zero"
+        tracked(0.4, start=1.0), [sw.constraints.TrackPermission("robot", 8.0), fast], fallback="zero"
     )
     with pytest.warns(sw.UnsafeStateWarning):
         env.reset(seed=0)
@@ -104,21 +112,23 @@ def test_what_it_is_given_is_checked():
         ("tracks is a list of names, or None for all", {"braking": 1.0, "tracks": []}),
     ):
         with pytest.raises(ConfigurationError, match=words):
-            sw.TrackPermission("robot", **given)
+            sw.constraints.TrackPermission("robot", **given)
     with pytest.raises(UnknownNameError, match="no track 'car9'; there are car0, car1"):
-        sw.CBFActionFilter(tracked(1.0), [sw.TrackPermission("robot", 3.0, tracks=["car9"])])
+        sw.CBFActionFilter(tracked(1.0), [sw.constraints.TrackPermission("robot", 3.0, tracks=["car9"])])
     with pytest.raises(UnknownNameError, match="robo"):
-        sw.CBFActionFilter(tracked(1.0), [sw.TrackPermission("robo", 3.0)])
+        sw.CBFActionFilter(tracked(1.0), [sw.constraints.TrackPermission("robo", 3.0)])
     with pytest.raises(UnknownNameError, match="track_names"):
-        sw.CBFActionFilter(gym.make("OccludedCrossing-v0"), [sw.TrackPermission("robot", 3.0)])
+        sw.CBFActionFilter(gym.make("OccludedCrossing-v0"), [sw.constraints.TrackPermission("robot", 3.0)])
     plant = sw.AnalyticPlant(
         f=lambda x: x, g=lambda x: np.ones((3, 1)), state=lambda env: env.state, hold_s=0.05
     )
     with pytest.raises(UnsupportedEnvError, match="MujocoPlant"):
-        sw.CBFActionFilter(gym.make("Pendulum-v1"), [sw.TrackPermission("robot", 3.0)], plant=plant)
+        sw.CBFActionFilter(
+            gym.make("Pendulum-v1"), [sw.constraints.TrackPermission("robot", 3.0)], plant=plant
+        )
 
 
 def test_it_is_plain_data():
-    given = sw.TrackPermission("robot", 3.0, creep=0.1, tracks=("car0",))
+    given = sw.constraints.TrackPermission("robot", 3.0, creep=0.1, tracks=("car0",))
     data = json.loads(json.dumps(plain_data(given)))
     assert constraint_from(data) == given and data["kind"] == "TrackPermission"

@@ -69,7 +69,7 @@ cases = given(seed=st.integers(0, 10**6), sigmas=st.sampled_from([0.0, 1.0, 3.0]
 @settings(deadline=None, max_examples=60)
 def test_the_distance_is_that_of_the_nearest_place_and_never_more(seed, sigmas, d):
     tracks = some_tracks(seed, d)
-    discs, plant = sw.TrackedDiscs(RADIUS, sigmas), Holding(tracks)
+    discs, plant = sw.constraints.TrackedDiscs(RADIUS, sigmas), Holding(tracks)
     point = np.random.default_rng(seed + 1).normal(size=d) * 4.0
     found = discs.nearest(point, plant)
     away = np.linalg.norm(point - rims(tracks, sigmas, [1e-12])[0], axis=-1).min(axis=1)
@@ -87,7 +87,7 @@ def test_the_distance_is_that_of_the_nearest_place_and_never_more(seed, sigmas, 
 def test_nothing_comes_nearer_faster_than_the_velocity_says(seed, sigmas, d):
     tracks = some_tracks(seed, d)
     horizon = 1.3
-    discs = sw.TrackedDiscs(RADIUS, sigmas, horizon_s=horizon)
+    discs = sw.constraints.TrackedDiscs(RADIUS, sigmas, horizon_s=horizon)
     point = np.random.default_rng(seed + 1).normal(size=d) * 4.0
     found = discs.nearest(point, Holding(tracks))
     times = (horizon * np.array([1e-4, 0.02, 0.05, 0.1, 0.17, 0.25, 0.4, 0.5, 0.75, 1.0])).tolist()
@@ -105,13 +105,13 @@ def test_what_brakes_comes_as_fast_as_it_does_now():
     # At 2 m/s towards the point and soon back to rest: over the horizon slow, at this moment not.
     tracks = Tracks([Motion(np.zeros((2, 2)), 0.2, np.zeros(2))])
     tracks.start(np.array([[0.0, 0.0, 2.0, 0.0]]), np.zeros((1, 4, 4)))
-    found = sw.TrackedDiscs(RADIUS, horizon_s=2.0).nearest(np.array([3.0, 0.0]), Holding(tracks))
+    found = sw.constraints.TrackedDiscs(RADIUS, horizon_s=2.0).nearest(np.array([3.0, 0.0]), Holding(tracks))
     assert found.velocity[0, 0] == pytest.approx(2.0, rel=1e-2)
 
 
 def test_the_velocity_across_is_the_estimate_s():
     tracks = some_tracks(5)
-    found = sw.TrackedDiscs(RADIUS).nearest(np.array([4.0, 4.0]), Holding(tracks))
+    found = sw.constraints.TrackedDiscs(RADIUS).nearest(np.array([4.0, 4.0]), Holding(tracks))
     across = np.stack([-found.normal[:, 1], found.normal[:, 0]], axis=1)
     np.testing.assert_allclose(
         (found.velocity * across).sum(1), (tracks.velocities * across).sum(1), atol=1e-12
@@ -121,7 +121,7 @@ def test_the_velocity_across_is_the_estimate_s():
 def test_what_is_sure_to_stay_in_its_lane_is_only_uncertain_along_it():
     tracks = Tracks([Motion(np.diag([0.1, 0.0]), np.inf, np.zeros(2))])
     tracks.start(np.zeros((1, 4)), np.diag([0.25, 0.0, 0.1, 0.0])[None])
-    discs, plant = sw.TrackedDiscs(RADIUS, 3.0), Holding(tracks)
+    discs, plant = sw.constraints.TrackedDiscs(RADIUS, 3.0), Holding(tracks)
     beside, before = (discs.nearest(np.array(p), plant).distance[0] for p in ([0.7, 1.0], [2.5, 0.0]))
     assert beside == pytest.approx(1.0 - RADIUS, abs=1e-6) and before == pytest.approx(1.0 - RADIUS, abs=1e-6)
 
@@ -130,7 +130,7 @@ def test_what_is_sure_to_stay_in_its_lane_is_only_uncertain_along_it():
 def test_boxes_hold_the_bounds_and_touch_them(sigmas):
     tracks = some_tracks(7)
     times = np.array([0.0, 0.4, 2.0])
-    centers, halves = sw.TrackedDiscs(RADIUS, sigmas).boxes(Holding(tracks), times)
+    centers, halves = sw.constraints.TrackedDiscs(RADIUS, sigmas).boxes(Holding(tracks), times)
     rim = rims(tracks, sigmas, times.tolist())
     np.testing.assert_allclose(rim.max(axis=2), centers + halves, atol=1e-4)
     np.testing.assert_allclose(rim.min(axis=2), centers - halves, atol=1e-4)
@@ -139,24 +139,25 @@ def test_boxes_hold_the_bounds_and_touch_them(sigmas):
 def test_a_flat_track_stands_upright_in_space_and_the_other_way_round_it_is_refused():
     flat = some_tracks(1, d=2)
     plane, space = (
-        sw.TrackedDiscs(RADIUS).nearest(np.array(p), Holding(flat)) for p in ([3.0, 1.0], [3.0, 1.0, 9.0])
+        sw.constraints.TrackedDiscs(RADIUS).nearest(np.array(p), Holding(flat))
+        for p in ([3.0, 1.0], [3.0, 1.0, 9.0])
     )
     np.testing.assert_allclose(plane.distance, space.distance)
     assert not space.normal[:, 2].any()
     with pytest.raises(ConfigurationError, match="3-dimensional tracks cannot meet a 2-dim"):
-        sw.TrackedDiscs(RADIUS).nearest(np.zeros(2), Holding(some_tracks(1, d=3)))
+        sw.constraints.TrackedDiscs(RADIUS).nearest(np.zeros(2), Holding(some_tracks(1, d=3)))
 
 
 def test_estimates_that_are_no_numbers_are_told_as_such():
     tracks = some_tracks(1)
     tracks.mean[0, 0] = np.nan
-    discs, plant = sw.TrackedDiscs(RADIUS), Holding(tracks)
+    discs, plant = sw.constraints.TrackedDiscs(RADIUS), Holding(tracks)
     assert np.isnan(discs.nearest(np.zeros(2), plant).distance).all()
     assert np.isnan(discs.distances(np.zeros((4, 2)), plant)).all()
 
 
 def test_it_is_plain_data_and_what_is_wrong_is_refused():
-    given = sw.TrackedDiscs(0.3, 2.0, 0.5, "car_tracks")
+    given = sw.constraints.TrackedDiscs(0.3, 2.0, 0.5, "car_tracks")
     assert obstacle_from(json.loads(json.dumps(plain_data(given)))) == given
     for words, bad in (
         ("radius", {"radius": 0.0}),
@@ -164,15 +165,19 @@ def test_it_is_plain_data_and_what_is_wrong_is_refused():
         ("horizon_s", {"radius": 1.0, "horizon_s": 0.0}),
     ):
         with pytest.raises(ConfigurationError, match=words):
-            sw.TrackedDiscs(**bad)
+            sw.constraints.TrackedDiscs(**bad)
     with pytest.raises(ConfigurationError, match=r"holds no tracks but str.*OcclusionPenalty"):
-        sw.TrackedDiscs(0.3).nearest(np.zeros(2), Holding("tracks"))
+        sw.constraints.TrackedDiscs(0.3).nearest(np.zeros(2), Holding("tracks"))
 
 
 def test_in_a_clearance_it_keeps_a_machine_out_and_what_is_missing_is_named():
     def clearance(**options):
-        return sw.Clearance(
-            [sw.TrackedDiscs(0.4, **options)], bodies=["robot"], braking=3.0, radius=0.2, margin=0.02
+        return sw.constraints.Clearance(
+            [sw.constraints.TrackedDiscs(0.4, **options)],
+            bodies=["robot"],
+            braking=3.0,
+            radius=0.2,
+            margin=0.02,
         )
 
     assert isinstance(clearance(), Constraint)

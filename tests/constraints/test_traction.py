@@ -193,7 +193,9 @@ def test_a_plant_that_is_wrong_still_limits(mass):
 def test_in_one_list_with_others():
     env = gym.make("SafeRover-v0", max_episode_steps=100_000)
     wheels = list(env.unwrapped.wheels)
-    both = sw.CBFActionFilter(env, [sw.Traction(wheels), sw.JointSpeedLimit(8.0, joints=wheels, margin=0.5)])
+    both = sw.CBFActionFilter(
+        env, [sw.constraints.Traction(wheels), sw.constraints.JointSpeedLimit(8.0, joints=wheels, margin=0.5)]
+    )
     infos = drive(both, FULL, 200)
     assert max(info["slip_max"] for info in infos) < 0.16
     # Its forecast holds the tyres' forces as they are, which the margin has to cover.
@@ -204,7 +206,7 @@ def test_in_one_list_with_others():
 
 def test_twice_in_one_list_is_refused():
     env = gym.make("SafeRover-v0")
-    front, rear = (sw.Traction([f"{axle}_left", f"{axle}_right"]) for axle in ("front", "rear"))
+    front, rear = (sw.constraints.Traction([f"{axle}_left", f"{axle}_right"]) for axle in ("front", "rear"))
     with pytest.raises(ConfigurationError, match="2 times"):
         sw.CBFActionFilter(env, [front, rear])
 

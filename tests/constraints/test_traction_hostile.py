@@ -485,4 +485,4 @@ def test_a_copy_filters_its_own_env(copied):
 )
 def test_arguments_of_other_types_are_refused_by_name(arguments, says):
     with pytest.raises(ConfigurationError, match=says):
-        sw.Traction(**{"wheels": ["left"]} | arguments)
+        sw.constraints.Traction(**{"wheels": ["left"]} | arguments)

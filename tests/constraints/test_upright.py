@@ -36,7 +36,7 @@ def test_height_and_tilt_of_any_pose(height, turn):
     env = Scene(BOX)
     env.data.qpos[:7] = [0.3, -0.2, height, *(np.array(turn) / np.linalg.norm(turn))]
     mujoco.mj_forward(env.model, env.data)
-    limit = sw.Upright("box", lowest=-1.0, highest=2.0, tilt=0.5)
+    limit = sw.constraints.Upright("box", lowest=-1.0, highest=2.0, tilt=0.5)
     w, x, y, z = turn
     up = Rotation.from_quat([x, y, z, w]).apply([0.0, 0.0, 1.0])
     angle = np.arctan2(np.hypot(up[0], up[1]), up[2])
@@ -56,7 +56,7 @@ def test_only_what_is_given_counts():
         ({"tilt": 0.5}, [0.1]),
         ({"highest": 2.0, "tilt": 0.5}, [0.8, 0.1]),
     ):
-        limit = sw.Upright("box", **arguments)
+        limit = sw.constraints.Upright("box", **arguments)
         np.testing.assert_allclose(bound(env, limit).value(), left, atol=1e-7)
 
 
@@ -65,7 +65,7 @@ def test_the_forecast_is_followed_substep_by_substep():
     env.data.qpos[:4] = [0.0, 0.0, 2.0, 1.0]
     env.data.qvel[3] = 2.0  # turning about x at 2 rad/s, and falling
     mujoco.mj_forward(env.model, env.data)
-    limit = bound(env, sw.Upright("box", lowest=1.0, tilt=1.0, holds=4))
+    limit = bound(env, sw.constraints.Upright("box", lowest=1.0, tilt=1.0, holds=4))
     room = limit._room(limit.plant.forecast(np.zeros(1), 4))
     assert room.shape == (20, 2)
     data = mujoco.MjData(env.model)
@@ -81,12 +81,12 @@ def test_the_forecast_is_followed_substep_by_substep():
 CASES = {
     "poles": (
         "InvertedDoublePendulum-v5",
-        sw.Upright("pole2", lowest=0.5),
+        sw.constraints.Upright("pole2", lowest=0.5),
         lambda model, data: data.body("pole2").xpos[2] - 0.5,
     ),
     "a hopper": (
         "Hopper-v5",
-        sw.Upright("torso", lowest=0.9, tilt=0.15),
+        sw.constraints.Upright("torso", lowest=0.9, tilt=0.15),
         lambda model, data: np.array(
             [data.body("torso").xpos[2] - 0.9, 0.15 - abs(data.qpos[2])]  # rooty turns about y alone
         ),
@@ -123,7 +123,7 @@ def test_it_stands_longer_with_the_filter():
     for filtered in (False, True):
         env = gym.make("Hopper-v5", disable_env_checker=True)
         if filtered:
-            env = sw.CBFActionFilter(env, [sw.Upright("torso", lowest=0.8, tilt=0.18)])
+            env = sw.CBFActionFilter(env, [sw.constraints.Upright("torso", lowest=0.8, tilt=0.18)])
         env.reset(seed=0)
         rng, stood[filtered], terminated = np.random.default_rng(0), 0, False
         while not terminated and stood[filtered] < 60:
@@ -134,7 +134,9 @@ def test_it_stands_longer_with_the_filter():
 
 def test_an_upright_robot_is_left_alone_bit_for_bit():
     bare = gym.make("Humanoid-v5")
-    filtered = sw.CBFActionFilter(gym.make("Humanoid-v5"), [sw.Upright("torso", lowest=-5.0, tilt=np.pi)])
+    filtered = sw.CBFActionFilter(
+        gym.make("Humanoid-v5"), [sw.constraints.Upright("torso", lowest=-5.0, tilt=np.pi)]
+    )
     rng = np.random.default_rng(0)
     a, b = bare.reset(seed=3)[0], filtered.reset(seed=3)[0]
     for _ in range(15):
@@ -148,7 +150,7 @@ def test_an_upright_robot_is_left_alone_bit_for_bit():
 def test_a_fall_that_nothing_stops_is_infeasible():
     env = Scene(BOX)
     env.start = [0.0, 0.0, 1.02, 1.0, 0.0, 0.0, 0.0, 0.0], np.zeros(7)
-    filtered = sw.CBFActionFilter(env, [sw.Upright("box", lowest=1.0, holds=2)])
+    filtered = sw.CBFActionFilter(env, [sw.constraints.Upright("box", lowest=1.0, holds=2)])
     filtered.reset(seed=0)
     info = filtered.step(np.array([0.3]))[4]
     assert info["cbf/infeasible"] and info["cbf/refused"].all() and not info["cbf/unsafe"]
@@ -156,11 +158,11 @@ def test_a_fall_that_nothing_stops_is_infeasible():
 
 
 def test_it_is_rebuilt_from_the_spec_and_from_json():
-    limit = sw.Upright("torso", lowest=0.4, tilt=0.5, margin=0.05, holds=6, reach=0.2)
+    limit = sw.constraints.Upright("torso", lowest=0.4, tilt=0.5, margin=0.05, holds=6, reach=0.2)
     filtered = sw.CBFActionFilter(gym.make("Walker2d-v5"), [limit])
     for spec in (filtered.spec, EnvSpec.from_json(filtered.spec.to_json())):
         again = gym.make(spec).constraints
-        assert again == [limit] and type(again[0]) is sw.Upright
+        assert again == [limit] and type(again[0]) is sw.constraints.Upright
     assert limit.promise == "best effort"
 
 
@@ -198,4 +200,4 @@ def test_it_is_rebuilt_from_the_spec_and_from_json():
 )
 def test_nonsense_is_refused(arguments, error, message):
     with pytest.raises(error, match=message):
-        sw.CBFActionFilter(gym.make("Walker2d-v5"), [sw.Upright(**arguments)])
+        sw.CBFActionFilter(gym.make("Walker2d-v5"), [sw.constraints.Upright(**arguments)])

@@ -21,7 +21,7 @@ ROOM = RADIUS + 2 * 0.002 + MARGIN
 
 
 def filtered(world=None, more=(), **options):
-    env = sw.CBFActionFilter(world or PointWorld(clip=5.0), [sw.WallClearance(**options), *more])
+    env = sw.CBFActionFilter(world or PointWorld(clip=5.0), [sw.constraints.WallClearance(**options), *more])
     env.reset(seed=0)
     return env
 
@@ -325,7 +325,9 @@ def test_a_plant_of_another_mass_is_read_anew():
 
 
 def test_a_delay_is_predicted():
-    env = sw.CBFActionFilter(PointWorld(), [sw.WallClearance()], plant=sw.MujocoPlant(delay_s=0.05))
+    env = sw.CBFActionFilter(
+        PointWorld(), [sw.constraints.WallClearance()], plant=sw.MujocoPlant(delay_s=0.05)
+    )
     env.reset(seed=0)
     at_once = placed(filtered(PointWorld()), (1.2, -1.2), (2.0, 0.0))
     late = placed(env, (1.2, -1.2), (2.0, 0.0))
@@ -342,7 +344,7 @@ def test_a_state_that_is_not_a_number_admits_nothing():
 
 
 def test_as_plain_data_it_is_the_same():
-    limit = sw.WallClearance(margin=0.02, velocity_clip=4.0)
+    limit = sw.constraints.WallClearance(margin=0.02, velocity_clip=4.0)
     data = plain_data(limit)
     assert data == {"kind": "WallClearance", "margin": 0.02, "velocity_clip": 4.0}
     assert constraint_from(data) == limit
@@ -362,7 +364,7 @@ def test_as_plain_data_it_is_the_same():
 )
 def test_bad_numbers_are_refused(options, says):
     with pytest.raises(ConfigurationError, match=says):
-        sw.WallClearance(**options)
+        sw.constraints.WallClearance(**options)
 
 
 def test_other_plants_and_machines_are_refused_with_the_alternative():
@@ -375,9 +377,9 @@ def test_other_plants_and_machines_are_refused_with_the_alternative():
         hold_s=0.01,
     )
     with pytest.raises(UnsupportedEnvError, match=r"MujocoPlant.*Clearance"):
-        sw.CBFActionFilter(PointWorld(), [sw.WallClearance()], plant=plant)
+        sw.CBFActionFilter(PointWorld(), [sw.constraints.WallClearance()], plant=plant)
     with pytest.raises(UnsupportedEnvError, match=r"two slides.*Use Clearance"):
-        sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.WallClearance()])
+        sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.WallClearance()])
 
 
 def test_the_blocks_are_where_the_tests_think():

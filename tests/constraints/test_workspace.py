@@ -47,7 +47,7 @@ def true_points(data):
 def test_bodies_sites_and_geoms_are_where_mujoco_has_them_now_and_ahead():
     env = Scene(ARM)
     names = {"bodies": ["lower", "upper"], "sites": ["tip"], "geoms": ["bone", "shin"]}
-    limit = bound(env, sw.Workspace(low=[0.0, 0.0, 0.0], holds=2, **names))
+    limit = bound(env, sw.constraints.Workspace(low=[0.0, 0.0, 0.0], holds=2, **names))
     plant = limit.plant
     rng = np.random.default_rng(0)
     truth = mujoco.MjData(env.model)
@@ -73,15 +73,18 @@ def test_every_bound_that_there_is_and_every_obstacle_counts_by_itself():
     (x, y, z), (p, q, r) = tip, bone = env.data.site("tip").xpos.copy(), env.data.geom("bone").xpos.copy()
 
     def left(**arguments):
-        return bound(env, sw.Workspace(sites=["tip"], geoms=["bone"], **arguments)).value()
+        return bound(env, sw.constraints.Workspace(sites=["tip"], geoms=["bone"], **arguments)).value()
 
     np.testing.assert_allclose(left(low=[-1.0, None, None]), [x + 1.0, p + 1.0])
     np.testing.assert_allclose(
         left(low=[None, -1.0, None], high=[2.0, None, 3.0], radius=0.1),
         np.array([y + 1.0, q + 1.0, 2.0 - x, 3.0 - z, 2.0 - p, 3.0 - r]) - 0.1,
     )
-    disc, ball = sw.Disc([0.1, 0.2], 0.05), sw.Sphere([0.1, 0.2, 0.9], 0.05)
-    wall, block = sw.Plane([0.0, 0.0, 0.5], [0.0, 3.0, 4.0]), sw.Box([9.0, 0.0, 0.0], [1.0, 99.0, 99.0])
+    disc, ball = sw.constraints.Disc([0.1, 0.2], 0.05), sw.constraints.Sphere([0.1, 0.2, 0.9], 0.05)
+    wall, block = (
+        sw.constraints.Plane([0.0, 0.0, 0.5], [0.0, 3.0, 4.0]),
+        sw.constraints.Box([9.0, 0.0, 0.0], [1.0, 99.0, 99.0]),
+    )
     np.testing.assert_allclose(
         left(keep_out=[disc, ball, wall, block], radius=0.01),
         np.concatenate(
@@ -98,7 +101,10 @@ def test_every_bound_that_there_is_and_every_obstacle_counts_by_itself():
 
 def test_published_obstacles_are_taken_where_they_are():
     env = gym.make("SafePointGoal1-v0", disable_env_checker=True)
-    limit = bound(env, sw.Workspace(keep_out=[sw.Discs("hazard_positions", 0.2)], bodies=["agent"]))
+    limit = bound(
+        env,
+        sw.constraints.Workspace(keep_out=[sw.constraints.Discs("hazard_positions", 0.2)], bodies=["agent"]),
+    )
     for seed in (0, 1):
         env.reset(seed=seed)
         limit.plant.observe()
@@ -109,7 +115,9 @@ def test_published_obstacles_are_taken_where_they_are():
 
 def test_where_nothing_stands_nothing_is_refused():
     env = gym.make("SafePointGoal0-v0", disable_env_checker=True)  # a level without hazards
-    limit = sw.Workspace(keep_out=[sw.Discs("hazard_positions", 0.2)], bodies=["agent"], reach=0.1)
+    limit = sw.constraints.Workspace(
+        keep_out=[sw.constraints.Discs("hazard_positions", 0.2)], bodies=["agent"], reach=0.1
+    )
     filtered = sw.CBFActionFilter(env, [limit])
     filtered.reset(seed=0)
     for _ in range(5):
@@ -134,17 +142,19 @@ def in_box(body, low, high):
 CASES = {
     "a box on Reacher": (
         "Reacher-v5",
-        sw.Workspace([*FINGER_LOW, None], [*FINGER_HIGH, None], bodies=["fingertip"], holds=10),
+        sw.constraints.Workspace([*FINGER_LOW, None], [*FINGER_HIGH, None], bodies=["fingertip"], holds=10),
         in_box("fingertip", FINGER_LOW, FINGER_HIGH),
     ),
     "a disc on Reacher": (
         "Reacher-v5",
-        sw.Workspace(keep_out=[sw.Disc([0.0, 0.15], 0.06)], geoms=["fingertip"], radius=0.01, holds=10),
+        sw.constraints.Workspace(
+            keep_out=[sw.constraints.Disc([0.0, 0.15], 0.06)], geoms=["fingertip"], radius=0.01, holds=10
+        ),
         lambda model, data: np.linalg.norm(data.geom("fingertip").xpos[:2] - [0.0, 0.15]) - 0.07,
     ),
     "a box on Pusher": (
         "Pusher-v5",
-        sw.Workspace(list(TABLE_LOW), list(TABLE_HIGH), bodies=["tips_arm"], holds=8),
+        sw.constraints.Workspace(list(TABLE_LOW), list(TABLE_HIGH), bodies=["tips_arm"], holds=8),
         in_box("tips_arm", TABLE_LOW, TABLE_HIGH),
     ),
 }
@@ -184,7 +194,9 @@ def test_without_the_filter_it_is_left():
 
 def test_far_inside_the_actions_pass_bit_for_bit():
     bare = gym.make("Pusher-v5")
-    limit = sw.Workspace([-9.0] * 3, [9.0] * 3, [sw.Sphere([9.0, 0.0, 0.0], 1.0)], bodies=["tips_arm"])
+    limit = sw.constraints.Workspace(
+        [-9.0] * 3, [9.0] * 3, [sw.constraints.Sphere([9.0, 0.0, 0.0], 1.0)], bodies=["tips_arm"]
+    )
     filtered = sw.CBFActionFilter(gym.make("Pusher-v5"), [limit])
     rng = np.random.default_rng(0)
     a, b = bare.reset(seed=3)[0], filtered.reset(seed=3)[0]
@@ -197,9 +209,9 @@ def test_far_inside_the_actions_pass_bit_for_bit():
 
 
 def test_from_inside_an_obstacle_it_goes_out():
-    disc = sw.Disc([0.21, 0.0], 0.04)  # Reacher starts with its arm along x, the tip at 0.21
+    disc = sw.constraints.Disc([0.21, 0.0], 0.04)  # Reacher starts with its arm along x, the tip at 0.21
     filtered = sw.CBFActionFilter(
-        gym.make("Reacher-v5"), [sw.Workspace(keep_out=[disc], bodies=["fingertip"], holds=10)]
+        gym.make("Reacher-v5"), [sw.constraints.Workspace(keep_out=[disc], bodies=["fingertip"], holds=10)]
     )
     raw = filtered.unwrapped
     judge = Judge(
@@ -221,8 +233,8 @@ def test_from_inside_an_obstacle_it_goes_out():
 
 
 def test_conflicting_workspaces_are_infeasible_and_the_action_stays_sound():
-    left = sw.Workspace(high=[-0.05, None, None], bodies=["fingertip"])
-    right = sw.Workspace(low=[0.05, None, None], bodies=["fingertip"])
+    left = sw.constraints.Workspace(high=[-0.05, None, None], bodies=["fingertip"])
+    right = sw.constraints.Workspace(low=[0.05, None, None], bodies=["fingertip"])
     filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [left, right])
     with pytest.warns(sw.UnsafeStateWarning):
         filtered.reset(seed=0)
@@ -237,10 +249,14 @@ def test_conflicting_workspaces_are_infeasible_and_the_action_stays_sound():
 
 
 def test_it_is_rebuilt_from_the_spec_and_from_json():
-    limit = sw.Workspace(
+    limit = sw.constraints.Workspace(
         [None, -0.5, None],
         [0.5, None, None],
-        [sw.Disc([0.1, 0.2], 0.05), sw.Box([1.0, 0.0, 0.0], [0.1, 0.2, 0.3]), sw.Discs("centres", 0.1)],
+        [
+            sw.constraints.Disc([0.1, 0.2], 0.05),
+            sw.constraints.Box([1.0, 0.0, 0.0], [0.1, 0.2, 0.3]),
+            sw.constraints.Discs("centres", 0.1),
+        ],
         bodies=["fingertip"],
         geoms=["link0"],
         radius=0.01,
@@ -251,8 +267,12 @@ def test_it_is_rebuilt_from_the_spec_and_from_json():
     filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [limit])
     for spec in (filtered.spec, EnvSpec.from_json(filtered.spec.to_json())):
         again = gym.make(spec).constraints
-        assert again == [limit] and type(again[0]) is sw.Workspace
-        assert [type(o) for o in again[0].keep_out] == [sw.Disc, sw.Box, sw.Discs]
+        assert again == [limit] and type(again[0]) is sw.constraints.Workspace
+        assert [type(o) for o in again[0].keep_out] == [
+            sw.constraints.Disc,
+            sw.constraints.Box,
+            sw.constraints.Discs,
+        ]
     assert limit.promise == "best effort"
 
 
@@ -294,7 +314,7 @@ FINGER = {"bodies": ["fingertip"]}
             "margin must be a finite number >= 0",
         ),
         (
-            {**FINGER, "keep_out": sw.Disc([0.0, 0.0], 1.0)},
+            {**FINGER, "keep_out": sw.constraints.Disc([0.0, 0.0], 1.0)},
             ConfigurationError,
             "keep_out is a list of obstacles",
         ),
@@ -311,4 +331,4 @@ FINGER = {"bodies": ["fingertip"]}
 )
 def test_nonsense_is_refused(arguments, error, message):
     with pytest.raises(error, match=message):
-        sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.Workspace(**arguments)])
+        sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.Workspace(**arguments)])

@@ -25,7 +25,9 @@ REFUSING = (TASK, CROSSING)
 
 
 def _clearance():
-    return sw.HeadingDriveClearance([sw.Discs("hazard_positions", radius=0.2)], margin=0.004)
+    return sw.constraints.HeadingDriveClearance(
+        [sw.constraints.Discs("hazard_positions", radius=0.2)], margin=0.004
+    )
 
 
 def _joint_speed(env):
@@ -48,7 +50,7 @@ EXAMPLES = {
         "a JointSpeedLimit with options": (
             "Reacher-v5",
             lambda: {
-                "constraints": [sw.JointSpeedLimit(4.0)],
+                "constraints": [sw.constraints.JointSpeedLimit(4.0)],
                 "fallback": "hold",
                 "solver": "clarabel",
                 "margin": 0.1,
@@ -58,7 +60,11 @@ EXAMPLES = {
             "InvertedPendulum-v5",
             lambda: {
                 "constraints": [
-                    sw.Clearance([sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])], bodies=["cart"], braking=8.0)
+                    sw.constraints.Clearance(
+                        [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])],
+                        bodies=["cart"],
+                        braking=8.0,
+                    )
                 ]
             },
         ),
@@ -99,8 +105,10 @@ EXAMPLES = {
             "InvertedPendulum-v5",
             lambda: {
                 "budget": sw.StoppingBudget(
-                    sw.Clearance(
-                        [sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])], bodies=["cart"], braking=8.0
+                    sw.constraints.Clearance(
+                        [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])],
+                        bodies=["cart"],
+                        braking=8.0,
                     ),
                     acceleration=20.0,
                     top_speed=5.0,
@@ -120,7 +128,7 @@ EXAMPLES = {
             "Reacher-v5",
             lambda: {
                 "budget": sw.StoppingBudget(
-                    sw.JointPositionLimit(-2.0, 2.0, ["joint1"], margin=0.01), closing_speed=10.0
+                    sw.constraints.JointPositionLimit(-2.0, 2.0, ["joint1"], margin=0.01), closing_speed=10.0
                 ),
                 "reach": {"max_acceleration": [8.0, 20.0], "max_speed": 4.0},
                 "fallback": "hold",
@@ -132,10 +140,10 @@ EXAMPLES = {
             CROSSING,
             lambda: {
                 "tracks": [
-                    sw.Track("car*", acceleration_noise=[0.0225, 0.0], reversion_s=2.0),
-                    sw.Track(published="pillar_positions", acceleration_noise=0),
+                    sw.occlusion.Track("car*", acceleration_noise=[0.0225, 0.0], reversion_s=2.0),
+                    sw.occlusion.Track(published="pillar_positions", acceleration_noise=0),
                 ],
-                "sensor": sw.Sensor("eye", view_deg=120.0, range_m=6.0, dropout=0.1),
+                "sensor": sw.occlusion.Sensor("eye", view_deg=120.0, range_m=6.0, dropout=0.1),
                 "tolerance": 0.5,
                 "weight": 0.1,
             },
@@ -143,7 +151,7 @@ EXAMPLES = {
         "some bodies, and nothing added to the observation": (
             TASK,
             lambda: {
-                "tracks": [sw.Track("hazard[0-3]", acceleration_noise=0.1)],
+                "tracks": [sw.occlusion.Track("hazard[0-3]", acceleration_noise=0.1)],
                 "sensor": {"site": "agent", "position_std": [[0.01, 0.0], [0.0, 0.02]]},
                 "tolerance": 0.3,
                 "sigmas": 2.0,
@@ -153,8 +161,8 @@ EXAMPLES = {
         "bodies in space": (
             "HalfCheetah-v5",
             lambda: {
-                "tracks": [sw.Track("?foot", acceleration_noise=100.0)],
-                "sensor": sw.Sensor("track", velocity_std=0.1, lever_arm=False),
+                "tracks": [sw.occlusion.Track("?foot", acceleration_noise=100.0)],
+                "sensor": sw.occlusion.Sensor("track", velocity_std=0.1, lever_arm=False),
                 "tolerance": 0.1,
                 "axes": "xyz",
             },
@@ -180,7 +188,7 @@ EXAMPLES = {
         "plain, any env": (
             "Reacher-v5",
             lambda: {
-                "uplink": sw.Link(0.04, 0.03, loss=0.1, in_order=False),
+                "uplink": sw.teleop.Link(0.04, 0.03, loss=0.1, in_order=False),
                 "downlink": {"delay_s": 0.02, "outage_between_s": 0.5, "outage_length_s": 0.1},
                 "missing": "zero",
                 "seed": 3,
@@ -189,14 +197,16 @@ EXAMPLES = {
         "waves under a ceiling": (
             "TeleopContact-v0",
             lambda: {
-                "uplink": sw.Link(0.003, 0.004, loss=0.05),
+                "uplink": sw.teleop.Link(0.003, 0.004, loss=0.05),
                 "downlink": 0.002,
                 "coding": "wave",
                 "impedance": 40.0,
                 "wave_rule": "hold",
-                "ceiling": sw.RoundTripCeiling(
+                "ceiling": sw.teleop.RoundTripCeiling(
                     sw.StoppingBudget(
-                        sw.Clearance([sw.Plane([0, 0.25], [0, -1])], 24.0, bodies=["tool"], radius=0.015),
+                        sw.constraints.Clearance(
+                            [sw.constraints.Plane([0, 0.25], [0, -1])], 24.0, bodies=["tool"], radius=0.015
+                        ),
                         acceleration=55.0,
                         top_speed=1.4,
                     )
@@ -212,7 +222,7 @@ EXAMPLES = {
                 "damping_limit": 20.0,
                 "storage_j": 0.01,
                 "missing": "fallback",
-                "port": sw.TeleopPort([0, 1], [4, 5], feedthrough=40.0),
+                "port": sw.teleop.TeleopPort([0, 1], [4, 5], feedthrough=40.0),
             },
         ),
     },
@@ -338,7 +348,7 @@ def test_what_is_not_plain_data_is_still_recorded_for_gym_make():
         state=lambda env: env.state,
         hold_s=0.05,
     )
-    slow = sw.Barrier(lambda x: 4.0 - x[1] ** 2, alpha=2.0)
+    slow = sw.constraints.Barrier(lambda x: 4.0 - x[1] ** 2, alpha=2.0)
     env = sw.CBFActionFilter(gym.make("Pendulum-v1"), [slow], plant=plant, fallback=lambda plant: [0.0])
     again = gym.make(env.spec)
     with warnings.catch_warnings():
@@ -574,11 +584,11 @@ def test_constraints_and_plant_survive_pickling(case, bound):
 def harmless(name, case):
     """The wrapper over a witness, with limits that nothing reaches."""
     if name == "CBFActionFilter":
-        return sw.CBFActionFilter(Witness(gym.make("Reacher-v5")), [sw.JointSpeedLimit(1e9)])
+        return sw.CBFActionFilter(Witness(gym.make("Reacher-v5")), [sw.constraints.JointSpeedLimit(1e9)])
     if name in CHUNKED:
         return getattr(sw, name)(Witness(gym.make("Reacher-v5", max_episode_steps=500)), 5, 3, rate_limit=1e6)
     if name == "LeaseExpiry":
-        far = sw.JointSpeedLimit(1e9)
+        far = sw.constraints.JointSpeedLimit(1e9)
         return sw.LeaseExpiry(Witness(gym.make("Reacher-v5")), sw.StoppingBudget(far, closing_speed=1.0))
     if name == "SlipLimiter":  # a ground that is said to carry any torque
         return sw.SlipLimiter(Witness(gym.make("SafeRover-v0")), list(WHEELS), friction=1e9)

@@ -129,7 +129,10 @@ def test_entries_of_very_different_size_in_one_row():
 
 
 def test_what_rounding_leaves_of_one_row_is_taken_up_by_what_can_still_move():
-    u, slope = np.array([0.01172586897845124, -618.5426038380589]), np.array([[846.8203579383486, -0.00035567]])
+    u, slope = (
+        np.array([0.01172586897845124, -618.5426038380589]),
+        np.array([[846.8203579383486, -0.00035567]]),
+    )
     upper = np.array([0.023554409701342264, 1020.4451077247508])
     answer = project(u, slope, [-19.95259653062522], -upper, upper)
     assert answer.status == "projected"

@@ -336,7 +336,10 @@ def test_walls_hide_patrols():
 
 def test_protect_knows_it():
     bare = sw.protect(gym.make(PATROLLED_MAZE_ID))
-    assert [type(c) for c in bare.constraints] == [sw.WallClearance, sw.EscapeClearance]
+    assert [type(c) for c in bare.constraints] == [
+        sw.constraints.WallClearance,
+        sw.constraints.EscapeClearance,
+    ]
     assert bare.constraints[1].obstacles[0].attribute == "patrol_tracks"
     for patrols, attribute in (("estimated", "tracking"), ("true", "patrol_tracks"), ("", "tracking")):
         env = sw.protect(patrolled(gym.make(PATROLLED_MAZE_ID)), patrols=patrols, sigmas=2.0)

@@ -74,7 +74,7 @@ class Slow(gym.Env):
 def on_cart(env, **timing):
     plant = sw.AnalyticPlant(np.zeros_like, lambda x: np.eye(1), lambda env: env.v, **timing)
     return sw.CBFActionFilter(
-        env, [sw.Barrier(lambda x: 1.5 - x[0], gradient=lambda x: -np.ones(1))], plant=plant
+        env, [sw.constraints.Barrier(lambda x: 1.5 - x[0], gradient=lambda x: -np.ones(1))], plant=plant
     )
 
 

@@ -62,9 +62,10 @@ EXPECTED = {
 def test_layers_and_judges_that_are_not_there_log_no_zeros(tmp_path, leased):
     env = gym.make("InvertedPendulum-v5", max_episode_steps=16)  # reports no cost
     if leased:
-        rail = [sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])]
+        rail = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
         env = sw.LeaseExpiry(
-            env, sw.StoppingBudget(sw.Clearance(rail, bodies=["cart"], braking=8.0), acceleration=1.0)
+            env,
+            sw.StoppingBudget(sw.constraints.Clearance(rail, bodies=["cart"], braking=8.0), acceleration=1.0),
         )
     model = PPO("MlpPolicy", RecordInterventions(env), n_steps=32, n_epochs=1, batch_size=32, device="cpu")
     model.set_logger(configure(str(tmp_path), ["tensorboard"]))
@@ -78,9 +79,10 @@ def test_layers_and_judges_that_are_not_there_log_no_zeros(tmp_path, leased):
 def lost_now_and_then():
     """The whole stack, whose policy is never heard at all."""
     cart = gym.make("InvertedPendulum-v5", max_episode_steps=16)
-    rail = [sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])]
+    rail = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
     lease = sw.LeaseExpiry(
-        cart, sw.StoppingBudget(sw.Clearance(rail, bodies=["cart"], braking=8.0), acceleration=1.0)
+        cart,
+        sw.StoppingBudget(sw.constraints.Clearance(rail, bodies=["cart"], braking=8.0), acceleration=1.0),
     )
     stack = sw.ChunkHandover(sw.RecordInterventions(lease), 8, 4, rate_limit=10.0)
     return Monitor(DroppedRefreshes(stack, share=1.0))
@@ -120,7 +122,7 @@ def test_slips_spin_outs_and_contact_forces_reach_tensorboard(tmp_path):
 
 def crossing(**more):
     """A robot among cars of which little is known, for 16 steps."""
-    cars = [sw.Track("car*", acceleration_noise=[0.5, 0.0], start_velocity_std=1.0)]
+    cars = [sw.occlusion.Track("car*", acceleration_noise=[0.5, 0.0], start_velocity_std=1.0)]
     task = gym.make("OccludedCrossing-v0", max_episode_steps=16)
     return sw.RecordInterventions(sw.OcclusionPenalty(task, cars, "eye", tolerance=0.5, **more))
 

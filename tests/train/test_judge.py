@@ -32,7 +32,7 @@ SHORT = ("seeds=[0]", "total_steps=128", "evaluation.episodes=2")
 def slow_joints(env, limit=4.0, mass=1.0, delay_s=0.0):
     plant = sw.MujocoPlant(delay_s=delay_s)
     plant.perturb(mass=mass)
-    return sw.CBFActionFilter(env, [sw.JointSpeedLimit(limit)], plant=plant, margin=0.5)
+    return sw.CBFActionFilter(env, [sw.constraints.JointSpeedLimit(limit)], plant=plant, margin=0.5)
 
 
 def slow_pendulum(env, delay_s=0.0):
@@ -43,7 +43,9 @@ def slow_pendulum(env, delay_s=0.0):
         hold_s=0.05,
         delay_s=delay_s,
     )
-    return sw.CBFActionFilter(env, [sw.Barrier(lambda x: 4.0 - x[1] ** 2, alpha=2.0)], plant=plant)
+    return sw.CBFActionFilter(
+        env, [sw.constraints.Barrier(lambda x: 4.0 - x[1] ** 2, alpha=2.0)], plant=plant
+    )
 
 
 class RowsOnly(sw.Constraint):
@@ -54,7 +56,7 @@ class RowsOnly(sw.Constraint):
 
 
 def without_h(env):
-    return sw.CBFActionFilter(env, [sw.JointSpeedLimit(4.0), RowsOnly()])
+    return sw.CBFActionFilter(env, [sw.constraints.JointSpeedLimit(4.0), RowsOnly()])
 
 
 # ------------------------------------------------------------------------------------------------------------------

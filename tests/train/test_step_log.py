@@ -23,7 +23,7 @@ def record(env, actions, seed=0):
 
 
 def test_the_filters_word_is_taken_down_step_by_step(tmp_path):
-    limits = [sw.JointSpeedLimit(limit=4.0), sw.JointSpeedLimit(limit=2.0)]
+    limits = [sw.constraints.JointSpeedLimit(limit=4.0), sw.constraints.JointSpeedLimit(limit=2.0)]
     env = sw.CBFActionFilter(gym.make("Reacher-v5"), limits)
     actions = np.random.default_rng(0).uniform(-1, 1, (40, 2)).astype(np.float32)
     log, infos = record(sw.RecordInterventions(env), actions)

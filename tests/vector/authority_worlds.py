@@ -9,8 +9,8 @@ from vector_worlds import DT, AtHazard, ScheduledCart, drift, push, read
 import safe_wrappers as sw
 from safe_wrappers.wrappers.faults import FrozenPolicy, Jitter, Outages, RepeatedCommands
 
-HAZARDS = [sw.Discs("hazard_positions", radius=0.2)]
-RAIL = [sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])]
+HAZARDS = [sw.constraints.Discs("hazard_positions", radius=0.2)]
+RAIL = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
 
 
 def _plant():
@@ -19,7 +19,9 @@ def _plant():
 
 def cart(index=0, chunked=True):
     """A cart in front of a wall; `hold` shows the last command after a reset, and what is left of an episode."""
-    wall = sw.Clearance([sw.Plane([1.0], [-1.0])], braking=1.0, position=[0], velocity=[1])
+    wall = sw.constraints.Clearance(
+        [sw.constraints.Plane([1.0], [-1.0])], braking=1.0, position=[0], velocity=[1]
+    )
     env = sw.CBFActionFilter(ScheduledCart(index), [wall], plant=_plant(), fallback="hold")
     env = sw.LeaseExpiry(
         env,
@@ -42,7 +44,7 @@ def single_cart(index=0):
 
 
 def point_goal(index=0):
-    clearance = sw.HeadingDriveClearance(HAZARDS, margin=0.004)
+    clearance = sw.constraints.HeadingDriveClearance(HAZARDS, margin=0.004)
     env = AtHazard(gym.make("SafePointGoal1-v0", max_episode_steps=14 + 4 * index))
     env = sw.CBFActionFilter(env, [clearance], fallback="hold")
     env = sw.LeaseExpiry(
@@ -54,7 +56,7 @@ def point_goal(index=0):
 
 def pendulum(index=0):
     """Lease and faults alone, no filter; the pole falls by itself."""
-    clearance = sw.Clearance(RAIL, bodies=["cart"], braking=8.0)
+    clearance = sw.constraints.Clearance(RAIL, bodies=["cart"], braking=8.0)
     env = gym.make("InvertedPendulum-v5", max_episode_steps=8 + index)
     env = sw.LeaseExpiry(env, sw.StoppingBudget(clearance, acceleration=20.0), max_lease_s=0.12)
     return Outages(sw.RecordInterventions(env), 0.12, 0.3)

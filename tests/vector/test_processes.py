@@ -36,7 +36,7 @@ def ahead(x):
 
 def with_wrong_barrier(index):
     plant = sw.AnalyticPlant(f=drift, g=push, state=read, hold_s=DT)
-    return sw.CBFActionFilter(ScheduledCart(index), [sw.Barrier(ahead)], plant=plant)
+    return sw.CBFActionFilter(ScheduledCart(index), [sw.constraints.Barrier(ahead)], plant=plant)
 
 
 @pytest.mark.parametrize("context", ["spawn", "fork"])

@@ -164,7 +164,11 @@ def test_closing_leaves_no_process():
     assert set(multiprocessing.active_children()) == before
 
 
-SHARED = [sw.HeadingDriveClearance([sw.Discs("hazard_positions", radius=0.2)], margin=0.004, detour=True)]
+SHARED = [
+    sw.constraints.HeadingDriveClearance(
+        [sw.constraints.Discs("hazard_positions", radius=0.2)], margin=0.004, detour=True
+    )
+]
 """One constraint for all: the filter's business is to take a copy."""
 
 

@@ -16,7 +16,7 @@ CARS = [
     }
     for names, speed in (("012", 1.0), ("345", -1.0))
 ]
-EYE = sw.Sensor("eye", view_deg=120, range_m=6.0)
+EYE = sw.occlusion.Sensor("eye", view_deg=120, range_m=6.0)
 
 
 def crossing(cars="estimated", tolerance=0.5, **protect):

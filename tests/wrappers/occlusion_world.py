@@ -81,6 +81,6 @@ STILL = np.zeros(1)
 
 def straight(bodies="thing", **options):
     """A track of what drives straight on, without noise in its motion."""
-    return sw.Track(
+    return sw.occlusion.Track(
         bodies, **{"acceleration_noise": 0.0, "start_position_std": 0.3, "start_velocity_std": 0.3} | options
     )

@@ -19,14 +19,14 @@ MARGIN = 0.001
 
 def clamp(braking=TELEOP_BRAKING, margin=MARGIN):
     """The clamp's face, as a constraint."""
-    face = sw.Plane([0.0, CLAMP_Y], [0.0, -1.0])
-    return sw.Clearance([face], braking, bodies=["tool"], radius=TOOL_RADIUS, margin=margin)
+    face = sw.constraints.Plane([0.0, CLAMP_Y], [0.0, -1.0])
+    return sw.constraints.Clearance([face], braking, bodies=["tool"], radius=TOOL_RADIUS, margin=margin)
 
 
 def ceiling(braking=TELEOP_BRAKING, margin=MARGIN, **changes):
     arguments = {"acceleration": TELEOP_ACCELERATION, "top_speed": TELEOP_TOP_SPEED} | changes
     budget = {f.name: arguments.pop(f.name) for f in fields(sw.StoppingBudget) if f.name in arguments}
-    return sw.RoundTripCeiling(sw.StoppingBudget(clamp(braking, margin), **budget), **arguments)
+    return sw.teleop.RoundTripCeiling(sw.StoppingBudget(clamp(braking, margin), **budget), **arguments)
 
 
 def channel(uplink=0.0, downlink=0.0, inside=None, **options):

@@ -17,8 +17,8 @@ from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.faults import DroppedRefreshes, FrozenPolicy, Jitter, Outages, RepeatedCommands
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
-RAIL = [sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])]
-HAZARDS = [sw.Discs("hazard_positions", radius=0.2)]
+RAIL = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
+HAZARDS = [sw.constraints.Discs("hazard_positions", radius=0.2)]
 
 
 class Task:
@@ -58,17 +58,17 @@ class Task:
 TASKS = {
     "point": Task(
         "SafePointGoal1-v0",
-        lambda: sw.HeadingDriveClearance(HAZARDS, margin=0.004),
+        lambda: sw.constraints.HeadingDriveClearance(HAZARDS, margin=0.004),
         {"closing_speed": 4.0, "max_lease_s": 0.15},
     ),
     "pendulum": Task(
         "InvertedPendulum-v5",
-        lambda: sw.Clearance(RAIL, bodies=["cart"], braking=8.0),
+        lambda: sw.constraints.Clearance(RAIL, bodies=["cart"], braking=8.0),
         {"acceleration": 20.0, "max_lease_s": 0.2},
     ),
     "reacher": Task(
         "Reacher-v5",
-        lambda: sw.JointPositionLimit(-1.5, 1.5, ["joint1"]),
+        lambda: sw.constraints.JointPositionLimit(-1.5, 1.5, ["joint1"]),
         {"closing_speed": 10.0, "max_lease_s": 0.15},
     ),
 }
@@ -218,9 +218,9 @@ def test_what_is_said_to_be_executed_was(task, layers):
 def test_with_nothing_to_say_every_layer_passes_on_the_same_bits(layers):
     """Chunks of a constant command, full leases, far limits: the arm gets what the policy gave."""
     env = watch = Watch(gym.make("Reacher-v5"))
-    far = sw.JointSpeedLimit(1e9)
+    far = sw.constraints.JointSpeedLimit(1e9)
     env = sw.CBFActionFilter(env, [far])
-    env = sw.LeaseExpiry(env, sw.StoppingBudget(sw.JointSpeedLimit(1e9), closing_speed=1.0))
+    env = sw.LeaseExpiry(env, sw.StoppingBudget(sw.constraints.JointSpeedLimit(1e9), closing_speed=1.0))
     if "handover" in layers:
         env = sw.ChunkHandover(env, 4, 2, rate_limit=1e6)
     env.reset(seed=0)

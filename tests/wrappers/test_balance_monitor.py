@@ -516,7 +516,7 @@ def test_around_and_inside_a_filter_and_beside_a_contact_monitor_it_says_the_sam
         return env
 
     def limit(env):
-        return sw.CBFActionFilter(env, [sw.JointSpeedLimit(3.0)])
+        return sw.CBFActionFilter(env, [sw.constraints.JointSpeedLimit(3.0)])
 
     orders = [(sw.BalanceMonitor, limit, sw.ContactMonitor), (sw.ContactMonitor, limit, sw.BalanceMonitor)]
     traces = []

@@ -9,7 +9,7 @@ from safe_wrappers.constraints.obstacles.obstacles import Discs
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 
-POINT = [sw.HeadingDriveClearance([Discs("hazard_positions", 0.2)], detour=True)]
+POINT = [sw.constraints.HeadingDriveClearance([Discs("hazard_positions", 0.2)], detour=True)]
 
 
 class Given(gym.Wrapper):
@@ -40,8 +40,11 @@ def executed(filtered, action):
     ("env_id", "constraints"),
     [
         ("SafePointGoal1-v0", POINT),
-        ("Reacher-v5", [sw.JointSpeedLimit(4.0)]),
-        ("Reacher-v5", [sw.Clearance([sw.Plane([-1.0], [1.0])], 1.0, bodies=["fingertip"])]),
+        ("Reacher-v5", [sw.constraints.JointSpeedLimit(4.0)]),
+        (
+            "Reacher-v5",
+            [sw.constraints.Clearance([sw.constraints.Plane([-1.0], [1.0])], 1.0, bodies=["fingertip"])],
+        ),
     ],
 )
 def test_a_broken_state_runs_the_fallback(env_id, constraints, broken, fallback):
@@ -55,9 +58,9 @@ def test_a_broken_state_runs_the_fallback(env_id, constraints, broken, fallback)
 def test_a_broken_obstacle_runs_the_fallback(kind):
     discs = Discs("hazards", 0.2)
     limit = (
-        sw.HeadingDriveClearance([discs])
+        sw.constraints.HeadingDriveClearance([discs])
         if kind == "heading drive"
-        else sw.Clearance([discs], 1.0, bodies=["agent"])
+        else sw.constraints.Clearance([discs], 1.0, bodies=["agent"])
     )
     env = Published(gym.make("SafePointGoal1-v0"))
     filtered = sw.CBFActionFilter(Given(env), [limit])
@@ -68,7 +71,9 @@ def test_a_broken_obstacle_runs_the_fallback(kind):
 
 def test_a_broken_state_is_not_hidden_by_the_prediction_over_a_delay():
     plant = sw.MujocoPlant(delay_s=0.02)
-    filtered = sw.CBFActionFilter(Given(gym.make("Reacher-v5")), [sw.JointSpeedLimit(4.0)], plant=plant)
+    filtered = sw.CBFActionFilter(
+        Given(gym.make("Reacher-v5")), [sw.constraints.JointSpeedLimit(4.0)], plant=plant
+    )
     filtered.reset(seed=0)
     filtered.step(np.zeros(2, np.float32))
     filtered.unwrapped.data.qvel[0] = np.nan

@@ -64,7 +64,7 @@ def test_inactive_hands_the_very_object_on(action):
 
 def test_inactive_episode_is_the_unfiltered_episode_bit_for_bit():
     bare = gym.make("Reacher-v5")
-    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(1e6)])
+    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(1e6)])
     rng = np.random.default_rng(0)
     a, b = bare.reset(seed=3)[0], filtered.reset(seed=3)[0]
     for _ in range(50):
@@ -109,7 +109,7 @@ def test_the_rows_hold_for_what_was_executed():
 
 
 def test_every_step_has_every_key_with_its_dtype():
-    filtered = cart([wall(0.5), sw.Barrier(lambda x: 1.0 - x[1] ** 2, alpha=2.0)])
+    filtered = cart([wall(0.5), sw.constraints.Barrier(lambda x: 1.0 - x[1] ** 2, alpha=2.0)])
     filtered.reset(seed=0)
     actions = [[0.5], [1.0], [7.0], [np.nan], [np.inf], [-1.0], [-np.inf], [0.0]]
     with warnings.catch_warnings():
@@ -127,7 +127,7 @@ def test_reset_reports_the_margin_and_no_intervention():
 
 
 def test_margin_is_the_smallest_over_all_constraints_before_the_step():
-    filtered = cart([wall(2.0), sw.Barrier(lambda x: 1.0 - x[1] ** 2), SpeedRow(9.0)])
+    filtered = cart([wall(2.0), sw.constraints.Barrier(lambda x: 1.0 - x[1] ** 2), SpeedRow(9.0)])
     filtered.reset(seed=0, options={"state": [0.0, 0.8]})
     info = filtered.step(np.array([0.0], np.float32))[4]
     assert info["cbf/margin"] == pytest.approx(min(2.0 - 0.32, 1.0 - 0.64))
@@ -155,7 +155,7 @@ def test_a_non_finite_action_never_reaches_the_env(bad):
 
 
 def test_a_partly_nan_action_on_mujoco():
-    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(4.0)])
+    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(4.0)])
     filtered.reset(seed=0)
     with pytest.warns(UserWarning, match="not finite"):
         info = filtered.step(np.array([0.5, np.nan]))[4]
@@ -251,22 +251,32 @@ def test_unknown_names_and_bad_margins_are_refused(options, error, message):
             lambda: {"kind": "Clearence"},
             "unknown constraint kind 'Clearence'; the kinds are Barrier, Clearance",
         ),
-        (lambda: sw.JointSpeedLimit(4.0, joints=["elbow"]), "no joint 'elbow'; it has: joint0, joint1"),
         (
-            lambda: sw.Clearance([sw.Sphere([1, 1, 1], 0.1)], braking=1.0, bodies=["hand"]),
+            lambda: sw.constraints.JointSpeedLimit(4.0, joints=["elbow"]),
+            "no joint 'elbow'; it has: joint0, joint1",
+        ),
+        (
+            lambda: sw.constraints.Clearance(
+                [sw.constraints.Sphere([1, 1, 1], 0.1)], braking=1.0, bodies=["hand"]
+            ),
             "no body 'hand'; it has: .*body0, body1, fingertip",
         ),
         (
-            lambda: sw.Clearance([sw.Sphere([1, 1, 1], 0.1)], braking=1.0, sites=["tip"]),
+            lambda: sw.constraints.Clearance(
+                [sw.constraints.Sphere([1, 1, 1], 0.1)], braking=1.0, sites=["tip"]
+            ),
             "no site 'tip'",
         ),
         (
-            lambda: sw.Clearance([sw.Sphere([1, 1, 1], 0.1)], braking=1.0),
+            lambda: sw.constraints.Clearance([sw.constraints.Sphere([1, 1, 1], 0.1)], braking=1.0),
             "name the bodies, sites or geoms .*fingertip",
         ),
-        (lambda: sw.HeadingDriveClearance([sw.Disc([1, 1], 0.1)], body="agent"), "no body 'agent'"),
         (
-            lambda: sw.HeadingDriveClearance([sw.Disc([1, 1], 0.1)], body="body0"),
+            lambda: sw.constraints.HeadingDriveClearance([sw.constraints.Disc([1, 1], 0.1)], body="agent"),
+            "no body 'agent'",
+        ),
+        (
+            lambda: sw.constraints.HeadingDriveClearance([sw.constraints.Disc([1, 1], 0.1)], body="body0"),
             "must slide along world x and y",
         ),
     ],
@@ -277,7 +287,9 @@ def test_names_that_do_not_exist_are_listed(constraint, message):
 
 
 def test_an_obstacle_attribute_that_the_env_lacks_is_refused_with_the_list():
-    clear = sw.Clearance([sw.Discs("hazards", 0.1)], braking=1.0, bodies=["fingertip"])
+    clear = sw.constraints.Clearance(
+        [sw.constraints.Discs("hazards", 0.1)], braking=1.0, bodies=["fingertip"]
+    )
     with pytest.raises(UnknownNameError, match=r"publishes no attribute 'hazards'; it has: .*frame_skip"):
         filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [clear])
         filtered.reset(seed=0)
@@ -287,7 +299,7 @@ def test_an_env_without_mujoco_asks_for_an_analytic_plant():
     with pytest.raises(UnsupportedEnvError, match=r"no MuJoCo .model and .data; .*AnalyticPlant"):
         sw.CBFActionFilter(gym.make("Pendulum-v1"), [wall(1.0)])
     with pytest.raises(UnsupportedEnvError, match="JointSpeedLimit needs a MujocoPlant"):
-        cart([sw.JointSpeedLimit(1.0)])
+        cart([sw.constraints.JointSpeedLimit(1.0)])
 
 
 def test_a_rescaled_action_space_is_refused():
@@ -295,8 +307,8 @@ def test_a_rescaled_action_space_is_refused():
         return gym.wrappers.RescaleAction(env, np.float32(0.0), np.float32(1.0))
 
     with pytest.raises(ConfigurationError, match=r"RescaleAction inside the filter .* put it outside"):
-        sw.CBFActionFilter(rescaled(gym.make("Reacher-v5")), [sw.JointSpeedLimit(4.0)])
-    rescaled(sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(4.0)]))
+        sw.CBFActionFilter(rescaled(gym.make("Reacher-v5")), [sw.constraints.JointSpeedLimit(4.0)])
+    rescaled(sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(4.0)]))
 
 
 PARTS = {"a": gym.spaces.Box(-1.0, 1.0, (2,)), "b": gym.spaces.Box(0.0, 1.0, (1, 2))}
@@ -334,7 +346,7 @@ def test_composed_actions_are_not_called_discrete_and_the_remedy_works(kind):
     def filtered(env):
         effect = np.ones((1, gym.spaces.flatdim(env.action_space)))
         plant = sw.AnalyticPlant(np.zeros_like, lambda x: effect, lambda env: np.zeros(1))
-        return sw.CBFActionFilter(env, [sw.Barrier(lambda x: 1.0 - x[0])], plant=plant)
+        return sw.CBFActionFilter(env, [sw.constraints.Barrier(lambda x: 1.0 - x[0])], plant=plant)
 
     wraps = (
         filtered,
@@ -402,7 +414,7 @@ def test_a_constraint_without_margin_cannot_be_widened():
 
 def test_an_unsafe_start_is_warned_of_once_per_episode_counted_and_left():
     # Recovery is exponential towards h = margin, so a margin is what gets it inside.
-    filtered = cart([sw.Barrier(lambda x: 1.0 - x[1] ** 2, alpha=2.0, margin=0.1)])
+    filtered = cart([sw.constraints.Barrier(lambda x: 1.0 - x[1] ** 2, alpha=2.0, margin=0.1)])
     for _ in range(2):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -564,7 +576,9 @@ def test_a_broken_constraint_is_a_failed_solve_and_the_fallback(row):
 
 
 def test_a_barrier_that_turns_nan_is_unsafe_and_falls_back():
-    filtered = cart([sw.Barrier(lambda x: np.nan if x[1] > 0.15 else 1.0 - x[1])], fallback="zero")
+    filtered = cart(
+        [sw.constraints.Barrier(lambda x: np.nan if x[1] > 0.15 else 1.0 - x[1])], fallback="zero"
+    )
     infos = full_throttle(filtered, 6)
     assert any(i["cbf/intervened"] for i in infos)  # prediction keeps it out of there
     assert not any(i["cbf/unsafe"] for i in infos)
@@ -636,7 +650,7 @@ def test_several_constraints_are_one_projection():
 
 
 def test_certifying_and_plain_constraints_hold_together():
-    limits = [sw.JointSpeedLimit(3.0, margin=0.01), Raw([[1.0, 1.0]], [0.1])]
+    limits = [sw.constraints.JointSpeedLimit(3.0, margin=0.01), Raw([[1.0, 1.0]], [0.1])]
     filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), limits)
     filtered.reset(seed=0)
     rng = np.random.default_rng(0)
@@ -698,7 +712,9 @@ def pendulum(gravity=10.0, dt=0.05, **options):
         upper=2.0,
         hold_s=dt,
     )
-    return sw.CBFActionFilter(env, [sw.Barrier(lambda x: 4.0 - x[1] ** 2, alpha=2.0)], plant=plant, **options)
+    return sw.CBFActionFilter(
+        env, [sw.constraints.Barrier(lambda x: 4.0 - x[1] ** 2, alpha=2.0)], plant=plant, **options
+    )
 
 
 def pump(state, rng, k):
@@ -768,7 +784,7 @@ def car():
         state=lambda env: env.state,
         hold_s=1.0,
     )
-    slow = sw.Barrier(lambda x: 1.0 - (x[1] / 0.02) ** 2, alpha=0.5, margin=0.05)
+    slow = sw.constraints.Barrier(lambda x: 1.0 - (x[1] / 0.02) ** 2, alpha=0.5, margin=0.05)
     return sw.CBFActionFilter(gym.make("MountainCarContinuous-v0"), [slow], plant=plant)
 
 
@@ -860,7 +876,9 @@ def test_filter_time_is_an_attribute_and_not_in_info():
 
 def fast_cart():
     """A cart under its limit whose episodes are short; module level, so that workers can import it."""
-    constraint = sw.Clearance([sw.Plane([0.4], [-1.0])], braking=1.0, position=[0], velocity=[1])
+    constraint = sw.constraints.Clearance(
+        [sw.constraints.Plane([0.4], [-1.0])], braking=1.0, position=[0], velocity=[1]
+    )
     plant = sw.AnalyticPlant(f=drift, g=push, state=read, hold_s=0.1)
     return gym.wrappers.TimeLimit(sw.CBFActionFilter(Cart(), [constraint], plant=plant), 12)
 

@@ -878,7 +878,7 @@ def reacher(**arguments):
 @pytest.mark.parametrize(
     "outer",
     [
-        lambda env: sw.CBFActionFilter(env, [sw.JointSpeedLimit(4.0)]),
+        lambda env: sw.CBFActionFilter(env, [sw.constraints.JointSpeedLimit(4.0)]),
         lambda env: sw.LeaseExpiry(
             env, sw.StoppingBudget(lambda e: ([1.0], [0.0]), braking=1.0, acceleration=1.0)
         ),

@@ -87,7 +87,9 @@ def test_no_driver_gets_there_in_a_thousand_steps(env_id, driver):
 
 def test_three_lines_protect_by_hand():
     env = gym.make("FetchReach-v4")
-    box = sw.Workspace([1.2, 0.6, 0.45], [1.45, 0.9, 0.7], sites=["robot0:grip"], margin=0.001, holds=2)
+    box = sw.constraints.Workspace(
+        [1.2, 0.6, 0.45], [1.45, 0.9, 0.7], sites=["robot0:grip"], margin=0.001, holds=2
+    )
     env = sw.CBFActionFilter(env, [box])
     assert isinstance(env.plant, sw.DisplacementPlant)
     env.reset(seed=0)
@@ -224,9 +226,17 @@ def test_where_nothing_is_near_the_action_is_the_policys_to_the_last_bit(env_id)
 
 
 @pytest.mark.parametrize("constraint, value, limit", [
-    (sw.JointSpeedLimit(1.0, joints=ARM, margin=0.02, holds=1), "joint speed", 1.0),
-    (sw.JointPositionLimit([-0.7, 0.4], [0.7, 2.0], joints=[ARM[0], ARM[3]], margin=0.01, holds=2), "angles", 0.0),
-    (sw.SpeedLimit(0.5, body="robot0:gripper_link", direction="xy", margin=0.01, holds=2), "gripper speed", 0.5),
+    (sw.constraints.JointSpeedLimit(1.0, joints=ARM, margin=0.02, holds=1), "joint speed", 1.0),
+    (
+        sw.constraints.JointPositionLimit([-0.7, 0.4], [0.7, 2.0], joints=[ARM[0], ARM[3]], margin=0.01, holds=2),
+        "angles",
+        0.0,
+    ),
+    (
+        sw.constraints.SpeedLimit(0.5, body="robot0:gripper_link", direction="xy", margin=0.01, holds=2),
+        "gripper speed",
+        0.5,
+    ),
 ])  # fmt: skip
 def test_other_limits_hold_too(constraint, value, limit):
     env = sw.CBFActionFilter(fetch("FetchReach-v4"), [constraint])

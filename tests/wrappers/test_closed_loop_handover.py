@@ -104,7 +104,7 @@ def test_blended_seams_leave_the_joints_ringing_less_than_replacement():
 
 def test_a_filter_inside_may_break_the_limit_and_then_it_shows():
     """What is sent keeps it; what is executed is the filter's, and that is what is reported."""
-    recorder = Recorder(sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(6.0)]))
+    recorder = Recorder(sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(6.0)]))
     limit = 4.0
     env = sw.ChunkHandover(recorder, 24, 8, 2, rate_limit=limit)
     rng = np.random.default_rng(0)
@@ -123,7 +123,7 @@ def test_a_filter_inside_may_break_the_limit_and_then_it_shows():
 
 
 def test_what_a_filter_lets_pass_keeps_the_limit_as_executed_action():
-    recorder = Recorder(sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(1e9)]))
+    recorder = Recorder(sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(1e9)]))
     env = sw.ChunkHandover(recorder, 24, 8, [0, 5], rate_limit=4.0)
     rng = np.random.default_rng(0)
     for _, infos in episodes(env, smooth_chunks(env, rng), 30, late=rng)[1]:
@@ -156,7 +156,7 @@ def test_control_goes_from_a_policy_to_a_human_and_back_on_an_arm():
 
 def test_a_stack_of_handover_lease_and_filter_keeps_its_figures():
     """The whole stack on the arm of Reacher, with commands that are lost."""
-    inner = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(6.0)])
+    inner = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(6.0)])
     lease = sw.LeaseExpiry(
         inner, sw.StoppingBudget(lambda env: ([1.0], [0.0]), braking=1.0, acceleration=1.0), max_lease_s=0.3
     )

@@ -52,10 +52,10 @@ def test_where_they_were_seen_last_is_not_where_they_are():
 @pytest.mark.slow
 def test_under_a_delay_it_holds_as_well():
     raw = gym.make("OccludedCrossing-v0")
-    env = sw.OcclusionPenalty(raw, CARS, sw.Sensor("eye", view_deg=120, range_m=6.0), 0.5)
-    pillars = sw.Discs("pillar_positions", 0.35)  # not to be pressed against one, with no way out
-    rails = [sw.Plane([x, y], [-x, -y]) for x, y in ((-4, 0), (4, 0), (0, -3.5), (0, 3.5))]
-    ways = sw.EscapeClearance("robot", [sw.TrackedDiscs(0.4), pillars, *rails], 0.2)
+    env = sw.OcclusionPenalty(raw, CARS, sw.occlusion.Sensor("eye", view_deg=120, range_m=6.0), 0.5)
+    pillars = sw.constraints.Discs("pillar_positions", 0.35)  # not to be pressed against one, with no way out
+    rails = [sw.constraints.Plane([x, y], [-x, -y]) for x, y in ((-4, 0), (4, 0), (0, -3.5), (0, 3.5))]
+    ways = sw.constraints.EscapeClearance("robot", [sw.constraints.TrackedDiscs(0.4), pillars, *rails], 0.2)
 
     class Late(gym.Wrapper):
         """Executes what was sent two steps before."""
@@ -78,11 +78,14 @@ def test_under_a_delay_it_holds_as_well():
 
 def test_a_permission_and_ways_out_together_stop_where_it_is_safe_to():
     env = sw.OcclusionPenalty(
-        gym.make("OccludedCrossing-v0"), CARS, sw.Sensor("eye", view_deg=120, range_m=6.0), tolerance=0.8
+        gym.make("OccludedCrossing-v0"),
+        CARS,
+        sw.occlusion.Sensor("eye", view_deg=120, range_m=6.0),
+        tolerance=0.8,
     )
     both = [
-        sw.EscapeClearance("robot", [sw.TrackedDiscs(0.4)], 0.2),
-        sw.TrackPermission("robot", 3.0, creep=0.4),
+        sw.constraints.EscapeClearance("robot", [sw.constraints.TrackedDiscs(0.4)], 0.2),
+        sw.constraints.TrackPermission("robot", 3.0, creep=0.4),
     ]
     filtered = sw.CBFActionFilter(env, both)
     filtered.reset(seed=2)
@@ -115,15 +118,17 @@ def test_a_clearance_from_tracks_and_one_from_walls_in_one_projection():
 
     env = sw.OcclusionPenalty(
         Patrolled(gym.make("PointMaze_UMaze-v3")),
-        [sw.Track(published="patrol", acceleration_noise=[2.0, 0.0], start_velocity_std=1.0)],
-        sw.Sensor(site="particle_site", position_std=0.02),
+        [sw.occlusion.Track(published="patrol", acceleration_noise=[2.0, 0.0], start_velocity_std=1.0)],
+        sw.occlusion.Sensor(site="particle_site", position_std=0.02),
         tolerance=1.0,
     )
     filtered = sw.CBFActionFilter(
         env,
         [
-            sw.WallClearance(velocity_clip=5.0),
-            sw.Clearance([sw.TrackedDiscs(0.15, 2.0)], bodies=["particle"], braking=4.0, radius=0.1),
+            sw.constraints.WallClearance(velocity_clip=5.0),
+            sw.constraints.Clearance(
+                [sw.constraints.TrackedDiscs(0.15, 2.0)], bodies=["particle"], braking=4.0, radius=0.1
+            ),
         ],
     )
     filtered.reset(seed=0)

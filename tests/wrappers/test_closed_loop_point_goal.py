@@ -156,7 +156,7 @@ def test_a_wrong_plant_that_is_not_declared_violates():
 def alone(hazards, agent=(0.0, 0.0, 0.0), **options):
     env = sw.CBFActionFilter(
         gym.make("SafePointGoal1-v0"),
-        [sw.HeadingDriveClearance([sw.Discs("hazard_positions", 0.2)], **options)],
+        [sw.constraints.HeadingDriveClearance([sw.constraints.Discs("hazard_positions", 0.2)], **options)],
     )
     layout = {"agent": list(agent), "goal": [9.0, 9.0], "hazards": [list(h) for h in hazards], "vases": []}
     env.reset(seed=0, options={"layout": layout})
@@ -227,7 +227,7 @@ def test_without_any_disc_there_is_no_limit():
 
 # Refusals -----------------------------------------------------------------------------------------------------
 
-DISCS = [sw.Discs("hazard_positions", 0.2)]
+DISCS = [sw.constraints.Discs("hazard_positions", 0.2)]
 
 
 @pytest.mark.parametrize(
@@ -245,16 +245,23 @@ DISCS = [sw.Discs("hazard_positions", 0.2)]
 )
 def test_constructor_refuses_nonsense(arguments, message):
     with pytest.raises(ConfigurationError, match=message):
-        limit = sw.HeadingDriveClearance(**{"obstacles": DISCS, **arguments})
+        limit = sw.constraints.HeadingDriveClearance(**{"obstacles": DISCS, **arguments})
         sw.CBFActionFilter(gym.make("SafePointGoal1-v0"), [limit])
 
 
 @pytest.mark.parametrize(
-    "obstacle", [sw.Plane([1, 0], [-1, 0]), sw.Box([1, 0], [0.1, 0.1]), sw.Sphere([1, 0, 0], 0.1)]
+    "obstacle",
+    [
+        sw.constraints.Plane([1, 0], [-1, 0]),
+        sw.constraints.Box([1, 0], [0.1, 0.1]),
+        sw.constraints.Sphere([1, 0, 0], 0.1),
+    ],
 )
 def test_obstacles_that_are_no_discs_are_refused(obstacle):
     with pytest.raises(ConfigurationError, match="Disc"):
-        env = sw.CBFActionFilter(gym.make("SafePointGoal1-v0"), [sw.HeadingDriveClearance([obstacle])])
+        env = sw.CBFActionFilter(
+            gym.make("SafePointGoal1-v0"), [sw.constraints.HeadingDriveClearance([obstacle])]
+        )
         env.reset(seed=0)
 
 
@@ -263,4 +270,6 @@ def test_an_analytic_plant_is_refused():
         f=np.zeros_like, g=lambda x: np.eye(2), state=lambda env: env.agent_position, hold_s=0.02
     )
     with pytest.raises(UnsupportedEnvError, match="HeadingDriveClearance needs a MujocoPlant"):
-        sw.CBFActionFilter(gym.make("SafePointGoal1-v0"), [sw.HeadingDriveClearance(DISCS)], plant=plant)
+        sw.CBFActionFilter(
+            gym.make("SafePointGoal1-v0"), [sw.constraints.HeadingDriveClearance(DISCS)], plant=plant
+        )

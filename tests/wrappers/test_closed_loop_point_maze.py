@@ -116,7 +116,7 @@ def test_the_drivers_do_touch_walls_without_the_filter(driver):
 @pytest.mark.parametrize("env_id", [i for i in IDS if "Dense" not in i] + ["PointMaze_UMazeDense-v3"])
 def test_every_maze_is_protected(env_id):
     env = sw.protect(gym.make(env_id))
-    assert isinstance(env.constraints[0], sw.WallClearance)
+    assert isinstance(env.constraints[0], sw.constraints.WallClearance)
     total = drive(env, WallSeeking, 150, seed=3)
     assert total["touched"] == total["infeasible"] == total["unsafe"] == 0, total
 
@@ -130,7 +130,7 @@ def test_a_maze_of_one_s_own_too():
 
 
 def test_without_the_clip_s_level_it_holds_as_well():
-    env = sw.CBFActionFilter(gym.make("PointMaze_UMaze-v3"), [sw.WallClearance()])
+    env = sw.CBFActionFilter(gym.make("PointMaze_UMaze-v3"), [sw.constraints.WallClearance()])
     for driver in (BangBang, WallSeeking):
         total = drive(env, driver, 1000)
         assert total["touched"] == total["infeasible"] == 0 and total["speed"] > 5.0, total
@@ -138,7 +138,9 @@ def test_without_the_clip_s_level_it_holds_as_well():
 
 def test_a_clip_that_is_not_the_env_s_is_found_out():
     # The other way round: with a clip that the env does not have, the same drivers get through.
-    env = sw.CBFActionFilter(gym.make("PointMaze_UMaze-v3"), [sw.WallClearance(velocity_clip=2.0)])
+    env = sw.CBFActionFilter(
+        gym.make("PointMaze_UMaze-v3"), [sw.constraints.WallClearance(velocity_clip=2.0)]
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         assert drive(env, BangBang, 1500)["touched"] > 0

@@ -26,7 +26,7 @@ def slow_cheetah(average):
     """A limit that a random driver breaks from rest, without any margin."""
     env = gym.make("SafeHalfCheetahVelocity-v0", disable_env_checker=True)
     env.unwrapped.speed_limit = 0.7
-    return sw.CBFActionFilter(env, [sw.SpeedLimit(0.7, "torso", "+x", average)])
+    return sw.CBFActionFilter(env, [sw.constraints.SpeedLimit(0.7, "torso", "+x", average)])
 
 
 def flagged(info):

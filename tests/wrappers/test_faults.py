@@ -542,7 +542,7 @@ def test_orders_that_are_refused():
             leased_over, sw.StoppingBudget(read_cart, braking=1.0, acceleration=1.0), fallback="zero"
         )
     with pytest.raises(ConfigurationError, match="Outages inside CBFActionFilter"):
-        sw.CBFActionFilter(faulty("Outages", gym.make("Reacher-v5")), [sw.JointSpeedLimit(4.0)])
+        sw.CBFActionFilter(faulty("Outages", gym.make("Reacher-v5")), [sw.constraints.JointSpeedLimit(4.0)])
 
 
 def test_actions_that_are_no_box():

@@ -41,7 +41,7 @@ def drive(filtered, h, driver, steps=300):
 def test_a_barrier_whose_gradient_vanishes_at_rest_holds_on_a_strong_arm(alpha, driver):
     # At rest the row of 4 - v^2 allows everything; one held step reaches twice the limit.
     env = gym.make("Reacher-v5", max_episode_steps=1000)
-    filtered = sw.CBFActionFilter(env, [sw.Barrier(lambda x: 4.0 - x[4] ** 2, alpha=alpha)])
+    filtered = sw.CBFActionFilter(env, [sw.constraints.Barrier(lambda x: 4.0 - x[4] ** 2, alpha=alpha)])
     assert drive(filtered, lambda raw: 4.0 - raw.data.qvel[0] ** 2, driver) == (0, 0, 0)
 
 
@@ -57,7 +57,9 @@ def test_a_barrier_on_pendulum_is_never_broken_in_silence(alpha, torque, holds):
         state=lambda raw: raw.state,
         hold_s=0.05,
     )
-    filtered = sw.CBFActionFilter(env, [sw.Barrier(lambda x: 16.0 - x[1] ** 2, alpha=alpha)], plant=plant)
+    filtered = sw.CBFActionFilter(
+        env, [sw.constraints.Barrier(lambda x: 16.0 - x[1] ** 2, alpha=alpha)], plant=plant
+    )
     bad, silent, _ = drive(filtered, lambda raw: 16.0 - raw.state[1] ** 2, "bang")
     assert silent == 0
     assert (bad == 0) == holds  # gravity is stronger than the 2 N m of the published task
@@ -65,7 +67,7 @@ def test_a_barrier_on_pendulum_is_never_broken_in_silence(alpha, torque, holds):
 
 @pytest.mark.parametrize("env_id", ["Swimmer-v5", "Pusher-v5", "HalfCheetah-v5"])
 def test_a_speed_limit_is_never_broken_in_silence_at_any_substep(env_id, monkeypatch):
-    filtered = sw.CBFActionFilter(gym.make(env_id), [sw.JointSpeedLimit(3.0)])
+    filtered = sw.CBFActionFilter(gym.make(env_id), [sw.constraints.JointSpeedLimit(3.0)])
     dofs, worst = filtered.filter.bound[0]._dofs, [0.0]
     raw, step = filtered.unwrapped, mujoco.mj_step
 

@@ -507,10 +507,11 @@ def test_an_env_that_hands_out_one_info_dict_makes_nothing_stale():
 
 def test_a_filter_inside_has_the_last_word_on_what_was_executed():
     env = gym.make("InvertedPendulum-v5")
-    rail = [sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])]
-    inside = sw.CBFActionFilter(env, [sw.Clearance(rail, bodies=["cart"], braking=8.0)])
+    rail = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
+    inside = sw.CBFActionFilter(env, [sw.constraints.Clearance(rail, bodies=["cart"], braking=8.0)])
     env = sw.LeaseExpiry(
-        inside, sw.StoppingBudget(sw.Clearance(rail, bodies=["cart"], braking=8.0), acceleration=30.0)
+        inside,
+        sw.StoppingBudget(sw.constraints.Clearance(rail, bodies=["cart"], braking=8.0), acceleration=30.0),
     )
     env.reset(seed=0)
     changed = 0
@@ -615,7 +616,9 @@ def test_missing_bounds():
         leased(BrakedCart(), closing_speed=1.0)
 
 
-@pytest.mark.parametrize("clearance", [1.0, None, "wall", [1.0], sw.Clearance, sw.Plane([0.0], [1.0])])
+@pytest.mark.parametrize(
+    "clearance", [1.0, None, "wall", [1.0], sw.constraints.Clearance, sw.constraints.Plane([0.0], [1.0])]
+)
 def test_a_clearance_that_is_neither(clearance):
     with pytest.raises(ConfigurationError, match="a constraint"):
         sw.LeaseExpiry(
@@ -688,7 +691,7 @@ def test_orders_that_are_refused():
     with pytest.raises(ConfigurationError, match=r"ChunkHandover\(LeaseExpiry"):
         sw.LeaseExpiry(chunked, sw.StoppingBudget(read_cart, braking=1.0, acceleration=1.0), fallback="zero")
     with pytest.raises(ConfigurationError, match=r"LeaseExpiry\(CBFActionFilter"):
-        sw.CBFActionFilter(once, [sw.Barrier(lambda x: 1.0 - x[1])], plant=cart_plant(0.1))
+        sw.CBFActionFilter(once, [sw.constraints.Barrier(lambda x: 1.0 - x[1])], plant=cart_plant(0.1))
     with pytest.raises(ConfigurationError, match="outside"):
         changed = gym.wrappers.RescaleAction(BrakedCart(), 0.0, 1.0)
         sw.LeaseExpiry(changed, sw.StoppingBudget(read_cart, braking=1.0, acceleration=1.0), fallback="zero")

@@ -133,7 +133,7 @@ def bang(env, steps, seed=0):
 
 
 def test_no_intervention_of_the_filter_is_lost_and_penalties_explain_the_reward():
-    env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(6.0)])
+    env = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(6.0)])
     recorder = Recorder(sw.AdaptionPenalty(env, penalty=0.5, per_correction=0.25))
     env = sw.ChunkHandover(recorder, 6, 5, rate_limit=1000.0)
     env.reset(seed=0)
@@ -174,7 +174,7 @@ def test_no_braking_of_the_lease_and_no_fault_inside_is_lost():
 
 
 def test_penalties_for_not_seeing_explain_a_chunk_s_reward_and_no_expiry_inside_is_lost():
-    cars = [sw.Track("car*", acceleration_noise=[0.2, 0.0])]
+    cars = [sw.occlusion.Track("car*", acceleration_noise=[0.2, 0.0])]
     seen = sw.OcclusionPenalty(gym.make("OccludedCrossing-v0"), cars, "eye", tolerance=0.5, weight=0.1)
     recorder = Recorder(seen)
     env = sw.ChunkHandover(recorder, 6, 5, rate_limit=1e6, fallback="zero")

@@ -22,12 +22,12 @@ from safe_wrappers.errors import (
     UnsupportedEnvError,
 )
 
-EYE = sw.Sensor(site="eye", position_std=0.05)
+EYE = sw.occlusion.Sensor(site="eye", position_std=0.05)
 
 
 def crossing(weight=0.0, tolerance=1.0, sensor=None, **options):
     cars = [
-        sw.Track(
+        sw.occlusion.Track(
             f"car[{names}]",
             acceleration_noise=[0.0225, 0.0],
             reversion_s=2.0,
@@ -37,7 +37,7 @@ def crossing(weight=0.0, tolerance=1.0, sensor=None, **options):
         )
         for names, speed in (("012", 1.0), ("345", -1.0))
     ]
-    sensor = sensor or sw.Sensor("eye", view_deg=120, range_m=6.0)
+    sensor = sensor or sw.occlusion.Sensor("eye", view_deg=120, range_m=6.0)
     return sw.OcclusionPenalty(gym.make("OccludedCrossing-v0"), cars, sensor, tolerance, weight, **options)
 
 
@@ -74,7 +74,7 @@ def test_errors_have_the_covariances_that_are_given_seen_and_unseen():
 
 
 def test_unseen_sigma_is_the_closed_form():
-    blind = sw.Sensor(site="eye", range_m=0.01)
+    blind = sw.occlusion.Sensor(site="eye", range_m=0.01)
     env = sw.OcclusionPenalty(Turning(), [straight(acceleration_noise=0.2)], blind, tolerance=100.0)
     env.reset(seed=0)
     start = np.diag([0.09, 0.09])
@@ -88,7 +88,7 @@ def test_unseen_sigma_is_the_closed_form():
 def test_what_is_measured_has_the_declared_noise():
     covariance = np.array([[0.04, 0.03], [0.03, 0.09]])
     env = sw.OcclusionPenalty(
-        Turning(), [straight()], sw.Sensor(site="eye", position_std=covariance), tolerance=1.0
+        Turning(), [straight()], sw.occlusion.Sensor(site="eye", position_std=covariance), tolerance=1.0
     )
     env.reset(seed=0)
     noise = []
@@ -111,7 +111,10 @@ def test_without_the_lever_arm_the_estimate_is_off_by_it(arm):
     offset = np.array([float(x) for x in arm.split()])
     for knows in (True, False):
         env = sw.OcclusionPenalty(
-            Turning(SPIN, arm=arm), [sure], sw.Sensor(site="eye", lever_arm=knows, **sharp), tolerance=1.0
+            Turning(SPIN, arm=arm),
+            [sure],
+            sw.occlusion.Sensor(site="eye", lever_arm=knows, **sharp),
+            tolerance=1.0,
         )
         env.reset(seed=0)
         for _ in range(30):
@@ -128,7 +131,7 @@ def test_with_it_the_mean_error_is_zero_on_a_robot_that_spins():
     env = sw.OcclusionPenalty(
         Turning(SPIN),
         [straight(acceleration_noise=0.5)],
-        sw.Sensor(site="eye", velocity_std=0.1),
+        sw.occlusion.Sensor(site="eye", velocity_std=0.1),
         tolerance=1.0,
     )
     errors = []
@@ -142,7 +145,7 @@ def test_with_it_the_mean_error_is_zero_on_a_robot_that_spins():
 
 
 def test_velocities_alone_leave_positions_unresolved_and_it_says_so():
-    only = sw.Sensor(site="eye", position_std=None, velocity_std=0.1)
+    only = sw.occlusion.Sensor(site="eye", position_std=None, velocity_std=0.1)
     env = sw.OcclusionPenalty(Turning(), [straight("thing*")], only, tolerance=1.0)
     assert env.unobservable == {"thing": ["x", "y"], "thing2": ["x", "y"]}
     assert crossing().unobservable == {f"car{i}": [] for i in range(6)}
@@ -156,7 +159,7 @@ def test_velocities_alone_leave_positions_unresolved_and_it_says_so():
 
 
 def test_a_share_of_measurements_is_lost_for_each_track_by_itself():
-    dropping = sw.Sensor(site="eye", dropout=0.3)
+    dropping = sw.occlusion.Sensor(site="eye", dropout=0.3)
     env = sw.OcclusionPenalty(Turning(), [straight("thing*")], dropping, tolerance=1.0)
     env.reset(seed=0)
     seen = np.array([env.step(STILL)[4]["occlusion/visible"] for _ in range(3000)])
@@ -184,7 +187,7 @@ def test_a_wall_hides_and_last_seen_stays():
 def test_published_points_are_looked_at_level():
     world = WALL.replace("0 0.5", "0 0").replace("3 1", "3 0.4")  # lower than the sensor
     for text, expected in ((WALL, [False, True]), (world, [True, True])):
-        points = sw.Track(published="spots", acceleration_noise=0.1)
+        points = sw.occlusion.Track(published="spots", acceleration_noise=0.1)
         aside = (0, 1, -2, -1, 0), (0, 0, 0, 0, 0)
         env = sw.OcclusionPenalty(Turning(aside, world=text), [points], EYE, tolerance=1.0)
         assert env.track_names == ["spots[0]", "spots[1]"]
@@ -193,7 +196,7 @@ def test_published_points_are_looked_at_level():
 
 def test_points_and_bodies_together_keep_their_order():
     tracks = [
-        sw.Track(published="spots", acceleration_noise=0.1, start_position_std=1e-9),
+        sw.occlusion.Track(published="spots", acceleration_noise=0.1, start_position_std=1e-9),
         straight("thing2"),
     ]
     env = sw.OcclusionPenalty(Turning(), tracks, EYE, tolerance=1.0)
@@ -207,7 +210,7 @@ def test_points_that_come_and_go_cannot_be_tracked():
         spots = np.zeros((2, 2))
 
     env = sw.OcclusionPenalty(
-        Shrinking(), [sw.Track(published="spots", acceleration_noise=0.1)], EYE, tolerance=1.0
+        Shrinking(), [sw.occlusion.Track(published="spots", acceleration_noise=0.1)], EYE, tolerance=1.0
     )
     env.reset(seed=0)
     env.unwrapped.spots = np.zeros((1, 2))
@@ -220,7 +223,7 @@ def test_a_truth_that_is_no_number_is_not_seen():
         spots = np.array([[1.0, 0.0]])
 
     env = sw.OcclusionPenalty(
-        Broken(), [sw.Track(published="spots", acceleration_noise=0.1)], EYE, tolerance=1.0
+        Broken(), [sw.occlusion.Track(published="spots", acceleration_noise=0.1)], EYE, tolerance=1.0
     )
     env.reset(seed=0)
     env.unwrapped.spots = np.array([[np.nan, 0.0]])
@@ -250,7 +253,7 @@ def test_in_space_the_height_is_estimated_too():
 def test_a_permission_expires_before_the_bound_crosses_and_no_more_than_a_step_before(
     q, tolerance, sigmas, reversion
 ):
-    blind = sw.Sensor(site="eye", range_m=0.01)
+    blind = sw.occlusion.Sensor(site="eye", range_m=0.01)
     track = straight(acceleration_noise=q, reversion_s=reversion)
     env = sw.OcclusionPenalty(Turning(), [track], blind, tolerance, sigmas=sigmas)
     info = env.reset(seed=0)[1]
@@ -274,7 +277,7 @@ def test_a_permission_expires_before_the_bound_crosses_and_no_more_than_a_step_b
 
 
 def test_permissions_say_for_how_long_they_last():
-    env = crossing(tolerance=1.5, sensor=sw.Sensor("eye", range_m=0.01))
+    env = crossing(tolerance=1.5, sensor=sw.occlusion.Sensor("eye", range_m=0.01))
     env.reset(seed=0)
     foretold = env.permissions()
     assert np.isfinite(foretold).all() and (foretold > 0.2).all()
@@ -334,7 +337,7 @@ def test_without_a_weight_the_reward_is_the_task_s_own():
 
 
 def test_no_track_in_range_costs_nothing():
-    blind = sw.Sensor(site="eye", range_m=0.3)
+    blind = sw.occlusion.Sensor(site="eye", range_m=0.3)
     env = sw.OcclusionPenalty(
         Turning(((0, 9, 0, -9, 0), (0,) * 5)), [straight("thing*")], blind, tolerance=0.1, weight=1.0
     )
@@ -368,7 +371,7 @@ def test_the_recorder_counts_the_task_s_own_return_sight_and_expiries():
 @pytest.mark.parametrize("axes", ["xy", "xyz"])
 def test_the_observation_gains_the_estimates_relative_to_the_robot(axes):
     d = len(axes)
-    cars = [sw.Track("car*", acceleration_noise=0.1)]
+    cars = [sw.occlusion.Track("car*", acceleration_noise=0.1)]
     env = sw.OcclusionPenalty(gym.make("OccludedCrossing-v0"), cars, "eye", 1.0, axes=axes)
     bare = gym.make("OccludedCrossing-v0")
     seen = [env.reset(seed=2)[0], *(s[0] for s in steps(env, 20))]
@@ -421,7 +424,7 @@ def trace(env, seed=0, count=40):
 
 
 def test_seeds_repeat_and_differ_and_the_env_s_own_generator_is_untouched():
-    env, bare = crossing(sensor=sw.Sensor("eye", dropout=0.2)), gym.make("OccludedCrossing-v0")
+    env, bare = crossing(sensor=sw.occlusion.Sensor("eye", dropout=0.2)), gym.make("OccludedCrossing-v0")
     first = trace(env, 5)
     assert trace(env, 6) != first and trace(env, 5) == first
     bare.reset(seed=5)
@@ -461,7 +464,10 @@ def test_the_noise_of_a_track_does_not_depend_on_what_else_is_seen():
 
 def test_a_reset_starts_every_track_anew():
     env = sw.OcclusionPenalty(
-        Turning(), [straight(acceleration_noise=1.0)], sw.Sensor(site="eye", range_m=0.01), tolerance=1.0
+        Turning(),
+        [straight(acceleration_noise=1.0)],
+        sw.occlusion.Sensor(site="eye", range_m=0.01),
+        tolerance=1.0,
     )
     info = env.reset(seed=0)[1]
     for _ in range(100):
@@ -471,7 +477,7 @@ def test_a_reset_starts_every_track_anew():
 
 
 def test_the_first_fix_has_the_declared_accuracy():
-    blind = sw.Sensor(site="eye", range_m=0.01)
+    blind = sw.occlusion.Sensor(site="eye", range_m=0.01)
     env = sw.OcclusionPenalty(
         Turning(), [straight(start_position_std=[0.5, 0.1], mean_velocity=[2.0, 0.0])], blind, tolerance=1.0
     )
@@ -512,7 +518,10 @@ def test_steps_of_any_length_grow_as_long_as_they_last():
             return super().step(STILL)
 
     env = sw.OcclusionPenalty(
-        Uneven(), [straight(acceleration_noise=0.3)], sw.Sensor(site="eye", range_m=0.01), tolerance=9.0
+        Uneven(),
+        [straight(acceleration_noise=0.3)],
+        sw.occlusion.Sensor(site="eye", range_m=0.01),
+        tolerance=9.0,
     )
     env.reset(seed=0)
     for skip in (4, 1, 7, 30, 4):
@@ -543,9 +552,9 @@ def test_an_env_that_names_no_time_step_is_taken_at_its_physics():
     env.step(STILL)
     maze = pytest.importorskip("gymnasium_robotics")
     gym.register_envs(maze)
-    particle = sw.Track("particle", acceleration_noise=0.1)
+    particle = sw.occlusion.Track("particle", acceleration_noise=0.1)
     env = sw.OcclusionPenalty(
-        gym.make("PointMaze_UMaze-v3"), [particle], sw.Sensor(site="target"), tolerance=1.0
+        gym.make("PointMaze_UMaze-v3"), [particle], sw.occlusion.Sensor(site="target"), tolerance=1.0
     )
     env.reset(seed=0)
     assert env.step(env.action_space.sample())[0]["tracks"].shape == (6,)
@@ -555,7 +564,9 @@ def test_an_env_that_names_no_time_step_is_taken_at_its_physics():
 
 
 def test_gymnasium_s_checks_specs_json_and_pickles():
-    env = crossing(weight=0.1, sensor=sw.Sensor("eye", position_std=0.01 * np.eye(2), occluder_groups=(0, 1)))
+    env = crossing(
+        weight=0.1, sensor=sw.occlusion.Sensor("eye", position_std=0.01 * np.eye(2), occluder_groups=(0, 1))
+    )
     first = trace(env)
     assert trace(gym.make(env.spec)) == first
     assert trace(gym.make(EnvSpec.from_json(env.spec.to_json()))) == first
@@ -607,17 +618,29 @@ def made(env=None, tracks=None, sensor=EYE, tolerance=1.0, **options):
         ({"tracks": [straight("think")]}, UnknownNameError, "'think'; it has: robot, thing, thing2"),
         ({"tracks": [straight("")]}, UnknownNameError, "no body ''"),
         ({"tracks": [straight("thing"), straight("thing*")]}, ConfigurationError, "twice: thing$"),
-        ({"tracks": [sw.Track(published="spot", acceleration_noise=1)]}, UnknownNameError, "'spot'.*spots"),
-        ({"tracks": [sw.Track(published="dt", acceleration_noise=1)]}, ConfigurationError, r"shape \(k, 2\)"),
+        (
+            {"tracks": [sw.occlusion.Track(published="spot", acceleration_noise=1)]},
+            UnknownNameError,
+            "'spot'.*spots",
+        ),
+        (
+            {"tracks": [sw.occlusion.Track(published="dt", acceleration_noise=1)]},
+            ConfigurationError,
+            r"shape \(k, 2\)",
+        ),
         ({"tracks": [straight(acceleration_noise=[[1, 2], [2, 1]])]}, ConfigurationError, "semidefinite"),
         ({"tracks": [straight(start_position_std=-1)]}, ConfigurationError, "start_position_std"),
         ({"sensor": "eye"}, UnknownNameError, "no camera 'eye'; it has: front"),
-        ({"sensor": sw.Sensor(site="front")}, UnknownNameError, "no site 'front'; it has: eye"),
-        ({"sensor": sw.Sensor("front", position_std=[[1, 1], [1, 1]])}, ConfigurationError, "definite"),
+        ({"sensor": sw.occlusion.Sensor(site="front")}, UnknownNameError, "no site 'front'; it has: eye"),
+        (
+            {"sensor": sw.occlusion.Sensor("front", position_std=[[1, 1], [1, 1]])},
+            ConfigurationError,
+            "definite",
+        ),
         (
             {
-                "sensor": sw.Sensor("front", velocity_std=0.1),
-                "tracks": [sw.Track(published="spots", acceleration_noise=1)],
+                "sensor": sw.occlusion.Sensor("front", velocity_std=0.1),
+                "tracks": [sw.occlusion.Track(published="spots", acceleration_noise=1)],
             },
             ConfigurationError,
             "velocities are measured of bodies",
@@ -652,8 +675,8 @@ def test_unnamed_bodies_do_not_fit_any_pattern():
 def test_wrong_orders_are_refused():
     with pytest.raises(ConfigurationError, match="already; give that one all the tracks"):
         made(env=made())
-    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.JointSpeedLimit(4.0)])
-    arm = sw.Track("body1", acceleration_noise=1)
+    filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.JointSpeedLimit(4.0)])
+    arm = sw.occlusion.Track("body1", acceleration_noise=1)
     with pytest.raises(ConfigurationError, match=r"put it outside: CBFActionFilter\(OcclusionPenalty"):
         made(env=filtered, tracks=[arm])
     chunks = sw.ChunkHandover(gym.make("Reacher-v5"), 4, 2)

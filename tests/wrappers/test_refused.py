@@ -16,16 +16,18 @@ pytestmark = pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarnin
 
 LIMITS = {
     "Reacher-v5": [
-        sw.JointSpeedLimit(6.0),
-        sw.JointPositionLimit(-1.5, 1.5, ["joint0"], holds=6),
-        sw.Workspace(keep_out=[sw.Disc([0.0, 0.15], 0.06)], bodies=["fingertip"], holds=6),
-        sw.SpeedLimit(0.8, "fingertip", holds=2),
-        sw.JointPositionLimit(-2.0, 2.0, ["joint1"], holds=6),
+        sw.constraints.JointSpeedLimit(6.0),
+        sw.constraints.JointPositionLimit(-1.5, 1.5, ["joint0"], holds=6),
+        sw.constraints.Workspace(
+            keep_out=[sw.constraints.Disc([0.0, 0.15], 0.06)], bodies=["fingertip"], holds=6
+        ),
+        sw.constraints.SpeedLimit(0.8, "fingertip", holds=2),
+        sw.constraints.JointPositionLimit(-2.0, 2.0, ["joint1"], holds=6),
     ],
     "HalfCheetah-v5": [
-        sw.SpeedLimit(0.5, "torso", "+x"),
-        sw.Upright("torso", lowest=-0.15, tilt=0.2, holds=3),
-        sw.JointSpeedLimit(12.0),
+        sw.constraints.SpeedLimit(0.5, "torso", "+x"),
+        sw.constraints.Upright("torso", lowest=-0.15, tilt=0.2, holds=3),
+        sw.constraints.JointSpeedLimit(12.0),
     ],
 }
 
@@ -67,7 +69,7 @@ def test_refused_names_exactly_those_that_refuse_alone(env_id):
 
 
 def test_alone_a_constraint_refuses_what_it_changes():
-    env = made("Reacher-v5", [sw.JointSpeedLimit(4.0)])
+    env = made("Reacher-v5", [sw.constraints.JointSpeedLimit(4.0)])
     env.reset(seed=0)
     for k in range(60):
         info = env.step(bang_bang(env, k, None))[4]
@@ -127,16 +129,19 @@ def test_an_action_that_is_no_number_was_refused_by_nobody(bad):
 def stuck(fallback="brake", **options):
     """Two demands that no control meets: the tip is to be left of one line and right of another."""
     limits = [
-        sw.Workspace(high=[0.0, None, None], bodies=["fingertip"], holds=4),
-        sw.Workspace(low=[0.1, None, None], bodies=["fingertip"], holds=4),
-        sw.JointSpeedLimit(3.0),
+        sw.constraints.Workspace(high=[0.0, None, None], bodies=["fingertip"], holds=4),
+        sw.constraints.Workspace(low=[0.1, None, None], bodies=["fingertip"], holds=4),
+        sw.constraints.JointSpeedLimit(3.0),
     ]
     return made("Reacher-v5", limits, fallback=fallback, **options)
 
 
 def too_fast():
     """A cheetah thrown at twice the limit: no control keeps it."""
-    env = made("HalfCheetah-v5", [sw.SpeedLimit(2.0, "torso", "+x"), sw.JointSpeedLimit(10.0)])
+    env = made(
+        "HalfCheetah-v5",
+        [sw.constraints.SpeedLimit(2.0, "torso", "+x"), sw.constraints.JointSpeedLimit(10.0)],
+    )
     env.reset(seed=0)
     env.unwrapped.data.qvel[0] = 4.0
     return env
@@ -222,11 +227,11 @@ def test_what_fails_least_is_judged_in_shares_of_the_scales(scale, executed):
 
 def test_scales_are_the_limits_where_there_is_one():
     limits = [
-        sw.SpeedLimit(2.5),
-        sw.JointSpeedLimit([4.0, 3.0]),
-        sw.JointPositionLimit(-1.0, 1.0, ["joint1"]),
-        sw.Workspace([0.0] * 3, bodies=["fingertip"]),
-        sw.Upright("body0", tilt=0.5),
+        sw.constraints.SpeedLimit(2.5),
+        sw.constraints.JointSpeedLimit([4.0, 3.0]),
+        sw.constraints.JointPositionLimit(-1.0, 1.0, ["joint1"]),
+        sw.constraints.Workspace([0.0] * 3, bodies=["fingertip"]),
+        sw.constraints.Upright("body0", tilt=0.5),
     ]
     env = made("Reacher-v5", limits)
     assert [limit.scale for limit in env.filter.bound] == [2.5, 3.0, 1.0, 1.0, 1.0]
@@ -296,7 +301,7 @@ def test_intervened_says_whether_the_executed_action_is_another_one(make, may_ag
 
 
 def test_the_least_failing_control_may_be_the_policys_own():
-    env = made("InvertedPendulum-v5", [sw.JointPositionLimit(-0.3, 0.3, ["slider"])])
+    env = made("InvertedPendulum-v5", [sw.constraints.JointPositionLimit(-0.3, 0.3, ["slider"])])
     env.reset(seed=0)
     env.unwrapped.data.qvel[0] = 8.0  # far too fast to stop
     action = np.array([-3.0], np.float32)  # but the policy brakes fully

@@ -9,7 +9,7 @@ from safe_wrappers.errors import ConfigurationError, UnknownNameError, Unsupport
 
 
 def speed(limit=2.0):
-    return sw.JointSpeedLimit(limit)
+    return sw.constraints.JointSpeedLimit(limit)
 
 
 def test_one_plant_for_two_envs():
@@ -26,7 +26,7 @@ def test_one_analytic_plant_in_a_vector_env():
         state=lambda env: env.state,
         hold_s=0.05,
     )
-    barrier = sw.Barrier(lambda x: 16.0 - x[1] ** 2)
+    barrier = sw.constraints.Barrier(lambda x: 16.0 - x[1] ** 2)
     with pytest.raises(ConfigurationError, match="bound to another env"):
         gym.vector.SyncVectorEnv(
             [lambda: sw.CBFActionFilter(gym.make("Pendulum-v1"), [barrier], plant=plant)] * 2
@@ -58,7 +58,11 @@ def test_wrappers_inside_that_change_or_repeat_the_action(wrap):
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda e: sw.CBFActionFilter(e, [sw.JointSpeedLimit]), ConfigurationError, "expected a constraint"),
+        (
+            lambda e: sw.CBFActionFilter(e, [sw.constraints.JointSpeedLimit]),
+            ConfigurationError,
+            "expected a constraint",
+        ),
         (
             lambda e: sw.CBFActionFilter(e, [speed()], plant=sw.MujocoPlant),
             ConfigurationError,
@@ -76,7 +80,9 @@ def test_wrappers_inside_that_change_or_repeat_the_action(wrap):
         ),
         (lambda e: sw.protect(e, magrin=1.0), UnknownNameError, "protect has no option 'magrin'"),
         (
-            lambda e: sw.CBFActionFilter(e, [sw.Clearance([sw.Plane([0], [1])], 1.0, geoms=["arm"])]),
+            lambda e: sw.CBFActionFilter(
+                e, [sw.constraints.Clearance([sw.constraints.Plane([0], [1])], 1.0, geoms=["arm"])]
+            ),
             UnknownNameError,
             "no geom 'arm'; it has: .*link0",
         ),
@@ -94,7 +100,7 @@ def test_what_is_not_what_it_should_be(make, error, message):
 
 
 def test_a_geom_is_kept_clear():
-    limit = sw.Clearance([sw.Plane([-5.0], [1.0])], 1.0, geoms=["fingertip"])
+    limit = sw.constraints.Clearance([sw.constraints.Plane([-5.0], [1.0])], 1.0, geoms=["fingertip"])
     filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [limit])
     _, info = filtered.reset(seed=0)
     fingertip = filtered.unwrapped.data.geom("fingertip").xpos

@@ -91,7 +91,7 @@ def approach(env):
 
 def test_a_function_of_the_env_measures_as_well(env):
     budget = sw.StoppingBudget(approach, acceleration=55.0, braking=24.0, margin=0.001)
-    by_function = watch(env, sw.RoundTripCeiling(budget, longest_s=9.0))
+    by_function = watch(env, sw.teleop.RoundTripCeiling(budget, longest_s=9.0))
     by_constraint = watch(env, ceiling(longest_s=9.0))
     place(env, (0.0, 0.1), (0.0, 0.3))
     for looking in (by_function, by_constraint):
@@ -107,7 +107,7 @@ def test_a_function_of_the_env_measures_as_well(env):
 @pytest.mark.parametrize("answer", [(np.nan, 0.1), (0.1, np.inf), (-np.inf, 0.0)])
 def test_what_cannot_be_read_has_no_ceiling(env, answer):
     looking = watch(
-        env, sw.RoundTripCeiling(sw.StoppingBudget(lambda env: answer, braking=1.0, acceleration=1.0))
+        env, sw.teleop.RoundTripCeiling(sw.StoppingBudget(lambda env: answer, braking=1.0, acceleration=1.0))
     )
     env.reset(seed=0)
     looking.look()
@@ -119,5 +119,5 @@ def test_a_ceiling_is_plain_data():
     wanted = ceiling(video_s=0.05, release=0.5)
     data = plain_data(wanted)
     assert json.loads(json.dumps(data)) == data
-    assert plain_data(settings_from(sw.RoundTripCeiling, data, "ceiling")) == data
+    assert plain_data(settings_from(sw.teleop.RoundTripCeiling, data, "ceiling")) == data
     assert data["budget"]["clearance"]["kind"] == "Clearance"

@@ -15,14 +15,16 @@ from safe_wrappers.wrappers.faults import FAULTS
 
 STEPS = 40
 PENALTY = 0.5
-BLOCKED = sw.HeadingDriveClearance([sw.Discs("hazard_positions", radius=0.2)], margin=0.004)
+BLOCKED = sw.constraints.HeadingDriveClearance(
+    [sw.constraints.Discs("hazard_positions", radius=0.2)], margin=0.004
+)
 
 
 def tracked(env):
     """Some body of the env, seen from another."""
     model = env.unwrapped.model
     named = [model.body(i).name for i in range(model.nbody) if model.body(i).name]
-    track = sw.Track(named[-1], acceleration_noise=0.1)
+    track = sw.occlusion.Track(named[-1], acceleration_noise=0.1)
     eye = {"site": model.site(0).name} if model.nsite else "track"
     return sw.OcclusionPenalty(env, [track], eye, tolerance=0.3, weight=0.25, observe=False)
 
@@ -185,7 +187,11 @@ def test_a_pair_is_right_in_its_numbers_or_refused_with_an_order_that_is(task_id
         if "them to one filter" in message:
             expression = re.search(r": (CBFActionFilter\(.*\))$", message).group(1)
             there = inner if inner in filters else filters[0]
-            names = {"inner": MAKE[there](base(task_id)), "more": sw.SpeedLimit(50.0), "env": base(task_id)}
+            names = {
+                "inner": MAKE[there](base(task_id)),
+                "more": sw.constraints.SpeedLimit(50.0),
+                "env": base(task_id),
+            }
             together = eval(expression, {"CBFActionFilter": sw.CBFActionFilter}, names)
             check_numbers(Asked(together))
         else:

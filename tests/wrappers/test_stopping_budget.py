@@ -15,12 +15,12 @@ from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import BoundConstraint
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
-RAIL = [sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])]
+RAIL = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
 FULL = np.array([1.0, 0.0])
 
 
 def rail(**more):
-    return sw.Clearance(RAIL, bodies=["cart"], braking=8.0, **more)
+    return sw.constraints.Clearance(RAIL, bodies=["cart"], braking=8.0, **more)
 
 
 def granted(env, action):
@@ -74,7 +74,9 @@ def test_a_clearance_on_a_mujoco_cart(reserve):
 def test_its_own_braking_unless_another_is_given():
     def lease_of(**more):
         cart = BrakedCart(wall=5.0, v=2.0, drive=0.0)
-        near = sw.Clearance([sw.Plane([5.0], [-1.0])], braking=1.0, position=[0], velocity=[1])
+        near = sw.constraints.Clearance(
+            [sw.constraints.Plane([5.0], [-1.0])], braking=1.0, position=[0], velocity=[1]
+        )
         env = lease(
             cart, near, acceleration=0.0, plant=cart_plant(0.1), fallback="zero", max_lease_s=9.0, **more
         )
@@ -91,7 +93,9 @@ def test_a_delayed_plants_prediction_is_used_with_the_commands_in_flight():
         cart = BrakedCart(wall=9.0, v=2.0, drive=1.0, delay_s=delay)
         plant = cart_plant(0.1)
         plant.delay_s = delay
-        near = sw.Clearance([sw.Plane([9.0], [-1.0])], braking=4.0, position=[0], velocity=[1])
+        near = sw.constraints.Clearance(
+            [sw.constraints.Plane([9.0], [-1.0])], braking=4.0, position=[0], velocity=[1]
+        )
         env = sw.LeaseExpiry(
             cart, sw.StoppingBudget(near, acceleration=0.0), plant=plant, fallback="zero", max_lease_s=9.0
         )
@@ -121,7 +125,7 @@ def test_a_delayed_plants_prediction_is_used_with_the_commands_in_flight():
 @pytest.mark.parametrize("env_id", ["InvertedPendulum-v5", "Reacher-v5"])
 def test_a_joint_position_limit_with_a_closing_speed(env_id):
     joint = {"InvertedPendulum-v5": "slider", "Reacher-v5": "joint1"}[env_id]
-    limit = sw.JointPositionLimit(-0.8, 0.8, [joint], margin=0.05)
+    limit = sw.constraints.JointPositionLimit(-0.8, 0.8, [joint], margin=0.05)
     env = sw.LeaseExpiry(
         gym.make(env_id),
         sw.StoppingBudget(limit, closing_speed=4.0, margin=0.02, localisation=0.01),
@@ -147,7 +151,7 @@ def test_a_joint_position_limit_with_a_closing_speed(env_id):
     assert seen == {True, False}
 
 
-HAZARDS = [sw.Discs("hazard_positions", radius=0.2)]
+HAZARDS = [sw.constraints.Discs("hazard_positions", radius=0.2)]
 
 
 def at_hazard(robot):
@@ -159,7 +163,7 @@ def at_hazard(robot):
 
 
 def test_a_heading_drive_brakes_by_its_own_backup():
-    clearance = sw.HeadingDriveClearance(HAZARDS, margin=0.01)
+    clearance = sw.constraints.HeadingDriveClearance(HAZARDS, margin=0.01)
     env = sw.LeaseExpiry(
         gym.make("SafePointGoal1-v0"), sw.StoppingBudget(clearance, closing_speed=4.0), max_lease_s=0.2
     )
@@ -183,7 +187,7 @@ def test_a_heading_drive_brakes_by_its_own_backup():
 
 def test_a_heading_drive_never_violates_when_commands_stop():
     # The lease alone, no filter inside. The closing speed is measured first: the fastest that the value ever falls.
-    clearance = sw.HeadingDriveClearance(HAZARDS, margin=0.01)
+    clearance = sw.constraints.HeadingDriveClearance(HAZARDS, margin=0.01)
     bare = gym.make("SafePointGoal1-v0")
     plant, watch = sw.MujocoPlant(), copy.deepcopy(clearance)
     plant.bind(bare)
@@ -249,7 +253,7 @@ def test_a_value_of_nothing_near_is_no_limit(values, wanted):
 
 def test_a_state_error_counts_for_values_too():
     def lease(error):
-        clearance = sw.HeadingDriveClearance(HAZARDS, margin=0.01, state_error=error)
+        clearance = sw.constraints.HeadingDriveClearance(HAZARDS, margin=0.01, state_error=error)
         env = sw.LeaseExpiry(
             gym.make("SafePointGoal1-v0"), sw.StoppingBudget(clearance, closing_speed=4.0), max_lease_s=5.0
         )
@@ -356,7 +360,7 @@ def test_it_revokes_whatever_the_least_lease_is(bad):
     ("clearance", "more"),
     [
         (rail(), {"acceleration": 1.0}),
-        (sw.JointPositionLimit(-0.8, 0.8, ["slider"]), {"closing_speed": 4.0}),
+        (sw.constraints.JointPositionLimit(-0.8, 0.8, ["slider"]), {"closing_speed": 4.0}),
     ],
 )
 def test_a_mujoco_state_that_is_not_a_number_revokes_and_nothing_else_passes(clearance, more):
@@ -376,7 +380,7 @@ def test_a_mujoco_state_that_is_not_a_number_revokes_and_nothing_else_passes(cle
 
 def test_a_constraint_may_serve_the_filter_inside_and_a_second_env_too():
     def run(share):
-        mine = [sw.HeadingDriveClearance(HAZARDS, margin=0.01) for _ in range(3)]
+        mine = [sw.constraints.HeadingDriveClearance(HAZARDS, margin=0.01) for _ in range(3)]
         if share:
             mine = mine[:1] * 3
         env = sw.CBFActionFilter(gym.make("SafePointGoal1-v0"), [mine[0]])
@@ -402,7 +406,7 @@ def test_a_constraint_may_serve_the_filter_inside_and_a_second_env_too():
 
 
 def test_what_constraints_with_a_value_need():
-    limit = sw.JointPositionLimit(-1.0, 1.0, ["joint1"])
+    limit = sw.constraints.JointPositionLimit(-1.0, 1.0, ["joint1"])
     with pytest.raises(ConfigurationError, match=r"JointPositionLimit does not say how fast.*closing_speed"):
         sw.LeaseExpiry(gym.make("Reacher-v5"), limit)
     for value in (0.0, -1.0, math.nan, math.inf, "fast"):

@@ -34,7 +34,7 @@ def test_an_ideal_channel_is_no_channel(env_id):
     bare = gym.make(env_id)
     actions = some_actions(bare, 40)
     options = {"hold_s": 0.05} if env_id == "Pendulum-v1" else {}
-    env = sw.TeleopChannel(gym.make(env_id), 0.0, sw.Link(), **options)
+    env = sw.TeleopChannel(gym.make(env_id), 0.0, sw.teleop.Link(), **options)
     (seen, rewards), (expected, expected_rewards) = rollout(env, actions), rollout(bare, actions)
     assert np.array_equal(seen, expected) and rewards == expected_rewards
     info = env.step(actions[0])[4]
@@ -117,7 +117,7 @@ def test_what_acts_while_nothing_arrives_is_declared(missing, expected):
 
 
 def test_overtaken_and_lost_packets_are_counted_and_the_newest_acts():
-    env = channel(sw.Link(0.002, 0.01, 0.2, in_order=False), sw.Link(loss=0.1))
+    env = channel(sw.teleop.Link(0.002, 0.01, 0.2, in_order=False), sw.teleop.Link(loss=0.1))
     place(env)
     raw, lost, late, stamps = env.unwrapped, 0, 0, []
     for k in range(1000):
@@ -135,14 +135,14 @@ def test_overtaken_and_lost_packets_are_counted_and_the_newest_acts():
 def test_links_and_operators_are_seeded_bit_for_bit():
     runs = []
     for seed in (0, 0, 1):
-        env = channel(sw.Link(0.01, 0.02, 0.1, False), sw.Link(0.01, 0.02, 0.1, False), seed=7)
+        env = channel(sw.teleop.Link(0.01, 0.02, 0.1, False), sw.teleop.Link(0.01, 0.02, 0.1, False), seed=7)
         observation, _ = env.reset(seed=3)
         operator = TeleopOperator(seed)
         for _ in range(400):
             observation = env.step(operator.act(observation))[0]
         runs.append(observation)
     assert np.array_equal(runs[0], runs[1]) and not np.array_equal(runs[0], runs[2])
-    late = [channel(sw.Link(0.0, 0.05), seed=seed) for seed in (0, 1)]
+    late = [channel(sw.teleop.Link(0.0, 0.05), seed=seed) for seed in (0, 1)]
     ages = []
     for env in late:
         env.reset(seed=0)
@@ -181,12 +181,12 @@ def test_an_action_that_is_not_finite_is_not_sent():
 def test_the_spec_rebuilds_it_with_all_that_it_holds():
     env = sw.TeleopChannel(
         sw.CBFActionFilter(gym.make("TeleopContact-v0"), [clamp()]),
-        sw.Link(0.01, 0.02, 0.1, False, 1.0, 0.1),
+        sw.teleop.Link(0.01, 0.02, 0.1, False, 1.0, 0.1),
         0.005,
         coding="wave",
         impedance=30.0,
         ceiling=ceiling(release=0.5),
-        port=sw.TeleopPort([0, 1], [4, 5], 40.0),
+        port=sw.teleop.TeleopPort([0, 1], [4, 5], 40.0),
     )
     again = gym.make(EnvSpec.from_json(env.spec.to_json()))
     actions = some_actions(env, 100)
@@ -232,7 +232,7 @@ def refused(error=ConfigurationError, inside=None, env_id="TeleopContact-v0", ma
         ({"port": 3}, "TeleopPort"),
         ({"ceiling": 0.2}, "RoundTripCeiling"),
         (
-            {"ceiling": {"budget": {"clearance": sw.JointSpeedLimit(1.0), "closing_speed": 1.0}}},
+            {"ceiling": {"budget": {"clearance": sw.constraints.JointSpeedLimit(1.0), "closing_speed": 1.0}}},
             "how fast it is approached",
         ),
         (

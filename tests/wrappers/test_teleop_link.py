@@ -47,7 +47,7 @@ def traffic(made, ticks=400):
     seed=st.integers(0, 1000),
 )
 def test_every_packet_arrives_once_in_its_time_or_is_lost(delay, jitter, loss, in_order, seed):
-    link = sw.Link(delay * TICK, jitter * TICK, loss, in_order)
+    link = sw.teleop.Link(delay * TICK, jitter * TICK, loss, in_order)
     sent, came, order = traffic(line(link, seed), 150)
     for sequence, k in sent.items():
         if sequence not in came:
@@ -61,25 +61,25 @@ def test_every_packet_arrives_once_in_its_time_or_is_lost(delay, jitter, loss, i
 
 
 def test_datagrams_overtake_each_other_and_a_stream_does_not():
-    loose = traffic(line(sw.Link(0.01, 0.03, in_order=False)))[2]
+    loose = traffic(line(sw.teleop.Link(0.01, 0.03, in_order=False)))[2]
     assert loose != sorted(loose)
-    stream = traffic(line(sw.Link(0.01, 0.03)))[2]
+    stream = traffic(line(sw.teleop.Link(0.01, 0.03)))[2]
     assert stream == sorted(stream) and len(stream) > 350
 
 
 def test_no_delay_arrives_at_once():
-    assert traffic(line(sw.Link()), 50)[1] == {k: k for k in range(50)}
+    assert traffic(line(sw.teleop.Link()), 50)[1] == {k: k for k in range(50)}
 
 
 def test_the_delay_is_exact_without_jitter():
-    _, came, _ = traffic(line(sw.Link(0.025)), 200)
+    _, came, _ = traffic(line(sw.teleop.Link(0.025)), 200)
     assert came == {k: k + 25 for k in range(175)}
 
 
 def test_loss_and_outages_take_their_share():
     for link, expected in (
-        (sw.Link(loss=0.3), 0.3),
-        (sw.Link(outage_between_s=0.2, outage_length_s=0.1), 1.0 / 3.0),
+        (sw.teleop.Link(loss=0.3), 0.3),
+        (sw.teleop.Link(outage_between_s=0.2, outage_length_s=0.1), 1.0 / 3.0),
     ):
         shares = []
         for seed in range(4):
@@ -87,14 +87,15 @@ def test_loss_and_outages_take_their_share():
             shares.append(sum(c is None for c in came) / 20_000)
         assert np.mean(shares) == pytest.approx(expected, abs=0.06)
     lost = [
-        c is None for c in traffic(line(sw.Link(outage_between_s=0.2, outage_length_s=0.1)), 3000)[1].values()
+        c is None
+        for c in traffic(line(sw.teleop.Link(outage_between_s=0.2, outage_length_s=0.1)), 3000)[1].values()
     ]
     changes = np.count_nonzero(np.diff(np.array(lost, int)))
     assert changes < 60  # in spells, not one by one
 
 
 def test_random_numbers_are_seeded_and_kept_apart():
-    link = sw.Link(0.01, 0.05, 0.1, False)
+    link = sw.teleop.Link(0.01, 0.05, 0.1, False)
     first = traffic(line(link))
     assert traffic(line(link)) == first
     assert traffic(line(link, seed=1)) != first and traffic(line(link, stream="another")) != first
@@ -102,17 +103,17 @@ def test_random_numbers_are_seeded_and_kept_apart():
 
 def test_lost_packets_do_not_shift_the_others_times():
     # As many random numbers for each packet: with another loss those that arrive do so at the same time.
-    some = traffic(line(sw.Link(0.01, 0.05, 0.1, False)))[1]
-    more = traffic(line(sw.Link(0.01, 0.05, 0.5, False)))[1]
+    some = traffic(line(sw.teleop.Link(0.01, 0.05, 0.1, False)))[1]
+    more = traffic(line(sw.teleop.Link(0.01, 0.05, 0.5, False)))[1]
     both = [s for s in some if some[s] is not None and more.get(s) is not None]
     assert len(both) > 100 and all(some[s] == more[s] for s in both)
 
 
 def test_links_are_plain_data():
-    link = sw.Link(0.1, 0.02, 0.1, False, 2.0, 0.3)
+    link = sw.teleop.Link(0.1, 0.02, 0.1, False, 2.0, 0.3)
     data = json.loads(json.dumps(plain_data(link)))
     assert link_from("uplink", data) == link == link_from("uplink", link)
-    assert link_from("uplink", 0.2) == sw.Link(0.2)
+    assert link_from("uplink", 0.2) == sw.teleop.Link(0.2)
     with pytest.raises(dataclasses.FrozenInstanceError):
         link.delay_s = 0.0
 
@@ -135,7 +136,7 @@ def test_links_are_plain_data():
 )
 def test_links_that_cannot_be_are_refused(arguments):
     with pytest.raises(ConfigurationError):
-        sw.Link(**arguments)
+        sw.teleop.Link(**arguments)
 
 
 def test_what_is_no_link_is_refused():

@@ -11,9 +11,12 @@ from safe_wrappers.envs.teleop_operator import TeleopOperator
 NETWORKS = {
     "ideal": (0.0, 0.0),
     "100 ms each way": (0.1, 0.1),
-    "bursts of jitter": (sw.Link(0.01, 0.3), sw.Link(0.01, 0.2, 0.0, False)),
-    "half lost": (sw.Link(0.02, 0.02, 0.5, False), sw.Link(0.02, 0.02, 0.5, False)),
-    "outages": (sw.Link(0.01, 0.0, 0.0, True, 0.2, 0.2), sw.Link(0.01, 0.0, 0.0, True, 0.2, 0.2)),
+    "bursts of jitter": (sw.teleop.Link(0.01, 0.3), sw.teleop.Link(0.01, 0.2, 0.0, False)),
+    "half lost": (sw.teleop.Link(0.02, 0.02, 0.5, False), sw.teleop.Link(0.02, 0.02, 0.5, False)),
+    "outages": (
+        sw.teleop.Link(0.01, 0.0, 0.0, True, 0.2, 0.2),
+        sw.teleop.Link(0.01, 0.0, 0.0, True, 0.2, 0.2),
+    ),
 }
 
 
@@ -112,7 +115,7 @@ def test_authority_is_revoked_at_the_ceiling_and_comes_back_below_it_with_a_new_
 def test_between_release_and_ceiling_authority_stays_where_it_is():
     # A clearance that a test can move, a machine that approaches at 1 m/s for ever.
     reading = {"clearance": 2.0}
-    wanted = sw.RoundTripCeiling(
+    wanted = sw.teleop.RoundTripCeiling(
         sw.StoppingBudget(lambda env: (reading["clearance"], 1.0), braking=1e6, acceleration=0.0),
         video_s=0.0,
         human_s=0.0,
@@ -158,7 +161,9 @@ def test_next_to_the_clamp_the_operator_may_still_back_off():
 
 def test_a_state_that_is_no_number_revokes():
     answers = iter([(0.5, 0.0)] * 5 + [(np.nan, 0.0)] * 3 + [(0.5, 0.0)] * 50)
-    wanted = sw.RoundTripCeiling(sw.StoppingBudget(lambda env: next(answers), braking=1.0, acceleration=0.0))
+    wanted = sw.teleop.RoundTripCeiling(
+        sw.StoppingBudget(lambda env: next(answers), braking=1.0, acceleration=0.0)
+    )
     env = channel(ceiling=wanted)
     place(env)
     flags = [env.step(np.zeros(2))[4]["teleop/revoked"] for _ in range(20)]
@@ -167,8 +172,10 @@ def test_a_state_that_is_no_number_revokes():
 
 def test_an_arm_that_is_far_from_the_task_is_watched_as_well():
     # A cart on a rail, 40 ms a step, whose operator drives at its end.
-    rail = sw.Clearance([sw.Plane([-0.9], [1]), sw.Plane([0.9], [-1])], bodies=["cart"], braking=8.0)
-    watched = sw.RoundTripCeiling(sw.StoppingBudget(rail, acceleration=30.0), human_s=0.1, video_s=0.0)
+    rail = sw.constraints.Clearance(
+        [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])], bodies=["cart"], braking=8.0
+    )
+    watched = sw.teleop.RoundTripCeiling(sw.StoppingBudget(rail, acceleration=30.0), human_s=0.1, video_s=0.0)
     for wanted in (watched, None):
         env = sw.TeleopChannel(gym.make("InvertedPendulum-v5"), 0.04, 0.04, ceiling=wanted)
         env.reset(seed=0)

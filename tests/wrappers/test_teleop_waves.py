@@ -12,11 +12,17 @@ from safe_wrappers.wrappers.teleop.wave_coding import WaveCoding
 
 B = 40.0
 NETWORKS = {
-    "ideal": (sw.Link(), sw.Link()),
-    "300 ms": (sw.Link(0.15), sw.Link(0.15)),
-    "jitter, stream": (sw.Link(0.05, 0.03), sw.Link(0.05, 0.03)),
-    "jitter, datagrams, loss": (sw.Link(0.02, 0.03, 0.1, False), sw.Link(0.04, 0.05, 0.2, False)),
-    "outages": (sw.Link(0.01, 0.0, 0.0, True, 0.2, 0.1), sw.Link(0.02, 0.01, 0.05, False, 0.3, 0.05)),
+    "ideal": (sw.teleop.Link(), sw.teleop.Link()),
+    "300 ms": (sw.teleop.Link(0.15), sw.teleop.Link(0.15)),
+    "jitter, stream": (sw.teleop.Link(0.05, 0.03), sw.teleop.Link(0.05, 0.03)),
+    "jitter, datagrams, loss": (
+        sw.teleop.Link(0.02, 0.03, 0.1, False),
+        sw.teleop.Link(0.04, 0.05, 0.2, False),
+    ),
+    "outages": (
+        sw.teleop.Link(0.01, 0.0, 0.0, True, 0.2, 0.1),
+        sw.teleop.Link(0.02, 0.01, 0.05, False, 0.3, 0.05),
+    ),
 }
 
 
@@ -49,7 +55,7 @@ def test_waves_never_give_out_more_than_went_in_less_what_is_in_flight(network, 
 
 @pytest.mark.parametrize(("seed", "rule"), [(0, "queue"), (1, "hold")])
 def test_an_operator_in_contact_gets_not_one_picojoule(seed, rule):
-    up = sw.Link(0.05, 0.02, 0.05, False)
+    up = sw.teleop.Link(0.05, 0.02, 0.05, False)
     env = channel(up, up, coding="wave", impedance=B, wave_rule=rule)
     energies, operator = Energies(env), TeleopOperator(seed)
     observation, _ = place(env, (0.15, 0.0), seed=seed)
@@ -161,7 +167,7 @@ def test_while_authority_is_revoked_the_operator_feels_a_damper_and_nothing_pile
 def test_energy_is_kept_whatever_acts_while_nothing_arrives(missing, coding):
     waves = {"coding": "wave", "impedance": B}
     options = waves if coding == "wave" else {"passivity": "controller", "damping_limit": 20.0}
-    link = sw.Link(0.01, 0.01, 0.4, False)
+    link = sw.teleop.Link(0.01, 0.01, 0.4, False)
     env = channel(link, link, missing=missing, **options)
     raw, allowed = env.unwrapped, 1e-8 if coding == "wave" else 2 * 0.02 + 1e-6
     place(env, (0.17, 0.0))
@@ -212,7 +218,7 @@ def test_waves_in_a_queue_are_as_old_as_they_are():
     # A queue puts every wave out in turn, so it is as late as the latest; a single command overtakes.
     ages = {}
     for rule in ("queue", "hold"):
-        env = channel(sw.Link(0.01, 0.05, 0.0, False), 0.0, coding="wave", impedance=B, wave_rule=rule)
+        env = channel(sw.teleop.Link(0.01, 0.05, 0.0, False), 0.0, coding="wave", impedance=B, wave_rule=rule)
         place(env)
         for _ in range(400):
             info = env.step(np.zeros(2))[4]
@@ -244,7 +250,7 @@ def test_what_a_machine_took_unpaid_is_paid_by_the_next_waves():
 
 def test_named_by_the_user_a_port_is_the_published_one():
     runs = []
-    for port in (None, sw.TeleopPort([0, 1], [4, 5], 40.0), {"flow": [0, 1], "effort": [4, 5]}):
+    for port in (None, sw.teleop.TeleopPort([0, 1], [4, 5], 40.0), {"flow": [0, 1], "effort": [4, 5]}):
         env = channel(0.005, 0.005, coding="wave", impedance=B, port=port)
         place(env)
         runs.append([env.step(np.array([0.1, 0.05]))[0] for _ in range(200)])

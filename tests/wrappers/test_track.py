@@ -89,7 +89,9 @@ def test_what_does_not_fit_the_coordinates_is_refused_by_name(given, words):
 
 
 def test_a_name_alone_says_what_is_missing_and_an_unknown_key_what_there_is():
-    with pytest.raises(ConfigurationError, match=r"sw.Track\('car\*', acceleration_noise=0.1\).*got 'car\*'"):
+    with pytest.raises(
+        ConfigurationError, match=r"sw.occlusion.Track\('car\*', acceleration_noise=0.1\).*got 'car\*'"
+    ):
         track_from("car*")
     with pytest.raises(ConfigurationError, match="no 'noise'; it has bodies, published, acceleration_noise"):
         track_from({"bodies": "a", "noise": 1})

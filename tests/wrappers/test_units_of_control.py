@@ -53,15 +53,15 @@ def sled_plant(unit):
 def corner():
     """A wedge of two oblique walls, and a third one behind: their rows meet at a corner that the policy heads for."""
     planes = [
-        sw.Plane([0.6, 0.0], [-1.0, 0.1]),
-        sw.Plane([0.0, 0.4], [-0.2, -1.0]),
-        sw.Plane([-0.5, 0.0], [1.0, 0.0]),
+        sw.constraints.Plane([0.6, 0.0], [-1.0, 0.1]),
+        sw.constraints.Plane([0.0, 0.4], [-0.2, -1.0]),
+        sw.constraints.Plane([-0.5, 0.0], [1.0, 0.0]),
     ]
-    return sw.Clearance(planes, braking=0.5, position=[0, 1], velocity=[2, 3])
+    return sw.constraints.Clearance(planes, braking=0.5, position=[0, 1], velocity=[2, 3])
 
 
 def speed():
-    return sw.Barrier(lambda x: 0.09 - x[2] ** 2 - x[3] ** 2, alpha=5.0)
+    return sw.constraints.Barrier(lambda x: 0.09 - x[2] ** 2 - x[3] ** 2, alpha=5.0)
 
 
 @functools.cache

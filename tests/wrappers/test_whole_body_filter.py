@@ -24,17 +24,17 @@ def test_it_is_these_constraints():
         gym.make("Hopper-v5"), friction_share=0.6, zmp_inset=0.02, tolerance=0.03, bodies=["foot"], holds=4
     )
     contact, support, joints = env.constraints
-    assert contact == sw.ContactFeasibility(0.6, 0.03, ["foot"])
-    assert support == sw.SupportMargin(0.02)
+    assert contact == sw.constraints.ContactFeasibility(0.6, 0.03, ["foot"])
+    assert support == sw.constraints.SupportMargin(0.02)
     names = ["thigh_joint", "leg_joint", "foot_joint"]
     stops = np.array([env.unwrapped.model.joint(name).range for name in names])
     assert joints.joints == names and joints.holds == 4
     np.testing.assert_allclose([joints.lower, joints.upper], stops.T + np.array([[-0.1], [0.1]]))
     for kind, cone in (("pyramid", "pyramid"), ("cone", "exact")):
         (stance,) = sw.WholeBodyFilter(gym.make("Hopper-v5"), kind, 0.6, 0.05, 0.02).constraints
-        assert stance == sw.Stance(0.6, cone, joint_tolerance=0.05, zmp_inset=0.02)
+        assert stance == sw.constraints.Stance(0.6, cone, joint_tolerance=0.05, zmp_inset=0.02)
     (alone,) = sw.WholeBodyFilter(gym.make("Hopper-v5"), joint_tolerance=None).constraints
-    assert alone == sw.ContactFeasibility(0.7, 0.01)
+    assert alone == sw.constraints.ContactFeasibility(0.7, 0.01)
 
 
 @pytest.mark.parametrize(
@@ -191,9 +191,9 @@ def test_joints_stay_off_their_stops_at_every_evaluation():
 
 def test_its_constraints_compose_in_one_projection():
     limits = [
-        sw.ContactFeasibility(0.7),
-        sw.JointSpeedLimit(12.0, holds=1),
-        sw.JointPositionLimit(-0.9, 1.4, margin=0.0, holds=2),
+        sw.constraints.ContactFeasibility(0.7),
+        sw.constraints.JointSpeedLimit(12.0, holds=1),
+        sw.constraints.JointPositionLimit(-0.9, 1.4, margin=0.0, holds=2),
     ]
     env = sw.CBFActionFilter(gym.make("HalfCheetah-v5"), limits)
     rng = np.random.default_rng(0)
@@ -211,8 +211,8 @@ def test_its_constraints_compose_in_one_projection():
 
 @pytest.mark.parametrize("kind", ["ContactFeasibility", "SupportMargin", "Stance"])
 def test_two_that_would_write_the_same_report_are_refused(kind):
-    one = {"ContactFeasibility": sw.ContactFeasibility, "Stance": sw.Stance}.get(
-        kind, lambda: sw.SupportMargin(0.1)
+    one = {"ContactFeasibility": sw.constraints.ContactFeasibility, "Stance": sw.constraints.Stance}.get(
+        kind, lambda: sw.constraints.SupportMargin(0.1)
     )
     with pytest.raises(ConfigurationError, match="2 times"):
         sw.CBFActionFilter(gym.make("Hopper-v5"), [one(), one()])

@@ -61,7 +61,9 @@ def cart_plant(dt=0.1, delay_s=0.0, **bounds):
 
 def wall(at, **more):
     """Stay left of a wall, on the cart's line."""
-    return sw.Clearance([sw.Plane([at], [-1.0])], braking=1.0, position=[0], velocity=[1], **more)
+    return sw.constraints.Clearance(
+        [sw.constraints.Plane([at], [-1.0])], braking=1.0, position=[0], velocity=[1], **more
+    )
 
 
 @dataclass

@@ -67,7 +67,7 @@ class WallClearance(Constraint):
 
     Example:
         >>> import safe_wrappers as sw
-        >>> walls = sw.WallClearance(margin=0.01, velocity_clip=5.0)
+        >>> walls = sw.constraints.WallClearance(margin=0.01, velocity_clip=5.0)
         >>> walls.promise
         'proved'
     """
