@@ -2,19 +2,19 @@
 
 from benchmarks.mutants.room import Mutant, Room
 
-_FORGOTTEN = "Detour(memory.side, memory.steps - 1)"
+_FORGOTTEN = "Detour(self._memory.side, self._memory.steps - 1)"
 
 HEADING_DRIVE = Room(
-    "constraints/backup/heading_drive_clearance.py",
+    "constraints/backup/[bh]*.py",
     ("tests/constraints/test_heading_drive_clearance.py", "tests/wrappers/test_closed_loop_point_goal.py"),
     (
         Mutant(_FORGOTTEN, "Detour()"),
-        Mutant(_FORGOTTEN, "memory"),
-        Mutant("_DETOUR_MEMORY = 50", "_DETOUR_MEMORY = 0"),
+        Mutant(_FORGOTTEN, "self._memory"),
+        Mutant("detour_steps = 50", "detour_steps = 0"),
         Mutant("beside * (x - m.x) <= 0.0 else -1.0", "beside * (x - m.x) > 0.0 else -1.0"),
-        Mutant("if self._detour.steps <= 0:", "if True:"),
+        Mutant("self._memory.side if self._memory.steps > 0 else choose()", "choose()"),
         Mutant("        if not in_front:\n            return []", "        if False:\n            return []"),
-        Mutant("return min(target, self._clearance(backup, disc))", "return target"),
+        Mutant("return min(target, self._to_disc(backup, disc))", "return target"),
         Mutant("_DECAY_PER_HOLD = 0.5", "_DECAY_PER_HOLD = 2.0"),
         Mutant("self._models = drive.corners()", "self._models = [drive]"),
         Mutant("drive = max((drive, full, -full), key=lambda d: self._least_after(d))", "pass"),
@@ -32,16 +32,16 @@ HEADING_DRIVE = Room(
 )
 
 COASTING = Room(
-    "constraints/backup/coasting_clearance.py",
+    "constraints/backup/[bc]*.py",
     ("tests/constraints/test_coasting_clearance.py", "tests/wrappers/test_closed_loop_car_goal.py"),
     (
         Mutant(_FORGOTTEN, "Detour()"),
-        Mutant(_FORGOTTEN, "memory"),
-        Mutant("_DETOUR_MEMORY = 25", "_DETOUR_MEMORY = 0"),
-        Mutant("side = -1.0 if way[0] * y", "side = 1.0 if way[0] * y"),
+        Mutant(_FORGOTTEN, "self._memory"),
+        Mutant("detour_steps = 25", "detour_steps = 0"),
+        Mutant("return -1.0 if way[0] * y", "return 1.0 if way[0] * y"),
         Mutant("pairs if outer_is_first else pairs[:, ::-1]", "pairs"),
         Mutant("if after.least >= self.spec.margin:", "if after.least >= 0.0:"),
-        Mutant("least if course.rests else -math.inf", "least"),
+        Mutant("min(least) if course.rests else -math.inf", "min(least)"),
         Mutant("if fallen > self._within + _SAME_M:", "if False:"),
         Mutant("[*around, 0.5 * acting, self._still]", "around"),
         Mutant("return rest.least < self.spec.margin and kept", "return kept"),

@@ -6,10 +6,10 @@ PROJECTION = Room(
     "filter/**/*.py",
     ("tests/control/test_projection.py", "tests/control/test_projection_scale.py", "tests/filter"),
     (
-        Mutant("_FEASIBILITY_TOLERANCE = 1e-9", "_FEASIBILITY_TOLERANCE = 1e-6"),
-        Mutant("_EXACT = 1e-3", "_EXACT = 1e3"),
+        Mutant("FEASIBILITY_TOLERANCE = 1e-9", "FEASIBILITY_TOLERANCE = 1e-6"),
+        Mutant("EXACT_SHARE = 1e-3", "EXACT_SHARE = 1e3"),
         Mutant("_SOFT = 1e-8", "_SOFT = 1e-2"),
-        Mutant("_ORDINARY = 16.0", "_ORDINARY = 1e9"),
+        Mutant("ORDINARY_BOX = 16.0", "ORDINARY_BOX = 1e9"),
         Mutant("kept = normals @ control - offsets <= 10.0 *", "kept = normals @ control - offsets <= 1e7 *"),
         Mutant("return bool((kept & np.isfinite(length)).all())", "return bool(kept.all())"),
         Mutant("if inside and dot <= limit:", "if dot <= limit:"),
@@ -34,7 +34,9 @@ PROJECTION = Room(
         Mutant("if not np.isfinite(x).all() or bool((g @ x - h > allowed).any()):", "if False:"),
         Mutant("- x).max()) > _OPTIMALITY_TOLERANCE:", "- x).max()) > 1e9:"),
         Mutant("relaxed = np.maximum(h, g @ least) + 0.1 * allowed", "relaxed = h + 0.1 * allowed"),
-        Mutant("harmless = np.isfinite(length) & (b == np.inf)", "harmless = np.zeros(b.size, bool)"),
+        Mutant(
+            "harmless = (length < _OVERFLOWING) & (b >= _OVERFLOWING)", "harmless = np.zeros(b.size, bool)"
+        ),
         Mutant(
             "violation = part.violation if status is not Status.FAILED else math.inf",
             "violation = part.violation",
@@ -44,7 +46,7 @@ PROJECTION = Room(
             "status = Status.FAILED if (feasible or not solved) else Status.INFEASIBLE",
             "status = Status.INFEASIBLE",
         ),
-        Mutant("unit = 1.0 if box.ordinary else _unit(box, u, excess, length)", "unit = 1.0"),
+        Mutant("unit = 1.0 if box.ordinary else control_unit(box, u, excess, length)", "unit = 1.0"),
         Mutant("answer[1] * (unit * unit)", "answer[1]"),
         Mutant("weights * unit / norm", "weights"),
         Mutant(

@@ -10,7 +10,7 @@ import pytest
 from asking import Asked
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.backup.detour import Detour
+from safe_wrappers.constraints.backup.base import Detour
 from safe_wrappers.errors import ConfigurationError, UnsafeStateWarning, UnsupportedEnvError
 from safe_wrappers.serialize import constraint_from, plain_data
 
@@ -204,15 +204,14 @@ def test_a_detour_keeps_its_side_for_25_steps_after_it_was_last_needed():
         first, second = limit.candidates(FULL)[0]
         return float(np.sign(first - second))
 
-    first_turns = {memory.side: turns(memory) for memory in (Detour(1.0, 2), Detour(-1.0, 2))}
+    first_turns = {memory.side: turns(memory) for memory in (Detour(1.0, 1), Detour(-1.0, 1))}
     assert first_turns[1.0] == -first_turns[-1.0] != 0.0  # what is being made goes on
     assert turns(Detour()) == first_turns[-1.0]  # what is on the left is passed on the right
-    assert (
-        turns(Detour(1.0, 1)) == first_turns[-1.0]
-    )  # so is it when the other side has not been needed for long
-    assert limit.executed(FULL) == Detour(-1.0, 25)
-    limit.observe(Detour(-1.0, 25))  # not needed in this step
+    # So is it when the other side has not been needed for long.
+    assert turns(Detour(1.0, 0)) == first_turns[-1.0]
     assert limit.executed(FULL) == Detour(-1.0, 24)
+    limit.observe(Detour(-1.0, 24))  # not needed in this step
+    assert limit.executed(FULL) == Detour(-1.0, 23)
     assert limit.start() == Detour(0.0, 0)
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.backup.detour import Detour
+from safe_wrappers.constraints.backup.base import Detour
 
 LAYOUT = {"agent": [0.0, 0.0, 0.0], "goal": [1.2, 1.2], "hazards": [[0.6, 0.0]], "vases": []}
 
@@ -64,12 +64,12 @@ def test_a_detour_keeps_its_side_for_fifty_steps_after_it_was_last_needed():
         return limit.candidates(drive)[0][1]
 
     assert side(Detour()) == -1.0  # on the left: passed on the right
-    assert side(Detour(1.0, 2)) == 1.0  # but a detour on the left goes on
-    assert limit.executed(drive) == Detour(1.0, 50)
-    assert side(Detour(1.0, 1)) == -1.0  # until it has not been needed for long
-    assert limit.executed(drive) == Detour(-1.0, 50)
-    limit.observe(Detour(-1.0, 50))  # not needed in this step
+    assert side(Detour(1.0, 1)) == 1.0  # but a detour on the left goes on
+    assert limit.executed(drive) == Detour(1.0, 49)
+    assert side(Detour(1.0, 0)) == -1.0  # until it has not been needed for long
     assert limit.executed(drive) == Detour(-1.0, 49)
+    limit.observe(Detour(-1.0, 49))  # not needed in this step
+    assert limit.executed(drive) == Detour(-1.0, 48)
     assert limit.start() == Detour(0.0, 0)
 
 

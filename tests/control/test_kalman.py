@@ -206,9 +206,9 @@ def test_the_band_is_scipy_s_chi_square():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ((0, 10), ["n must be", "0"]),
-        ((2, 0), ["runs must be", "0"]),
-        ((2.5, 10), ["n must be", "2.5"]),
+        ((0, 10), ["n is a whole number", "0"]),
+        ((2, 0), ["runs is a whole number", "0"]),
+        ((2.5, 10), ["n is a whole number", "2.5"]),
         ((2, 10, 1.0), ["confidence", "1.0"]),
         ((2, 10, 0.0), ["confidence", "0.0"]),
         ((2, 10, float("nan")), ["confidence", "nan"]),

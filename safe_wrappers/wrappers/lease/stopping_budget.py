@@ -70,8 +70,8 @@ class StoppingBudget:
             object.__setattr__(self, "clearance", constraint_from(given))
         elif isinstance(given, type) or not callable(given):
             raise ConfigurationError(
-                "clearance is a constraint, such as sw.constraints.Clearance(...), or a function of the env that returns "
-                f"the clearance in m and the approach speed in m/s; got {given!r}"
+                "clearance is a constraint, such as sw.constraints.Clearance(...), or a function of the env that "
+                f"returns the clearance in m and the approach speed in m/s; got {given!r}"
             )
         check_fields(self, non_negative, ["localisation", "margin"], "m")
         check_fields(self, non_negative, ["act_s"], "s")

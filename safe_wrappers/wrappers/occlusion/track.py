@@ -125,6 +125,6 @@ def track_from(given: Any) -> Track:
     if isinstance(given, Track | dict):
         return settings_from(Track, given, "a track")
     raise ConfigurationError(
-        f"expected a Track, such as sw.occlusion.Track({given!r}, acceleration_noise=0.1) with the intensity in m^2/s^3: "
-        f"a name alone does not say how it moves; got {given!r}"
+        f"expected a Track, such as sw.occlusion.Track({given!r}, acceleration_noise=0.1) with the intensity in "
+        f"m^2/s^3: a name alone does not say how it moves; got {given!r}"
     )
