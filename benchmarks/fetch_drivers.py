@@ -87,7 +87,7 @@ def margin_reading(ball: bool) -> Maker:
     def make(env: Any, rng: np.random.Generator) -> Driver:
         recipe = RECIPES[env.spec.id.rpartition("-v")[0]]
         constraints: list[Any] = recipe(env, keep_out=obstacles(env) if ball else [])
-        plant = sw.DisplacementPlant()
+        plant = sw.plants.DisplacementPlant()
         plant.bind(env)
         bound = [constraint.bind(plant) for constraint in constraints]
         state: dict[str, Any] = {"way": rng.normal(size=3)}

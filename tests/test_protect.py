@@ -376,7 +376,7 @@ def test_a_fetch_arm_with_the_wrong_plant_is_told_the_right_one():
     limit = sw.constraints.Workspace([None, None, 0.3], [None, None, 1.0], sites=["robot0:grip"])
     with pytest.raises(UnsupportedEnvError, match=r"take DisplacementPlant\(\), or leave plant out"):
         sw.CBFActionFilter(gym.make("FetchReach-v4"), [limit], plant=sw.MujocoPlant())
-    sw.CBFActionFilter(gym.make("FetchReach-v4"), [limit], plant=sw.DisplacementPlant())
+    sw.CBFActionFilter(gym.make("FetchReach-v4"), [limit], plant=sw.plants.DisplacementPlant())
     sw.CBFActionFilter(gym.make("FetchReach-v4"), [limit])
 
 

@@ -370,12 +370,12 @@ def check_fetch(env, seen, driver, steps):
 @pytest.mark.parametrize(("env_id", "driver"), [("FetchReach-v4", stretched), ("FetchPush-v4", turned)])
 def test_on_fetch_no_step_that_is_not_flagged_goes_below_the_threshold(env_id, driver):
     env, seen = fetch(env_id)
-    assert isinstance(env.plant, sw.DisplacementPlant)
+    assert isinstance(env.plant, sw.plants.DisplacementPlant)
     check_fetch(env, seen, driver, 40)
 
 
 def test_on_fetch_a_margin_covers_a_plant_that_is_wrong():
-    plant = sw.DisplacementPlant()
+    plant = sw.plants.DisplacementPlant()
     plant.perturb(mass=1.2, damping=0.8)
     env, seen = fetch("FetchReach-v4", plant=plant, margin=0.1)
     check_fetch(env, seen, stretched, 40)

@@ -525,7 +525,7 @@ def test_nonsense_is_refused(arguments, message):
 
 def test_public_name_and_status_are_strings():
     answer = sw.project([0.0], [[1.0]], [1.0], [-1.0], [1.0])
-    assert isinstance(answer, sw.Projection)
+    assert isinstance(answer, sw.filter.projection.Projection)
     assert answer.status == "inactive" and isinstance(answer.status, Status)
 
 

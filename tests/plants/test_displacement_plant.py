@@ -16,7 +16,7 @@ every_env = pytest.mark.parametrize("env_id", ENVS)
 
 
 def bound(env, **options):
-    plant = sw.DisplacementPlant(**options)
+    plant = sw.plants.DisplacementPlant(**options)
     plant.bind(env)
     return plant
 
@@ -190,7 +190,7 @@ def test_a_blocked_gripper_takes_no_command_and_costs_no_forecast():
 @pytest.mark.parametrize("bound_first", [False, True])
 def test_a_plant_with_other_masses_forecasts_another_motion(bound_first):
     env = gym.make("FetchReach-v4")
-    plant = sw.DisplacementPlant()
+    plant = sw.plants.DisplacementPlant()
     if bound_first:
         plant.bind(env)
     plant.perturb(mass=1.5, damping=0.5)
@@ -316,7 +316,7 @@ def test_constraints_that_need_accelerations_are_refused_when_the_filter_is_buil
 
 @every_env
 def test_it_is_what_a_fetch_env_gets_when_no_plant_is_named(env_id):
-    assert type(default_plant(gym.make(env_id))) is sw.DisplacementPlant
+    assert type(default_plant(gym.make(env_id))) is sw.plants.DisplacementPlant
     assert type(default_plant(gym.make("Reacher-v5"))) is sw.MujocoPlant
 
 

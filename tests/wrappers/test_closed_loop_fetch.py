@@ -91,7 +91,7 @@ def test_three_lines_protect_by_hand():
         [1.2, 0.6, 0.45], [1.45, 0.9, 0.7], sites=["robot0:grip"], margin=0.001, holds=2
     )
     env = sw.CBFActionFilter(env, [box])
-    assert isinstance(env.plant, sw.DisplacementPlant)
+    assert isinstance(env.plant, sw.plants.DisplacementPlant)
     env.reset(seed=0)
     data, site = env.unwrapped.data, env.unwrapped.model.site("robot0:grip").id
     for way in ([1, 1, 1, 0], [-1, -1, -1, 0]):
@@ -268,7 +268,7 @@ def test_other_limits_hold_too(constraint, value, limit):
 
 @pytest.mark.parametrize("factor", [0.8, 1.2])
 def test_with_masses_that_are_wrong_by_a_fifth_it_stays_inside_its_margin(factor):
-    plant = sw.DisplacementPlant()
+    plant = sw.plants.DisplacementPlant()
     plant.perturb(mass=factor)
     env = sw.protect(fetch("FetchReach-v4", 70), plant=plant, margin=0.003)
     assert drive(env, "corner-seeking", 70)["violations"] == 0
@@ -278,7 +278,7 @@ def test_commands_in_flight_are_counted_on():
     missed = {}
     for delay_s in (0.0, 0.08):
         bare = fetch("FetchReach-v4", 60)
-        env = sw.protect(bare, plant=sw.DisplacementPlant(delay_s=delay_s))
+        env = sw.protect(bare, plant=sw.plants.DisplacementPlant(delay_s=delay_s))
         late = bare.unwrapped
         arrive = late.step
         queue = [np.zeros(4, np.float32)] * 2
