@@ -22,8 +22,8 @@ def own_plant(plant: Any) -> Plant | None:
     """The plant that was given, a fresh one if it comes from a spec, or an error if it is none."""
     if isinstance(plant, PlantOfSpec):
         return plant.fresh()
-    if plant is not None and (isinstance(plant, type) or not callable(getattr(plant, "observe", None))):
+    if plant is not None and not isinstance(plant, Plant):
         raise ConfigurationError(
-            f"plant is a MujocoPlant, an AnalyticPlant or another object with the Plant protocol, got {plant!r}"
+            f"plant is a MujocoPlant, an AnalyticPlant or another subclass of sw.Plant, got {plant!r}"
         )
     return plant

@@ -143,9 +143,9 @@ class Coasting:
 def _addresses(m: mujoco.MjModel, plant: MujocoPlant, joint: int, kind: str) -> NDArray[np.intp]:
     """Where a joint of the machine's own model is in the plant's state ("qpos" or "dof")."""
     name = m.joint(joint).name
-    there = plant.named("joint", name)
+    model, there = plant.model, plant.named("joint", name)
     sizes = {"qpos": (7, 4, 1, 1), "dof": (6, 3, 1, 1)}[kind]
-    first = int(getattr(plant.model, f"jnt_{kind}adr")[there])
+    first = int(getattr(model, f"jnt_{kind}adr")[there])
     return np.arange(first, first + sizes[int(m.jnt_type[joint])])
 
 
