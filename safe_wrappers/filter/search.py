@@ -136,7 +136,8 @@ class SafeActionSearch:
 
     def candidate(self, proposal: Array, strict: Rows) -> Array | None:
         """The first candidate of a constraint that keeps the rows and every prediction."""
-        every = (control for c in self._constraints for control in c.candidates(proposal))
+        known = (control for c in self._constraints for control in c.candidates(proposal))
+        every = (np.clip(control, self._low, self._high) for control in known)
         return next((control for control in every if self._keeps(control, strict)), None)
 
     def _search(self, proposal: Array, strict: Rows, last: Array) -> Decision:
@@ -267,7 +268,8 @@ class SafeActionSearch:
         return True
 
     def _keeps(self, control: Array, strict: Rows) -> bool:
-        return self._within(control, strict) and self._admitted(control)
+        # Comparisons with NaN are false, so a prediction may take what is not finite for admitted.
+        return bool(np.isfinite(control).all()) and self._within(control, strict) and self._admitted(control)
 
     def _within(self, control: Array, strict: Rows) -> bool:
         return not strict[1].size or keeps_rows(control, *strict, self._low, self._high)

@@ -4,6 +4,7 @@ Each answers, for a point, how far its surface is and in which direction it lies
 that is given obstacles can be recorded and rebuilt.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -68,14 +69,14 @@ def _vector(name: str, values: Sequence[float], sizes: tuple[int, ...]) -> list[
     return vector
 
 
-class _Round:
+class _Round(ABC):
     """Discs and spheres of one radius; a disc seen from three dimensions is an upright cylinder."""
 
     radius: float
 
+    @abstractmethod
     def centers(self, plant: Plant) -> Array:
         """Where they are now, shape (k, d), m."""
-        raise NotImplementedError
 
     def _velocities(self, plant: Plant) -> Array | float:
         return 0.0
