@@ -63,7 +63,7 @@ class Case:
 
     machine: Machine
     steps: int
-    hold_s: float
+    control_dt: float
     end: Array
     kind: str
     beyond: float = 0.0
@@ -71,7 +71,7 @@ class Case:
     @property
     def time(self) -> float:
         """From now to the end of the last command, s."""
-        return self.steps * self.hold_s
+        return self.steps * self.control_dt
 
 
 def viable(rng: np.random.Generator, speed: Array, acceleration: Array, jerk: Array) -> tuple[Array, Array]:
@@ -233,7 +233,7 @@ def beyond(rng: np.random.Generator, case: Case, lowest: Array, highest: Array, 
     way = highest[i] + share * width if rng.random() < 0.5 else lowest[i] - share * width
     end = case.end.copy()
     end[i] = case.machine.position[i] + way
-    return Case(case.machine, case.steps, case.hold_s, end, case.kind, share)
+    return Case(case.machine, case.steps, case.control_dt, end, case.kind, share)
 
 
 def real_reach(m: Machine, time: float, i: int) -> tuple[float, float]:
@@ -268,11 +268,11 @@ def by_wrapper(case: Case) -> bool:
     wrapper = sw.LeaseExpiry(
         Still(m.speed.size),
         sw.StoppingBudget(lambda env: (1.0, 0.0), braking=1.0, acceleration=0.0),
-        reach={name: limit.tolist() for name, limit in limits.items()},
+        motion_limits={name: limit.tolist() for name, limit in limits.items()},
         measured=lambda env: (m.position, m.velocity),
-        max_lease_s=max(1.0, case.hold_s),
+        max_lease_s=max(1.0, case.control_dt),
         fallback="zero",
-        hold_s=case.hold_s,
+        control_dt=case.control_dt,
     )
     return wrapper.admits(case.end, case.steps)
 

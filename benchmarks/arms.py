@@ -42,7 +42,7 @@ class Arm:
         task: How `SingularityMargin` is told the same.
         task_speed: That the threshold is validated for, m/s.
         rate_limit: Likewise, rad/s.
-        holds: Of the forecast.
+        horizon: Of the forecast.
         length: By which a rotation counts, m.
     """
 
@@ -54,7 +54,7 @@ class Arm:
     task: dict[str, Any]
     task_speed: float
     rate_limit: float
-    holds: int
+    horizon: int
     length: float = 1.0
     options: dict[str, Any] = field(default_factory=dict)
 
@@ -69,7 +69,7 @@ class Arm:
     def margin(self, **more: Any) -> sw.constraints.SingularityMargin:
         """The constraint, its threshold validated when it is bound."""
         named = {self.kind: self.frame, "joints": list(self.joints), **self.task}
-        chosen = {"task_speed": self.task_speed, "rate_limit": self.rate_limit, "holds": self.holds}
+        chosen = {"task_speed": self.task_speed, "rate_limit": self.rate_limit, "horizon": self.horizon}
         return sw.constraints.SingularityMargin(**(named | chosen | more))
 
 
@@ -83,7 +83,7 @@ ARMS = {
         {"directions": "xy"},
         task_speed=0.1,
         rate_limit=5.0,
-        holds=8,
+        horizon=8,
     ),
     "Pusher": Arm(
         "Pusher-v5",
@@ -94,7 +94,7 @@ ARMS = {
         {},
         task_speed=0.2,
         rate_limit=5.0,
-        holds=8,
+        horizon=8,
     ),
     "Fetch": Arm(
         "FetchReach-v4",
@@ -105,7 +105,7 @@ ARMS = {
         {"rotations": "xyz", "length": 0.3},
         task_speed=0.1,
         rate_limit=3.0,
-        holds=5,
+        horizon=5,
         length=0.3,
     ),
 }

@@ -78,9 +78,12 @@ def _joint_speeds(limit: float) -> Callable[[Any], Judge]:
 
 
 def _reacher_and_disc(env: gym.Env[Any, Any]) -> sw.CBFActionFilter:
-    speeds = sw.constraints.JointSpeedLimit(5.0, margin=0.01, reach=4.5)
+    speeds = sw.constraints.JointSpeedLimit(5.0, margin=0.01, max_decrease=4.5)
     disc = sw.constraints.Workspace(
-        keep_out=[sw.constraints.Disc(list(_DISC), _DISC_RADIUS)], bodies=["fingertip"], margin=0.001, holds=3
+        keep_out=[sw.constraints.Disc(list(_DISC), _DISC_RADIUS)],
+        bodies=["fingertip"],
+        margin=0.001,
+        horizon=3,
     )
     return sw.CBFActionFilter(env, [speeds, disc])
 

@@ -65,7 +65,7 @@ def main() -> None:
     env = DoubleIntegrator()
     effect = np.array([[0.0], [1.0]])
     plant = sw.AnalyticPlant(
-        f=lambda x: np.array([x[1], 0.0]), g=lambda x: effect, state=lambda e: e.x, hold_s=0.02
+        f=lambda x: np.array([x[1], 0.0]), g=lambda x: effect, state=lambda e: e.x, control_dt=0.02
     )
     barrier = sw.constraints.Barrier(
         lambda x: WALL - x[0] - x[1] ** 2 / (2.0 * BRAKE),

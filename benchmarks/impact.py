@@ -217,7 +217,7 @@ def env_of(kind: Machine, limited: bool) -> Any:
         force_limit=kind.force,
         stiffness=kind.stiffness,
         margin=MARGIN * kind.force,
-        holds=6,
+        horizon=6,
     )
     return sw.CBFActionFilter(env, [limit])
 

@@ -51,7 +51,7 @@ def bounds_of(env: Any, horizon: int, range_per_second: float) -> Bounds:
     angles = np.zeros((721, 2))
     angles[:, 1] = np.linspace(-math.pi, math.pi, len(angles))
     constants = arm.stiffness, arm.rotor_inertia, arm.link_inertia(angles)
-    limit = torque_slew_limit(RAMP_ENERGY, *constants, weights=high, hold_s=hold).min(axis=0)
+    limit = torque_slew_limit(RAMP_ENERGY, *constants, weights=high, control_dt=hold).min(axis=0)
     lowest = float(resonances(*constants).min()) / (2.0 * math.pi)
     span = PERIODS / lowest
     reasons = (

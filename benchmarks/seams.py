@@ -183,7 +183,7 @@ class Episode:
 
 def episode(env: Any, recorder: Recorder, act: Policy, job: Job, bounds: Bounds, seed: int) -> Episode:
     """Run one."""
-    fade = math.ceil(bounds.blend_time / env.hold_s)
+    fade = math.ceil(bounds.blend_time / env.control_dt)
     observation, _ = env.reset(seed=seed)
     takeovers, infos, total, limited, over = [], [], 0.0, 0, False
     while not over:
@@ -196,7 +196,7 @@ def episode(env: Any, recorder: Recorder, act: Policy, job: Job, bounds: Bounds,
             takeovers.append(begins + info["handover/latency"] % env.execution_horizon)
             infos.append(info)
     commands = np.array(recorder.commands)
-    step = np.abs(np.diff(commands, axis=0, prepend=commands[:1])) / env.hold_s
+    step = np.abs(np.diff(commands, axis=0, prepend=commands[:1])) / env.control_dt
     rates = (step / bounds.rate_limit).max(axis=1)
     blend_times = np.array([info["handover/blend_time"] for info in infos])
     energy = np.array(recorder.energy)
@@ -212,7 +212,7 @@ def episode(env: Any, recorder: Recorder, act: Policy, job: Job, bounds: Bounds,
         np.maximum.reduceat(energy, takeovers)[1:] if len(energy) else energy,
         by_itself,
         blend_times[1:],
-        int((np.rint(blend_times / env.hold_s) > np.diff(takeovers, append=len(commands)))[1:].sum()),
+        int((np.rint(blend_times / env.control_dt) > np.diff(takeovers, append=len(commands)))[1:].sum()),
         limited,
         recorder.error,
         float(total),

@@ -88,6 +88,23 @@ def deprecated_names(kind: type[Any]) -> tuple[str, ...]:
     return getattr(kind.__init__, "deprecated_parameters", ())
 
 
+def deprecated_attribute(old: str, new: str) -> Any:
+    """A property of the old name that reads and sets the attribute of the new one."""
+
+    def warn(kind: type[Any]) -> None:
+        warnings.warn(f"{kind.__name__}.{old} is deprecated; write {new}", DeprecationWarning, stacklevel=3)
+
+    def read(self: Any) -> Any:
+        warn(type(self))
+        return getattr(self, new)
+
+    def write(self: Any, value: Any) -> None:
+        warn(type(self))
+        setattr(self, new, value)
+
+    return property(read, write, doc=f"Old name of `{new}`.")
+
+
 def deprecated_method(old: str, new: str) -> Any:
     """A method that calls the one of the new name."""
 

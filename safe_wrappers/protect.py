@@ -76,9 +76,10 @@ def _by_hand(env: gym.Env[Any, Any]) -> str:
     named = env.has_wrapper_attr("dt")
     return (
         "It has no MuJoCo model. Describe it by x' = f(x) + g(x) u with x = state(env), and what must stay positive "
-        f"by h(x){'' if named else ', and say with hold_s how long a step lasts, in s'}; then it is three lines:\n"
+        f"by h(x){'' if named else ', and say with control_dt how long a step lasts, in s'}; then it is three "
+        "lines:\n"
         "    import safe_wrappers as sw\n"
-        f"    plant = sw.AnalyticPlant(f, g, state{'' if named else ', hold_s=hold_s'})\n"
+        f"    plant = sw.AnalyticPlant(f, g, state{'' if named else ', control_dt=control_dt'})\n"
         "    env = sw.CBFActionFilter(env, [sw.constraints.Barrier(h)], plant=plant)"
     )
 

@@ -53,11 +53,11 @@ def _car_goal(env: gym.Env[Any, Any], detour: bool = True) -> list[Constraint]:
             keep_out=[Discs("hazard_positions", radius=0.2)],
             untouched=[Discs("vase_positions", radius=VASE_HULL_RADIUS_M)] if vases else [],
             outline=[[side * x, y] for x, y in CAR.corners for side in (1.0, -1.0)],
-            alone="robot_model",
+            robot_model_attr="robot_model",
             # Full torque for one control step and rest: 0.03 m from rest and 0.09 m from full speed (measured), half
             # as much again.
-            reach=0.05,
-            reach_s=0.13,
+            max_decrease=0.05,
+            max_decrease_per_speed=0.13,
             detour=detour,
         )
     ]
@@ -77,17 +77,17 @@ def _inverted_pendulum(env: gym.Env[Any, Any]) -> list[Constraint]:
 def _inverted_double_pendulum(env: gym.Env[Any, Any]) -> list[Constraint]:
     # 500 N on 20 kg of cart and poles is 24 m/s^2, but swinging poles pull: the inset for a third of it, and a
     # forecast, which alone would brake late.
-    return [_rail(braking=8.0), JointPositionLimit(-0.95, 0.95, joints=["slider"], margin=0.005, holds=5)]
+    return [_rail(braking=8.0), JointPositionLimit(-0.95, 0.95, joints=["slider"], margin=0.005, horizon=5)]
 
 
 def _reacher(env: gym.Env[Any, Any]) -> list[Constraint]:
     # A torque of 200 N m on 1 kg m^2 for 0.02 s: one step can add 4 rad/s.
-    return [JointSpeedLimit(limit=5.0, margin=0.01, reach=4.5)]
+    return [JointSpeedLimit(limit=5.0, margin=0.01, max_decrease=4.5)]
 
 
 def _flex_joint_reach(env: gym.Env[Any, Any]) -> list[Constraint]:
     # What a torque does to a joint that rings shows within one and a half periods of the lowest resonance.
-    return [JointSpeedLimit(limit=8.0, margin=0.3, holds=15)]
+    return [JointSpeedLimit(limit=8.0, margin=0.3, horizon=15)]
 
 
 def _safe_rover(
@@ -130,7 +130,7 @@ def _occluded_crossing(env: gym.Env[Any, Any], cars: str = "", sigmas: float = 3
 
 def _pusher(env: gym.Env[Any, Any]) -> list[Constraint]:
     # The tip stays over the table, clear of its top by 2.5 cm, and in front of the shoulder.
-    table = Workspace([-0.2, -1.2, -0.3], [0.9, 0.15, 0.4], bodies=["tips_arm"], margin=0.005, holds=8)
+    table = Workspace([-0.2, -1.2, -0.3], [0.9, 0.15, 0.4], bodies=["tips_arm"], margin=0.005, horizon=8)
     return [JointSpeedLimit(limit=6.0, margin=0.05), table]
 
 
@@ -164,7 +164,7 @@ def _ant_maze(env: gym.Env[Any, Any]) -> list[Constraint]:
         Box([(a + b) / 2.0, (c + d) / 2.0], [(b - a) / 2.0, (d - c) / 2.0]) for a, b, c, d in merged(blocks)
     ]
     # An ant at 4 m/s moves 1 m in five steps.
-    return [Workspace(keep_out=walls, bodies=["torso"], radius=0.4, margin=0.01, holds=5, reach=1.0)]
+    return [Workspace(keep_out=walls, bodies=["torso"], radius=0.4, margin=0.01, horizon=5, max_decrease=1.0)]
 
 
 FINGER_RADIUS_M = 0.0414
@@ -196,8 +196,8 @@ def _fetch(
         most if high is None else high,
         sites=["robot0:grip"],
         margin=0.001,
-        holds=2,
-        reach=0.1,
+        horizon=2,
+        max_decrease=0.1,
     )
     # An upright finger's tip stays 4 mm above the table, where it still meets the lower half of block and puck.
     obstacles = [*([Box(middle.tolist(), half.tolist())] if table else []), *keep_out]
@@ -205,12 +205,12 @@ def _fetch(
         return [grip]
     fingers = [f"robot0:{side}_gripper_finger_link" for side in "lr"]
     clear = Workspace(
-        keep_out=obstacles, geoms=fingers, radius=FINGER_RADIUS_M, margin=0.001, holds=2, reach=0.2
+        keep_out=obstacles, geoms=fingers, radius=FINGER_RADIUS_M, margin=0.001, horizon=2, max_decrease=0.2
     )
     return [grip, clear]
 
 
-def _velocity(robot: str, margin: float, holds: int = 3) -> Callable[..., list[Constraint]]:
+def _velocity(robot: str, margin: float, horizon: int = 3) -> Callable[..., list[Constraint]]:
     plane = robot in ("Ant", "Humanoid")
 
     def recipe(env: gym.Env[Any, Any]) -> list[Constraint]:
@@ -219,7 +219,7 @@ def _velocity(robot: str, margin: float, holds: int = 3) -> Callable[..., list[C
             body=None if robot == "Humanoid" else "torso",
             direction="xy" if plane else "+x",
             margin=margin,
-            holds=holds,
+            horizon=horizon,
         )
         return [limit]
 
@@ -250,7 +250,7 @@ RECIPES: dict[str, Callable[..., list[Constraint]]] = {
     "FetchSlide": _fetch,
     "FetchPickAndPlace": _fetch,
     # A policy trained through three steps ahead found states with no way out (1 violation in 1000 steps).
-    "HalfCheetah": _velocity("HalfCheetah", margin=0.02, holds=5),
+    "HalfCheetah": _velocity("HalfCheetah", margin=0.02, horizon=5),
     "Hopper": _velocity("Hopper", margin=0.02),
     "Walker2d": _velocity("Walker2d", margin=0.02),
     "Swimmer": _velocity("Swimmer", margin=0.005),

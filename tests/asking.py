@@ -18,7 +18,7 @@ class Asked:
         self.memory, self.seen = self.bound.start(), None
 
     def __getattr__(self, name):
-        if self.seen != self.plant.stamp:
-            self.seen = self.plant.stamp
+        if self.seen != self.plant.observation_id:
+            self.seen = self.plant.observation_id
             self.bound.observe(self.memory)
         return getattr(self.bound, name)

@@ -161,3 +161,71 @@ def test_the_old_name_of_the_info_keys_module():
     assert found is sw.info and says.endswith("write safe_wrappers.info")
     with pytest.raises(AttributeError, match="no attribute 'intervention'"):
         sw.intervention  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    ("make", "name", "value"),
+    [
+        (lambda: sw.constraints.JointPositionLimit(holds=4), "horizon", 4),
+        (lambda: sw.constraints.JointSpeedLimit(5.0, reach=4.5), "max_decrease", 4.5),
+        (lambda: sw.constraints.SpeedLimit(5.0, holds=2), "horizon", 2),
+        (lambda: sw.constraints.Workspace(high=[1.0, 1.0, 1.0], bodies=["a"], holds=2), "horizon", 2),
+        (lambda: sw.constraints.Upright("torso", tilt=0.5, holds=2), "horizon", 2),
+        (
+            lambda: sw.constraints.SingularityMargin(
+                body="a", directions="xy", task_speed=0.1, rate_limit=5.0, holds=2
+            ),
+            "horizon",
+            2,
+        ),
+        (
+            lambda: sw.constraints.ImpactSpeedLimit(["a"], ["b"], force_limit=1.0, stiffness=1.0, holds=2),
+            "horizon",
+            2,
+        ),
+        (lambda: coasting(alone="robot_model"), "robot_model_attr", "robot_model"),
+        (lambda: coasting(reach=0.1), "max_decrease", 0.1),
+        (lambda: coasting(reach=0.1, reach_s=0.2), "max_decrease_per_speed", 0.2),
+        (lambda: sw.ChunkHandover(pendulum(), 4, 2, fallback="hold", hold_s=0.05), "control_dt", 0.05),
+        (lambda: leased(hold_s=0.04), "control_dt", 0.04),
+        (lambda: sw.faults.Jitter(pendulum(), 0.1, hold_s=0.05), "control_dt", 0.05),
+        (lambda: sw.faults.ClockSkew(pendulum(), 0.1, hold_s=0.05), "control_dt", 0.05),
+        (lambda: sw.faults.DroppedRefreshes(pendulum(), 0.1, hold_s=0.05), "control_dt", 0.05),
+        (lambda: sw.faults.Outages(pendulum(), 0.1, 0.2, hold_s=0.05), "control_dt", 0.05),
+        (lambda: sw.AnalyticPlant(np.zeros, np.zeros, np.zeros, hold_s=0.05), "control_dt", 0.05),
+    ],
+)
+def test_renamed_parameters_of_the_library(make, name, value):
+    made, message = warned(make)
+    assert getattr(made, name) == value and f"{name}=..." in message
+
+
+def test_renamed_parameters_of_wrappers_over_filters():
+    made, message = warned(lambda: sw.WholeBodyFilter(gym.make("Hopper-v5"), holds=3))
+    assert made.spec.additional_wrappers[-1].kwargs["horizon"] == 3 and "horizon=..." in message
+    teleop = gym.make("TeleopContact-v0")
+    made, message = warned(lambda: sw.TeleopChannel(teleop, 0.0, 0.0, hold_s=0.001))
+    assert made.control_dt == 0.001 and "control_dt=..." in message
+
+
+def leased(**more):
+    budget = sw.StoppingBudget(rail(), acceleration=20.0, top_speed=3.0, margin=0.1)
+    return sw.LeaseExpiry(gym.make("InvertedPendulum-v5"), budget, max_lease_s=0.4, **more)
+
+
+def coasting(**more):
+    discs = [sw.constraints.Disc([0.0, 0.0], 1.0)]
+    return sw.constraints.CoastingClearance(keep_out=discs, **more)
+
+
+def pendulum():
+    return gym.make("Pendulum-v1")
+
+
+def test_renamed_attributes_read_and_set_the_new_ones():
+    plant = sw.AnalyticPlant(np.zeros, np.zeros, np.zeros, control_dt=0.05)
+    assert warned(lambda: plant.hold_s)[0] == 0.05
+    warned(lambda: setattr(plant, "revision", 3))
+    assert plant.model_version == 3 and warned(lambda: plant.stamp)[0] == plant.observation_id == 0
+    env = sw.ChunkHandover(pendulum(), 4, 2, fallback="hold")
+    assert warned(lambda: env.hold_s)[0] == env.control_dt

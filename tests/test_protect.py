@@ -203,7 +203,7 @@ def test_hulls_are_as_large_as_the_geoms():
     from safe_wrappers.envs.goal.robot import POINT
     from safe_wrappers.recipes import POINT_HULL_RADIUS_M, VASE_HULL_RADIUS_M
 
-    assert POINT.reach <= POINT_HULL_RADIUS_M < POINT.reach + 1e-3
+    assert POINT.radius <= POINT_HULL_RADIUS_M < POINT.radius + 1e-3
     assert np.hypot(VASE_HALF_SIZE, VASE_HALF_SIZE) <= VASE_HULL_RADIUS_M < np.sqrt(2) * VASE_HALF_SIZE + 1e-3
     assert sw.protect(gym.make("SafePointGoal1-v0")).constraints[0].obstacles[0].radius == HAZARD_RADIUS
 
@@ -294,7 +294,7 @@ MACHINES = {
         "f": lambda x: np.array([x[1], -0.0025 * np.cos(3.0 * x[0])]),
         "g": lambda x: np.array([[0.0], [0.0015]]),
         "h": lambda x: 0.06 - x[1],
-        "hold_s": 1.0,
+        "control_dt": 1.0,
     },
 }
 
@@ -306,7 +306,7 @@ def test_an_env_without_mujoco_gets_lines_for_it(env_id):
     message = refusal(env)
     assert "JointSpeedLimit" not in message
     lines = textwrap.dedent("\n".join(message.splitlines()[1:]))
-    assert len(lines.splitlines()) == 3 and ("hold_s" in message) == ("hold_s" in MACHINES[env_id])
+    assert len(lines.splitlines()) == 3 and ("control_dt" in message) == ("control_dt" in MACHINES[env_id])
     scope = {"env": env, "state": lambda env: env.state, **MACHINES[env_id]}
     exec(lines, scope)
     scope["env"].reset(seed=0)
@@ -362,8 +362,8 @@ def test_envs_that_rescale_in_their_own_step_are_named_and_not_blamed_on_wrapper
             refused()
         assert "wrapper" not in str(caught.value)
     effect = np.ones((1, *env.action_space.shape))
-    hold_s = None if env.has_wrapper_attr("dt") else 0.1
-    plant = sw.AnalyticPlant(np.zeros_like, lambda x: effect, lambda env: np.zeros(1), hold_s=hold_s)
+    control_dt = None if env.has_wrapper_attr("dt") else 0.1
+    plant = sw.AnalyticPlant(np.zeros_like, lambda x: effect, lambda env: np.zeros(1), control_dt=control_dt)
     filtered = sw.CBFActionFilter(
         env, [sw.constraints.Barrier(lambda x: 1.0 - x[0])], plant=plant
     )  # what the message suggests

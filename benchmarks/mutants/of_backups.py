@@ -87,8 +87,8 @@ ESCAPE = Room(
         ),
         Mutant("    np.maximum(along, 0.0, out=along)\n", ""),
         Mutant(
-            "times = self.plant.hold_s * np.concatenate([[0.0], 1.0 + self._escapes.instants])",
-            "times = self.plant.hold_s * np.concatenate([[0.0], self._escapes.instants])",
+            "times = self.plant.control_dt * np.concatenate([[0.0], 1.0 + self._escapes.instants])",
+            "times = self.plant.control_dt * np.concatenate([[0.0], self._escapes.instants])",
         ),
         Mutant(
             "((led_to - velocity) ** 2).sum(axis=1).argmin()",

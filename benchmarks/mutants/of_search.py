@@ -112,8 +112,8 @@ ROLLOUT = Room(
             "                stacklevel=2,\n            )\n            self._reach = None",
             "                stacklevel=2,\n            )",
         ),
-        Mutant("(*self._recent, self._least)[-self.spec.holds :]", "(*self._recent, self._least)[-1:]"),
-        Mutant("(*self._recent, self._least)[-self.spec.holds :]", "(*self._recent, self._least)"),
+        Mutant("(*self._recent, self._least)[-self.spec.horizon :]", "(*self._recent, self._least)[-1:]"),
+        Mutant("(*self._recent, self._least)[-self.spec.horizon :]", "(*self._recent, self._least)"),
         Mutant(
             "[left.min(axis=0) - self._outside, left[-1] - self._closer()]",
             "[left.min(axis=0) - self._outside]",
@@ -122,8 +122,8 @@ ROLLOUT = Room(
             "[left.min(axis=0) - self._outside, left[-1] - self._closer()]", "[left[-1] - self._closer()]"
         ),
         Mutant(
-            "np.exp(-self.spec.holds * self.plant.hold_s / RECOVERY_S)",
-            "np.exp(-self.plant.hold_s / RECOVERY_S)",
+            "np.exp(-self.spec.horizon * self.plant.control_dt / RECOVERY_S)",
+            "np.exp(-self.plant.control_dt / RECOVERY_S)",
         ),
         Mutant("return least if least == least else -np.inf", "return least"),
         Mutant("np.where(control < 0.0, _STEP, -_STEP)", "_STEP"),
@@ -131,7 +131,9 @@ ROLLOUT = Room(
         Mutant("        left[-1] += self._outside - self._closer()\n", ""),
         Mutant("np.minimum(value - self.spec.margin, 0.0)", "np.minimum(value, 0.0)"),
         Mutant("if self._linear is None:", "if True:"),
-        Mutant("self.plant.stamp >= self._response[1]", "self.plant.stamp > self._response[1]"),
-        Mutant("if self._response is None or self.plant.stamp", "if self.plant.stamp"),
+        Mutant(
+            "self.plant.observation_id >= self._response[1]", "self.plant.observation_id > self._response[1]"
+        ),
+        Mutant("if self._response is None or self.plant.observation_id", "if self.plant.observation_id"),
     ),
 )

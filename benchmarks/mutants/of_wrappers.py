@@ -69,7 +69,7 @@ LEASE_EXPIRY = Room(
     (
         Mutant("refused |= not self._grant(now)", "self._grant(now)"),
         Mutant(
-            "covered = now + self.hold_s <= self._until_s + self._same_s",
+            "covered = now + self.control_dt <= self._until_s + self._same_s",
             "covered = now <= self._until_s + self._same_s",
         ),
         Mutant("expired = not covered and self._until_s > -math.inf", "expired = not covered"),
@@ -92,12 +92,12 @@ LEASE_EXPIRY = Room(
         ),
         Mutant("observed_s > now + self._clock_error_s + self._same_s", "observed_s > now + self._same_s"),
         Mutant(
-            "of_formula.total_s + self._brake_steps * self.hold_s + self._clock_error_s",
+            "of_formula.total_s + self._brake_steps * self.control_dt + self._clock_error_s",
             "of_formula.total_s + self._clock_error_s",
         ),
         Mutant(
-            "of_formula.total_s + self._brake_steps * self.hold_s + self._clock_error_s",
-            "of_formula.total_s + self._brake_steps * self.hold_s",
+            "of_formula.total_s + self._brake_steps * self.control_dt + self._clock_error_s",
+            "of_formula.total_s + self._brake_steps * self.control_dt",
         ),
         Mutant("self._delays_s + max(now - self._newest_s, 0.0)", "self._delays_s"),
         Mutant(
@@ -157,11 +157,11 @@ HANDOVER = Room(
             "        self._fade = None\n        return len(self._sent) > 0, joined.steps",
             "        return len(self._sent) > 0, joined.steps",
         ),
-        Mutant("shortest / self._hold_s - _WHOLE) - 1)", "shortest / self._hold_s - _WHOLE))"),
+        Mutant("shortest / self._control_dt - _WHOLE) - 1)", "shortest / self._control_dt - _WHOLE))"),
         Mutant("starved, limited or held, took_over", "starved, limited, took_over"),
         Mutant("if acting != self._acting and len(self._sent):", "if False:"),
         Mutant("weights @ votes / weights.sum()", "weights @ votes / len(votes)"),
-        Mutant("np.where(step / hold_s > rate_limit, np.nextafter(step, 0.0), step)", "step"),
+        Mutant("np.where(step / control_dt > rate_limit, np.nextafter(step, 0.0), step)", "step"),
         Mutant(
             "if name in i and (not key.where or i.get(key.where))]",
             "if name in i]",
@@ -197,23 +197,26 @@ CHUNK_HANDOVER = Room(
             "self.now_s < observed_s <= self.now_s + self._clock_error_s +",
             "self.now_s < observed_s <= self.now_s +",
         ),
-        Mutant("math.floor(observed_s / self.hold_s + _SAME_STEP)", "math.floor(observed_s / self.hold_s)"),
+        Mutant(
+            "math.floor(observed_s / self.control_dt + _SAME_STEP)",
+            "math.floor(observed_s / self.control_dt)",
+        ),
         Mutant("self._delay[1] + 1))", "self._delay[1] + 2))"),
         Mutant("            if terminated or truncated:\n                break\n", ""),
         Mutant("now + command.blend_steps + DIFFERENCES - 1", "now + command.blend_steps"),
-        Mutant("(max(blends) + 1) * self.hold_s", "max(blends) * self.hold_s"),
+        Mutant("(max(blends) + 1) * self.control_dt", "max(blends) * self.control_dt"),
         Mutant(
             "self._executed, self._in_seam = self._executed[-DIFFERENCES:], []",
             "self._in_seam = []",
             equal="only the last control steps' differences are looked at; the memory would grow",
         ),
         Mutant(
-            "peak = float(steps.max(initial=0.0)) / self.hold_s",
-            "peak = float(at_seam.max(initial=0.0)) / self.hold_s",
+            "peak = float(steps.max(initial=0.0)) / self.control_dt",
+            "peak = float(at_seam.max(initial=0.0)) / self.control_dt",
         ),
         Mutant(
-            "None if command.observed < 0 else command.observed * self.hold_s",
-            "command.observed * self.hold_s",
+            "None if command.observed < 0 else command.observed * self.control_dt",
+            "command.observed * self.control_dt",
         ),
         Mutant("        self._random.reset(self.env, seed)\n", ""),
         Mutant("        self._queue.reset()\n", ""),

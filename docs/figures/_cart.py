@@ -61,7 +61,7 @@ def plant(env: Cart, delay_s: float = 0.0) -> sw.AnalyticPlant:
         f=lambda x: np.array([x[1], 0.0]),
         g=lambda x: np.array([[0.0], [1.0]]),
         state=lambda raw: raw.state,
-        hold_s=env.dt,
+        control_dt=env.dt,
         delay_s=delay_s,
     )
 

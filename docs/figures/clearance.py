@@ -72,7 +72,7 @@ def draw() -> Figure:
         f=lambda x: np.array([x[2], x[3], 0.0, 0.0]),
         g=lambda x: np.array([[0.0, 0.0], [0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]),
         state=lambda env: env.state,
-        hold_s=0.05,
+        control_dt=0.05,
     )
     disc = sw.constraints.Clearance(
         [sw.constraints.Disc(CENTER, RADIUS)],

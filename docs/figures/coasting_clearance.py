@@ -47,7 +47,7 @@ def ways() -> tuple[Array, list[Array], Array]:
         env.step(np.ones(2, dtype=np.float32))
     run = constraint._coasting.run
     controls = ([1.0, 1.0], [0.0, 0.0])
-    courses = [run(np.array(u), constraint.spec.holds, 0.2).places for u in controls]
+    courses = [run(np.array(u), constraint.spec.horizon, 0.2).places for u in controls]
     return env.unwrapped.agent_position, courses, np.array(HAZARD)
 
 

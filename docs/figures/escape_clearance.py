@@ -46,12 +46,12 @@ def draw() -> Figure:
     point = planar_point(plant, np.inf, "robot")
     ways = [Maneuver(0.0, 0.0, 0)]
     for x, y in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)):
-        ways += [Maneuver(x, y, round(s / plant.hold_s)) for s in (0.3, 0.8)]
-    instants = np.arange(0, round(2.4 / plant.hold_s) + 1)
+        ways += [Maneuver(x, y, round(s / plant.control_dt)) for s in (0.3, 0.8)]
+    instants = np.arange(0, round(2.4 / plant.control_dt) + 1)
     x, y = EvasiveManeuvers(point.axes, ways, instants).paths(
         raw.agent_position[None], raw.agent_velocity[None], np.arange(len(ways))
     )
-    times = plant.hold_s * instants
+    times = plant.control_dt * instants
     centers, halves = discs.boxes(plant, times)
     for along, across in zip(x[0], y[0], strict=True):
         place = np.stack([along, across], axis=1)[:, None]

@@ -73,7 +73,7 @@ def draw() -> Figure:
     """Left: speed against distance. Right: force in time."""
     figure, (way, force) = panels(2, height=3.0)
     limit = sw.constraints.ImpactSpeedLimit(
-        ["cart"], ["wall"], force_limit=LIMIT, stiffness=STIFFNESS, margin=2.0, holds=8
+        ["cart"], ["wall"], force_limit=LIMIT, stiffness=STIFFNESS, margin=2.0, horizon=8
     )
     runs = {
         "unfiltered": (run(Slide()), OFF, "-"),

@@ -14,7 +14,7 @@ RANGE = 1.0
 def draw() -> Figure:
     """Left: over time. Right: braking begins before the range ends, earlier when faster."""
     figure, (time, plane) = panels(2, height=2.8, width_ratios=[3, 2])
-    limit = sw.constraints.JointPositionLimit(-RANGE, RANGE, joints=["joint1"], margin=0.01, holds=10)
+    limit = sw.constraints.JointPositionLimit(-RANGE, RANGE, joints=["joint1"], margin=0.01, horizon=10)
     raw = gym.make("Reacher-v5").unwrapped
     limited = sw.CBFActionFilter(gym.make("Reacher-v5").unwrapped, [limit])
     for env, color, name in ((raw, OFF, "unfiltered"), (limited, ON, "filtered")):

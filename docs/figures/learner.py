@@ -58,7 +58,7 @@ class Stored(NamedTuple):
 def stored(penalised: bool, mode: str | None) -> list[Stored]:
     """What one changed step leaves in the buffer."""
     plant = sw.AnalyticPlant(
-        f=lambda x: 0.0 * x, g=lambda x: np.ones((1, 1)), state=lambda env: np.zeros(1), hold_s=1.0
+        f=lambda x: 0.0 * x, g=lambda x: np.ones((1, 1)), state=lambda env: np.zeros(1), control_dt=1.0
     )
     env: Any = sw.CBFActionFilter(Line(), [Limit()], plant=plant)
     if penalised:

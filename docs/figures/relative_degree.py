@@ -25,7 +25,7 @@ class BoundNextPosition(BoundConstraint):
 
     def rows(self) -> sw.HalfSpaces:
         """X + v hold + u hold^2 / 2 <= wall."""
-        (x, v), hold = self.plant.state, self.plant.hold_s
+        (x, v), hold = self.plant.state, self.plant.control_dt
         return sw.HalfSpaces(np.array([[0.5 * hold**2]]), np.array([WALL - x - v * hold]))
 
 

@@ -45,7 +45,7 @@ def draw() -> Figure:
     """Left the ways, right the joint rates."""
     figure, (ways, speeds) = panels(2, height=3.0, width_ratios=[0.9, 1.3])
     margin = sw.constraints.SingularityMargin(
-        body="fingertip", directions="xy", task_speed=0.1, rate_limit=5.0, holds=8
+        body="fingertip", directions="xy", task_speed=0.1, rate_limit=5.0, horizon=8
     )
     raw = gym.make("Reacher-v5").unwrapped
     filtered = sw.CBFActionFilter(gym.make("Reacher-v5").unwrapped, [margin])

@@ -16,7 +16,7 @@ def draw() -> Figure:
     env = sw.protect(gym.make("SafePointGoal1-v0"))
     env.reset(seed=0, options={"layout": LAYOUT})
     infos = [env.step(np.array([-1.0, 0.3]))[4] for _ in range(75)]
-    time = np.arange(len(infos)) * env.plant.hold_s
+    time = np.arange(len(infos)) * env.plant.control_dt
     margin = 100.0 * np.array([i["cbf/margin"] for i in infos])
     unsafe = np.array([i["cbf/unsafe"] for i in infos])
     ax.plot(time, margin, color=ON)

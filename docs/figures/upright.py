@@ -14,7 +14,7 @@ TILT = 0.7
 def draw() -> Figure:
     """Tilt over time; steps that were flagged infeasible are marked."""
     figure, ax = panels(height=2.8)
-    upright = sw.constraints.Upright("torso", tilt=TILT, margin=0.02, holds=5)
+    upright = sw.constraints.Upright("torso", tilt=TILT, margin=0.02, horizon=5)
     raw = gym.make("HalfCheetah-v5")
     filtered = sw.CBFActionFilter(gym.make("HalfCheetah-v5"), [upright])
     for env, color, name in ((raw, OFF, "unfiltered"), (filtered, ON, "filtered")):

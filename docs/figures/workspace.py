@@ -21,7 +21,7 @@ def draw() -> Figure:
         keep_out=[sw.constraints.Disc(DISC, RADIUS)],
         bodies=["fingertip"],
         margin=0.003,
-        holds=8,
+        horizon=8,
     )
     raw = gym.make("Reacher-v5").unwrapped
     filtered = sw.CBFActionFilter(gym.make("Reacher-v5").unwrapped, [inside])

@@ -33,7 +33,7 @@ class WheeledCar:
     corners: tuple[tuple[float, float], ...]
 
     @property
-    def reach(self) -> float:
+    def radius(self) -> float:
         """Largest horizontal distance of any point of the upright car from its centre, m."""
         return max(math.hypot(x, y) for x, y in self.corners)
 

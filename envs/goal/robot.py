@@ -25,7 +25,7 @@ class Robot(Protocol):
         """How many numbers its sensors put at the front of the observation."""
 
     @property
-    def reach(self) -> float:
+    def radius(self) -> float:
         """Largest horizontal distance of any point of the robot from its centre, m."""
 
     def place(self, qpos: NDArray[np.float64], pose: NDArray[np.float64]) -> None:
@@ -60,7 +60,7 @@ class PlanarRobot:
     hull_corners: tuple[tuple[float, float], ...]
 
     @property
-    def reach(self) -> float:
+    def radius(self) -> float:
         """Largest distance of any point of the robot from its turning axis, m."""
         return max(self.hull_radius, *(math.hypot(x, y) for x, y in self.hull_corners))
 

@@ -95,10 +95,10 @@ class BoundBarrier(BoundConstraint):
     def __init__(self, spec: Barrier, plant: Plant) -> None:
         plant.require_acceleration("Barrier")
         super().__init__(spec, plant)
-        if not callable(self.spec.alpha) and self.spec.alpha * self.plant.hold_s > 1.0:
+        if not callable(self.spec.alpha) and self.spec.alpha * self.plant.control_dt > 1.0:
             raise ConfigurationError(
-                f"alpha = {self.spec.alpha}/s lets h cross zero within one hold of {self.plant.hold_s} s; "
-                f"alpha must be at most 1/hold = {1.0 / self.plant.hold_s:g}/s"
+                f"alpha = {self.spec.alpha}/s lets h cross zero within one hold of {self.plant.control_dt} s; "
+                f"alpha must be at most 1/hold = {1.0 / self.plant.control_dt:g}/s"
             )
         self._degree_checked = False
 
@@ -133,7 +133,7 @@ class BoundBarrier(BoundConstraint):
         drift, effect = lie_derivatives(gradient, self.plant.f, self.plant.g)
         room = self._now - self.spec.margin
         decay = self.spec.alpha(room) if callable(self.spec.alpha) else linear_decay(room, self.spec.alpha)
-        normal, offset = cbf_rows(drift, effect, decay - 0.5 * self.spec.curvature * self.plant.hold_s)
+        normal, offset = cbf_rows(drift, effect, decay - 0.5 * self.spec.curvature * self.plant.control_dt)
         return HalfSpaces(normal[None, :], offset.reshape(1))
 
     def slack(self, control: Array) -> float:

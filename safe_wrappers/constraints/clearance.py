@@ -127,7 +127,7 @@ class BoundClearance(BoundConstraint):
         """Room left after braking, margin and state error not taken off, m, one per point and surface."""
         return np.concatenate(
             [
-                sampled_inset(s.clearance, s.approach, self.spec.braking, self.plant.hold_s)
+                sampled_inset(s.clearance, s.approach, self.spec.braking, self.plant.control_dt)
                 for s in self._seen()
             ]
         )
@@ -148,7 +148,7 @@ class BoundClearance(BoundConstraint):
         reserve = {"state_error": self.spec.state_error, "margin": self.spec.margin}
         for near, clearance, approach, relative, drift, effect in self._seen():
             limit = sampled_acceleration_limit(
-                clearance, approach, self.spec.braking, self.plant.hold_s, **reserve
+                clearance, approach, self.spec.braking, self.plant.control_dt, **reserve
             )
             # approach acceleration = -n . (drift + effect u) - |sideways speed|^2 * curvature
             bend = (

@@ -2,7 +2,7 @@
 
 import warnings
 from abc import abstractmethod
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,25 +38,29 @@ def mujoco_rollouts(plant: Plant, asker: str) -> MujocoPlant:
     )
 
 
+RENAMED: Final = {"holds": "horizon", "reach": "max_decrease"}
+"""Old names of parameters of its subclasses."""
+
+
 class RolloutConstraint(Constraint):
     """A requirement along a rollout: the held control first, braking after it.
 
-    Attributes of a subclass (dataclass fields): `margin` (units of the value), `holds` (control intervals to
-    look ahead), `reach` (units of the value, or None: always forecast).
+    Attributes of a subclass (dataclass fields): `margin` (units of the value), `horizon` (control intervals to
+    look ahead), `max_decrease` (units of the value, or None: always forecast).
     """
 
     margin: float
-    holds: int
-    reach: float | None
+    horizon: int
+    max_decrease: float | None
     unit: ClassVar[str] = "units of the value"
 
     def _check_shared(self) -> None:
         self.margin = non_negative("margin", self.margin, self.unit)
-        whole = isinstance(self.holds, float | np.floating) and float(self.holds).is_integer()
-        holds = int(self.holds) if whole else self.holds
-        self.holds = whole_number("holds", holds, 1, "control intervals to look ahead")
-        if self.reach is not None:
-            self.reach = positive("reach", self.reach, self.unit)
+        whole = isinstance(self.horizon, float | np.floating) and float(self.horizon).is_integer()
+        horizon = int(self.horizon) if whole else self.horizon
+        self.horizon = whole_number("horizon", horizon, 1, "control intervals to look ahead")
+        if self.max_decrease is not None:
+            self.max_decrease = positive("max_decrease", self.max_decrease, self.unit)
 
 
 class BoundSlacks(BoundConstraint):
@@ -88,7 +92,7 @@ class RolloutMemory(NamedTuple):
     """What a rollout constraint remembers of an episode.
 
     Attributes:
-        least: What was left at the last states, the newest last, at most `holds` of them.
+        least: What was left at the last states, the newest last, at most `horizon` of them.
         response: How what is left at every instant changes with a control, and the observation until which it is
             kept; None: not known.
     """
@@ -104,7 +108,8 @@ class BoundRollout(BoundSlacks):
     This class decides from it (`admits`), linearises about a refused control (`linearize`) and says what a control
     leaves (`slack`).
 
-    A forecast costs at least as much as a step of the env. So `reach` may declare how far `value` can fall at most
+    A forecast costs at least as much as a step of the env. So `max_decrease` may declare how far `value` can fall at
+    most
     within the forecast, for any control: a state with more than that left needs none. The declaration is checked at
     every step, and dropped with a warning when broken.
     """
@@ -115,7 +120,7 @@ class BoundRollout(BoundSlacks):
 
     def __init__(self, spec: RolloutConstraint, plant: Plant) -> None:
         super().__init__(spec, mujoco_rollouts(plant, type(spec).__name__))
-        self._reach = spec.reach
+        self._max_decrease = spec.max_decrease
 
     @abstractmethod
     def _room(self, forecast: Forecast) -> Array:
@@ -136,26 +141,28 @@ class BoundRollout(BoundSlacks):
         self._linearized = 0
         self._least = float(self._value.min(initial=np.inf))
         self._recent, self._response = memory
-        if self._reach is not None:
-            self._check_reach(self._reach)
+        if self._max_decrease is not None:
+            self._check_max_decrease(self._max_decrease)
         self._outside = self._violation(self._value)
         margin = self.spec.margin
-        self._far = self._reach is not None and self._least - self._reach >= margin + self.tolerance
+        self._far = (
+            self._max_decrease is not None and self._least - self._max_decrease >= margin + self.tolerance
+        )
 
-    def _check_reach(self, reach: float) -> None:
+    def _check_max_decrease(self, max_decrease: float) -> None:
         fallen = max(self._recent, default=-np.inf) - self._least
-        if fallen > reach + self.tolerance:
+        if fallen > max_decrease + self.tolerance:
             warnings.warn(
                 f"{type(self.spec).__name__}: what is left of the limit fell by {fallen:.3g} {self.spec.unit} within "
-                f"{len(self._recent)} control steps, farther than the declared reach of {reach:g}; from now on every "
-                "control is forecast",
+                f"{len(self._recent)} control steps, farther than the declared max_decrease of {max_decrease:g}; "
+                "from now on every control is forecast",
                 stacklevel=2,
             )
-            self._reach = None
+            self._max_decrease = None
 
     def executed(self, control: Array) -> Memory:
-        """What was left in the last `holds` states, and the response if it is known."""
-        recent = (*self._recent, self._least)[-self.spec.holds :] if self._reach is not None else ()
+        """What was left in the last `horizon` states, and the response if it is known."""
+        recent = (*self._recent, self._least)[-self.spec.horizon :] if self._max_decrease is not None else ()
         return RolloutMemory(recent, self._response)
 
     def value(self) -> Array:
@@ -168,7 +175,7 @@ class BoundRollout(BoundSlacks):
 
     def slacks(self, control: Array) -> Array:
         """What is left of what is asked for along the forecast of a control, shape (k,); wanted >= 0."""
-        left = self._room(self.plant.forecast(control, self.spec.holds)) - self.spec.margin
+        left = self._room(self.plant.forecast(control, self.spec.horizon)) - self.spec.margin
         if not self._outside.any():
             return np.asarray(left.min(axis=0))
         # From outside, bound by bound: no farther out on the way, and closer at the end.
@@ -176,7 +183,7 @@ class BoundRollout(BoundSlacks):
 
     def _closer(self) -> Array:
         """What is left of the present violations at the end of a forecast, <= 0, shape (n,)."""
-        return np.asarray(self._outside * np.exp(-self.spec.holds * self.plant.hold_s / RECOVERY_S))
+        return np.asarray(self._outside * np.exp(-self.spec.horizon * self.plant.control_dt / RECOVERY_S))
 
     def admits(self, control: Array) -> bool:
         """Whether the forecast keeps the margin (from outside: whether it comes back towards it)."""
@@ -201,27 +208,27 @@ class BoundRollout(BoundSlacks):
             return super().rows()
         if self._linear is None:
             braking = self.plant.braking()
-            if self._response is None or self.plant.stamp >= self._response[1]:
+            if self._response is None or self.plant.observation_id >= self._response[1]:
                 self._respond(braking)
             self._linear = self._instants(braking)
         return self._linear
 
     def _respond(self, control: Array) -> None:
         """How what is left at every instant changes with a control, by differences, shape (instants, n, nu)."""
-        plant, holds = self.plant, self.spec.holds
-        room = self._room(plant.forecast(control, holds))
+        plant, horizon = self.plant, self.spec.horizon
+        room = self._room(plant.forecast(control, horizon))
         step = np.where(control < 0.0, _STEP, -_STEP) * (plant.upper - plant.lower)
-        changed = [self._room(plant.forecast(control + part, holds)) for part in np.diag(step)]
+        changed = [self._room(plant.forecast(control + part, horizon)) for part in np.diag(step)]
         parts = [(other - room) / width for other, width in zip(changed, step, strict=True)]
-        self._response = np.stack(parts, axis=-1), plant.stamp + _KEPT
+        self._response = np.stack(parts, axis=-1), plant.observation_id + _KEPT
 
     def _instants(self, control: Array) -> HalfSpaces:
         """A row for every bound that some control could break, at a few instants of a control's forecast."""
         assert self._response is not None  # `rows` is asked first
-        plant, holds = self.plant, self.spec.holds
-        left = self._room(plant.forecast(control, holds)) - self.spec.margin - self._outside
+        plant, horizon = self.plant, self.spec.horizon
+        left = self._room(plant.forecast(control, horizon)) - self.spec.margin - self._outside
         left[-1] += self._outside - self._closer()
-        each = len(left) // holds
+        each = len(left) // horizon
         chosen = [i for i in range(len(left)) if i % each + 1 in (*_INSTANTS, each)]
         left, response = left[chosen], self._response[0][chosen]
         away = np.where(response > 0.0, plant.lower - control, plant.upper - control)

@@ -82,10 +82,13 @@ class BoundTrackPermission(BoundConstraint):
         acted = np.abs(effect).max(axis=1) > 1e-12
         v, drift, effect = v[acted], drift[acted], effect[acted]
         speed = float(np.sqrt(v @ v))
-        left = max(0.0, 1.0 - self.spec.braking * self.plant.hold_s / speed) if speed > 0.0 else 0.0
+        left = max(0.0, 1.0 - self.spec.braking * self.plant.control_dt / speed) if speed > 0.0 else 0.0
         # The speed in each axis at the end of the hold: what braking leaves, and a share of the room up to `creep`.
         # All axes together are then no faster than the larger of the two.
         room = max(0.0, self.spec.creep**2 - (left * speed) ** 2) / max(v.size, 1)
         allowed = np.sqrt((left * v) ** 2 + room)
-        least, most = (-allowed - v) / self.plant.hold_s - drift, (allowed - v) / self.plant.hold_s - drift
+        least, most = (
+            (-allowed - v) / self.plant.control_dt - drift,
+            (allowed - v) / self.plant.control_dt - drift,
+        )
         return HalfSpaces(np.concatenate([effect, -effect]), np.concatenate([most, -least]))

@@ -149,7 +149,7 @@ class BoundTraction(BoundConstraint):
         self._read_constants()
 
     def _read_constants(self) -> None:
-        self._revision = self.plant.revision
+        self._model_version = self.plant.model_version
         self._constants = self._wheels.constants(self.plant)
         options = self.plant.model.opt
         self._response = self._constants.response(
@@ -178,7 +178,7 @@ class BoundTraction(BoundConstraint):
         _, self._rate, self._time, self._ground, self._slip, self._across, *rest = memory
         self._load, self._most_load, self._faster, self._slower, *measured = rest
         self._ahead, self._traction, self._present = measured
-        if self.plant.revision != self._revision:
+        if self.plant.model_version != self._model_version:
             self._read_constants()
         rate, ground, sideways = self._wheels.motion(self.plant)
         published = self.plant.published()
@@ -192,7 +192,7 @@ class BoundTraction(BoundConstraint):
         faster = np.maximum(np.maximum(np.abs(ground), np.abs(wheel)), self.spec.regularization)
         across = np.abs(sideways) / faster
         elapsed, self._time = self.plant.time - self._time, self.plant.time
-        held = math.isclose(elapsed, self.plant.hold_s, rel_tol=1e-6)
+        held = math.isclose(elapsed, self.plant.control_dt, rel_tol=1e-6)
         again = elapsed == 0.0 and bool((rate == self._rate).all())  # keeps what was measured
         if self._rate is None or not (held or again):
             # Nothing before it, or a clock that was set: no held control led from that state to this one.
@@ -240,7 +240,7 @@ class BoundTraction(BoundConstraint):
         mean_load, along = 0.5 * (load + self._load), 0.5 * (slip + self._slip)
         total = np.hypot(along, 0.5 * (across + self._across))
         self._most_load = np.maximum(self._most_load, mean_load)
-        self._estimate.travel(np.abs(ground) * self.plant.hold_s)
+        self._estimate.travel(np.abs(ground) * self.plant.control_dt)
         loaded = np.minimum(load, self._load) > _LEAST_LOAD * self._most_load
         usable = loaded & rolls & (self._traction * along > 0.0) & (np.abs(along) > _LEAST_SHARE * total)
         # The force points against the sliding: its part along the heading is the part of the slip there.

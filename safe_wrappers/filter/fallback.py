@@ -103,5 +103,5 @@ def brake(plant: Any) -> Array:
     scale = float(np.sqrt((a * a).sum(axis=0).max(initial=1e-12)))
     low, high = plant.acting_range
     stacked = np.vstack([a / scale, 1e-4 * np.eye(low.size)])
-    aim = np.concatenate([-(plant.qvel / plant.hold_s + drift) * weight / scale, np.zeros(low.size)])
+    aim = np.concatenate([-(plant.qvel / plant.control_dt + drift) * weight / scale, np.zeros(low.size)])
     return box_least_squares(stacked, aim, low, high)

@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.env_checks import (
     check_delay,
@@ -21,6 +22,7 @@ from safe_wrappers.plants.plant import Plant
 Array = NDArray[np.float64]
 
 
+@deprecated_parameters(renamed={"hold_s": "control_dt"})
 class AnalyticPlant(Plant):
     """`x' = f(x) + g(x) u` from plain functions.
 
@@ -30,7 +32,7 @@ class AnalyticPlant(Plant):
         state: Takes the (unwrapped) env, returns x.
         lower: Smallest control, shape (m,) or scalar; None takes the action space's.
         upper: Largest control, likewise.
-        hold_s: Control interval in s; None takes the env's `dt`. An env that names none needs it.
+        control_dt: Control interval in s; None takes the env's `dt`. An env that names none needs it.
         delay_s: Delay from measurement to effect in s; predicted over with the commands in flight.
 
     Raises:
@@ -47,8 +49,8 @@ class AnalyticPlant(Plant):
         >>> env = sw.CBFActionFilter(gym.make("Pendulum-v1", g=1.62), [slow], plant=plant)
     """
 
-    hold_s: float
-    """Control interval, s; without a `hold_s` of the user's known once the plant is bound to an env."""
+    control_dt: float
+    """Control interval, s; without a `control_dt` of the user's known once the plant is bound to an env."""
 
     def __init__(
         self,
@@ -57,16 +59,16 @@ class AnalyticPlant(Plant):
         state: Callable[[Any], ArrayLike],
         lower: ArrayLike | None = None,
         upper: ArrayLike | None = None,
-        hold_s: float | None = None,
+        control_dt: float | None = None,
         delay_s: float = 0.0,
     ) -> None:
         for name, function in (("f", f), ("g", g), ("state", state)):
             if not callable(function):
                 raise ConfigurationError(f"{name} must be a function, got {function!r}")
         self._f, self._g, self._state_of = f, g, state
-        self._given_hold_s = None if hold_s is None else seconds("hold_s", hold_s)
-        if self._given_hold_s is not None:
-            self.hold_s = self._given_hold_s
+        self._given_control_dt = None if control_dt is None else seconds("control_dt", control_dt)
+        if self._given_control_dt is not None:
+            self.control_dt = self._given_control_dt
         self.delay_s = seconds("delay_s", delay_s)
         self._box = (lower, upper)
         self._env: gym.Env[Any, Any] | None = None
@@ -78,9 +80,9 @@ class AnalyticPlant(Plant):
     def bind(self, env: gym.Env[Any, Any]) -> None:
         """Attach to an env: checks the time step and the bounds."""
         refuse_second_env(self._env, env)
-        self.hold_s = check_timing(env, self._given_hold_s)
+        self.control_dt = check_timing(env, self._given_control_dt)
         check_delay(self.delay_s)
-        self._pending = deque(maxlen=max(1, int(np.ceil(self.delay_s / self.hold_s - 1e-9))))
+        self._pending = deque(maxlen=max(1, int(np.ceil(self.delay_s / self.control_dt - 1e-9))))
         space = env.action_space
         assert isinstance(space, gym.spaces.Box)  # the filter has refused every other space
         m = space.shape[0]
@@ -100,7 +102,7 @@ class AnalyticPlant(Plant):
 
     def observe(self) -> None:
         """Read the state, predict it over the delay."""
-        self.stamp += 1
+        self.observation_id += 1
         assert self._env is not None  # bound by the filter
         x = np.array(self._state_of(self._env.unwrapped), dtype=np.float64).reshape(-1)
         if self.delay_s > 0.0:
@@ -119,11 +121,11 @@ class AnalyticPlant(Plant):
 
         Before the first command of an episode no control acts.
         """
-        early = self.delay_s - self.hold_s * len(self._pending)
+        early = self.delay_s - self.control_dt * len(self._pending)
         if early > 0.0:
             x = self.integrate(x, np.zeros(self._lower.size), early)
         for i, control in enumerate(self._pending):
-            x = self.integrate(x, control, self.hold_s + (min(early, 0.0) if i == 0 else 0.0))
+            x = self.integrate(x, control, self.control_dt + (min(early, 0.0) if i == 0 else 0.0))
         return x
 
     def integrate(self, x: Array, control: Array, span_s: float, substeps: int = 4) -> Array:
@@ -142,7 +144,7 @@ class AnalyticPlant(Plant):
 
         And the end by one Euler step: many envs integrate that way, and their truth counts.
         """
-        x, hold = self._x, self.hold_s
+        x, hold = self._x, self.control_dt
         k1 = self.f + self.g @ control
         k2 = self._rate(x + 0.5 * hold * k1, control)
         k3 = self._rate(x + 0.5 * hold * k2, control)

@@ -91,7 +91,7 @@ class DisplacementPlant(MujocoPlant):
         delayed = self._delay_steps / self.substeps
         if delayed != int(delayed):
             raise ConfigurationError(
-                f"delay_s = {self.delay_s} s is not a whole number of control intervals of {self.hold_s} s: a "
+                f"delay_s = {self.delay_s} s is not a whole number of control intervals of {self.control_dt} s: a "
                 "displacement counts from where the gripper is when a control interval starts"
             )
 
@@ -124,11 +124,11 @@ class DisplacementPlant(MujocoPlant):
         self._keep()
         self._pose[:3], self._pose[3:] = self.data.xpos[self._body], self.data.xquat[self._body]
 
-    def forecast(self, control: Array, holds: int = 1) -> Forecast:
+    def forecast(self, control: Array, horizon: int = 1) -> Forecast:
         """What a displacement leads to: held for one control interval, then none."""
         if self.blocked:  # one forecast for all that differ in what does nothing
             control = np.append(control[:3], 0.0)
-        return super().forecast(control, holds)
+        return super().forecast(control, horizon)
 
     def forward(self) -> mujoco.MjData:
         """The plant's data, every derived quantity up to date at the present state, mocap body and servos as set."""

@@ -70,8 +70,8 @@ def check_delay(delay_s: float) -> None:
         raise ConfigurationError(f"delay_s is a time in seconds, >= 0; got {delay_s}")
 
 
-def check_timing(env: gym.Env[Any, Any], hold_s: float | None) -> float:
-    """How long one action is held, s: the env's `dt`, or `hold_s` where the env has none.
+def check_timing(env: gym.Env[Any, Any], control_dt: float | None) -> float:
+    """How long one action is held, s: the env's `dt`, or `control_dt` where the env has none.
 
     Raises:
         ConfigurationError: Neither is there, or they disagree, or it is no time above 0.
@@ -80,18 +80,18 @@ def check_timing(env: gym.Env[Any, Any], hold_s: float | None) -> float:
         dt = float(env.get_wrapper_attr("dt"))
     except (AttributeError, TypeError, ValueError):
         dt = None
-    if hold_s is None and dt is None:
+    if control_dt is None and dt is None:
         raise ConfigurationError(
-            f"{name_of(env)} does not say how long a step lasts (it has no attribute dt): pass hold_s, in seconds"
+            f"{name_of(env)} does not say how long a step lasts (it has no attribute dt): pass control_dt, in seconds"
         )
-    hold = seconds("hold_s", dt if hold_s is None else hold_s)
+    hold = seconds("control_dt", dt if control_dt is None else control_dt)
     if not (np.isfinite(hold) and hold > 0.0):
-        whose = "the env's dt" if hold_s is None else "hold_s"
+        whose = "the env's dt" if control_dt is None else "control_dt"
         raise ConfigurationError(f"{whose} is the control interval in seconds, > 0; got {hold}")
     if dt is not None and not np.isclose(dt, hold, rtol=1e-6):
         raise ConfigurationError(
-            f"hold_s = {hold} s, but one step of this env lasts dt = {dt} s; a filter that looks ahead by "
-            "another interval than the env's promises nothing: pass hold_s equal to env.unwrapped.dt"
+            f"control_dt = {hold} s, but one step of this env lasts dt = {dt} s; a filter that looks ahead by "
+            "another interval than the env's promises nothing: pass control_dt equal to env.unwrapped.dt"
         )
     return hold
 

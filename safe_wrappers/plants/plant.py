@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.deprecation import deprecated_attribute
 from safe_wrappers.errors import UnsupportedEnvError
 
 Array = NDArray[np.float64]
@@ -20,17 +21,20 @@ class Plant(ABC):
     """A control-affine machine `x' = f(x) + g(x) u`, read afresh from an env at every step.
 
     Attributes:
-        hold_s: Control interval in s: how long one action is held.
+        control_dt: Control interval in s: how long one action is held.
         delay_s: Evidence age plus detection plus actuation delay in s; the state that the constraints see is
             predicted over it with the commands in flight.
-        stamp: Counts observations.
-        revision: Counts changes of the model, so that a constraint can read its constants anew.
+        observation_id: Counts observations.
+        model_version: Counts changes of the model, so that a constraint can read its constants anew.
     """
 
-    hold_s: float
+    control_dt: float
     delay_s: float
-    stamp: int = 0
-    revision: int = 0
+    observation_id: int = 0
+    model_version: int = 0
+    hold_s = deprecated_attribute("hold_s", "control_dt")
+    stamp = deprecated_attribute("stamp", "observation_id")
+    revision = deprecated_attribute("revision", "model_version")
     has_acceleration: ClassVar[bool] = True
     """Whether a control acts as a force, so that `f` and `g` are known."""
     bounds_are_action_space: ClassVar[bool] = False

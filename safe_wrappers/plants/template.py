@@ -7,7 +7,7 @@ from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.plant import Plant
 
 
-class PlantOfSpec:
+class PlantTemplate:
     """A plant as an env's spec keeps it: every env that is made from the spec gets one of its own."""
 
     def __init__(self, plant: Plant) -> None:
@@ -20,7 +20,7 @@ class PlantOfSpec:
 
 def own_plant(plant: Any) -> Plant | None:
     """The plant that was given, a fresh one if it comes from a spec, or an error if it is none."""
-    if isinstance(plant, PlantOfSpec):
+    if isinstance(plant, PlantTemplate):
         return plant.fresh()
     if plant is not None and not isinstance(plant, Plant):
         raise ConfigurationError(

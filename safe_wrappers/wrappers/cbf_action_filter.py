@@ -23,7 +23,7 @@ from safe_wrappers.filter.search import Stage
 from safe_wrappers.plants.default import default_plant
 from safe_wrappers.plants.env_checks import check_actions, wrappers_of
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.template import PlantOfSpec, own_plant
+from safe_wrappers.plants.template import PlantTemplate, own_plant
 from safe_wrappers.serialize import constraint_from, plain_data
 from safe_wrappers.stack import Layer, refuse_order
 
@@ -102,7 +102,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         gym.utils.RecordConstructorArgs.__init__(
             self,
             constraints=[plain_data(c) for c in own],
-            plant=None if plant is None else PlantOfSpec(plant),
+            plant=None if plant is None else PlantTemplate(plant),
             fallback=fallback,
             solver=solver,
             margin=margin,

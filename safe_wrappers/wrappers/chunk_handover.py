@@ -17,7 +17,7 @@ from safe_wrappers.errors import ActionError, UnknownNameError
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.env_checks import check_actions, check_timing
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.template import PlantOfSpec, own_plant
+from safe_wrappers.plants.template import PlantTemplate, own_plant
 from safe_wrappers.serialize import plain_numbers, recorded
 from safe_wrappers.stack import Layer, refuse_order
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
@@ -44,7 +44,7 @@ _REST: Final = {
 """What a reset reports beside `handover/seam_jump`."""
 
 
-@deprecated_parameters(renamed={"jerk_limit": "rate_limit"})
+@deprecated_parameters(renamed={"jerk_limit": "rate_limit", "hold_s": "control_dt"})
 class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, CommandReceiver):
     """Executes action chunks that come late, over seams that keep a rate limit.
 
@@ -89,7 +89,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             where the command is an acceleration or a torque).
         fallback: "brake", "hold", "zero", or a function of the plant; "brake" needs MuJoCo or a plant.
         plant: For the fallback; None reads the env's MuJoCo model.
-        hold_s: Control interval, s; None reads the env's `dt`.
+        control_dt: Control interval, s; None reads the env's `dt`.
         decay: Of the ensemble's weights.
         steps_per_entry: Control steps from one entry of a chunk to the next, for policies that are slower than the
             control loop: the commands between are a cubic Hermite spline's (`wrappers/handover/upsampling.py`). H
@@ -134,7 +134,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         rate_limit: float | Sequence[float] | None = None,
         fallback: str | FallbackFunction = "brake",
         plant: Plant | None = None,
-        hold_s: float | None = None,
+        control_dt: float | None = None,
         decay: float = 0.01,
         steps_per_entry: int = 1,
         clock_error_s: float = 0.0,
@@ -148,7 +148,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         if blend not in (*BLENDS, *BASELINES):
             raise UnknownNameError(f"no blend {blend!r}; choose {', '.join((*BLENDS, *BASELINES))}")
         decay = non_negative("decay", decay, "a number")
-        blend_time, rate_limit, hold_s = map(plain_numbers, (blend_time, rate_limit, hold_s))
+        blend_time, rate_limit, control_dt = map(plain_numbers, (blend_time, rate_limit, control_dt))
         gym.utils.RecordConstructorArgs.__init__(
             self,
             **recorded(
@@ -158,15 +158,15 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
                 inference_delay=sizes.delay[0] if sizes.delay[0] == sizes.delay[1] else list(sizes.delay),
                 blend_time=blend_time,
                 rate_limit=rate_limit,
-                plant=None if plant is None else PlantOfSpec(plant),
-                hold_s=hold_s,
+                plant=None if plant is None else PlantTemplate(plant),
+                control_dt=control_dt,
                 decay=decay,
                 steps_per_entry=sizes.steps_per_entry,
             ),
         )
         gym.Wrapper.__init__(self, env)
         self.chunk_size, self.execution_horizon, self.blend = sizes.entries, sizes.horizon, blend
-        self.hold_s = check_timing(env, hold_s)
+        self.control_dt = check_timing(env, control_dt)
         self._delay = sizes.delay
         self._clock_error_s = non_negative("clock_error_s", clock_error_s, "s")
         self._upsampling = Upsampling(sizes.entries, sizes.steps_per_entry)
@@ -177,10 +177,10 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             dtype=space.dtype,
         )
         self._fallback = FallbackController(env, fallback, plant)
-        fewest, rate_limits = blend_bounds(sizes, space, self.hold_s, blend, blend_time, rate_limit)
+        fewest, rate_limits = blend_bounds(sizes, space, self.control_dt, blend, blend_time, rate_limit)
         self._queue = ChunkQueue(
             self._controls,
-            self.hold_s,
+            self.control_dt,
             blend=blend,
             fewest=fewest,
             rate_limit=rate_limits,
@@ -220,7 +220,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             if command.took_over:
                 latency = now - command.observed
             if self._inside is not None:
-                observed_s = None if command.observed < 0 else command.observed * self.hold_s
+                observed_s = None if command.observed < 0 else command.observed * self.control_dt
                 self._inside.set_observation_time(observed_s)
             observation, reward, terminated, truncated, info = self.env.step(command.control)
             executed = np.array(info.get(keys.EXECUTED_ACTION, command.control), dtype=np.float64)
@@ -242,7 +242,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
     @property
     def now_s(self) -> float:
         """Seconds of the episode so far, on the clock of control steps."""
-        return self._queue.now * self.hold_s
+        return self._queue.now * self.control_dt
 
     def switch(self, source: str) -> None:
         """Name the source of the chunks from now on; the change is blended, from the last command.
@@ -292,9 +292,9 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         if not np.isfinite(chunk).all():
             return False
         observed_s = self._observed_s
-        if self.now_s < observed_s <= self.now_s + self._clock_error_s + _SAME_STEP * self.hold_s:
+        if self.now_s < observed_s <= self.now_s + self._clock_error_s + _SAME_STEP * self.control_dt:
             observed_s = self.now_s
-        observed = math.floor(observed_s / self.hold_s + _SAME_STEP)
+        observed = math.floor(observed_s / self.control_dt + _SAME_STEP)
         return self._queue.submit(self._upsampling.commands(chunk), observed, self._queue.now + delay)
 
     def _start(self) -> None:
@@ -318,7 +318,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             at_seam = steps[counted[len(counted) - len(steps) :]]
             jump[order - 1] = at_seam.max(initial=0.0)
             if order == 1:
-                peak = float(steps.max(initial=0.0)) / self.hold_s
+                peak = float(steps.max(initial=0.0)) / self.control_dt
         self._executed, self._in_seam = self._executed[-DIFFERENCES:], []
         blends = [c.blend_steps for c in commands if c.blend_steps]
         limited = sum(c.limited for c in commands)
@@ -333,7 +333,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         return {
             keys.HANDOVER_SEAM_JUMP: jump,
             keys.HANDOVER_PEAK_JERK: peak,
-            keys.HANDOVER_BLEND_TIME: (max(blends) + 1) * self.hold_s if blends else 0.0,
+            keys.HANDOVER_BLEND_TIME: (max(blends) + 1) * self.control_dt if blends else 0.0,
             keys.HANDOVER_STARVED: sum(c.starved for c in commands),
             keys.HANDOVER_LIMITED: limited,
             keys.HANDOVER_STEPS: len(commands),

@@ -19,7 +19,7 @@ from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.env_checks import check_actions, check_timing, refuse_changed_actions
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.template import PlantOfSpec, own_plant
+from safe_wrappers.plants.template import PlantTemplate, own_plant
 from safe_wrappers.serialize import plain_data, recorded
 from safe_wrappers.stack import Layer, refuse_order
 from safe_wrappers.wrappers.cbf_action_filter import is_filtered
@@ -40,7 +40,12 @@ _SAME_TIME: Final = 1e-6
 
 
 @deprecated_parameters(
-    renamed={"longest_s": "max_lease_s", "least_s": "min_lease_s"},
+    renamed={
+        "longest_s": "max_lease_s",
+        "least_s": "min_lease_s",
+        "reach": "motion_limits",
+        "hold_s": "control_dt",
+    },
     moved={"budget": StoppingBudget},
     positional=("braking", "acceleration", "closing_speed", "top_speed"),
 )
@@ -88,14 +93,15 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         blend_time: s, of the way back from the fallback to a fresh command.
         brake_blend_time: s, of the way to the fallback; it counts in the budget. 0: at once.
         clock_error_s: Bound on how wrong the times of observations may be, s; it counts in the budget.
-        reach: Limits on the motion, {"max_acceleration": ..., "max_speed": ..., "max_jerk": ..., "arrival": "moving"
+        motion_limits: Limits on the motion, {"max_acceleration": ..., "max_speed": ..., "max_jerk": ..., "arrival":
+            "moving"
             or "rest"}, for actions that are position setpoints: `ChunkHandover` then has a chunk refused whose end is
             out of reach in its time (`wrappers/lease/admission.py`).
-        measured: For `reach`: a function of the env that returns positions, velocities and, for an arrival at rest
-            with limited jerk, accelerations; None reads the lengths of the MuJoCo actuators.
+        measured: For `motion_limits`: a function of the env that returns positions, velocities and, for an arrival at
+            rest with limited jerk, accelerations; None reads the lengths of the MuJoCo actuators.
         fallback: "brake", "hold", "zero", or a function of the plant.
         plant: For the constraint and the fallback; None reads the env's MuJoCo model.
-        hold_s: Control interval, s; None reads the env's `dt`.
+        control_dt: Control interval, s; None reads the env's `dt`.
 
     Info, at every step: ``lease/remaining_s`` (float), ``lease/expired``, ``lease/refused``, ``lease/braking``
     (bool).
@@ -140,11 +146,11 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         blend_time: float = 0.1,
         brake_blend_time: float = 0.0,
         clock_error_s: float = 0.0,
-        reach: Mapping[str, Any] | None = None,
+        motion_limits: Mapping[str, Any] | None = None,
         measured: Measured | None = None,
         fallback: str | FallbackFunction = "brake",
         plant: Plant | None = None,
-        hold_s: float | None = None,
+        control_dt: float | None = None,
     ) -> None:
         arguments = dict(locals())
         refuse_order(env, self.layer, type(self).__name__)
@@ -156,17 +162,17 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
             **recorded(
                 arguments,
                 budget=plain_data(budget),
-                reach=dict(reach) if isinstance(reach, Mapping) else reach,
-                plant=None if plant is None else PlantOfSpec(plant),
+                motion_limits=dict(motion_limits) if isinstance(motion_limits, Mapping) else motion_limits,
+                plant=None if plant is None else PlantTemplate(plant),
             ),
         )
         gym.Wrapper.__init__(self, env)
-        self.hold_s = check_timing(env, hold_s)
-        self._same_s = _SAME_TIME * self.hold_s
+        self.control_dt = check_timing(env, control_dt)
+        self._same_s = _SAME_TIME * self.control_dt
         self._max_lease_s = positive("max_lease_s", max_lease_s, "s")
-        if self._max_lease_s < self.hold_s - self._same_s:
+        if self._max_lease_s < self.control_dt - self._same_s:
             raise ConfigurationError(
-                f"max_lease_s = {max_lease_s} s is less than one control step, {self.hold_s} s: no command would "
+                f"max_lease_s = {max_lease_s} s is less than one control step, {self.control_dt} s: no command would "
                 "ever be executed"
             )
         self._min_lease_s = _min_lease(env, min_lease_s, self._max_lease_s)
@@ -175,15 +181,17 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         self._clock_error_s = non_negative("clock_error_s", clock_error_s, "s")
         delays = {"detect_s": detect_s, "confirm_s": confirm_s, "age_s": age_s}
         of_formula = LeaseDelays(*(non_negative(name, value, "s") for name, value in delays.items()))
-        self._delays_s = of_formula.total_s + self._brake_steps * self.hold_s + self._clock_error_s
+        self._delays_s = of_formula.total_s + self._brake_steps * self.control_dt + self._clock_error_s
         self._delays_s += self._same_s  # by which a step may outlast its lease
         self._budget = BoundBudget(budget, env)
         plant = self._budget.plant_of(plant)
         self._fallback = FallbackController(env, fallback, plant, self._budget.constraint)
         self._budget.bind(plant, self._fallback.constraint)
-        if reach is None and measured is not None:
-            raise ConfigurationError("measured is for reach, which is missing: give both, or neither")
-        self._admission = None if reach is None else Admission(env, reach, measured, space.shape[0])
+        if motion_limits is None and measured is not None:
+            raise ConfigurationError("measured is for motion_limits, which is missing: give both, or neither")
+        self._admission = (
+            None if motion_limits is None else Admission(env, motion_limits, measured, space.shape[0])
+        )
         self._shape, self._dtype = space.shape, space.dtype
         self._box = tuple(
             np.nan_to_num(np.asarray(end)).astype(np.float64) for end in (space.low, space.high)
@@ -213,7 +221,7 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         arrived, fresh, refused = self._accept(given, now)
         if fresh:
             refused |= not self._grant(now)
-        covered = now + self.hold_s <= self._until_s + self._same_s
+        covered = now + self.control_dt <= self._until_s + self._same_s
         expired = not covered and self._until_s > -math.inf
         if covered:
             if arrived:
@@ -244,15 +252,15 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         return observation, reward, terminated, truncated, info
 
     def admits(self, end: Array, steps: int) -> bool:
-        """Whether the end of a chunk of position setpoints is within `reach`; a refusal is in the next step's info.
+        """Whether the end of a chunk of setpoints is within `motion_limits`; a refusal is in the next step's info.
 
-        Necessary only: what is admitted still needs its path and its stopping checked. True without `reach`.
+        Necessary only: what is admitted still needs its path and its stopping checked. True without `motion_limits`.
 
         Args:
             end: The chunk's last command, shape (m,).
             steps: Control steps from now to the end of that command.
         """
-        admitted = self._admission is None or self._admission.admits(end, steps * self.hold_s)
+        admitted = self._admission is None or self._admission.admits(end, steps * self.control_dt)
         self._chunk_refused |= not admitted
         return admitted
 
@@ -284,7 +292,7 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         longest_s = self._budget.longest_time(self._delays_s + max(now - self._newest_s, 0.0))
         lease = max(min(longest_s, self._max_lease_s), self._min_lease_s)
         # NaN gives no lease at all: a filter inside reads the same state.
-        granted = not math.isnan(longest_s) and lease + self._same_s >= self.hold_s
+        granted = not math.isnan(longest_s) and lease + self._same_s >= self.control_dt
         self._until_s = now + lease if granted else -math.inf
         return granted
 
@@ -306,7 +314,7 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
 
     def _steps(self, name: str, value: float) -> int:
         """Whole control steps, rounded up."""
-        return math.ceil(non_negative(name, value, "s") / self.hold_s - _SAME_TIME)
+        return math.ceil(non_negative(name, value, "s") / self.control_dt - _SAME_TIME)
 
     def _start(self) -> None:
         self._steps_done = 0

@@ -144,7 +144,7 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         )
         gym.Wrapper.__init__(self, env)
         self._raw, self._d, self._random = raw, len(axes), WrapperRng("OcclusionPenalty")
-        self._hold_s = control_interval(raw)
+        self._control_dt = control_interval(raw)
         self._matrix, self._noise = self.sensor.matrices(self._d)
         self._noise_root = np.linalg.cholesky(self._noise)
         self._look_at(raw.model)
@@ -279,8 +279,8 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
     def _elapsed(self) -> float:
         now = float(self._raw.data.time)
         elapsed, self._time = now - self._time, now
-        if abs(elapsed - self._hold_s) < 1e-9:
-            return self._hold_s
+        if abs(elapsed - self._control_dt) < 1e-9:
+            return self._control_dt
         if elapsed < 0.0:
             raise SafeWrappersError(
                 f"the simulation's time ran backwards by {-elapsed:g} s within a step; an estimate cannot. Reset the "
@@ -321,7 +321,7 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
                 self.last_seen_positions[which] = measurements[:, :d]
         self._visible = seen
         self._sigma = largest_deviation(self.tracking.position_covariances)
-        soon = largest_deviation(self.tracking.ahead([self._hold_s])[1][0])
+        soon = largest_deviation(self.tracking.ahead([self._control_dt])[1][0])
         self.permitted = self.sigmas * np.maximum(self._sigma, soon) <= self.tolerance
 
     def _uncertainty(self) -> float:

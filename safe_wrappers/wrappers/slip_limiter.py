@@ -8,7 +8,7 @@ import gymnasium as gym
 from safe_wrappers.constraints.traction import Traction
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.template import PlantOfSpec, own_plant
+from safe_wrappers.plants.template import PlantTemplate, own_plant
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 
 
@@ -73,7 +73,7 @@ class SlipLimiter(CBFActionFilter):
             max_slip=max_slip,
             friction=friction,
             regularization=regularization,
-            plant=None if plant is None else PlantOfSpec(plant),
+            plant=None if plant is None else PlantTemplate(plant),
             fallback=fallback,
             solver=solver,
             margin=margin,

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from safe_wrappers import info as keys
 from safe_wrappers.checks import settings_from
 from safe_wrappers.control.teleop.wave_line import Rule
+from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.env_checks import check_actions, check_timing, refuse_changed_actions
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.template import PlantOfSpec, own_plant
+from safe_wrappers.plants.template import PlantTemplate, own_plant
 from safe_wrappers.serialize import plain_data, recorded
 from safe_wrappers.stack import Layer, refuse_order
 from safe_wrappers.wrappers.cbf_action_filter import is_filtered
@@ -37,6 +38,7 @@ _SAME_TIME: Final = 1e-6
 """Control steps: times that are closer count as the same."""
 
 
+@deprecated_parameters(renamed={"hold_s": "control_dt"})
 class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, CommandReceiver):
     """Puts a network between the policy, as a remote operator, and the machine.
 
@@ -94,7 +96,7 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             operator who feels no force puts no energy in, so nothing would ever move.
         fallback: The local brake: "brake", "hold", "zero", or a function of the plant.
         plant: For the ceiling's constraint and the fallback; None reads the env's MuJoCo model.
-        hold_s: Control interval, s; None reads the env's `dt`.
+        control_dt: Control interval, s; None reads the env's `dt`.
         seed: A number that keeps the random numbers of several channels apart; they start anew with a reset's seed.
 
     Info, at every step: ``teleop/round_trip_s``, ``teleop/ceiling_s``, ``teleop/clearance_m``,
@@ -135,7 +137,7 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         storage_j: float | None = None,
         fallback: str | FallbackFunction = "brake",
         plant: Plant | None = None,
-        hold_s: float | None = None,
+        control_dt: float | None = None,
         seed: int = 0,
     ) -> None:
         arguments = dict(locals())
@@ -162,16 +164,16 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
                 downlink=plain_data(self.downlink),
                 ceiling=plain_data(watched),
                 port=plain_data(port),
-                plant=None if plant is None else PlantOfSpec(plant),
+                plant=None if plant is None else PlantTemplate(plant),
             ),
         )
         gym.Wrapper.__init__(self, env)
-        self.hold_s = check_timing(env, hold_s)
+        self.control_dt = check_timing(env, control_dt)
         self.port = port_from(port, env)
         self._coding = coding_from(
-            env, self.port, self.hold_s, coding, impedance, passivity, damping_limit, storage_j, wave_rule
+            env, self.port, self.control_dt, coding, impedance, passivity, damping_limit, storage_j, wave_rule
         )
-        self._same_s = _SAME_TIME * self.hold_s
+        self._same_s = _SAME_TIME * self.control_dt
         # Two channels, one around the other, are refused; so a number is enough to keep their lines apart.
         self._up = Line(self.uplink, f"TeleopChannel up {seed}", self._same_s)
         self._down = Line(self.downlink, f"TeleopChannel down {seed}", self._same_s)
@@ -179,7 +181,7 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         self._watch: RoundTripWatch | None = None
         self._fallback: FallbackController | None = None
         if watched is not None:
-            self._watch = RoundTripWatch(env, watched, self.hold_s, self._same_s)
+            self._watch = RoundTripWatch(env, watched, self.control_dt, self._same_s)
             plant = self._watch.budget.plant_of(plant)
         if watched is not None or missing == "fallback":
             refuse_changed_actions(env)
@@ -267,14 +269,14 @@ class TeleopChannel(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         return None
 
     def _send_up(self, action: NDArray[Any] | None, now_s: float) -> None:
-        observed_s, self._observed_s = self._observed_s, self.now_s + self.hold_s
+        observed_s, self._observed_s = self._observed_s, self.now_s + self.control_dt
         if observed_s is None or observed_s > now_s + self._same_s:
             action = None
         self._moved = flow = None if action is None else self._flow_of(action)
         extra = self._coding.near(flow)
         if action is None or observed_s is None:
             return
-        step = min(max(math.floor(observed_s / self.hold_s + _SAME_TIME), 0), len(self._images) - 1)
+        step = min(max(math.floor(observed_s / self.control_dt + _SAME_TIME), 0), len(self._images) - 1)
         sequence, lost = self._up.send(Up(action, self._images[step], extra), now_s)
         self._coding.sent_up(sequence, extra, lost)
         self._lost += lost

@@ -12,11 +12,12 @@ from safe_wrappers.constraints.contact.stance import Stance
 from safe_wrappers.constraints.contact.support_margin import SupportMargin
 from safe_wrappers.constraints.limits.joint_position_limit import JointPositionLimit
 from safe_wrappers.constraints.limits.joints import refuse_uncovered_stops, stops
+from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.template import PlantOfSpec, own_plant
+from safe_wrappers.plants.template import PlantTemplate, own_plant
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 
 TOLERANCE = 0.01
@@ -25,6 +26,7 @@ HOLDS = 3
 """Control steps to look ahead for the joints unless told otherwise."""
 
 
+@deprecated_parameters(renamed={"holds": "horizon"})
 class WholeBodyFilter(CBFActionFilter):
     """Keeps a legged robot's contact forces inside their friction cones and its joints off their stops.
 
@@ -60,7 +62,7 @@ class WholeBodyFilter(CBFActionFilter):
         tolerance: By how much a forecast contact force may miss its cone, as a share of the robot's weight; None is
             0.01. For forecasts only.
         bodies: Names of the bodies whose contacts count; None is every moving body. For forecasts only.
-        holds: Control steps to look ahead for the joints; cover the time that braking them takes; None is 3. For
+        horizon: Control steps to look ahead for the joints; cover the time that braking them takes; None is 3. For
             forecasts only.
         plant: None reads the env's model.
         fallback: As of `CBFActionFilter`.
@@ -95,13 +97,13 @@ class WholeBodyFilter(CBFActionFilter):
         zmp_inset: float | None = None,
         tolerance: float | None = None,
         bodies: Sequence[str] | None = None,
-        holds: int | None = None,
+        horizon: int | None = None,
         plant: Plant | None = None,
         fallback: str | FallbackFunction = "brake",
         solver: str = "daqp",
     ) -> None:
         constraints = _constraints(
-            env, contacts, friction_share, tolerance, joint_tolerance, zmp_inset, bodies, holds
+            env, contacts, friction_share, tolerance, joint_tolerance, zmp_inset, bodies, horizon
         )
         plant = own_plant(plant)
         gym.utils.RecordConstructorArgs.__init__(
@@ -112,8 +114,8 @@ class WholeBodyFilter(CBFActionFilter):
             zmp_inset=zmp_inset,
             tolerance=tolerance,
             bodies=None if bodies is None else list(bodies),
-            holds=holds,
-            plant=None if plant is None else PlantOfSpec(plant),
+            horizon=horizon,
+            plant=None if plant is None else PlantTemplate(plant),
             fallback=fallback,
             solver=solver,
         )
@@ -128,7 +130,7 @@ def _constraints(
     joint_tolerance: float | None,
     zmp_inset: float | None,
     bodies: Sequence[str] | None,
-    holds: int | None,
+    horizon: int | None,
 ) -> list[Constraint]:
     model = getattr(env.unwrapped, "model", None)
     if not isinstance(model, mujoco.MjModel):
@@ -143,12 +145,12 @@ def _constraints(
             raise UnsupportedEnvError(
                 "no driven joint of this model has a range: joint_tolerance=None leaves the joints alone"
             )
-    elif holds is not None:
+    elif horizon is not None:
         raise ConfigurationError(
-            "holds is how far to look ahead for the joints, which joint_tolerance=None leaves alone"
+            "horizon is how far to look ahead for the joints, which joint_tolerance=None leaves alone"
         )
     if contacts in ("pyramid", "cone"):
-        _only_for_forecasts(contacts, tolerance=tolerance, bodies=bodies, holds=holds)
+        _only_for_forecasts(contacts, tolerance=tolerance, bodies=bodies, horizon=horizon)
         cone: Any = "exact" if contacts == "cone" else "pyramid"
         return [Stance(friction_share, cone, joint_tolerance=joint_tolerance, zmp_inset=zmp_inset)]
     if contacts != "forecast":
@@ -163,7 +165,7 @@ def _constraints(
             lower=(low - joint_tolerance).tolist(),
             upper=(high + joint_tolerance).tolist(),
             joints=[model.joint(j).name for j in joints],
-            holds=HOLDS if holds is None else holds,
+            horizon=HOLDS if horizon is None else horizon,
         )
         found.append(within)
     return found

@@ -272,7 +272,7 @@ def ramps_energy(rates, durations, hold, k, j, m):
 @pytest.mark.parametrize("weights", [1.0, [3.0, 1.0]])
 def test_ramps_at_the_limit_stay_below_the_energy_and_come_near_it(hold, weights):
     allowed = 1e-3
-    limit = torque_slew_limit(allowed, *MACHINE, weights=weights, hold_s=hold)
+    limit = torque_slew_limit(allowed, *MACHINE, weights=weights, control_dt=hold)
     np.testing.assert_allclose(limit / limit[1], np.broadcast_to(weights, 2) / np.broadcast_to(weights, 2)[1])
     worst = max(
         ramps_energy(limit * signs, 3.0, hold, *MACHINE).max()
@@ -355,9 +355,9 @@ def test_batches_are_element_by_element():
         (lambda: smoothstep_energy([1.0, 0.0], np.nan, *MACHINE), "duration must be positive"),
         (lambda: torque_slew_limit(0.0, *MACHINE), "energy must be positive"),
         (lambda: torque_slew_limit(1.0, *MACHINE, weights=[1.0, -1.0]), "weights must be positive"),
-        (lambda: torque_slew_limit(1.0, *MACHINE, hold_s=0.04), r"half a period .*16\.5 Hz.* got 0\.04"),
-        (lambda: torque_slew_limit(1.0, *MACHINE, hold_s=-0.01), "hold_s must be 0 or more"),
-        (lambda: torque_slew_limit(1.0, *MACHINE, hold_s=np.nan), "hold_s must be 0 or more"),
+        (lambda: torque_slew_limit(1.0, *MACHINE, control_dt=0.04), r"half a period .*16\.5 Hz.* got 0\.04"),
+        (lambda: torque_slew_limit(1.0, *MACHINE, control_dt=-0.01), "control_dt must be 0 or more"),
+        (lambda: torque_slew_limit(1.0, *MACHINE, control_dt=np.nan), "control_dt must be 0 or more"),
     ],
 )
 def test_bad_input_is_refused(call, said):

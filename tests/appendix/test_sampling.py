@@ -95,8 +95,8 @@ def test_the_figures_of_the_module_s_docstring():
 @pytest.mark.parametrize(
     ("call", "says"),
     [
-        (lambda: hold_lag_s(-0.01), "hold_s must be >= 0"),
-        (lambda: hold_lag_s("slow"), "hold_s is a number in s"),
+        (lambda: hold_lag_s(-0.01), "control_dt must be >= 0"),
+        (lambda: hold_lag_s("slow"), "control_dt is a number in s"),
         (lambda: phase_lag(0.0, 0.01), "crossover must be > 0"),
         (lambda: phase_lag(np.nan, 0.01), "crossover must be > 0"),
         (lambda: phase_lag(1.0, 0.01, compute_s=-1e-3), "compute_s must be >= 0"),

@@ -42,7 +42,7 @@ def test_runners_get_a_lower_limit_and_nothing_else():
     env = gym.make("SafeAntVelocity-v0")
     (usual,), (lower,) = sw.protect(env).constraints, env_step.slower(0.3)(env).constraints
     assert lower.limit == 0.3 and usual.limit == 2.6222
-    assert (lower.direction, lower.holds, lower.margin) == (usual.direction, usual.holds, usual.margin)
+    assert (lower.direction, lower.horizon, lower.margin) == (usual.direction, usual.horizon, usual.margin)
 
 
 def test_every_timed_env_is_a_case():

@@ -69,11 +69,11 @@ class Judge:
         mujoco.mj_kinematics(self.raw.model, self._still)
         return float(np.min(self.room(self.raw.model, self._still)))
 
-    def ahead(self, control, holds):
+    def ahead(self, control, horizon):
         """Room after holding a control for some steps."""
         mujoco.mj_copyData(self.data, self.raw.model, self.raw.data)
         self.data.ctrl[:] = control
-        mujoco.mj_step(self.raw.model, self.data, nstep=holds * self.raw.frame_skip)
+        mujoco.mj_step(self.raw.model, self.data, nstep=horizon * self.raw.frame_skip)
         return self.at(self.data)
 
     def step(self, env, action):

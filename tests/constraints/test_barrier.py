@@ -34,7 +34,7 @@ class Spring(gym.Env):
 
 def spring_plant(dt=0.1):
     return sw.AnalyticPlant(
-        f=lambda x: -(x**2), g=lambda x: np.array([[4.0 + x[0]]]), state=lambda env: env.state, hold_s=dt
+        f=lambda x: -(x**2), g=lambda x: np.array([[4.0 + x[0]]]), state=lambda env: env.state, control_dt=dt
     )
 
 
@@ -128,7 +128,7 @@ def cart_filter(barrier):
         f=lambda x: np.array([x[1], 0.0]),
         g=lambda x: np.array([[0.0], [1.0]]),
         state=lambda env: env.state,
-        hold_s=0.1,
+        control_dt=0.1,
     )
     return sw.CBFActionFilter(Cart(), [barrier], plant=plant)
 

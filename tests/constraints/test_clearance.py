@@ -89,7 +89,7 @@ def test_rows_are_the_second_derivative_of_the_distance(tmp_path, kind):
         if not len(rows.offsets):
             continue
         asked += 1
-        limit = sampled_acceleration_limit(distance(0.0), approach, 1.5, plant.hold_s)
+        limit = sampled_acceleration_limit(distance(0.0), approach, 1.5, plant.control_dt)
         if limit > -1e6:
             assert rows.offsets[0] - rows.normals[0] @ u == pytest.approx(limit - acceleration, abs=1e-4)
     assert asked > 20
@@ -251,7 +251,7 @@ def test_constructor_refuses_nonsense(arguments, message):
 
 def test_on_an_analytic_plant_the_indices_are_asked_for():
     plant = sw.AnalyticPlant(
-        f=np.zeros_like, g=lambda x: np.ones((2, 1)), state=lambda env: env.state, hold_s=0.05
+        f=np.zeros_like, g=lambda x: np.ones((2, 1)), state=lambda env: env.state, control_dt=0.05
     )
     plant.bind(gym.make("Pendulum-v1"))
     with pytest.raises(ConfigurationError, match=r"say where the point is in the state: position=\[0, 1\]"):

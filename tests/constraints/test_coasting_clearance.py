@@ -22,7 +22,10 @@ SQUARE = [[0.16, 0.18], [0.16, -0.18], [-0.16, 0.18], [-0.16, -0.18]]
 
 def bound(hazards, level=1, vases=(), heading=0.0, speed_up=0, **options):
     """A filtered car at the origin after `speed_up` steps of full drive without the filter, and its constraint."""
-    options = {"keep_out": [sw.constraints.Discs("hazard_positions", 0.2)], "alone": "robot_model"} | options
+    options = {
+        "keep_out": [sw.constraints.Discs("hazard_positions", 0.2)],
+        "robot_model_attr": "robot_model",
+    } | options
     env = sw.CBFActionFilter(
         gym.make(f"SafeCarGoal{level}-v0"), [sw.constraints.CoastingClearance(**options)]
     )
@@ -86,7 +89,7 @@ def test_no_control_is_admitted_as_long_as_its_way_is_clear():
 
 
 def test_far_from_everything_nothing_is_forecast():
-    _, constraint, _ = bound([[3.0, 0.0]], reach=0.05, reach_s=0.13)
+    _, constraint, _ = bound([[3.0, 0.0]], max_decrease=0.05, max_decrease_per_speed=0.13)
     constraint._coasting.run = None  # any forecast would fail
     assert constraint.admits(FULL)
     assert constraint.value() == pytest.approx(2.8)
@@ -106,20 +109,20 @@ def test_the_outline_counts_where_it_should():
 
 def test_without_a_model_of_the_machine_alone_it_takes_the_plants():
     for alone in (None, "robot_model"):
-        _, constraint, plant = bound([[0.215, 0.0]], vases=[[3.0, 3.0]], alone=alone)
+        _, constraint, plant = bound([[0.215, 0.0]], vases=[[3.0, 3.0]], robot_model_attr=alone)
         assert constraint._coasting._model is plant.model or alone is not None
         assert not constraint.admits(FULL)
         assert constraint.admits(BACK)
 
 
 def test_a_reach_that_is_broken_is_dropped_with_a_warning():
-    _, constraint, _ = bound([[0.2055, 0.0]], reach=0.001)
-    with pytest.warns(UserWarning, match=r"farther than the declared reach of 0\.001 m"):
+    _, constraint, _ = bound([[0.2055, 0.0]], max_decrease=0.001)
+    with pytest.warns(UserWarning, match=r"farther than the declared max_decrease of 0\.001 m"):
         assert not constraint.admits(FULL)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert not constraint.admits(FULL)
-    assert constraint._reach is None
+    assert constraint._max_decrease is None
 
 
 def test_what_stands_still_is_forecast_once():
@@ -141,7 +144,7 @@ def test_what_stands_still_is_forecast_once():
 
 
 def test_from_inside_it_drives_out():
-    options = {"keep_out": [sw.constraints.Discs("hazard_positions", 0.2)], "alone": "robot_model"}
+    options = {"keep_out": [sw.constraints.Discs("hazard_positions", 0.2)], "robot_model_attr": "robot_model"}
     env = sw.CBFActionFilter(gym.make("SafeCarGoal1-v0"), [sw.constraints.CoastingClearance(**options)])
     layout = {"agent": [0.0, 0.0, 0.0], "goal": [9.0, 9.0], "hazards": [[0.12, 0.05]], "vases": []}
     with pytest.warns(UnsafeStateWarning):
@@ -220,7 +223,7 @@ def test_plain_data_rebuilds_it():
         keep_out=[sw.constraints.Disc([1.0, 2.0], 0.2)],
         untouched=[sw.constraints.Discs("vase_positions", 0.1)],
         outline=SQUARE,
-        reach=0.1,
+        max_decrease=0.1,
     )
     assert constraint_from(json.loads(json.dumps(plain_data(constraint)))) == constraint
 
@@ -238,9 +241,12 @@ def test_plain_data_rebuilds_it():
             "outline: .*not on one line",
         ),
         ({"keep_out": [sw.constraints.Disc([0, 0], 1)], "outline": [[0, "x"]]}, "list of points"),
-        ({"keep_out": [sw.constraints.Disc([0, 0], 1)], "holds": 1}, "holds is a whole number"),
-        ({"keep_out": [sw.constraints.Disc([0, 0], 1)], "reach": -1.0}, "reach must be"),
-        ({"keep_out": [sw.constraints.Disc([0, 0], 1)], "reach_s": -1.0}, "reach_s must be"),
+        ({"keep_out": [sw.constraints.Disc([0, 0], 1)], "horizon": 1}, "horizon is a whole number"),
+        ({"keep_out": [sw.constraints.Disc([0, 0], 1)], "max_decrease": -1.0}, "max_decrease must be"),
+        (
+            {"keep_out": [sw.constraints.Disc([0, 0], 1)], "max_decrease_per_speed": -1.0},
+            "max_decrease_per_speed must be",
+        ),
         ({"keep_out": [sw.constraints.Disc([0, 0], 1)], "margin": -0.1}, "margin must be"),
     ],
 )
@@ -251,7 +257,7 @@ def test_bad_arguments_are_refused_when_it_is_made(options, message):
 
 def test_an_attribute_that_holds_no_model_is_refused():
     with pytest.raises(ConfigurationError, match="an attribute that holds an MjModel; 'goal_position' is"):
-        bound([], alone="goal_position")
+        bound([], robot_model_attr="goal_position")
 
 
 def test_a_plant_without_a_model_is_refused():

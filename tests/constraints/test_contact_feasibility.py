@@ -146,7 +146,9 @@ def test_what_it_cannot_watch_is_refused_when_it_is_bound():
         bound(pushed_balls(condim=1))
     with pytest.raises(UnsupportedEnvError, match="no body of this model"):
         bound(gym.make("Reacher-v5"))
-    plant = sw.AnalyticPlant(f=lambda x: x, g=lambda x: np.ones((1, 1)), state=lambda e: e.state, hold_s=0.1)
+    plant = sw.AnalyticPlant(
+        f=lambda x: x, g=lambda x: np.ones((1, 1)), state=lambda e: e.state, control_dt=0.1
+    )
     with pytest.raises(UnsupportedEnvError, match="AnalyticPlant"):
         sw.constraints.ContactFeasibility().bind(plant)
 

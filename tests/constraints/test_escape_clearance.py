@@ -392,13 +392,13 @@ def test_what_does_not_fit_the_env_is_refused_at_binding():
             )
         )
     plant = sw.AnalyticPlant(
-        f=lambda x: x, g=lambda x: np.ones((3, 1)), state=lambda env: env.state, hold_s=0.05
+        f=lambda x: x, g=lambda x: np.ones((3, 1)), state=lambda env: env.state, control_dt=0.05
     )
     with pytest.raises(UnsupportedEnvError, match="MujocoPlant"):
         filtered(sw.constraints.EscapeClearance("robot", [TRUE_CARS]), "Pendulum-v1", plant=plant)
     slow = gym.make("OccludedCrossing-v0")
     slow.unwrapped.frame_skip = 100
-    with pytest.raises(ConfigurationError, match="too short for control steps of 1 s"):
+    with pytest.raises(ConfigurationError, match="too short for steps of 1 s"):
         sw.CBFActionFilter(slow, [sw.constraints.EscapeClearance("robot", [TRUE_CARS], horizon_s=0.9)])
 
 

@@ -325,7 +325,7 @@ def test_a_wall_that_the_env_moves_by_hand_is_taken_where_it_is():
 
 @pytest.mark.parametrize(("mass", "stiffness"), [(0.5, 6e4), (MASS, 8e3), (40.0, 6e4)])
 def test_at_full_throttle_it_arrives_with_what_is_allowed_and_then_holds_it(mass, stiffness):
-    held = limit(stiffness=stiffness, margin=2.0, holds={0.5: 8, MASS: 12, 40.0: 40}[mass])
+    held = limit(stiffness=stiffness, margin=2.0, horizon={0.5: 8, MASS: 12, 40.0: 40}[mass])
     fine = (
         {"timestep": 2.5e-4, "frame_skip": 40, "gap": 0.05} if mass < 1.0 else {}
     )  # a contact lasts 20 ms or less
@@ -340,7 +340,7 @@ def test_at_full_throttle_it_arrives_with_what_is_allowed_and_then_holds_it(mass
 
 
 def test_the_speed_is_taken_off_before_the_touch():
-    env = sw.CBFActionFilter(slide(), [limit(margin=1.0, holds=10)])
+    env = sw.CBFActionFilter(slide(), [limit(margin=1.0, horizon=10)])
     raw = env.unwrapped
     env.reset(seed=0)
     speeds, gaps = [], []
@@ -378,7 +378,7 @@ def test_a_reactive_brake_comes_too_late_where_the_constraint_does_not():
     assert unmitigated > 2.0 * LIMIT
     # Even a brake that acts at the touch itself would not do.
     assert hit(1.0, 0.0) > LIMIT
-    filtered = sw.CBFActionFilter(slide(), [limit(margin=1.0, holds=10)])
+    filtered = sw.CBFActionFilter(slide(), [limit(margin=1.0, horizon=10)])
     filtered.reset(seed=0)
     filtered.unwrapped.data.qvel[0] = 1.0
     assert peaks(filtered, full, 80, reset=False)[0].max() <= LIMIT
@@ -387,7 +387,7 @@ def test_a_reactive_brake_comes_too_late_where_the_constraint_does_not():
 def test_a_declared_braking_makes_up_for_a_short_look_ahead():
     # 40 kg at 200 N need some 0.4 s to stop; three control steps are 0.03 s.
     def drive(**more):
-        env = sw.CBFActionFilter(slide(mass=40.0, gap=1.0), [limit(margin=2.0, holds=3, **more)])
+        env = sw.CBFActionFilter(slide(mass=40.0, gap=1.0), [limit(margin=2.0, horizon=3, **more)])
         return peaks(env, full, 150)
 
     force, infos = drive(braking=4.9)
@@ -406,7 +406,7 @@ def test_pushing_counts():
     for share, passes in ((0.48, True), (0.52, False)):
         env = slide(force=LIMIT)
         env.start = [0.3 - 1e-5], [0.0]
-        filtered = sw.CBFActionFilter(env, [limit(holds=10)])
+        filtered = sw.CBFActionFilter(env, [limit(horizon=10)])
         force, infos = peaks(filtered, lambda raw, k, share=share: np.full(1, share), 40)
         assert force.max() <= LIMIT and (force.max() > 0.9 * LIMIT)
         assert any(i["cbf/intervened"] for i in infos) != passes
@@ -415,7 +415,7 @@ def test_pushing_counts():
 def test_pushing_counts_in_an_env_of_single_physics_steps():
     env = slide(force=LIMIT, frame_skip=1)
     env.data.qpos[0] = 0.3 + 1e-6
-    constraint = ready(env, limit(holds=30))
+    constraint = ready(env, limit(horizon=30))
     assert constraint.admits(np.full(1, 0.48)) and not constraint.admits(np.full(1, 0.52))
 
 
@@ -432,14 +432,14 @@ def test_a_forecast_that_mujoco_gives_up_is_refused():
 def test_falling_counts():
     env = slide(force=400.0, mass=MASS, gap=0.2, option='integrator="RK4"')
     env.model.opt.gravity[:] = 9.81, 0.0, 0.0  # "down" is along x: 49 N of 140
-    held = sw.CBFActionFilter(env, [limit(margin=2.0, holds=12)])
+    held = sw.CBFActionFilter(env, [limit(margin=2.0, horizon=12)])
     force, infos = peaks(held, lambda raw, k: np.zeros(1), 100)
     assert 0.8 * LIMIT < force.max() <= LIMIT and not any(i["cbf/infeasible"] for i in infos)
 
 
 def test_it_composes_with_others_in_one_filter():
     env = sw.CBFActionFilter(
-        slide(), [sw.constraints.JointSpeedLimit(0.8, margin=0.01), limit(margin=2.0, holds=10)], margin=0.0
+        slide(), [sw.constraints.JointSpeedLimit(0.8, margin=0.01), limit(margin=2.0, horizon=10)], margin=0.0
     )
     speeds = []
 
@@ -516,7 +516,7 @@ def test_it_is_rebuilt_from_the_spec_and_from_json():
         effective_mass=20.0,
         braking=3.0,
         margin=1.0,
-        holds=4,
+        horizon=4,
     )
     filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [given])
     for spec in (filtered.spec, EnvSpec.from_json(filtered.spec.to_json())):
@@ -542,7 +542,7 @@ REACHER = {"bodies": ["fingertip"], "against": ["sideE"]}
         ({"braking": -1.0}, ConfigurationError, r"braking must be a finite number > 0 in m/s\^2"),
         ({"margin": -1.0}, ConfigurationError, "margin must be a finite number >= 0 in N"),
         ({"margin": 100.0}, ConfigurationError, "the margin 100.0 N leaves nothing of the limit 100.0 N"),
-        ({"holds": 0}, ConfigurationError, "holds is a whole number of control intervals"),
+        ({"horizon": 0}, ConfigurationError, "horizon is a whole number of control intervals"),
         (
             {"force_limit": None},
             ConfigurationError,
@@ -588,7 +588,7 @@ def test_an_env_without_a_mujoco_model_is_refused():
         state=lambda env: env.state,
         lower=-2.0,
         upper=2.0,
-        hold_s=0.05,
+        control_dt=0.05,
     )
     with pytest.raises(UnsupportedEnvError, match="ImpactSpeedLimit forecasts with a MuJoCo model"):
         sw.CBFActionFilter(gym.make("Pendulum-v1"), [limit()], plant=plant)

@@ -14,18 +14,18 @@ PUSHER_LOW = np.array([-2.2854, -0.5236, -1.5, -2.3213, -1.5, -1.094, -1.5])
 PUSHER_HIGH = np.array([1.714602, 1.3963, 1.7, 0.0, 1.5, 0.0, 1.5])
 CASES = {
     "Reacher-v5": (
-        sw.constraints.JointPositionLimit(-1.5, 1.5, ["joint0", "joint1"], holds=10),
+        sw.constraints.JointPositionLimit(-1.5, 1.5, ["joint0", "joint1"], horizon=10),
         [0, 1],
         -1.5,
         1.5,
     ),
     "InvertedPendulum-v5": (
-        sw.constraints.JointPositionLimit(-0.2, 0.2, ["slider"], holds=8),
+        sw.constraints.JointPositionLimit(-0.2, 0.2, ["slider"], horizon=8),
         [0],
         -0.2,
         0.2,
     ),
-    "Pusher-v5": (sw.constraints.JointPositionLimit(holds=6), np.arange(7), PUSHER_LOW, PUSHER_HIGH),
+    "Pusher-v5": (sw.constraints.JointPositionLimit(horizon=6), np.arange(7), PUSHER_LOW, PUSHER_HIGH),
 }
 
 
@@ -69,7 +69,7 @@ def test_without_the_filter_the_range_is_left():
 
 
 def test_a_margin_covers_a_wrong_mass():
-    limit = sw.constraints.JointPositionLimit(-1.5, 1.5, joints=["joint0", "joint1"], margin=0.1, holds=10)
+    limit = sw.constraints.JointPositionLimit(-1.5, 1.5, joints=["joint0", "joint1"], margin=0.1, horizon=10)
     filtered = sw.CBFActionFilter(gym.make("Reacher-v5", disable_env_checker=True), [limit])
     filtered.plant.perturb(mass=1.2, damping=0.8)
     judge = Judge(filtered, room_of([0, 1], -1.5, 1.5))
@@ -99,7 +99,7 @@ def test_far_inside_the_actions_pass_bit_for_bit():
 def test_from_outside_it_goes_inwards(start):
     filtered = sw.CBFActionFilter(
         gym.make("Reacher-v5"),
-        [sw.constraints.JointPositionLimit(-1.5, 1.5, joints=["joint0", "joint1"], holds=10)],
+        [sw.constraints.JointPositionLimit(-1.5, 1.5, joints=["joint0", "joint1"], horizon=10)],
     )
     filtered.reset(seed=0)
     raw = filtered.unwrapped
@@ -151,7 +151,7 @@ def test_one_value_per_bound_that_there_is():
 
 def test_a_joint_without_a_range_does_not_spoil_the_others():
     # The linearisation about a refused control must not see its infinities.
-    limit = sw.constraints.JointPositionLimit(upper=[np.inf, 1.5], holds=10)
+    limit = sw.constraints.JointPositionLimit(upper=[np.inf, 1.5], horizon=10)
     filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [limit])
     judge = Judge(filtered, room_of([1], -3.0, 1.5))
     filtered.reset(seed=0)
@@ -167,7 +167,7 @@ def test_a_joint_without_a_range_does_not_spoil_the_others():
 
 def test_the_filters_margin_comes_on_top_of_its_own():
     env = gym.make("InvertedPendulum-v5")
-    limit = sw.constraints.JointPositionLimit(-0.5, 0.5, joints=["slider"], margin=0.1, holds=8)
+    limit = sw.constraints.JointPositionLimit(-0.5, 0.5, joints=["slider"], margin=0.1, horizon=8)
     filtered = sw.CBFActionFilter(env, [limit], margin=0.1)
     assert limit.margin == 0.1 and filtered.constraints[0].margin == 0.2
     filtered.reset(seed=0)
@@ -192,7 +192,7 @@ def test_conflicting_limits_are_infeasible_and_the_action_stays_sound():
 
 def test_it_is_rebuilt_from_the_spec_and_from_json():
     limit = sw.constraints.JointPositionLimit(
-        [-1.0, -np.inf], 2, joints=["joint1", "joint0"], margin=0.1, holds=7, reach=0.5
+        [-1.0, -np.inf], 2, joints=["joint1", "joint0"], margin=0.1, horizon=7, max_decrease=0.5
     )
     filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [limit])
     for spec in (filtered.spec, EnvSpec.from_json(filtered.spec.to_json())):

@@ -139,7 +139,7 @@ def test_value_and_rows_against_the_plants_own_prediction():
     drift, effect = plant.acceleration
     rng = np.random.default_rng(0)
     for u in rng.uniform(-1, 1, (50, 2)):
-        after = plant.qvel[:2] + plant.hold_s * (drift + effect @ u)[:2]
+        after = plant.qvel[:2] + plant.control_dt * (drift + effect @ u)[:2]
         linear = bool((np.abs(after) <= 3.9).all())
         assert bool((rows.normals @ u <= rows.offsets).all()) == linear
 

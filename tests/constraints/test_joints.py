@@ -13,7 +13,7 @@ from safe_wrappers.errors import ConfigurationError
 
 LIMITS = {
     "JointSpeedLimit": lambda **more: sw.constraints.JointSpeedLimit(3.0, **more),
-    "JointPositionLimit": lambda **more: sw.constraints.JointPositionLimit(-7.0, 7.0, holds=1, **more),
+    "JointPositionLimit": lambda **more: sw.constraints.JointPositionLimit(-7.0, 7.0, horizon=1, **more),
 }
 
 

@@ -224,7 +224,7 @@ def chase(obstacle, policy, delay_s=0.0):
         f=lambda x: np.array([x[2], x[3], 0.0, 0.0]),
         g=lambda x: np.array([[0.0], [0.0], [1.0], [0.0]]),
         state=lambda env: env.state,
-        hold_s=0.1,
+        control_dt=0.1,
         delay_s=delay_s,
     )
     clear = sw.constraints.Clearance([obstacle], braking=1.0, position=[0, 1], velocity=[2, 3], margin=1e-3)

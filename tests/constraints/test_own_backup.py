@@ -69,7 +69,7 @@ def filtered(state=None, **fields):
         f=lambda s: np.array([s[1], 0.0]),
         g=lambda s: np.array([[0.0], [1.0]]),
         state=lambda env: env.state,
-        hold_s=DT,
+        control_dt=DT,
     )
     env = sw.CBFActionFilter(Point(), [StopBefore(**fields)], plant)
     env.reset(seed=0, options=None if state is None else {"state": state})
@@ -119,7 +119,7 @@ def test_constants_are_read_at_binding_and_when_the_model_has_changed():
     env, bound = filtered()
     env.step(np.zeros(1, np.float32))
     assert bound.constants == 1
-    env.plant.revision += 1
+    env.plant.model_version += 1
     env.step(np.zeros(1, np.float32))
     env.step(np.zeros(1, np.float32))
     assert bound.constants == 2

@@ -28,13 +28,13 @@ LIMITS = {
 kinds = pytest.mark.parametrize("kind", LIMITS)
 
 
-def slider_path(x, v, u, holds, strength):
+def slider_path(x, v, u, horizon, strength):
     """The slider after every substep: the control held, then braking at half of its speed per control step.
 
     The speed that is read for it is MuJoCo's `actuator_velocity`, which is one Euler step old.
     """
     path, before = [], v
-    for hold in range(holds):
+    for hold in range(horizon):
         if hold:
             u = float(np.clip(-0.5 * before / HOLD_S, -strength, strength))
         for _ in range(5):
@@ -62,20 +62,20 @@ def looking(scene, limit, qpos, qvel):
     x=st.floats(-1.6, 1.6),
     v=st.floats(-4.0, 4.0),
     u=st.floats(-30.0, 30.0),
-    holds=st.integers(1, 6),
+    horizon=st.integers(1, 6),
     margin=st.sampled_from([0.0, 0.2]),
 )
-def test_a_control_is_admitted_by_where_it_leads(x, v, u, holds, margin):
-    limit = sw.constraints.JointPositionLimit(-1.0, 1.0, holds=holds, margin=margin)
+def test_a_control_is_admitted_by_where_it_leads(x, v, u, horizon, margin):
+    limit = sw.constraints.JointPositionLimit(-1.0, 1.0, horizon=horizon, margin=margin)
     limit = looking(sliders(range_="-30 30"), limit, [x], [v])
-    beyond = np.abs(slider_path(x, v, u, holds, 30.0)) - (1.0 - margin)
+    beyond = np.abs(slider_path(x, v, u, horizon, 30.0)) - (1.0 - margin)
     start = abs(x) - (1.0 - margin)
     if start <= 0.0:
         missing = beyond.max()
     else:  # no farther out than it is, and back to exp(-t / 0.1 s) of it at the end, on the side that it is out on
-        side = np.sign(x) * slider_path(x, v, u, holds, 30.0) - (1.0 - margin)
+        side = np.sign(x) * slider_path(x, v, u, horizon, 30.0) - (1.0 - margin)
         other = -side - 2.0 * (1.0 - margin)
-        missing = max(side.max() - start, side[-1] - start * np.exp(-holds * HOLD_S / 0.1), other.max())
+        missing = max(side.max() - start, side[-1] - start * np.exp(-horizon * HOLD_S / 0.1), other.max())
     assume(abs(missing) > 1e-7 and abs(start) > 1e-9)
     assert limit.admits(np.array([u])) == (missing < 0.0)
     assert limit.slack(np.array([u])) == pytest.approx(-missing, abs=1e-9)
@@ -119,7 +119,7 @@ def test_a_bound_that_holds_is_not_given_up_while_another_comes_back():
 def test_a_start_too_far_out_for_the_actuators_is_infeasible_and_still_driven_inwards():
     scene = sliders(range_="-1 1")
     scene.start = [1.4], [0.0]
-    filtered = sw.CBFActionFilter(scene, [sw.constraints.JointPositionLimit(-1.0, 1.0, holds=8)])
+    filtered = sw.CBFActionFilter(scene, [sw.constraints.JointPositionLimit(-1.0, 1.0, horizon=8)])
     with pytest.warns(sw.UnsafeStateWarning):
         filtered.reset(seed=0)
     infos = [filtered.step(np.array([1.0]))[4] for _ in range(12)]
@@ -134,9 +134,9 @@ def count_forecasts(monkeypatch):
     calls = [0]
     real = sw.MujocoPlant.forecast
 
-    def counted(self, control, holds=1):
+    def counted(self, control, horizon=1):
         calls[0] += 1
-        return real(self, control, holds)
+        return real(self, control, horizon)
 
     monkeypatch.setattr(sw.MujocoPlant, "forecast", counted)
     return calls
@@ -146,15 +146,15 @@ def test_a_reach_spares_forecasts_and_changes_nothing_else(monkeypatch):
     calls = count_forecasts(monkeypatch)
     actions = np.repeat(np.random.default_rng(0).choice([-1.0, 1.0], (40, 1)), 12, axis=0)
     seen, spent = {}, {}
-    for reach in (None, 0.5):  # the fastest is 2 m/s, four control steps are 0.2 s
-        limit = sw.constraints.JointPositionLimit(-1.0, 1.0, holds=4, reach=reach)
+    for max_decrease in (None, 0.5):  # the fastest is 2 m/s, four control steps are 0.2 s
+        limit = sw.constraints.JointPositionLimit(-1.0, 1.0, horizon=4, max_decrease=max_decrease)
         filtered = sw.CBFActionFilter(sliders(range_="-10 10"), [limit])
         filtered.reset(seed=0)
         calls[0] = 0
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             infos = [filtered.step(a)[4] for a in actions]
-        seen[reach], spent[reach] = np.array([i["executed_action"] for i in infos]), calls[0]
+        seen[max_decrease], spent[max_decrease] = np.array([i["executed_action"] for i in infos]), calls[0]
         assert sum(i["cbf/intervened"] for i in infos) > 20
     np.testing.assert_array_equal(seen[None], seen[0.5])
     assert spent[0.5] < spent[None] - 50
@@ -164,7 +164,7 @@ def test_far_from_the_limit_nothing_is_simulated(monkeypatch):
     simulated = []
     step = mujoco.mj_step
     filtered = sw.CBFActionFilter(
-        gym.make("Reacher-v5"), [sw.constraints.JointPositionLimit(-9.0, 9.0, ["joint0"], reach=2.0)]
+        gym.make("Reacher-v5"), [sw.constraints.JointPositionLimit(-9.0, 9.0, ["joint0"], max_decrease=2.0)]
     )
     filtered.reset(seed=0)
 
@@ -182,7 +182,7 @@ def test_a_broken_reach_is_warned_of_once_and_dropped(monkeypatch):
     calls = count_forecasts(monkeypatch)
     scene = sliders(range_="-1 1")
     scene.start = [-0.9], [1.0]  # 5 cm in a control step
-    limit = sw.constraints.JointPositionLimit(None, 2.0, joints=["x0"], holds=4, reach=0.12)
+    limit = sw.constraints.JointPositionLimit(None, 2.0, joints=["x0"], horizon=4, max_decrease=0.12)
     filtered = sw.CBFActionFilter(scene, [limit])
     filtered.reset(seed=0)
     with pytest.warns(UserWarning) as caught:
@@ -190,7 +190,7 @@ def test_a_broken_reach_is_warned_of_once_and_dropped(monkeypatch):
             filtered.step(np.array([0.0]))
     assert [str(w.message) for w in caught] == [
         "JointPositionLimit: what is left of the limit fell by 0.15 rad or m within 3 control steps, farther than "
-        "the declared reach of 0.12; from now on every control is forecast"
+        "the declared max_decrease of 0.12; from now on every control is forecast"
     ]
     assert calls[0] == 17  # three steps were taken for granted
     with warnings.catch_warnings():
@@ -202,7 +202,9 @@ def test_a_broken_reach_is_warned_of_once_and_dropped(monkeypatch):
 
 def test_a_reset_is_not_taken_for_a_broken_reach():
     scene = sliders(range_="-1 1")
-    filtered = sw.CBFActionFilter(scene, [sw.constraints.JointPositionLimit(-1.0, 1.0, holds=4, reach=0.5)])
+    filtered = sw.CBFActionFilter(
+        scene, [sw.constraints.JointPositionLimit(-1.0, 1.0, horizon=4, max_decrease=0.5)]
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for start in (0.0, 0.9, -0.2, 0.99):
@@ -254,10 +256,10 @@ def test_a_state_that_is_no_number_admits_nothing(kind, tmp_path, monkeypatch):
 
 
 @kinds
-@pytest.mark.parametrize("reach", [None, 0.1])
-def test_a_reading_that_is_no_number_runs_the_fallback(kind, reach):
+@pytest.mark.parametrize("max_decrease", [None, 0.1])
+def test_a_reading_that_is_no_number_runs_the_fallback(kind, max_decrease):
     scene = sliders()
-    filtered = sw.CBFActionFilter(scene, [LIMITS[kind](reach=reach)])
+    filtered = sw.CBFActionFilter(scene, [LIMITS[kind](max_decrease=max_decrease)])
     filtered.reset(seed=0)
     filtered.step(np.array([0.5]))
     scene.data.qvel[0] = np.nan
@@ -268,26 +270,26 @@ def test_a_reading_that_is_no_number_runs_the_fallback(kind, reach):
 
 
 @kinds
-@pytest.mark.parametrize("holds", [0, -1, 1.5, True, "3", None, np.nan, np.inf])
-def test_holds_is_a_whole_number(kind, holds):
+@pytest.mark.parametrize("horizon", [0, -1, 1.5, True, "3", None, np.nan, np.inf])
+def test_holds_is_a_whole_number(kind, horizon):
     with pytest.raises(
-        ConfigurationError, match="holds is a whole number of control intervals to look ahead"
+        ConfigurationError, match="horizon is a whole number of control intervals to look ahead"
     ):
-        LIMITS[kind](holds=holds)
+        LIMITS[kind](horizon=horizon)
 
 
 @kinds
-@pytest.mark.parametrize("reach", [0.0, -1.0, np.nan, np.inf, "far"])
-def test_reach_is_a_positive_number_with_the_unit_of_the_limit(kind, reach):
+@pytest.mark.parametrize("max_decrease", [0.0, -1.0, np.nan, np.inf, "far"])
+def test_reach_is_a_positive_number_with_the_unit_of_the_limit(kind, max_decrease):
     unit = {"speed": "m/s", "joint speed": "rad/s or m/s", "workspace": "m"}.get(kind, "m or rad|rad or m")
-    with pytest.raises(ConfigurationError, match=f"reach must be a .*number.* in ({unit}), got"):
-        LIMITS[kind](reach=reach)
+    with pytest.raises(ConfigurationError, match=f"max_decrease must be a .*number.* in ({unit}), got"):
+        LIMITS[kind](max_decrease=max_decrease)
 
 
 @kinds
 def test_a_plant_without_a_model_is_refused(kind):
     plant = sw.AnalyticPlant(
-        f=lambda x: np.zeros(2), g=lambda x: np.ones((2, 1)), state=lambda e: np.zeros(2), hold_s=HOLD_S
+        f=lambda x: np.zeros(2), g=lambda x: np.ones((2, 1)), state=lambda e: np.zeros(2), control_dt=HOLD_S
     )
     with pytest.raises(UnsupportedEnvError, match=r"on an AnalyticPlant (use|write)"):
         sw.CBFActionFilter(sliders(), [LIMITS[kind]()], plant=plant)
@@ -295,7 +297,7 @@ def test_a_plant_without_a_model_is_refused(kind):
 
 @kinds
 def test_a_recorded_limit_is_rebuilt_from_json(kind):
-    limit = LIMITS[kind](margin=0.05, holds=4, reach=0.3)
+    limit = LIMITS[kind](margin=0.05, horizon=4, max_decrease=0.3)
     filtered = sw.CBFActionFilter(sliders(), [limit])
     saved = json.loads(json.dumps(filtered._saved_kwargs["constraints"]))
     again = sw.CBFActionFilter(sliders(), saved)

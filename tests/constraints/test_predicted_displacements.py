@@ -80,7 +80,7 @@ def test_a_cut_goes_through_its_forecast_and_aims_a_little_inward(monkeypatch):
 
 
 def test_who_is_far_from_a_limit_has_no_rows_and_forecasts_nothing(monkeypatch):
-    box = sw.constraints.Workspace([-9.0] * 3, [9.0] * 3, sites=["robot0:grip"], holds=2, reach=0.1)
+    box = sw.constraints.Workspace([-9.0] * 3, [9.0] * 3, sites=["robot0:grip"], horizon=2, max_decrease=0.1)
     env = sw.CBFActionFilter(gym.make("FetchReach-v4"), [box])
     env.reset(seed=0)
     monkeypatch.setattr(Recorder, "record", None)

@@ -14,9 +14,9 @@ INSTANTS = 8
 class Approaching(BoundRollout):
     """What is left of a bound on the first control, which acts the more the later it is."""
 
-    def __init__(self, plant, margin=0.0, holds=1):
-        self.spec, self.plant, self._reach = (
-            SimpleNamespace(margin=margin, holds=holds, unit="m"),
+    def __init__(self, plant, margin=0.0, horizon=1):
+        self.spec, self.plant, self._max_decrease = (
+            SimpleNamespace(margin=margin, horizon=horizon, unit="m"),
             plant,
             None,
         )
@@ -30,10 +30,12 @@ class Approaching(BoundRollout):
 
 
 def still_plant():
-    plant = SimpleNamespace(has_acceleration=False, lower=-np.ones(2), upper=np.ones(2), hold_s=0.1, stamp=0)
+    plant = SimpleNamespace(
+        has_acceleration=False, lower=-np.ones(2), upper=np.ones(2), control_dt=0.1, observation_id=0
+    )
     plant.left, plant.gain, plant.asked = 0.5, 1.0, []
 
-    def forecast(control, holds):
+    def forecast(control, horizon):
         plant.asked.append(np.array(control))
         return control
 
@@ -44,7 +46,7 @@ def still_plant():
 def test_a_response_is_kept_for_ten_control_steps():
     plant = still_plant()
     limit, memory, asked = Approaching(plant), RolloutMemory(), []
-    for plant.stamp in range(1, 25):
+    for plant.observation_id in range(1, 25):
         limit.observe(memory)
         plant.asked.clear()
         limit.rows()
@@ -116,18 +118,18 @@ def test_differences_stay_inside_the_bounds(control):
 def test_rows_of_a_limit_far_away_are_none():
     plant = still_plant()
     limit = Approaching(plant)
-    limit._reach = 0.1
+    limit._max_decrease = 0.1
     limit.observe(RolloutMemory())
     assert not limit.rows().offsets.size and limit.admits(np.ones(2)) and not plant.asked
-    limit._reach = 0.5000001
+    limit._max_decrease = 0.5000001
     limit.observe(RolloutMemory())
     assert limit.rows().offsets.size and not limit.admits(np.ones(2))
 
 
 def test_only_as_many_states_are_remembered_as_are_looked_ahead():
     plant = still_plant()
-    limit = Approaching(plant, holds=3)
-    limit._reach = 9.0
+    limit = Approaching(plant, horizon=3)
+    limit._max_decrease = 9.0
     memory = limit.start()
     for plant.left in (5.0, 4.0, 3.0, 2.0, 1.0):
         limit.observe(memory)

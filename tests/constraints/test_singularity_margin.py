@@ -78,7 +78,7 @@ TASKS = {
 def test_w_is_that_of_mujoco_s_jacobian_now_and_ahead(task):
     arguments, truth = TASKS[task]
     env, threshold = Scene(CHAIN), 1e-3
-    limit = bound(env, sw.constraints.SingularityMargin(threshold, holds=2, **arguments))
+    limit = bound(env, sw.constraints.SingularityMargin(threshold, horizon=2, **arguments))
     plant = limit.plant
     kind = next(k for k in ("site", "body", "geom") if k in arguments)
     rng, still = np.random.default_rng(0), mujoco.MjData(env.model)
@@ -111,7 +111,7 @@ def test_its_row_is_the_second_derivative_of_w_under_a_torque(task):
     limit = bound(env, sw.constraints.SingularityMargin(1e-2, margin=0.1, **arguments))
     plant = limit.plant
     rng, data = np.random.default_rng(1), mujoco.MjData(env.model)
-    h, a, checked = 3e-5, 1.0 / (2.0 * plant.hold_s), 0
+    h, a, checked = 3e-5, 1.0 / (2.0 * plant.control_dt), 0
     for _ in range(12):
         env.data.qpos[:] = rng.uniform(-1.2, 1.2, 5) * [0.3, 1.0, 1.0, 1.0, 1.0]
         env.data.qvel[:] = rng.uniform(-1.0, 1.0, 5)
@@ -234,8 +234,8 @@ def pusher_room(threshold):
 
 
 CASES = {
-    "Reacher": ("Reacher-v5", 0.0033, {"body": "fingertip", "directions": "xy", "holds": 5}, reacher_room),
-    "Pusher": ("Pusher-v5", 0.05, {"body": "tips_arm", "holds": 8}, pusher_room),
+    "Reacher": ("Reacher-v5", 0.0033, {"body": "fingertip", "directions": "xy", "horizon": 5}, reacher_room),
+    "Pusher": ("Pusher-v5", 0.05, {"body": "tips_arm", "horizon": 8}, pusher_room),
 }
 
 
@@ -340,7 +340,7 @@ def fetch(env_id, limited=True, plant=None, margin=0.0):
     env = gym.make(env_id, max_episode_steps=1000, disable_env_checker=True)
     seen = watch(env, LENGTH)
     if limited:
-        limit = sw.constraints.SingularityMargin(FETCH_THRESHOLD, holds=5, margin=margin, **GRIP)
+        limit = sw.constraints.SingularityMargin(FETCH_THRESHOLD, horizon=5, margin=margin, **GRIP)
         env = sw.CBFActionFilter(env, [limit], plant)
     return env, seen
 
@@ -408,7 +408,13 @@ def test_it_is_rebuilt_from_the_spec_and_from_json():
             0.003, body="fingertip", directions="xy", joints=["joint0", "joint1"], margin=0.1
         ),
         sw.constraints.SingularityMargin(
-            geom="fingertip", directions="xy", frame="own", task_speed=0.1, rate_limit=6.0, holds=7, reach=2.0
+            geom="fingertip",
+            directions="xy",
+            frame="own",
+            task_speed=0.1,
+            rate_limit=6.0,
+            horizon=7,
+            max_decrease=2.0,
         ),
     ]
     env = sw.CBFActionFilter(gym.make("Reacher-v5"), limits)
@@ -463,8 +469,12 @@ TIP = {"body": "fingertip", "directions": "xy"}
             ConfigurationError,
             r"joints is a list of names.*got \[\]",
         ),
-        ({**TIP, "threshold": 1e-3, "holds": 0}, ConfigurationError, "holds is a whole number"),
-        ({**TIP, "threshold": 1e-3, "reach": 0.0}, ConfigurationError, "reach must be a finite number > 0"),
+        ({**TIP, "threshold": 1e-3, "horizon": 0}, ConfigurationError, "horizon is a whole number"),
+        (
+            {**TIP, "threshold": 1e-3, "max_decrease": 0.0},
+            ConfigurationError,
+            "max_decrease must be a finite number > 0",
+        ),
         ({"threshold": 1e-3, "body": "hand"}, UnknownNameError, "no body 'hand'; it has: world, body0"),
         ({"threshold": 1e-3, "site": "tip"}, UnknownNameError, "no site 'tip'"),
         ({**TIP, "threshold": 1e-3, "joints": ["elbow"]}, UnknownNameError, "no joint 'elbow'"),

@@ -28,7 +28,7 @@ def watching(env, **options):
     plant = sw.MujocoPlant()
     plant.bind(env)
     plant.observe()
-    return Asked(sw.constraints.SpeedLimit(**{"limit": 50.0, "holds": 1, **options}), plant), plant
+    return Asked(sw.constraints.SpeedLimit(**{"limit": 50.0, "horizon": 1, **options}), plant), plant
 
 
 # The speed that is meant --------------------------------------------------------------------------------------
@@ -117,7 +117,7 @@ def test_a_control_is_admitted_by_the_speed_it_leads_to(v, u, direction, average
     env.data.qvel[:] = v
     mujoco.mj_forward(env.model, env.data)
     limit, _ = watching(
-        env, limit=2.0, body=body, direction=direction, average=average, margin=margin, holds=1
+        env, limit=2.0, body=body, direction=direction, average=average, margin=margin, horizon=1
     )
     both = velocities(v, u, timestep, substeps)
     weights = {"b0": (1.0, 0.0), "b1": (0.0, 1.0), None: np.array(WEIGHTS) / sum(WEIGHTS)}[body]
@@ -216,13 +216,13 @@ def test_a_broken_limit_shows_in_the_margin(average):
 def test_a_speed_that_is_kept_only_to_be_exceeded_next_is_refused_now():
     # Downhill at 5 m/s^2 with brakes for 1: every control step adds 0.2 m/s at least.
     admitted = {}
-    for holds in (1, 2, 3):
+    for horizon in (1, 2, 3):
         env = sliders(range_="-1 1")
         env.model.opt.gravity[0] = 5.0
         env.data.qvel[0] = 0.6
         mujoco.mj_forward(env.model, env.data)
-        limit, _ = watching(env, limit=1.0, direction="+x", holds=holds)
-        admitted[holds] = [limit.admits(np.array([u])) for u in (-1.0, 1.0)]
+        limit, _ = watching(env, limit=1.0, direction="+x", horizon=horizon)
+        admitted[horizon] = [limit.admits(np.array([u])) for u in (-1.0, 1.0)]
     # The averages of the next steps, braking: 0.72, 0.92, 1.12; at full throttle: 0.78, 1.0 + ...
     assert admitted == {1: [True, True], 2: [True, False], 3: [False, False]}
 
@@ -230,7 +230,7 @@ def test_a_speed_that_is_kept_only_to_be_exceeded_next_is_refused_now():
 def test_under_a_delay_only_the_predicted_states_count():
     env = sliders(range_="-20 20")
     plant = sw.MujocoPlant(delay_s=0.1)
-    limit = sw.constraints.SpeedLimit(1.0, direction="x", holds=1)
+    limit = sw.constraints.SpeedLimit(1.0, direction="x", horizon=1)
     filtered = sw.CBFActionFilter(env, [limit], plant=plant)
     filtered.reset(seed=0)
     fastest = 0.0
@@ -279,13 +279,13 @@ def test_an_executed_control_that_is_not_flagged_costs_nothing(robot):
 def test_a_reach_spares_the_forecasts_far_from_the_limit(monkeypatch):
     calls, real = [0], sw.MujocoPlant.forecast
 
-    def counted(self, control, holds=1):
+    def counted(self, control, horizon=1):
         calls[0] += 1
-        return real(self, control, holds)
+        return real(self, control, horizon)
 
     monkeypatch.setattr(sw.MujocoPlant, "forecast", counted)
-    for reach, spent in ((None, 10), (3.0, 0)):
-        filtered = launched("HalfCheetah", 0.0, limit=9.0, reach=reach)
+    for max_decrease, spent in ((None, 10), (3.0, 0)):
+        filtered = launched("HalfCheetah", 0.0, limit=9.0, max_decrease=max_decrease)
         calls[0] = 0
         for _ in range(10):
             filtered.step(np.zeros(6, np.float32))
@@ -293,7 +293,7 @@ def test_a_reach_spares_the_forecasts_far_from_the_limit(monkeypatch):
     env = sliders(range_="-20 20")
     env.start = [0.0], [0.4]
     filtered = sw.CBFActionFilter(
-        env, [sw.constraints.SpeedLimit(1.0, direction="+x", margin=0.2, holds=1, reach=0.4)]
+        env, [sw.constraints.SpeedLimit(1.0, direction="+x", margin=0.2, horizon=1, max_decrease=0.4)]
     )
     filtered.reset(seed=0)
     calls[0] = 0
@@ -305,7 +305,9 @@ def test_a_reach_spares_the_forecasts_far_from_the_limit(monkeypatch):
 
 
 def test_it_is_rebuilt_from_the_spec_and_from_json():
-    limit = sw.constraints.SpeedLimit(1.5, "torso", "-x", average="substep", margin=0.1, holds=4, reach=0.7)
+    limit = sw.constraints.SpeedLimit(
+        1.5, "torso", "-x", average="substep", margin=0.1, horizon=4, max_decrease=0.7
+    )
     filtered = sw.CBFActionFilter(gym.make("HalfCheetah-v5"), [limit])
     for spec in (filtered.spec, EnvSpec.from_json(filtered.spec.to_json())):
         again = gym.make(spec)
@@ -318,8 +320,8 @@ def test_it_is_rebuilt_from_the_spec_and_from_json():
         "direction": "-x",
         "average": "substep",
         "margin": 0.1,
-        "holds": 4,
-        "reach": 0.7,
+        "horizon": 4,
+        "max_decrease": 0.7,
     }
     assert constraint_from(data) == limit
     assert limit.promise == "best effort" and filtered.filter.bound[0].scale == 1.5

@@ -242,7 +242,7 @@ def test_asked_second_it_still_answers_the_proposal():
     env = table()
     alone = sw.CBFActionFilter(env, [sw.constraints.Stance(0.3, **STANCE)])
     both = sw.CBFActionFilter(
-        table(), [sw.constraints.JointSpeedLimit(1e3, holds=1), sw.constraints.Stance(0.3, **STANCE)]
+        table(), [sw.constraints.JointSpeedLimit(1e3, horizon=1), sw.constraints.Stance(0.3, **STANCE)]
     )
     executed = []
     for filtered in (alone, both):
@@ -356,7 +356,9 @@ def test_bad_arguments_are_refused_in_words(arguments, words):
 
 
 def test_plants_that_it_cannot_read_are_refused():
-    plant = sw.AnalyticPlant(f=lambda x: x, g=lambda x: np.ones((1, 1)), state=lambda e: e.state, hold_s=0.1)
+    plant = sw.AnalyticPlant(
+        f=lambda x: x, g=lambda x: np.ones((1, 1)), state=lambda e: e.state, control_dt=0.1
+    )
     with pytest.raises(UnsupportedEnvError, match="MujocoPlant"):
         sw.constraints.Stance().bind(plant)
     reacher = sw.MujocoPlant()

@@ -120,7 +120,7 @@ def test_what_it_is_given_is_checked():
     with pytest.raises(UnknownNameError, match="track_names"):
         sw.CBFActionFilter(gym.make("OccludedCrossing-v0"), [sw.constraints.TrackPermission("robot", 3.0)])
     plant = sw.AnalyticPlant(
-        f=lambda x: x, g=lambda x: np.ones((3, 1)), state=lambda env: env.state, hold_s=0.05
+        f=lambda x: x, g=lambda x: np.ones((3, 1)), state=lambda env: env.state, control_dt=0.05
     )
     with pytest.raises(UnsupportedEnvError, match="MujocoPlant"):
         sw.CBFActionFilter(

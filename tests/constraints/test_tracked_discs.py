@@ -21,7 +21,7 @@ RADIUS = 0.4
 class Holding:
     """As much of a plant as obstacles ask for."""
 
-    hold_s, delay_s = 0.04, 0.0
+    control_dt, delay_s = 0.04, 0.0
 
     def __init__(self, tracks):
         self.tracks = tracks

@@ -185,7 +185,7 @@ def test_a_plant_that_is_wrong_still_limits(mass):
     env = rover(plant=plant)
     # A quarter off in mass is little of the wheels' inertia: take the rotors along.
     env.plant.model.dof_armature[:] *= mass
-    env.plant.revision += 1
+    env.plant.model_version += 1
     infos = drive(env, FULL, 100, ground="wet")
     assert max(info["slip_max"] for info in infos[5:]) < 0.2
 
@@ -338,7 +338,7 @@ def test_an_env_without_a_model_is_refused():
     with pytest.raises(UnsupportedEnvError):
         sw.SlipLimiter(gym.make("Pendulum-v1"), wheels=["left"])
     plant = sw.AnalyticPlant(
-        f=lambda x: x, g=lambda x: np.ones((1, 1)), state=lambda env: np.zeros(1), hold_s=0.05
+        f=lambda x: x, g=lambda x: np.ones((1, 1)), state=lambda env: np.zeros(1), control_dt=0.05
     )
     with pytest.raises(UnsupportedEnvError, match="MujocoPlant"):
         sw.SlipLimiter(gym.make("Pendulum-v1"), wheels=["left"], plant=plant)

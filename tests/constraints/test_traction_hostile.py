@@ -241,7 +241,7 @@ def test_a_drive_of_the_plants_model_that_changes_is_read_anew():
     traction, plant = env.filter.bound[0], env.plant
     before = traction.rows().normals
     plant.model.actuator_gear[:, 0] *= 2.0
-    plant.revision += 1
+    plant.model_version += 1
     env.filter.observe()
     np.testing.assert_allclose(traction.rows().normals, 2.0 * before)
 

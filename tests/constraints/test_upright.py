@@ -65,7 +65,7 @@ def test_the_forecast_is_followed_substep_by_substep():
     env.data.qpos[:4] = [0.0, 0.0, 2.0, 1.0]
     env.data.qvel[3] = 2.0  # turning about x at 2 rad/s, and falling
     mujoco.mj_forward(env.model, env.data)
-    limit = bound(env, sw.constraints.Upright("box", lowest=1.0, tilt=1.0, holds=4))
+    limit = bound(env, sw.constraints.Upright("box", lowest=1.0, tilt=1.0, horizon=4))
     room = limit._room(limit.plant.forecast(np.zeros(1), 4))
     assert room.shape == (20, 2)
     data = mujoco.MjData(env.model)
@@ -150,7 +150,7 @@ def test_an_upright_robot_is_left_alone_bit_for_bit():
 def test_a_fall_that_nothing_stops_is_infeasible():
     env = Scene(BOX)
     env.start = [0.0, 0.0, 1.02, 1.0, 0.0, 0.0, 0.0, 0.0], np.zeros(7)
-    filtered = sw.CBFActionFilter(env, [sw.constraints.Upright("box", lowest=1.0, holds=2)])
+    filtered = sw.CBFActionFilter(env, [sw.constraints.Upright("box", lowest=1.0, horizon=2)])
     filtered.reset(seed=0)
     info = filtered.step(np.array([0.3]))[4]
     assert info["cbf/infeasible"] and info["cbf/refused"].all() and not info["cbf/unsafe"]
@@ -158,7 +158,7 @@ def test_a_fall_that_nothing_stops_is_infeasible():
 
 
 def test_it_is_rebuilt_from_the_spec_and_from_json():
-    limit = sw.constraints.Upright("torso", lowest=0.4, tilt=0.5, margin=0.05, holds=6, reach=0.2)
+    limit = sw.constraints.Upright("torso", lowest=0.4, tilt=0.5, margin=0.05, horizon=6, max_decrease=0.2)
     filtered = sw.CBFActionFilter(gym.make("Walker2d-v5"), [limit])
     for spec in (filtered.spec, EnvSpec.from_json(filtered.spec.to_json())):
         again = gym.make(spec).constraints

@@ -374,7 +374,7 @@ def test_other_plants_and_machines_are_refused_with_the_alternative():
         state=lambda env: np.zeros(4),
         lower=-1.0,
         upper=1.0,
-        hold_s=0.01,
+        control_dt=0.01,
     )
     with pytest.raises(UnsupportedEnvError, match=r"MujocoPlant.*Clearance"):
         sw.CBFActionFilter(PointWorld(), [sw.constraints.WallClearance()], plant=plant)

@@ -47,7 +47,7 @@ def true_points(data):
 def test_bodies_sites_and_geoms_are_where_mujoco_has_them_now_and_ahead():
     env = Scene(ARM)
     names = {"bodies": ["lower", "upper"], "sites": ["tip"], "geoms": ["bone", "shin"]}
-    limit = bound(env, sw.constraints.Workspace(low=[0.0, 0.0, 0.0], holds=2, **names))
+    limit = bound(env, sw.constraints.Workspace(low=[0.0, 0.0, 0.0], horizon=2, **names))
     plant = limit.plant
     rng = np.random.default_rng(0)
     truth = mujoco.MjData(env.model)
@@ -116,7 +116,7 @@ def test_published_obstacles_are_taken_where_they_are():
 def test_where_nothing_stands_nothing_is_refused():
     env = gym.make("SafePointGoal0-v0", disable_env_checker=True)  # a level without hazards
     limit = sw.constraints.Workspace(
-        keep_out=[sw.constraints.Discs("hazard_positions", 0.2)], bodies=["agent"], reach=0.1
+        keep_out=[sw.constraints.Discs("hazard_positions", 0.2)], bodies=["agent"], max_decrease=0.1
     )
     filtered = sw.CBFActionFilter(env, [limit])
     filtered.reset(seed=0)
@@ -142,19 +142,19 @@ def in_box(body, low, high):
 CASES = {
     "a box on Reacher": (
         "Reacher-v5",
-        sw.constraints.Workspace([*FINGER_LOW, None], [*FINGER_HIGH, None], bodies=["fingertip"], holds=10),
+        sw.constraints.Workspace([*FINGER_LOW, None], [*FINGER_HIGH, None], bodies=["fingertip"], horizon=10),
         in_box("fingertip", FINGER_LOW, FINGER_HIGH),
     ),
     "a disc on Reacher": (
         "Reacher-v5",
         sw.constraints.Workspace(
-            keep_out=[sw.constraints.Disc([0.0, 0.15], 0.06)], geoms=["fingertip"], radius=0.01, holds=10
+            keep_out=[sw.constraints.Disc([0.0, 0.15], 0.06)], geoms=["fingertip"], radius=0.01, horizon=10
         ),
         lambda model, data: np.linalg.norm(data.geom("fingertip").xpos[:2] - [0.0, 0.15]) - 0.07,
     ),
     "a box on Pusher": (
         "Pusher-v5",
-        sw.constraints.Workspace(list(TABLE_LOW), list(TABLE_HIGH), bodies=["tips_arm"], holds=8),
+        sw.constraints.Workspace(list(TABLE_LOW), list(TABLE_HIGH), bodies=["tips_arm"], horizon=8),
         in_box("tips_arm", TABLE_LOW, TABLE_HIGH),
     ),
 }
@@ -211,7 +211,7 @@ def test_far_inside_the_actions_pass_bit_for_bit():
 def test_from_inside_an_obstacle_it_goes_out():
     disc = sw.constraints.Disc([0.21, 0.0], 0.04)  # Reacher starts with its arm along x, the tip at 0.21
     filtered = sw.CBFActionFilter(
-        gym.make("Reacher-v5"), [sw.constraints.Workspace(keep_out=[disc], bodies=["fingertip"], holds=10)]
+        gym.make("Reacher-v5"), [sw.constraints.Workspace(keep_out=[disc], bodies=["fingertip"], horizon=10)]
     )
     raw = filtered.unwrapped
     judge = Judge(
@@ -261,8 +261,8 @@ def test_it_is_rebuilt_from_the_spec_and_from_json():
         geoms=["link0"],
         radius=0.01,
         margin=0.02,
-        holds=7,
-        reach=0.3,
+        horizon=7,
+        max_decrease=0.3,
     )
     filtered = sw.CBFActionFilter(gym.make("Reacher-v5"), [limit])
     for spec in (filtered.spec, EnvSpec.from_json(filtered.spec.to_json())):

@@ -130,7 +130,7 @@ EXAMPLES = {
                 "budget": sw.StoppingBudget(
                     sw.constraints.JointPositionLimit(-2.0, 2.0, ["joint1"], margin=0.01), closing_speed=10.0
                 ),
-                "reach": {"max_acceleration": [8.0, 20.0], "max_speed": 4.0},
+                "motion_limits": {"max_acceleration": [8.0, 20.0], "max_speed": 4.0},
                 "fallback": "hold",
             },
         ),
@@ -235,7 +235,7 @@ EXAMPLES = {
                 "zmp_inset": 0.01,
                 "tolerance": 0.02,
                 "bodies": ["foot"],
-                "holds": 2,
+                "horizon": 2,
                 "fallback": "zero",
             },
         ),
@@ -346,7 +346,7 @@ def test_what_is_not_plain_data_is_still_recorded_for_gym_make():
         f=lambda x: np.array([x[1], 15 * np.sin(x[0])]),
         g=lambda x: np.array([[0.0], [3.0]]),
         state=lambda env: env.state,
-        hold_s=0.05,
+        control_dt=0.05,
     )
     slow = sw.constraints.Barrier(lambda x: 4.0 - x[1] ** 2, alpha=2.0)
     env = sw.CBFActionFilter(gym.make("Pendulum-v1"), [slow], plant=plant, fallback=lambda plant: [0.0])
@@ -569,7 +569,7 @@ def test_constraints_and_plant_survive_pickling(case, bound):
         env = sw.CBFActionFilter(gym.make(env_id), **arguments())
         env.reset(seed=0)
         bound, plant = pickle.loads(pickle.dumps((env.filter.bound, env.plant)))
-        assert plant.stamp == env.plant.stamp
+        assert plant.observation_id == env.plant.observation_id
         for mine, theirs in zip(env.filter.bound, bound, strict=True):
             np.testing.assert_array_equal(mine.value(), theirs.value())
     else:

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from safe_wrappers.control.numerics.rectangles import apart, closer, gaps, merged, nearest
@@ -61,6 +61,7 @@ def test_inside_it_is_the_shortest_way_out_along_an_axis(a, b):
 
 @settings(max_examples=200, deadline=None)
 @given(RECTANGLES, st.lists(RECTANGLES, max_size=6), st.floats(0.0, 3.0))
+@example((0.0, 2.458, 0.0, 1.0), [(2.897, 3.0, 0.0, 1.0)], 0.43899999999999967)  # the sum is rounded, too
 def test_nearest_and_closer_agree_with_every_single_distance(around, among, limit):
     distances = [apart(around, r) for r in among]
     assert closer(around, among, limit) == [r for r, d in zip(among, distances, strict=True) if d < limit]

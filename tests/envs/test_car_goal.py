@@ -164,7 +164,7 @@ def test_hull_is_the_model_s(make_car):
         corners = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T * model.geom_aabb[g, 3:]
         turned = (corners + model.geom_aabb[g, :3]) @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g]
         farthest = max(farthest, np.hypot(*(turned[:, :2] - env.agent_position).T).max())
-    assert pytest.approx(farthest) == CAR.reach
+    assert pytest.approx(farthest) == CAR.radius
 
 
 def test_a_standing_car_s_wheels_touch_the_floor(make_car):

@@ -221,7 +221,7 @@ def test_a_smoothstep_over_two_periods_injects_a_tenth_of_a_step_at_most(bare, e
 def test_ramps_within_the_slew_limit_stay_below_the_energy(bare, elbow):
     m = pose(bare, elbow)
     allowed = 1e-3
-    limit = torque_slew_limit(allowed, *machine(bare, m), weights=[3.0, 1.0], hold_s=bare.dt)
+    limit = torque_slew_limit(allowed, *machine(bare, m), weights=[3.0, 1.0], control_dt=bare.dt)
     worst = 0.0
     for signs in itertools.product((1.0, -1.0), repeat=2):
         pose(bare, elbow)

@@ -331,7 +331,7 @@ def test_a_plant_finds_the_machine(robot, version):
     assert type(bare) is getattr(module, f"Safe{robot}VelocityEnv")
     plant = MujocoPlant()
     plant.bind(env)
-    assert plant.hold_s == pytest.approx(bare.dt)
+    assert plant.control_dt == pytest.approx(bare.dt)
     assert plant.substeps == bare.frame_skip
 
 

@@ -14,7 +14,7 @@ PENDULUM = {
     "f": lambda x: np.array([x[1], 15.0 * np.sin(x[0])]),
     "g": lambda x: np.array([[0.0], [3.0]]),
     "state": lambda env: env.state,
-    "hold_s": 0.05,
+    "control_dt": 0.05,
 }
 
 
@@ -80,10 +80,14 @@ def on_cart(env, **timing):
 
 def test_a_step_of_unknown_length_is_asked_for_and_not_assumed():
     # With an assumed 0.05 s every step of this env left the limit behind, some of them unflagged.
-    with pytest.raises(ConfigurationError, match=r"Slow.* no attribute dt\): pass hold_s, in seconds"):
+    with pytest.raises(ConfigurationError, match=r"Slow.* no attribute dt\): pass control_dt, in seconds"):
         on_cart(Slow())
-    for filtered in (on_cart(Slow(), hold_s=1.0), on_cart(Slow(dt=1.0)), on_cart(Slow(dt=1.0), hold_s=1.0)):
-        assert filtered.plant.hold_s == 1.0
+    for filtered in (
+        on_cart(Slow(), control_dt=1.0),
+        on_cart(Slow(dt=1.0)),
+        on_cart(Slow(dt=1.0), control_dt=1.0),
+    ):
+        assert filtered.plant.control_dt == 1.0
         filtered.reset(seed=0)
         for _ in range(6):
             filtered.step(np.ones(1, np.float32))
@@ -92,7 +96,7 @@ def test_a_step_of_unknown_length_is_asked_for_and_not_assumed():
 
 def test_the_envs_own_time_step_is_taken():
     env = gym.make("Pendulum-v1")
-    assert plant_on(env, hold_s=None).hold_s == 0.05 == env.unwrapped.dt
+    assert plant_on(env, control_dt=None).control_dt == 0.05 == env.unwrapped.dt
 
 
 @pytest.mark.parametrize("dt", [0.0, -0.1, np.nan])
@@ -104,10 +108,10 @@ def test_a_senseless_time_step_of_the_env_is_refused(dt):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"hold_s": 0.02}, r"hold_s = 0.02 s, but one step of this env lasts dt = 0.05 s"),
-        ({"hold_s": -0.05}, r"hold_s is the control interval in seconds, > 0; got -0.05"),
-        ({"hold_s": 0.0}, r"hold_s is the control interval in seconds, > 0; got 0.0"),
-        ({"hold_s": np.nan}, r"hold_s is the control interval in seconds, > 0; got nan"),
+        ({"control_dt": 0.02}, r"control_dt = 0.02 s, but one step of this env lasts dt = 0.05 s"),
+        ({"control_dt": -0.05}, r"control_dt is the control interval in seconds, > 0; got -0.05"),
+        ({"control_dt": 0.0}, r"control_dt is the control interval in seconds, > 0; got 0.0"),
+        ({"control_dt": np.nan}, r"control_dt is the control interval in seconds, > 0; got nan"),
         ({"delay_s": -0.1}, r"delay_s is a time in seconds, >= 0; got -0.1"),
         ({"delay_s": np.inf}, r"delay_s is a time in seconds, >= 0; got inf"),
         ({"lower": [-1.0, -1.0]}, r"the env has 1 controls; got bounds of shape \(2,\)"),
@@ -145,7 +149,7 @@ def test_mountain_car_has_no_dt_so_any_hold_is_taken_at_its_word():
         env,
         f=lambda x: np.array([x[1], -0.0025 * np.cos(3 * x[0])]),
         g=lambda x: np.array([[0.0], [0.0015]]),
-        hold_s=1.0,
+        control_dt=1.0,
     )
     for _ in range(20):
         plant.observe()

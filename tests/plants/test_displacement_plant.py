@@ -67,7 +67,7 @@ def test_every_substep_is_the_envs_own_to_the_last_bit(env_id):
         control = action.astype(np.float64)
         if k % 3 == 1:  # other questions between do not disturb it
             plant.pose(), plant.forecast(-control), plant.forward(), plant.braking()
-        forecast = plant.forecast(control, holds=2)
+        forecast = plant.forecast(control, horizon=2)
         if k % 5 == 0:
             *_, last = plant.rollout(control)
             expected = inputs(last)
@@ -107,7 +107,7 @@ def test_after_the_held_action_a_forecast_brakes_as_steps_of_zero_do(env_id):
         env.step(action)
     plant.observe()
     action = np.array([1.0, -0.4, -0.2, 0.7], dtype=np.float32)
-    forecast = plant.forecast(action.astype(np.float64), holds=4)
+    forecast = plant.forecast(action.astype(np.float64), horizon=4)
     assert np.array_equal(plant.braking(), np.zeros(4))
     for hold in range(4):
         env.step(action if hold == 0 else np.zeros(4, np.float32))
@@ -270,11 +270,11 @@ def test_no_displacement_stops_the_gripper_within_one_interval():
         for _ in range(2):
             env.step(action)
         plant.observe()
-        places = plant.forecast(action.astype(np.float64), holds=3).poses().frames[:, gripper]
+        places = plant.forecast(action.astype(np.float64), horizon=3).poses().frames[:, gripper]
         end = plant.substeps
         speed = np.linalg.norm(places[end - 1] - places[end - 2]) / 0.002
         onwards = (places[end:] - places[end - 1]) @ (action[:3] / np.linalg.norm(action[:3]))
-        left = np.linalg.norm(places[-1] - places[2 * end - 1]) / plant.hold_s
+        left = np.linalg.norm(places[-1] - places[2 * end - 1]) / plant.control_dt
         assert 0.55 < speed < 1.05
         assert 0.003 < onwards.max() < 0.007
         assert left < 0.03

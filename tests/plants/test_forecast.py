@@ -162,8 +162,8 @@ def test_a_short_forecast_is_the_beginning_of_a_long_one():
     plant, other = bound(env), bound(env)
     for u in (np.full(8, 0.5), np.full(8, -1.0)):
         long = plant.forecast(u, 4)
-        for holds in (1, 2, 4):
-            short, alone = long.first(holds), other.forecast(u, holds)
+        for horizon in (1, 2, 4):
+            short, alone = long.first(horizon), other.forecast(u, horizon)
             for name in ("qpos", "qvel", "published_frames", "published_centres"):
                 assert getattr(short, name).tobytes() == getattr(alone, name).tobytes()
             np.testing.assert_array_equal(short.poses().frames, alone.poses().frames)
@@ -187,9 +187,9 @@ def test_one_control_is_simulated_once_until_something_changes(monkeypatch):
     plant, count = bound(env), simulated(monkeypatch)
     u = np.full(6, 0.3)
 
-    def asked(control, holds):
+    def asked(control, horizon):
         before = count[0]
-        forecast = plant.forecast(control, holds)
+        forecast = plant.forecast(control, horizon)
         return forecast, count[0] - before
 
     long, first = asked(u, 3)

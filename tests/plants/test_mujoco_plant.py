@@ -315,9 +315,9 @@ def test_a_step_of_unknown_length_is_not_taken_for_one_physics_step():
         bound(Timeless({}))
     for told in ({"dt": 0.04}, {"frame_skip": 4}, {"n_substeps": 4}):
         plant = bound(Timeless(told))
-        assert (plant.substeps, plant.hold_s) == (4, 0.04)
+        assert (plant.substeps, plant.control_dt) == (4, 0.04)
     with pytest.raises(
-        ConfigurationError, match=r"hold_s = 0.04 s, but one step of this env lasts dt = 0.044"
+        ConfigurationError, match=r"control_dt = 0.04 s, but one step of this env lasts dt = 0.044"
     ):
         bound(Timeless({"dt": 0.044}))  # no whole number of physics steps
 

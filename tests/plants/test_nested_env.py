@@ -11,15 +11,15 @@ gym.register_envs(robotics)
 
 
 @pytest.mark.parametrize(
-    ("env_id", "substeps", "hold_s"), [("AntMaze_UMaze-v5", 5, 0.05), ("PointMaze_UMaze-v3", 1, 0.01)]
+    ("env_id", "substeps", "control_dt"), [("AntMaze_UMaze-v5", 5, 0.05), ("PointMaze_UMaze-v3", 1, 0.01)]
 )
-def test_the_hold_is_the_inner_env_s(env_id, substeps, hold_s):
+def test_the_hold_is_the_inner_env_s(env_id, substeps, control_dt):
     env = gym.make(env_id)
     plant = sw.MujocoPlant()
     plant.bind(env)
     assert plant.substeps == substeps
-    assert plant.hold_s == pytest.approx(hold_s)
+    assert plant.control_dt == pytest.approx(control_dt)
     env.reset(seed=0)
     before = env.unwrapped.data.time
     env.step(np.zeros(env.action_space.shape, env.action_space.dtype))
-    assert env.unwrapped.data.time - before == pytest.approx(plant.hold_s)
+    assert env.unwrapped.data.time - before == pytest.approx(plant.control_dt)

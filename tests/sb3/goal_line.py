@@ -50,7 +50,7 @@ class BonusLine(GoalLine):
 
 
 def filtered(wall=WALL, task=GoalLine):
-    plant = sw.AnalyticPlant(f=drift, g=push, state=read, hold_s=HOLD)
+    plant = sw.AnalyticPlant(f=drift, g=push, state=read, control_dt=HOLD)
     return Monitor(sw.RecordInterventions(sw.CBFActionFilter(task(), [BehindTheWall(wall)], plant=plant)))
 
 

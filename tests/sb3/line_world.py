@@ -52,7 +52,7 @@ class BehindTheWall(sw.Constraint):
 class BoundBehindTheWall(BoundConstraint):
     def rows(self):
         left = self.spec.wall - self.plant.state[0]
-        return sw.HalfSpaces(np.array([[self.plant.hold_s]]), np.array([left]))
+        return sw.HalfSpaces(np.array([[self.plant.control_dt]]), np.array([left]))
 
 
 class AsDict(gym.ObservationWrapper):
@@ -80,7 +80,7 @@ def read(env):
 
 
 def filtered(wall=WALL):
-    plant = sw.AnalyticPlant(f=drift, g=push, state=read, hold_s=HOLD)
+    plant = sw.AnalyticPlant(f=drift, g=push, state=read, control_dt=HOLD)
     return Monitor(sw.RecordInterventions(sw.CBFActionFilter(Line(), [BehindTheWall(wall)], plant=plant)))
 
 

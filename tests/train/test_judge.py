@@ -40,7 +40,7 @@ def slow_pendulum(env, delay_s=0.0):
         f=lambda x: np.array([x[1], 15 * np.sin(x[0])]),
         g=lambda x: np.array([[0.0], [3.0]]),
         state=lambda env: env.state,
-        hold_s=0.05,
+        control_dt=0.05,
         delay_s=delay_s,
     )
     return sw.CBFActionFilter(

@@ -38,7 +38,7 @@ class BehindTheWall(sw.Constraint):
 
 class BoundBehindTheWall(BoundConstraint):
     def rows(self):
-        return sw.HalfSpaces(np.array([[self.plant.hold_s, 0.0]]), np.array([WALL - self.plant.state[0]]))
+        return sw.HalfSpaces(np.array([[self.plant.control_dt, 0.0]]), np.array([WALL - self.plant.state[0]]))
 
 
 def drift(x):
@@ -55,7 +55,7 @@ def read(env):
 
 def shield(env):
     """The fake task's point moves by 0.1 of its action: an integrator, held for 0.1 s."""
-    plant = sw.AnalyticPlant(f=drift, g=push, state=read, hold_s=0.1)
+    plant = sw.AnalyticPlant(f=drift, g=push, state=read, control_dt=0.1)
     return sw.CBFActionFilter(env, [BehindTheWall()], plant=plant)
 
 

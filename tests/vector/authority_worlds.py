@@ -14,7 +14,7 @@ RAIL = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
 
 
 def _plant():
-    return sw.AnalyticPlant(f=drift, g=push, state=read, hold_s=DT)
+    return sw.AnalyticPlant(f=drift, g=push, state=read, control_dt=DT)
 
 
 def cart(index=0, chunked=True):

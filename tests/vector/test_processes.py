@@ -35,7 +35,7 @@ def ahead(x):
 
 
 def with_wrong_barrier(index):
-    plant = sw.AnalyticPlant(f=drift, g=push, state=read, hold_s=DT)
+    plant = sw.AnalyticPlant(f=drift, g=push, state=read, control_dt=DT)
     return sw.CBFActionFilter(ScheduledCart(index), [sw.constraints.Barrier(ahead)], plant=plant)
 
 

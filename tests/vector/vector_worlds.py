@@ -94,7 +94,7 @@ class CountUnsafeWarnings(gym.Wrapper):
 
 def cart_filter(index=0, delay_s=0.0, fallback="hold"):
     """A cart that stays in front of a wall and below 0.5 m/s. `hold` shows the last action after a reset."""
-    plant = sw.AnalyticPlant(f=drift, g=push, state=read, hold_s=DT, delay_s=delay_s)
+    plant = sw.AnalyticPlant(f=drift, g=push, state=read, control_dt=DT, delay_s=delay_s)
     wall = sw.constraints.Clearance(
         [sw.constraints.Plane([WALL], [-1.0])], braking=1.0, position=[0], velocity=[1]
     )

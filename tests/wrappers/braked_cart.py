@@ -139,7 +139,7 @@ def _state(env):
 
 def cart_plant(dt):
     """For fallbacks, which want one."""
-    return sw.AnalyticPlant(f=_drift, g=_push, state=_state, hold_s=dt)
+    return sw.AnalyticPlant(f=_drift, g=_push, state=_state, control_dt=dt)
 
 
 def worst_way(tau, v, drive, top):

@@ -65,4 +65,4 @@ def unmoved(x):
 
 def counting_plant(dt=0.1):
     """Its state is the number of the control step."""
-    return sw.AnalyticPlant(f=still, g=unmoved, state=counted, hold_s=dt)
+    return sw.AnalyticPlant(f=still, g=unmoved, state=counted, control_dt=dt)

@@ -18,8 +18,8 @@ class Nowhere(gym.Env):
 
 
 def admission(state, arrival="moving", **changed):
-    reach = {**LIMITS, "arrival": arrival, **changed}
-    return Admission(Nowhere(), reach, lambda env: state, len(state[0]))
+    motion_limits = {**LIMITS, "arrival": arrival, **changed}
+    return Admission(Nowhere(), motion_limits, lambda env: state, len(state[0]))
 
 
 def quickest(start, end):
@@ -80,7 +80,7 @@ def test_the_lengths_of_actuators_are_what_is_measured_by_default():
 
 
 @pytest.mark.parametrize(
-    ("reach", "measured", "error", "words"),
+    ("motion_limits", "measured", "error", "words"),
     [
         ({**LIMITS, "arrival": "soon"}, lambda env: ([0.0], [0.0]), UnknownNameError, "'moving' or 'rest'"),
         ({"max_speed": 1.0}, lambda env: ([0.0], [0.0]), ConfigurationError, "max_acceleration"),
@@ -94,9 +94,9 @@ def test_the_lengths_of_actuators_are_what_is_measured_by_default():
         (LIMITS, None, UnsupportedEnvError, "pass measured"),
     ],
 )
-def test_bad_limits(reach, measured, error, words):
+def test_bad_limits(motion_limits, measured, error, words):
     with pytest.raises(error, match=words):
-        Admission(Nowhere(), reach, measured, 1)
+        Admission(Nowhere(), motion_limits, measured, 1)
 
 
 def test_rest_with_limited_jerk_needs_accelerations():

@@ -431,11 +431,11 @@ def far_away(env):
     return [9.0], [0.0]
 
 
-def admitted_stack(env, reach=LIMITS, **more):
+def admitted_stack(env, motion_limits=LIMITS, **more):
     env = sw.LeaseExpiry(
         env,
         sw.StoppingBudget(far_away, braking=1.0, acceleration=0.0),
-        reach=reach,
+        motion_limits=motion_limits,
         max_lease_s=5.0,
         fallback="hold",
         **more,
@@ -510,24 +510,24 @@ def test_where_the_machine_is_may_be_measured_by_a_function(arm):
 
 
 def test_without_limits_everything_is_admitted(arm):
-    env = admitted_stack(arm, reach=None)
+    env = admitted_stack(arm, motion_limits=None)
     env.reset(seed=0)
     assert not env.step(np.tile([2.0, 3.0], (10, 1)))[4]["lease/refused"]
 
 
 def test_a_limit_on_the_jerk_refuses_nothing_that_a_machine_in_full_acceleration_reaches(arm):
-    env = admitted_stack(arm, reach={**LIMITS, "max_jerk": 10.0})
+    env = admitted_stack(arm, motion_limits={**LIMITS, "max_jerk": 10.0})
     env.reset(seed=0)
     # The acceleration is not measured: it may be at its most.
-    reach = simulated_reach(0.2, 0.0, 1.0, 8.0, 1.0)
+    way = simulated_reach(0.2, 0.0, 1.0, 8.0, 1.0)
     chunk = np.zeros((10, 2))
-    chunk[-1, 0] = 0.999 * reach
+    chunk[-1, 0] = 0.999 * way
     assert not env.step(chunk)[4]["lease/refused"]
 
 
 def test_single_commands_are_not_a_chunks_business(arm):
     env = sw.LeaseExpiry(
-        arm, sw.StoppingBudget(far_away, braking=1.0, acceleration=0.0), reach=LIMITS, fallback="hold"
+        arm, sw.StoppingBudget(far_away, braking=1.0, acceleration=0.0), motion_limits=LIMITS, fallback="hold"
     )
     env.reset(seed=0)
     with warnings.catch_warnings():

@@ -399,7 +399,7 @@ def test_a_discrete_part_is_named(space):
 def test_another_dt_than_the_envs_is_refused(hold):
     # Bug 7.
     with pytest.raises(
-        ConfigurationError, match=rf"hold_s = {hold} s, but one step of this env lasts dt = 0.1 s"
+        ConfigurationError, match=rf"control_dt = {hold} s, but one step of this env lasts dt = 0.1 s"
     ):
         sw.CBFActionFilter(Cart(0.1), [wall(1.0)], plant=cart_plant(hold))
 
@@ -636,7 +636,7 @@ class Plane2(gym.Env):
 
 def test_several_constraints_are_one_projection():
     # Bug 5: projected one after another the second undoes the first.
-    plant = sw.AnalyticPlant(f=np.zeros_like, g=lambda x: np.eye(2), state=read, hold_s=0.1)
+    plant = sw.AnalyticPlant(f=np.zeros_like, g=lambda x: np.eye(2), state=read, control_dt=0.1)
     first, second = Raw([[1.0, 0.0]], [-0.1]), Raw([[-1.0, 1.0]], [-0.2])
     filtered = sw.CBFActionFilter(Plane2(), [first, second], plant=plant)
     filtered.reset(seed=0)
@@ -710,7 +710,7 @@ def pendulum(gravity=10.0, dt=0.05, **options):
         state=lambda env: env.state,
         lower=-2.0,
         upper=2.0,
-        hold_s=dt,
+        control_dt=dt,
     )
     return sw.CBFActionFilter(
         env, [sw.constraints.Barrier(lambda x: 4.0 - x[1] ** 2, alpha=2.0)], plant=plant, **options
@@ -782,7 +782,7 @@ def car():
         f=lambda x: np.array([x[1], -0.0025 * np.cos(3 * x[0])]),
         g=lambda x: np.array([[0.0], [0.0015]]),
         state=lambda env: env.state,
-        hold_s=1.0,
+        control_dt=1.0,
     )
     slow = sw.constraints.Barrier(lambda x: 1.0 - (x[1] / 0.02) ** 2, alpha=0.5, margin=0.05)
     return sw.CBFActionFilter(gym.make("MountainCarContinuous-v0"), [slow], plant=plant)
@@ -879,7 +879,7 @@ def fast_cart():
     constraint = sw.constraints.Clearance(
         [sw.constraints.Plane([0.4], [-1.0])], braking=1.0, position=[0], velocity=[1]
     )
-    plant = sw.AnalyticPlant(f=drift, g=push, state=read, hold_s=0.1)
+    plant = sw.AnalyticPlant(f=drift, g=push, state=read, control_dt=0.1)
     return gym.wrappers.TimeLimit(sw.CBFActionFilter(Cart(), [constraint], plant=plant), 12)
 
 

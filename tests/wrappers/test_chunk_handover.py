@@ -786,8 +786,8 @@ def handover(env, **changed):
         ),
         ({"rate_limit": None, "execution_horizon": 5, "inference_delay": [0, 3]}, "no left-over"),
         ({"rate_limit": None, "chunk_size": 1, "execution_horizon": 1}, "no left-over"),
-        ({"hold_s": 0.2}, "dt = 0.1"),
-        ({"hold_s": 0.0}, "hold_s .*> 0"),
+        ({"control_dt": 0.2}, "dt = 0.1"),
+        ({"control_dt": 0.0}, "control_dt .*> 0"),
         ({"decay": -0.1, "blend": "ensemble", "rate_limit": None}, "decay .*>= 0"),
         ({"decay": math.nan, "blend": "ensemble", "rate_limit": None}, "decay .*finite"),
         ({"fallback": "sleep"}, "no fallback 'sleep'; choose brake, hold, zero"),
@@ -807,7 +807,7 @@ def test_every_component_needs_a_limit_that_its_numbers_resolve(limit):
 
 
 def test_the_longest_blend_time_that_fits_is_accepted():
-    assert handover(Line(), blend_time=0.8, rate_limit=None).hold_s == HOLD
+    assert handover(Line(), blend_time=0.8, rate_limit=None).control_dt == HOLD
     assert handover(Line(), blend_time=0.5, inference_delay=3, rate_limit=None).chunk_size == 8
 
 
@@ -817,9 +817,9 @@ def test_an_env_that_does_not_say_how_long_a_step_lasts_needs_hold_s():
             super().__init__()
             del self.dt
 
-    with pytest.raises(ConfigurationError, match="pass hold_s"):
+    with pytest.raises(ConfigurationError, match="pass control_dt"):
         handover(Timeless())
-    env = handover(Timeless(), hold_s=0.02)
+    env = handover(Timeless(), control_dt=0.02)
     env.reset(seed=0)
     env.step(numbered(0, 8))
     assert env.now_s == pytest.approx(0.08)
@@ -929,7 +929,12 @@ def test_a_spec_holds_plain_data():
 )
 def test_limits_may_be_numpys_and_are_recorded_as_plain_numbers(limit):
     env = sw.ChunkHandover(
-        gym.make("Reacher-v5"), 8, 4, rate_limit=limit, blend_time=np.float32(0.1), hold_s=np.float64(0.02)
+        gym.make("Reacher-v5"),
+        8,
+        4,
+        rate_limit=limit,
+        blend_time=np.float32(0.1),
+        control_dt=np.float64(0.02),
     )
     again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
     assert (
@@ -1062,14 +1067,14 @@ def test_whoever_is_inside_is_told_what_every_command_is_made_from():
 
 @pytest.mark.parametrize("between", [lambda env: env, lambda env: DroppedRefreshes(env, 0.0)])
 def test_admission_inside_refuses_a_chunk_and_the_left_over_goes_on(between):
-    def reach(env):
+    def reached(env):
         return np.zeros(1), np.zeros(1)
 
     lease = sw.LeaseExpiry(
         Line(),
         sw.StoppingBudget(lambda env: ([9.0], [0.0]), braking=1.0, acceleration=1.0),
-        reach={"max_speed": 1.0, "max_acceleration": 10.0},
-        measured=reach,
+        motion_limits={"max_speed": 1.0, "max_acceleration": 10.0},
+        measured=reached,
         fallback="zero",
     )
     env = sw.ChunkHandover(between(lease), 6, 3, rate_limit=5.0, fallback="zero")

@@ -129,8 +129,8 @@ def test_without_counting_the_way_to_rest_it_violates():
     coasting = env.filter.bound[0]._coasting
     run = coasting.run
 
-    def short_sighted(control, holds, radius):
-        course = run(control, holds, radius)
+    def short_sighted(control, horizon, radius):
+        course = run(control, horizon, radius)
         return course._replace(places=course.places[:10], ahead=course.ahead[:10])
 
     coasting.run = short_sighted

@@ -88,7 +88,7 @@ def test_no_driver_gets_there_in_a_thousand_steps(env_id, driver):
 def test_three_lines_protect_by_hand():
     env = gym.make("FetchReach-v4")
     box = sw.constraints.Workspace(
-        [1.2, 0.6, 0.45], [1.45, 0.9, 0.7], sites=["robot0:grip"], margin=0.001, holds=2
+        [1.2, 0.6, 0.45], [1.45, 0.9, 0.7], sites=["robot0:grip"], margin=0.001, horizon=2
     )
     env = sw.CBFActionFilter(env, [box])
     assert isinstance(env.plant, sw.plants.DisplacementPlant)
@@ -226,14 +226,14 @@ def test_where_nothing_is_near_the_action_is_the_policys_to_the_last_bit(env_id)
 
 
 @pytest.mark.parametrize("constraint, value, limit", [
-    (sw.constraints.JointSpeedLimit(1.0, joints=ARM, margin=0.02, holds=1), "joint speed", 1.0),
+    (sw.constraints.JointSpeedLimit(1.0, joints=ARM, margin=0.02, horizon=1), "joint speed", 1.0),
     (
-        sw.constraints.JointPositionLimit([-0.7, 0.4], [0.7, 2.0], joints=[ARM[0], ARM[3]], margin=0.01, holds=2),
+        sw.constraints.JointPositionLimit([-0.7, 0.4], [0.7, 2.0], joints=[ARM[0], ARM[3]], margin=0.01, horizon=2),
         "angles",
         0.0,
     ),
     (
-        sw.constraints.SpeedLimit(0.5, body="robot0:gripper_link", direction="xy", margin=0.01, holds=2),
+        sw.constraints.SpeedLimit(0.5, body="robot0:gripper_link", direction="xy", margin=0.01, horizon=2),
         "gripper speed",
         0.5,
     ),

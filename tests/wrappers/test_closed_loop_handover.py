@@ -74,7 +74,7 @@ def test_hundreds_of_seams_and_not_one_beyond_the_limit(env_id, blend):
     assert seams > 80 and len(found) >= 4
     assert sum(i["handover/starved"] for i in infos) > 0, "the fallback had its turn"
     for commands, _ in found:
-        assert np.abs(np.diff(commands, axis=0)).max() <= limit * env.hold_s
+        assert np.abs(np.diff(commands, axis=0)).max() <= limit * env.control_dt
     assert max(i["handover/peak_jerk"] for i in infos) <= limit
     assert sum(i["handover/steps"] for i in infos) == sum(len(c) for c, _ in found)
     in_time = sum(i["handover/limited"] == 0 for i in infos) / len(infos)
@@ -115,10 +115,10 @@ def test_a_filter_inside_may_break_the_limit_and_then_it_shows():
         executed = np.array([i["executed_action"] for i in recorder.infos[-8:]], np.float64)
         whole = executed if last is None else np.vstack([last, executed])
         last = executed[-1:]
-        peak = np.abs(np.diff(whole, axis=0)).max() / env.hold_s
+        peak = np.abs(np.diff(whole, axis=0)).max() / env.control_dt
         assert info["handover/peak_jerk"] == pytest.approx(peak)
         above += peak > limit
-    assert np.abs(np.diff(recorder.commands, axis=0)).max() <= limit * env.hold_s
+    assert np.abs(np.diff(recorder.commands, axis=0)).max() <= limit * env.control_dt
     assert above > 0
 
 
@@ -128,7 +128,7 @@ def test_what_a_filter_lets_pass_keeps_the_limit_as_executed_action():
     rng = np.random.default_rng(0)
     for _, infos in episodes(env, smooth_chunks(env, rng), 30, late=rng)[1]:
         executed = np.array([i["executed_action"] for i in infos], np.float64)
-        assert np.abs(np.diff(executed, axis=0)).max() <= 4.0 * env.hold_s
+        assert np.abs(np.diff(executed, axis=0)).max() <= 4.0 * env.control_dt
 
 
 def test_control_goes_from_a_policy_to_a_human_and_back_on_an_arm():
@@ -146,7 +146,7 @@ def test_control_goes_from_a_policy_to_a_human_and_back_on_an_arm():
             env.switch("human" if t == 40 else "policy")
         env.step(chunk)
     commands = np.array(recorder.commands)
-    assert np.abs(np.diff(commands, axis=0)).max() <= limit * env.hold_s
+    assert np.abs(np.diff(commands, axis=0)).max() <= limit * env.control_dt
     executed = commands.astype(np.float32)
     assert executed[:40].tobytes() == asked[:40, 0].tobytes()
     for start in (40, 80):
@@ -166,6 +166,6 @@ def test_a_stack_of_handover_lease_and_filter_keeps_its_figures():
     infos, found, seams = episodes(env, smooth_chunks(env, rng), 60, late=rng)
     assert seams > 30
     for commands, of_steps in found:
-        assert np.abs(np.diff(commands, axis=0)).max() <= 8.0 * env.hold_s
+        assert np.abs(np.diff(commands, axis=0)).max() <= 8.0 * env.control_dt
         assert len(commands) == len(of_steps)
     assert {frozenset(i) for i in infos} == {frozenset(infos[0])}

@@ -267,7 +267,7 @@ def test_obstacles_that_are_no_discs_are_refused(obstacle):
 
 def test_an_analytic_plant_is_refused():
     plant = sw.AnalyticPlant(
-        f=np.zeros_like, g=lambda x: np.eye(2), state=lambda env: env.agent_position, hold_s=0.02
+        f=np.zeros_like, g=lambda x: np.eye(2), state=lambda env: env.agent_position, control_dt=0.02
     )
     with pytest.raises(UnsupportedEnvError, match="HeadingDriveClearance needs a MujocoPlant"):
         sw.CBFActionFilter(

@@ -21,7 +21,7 @@ class OldRow:
         self.limit = limit
 
     def rows(self, plant):
-        return sw.HalfSpaces(np.array([[plant.hold_s]]), np.array([self.limit - plant.state[1]]))
+        return sw.HalfSpaces(np.array([[plant.control_dt]]), np.array([self.limit - plant.state[1]]))
 
 
 class OldLimit:
@@ -51,7 +51,7 @@ class OldLimit:
         return sw.HalfSpaces.none(1)
 
     def shortfall(self, plant, control):
-        return plant.state[1] + plant.hold_s * control[0] - 1.0 + self.margin
+        return plant.state[1] + plant.control_dt * control[0] - 1.0 + self.margin
 
     def admits(self, plant, control):
         assert plant is self.bound_to
@@ -61,7 +61,7 @@ class OldLimit:
         if not self.linear:
             return sw.HalfSpaces.none(1)
         return sw.HalfSpaces(
-            np.array([[plant.hold_s]]), np.array([1.0 - self.margin - plant.state[1] - 1e-6])
+            np.array([[plant.control_dt]]), np.array([1.0 - self.margin - plant.state[1] - 1e-6])
         )
 
     def suggestions(self, plant, control):

@@ -43,11 +43,11 @@ def faulty(kind, env, **more):
 
 
 class Ear(gym.Wrapper, CommandReceiver):
-    """Writes down what arrives: the stamp (None: nothing) and the action, of a step of `hold_s`."""
+    """Writes down what arrives: the stamp (None: nothing) and the action, of a step of `control_dt`."""
 
-    def __init__(self, env, hold_s=0.1):
+    def __init__(self, env, control_dt=0.1):
         super().__init__(env)
-        self.hold_s = hold_s
+        self.control_dt = control_dt
 
     def reset(self, **kwargs):
         self.heard, self.stamp = [], "none given"
@@ -59,7 +59,7 @@ class Ear(gym.Wrapper, CommandReceiver):
 
     @property
     def now_s(self):
-        return len(self.heard) * self.hold_s
+        return len(self.heard) * self.control_dt
 
     def set_observation_time(self, observed_s):
         self.stamp = observed_s
@@ -351,7 +351,7 @@ def test_a_skewed_clock_outside_of_jitter():
 
 
 def test_now_is_the_receivers_clock():
-    ear = Ear(BrakedCart(dt=0.1), hold_s=0.25)
+    ear = Ear(BrakedCart(dt=0.1), control_dt=0.25)
     env = DroppedRefreshes(Outages(ear, 1.0, 1.0), 0.0)
     env.reset(seed=0)
     for t in range(4):
@@ -521,12 +521,12 @@ def test_a_clock_that_is_right():
 
 def test_who_counts_the_time():
     with pytest.raises(ConfigurationError, match="LeaseExpiry inside counts the time"):
-        DroppedRefreshes(leased(BrakedCart()), 0.5, hold_s=0.1)
-    with pytest.raises(ConfigurationError, match="hold_s"):
+        DroppedRefreshes(leased(BrakedCart()), 0.5, control_dt=0.1)
+    with pytest.raises(ConfigurationError, match="control_dt"):
         DroppedRefreshes(_timeless(), 0.5)
-    DroppedRefreshes(_timeless(), 0.5, hold_s=0.1)
-    with pytest.raises(ConfigurationError, match="hold_s"):
-        DroppedRefreshes(BrakedCart(dt=0.1), 0.5, hold_s=0.2)
+    DroppedRefreshes(_timeless(), 0.5, control_dt=0.1)
+    with pytest.raises(ConfigurationError, match="control_dt"):
+        DroppedRefreshes(BrakedCart(dt=0.1), 0.5, control_dt=0.2)
 
 
 def _timeless():
@@ -547,7 +547,7 @@ def test_orders_that_are_refused():
 
 def test_actions_that_are_no_box():
     with pytest.raises(ConfigurationError, match="Box"):
-        DroppedRefreshes(gym.make("CartPole-v1"), 0.5, hold_s=0.02)
+        DroppedRefreshes(gym.make("CartPole-v1"), 0.5, control_dt=0.02)
 
 
 def test_a_step_before_the_first_reset():

@@ -55,7 +55,7 @@ def test_a_barrier_on_pendulum_is_never_broken_in_silence(alpha, torque, holds):
         f=lambda x: np.array([x[1], 15.0 * np.sin(x[0])]),
         g=lambda x: np.array([[0.0], [3.0]]),
         state=lambda raw: raw.state,
-        hold_s=0.05,
+        control_dt=0.05,
     )
     filtered = sw.CBFActionFilter(
         env, [sw.constraints.Barrier(lambda x: 16.0 - x[1] ** 2, alpha=alpha)], plant=plant

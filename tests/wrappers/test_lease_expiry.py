@@ -70,9 +70,13 @@ def said(rng, env, t):
     """What the policy says at a step, and the stamp that comes with it."""
     action = np.where(rng.random(2) < 0.5, rng.uniform([-1.0, 0.0], 1.0), FULL)
     what = rng.choice(["fresh", "fresh", "fresh", "none", "repeat", "late", "old", "future", "sick"])
-    now = t * env.hold_s
-    stamps = {"none": None, "late": now - rng.uniform(0.0, 2.0) * env.hold_s, "old": now - 3.0 * env.hold_s}
-    stamps["future"] = now + rng.uniform(0.1, 2.0) * env.hold_s
+    now = t * env.control_dt
+    stamps = {
+        "none": None,
+        "late": now - rng.uniform(0.0, 2.0) * env.control_dt,
+        "old": now - 3.0 * env.control_dt,
+    }
+    stamps["future"] = now + rng.uniform(0.1, 2.0) * env.control_dt
     if what == "repeat" and t:
         stamps["repeat"] = env.repeated
     if what == "sick":
@@ -98,7 +102,7 @@ def follow(seed, steps=60):
         return lease_by_bisection(clearance, speed, cart.braking, cart.drive, cart.top, reserve, fixed + more)
 
     book = Book(
-        env.hold_s,
+        env.control_dt,
         lease,
         longest=options["max_lease_s"],
         blend=options["blend_time"],
@@ -117,7 +121,7 @@ def follow(seed, steps=60):
         action, stamp = said(rng, env, t)
         if t >= dead_from:
             stamp = None
-        if stamp != t * env.hold_s or rng.random() < 0.5:
+        if stamp != t * env.control_dt or rng.random() < 0.5:
             env.set_observation_time(stamp)
         asked = len(read)
         before = cart.readings
@@ -126,7 +130,7 @@ def follow(seed, steps=60):
         assert cart.readings - before == len(read) - asked  # the clearance is read for fresh commands alone
         assert lease_info(info) == tuple(flags), f"step {t}"
         # Never longer than the book's, and shorter by no more than what counts as the same time.
-        assert remaining - 2e-6 * env.hold_s <= info["lease/remaining_s"] <= remaining + 1e-9
+        assert remaining - 2e-6 * env.control_dt <= info["lease/remaining_s"] <= remaining + 1e-9
         np.testing.assert_allclose(cart.given[-1], wanted, rtol=0, atol=2e-7)
         counts += flags
     assert cart.farthest <= cart.wall - options["margin"] + 1e-9
@@ -576,7 +580,7 @@ def test_hold_holds_what_was_executed_last_and_nothing_after_a_reset():
 def test_the_clock_is_the_envs(dt):
     env = leased(BrakedCart(dt, wall=1e6), max_lease_s=0.5)
     env.reset()
-    assert env.hold_s == dt and env.now_s == 0.0
+    assert env.control_dt == dt and env.now_s == 0.0
     env.step(FULL)
     granted, lasted = env.now_s, 0
     assert granted == dt
@@ -601,7 +605,7 @@ def test_bounds_and_times_are_finite_and_not_negative(name, value):
         leased(BrakedCart(), **{name: value})
 
 
-@pytest.mark.parametrize("name", ["braking", "max_lease_s", "top_speed", "hold_s"])
+@pytest.mark.parametrize("name", ["braking", "max_lease_s", "top_speed", "control_dt"])
 @pytest.mark.parametrize("value", [*BAD[:-1], 0.0])
 def test_what_must_be_positive(name, value):
     with pytest.raises(ConfigurationError, match=name):
@@ -649,7 +653,7 @@ def test_leases_that_could_never_be_used_are_refused():
 
 
 @pytest.mark.parametrize(
-    "reach",
+    "motion_limits",
     [
         {"max_speed": 1.0},
         {"max_acceleration": -1.0},
@@ -659,15 +663,15 @@ def test_leases_that_could_never_be_used_are_refused():
         3.0,
     ],
 )
-def test_limits_of_reach_that_are_none(reach):
+def test_limits_of_reach_that_are_none(motion_limits):
     with pytest.raises(ConfigurationError, match=r"reach|max_acceleration"):
-        leased(BrakedCart(), reach=reach, measured=lambda env: ([0.0, 0.0], [0.0, 0.0]))
+        leased(BrakedCart(), motion_limits=motion_limits, measured=lambda env: ([0.0, 0.0], [0.0, 0.0]))
 
 
 def test_reach_needs_to_know_where_the_machine_is():
     with pytest.raises(UnsupportedEnvError, match="measured"):
-        leased(BrakedCart(), reach={"max_acceleration": 1.0})
-    with pytest.raises(ConfigurationError, match="reach"):
+        leased(BrakedCart(), motion_limits={"max_acceleration": 1.0})
+    with pytest.raises(ConfigurationError, match="motion_limits"):
         leased(BrakedCart(), measured=lambda env: ([0.0, 0.0], [0.0, 0.0]))
 
 

@@ -17,16 +17,16 @@ pytestmark = pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarnin
 LIMITS = {
     "Reacher-v5": [
         sw.constraints.JointSpeedLimit(6.0),
-        sw.constraints.JointPositionLimit(-1.5, 1.5, ["joint0"], holds=6),
+        sw.constraints.JointPositionLimit(-1.5, 1.5, ["joint0"], horizon=6),
         sw.constraints.Workspace(
-            keep_out=[sw.constraints.Disc([0.0, 0.15], 0.06)], bodies=["fingertip"], holds=6
+            keep_out=[sw.constraints.Disc([0.0, 0.15], 0.06)], bodies=["fingertip"], horizon=6
         ),
-        sw.constraints.SpeedLimit(0.8, "fingertip", holds=2),
-        sw.constraints.JointPositionLimit(-2.0, 2.0, ["joint1"], holds=6),
+        sw.constraints.SpeedLimit(0.8, "fingertip", horizon=2),
+        sw.constraints.JointPositionLimit(-2.0, 2.0, ["joint1"], horizon=6),
     ],
     "HalfCheetah-v5": [
         sw.constraints.SpeedLimit(0.5, "torso", "+x"),
-        sw.constraints.Upright("torso", lowest=-0.15, tilt=0.2, holds=3),
+        sw.constraints.Upright("torso", lowest=-0.15, tilt=0.2, horizon=3),
         sw.constraints.JointSpeedLimit(12.0),
     ],
 }
@@ -129,8 +129,8 @@ def test_an_action_that_is_no_number_was_refused_by_nobody(bad):
 def stuck(fallback="brake", **options):
     """Two demands that no control meets: the tip is to be left of one line and right of another."""
     limits = [
-        sw.constraints.Workspace(high=[0.0, None, None], bodies=["fingertip"], holds=4),
-        sw.constraints.Workspace(low=[0.1, None, None], bodies=["fingertip"], holds=4),
+        sw.constraints.Workspace(high=[0.0, None, None], bodies=["fingertip"], horizon=4),
+        sw.constraints.Workspace(low=[0.1, None, None], bodies=["fingertip"], horizon=4),
         sw.constraints.JointSpeedLimit(3.0),
     ]
     return made("Reacher-v5", limits, fallback=fallback, **options)

@@ -24,7 +24,7 @@ def test_one_analytic_plant_in_a_vector_env():
         f=lambda x: np.array([x[1], 15.0 * np.sin(x[0])]),
         g=lambda x: np.array([[0.0], [3.0]]),
         state=lambda env: env.state,
-        hold_s=0.05,
+        control_dt=0.05,
     )
     barrier = sw.constraints.Barrier(lambda x: 16.0 - x[1] ** 2)
     with pytest.raises(ConfigurationError, match="bound to another env"):
@@ -88,9 +88,9 @@ def test_wrappers_inside_that_change_or_repeat_the_action(wrap):
         ),
         (lambda e: sw.AnalyticPlant(f=None, g=len, state=len), ConfigurationError, "f must be a function"),
         (
-            lambda e: sw.AnalyticPlant(f=len, g=len, state=len, hold_s="a"),
+            lambda e: sw.AnalyticPlant(f=len, g=len, state=len, control_dt="a"),
             ConfigurationError,
-            "hold_s is a time in seconds, got 'a'",
+            "control_dt is a time in seconds, got 'a'",
         ),
     ],
 )

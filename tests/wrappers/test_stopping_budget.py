@@ -26,7 +26,7 @@ def rail(**more):
 def granted(env, action):
     """The lease that the next fresh command gets, s; None if it is refused."""
     info = env.step(action)[4]
-    return None if info["lease/refused"] else info["lease/remaining_s"] + env.hold_s
+    return None if info["lease/refused"] else info["lease/remaining_s"] + env.control_dt
 
 
 # Clearance ----------------------------------------------------------------------------------------------------
@@ -62,7 +62,7 @@ def test_a_clearance_on_a_mujoco_cart(reserve):
         )
         got = granted(env, np.zeros(1, np.float32))
         if got is None:
-            assert wanted < env.hold_s
+            assert wanted < env.control_dt
             refused += 1
         else:
             assert got == pytest.approx(wanted, abs=1e-6)
@@ -144,7 +144,7 @@ def test_a_joint_position_limit_with_a_closing_speed(env_id):
         wanted = (value - 0.05 - 0.02 - 0.01) / 4.0 - 0.015
         got = granted(env, env.action_space.high * rng.choice([-1.0, 1.0]))
         if got is None:
-            assert wanted < env.hold_s
+            assert wanted < env.control_dt
         else:
             assert got == pytest.approx(wanted, abs=1e-6)
         seen.add(got is None)

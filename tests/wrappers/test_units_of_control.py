@@ -46,7 +46,7 @@ def sled_plant(unit):
         f=lambda x: np.array([x[2], x[3], 0.0, 0.0]),
         g=lambda x: np.vstack([np.zeros((2, 2)), np.eye(2) / unit]),
         state=lambda env: env.state,
-        hold_s=Sled.dt,
+        control_dt=Sled.dt,
     )
 
 
@@ -148,14 +148,14 @@ def test_rows_of_a_forecast_keep_a_share_of_the_box_for_rounding(unit):
             has_acceleration=False,
             lower=-unit * np.ones(2),
             upper=unit * np.ones(2),
-            hold_s=0.1,
-            stamp=0,
+            control_dt=0.1,
+            observation_id=0,
             braking=lambda: np.zeros(2),
-            forecast=lambda control, holds: control,
+            forecast=lambda control, horizon: control,
         )
         constraint = Forecasting(unit)
-        constraint.spec, constraint.plant = SimpleNamespace(margin=0.0, holds=1), plant
-        constraint._reach = None
+        constraint.spec, constraint.plant = SimpleNamespace(margin=0.0, horizon=1), plant
+        constraint._max_decrease = None
         constraint.observe(RolloutMemory())
         rows = constraint.rows()
         return np.append(rows.normals[0] * unit, rows.offsets[0])

@@ -21,14 +21,14 @@ def flagged(info):
 
 def test_it_is_these_constraints():
     env = sw.WholeBodyFilter(
-        gym.make("Hopper-v5"), friction_share=0.6, zmp_inset=0.02, tolerance=0.03, bodies=["foot"], holds=4
+        gym.make("Hopper-v5"), friction_share=0.6, zmp_inset=0.02, tolerance=0.03, bodies=["foot"], horizon=4
     )
     contact, support, joints = env.constraints
     assert contact == sw.constraints.ContactFeasibility(0.6, 0.03, ["foot"])
     assert support == sw.constraints.SupportMargin(0.02)
     names = ["thigh_joint", "leg_joint", "foot_joint"]
     stops = np.array([env.unwrapped.model.joint(name).range for name in names])
-    assert joints.joints == names and joints.holds == 4
+    assert joints.joints == names and joints.horizon == 4
     np.testing.assert_allclose([joints.lower, joints.upper], stops.T + np.array([[-0.1], [0.1]]))
     for kind, cone in (("pyramid", "pyramid"), ("cone", "exact")):
         (stance,) = sw.WholeBodyFilter(gym.make("Hopper-v5"), kind, 0.6, 0.05, 0.02).constraints
@@ -52,9 +52,9 @@ def test_it_is_these_constraints():
             'tolerance is for contacts="forecast"',
         ),
         ({"bodies": ["foot"], "contacts": "cone"}, ConfigurationError, "bodies is for"),
-        ({"holds": 3, "contacts": "cone"}, ConfigurationError, "holds is for"),
-        ({"holds": 3, "joint_tolerance": None}, ConfigurationError, "holds is how far"),
-        ({"holds": 0}, ConfigurationError, "holds"),
+        ({"horizon": 3, "contacts": "cone"}, ConfigurationError, "horizon is for"),
+        ({"horizon": 3, "joint_tolerance": None}, ConfigurationError, "horizon is how far"),
+        ({"horizon": 0}, ConfigurationError, "horizon"),
         ({"tolerance": -1.0}, ConfigurationError, "tolerance"),
         ({"joint_tolerance": -0.1}, ConfigurationError, "joint_tolerance"),
         ({"joint_tolerance": "wide", "contacts": "cone"}, ConfigurationError, "joint_tolerance"),
@@ -192,8 +192,8 @@ def test_joints_stay_off_their_stops_at_every_evaluation():
 def test_its_constraints_compose_in_one_projection():
     limits = [
         sw.constraints.ContactFeasibility(0.7),
-        sw.constraints.JointSpeedLimit(12.0, holds=1),
-        sw.constraints.JointPositionLimit(-0.9, 1.4, margin=0.0, holds=2),
+        sw.constraints.JointSpeedLimit(12.0, horizon=1),
+        sw.constraints.JointPositionLimit(-0.9, 1.4, margin=0.0, horizon=2),
     ]
     env = sw.CBFActionFilter(gym.make("HalfCheetah-v5"), limits)
     rng = np.random.default_rng(0)

@@ -56,7 +56,7 @@ def read(env):
 
 
 def cart_plant(dt=0.1, delay_s=0.0, **bounds):
-    return sw.AnalyticPlant(f=drift, g=push, state=read, hold_s=dt, delay_s=delay_s, **bounds)
+    return sw.AnalyticPlant(f=drift, g=push, state=read, control_dt=dt, delay_s=delay_s, **bounds)
 
 
 def wall(at, **more):
@@ -79,7 +79,7 @@ class SpeedRow(sw.Constraint):
 class BoundSpeedRow(BoundConstraint):
     def rows(self):
         left = self.spec.limit - self.plant.state[1]
-        return sw.HalfSpaces(np.array([[self.plant.hold_s]]), np.array([left]))
+        return sw.HalfSpaces(np.array([[self.plant.control_dt]]), np.array([left]))
 
 
 class Raw(sw.Constraint):

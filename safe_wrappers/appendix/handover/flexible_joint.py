@@ -235,7 +235,7 @@ def torque_slew_limit(
     link_inertia: ArrayLike,
     *,
     weights: ArrayLike = 1.0,
-    hold_s: float = 0.0,
+    control_dt: float = 0.0,
 ) -> Array:
     """Torque rates of the joints, shape (..., n), N m/s, that keep every ramp within them below an energy.
 
@@ -250,7 +250,7 @@ def torque_slew_limit(
     joints the worst signs reach it; for more it is on the safe side).
 
     A torque held over control steps is a staircase, whose kicks add up to (w hold / 2) / sin(w hold / 2) times as
-    much at a resonance w: `hold_s` counts that.
+    much at a resonance w: `control_dt` counts that.
 
     It is one ramp from one constant torque to another, from an arm on its manifold: see the module for what a rate
     limit does not bound. Over several poses take the smallest.
@@ -261,17 +261,17 @@ def torque_slew_limit(
         rotor_inertia: See the module.
         link_inertia: See the module.
         weights: Relative rates of the joints, shape (n,), positive.
-        hold_s: Control step over which a torque is held, s; 0: a continuous ramp.
+        control_dt: Control step over which a torque is held, s; 0: a continuous ramp.
 
     Raises:
         ConfigurationError: Bad input, or a resonance at the control's Nyquist frequency or above.
     """
     root, omega, shapes = _modes(stiffness, rotor_inertia, link_inertia)
-    half = omega * hold_s / 2.0
-    if not hold_s >= 0.0 or (half >= np.pi / 2.0).any():
+    half = omega * control_dt / 2.0
+    if not control_dt >= 0.0 or (half >= np.pi / 2.0).any():
         raise ConfigurationError(
-            f"hold_s must be 0 or more, and less than half a period of every resonance "
-            f"(up to {omega.max() / (2.0 * np.pi):.3g} Hz); got {hold_s!r}"
+            f"control_dt must be 0 or more, and less than half a period of every resonance "
+            f"(up to {omega.max() / (2.0 * np.pi):.3g} Hz); got {control_dt!r}"
         )
     _, j, m = _checked(stiffness, rotor_inertia, link_inertia)
     per_rate = shapes.swapaxes(-1, -2) @ (_manifold_per_torque(j, m) / root[:, None])

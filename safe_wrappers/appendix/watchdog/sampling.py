@@ -33,23 +33,23 @@ def _quantity(name: str, given: ArrayLike, unit: str, *, zero: bool) -> Array:
     return array
 
 
-def hold_lag_s(hold_s: ArrayLike) -> Array:
-    """Delay in s that equals a zero-order hold of `hold_s` seconds in phase: half of it.
+def hold_lag_s(control_dt: ArrayLike) -> Array:
+    """Delay in s that equals a zero-order hold of `control_dt` seconds in phase: half of it.
 
     Raises:
         ConfigurationError: For a hold that is negative or not finite.
     """
-    return np.asarray(0.5 * _quantity("hold_s", hold_s, "s", zero=True))
+    return np.asarray(0.5 * _quantity("control_dt", control_dt, "s", zero=True))
 
 
 def phase_lag(
-    crossover: ArrayLike, hold_s: ArrayLike, compute_s: ArrayLike = 0.0, bus_s: ArrayLike = 0.0
+    crossover: ArrayLike, control_dt: ArrayLike, compute_s: ArrayLike = 0.0, bus_s: ArrayLike = 0.0
 ) -> Array:
     """Phase in rad that hold, computation and bus take from a loop at its crossover: `w (compute + bus + hold / 2)`.
 
     Args:
-        crossover: Crossover frequency w of the open loop, rad/s, > 0, below the Nyquist frequency pi / hold_s.
-        hold_s: Sampling period in s, >= 0; 0 for a loop that is not sampled.
+        crossover: Crossover frequency w of the open loop, rad/s, > 0, below the Nyquist frequency pi / control_dt.
+        control_dt: Sampling period in s, >= 0; 0 for a loop that is not sampled.
         compute_s: Fixed delay of the computation in s, >= 0.
         bus_s: Fixed delay of the bus in s, >= 0.
 
@@ -58,11 +58,12 @@ def phase_lag(
             Nyquist frequency.
     """
     w = _quantity("crossover", crossover, "rad/s", zero=False)
-    half = hold_lag_s(hold_s)
+    half = hold_lag_s(control_dt)
     if (w * half >= 0.5 * np.pi).any():
         raise ConfigurationError(
-            f"crossover must lie below the Nyquist frequency pi / hold_s; got {w} rad/s with hold_s = {2.0 * half} "
-            "s; the half-sample lag holds in the baseband only, so choose a slower loop or a shorter hold"
+            f"crossover must lie below the Nyquist frequency pi / control_dt; got {w} rad/s with "
+            f"control_dt = {2.0 * half} s; the half-sample "
+            "lag holds in the baseband only, so choose a slower loop or a shorter hold"
         )
     late = _quantity("compute_s", compute_s, "s", zero=True) + _quantity("bus_s", bus_s, "s", zero=True)
     return np.asarray(w * (late + half))
@@ -71,7 +72,7 @@ def phase_lag(
 def margin_left(
     phase_margin: ArrayLike,
     crossover: ArrayLike,
-    hold_s: ArrayLike,
+    control_dt: ArrayLike,
     compute_s: ArrayLike = 0.0,
     bus_s: ArrayLike = 0.0,
 ) -> Array:
@@ -82,7 +83,7 @@ def margin_left(
     Args:
         phase_margin: Margin of the loop without hold and delays, rad.
         crossover: As for `phase_lag`.
-        hold_s: As for `phase_lag`.
+        control_dt: As for `phase_lag`.
         compute_s: As for `phase_lag`.
         bus_s: As for `phase_lag`.
 
@@ -92,13 +93,13 @@ def margin_left(
     margin = np.asarray(phase_margin, dtype=np.float64)
     if not np.isfinite(margin).all():
         raise ConfigurationError(f"phase_margin must be finite (rad), got {margin}")
-    return np.asarray(margin - phase_lag(crossover, hold_s, compute_s, bus_s))
+    return np.asarray(margin - phase_lag(crossover, control_dt, compute_s, bus_s))
 
 
 def phase_margin_left(plant: Plant, phase_margin: float, crossover: float) -> float:
     """Phase margin in rad that a loop through this plant keeps of its continuous, delay-free design.
 
-    The plant's `delay_s` (evidence, detection and actuation together) and half its `hold_s` are what the loop is
+    The plant's `delay_s` (evidence, detection and actuation together) and half its `control_dt` are what the loop is
     late by. That holds well below the sampling frequency.
 
     Args:
@@ -114,10 +115,10 @@ def phase_margin_left(plant: Plant, phase_margin: float, crossover: float) -> fl
             Nyquist frequency, or a margin that is not finite.
     """
     try:
-        hold_s = plant.hold_s
+        control_dt = plant.control_dt
     except AttributeError:
         raise ConfigurationError(
-            "this plant does not know its hold_s yet: it reads it from the env; call plant.bind(env), or put it "
+            "this plant does not know its control_dt yet: it reads it from the env; call plant.bind(env), or put it "
             "into a CBFActionFilter first"
         ) from None
-    return float(margin_left(phase_margin, crossover, hold_s, plant.delay_s))
+    return float(margin_left(phase_margin, crossover, control_dt, plant.delay_s))

@@ -35,7 +35,7 @@ class BoundBackupClearance(BoundConstraint):
 
     def __init__(self, spec: Any, plant: Plant) -> None:
         super().__init__(spec, plant)
-        self._revision = plant.revision
+        self._model_version = plant.model_version
         self.read_constants()
 
     def read_constants(self) -> None:
@@ -62,8 +62,8 @@ class BoundBackupClearance(BoundConstraint):
     def observe(self, memory: Memory) -> None:
         """Take the state and the memory."""
         self._memory = memory
-        if self.plant.revision != self._revision:
-            self._revision = self.plant.revision
+        if self.plant.model_version != self._model_version:
+            self._model_version = self.plant.model_version
             self.read_constants()
         self._value = self.clearance()
 

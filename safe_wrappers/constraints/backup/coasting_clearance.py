@@ -15,6 +15,7 @@ from safe_wrappers.constraints.backup.base import BoundDetourClearance, Detour
 from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
 from safe_wrappers.constraints.obstacles.obstacles import Disc, Discs
 from safe_wrappers.control.numerics.outlines import convex_outline, distances_to_outline
+from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint, Promise
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
@@ -35,13 +36,21 @@ _AROUND = ((1.0, 0.5), (1.0, 0.0), (1.0, -1.0), (-0.5, -1.0))
 """Shares of the drive for the outer and the inner actuator of a detour, as they are tried."""
 
 
+@deprecated_parameters(
+    renamed={
+        "holds": "horizon",
+        "alone": "robot_model_attr",
+        "reach": "max_decrease",
+        "reach_s": "max_decrease_per_speed",
+    }
+)
 @dataclass
 class CoastingClearance(Constraint):
     """Keep a free-moving machine out of discs, counting its whole way until it rests without control.
 
     For machines that friction and damping stop within a few steps, for example on wheels. The backup manoeuvre is
     zero control. A control is rolled out on the machine's model, substep by substep: held for one control interval,
-    then zero, until rest. It is admitted if the machine rests within `holds` control intervals, and if on the whole
+    then zero, until rest. It is admitted if the machine rests within `horizon` control intervals, and if on the whole
     way the body's origin stays out of `keep_out` and the outline out of `untouched`, each by `margin`.
 
     What it promises: proved, for obstacles that stand still, and as far as `margin` covers the rollout's error. From
@@ -57,14 +66,15 @@ class CoastingClearance(Constraint):
         untouched: `Disc` and `Discs` for the outline.
         outline: Points [x, y] in the body's frame, m; the outline is their convex hull.
         body: Name of the machine's body, on a free joint.
-        alone: Name of an attribute of the env that holds a model of the machine alone, for the rollouts; None takes
-            the plant's model.
+        robot_model_attr: Name of an attribute of the env that holds a model of the machine alone, for the rollouts;
+            None takes the plant's model.
         margin: Kept free, m: covers the rollout's error and the tilt of the outline.
-        holds: Control intervals within which the machine has to rest.
-        reach: Bound on the way of the origin or a corner of the outline until rest, m, for any control held for one
+        horizon: Control intervals within which the machine has to rest.
+        max_decrease: Bound on the way of the origin or a corner of the outline until rest, m, for any control held
+            for one
             interval from rest; states with more clearance need no rollout. Checked at every rollout, and dropped
             with a warning when broken. None: always roll out.
-        reach_s: What the speed of the origin or a corner adds to that, m per m/s.
+        max_decrease_per_speed: What the speed of the origin or a corner adds to that, m per m/s.
         detour: When a driving action of a machine with two actuators is refused, first try to turn while driving, or
             to reverse while turning, around the obstacle. No safety measure.
     """
@@ -73,11 +83,11 @@ class CoastingClearance(Constraint):
     untouched: Sequence[Any] = ()
     outline: Sequence[Sequence[float]] = ()
     body: str = "agent"
-    alone: str | None = None
+    robot_model_attr: str | None = None
     margin: float = 0.005
-    holds: int = 12
-    reach: float | None = None
-    reach_s: float = 0.0
+    horizon: int = 12
+    max_decrease: float | None = None
+    max_decrease_per_speed: float = 0.0
     detour: bool = False
 
     promise: Promise = field(default="proved", init=False)
@@ -94,12 +104,16 @@ class CoastingClearance(Constraint):
             )
         self.outline = _checked_outline(self.outline, needed=bool(self.untouched))
         self.margin = non_negative("margin", self.margin, "m")
-        if isinstance(self.holds, bool) or self.holds != int(self.holds) or self.holds < 2:
-            raise ConfigurationError(f"holds is a whole number of control intervals >= 2, got {self.holds!r}")
-        self.holds = int(self.holds)
-        if self.reach is not None:
-            self.reach = positive("reach", self.reach, "m")
-        self.reach_s = non_negative("reach_s", self.reach_s, "m per m/s")
+        if isinstance(self.horizon, bool) or self.horizon != int(self.horizon) or self.horizon < 2:
+            raise ConfigurationError(
+                f"horizon is a whole number of control intervals >= 2, got {self.horizon!r}"
+            )
+        self.horizon = int(self.horizon)
+        if self.max_decrease is not None:
+            self.max_decrease = positive("max_decrease", self.max_decrease, "m")
+        self.max_decrease_per_speed = non_negative(
+            "max_decrease_per_speed", self.max_decrease_per_speed, "m per m/s"
+        )
 
     def bind(self, plant: Plant) -> "BoundCoastingClearance":
         """On a plant."""
@@ -116,17 +130,17 @@ class BoundCoastingClearance(BoundDetourClearance):
     def __init__(self, spec: CoastingClearance, plant: Plant) -> None:
         hint = "CoastingClearance needs a MujocoPlant: it forecasts with the machine's model"
         super().__init__(spec, require_mujoco(plant, hint))
-        alone = None if spec.alone is None else plant.attribute(spec.alone)
+        alone = None if spec.robot_model_attr is None else plant.attribute(spec.robot_model_attr)
         if alone is not None and not isinstance(alone, mujoco.MjModel):
             raise ConfigurationError(
-                f"alone names an attribute that holds an MjModel; {spec.alone!r} is {alone!r}"
+                f"robot_model_attr names an attribute that holds an MjModel; {spec.robot_model_attr!r} is {alone!r}"
             )
         self._coasting = Coasting(self.plant, spec.body, alone)
         self._still = np.zeros(self.plant.model.nu)
         outline = np.reshape(spec.outline, (-1, 2))
         self._corners = convex_outline(outline) if len(outline) else outline
         self._radius = float(np.sqrt((self._corners**2).sum(axis=1)).max(initial=0.0))
-        self._reach = spec.reach
+        self._max_decrease = spec.max_decrease
         self._first_turns_left: bool | None = None
         self._seen = np.zeros(0)
         self._known: dict[bytes, _Outcome] = {}
@@ -141,16 +155,16 @@ class BoundCoastingClearance(BoundDetourClearance):
         self._low, self._high = self.plant.acting_range
         here = self._coasting.start()
         self._here = here.places[0]
-        reach = math.inf
-        if self._reach is not None:
-            reach = self._reach + self.spec.reach_s * self._coasting.speed(self._radius)
+        way = math.inf
+        if self._max_decrease is not None:
+            way = self._max_decrease + self.spec.max_decrease_per_speed * self._coasting.speed(self._radius)
         self._origin = _Group(self.spec.keep_out, self.plant, None)
         self._body = _Group(self.spec.untouched, self.plant, self._corners)
-        self._least = min(group.keep(here, self.spec.margin + reach) for group in (self._origin, self._body))
-        self._within = reach
+        self._least = min(group.keep(here, self.spec.margin + way) for group in (self._origin, self._body))
+        self._within = way
         # Rollouts are kept while nothing moves.
         discs = np.concatenate([self._origin.centers, self._body.centers]).ravel()
-        seen = np.concatenate([[self.plant.revision], self._coasting.state(), discs])
+        seen = np.concatenate([[self.plant.model_version], self._coasting.state(), discs])
         if not (seen.shape == self._seen.shape and (np.abs(seen - self._seen) <= _STILL).all()):
             self._seen, self._known = seen, {}
         return np.array([self._least])
@@ -160,15 +174,15 @@ class BoundCoastingClearance(BoundDetourClearance):
         acting = np.minimum(np.maximum(control, self._low), self._high) + 0.0  # no -0.0: its bytes differ
         key = acting.tobytes()
         if key not in self._known:
-            course = self._coasting.run(acting, self.spec.holds, self._radius)
+            course = self._coasting.run(acting, self.spec.horizon, self._radius)
             outcome, fallen = self._outcome(course)
             if fallen > self._within + _SAME_M:
                 warnings.warn(
                     f"CoastingClearance: the clearance fell by {fallen:.3g} m until rest, farther than the declared "
-                    f"reach of {self._within:.3g} m; from now on every control is forecast",
+                    f"max_decrease of {self._within:.3g} m; from now on every control is forecast",
                     stacklevel=2,
                 )
-                self._reach, self._memory, self._seen = None, Detour(), np.zeros(0)
+                self._max_decrease, self._memory, self._seen = None, Detour(), np.zeros(0)
                 self.clearance()
                 outcome, _ = self._outcome(course)
             self._known[key] = outcome

@@ -125,17 +125,17 @@ class BoundEscapeClearance(BoundBackupClearance):
         self._point = point = planar_point(self.plant, np.inf, self.spec.body)
         # What one hold makes of a state; x and y.
         self._hold = np.array([(a.low, a.high, a.drift, a.shift, a.keep, a.add) for a in point.axes]).T
-        holds = int(np.ceil(self.spec.horizon_s / self.plant.hold_s))
-        longest = max(1, round(max(_GOING_S) / self.plant.hold_s))
+        holds = int(np.ceil(self.spec.horizon_s / self.plant.control_dt))
+        longest = max(1, round(max(_GOING_S) / self.plant.control_dt))
         if holds <= longest:
             raise ConfigurationError(
-                f"horizon_s = {self.spec.horizon_s:g} s is too short for control steps of {self.plant.hold_s:g} s: "
+                f"horizon_s = {self.spec.horizon_s:g} s is too short for steps of {self.plant.control_dt:g} s: "
                 f"a manoeuvre takes {longest} of them before it brakes"
             )
         bank = [Maneuver(0.0, 0.0, 0)]
         bank += [Maneuver(x, y, going) for x, y in _DIRECTIONS for going in range(1, longest + 1)]
         self._escapes = EvasiveManeuvers(point.axes, bank, np.arange(0, holds + 1, _EVERY))
-        starts = [max(1, round(seconds / self.plant.hold_s)) for seconds in _GOING_S]
+        starts = [max(1, round(seconds / self.plant.control_dt)) for seconds in _GOING_S]
         self._usual = [0, *(bank.index(Maneuver(x, y, n)) for x, y in _DIRECTIONS for n in starts)]
         self._firsts_of = [0, *(bank.index(Maneuver(x, y, 1)) for x, y in _DIRECTIONS)]
 
@@ -160,7 +160,7 @@ class BoundEscapeClearance(BoundBackupClearance):
         self._position = self.plant.qpos[joints] + np.asarray(self._point.origin)
         self._velocity = self.plant.qvel[joints]
         # A way after a held control begins one hold from now.
-        times = self.plant.hold_s * np.concatenate([[0.0], 1.0 + self._escapes.instants])
+        times = self.plant.control_dt * np.concatenate([[0.0], 1.0 + self._escapes.instants])
         parts = [self._expected(o, self.plant, times) for o in self._moving]
         none = np.zeros((times.size, 0, 2))
         centers = np.concatenate([none, *(c for c, _ in parts)], axis=1)

@@ -108,9 +108,11 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         self._models = drive.corners()
         self._swivel = 2.0 * abs(drive.com_offset)
         # The most that one hold's drive can add to the path; a turn and the way travelled depend on the speed.
-        self._push = drive.fastest_change * (drive.hold_s + drive.coast_time)
-        turn = drive.hold_s * min(drive.yaw_limit / max(drive.yaw_damping, 1e-12), math.pi / drive.hold_s)
-        self._per_speed = drive.hold_s + turn * drive.coast_time
+        self._push = drive.fastest_change * (drive.control_dt + drive.coast_time)
+        turn = drive.control_dt * min(
+            drive.yaw_limit / max(drive.yaw_damping, 1e-12), math.pi / drive.control_dt
+        )
+        self._per_speed = drive.control_dt + turn * drive.coast_time
 
     def clearance(self) -> Array:
         """Of the stopping path from the nearest disc, margin and state error not taken off, m, shape (1,)."""
@@ -160,7 +162,7 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         # As much recovery as the drive can give here: across the heading it can give none.
         full = self.drive.drive_limit / self.drive.drive_gain
         best = max(self._least_after(full), self._least_after(-full), self._least_of(backup))
-        return min(self._least * (1.0 - _RECOVERY_RATE * self.drive.hold_s), best)
+        return min(self._least * (1.0 - _RECOVERY_RATE * self.drive.control_dt), best)
 
     def _least_of(self, path: StoppingPath) -> float:
         return min(self._to_disc(path, disc) for disc in self._close)

@@ -13,6 +13,7 @@ from safe_wrappers.constraints.contact.geom_gaps import GeomGaps
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.control.contact.body_regions import body_region
 from safe_wrappers.control.contact.stiffness import series_stiffness
+from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Promise
 from safe_wrappers.plants.mujoco.forecast import Forecast
@@ -24,6 +25,7 @@ _FIXED = 1e-12
 """Mobility along the normal, 1/kg, below which a geom cannot move into contact."""
 
 
+@deprecated_parameters(renamed={"holds": "horizon"})
 @dataclass
 class ImpactSpeedLimit(RolloutConstraint):
     """Keep the approach speed at every contact so low that its peak force stays below a limit.
@@ -34,15 +36,15 @@ class ImpactSpeedLimit(RolloutConstraint):
     comes too late (`appendix.contact.impact.attenuation_after_delay`). m is the machine's effective mass at the
     contact point and along its normal, by the model's Jacobian and inertia.
 
-    The plant's model is stepped through the held action, and then with the actuated joints braking, for `holds`
+    The plant's model is stepped through the held action, and then with the actuated joints braking, for `horizon`
     control steps in all; every contact on the way has to be slow enough. In contact already, the deflection that the
     model shows counts as stored energy. Distances are MuJoCo's, between the declared geoms, at every physics substep.
 
     What it promises: along the held step of an executed control that is not flagged every first touch keeps the
     limit, for a plant that is right, a contact that is a linear spring of the declared stiffness, and one pair of
     geoms at a time; friction, and forces through other contacts and joint stops, are not counted. Braking can keep it
-    afterwards if it takes no more than `holds` control steps, or if `braking` is true. Obstacles are taken where they
-    are. The physics step should be at most a tenth of `appendix.contact.impact.time_to_peak`. Hence best effort.
+    afterwards if it takes no more than `horizon` control steps, or if `braking` is true. Obstacles are taken where
+    they are. The physics step should be at most a tenth of `appendix.contact.impact.time_to_peak`. Hence best effort.
 
     `value`, N: the limit less the peak that a contact at the present speed would have. Before contact, without
     `braking`, it is not below zero, since the machine may still slow down; with it, the speed counts that this
@@ -62,7 +64,7 @@ class ImpactSpeedLimit(RolloutConstraint):
         braking: Deceleration, m/s^2, that the machine can give every declared point towards every obstacle from
             everywhere: makes up for a look-ahead that ends before the machine stands. None relies on the forecast.
         margin: Kept free below the limit, N.
-        holds: Control steps to look ahead; cover the time that braking takes, and that of a contact.
+        horizon: Control steps to look ahead; cover the time that braking takes, and that of a contact.
     """
 
     bodies: Sequence[str]
@@ -74,9 +76,9 @@ class ImpactSpeedLimit(RolloutConstraint):
     effective_mass: float | None = None
     braking: float | None = None
     margin: float = 0.0
-    holds: int = 5
+    horizon: int = 5
 
-    reach: float | None = field(default=None, init=False, repr=False)
+    max_decrease: float | None = field(default=None, init=False, repr=False)
     promise: Promise = field(default="best effort", init=False)
     unit: ClassVar[str] = "N"
 
@@ -252,7 +254,7 @@ class BoundImpactSpeedLimit(BoundRollout):
 
     def slacks(self, control: Array) -> Array:
         """What is left along the forecast of a control; see `BoundRollout`."""
-        key = self.plant.revision, control.tobytes()
+        key = self.plant.model_version, control.tobytes()
         if key not in self._known:
             self._control = control
             self._known[key] = super().slacks(control)

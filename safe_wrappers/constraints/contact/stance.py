@@ -149,7 +149,7 @@ class BoundStance(BoundConstraint):
                 self.plant.qvel[self._dofs],
                 self._low,
                 self._high,
-                self.plant.hold_s,
+                self.plant.control_dt,
                 self.plant.model.nv,
             )
         if self.spec.zmp_inset is not None:

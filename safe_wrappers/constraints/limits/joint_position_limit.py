@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from safe_wrappers.checks import name_list
 from safe_wrappers.constraints.limits.joints import scalar_joints
-from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
+from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
+from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Promise
 from safe_wrappers.plants.mujoco.forecast import Forecast
@@ -19,16 +20,17 @@ from safe_wrappers.plants.plant import Plant
 Array = NDArray[np.float64]
 
 
+@deprecated_parameters(renamed=RENAMED)
 @dataclass
 class JointPositionLimit(RolloutConstraint):
     """Keep joint positions in a range that may be narrower than the model's own.
 
     Position under a force has relative degree two: a joint that is inside may be too fast to stay. So the
-    forecast goes on after the held control, braking every actuated joint, for `holds` control steps in all;
+    forecast goes on after the held control, braking every actuated joint, for `horizon` control steps in all;
     the range has to hold at every physics substep of it.
 
     What it promises: an executed control that is not flagged keeps the range at every substep of its step, for
-    a plant that is right, and as long as braking takes no more than `holds` steps leaves one that stops in time.
+    a plant that is right, and as long as braking takes no more than `horizon` steps leaves one that stops in time.
     Gravity, coupling, contacts and passive joints can be stronger than the actuators. Hence best effort.
 
     Args:
@@ -38,17 +40,17 @@ class JointPositionLimit(RolloutConstraint):
         joints: Names. None takes every hinge and slide that an actuator drives directly, and is refused where an
             action moves others as well.
         margin: Kept free inside the range, in the same units.
-        holds: Control steps to look ahead; cover the time that braking takes.
-        reach: The farthest that a joint can move within `holds` control steps in the declared envelope, rad or m;
-            states with more than that left need no forecast. None forecasts always.
+        horizon: Control steps to look ahead; cover the time that braking takes.
+        max_decrease: The farthest that a joint can move within `horizon` control steps in the declared envelope, rad
+            or m; states with more than that left need no forecast. None forecasts always.
     """
 
     lower: float | Sequence[float] | None = None
     upper: float | Sequence[float] | None = None
     joints: Sequence[str] | None = None
     margin: float = 0.0
-    holds: int = 5
-    reach: float | None = None
+    horizon: int = 5
+    max_decrease: float | None = None
 
     promise: Promise = field(default="best effort", init=False)
     unit: ClassVar[str] = "rad or m"

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from safe_wrappers.checks import name_list, positive
 from safe_wrappers.constraints.limits.joints import scalar_joints
-from safe_wrappers.constraints.rollout import RECOVERY_S, BoundRollout, RolloutConstraint
+from safe_wrappers.constraints.rollout import RECOVERY_S, RENAMED, BoundRollout, RolloutConstraint
+from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import HalfSpaces, Promise
 from safe_wrappers.plants.mujoco.forecast import Forecast
@@ -19,6 +20,7 @@ from safe_wrappers.plants.plant import Plant
 Array = NDArray[np.float64]
 
 
+@deprecated_parameters(renamed=RENAMED)
 @dataclass
 class JointSpeedLimit(RolloutConstraint):
     """Keep `|joint speed| <= limit`.
@@ -36,16 +38,16 @@ class JointSpeedLimit(RolloutConstraint):
         joints: Joint names. None takes every hinge and slide that an actuator drives directly, and is refused where
             an action moves others as well.
         margin: Kept free below the limit, for model and state error, in the same units.
-        holds: Control steps to look ahead; the actuated joints are braked after the first.
-        reach: The most that a joint's speed can rise within `holds` control steps in the declared envelope, rad/s
-            or m/s; states with more than that left need no forecast. None forecasts always.
+        horizon: Control steps to look ahead; the actuated joints are braked after the first.
+        max_decrease: The most that a joint's speed can rise within `horizon` control steps in the declared envelope,
+            rad/s or m/s; states with more than that left need no forecast. None forecasts always.
     """
 
     limit: float | Sequence[float]
     joints: Sequence[str] | None = None
     margin: float = 0.0
-    holds: int = 1
-    reach: float | None = None
+    horizon: int = 1
+    max_decrease: float | None = None
 
     promise: Promise = field(default="best effort", init=False)
     unit: ClassVar[str] = "rad/s or m/s"
@@ -101,10 +103,10 @@ class BoundJointSpeedLimit(BoundRollout):
 
     def slacks(self, control: Array) -> Array:
         """What is left below the bound along the forecast and at its end, per joint, shape (2 k,)."""
-        left = self._room(self.plant.forecast(control, self.spec.holds)) - self.spec.margin
+        left = self._room(self.plant.forecast(control, self.spec.horizon)) - self.spec.margin
         over = np.maximum(self._speeds - self._bound, 0.0)
         # From above the bound, joint by joint: never faster on the way, and closer at the end.
-        decay = np.exp(-self.spec.holds * self.plant.hold_s / RECOVERY_S)
+        decay = np.exp(-self.spec.horizon * self.plant.control_dt / RECOVERY_S)
         return np.concatenate([left.min(axis=0) + over, left[-1] + over * decay])
 
     def rows(self) -> HalfSpaces:
@@ -117,9 +119,9 @@ class BoundJointSpeedLimit(BoundRollout):
         strongest = np.maximum(np.abs(self.plant.lower), np.abs(self.plant.upper))
         # No push, not NaN, where an actuator without effect is infinitely strong.
         pushes = np.abs(a) * np.where(a == 0.0, 0.0, strongest)
-        reach = np.abs(v) + self.plant.hold_s * (np.abs(a0) + pushes.sum(axis=1))
-        near = reach > self._bound
+        highest = np.abs(v) + self.plant.control_dt * (np.abs(a0) + pushes.sum(axis=1))
+        near = highest > self._bound
         normals = np.vstack([a[near], -a[near]])
-        room = self._bound[near] / self.plant.hold_s
-        rate, bias = v[near] / self.plant.hold_s, a0[near]
+        room = self._bound[near] / self.plant.control_dt
+        rate, bias = v[near] / self.plant.control_dt, a0[near]
         return HalfSpaces(normals, np.concatenate([room - rate - bias, room + rate + bias]))

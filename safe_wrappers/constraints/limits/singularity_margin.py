@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers.checks import name_list, positive
 from safe_wrappers.constraints.limits.serial_chain import FrameKind, SerialChain
-from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
+from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
 from safe_wrappers.control.filtering.manipulability import (
     ValidatedThreshold,
     chain_derivative,
@@ -18,6 +18,7 @@ from safe_wrappers.control.filtering.manipulability import (
     task_rows,
     validated_threshold,
 )
+from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import HalfSpaces, Promise
 from safe_wrappers.plants.mujoco.forecast import Forecast
@@ -35,6 +36,7 @@ _ALONG_S = 1e-5
 """Width of the difference for the curvature of w along the motion, s."""
 
 
+@deprecated_parameters(renamed=RENAMED)
 @dataclass
 class SingularityMargin(RolloutConstraint):
     """Keep the manipulability `w = sqrt(det(J J'))` of a frame, for declared task directions, above a threshold.
@@ -46,12 +48,13 @@ class SingularityMargin(RolloutConstraint):
     samples.
 
     A torque changes w through two integrations. So the forecast goes on after the held control, braking every
-    actuated joint, for `holds` control steps in all; w has to stay at every physics substep of it. Where controls are
+    actuated joint, for `horizon` control steps in all; w has to stay at every physics substep of it. Where controls
+    are
     forces, rows `w'' + 2 a w' + a^2 (w - threshold) >= 0` are the first guess. With as many joints as directions the
     determinant's sign counts, too: an arm does not pass through the singular pose between two substeps.
 
     What it promises: an executed control that is not flagged keeps the threshold at every substep of its step, for a
-    plant that is right, and as long as braking takes no more than `holds` steps leaves one that stops in time.
+    plant that is right, and as long as braking takes no more than `horizon` steps leaves one that stops in time.
     Gravity, contacts and coupling can be stronger than the actuators. Hence best effort. It limits neither joint
     rates (`JointSpeedLimit`) nor torques.
 
@@ -74,9 +77,9 @@ class SingularityMargin(RolloutConstraint):
         task_speed: Speed that has to be possible in every direction, m/s (rad/s for rotations alone).
         rate_limit: Largest rate of each joint at that speed, rad/s for hinges, m/s for slides.
         margin: Kept free above the threshold, as a share of it.
-        holds: Control steps to look ahead; cover the time that braking takes.
-        reach: The most that w can fall within `holds` control steps in the declared envelope, in shares of the
-            threshold; states with more than that left need no forecast. None forecasts always.
+        horizon: Control steps to look ahead; cover the time that braking takes.
+        max_decrease: The most that w can fall within `horizon` control steps in the declared envelope, in shares of
+            the threshold; states with more than that left need no forecast. None forecasts always.
 
     Attributes:
         validated: What the sample said of the threshold; None if it was given, or before the constraint is bound.
@@ -94,8 +97,8 @@ class SingularityMargin(RolloutConstraint):
     task_speed: float | None = None
     rate_limit: float | None = None
     margin: float = 0.0
-    holds: int = 5
-    reach: float | None = None
+    horizon: int = 5
+    max_decrease: float | None = None
 
     promise: Promise = field(default="best effort", init=False)
     validated: ValidatedThreshold | None = field(default=None, init=False, repr=False, compare=False)
@@ -249,7 +252,7 @@ class BoundSingularityMargin(BoundRollout):
         along[1:, self._chain.qpos] += np.outer([_ALONG_S, -_ALONG_S], speeds)
         slope, ahead, behind = self._slope(along) / self._threshold
         curvature = (ahead - behind) @ speeds / (2.0 * _ALONG_S)
-        a = 1.0 / (_DECAY_HOLDS * self.plant.hold_s)
+        a = 1.0 / (_DECAY_HOLDS * self.plant.control_dt)
         left = 2.0 * a * (slope @ speeds) + a * a * (self._least - self.spec.margin)
         drift, effect = drift[self._chain.dofs], effect[self._chain.dofs]
         return HalfSpaces(-(slope @ effect)[None], np.array([slope @ drift + curvature + left]))

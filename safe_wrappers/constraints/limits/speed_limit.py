@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import positive
-from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint, RolloutMemory
+from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint, RolloutMemory
+from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.constraint import Memory, Promise
 from safe_wrappers.plants.mujoco.forecast import Forecast
@@ -18,13 +19,14 @@ Array = NDArray[np.float64]
 DIRECTIONS = ("+x", "-x", "x", "+y", "-y", "y", "+z", "-z", "z", "xy", "xyz")
 
 
+@deprecated_parameters(renamed=RENAMED)
 @dataclass
 class SpeedLimit(RolloutConstraint):
     """Keep the speed of a body, or of the centre of mass, below a limit.
 
     Speed is displacement over time, as Gymnasium's `x_velocity` is: over one control step, or over one physics
     substep. The action is held through the forecast's first control step, contacts included, and the actuated
-    joints are braked in the others (`holds`), so that the next step can keep the limit, too.
+    joints are braked in the others (`horizon`), so that the next step can keep the limit, too.
 
     What it promises: the first control step of an executed control that is not flagged keeps the limit, exactly,
     for a plant that is right. Such a control need not exist: in flight no actuator changes the momentum, and contact
@@ -40,9 +42,9 @@ class SpeedLimit(RolloutConstraint):
         direction: "+x" and so on limit one sign, "x" both, "xy" and "xyz" the length of the vector.
         average: "step" over a control step, "substep" over a physics substep (instantaneous).
         margin: Kept free below the limit, m/s.
-        holds: Control steps to look ahead.
-        reach: The most that the speed can rise within `holds` control steps in the declared envelope, m/s; states
-            with more than that left need no forecast. None forecasts always.
+        horizon: Control steps to look ahead.
+        max_decrease: The most that the speed can rise within `horizon` control steps in the declared envelope, m/s;
+            states with more than that left need no forecast. None forecasts always.
     """
 
     limit: float
@@ -50,8 +52,8 @@ class SpeedLimit(RolloutConstraint):
     direction: str = "xy"
     average: Literal["step", "substep"] = "step"
     margin: float = 0.0
-    holds: int = 3
-    reach: float | None = None
+    horizon: int = 3
+    max_decrease: float | None = None
 
     promise: Promise = field(default="best effort", init=False)
     unit: ClassVar[str] = "m/s"
@@ -98,7 +100,7 @@ class BoundSpeedLimit(BoundRollout):
         self._body = None if self.spec.body is None else self.plant.named("body", self.spec.body)
         self._axes = ["xyz".index(letter) for letter in spec.direction.strip("+-")]
         self._sign = {"+": 1.0, "-": -1.0}.get(spec.direction[0])
-        self._revision = self.plant.revision
+        self._model_version = self.plant.model_version
         self._weigh()
         self._window = self.plant.substeps if self.spec.average == "step" else 1
 
@@ -125,8 +127,8 @@ class BoundSpeedLimit(BoundRollout):
         return np.asarray(frames[..., self._body, :][..., self._axes])
 
     def _now(self) -> Array:
-        if self._revision != self.plant.revision:
-            self._revision = self.plant.revision
+        if self._model_version != self.plant.model_version:
+            self._model_version = self.plant.model_version
             self._weigh()
         pose = self.plant.pose()
         data = self.plant.published()
@@ -140,7 +142,7 @@ class BoundSpeedLimit(BoundRollout):
         return self._left((self._here - before)[None], self.plant.substeps)
 
     def _left(self, displacements: Array, substeps: int) -> Array:
-        velocity = displacements / (substeps * self.plant.hold_s / self.plant.substeps)
+        velocity = displacements / (substeps * self.plant.control_dt / self.plant.substeps)
         if self._sign is not None:
             return self.spec.limit - self._sign * velocity[:, 0]
         return np.asarray(self.spec.limit - np.sqrt((velocity * velocity).sum(axis=1)))

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import positive
-from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
+from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
+from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Promise
 from safe_wrappers.plants.mujoco.forecast import Forecast
@@ -17,12 +18,13 @@ from safe_wrappers.plants.plant import Plant
 Array = NDArray[np.float64]
 
 
+@deprecated_parameters(renamed=RENAMED)
 @dataclass
 class Upright(RolloutConstraint):
     """Keep a body's height in a range and its own z axis within an angle of the vertical.
 
     What it promises: an executed control that is not flagged keeps both at every physics substep of its step,
-    for a plant that is right. It looks `holds` control steps ahead, with the actuated joints braked after the
+    for a plant that is right. It looks `horizon` control steps ahead, with the actuated joints braked after the
     first: that refuses controls shortly before a fall, and does not balance. A robot on legs can be unrecoverable
     long before it falls. Hence best effort.
 
@@ -32,9 +34,9 @@ class Upright(RolloutConstraint):
         highest: Likewise.
         tilt: Largest angle between the body's z axis and the world's, rad; None: no bound.
         margin: Kept free, m for the heights and rad for the tilt.
-        holds: Control steps to look ahead.
-        reach: The most that height (m) and tilt (rad) can change within `holds` control steps in the declared
-            envelope; states with more than that left need no forecast. None forecasts always.
+        horizon: Control steps to look ahead.
+        max_decrease: The most that height (m) and tilt (rad) can change within `horizon` control steps in the
+            declared envelope; states with more than that left need no forecast. None forecasts always.
     """
 
     body: str = "torso"
@@ -42,8 +44,8 @@ class Upright(RolloutConstraint):
     highest: float | None = None
     tilt: float | None = None
     margin: float = 0.0
-    holds: int = 5
-    reach: float | None = None
+    horizon: int = 5
+    max_decrease: float | None = None
 
     promise: Promise = field(default="best effort", init=False)
     unit: ClassVar[str] = "m or rad"

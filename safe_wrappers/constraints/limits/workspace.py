@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from safe_wrappers.checks import name_list, non_negative
 from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
 from safe_wrappers.constraints.obstacles.obstacles import distances
-from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
+from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
+from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Promise
 from safe_wrappers.plants.mujoco.forecast import Forecast
@@ -19,16 +20,17 @@ from safe_wrappers.plants.plant import Plant
 Array = NDArray[np.float64]
 
 
+@deprecated_parameters(renamed=RENAMED)
 @dataclass
 class Workspace(RolloutConstraint):
     """Keep points of the machine inside an axis-aligned box and outside obstacles, in world coordinates.
 
     Position under a force has relative degree two: a point that is inside may be too fast to stay. So the
-    forecast goes on after the held control, braking every actuated joint, for `holds` control steps in all; the
+    forecast goes on after the held control, braking every actuated joint, for `horizon` control steps in all; the
     workspace has to hold at every physics substep of it. Moving obstacles are taken where they are.
 
     What it promises: an executed control that is not flagged keeps the workspace at every substep of its step,
-    for a plant that is right, and as long as braking takes no more than `holds` steps leaves one that stops in
+    for a plant that is right, and as long as braking takes no more than `horizon` steps leaves one that stops in
     time. Near a singular pose, or under loads stronger than the actuators, a point can move on. Hence best effort.
 
     Args:
@@ -40,9 +42,9 @@ class Workspace(RolloutConstraint):
         geoms: Names of geoms: their centres.
         radius: Of the machine around each point, m.
         margin: Kept free, m.
-        holds: Control steps to look ahead; cover the time that braking takes.
-        reach: The farthest that a point can move within `holds` control steps in the declared envelope, m; states
-            with more than that left need no forecast. None forecasts always.
+        horizon: Control steps to look ahead; cover the time that braking takes.
+        max_decrease: The farthest that a point can move within `horizon` control steps in the declared envelope, m;
+            states with more than that left need no forecast. None forecasts always.
     """
 
     low: Sequence[float | None] | None = None
@@ -53,8 +55,8 @@ class Workspace(RolloutConstraint):
     geoms: Sequence[str] = ()
     radius: float = 0.0
     margin: float = 0.0
-    holds: int = 5
-    reach: float | None = None
+    horizon: int = 5
+    max_decrease: float | None = None
 
     promise: Promise = field(default="best effort", init=False)
     unit: ClassVar[str] = "m"

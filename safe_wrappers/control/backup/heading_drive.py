@@ -136,7 +136,7 @@ class HeadingDrive:
     uncertainty: float = 0.0
 
     @property
-    def hold_s(self) -> float:
+    def control_dt(self) -> float:
         """Control interval, s."""
         return self.timestep * self.substeps
 
@@ -153,7 +153,7 @@ class HeadingDrive:
     @property
     def fastest_change(self) -> float:
         """Largest change of speed in one control step inside the uncertainty, m/s."""
-        return self.drive_limit / (self.mass * (1.0 - self.uncertainty)) * self.hold_s
+        return self.drive_limit / (self.mass * (1.0 - self.uncertainty)) * self.control_dt
 
     def corners(self) -> "list[HeadingDrive]":
         """The bodies at the corners of the uncertainty, each without uncertainty; this one if there is none."""
@@ -181,12 +181,14 @@ class HeadingDrive:
         """
         mass, damping = self.mass * (1.0 + self.uncertainty), self.damping * (1.0 - self.uncertainty)
         time, terminal = mass / damping, self.drive_limit / damping
-        last = 0.125 * self.drive_limit / mass * self.hold_s**2
-        return time * (speed - terminal * math.log1p(speed / terminal)) + min(last, 0.5 * speed * self.hold_s)
+        last = 0.125 * self.drive_limit / mass * self.control_dt**2
+        return time * (speed - terminal * math.log1p(speed / terminal)) + min(
+            last, 0.5 * speed * self.control_dt
+        )
 
     def brake_control(self, forward_speed: float) -> float:
         """The drive control that brakes fully, or just to rest within one hold."""
-        force = -forward_speed * self.mass / self.hold_s
+        force = -forward_speed * self.mass / self.control_dt
         return max(-self.drive_limit, min(force, self.drive_limit)) / self.drive_gain
 
     def residual_turn_angle(self, yaw_rate: float) -> float:

@@ -41,24 +41,24 @@ def predicted_approach(
     )
 
 
-def held_stopping_distance(speed: ArrayLike, brake: float, hold_s: float) -> Array:
+def held_stopping_distance(speed: ArrayLike, brake: float, control_dt: float) -> Array:
     """The shortest stopping distance when every deceleration, at most `brake`, is held for a whole interval.
 
     Full braking for as many holds as needed, the last one just strong enough to end at rest: the chord of
     `v^2 / (2 a_brake)` between whole multiples of the speed that one hold removes. It exceeds the continuous distance
     by at most `a_brake hold^2 / 8`, and braking along it never reverses the motion.
     """
-    loss = brake * hold_s
+    loss = brake * control_dt
     holds = np.maximum(np.asarray(speed, dtype=np.float64), 0.0) / loss
     whole = np.floor(holds)
-    return np.asarray(loss * hold_s * (0.5 * whole**2 + (whole + 0.5) * (holds - whole)))
+    return np.asarray(loss * control_dt * (0.5 * whole**2 + (whole + 0.5) * (holds - whole)))
 
 
 def sampled_acceleration_limit(
     clearance: ArrayLike,
     speed: ArrayLike,
     brake: float,
-    hold_s: float,
+    control_dt: float,
     *,
     delay_s: float = 0.0,
     pending: ArrayLike = 0.0,
@@ -77,7 +77,7 @@ def sampled_acceleration_limit(
         clearance: Measured clearance D in m, shape (...).
         speed: Measured approach speed in m/s, shape (...).
         brake: Validated braking deceleration in m/s^2.
-        hold_s: Control interval in s.
+        control_dt: Control interval in s.
         delay_s: Evidence age plus detection plus actuation delay, in s.
         pending: Approach acceleration of the commands in flight during the delay, m/s^2, shape (...).
         state_error: Bound on the error of the measured clearance, in m.
@@ -91,23 +91,23 @@ def sampled_acceleration_limit(
     room = room0 - state_error - margin
     # In units of the speed and the distance of one hold of full braking the condition on the end speed w is
     # w / 2 + (chord of w^2 / 2) <= left, which at whole w = k reads k (k + 1) / 2 and has slope k + 1 above it.
-    left = (room - 0.5 * v * hold_s) / (brake * hold_s**2)
+    left = (room - 0.5 * v * control_dt) / (brake * control_dt**2)
     whole = np.floor(0.5 * (np.sqrt(1.0 + 8.0 * np.maximum(left, 0.0)) - 1.0))
-    end = (whole + (left - 0.5 * whole * (whole + 1.0)) / (whole + 1.0)) * brake * hold_s
+    end = (whole + (left - 0.5 * whole * (whole + 1.0)) / (whole + 1.0)) * brake * control_dt
     # Otherwise the motion must reverse inside the hold, before the room ends if there is some.
     approach = np.maximum(v, 0.0)
     with np.errstate(divide="ignore", over="ignore"):
         halting = -(approach**2) / (2.0 * np.where(room > 0.0, room, np.inf))
-    retreat = (_RETREAT_RATE * np.minimum(room, 0.0) - v) / hold_s
-    late = np.where(room > 0.0, np.minimum(halting, -v / hold_s), retreat)
-    return np.asarray(np.where(left >= 0.0, (end - v) / hold_s, late))
+    retreat = (_RETREAT_RATE * np.minimum(room, 0.0) - v) / control_dt
+    late = np.where(room > 0.0, np.minimum(halting, -v / control_dt), retreat)
+    return np.asarray(np.where(left >= 0.0, (end - v) / control_dt, late))
 
 
 def sampled_inset(
     clearance: ArrayLike,
     speed: ArrayLike,
     brake: float,
-    hold_s: float,
+    control_dt: float,
     *,
     delay_s: float = 0.0,
     pending: ArrayLike = 0.0,
@@ -120,4 +120,4 @@ def sampled_inset(
     the clearance.
     """
     room, v = predicted_approach(clearance, speed, delay_s, pending)
-    return np.asarray(room - state_error - margin - held_stopping_distance(v, brake, hold_s))
+    return np.asarray(room - state_error - margin - held_stopping_distance(v, brake, control_dt))

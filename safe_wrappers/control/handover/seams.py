@@ -3,8 +3,8 @@
 A stream is a policy's commands for the next control steps, shape (n, m): one per step, in action units.
 Source: appendix "Smooth Trajectories and Bumpless Transfer". Its bounds are for continuous commands; here the
 commands are held between samples, so that what is bounded is the difference of neighbours: with `rate_limit` in
-action units per second no two neighbours differ by more than `rate_limit * hold_s`. The mean of a rate over a step
-is at most its peak, so a blend that keeps the continuous bound keeps this one too.
+action units per second no two neighbours differ by more than `rate_limit * control_dt`. The mean of a rate over a
+step is at most its peak, so a blend that keeps the continuous bound keeps this one too.
 """
 
 from dataclasses import dataclass
@@ -46,7 +46,7 @@ def join(
     sent: Array,
     prior: Array,
     new: Array,
-    hold_s: float,
+    control_dt: float,
     *,
     blend: Blend = "smoothstep",
     fewest: int = 0,
@@ -69,14 +69,14 @@ def join(
         sent: The latest commands, oldest first, shape (k, m), k >= 0; with none there is no seam.
         prior: Remaining commands of the present stream, shape (p, m), p >= 0.
         new: The new stream for the next steps, shape (n, m), n >= 1.
-        hold_s: Control interval, s.
+        control_dt: Control interval, s.
         blend: Which blend.
         fewest: Least number of steps of the blend (fewer only if the new stream is shorter).
         rate_limit: Largest ``|du/dt|``, action units per second: of every component, or of each, shape (m,).
         low: Action box, for the bridges, shape (m,) or a number.
         high: Likewise.
     """
-    step = np.asarray(rate_limit * hold_s)
+    step = np.asarray(rate_limit * control_dt)
     if not len(sent):
         plan, limited = limit_rate(new, None, step)
         return Seam(plan, 0, limited)

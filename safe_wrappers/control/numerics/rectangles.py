@@ -27,7 +27,8 @@ def apart(a: Rectangle, b: Rectangle) -> float:
 
 def closer(around: Rectangle, among: Iterable[Rectangle], limit: float) -> list[Rectangle]:
     """The rectangles that are closer than `limit` >= 0, m."""
-    x0, x1, y0, y1 = around[0] - limit, around[1] + limit, around[2] - limit, around[3] + limit
+    wide = limit + _TOUCHING  # sums and differences are rounded, and `apart` decides
+    x0, x1, y0, y1 = around[0] - wide, around[1] + wide, around[2] - wide, around[3] + wide
     found = [r for r in among if r[0] < x1 and r[1] > x0 and r[2] < y1 and r[3] > y0]
     # Near a corner the Euclidean distance may be larger than along either axis.
     return [r for r in found if apart(around, r) < limit] if found else found

@@ -98,7 +98,7 @@ class AffineActuators:
         )
         return self._moment
 
-    def acting_range(self, length: Array, velocity: Array, hold_s: float = 0.0) -> tuple[Array, Array]:
+    def acting_range(self, length: Array, velocity: Array, control_dt: float = 0.0) -> tuple[Array, Array]:
         """The controls between which the force still changes, inside ctrlrange; shapes (nu,) and (nu,).
 
         An actuator that is saturated over its whole ctrlrange gets a range of zero width.
@@ -106,7 +106,7 @@ class AffineActuators:
         Args:
             length: Of the actuators' transmissions, m or rad, shape (nu,).
             velocity: Of the same, shape (nu,).
-            hold_s: Widen by what a speed servo's own force can shift its clamp within this time, s; MuJoCo's
+            control_dt: Widen by what a speed servo's own force can shift its clamp within this time, s; MuJoCo's
                 `actuator_acc0` (acceleration per force in the reference pose) bounds how fast.
         """
         m = self._model
@@ -122,7 +122,7 @@ class AffineActuators:
         ends = (m.actuator_forcerange - bias[:, None]) / scale[:, None]
         feedback = np.abs(m.actuator_biastype * m.actuator_biasprm[:, 2])
         strongest = np.abs(m.actuator_forcerange).max(axis=1)
-        reach = np.abs(m.actuator_gear).max(axis=1) * m.actuator_acc0 * strongest * hold_s
+        reach = np.abs(m.actuator_gear).max(axis=1) * m.actuator_acc0 * strongest * control_dt
         widen = feedback * reach / np.abs(scale)
         least = np.where(acts, ends.min(axis=1) - widen, -np.inf)
         most = np.where(acts, ends.max(axis=1) + widen, np.inf)

@@ -59,12 +59,12 @@ class Forecast:
             self._poses[every] = self._recorder.poses(self.qpos[every - 1 :: every])
         return self._poses[every]
 
-    def first(self, holds: int) -> "Forecast":
+    def first(self, horizon: int) -> "Forecast":
         """Its first control intervals."""
-        if holds == len(self.published_frames):
+        if horizon == len(self.published_frames):
             return self
-        k = len(self.qpos) // len(self.published_frames) * holds
-        published = self.published_frames[:holds], self.published_centres[:holds]
+        k = len(self.qpos) // len(self.published_frames) * horizon
+        published = self.published_frames[:horizon], self.published_centres[:horizon]
         return Forecast(self._recorder, self.qpos[:k], self.qvel[:k], *published)
 
 
@@ -86,9 +86,9 @@ class Recorder:
         self._low = np.where(limited, model.actuator_ctrlrange[:, 0], -np.inf)
         self._high = np.where(limited, model.actuator_ctrlrange[:, 1], np.inf)
         # A unit force accelerates its joints by acc0 (in the reference pose), a transmission by gear times that.
-        hold_s = substeps * model.opt.timestep
+        control_dt = substeps * model.opt.timestep
         gain, gear = model.actuator_gainprm[:, 0], np.abs(model.actuator_gear).max(axis=1)
-        response = model.actuator_acc0 * gear * gain * hold_s
+        response = model.actuator_acc0 * gear * gain * control_dt
         acts = response != 0.0
         self._damping = np.where(acts, _BRAKING / np.where(acts, response, 1.0), 0.0)
         # At rest a servo must push neither way: one for position is told where it is, one for speed zero.
@@ -97,20 +97,20 @@ class Recorder:
         self._rest = -bias[:, :2] / np.where(acts, gain, 1.0)[:, None]
         self._damping[bias[:, 2] != 0.0] = 0.0  # it has damping of its own
 
-    def record(self, data: mujoco.MjData, control: Array, holds: int) -> Forecast:
+    def record(self, data: mujoco.MjData, control: Array, horizon: int) -> Forecast:
         """Hold a control for one control interval; in the others each actuator brakes its own joints.
 
         Args:
             data: At the present state; it is left at the end of the forecast.
             control: Shape (nu,).
-            holds: Control intervals in all, >= 1.
+            horizon: Control intervals in all, >= 1.
         """
         m, n = self._model, self._substeps
-        qpos, qvel = np.empty((holds * n, m.nq)), np.empty((holds * n, m.nv))
-        frames, centres = np.empty((holds, m.nbody, 3)), np.empty((holds, m.nbody, 3))
+        qpos, qvel = np.empty((horizon * n, m.nq)), np.empty((horizon * n, m.nv))
+        frames, centres = np.empty((horizon, m.nbody, 3)), np.empty((horizon, m.nbody, 3))
         data.warning.number[RESETS] = 0
         self.place(data)
-        for hold in range(holds):
+        for hold in range(horizon):
             self.act(data, self.braking(data) if hold else control)
             for i in range(hold * n, hold * n + n):
                 mujoco.mj_step(m, data)

@@ -61,7 +61,7 @@ class MujocoPlant(MujocoState):
         self._pending = deque()
         self._factors = (1.0, 1.0)
         self._raw = None
-        self.stamp = self.revision = 0
+        self.observation_id = self.model_version = 0
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
         """Attach to an env and copy its model."""
@@ -76,7 +76,7 @@ class MujocoPlant(MujocoState):
         refuse_changed_actions(env)
         self._check_action_space(env)
         self.substeps = physics_steps(raw)
-        self.hold_s = check_timing(env, control_interval(raw))
+        self.control_dt = check_timing(env, control_interval(raw))
         check_delay(self.delay_s)
         self._start()
         self._recorder = self._new_recorder()
@@ -97,7 +97,7 @@ class MujocoPlant(MujocoState):
         if self._raw is None:
             self._factors = (self._factors[0] * mass, self._factors[1] * damping)
             return
-        self.revision += 1
+        self.model_version += 1
         self.model.body_mass *= mass
         self.model.body_inertia *= mass
         self.model.dof_damping *= damping
@@ -165,7 +165,7 @@ class MujocoPlant(MujocoState):
         if motion is None:
             data = self.forward()
             motion = data.actuator_length, data.actuator_velocity
-        return self.actuators.acting_range(*motion, self.hold_s)
+        return self.actuators.acting_range(*motion, self.control_dt)
 
     def inertia_diagonal(self) -> Array:
         """Diagonal of the joint-space inertia, shape (nv,), kg or kg m^2."""
@@ -185,22 +185,22 @@ class MujocoPlant(MujocoState):
                 self._recorder.settle(self.data)
             yield self.data
 
-    def forecast(self, control: Array, holds: int = 1) -> Forecast:
+    def forecast(self, control: Array, horizon: int = 1) -> Forecast:
         """What a control leads to: held for one control interval, then the actuated joints are braked.
 
         Kept until the next observation, so that constraints that ask about one control share one forecast.
 
         Args:
             control: Shape (nu,).
-            holds: Control intervals to look ahead, >= 1. In those after the first every actuator opposes its
+            horizon: Control intervals to look ahead, >= 1. In those after the first every actuator opposes its
                 own motion (`Recorder`), which is one way to go on, not the best one.
         """
         key = control.tobytes()
         known = self._forecasts.get(key)
-        if known is None or len(known.published_frames) < holds:
+        if known is None or len(known.published_frames) < horizon:
             self._load_to_step()
-            known = self._forecasts[key] = self._recorder.record(self.data, control, holds)
-        return known.first(holds)
+            known = self._forecasts[key] = self._recorder.record(self.data, control, horizon)
+        return known.first(horizon)
 
     def contact_forecast(self, control: Array) -> ContactForecast:
         """The contacts with the fixed world while a control is held for one control interval, shape (nu,).

@@ -43,7 +43,7 @@ class MujocoState(Plant, ABC):
         self._loaded = self._forwarded = False
         self._forecasts.clear()
         self._contact_forecasts.clear()
-        self.stamp += 1
+        self.observation_id += 1
         # MuJoCo resets a state that is not a number, which a prediction would hide.
         if self._delay_steps and bool(np.isfinite(self._snapshot).all()):
             self._predict_over_delay()

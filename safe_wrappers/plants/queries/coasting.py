@@ -80,11 +80,11 @@ class Coasting:
         self._pose = self._qpos[self._at : self._at + 7]
         self._motion = self._qvel[self._moving : self._moving + 6]
         self._data = mujoco.MjData(m)
-        self._revision = -1
+        self._model_version = -1
 
     def _adopt(self) -> None:
         """Take the numbers that the plant's model may have wrong on purpose."""
-        self._revision = self._plant.revision
+        self._model_version = self._plant.model_version
         if not self._own:
             return
         m, whole = self._model, self._plant.model
@@ -110,25 +110,25 @@ class Coasting:
         vx, vy, _, wx, wy, wz = self._plant.qvel[self._motion].tolist()
         return math.hypot(vx, vy) + math.sqrt(wx * wx + wy * wy + wz * wz) * turning_radius
 
-    def run(self, control: Array, holds: int, turning_radius: float) -> Course:
+    def run(self, control: Array, horizon: int, turning_radius: float) -> Course:
         """Hold a control for one control interval, then none until the machine rests.
 
         Args:
             control: Shape (nu,).
-            holds: Control intervals at most, >= 1.
+            horizon: Control intervals at most, >= 1.
             turning_radius: The farthest point of the machine from its origin, m: turning moves it too.
         """
         plant, m, data = self._plant, self._model, self._data
-        if plant.revision != self._revision:
+        if plant.model_version != self._model_version:
             self._adopt()
         now = plant.pose()
         data.qpos[:], data.qvel[:] = now.qpos[self._qpos], now.qvel[self._qvel]
         data.qacc_warmstart[:] = now.qacc_warmstart[self._qvel]
         data.ctrl[:] = control
         n, at, speeds = plant.substeps, self._at, slice(self._moving, self._moving + 6)
-        poses = np.empty((holds * n, 7))
+        poses = np.empty((horizon * n, 7))
         rests = False
-        for hold in range(holds):
+        for hold in range(horizon):
             for i in range(hold * n, hold * n + n):
                 mujoco.mj_step(m, data)
                 poses[i] = data.qpos[at : at + 7]

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.deprecation import deprecated_method
+from safe_wrappers.deprecation import deprecated_attribute, deprecated_method
 from safe_wrappers.errors import ActionError
 from safe_wrappers.plants.env_checks import wrappers_of
 
@@ -20,15 +20,16 @@ class CommandReceiver:
     the action was made from the newest observation.
     """
 
-    hold_s: float
+    control_dt: float
     """Control interval, s."""
+    hold_s = deprecated_attribute("hold_s", "control_dt")
     _steps_done: int
     _observed_s: float | None
 
     @property
     def now_s(self) -> float:
         """Seconds of the episode so far, on the clock of control steps."""
-        return self._steps_done * self.hold_s
+        return self._steps_done * self.control_dt
 
     def set_observation_time(self, observed_s: float | None) -> None:
         """Say which observation the next action is made from.

@@ -39,7 +39,7 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
 
     Args:
         env: With a Box action space; it must say how long a step lasts (`dt`) if nothing inside counts the time.
-        hold_s: The time that a step lasts, s; None reads the env's.
+        control_dt: The time that a step lasts, s; None reads the env's.
         arguments: Of the fault itself, for the spec.
     """
 
@@ -47,16 +47,16 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
 
     _last: Any
 
-    def __init__(self, env: gym.Env[Any, Any], hold_s: float | None = None, **arguments: Any) -> None:
-        gym.utils.RecordConstructorArgs.__init__(self, hold_s=hold_s, **arguments)
+    def __init__(self, env: gym.Env[Any, Any], control_dt: float | None = None, **arguments: Any) -> None:
+        gym.utils.RecordConstructorArgs.__init__(self, control_dt=control_dt, **arguments)
         gym.Wrapper.__init__(self, env)
         if not isinstance(env.action_space, gym.spaces.Box):
             raise ConfigurationError(f"a fault carries actions of a Box action space, got {env.action_space}")
         self._inside = receiver_inside(env)
-        self.hold_s = 0.0 if self._inside is not None else check_timing(env, hold_s)
-        if self._inside is not None and hold_s is not None:
+        self.control_dt = 0.0 if self._inside is not None else check_timing(env, control_dt)
+        if self._inside is not None and control_dt is not None:
             raise ConfigurationError(
-                f"{type(self._inside).__name__} inside counts the time: leave hold_s out"
+                f"{type(self._inside).__name__} inside counts the time: leave control_dt out"
             )
         # Nested faults of one kind must not strike together.
         same = _count(env, type(self))

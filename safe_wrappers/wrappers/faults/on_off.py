@@ -5,6 +5,7 @@ from typing import Any
 import gymnasium as gym
 
 from safe_wrappers.checks import positive
+from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 from safe_wrappers.wrappers.faults.fault import Carried, Fault
 
@@ -34,6 +35,7 @@ class OnOffProcess:
         return self._on
 
 
+@deprecated_parameters(renamed={"hold_s": "control_dt"})
 class OnOffFault(Fault):
     """Base of the faults that are on for a while at a time.
 
@@ -41,7 +43,7 @@ class OnOffFault(Fault):
         env: See `Fault`.
         mean_between_s: Mean time from the end of the fault to its next start, s.
         mean_length_s: Mean time that it lasts, s.
-        hold_s: See `Fault`.
+        control_dt: See `Fault`.
     """
 
     def __init__(
@@ -49,10 +51,10 @@ class OnOffFault(Fault):
         env: gym.Env[Any, Any],
         mean_between_s: float,
         mean_length_s: float,
-        hold_s: float | None = None,
+        control_dt: float | None = None,
     ) -> None:
         self._process = OnOffProcess(mean_between_s, mean_length_s)
-        super().__init__(env, hold_s, mean_between_s=mean_between_s, mean_length_s=mean_length_s)
+        super().__init__(env, control_dt, mean_between_s=mean_between_s, mean_length_s=mean_length_s)
 
     def begin(self) -> None:
         """An episode begins without the fault."""

@@ -6,23 +6,25 @@ from typing import Any
 import gymnasium as gym
 
 from safe_wrappers.checks import positive
+from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.faults.fault import Carried, Fault
 from safe_wrappers.wrappers.faults.parameters import probability
 
 
+@deprecated_parameters(renamed={"hold_s": "control_dt"})
 class ShareFault(Fault):
     """Base of the faults that strike a share of the commands.
 
     Args:
         env: See `Fault`.
         share: Probability that a command is struck, independently of the others, from 0 to 1.
-        hold_s: See `Fault`.
+        control_dt: See `Fault`.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], share: float, hold_s: float | None = None) -> None:
+    def __init__(self, env: gym.Env[Any, Any], share: float, control_dt: float | None = None) -> None:
         self._share = probability("share", share)
-        super().__init__(env, hold_s, share=self._share)
+        super().__init__(env, control_dt, share=self._share)
 
     def strikes(self) -> bool:
         """Whether it strikes the next command."""
@@ -55,6 +57,7 @@ class RepeatedCommands(ShareFault):
         return given
 
 
+@deprecated_parameters(renamed={"hold_s": "control_dt"})
 class Jitter(Fault):
     """Delays every command by a random time, uniform from 0 to the longest, each by itself.
 
@@ -64,12 +67,12 @@ class Jitter(Fault):
     Args:
         env: See `Fault`.
         longest_s: s.
-        hold_s: See `Fault`.
+        control_dt: See `Fault`.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], longest_s: float, hold_s: float | None = None) -> None:
+    def __init__(self, env: gym.Env[Any, Any], longest_s: float, control_dt: float | None = None) -> None:
         self._longest_s = positive("longest_s", longest_s, "s")
-        super().__init__(env, hold_s, longest_s=self._longest_s)
+        super().__init__(env, control_dt, longest_s=self._longest_s)
 
     def begin(self) -> None:
         """Nothing is on its way."""
@@ -87,6 +90,7 @@ class Jitter(Fault):
         return newest
 
 
+@deprecated_parameters(renamed={"hold_s": "control_dt"})
 class ClockSkew(Fault):
     """Gives the observation times of a clock that is off, and runs at another rate: `(1 + drift) t + offset_s`.
 
@@ -97,7 +101,7 @@ class ClockSkew(Fault):
         env: See `Fault`.
         offset_s: s, positive for a clock that is ahead.
         drift: Seconds per second.
-        hold_s: See `Fault`.
+        control_dt: See `Fault`.
     """
 
     def __init__(
@@ -105,14 +109,14 @@ class ClockSkew(Fault):
         env: gym.Env[Any, Any],
         offset_s: float = 0.0,
         drift: float = 0.0,
-        hold_s: float | None = None,
+        control_dt: float | None = None,
     ) -> None:
         for name, value in (("offset_s", offset_s), ("drift", drift)):
             if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
                 raise ConfigurationError(f"{name} is a finite number, got {value!r}")
         if offset_s == 0.0 and drift == 0.0:
             raise ConfigurationError("a clock with neither offset_s nor drift is right; give one of them")
-        super().__init__(env, hold_s, offset_s=offset_s, drift=drift)
+        super().__init__(env, control_dt, offset_s=offset_s, drift=drift)
         self._offset_s, self._drift = offset_s, drift
 
     def carry(self, given: Carried | None, now_s: float) -> Carried | None:

@@ -79,7 +79,7 @@ class ChunkQueue:
 
     Args:
         controls: m.
-        hold_s: Control interval, s.
+        control_dt: Control interval, s.
         blend: A blend of `control/handover/seams.py`, "replace" or "ensemble".
         fewest: A blend takes at least so many control steps.
         rate_limit: Largest |du/dt| of every component, shape (m,), action units per second; infinite for none.
@@ -93,7 +93,7 @@ class ChunkQueue:
     def __init__(
         self,
         controls: int,
-        hold_s: float,
+        control_dt: float,
         *,
         blend: str,
         fewest: int,
@@ -103,11 +103,11 @@ class ChunkQueue:
         dtype: Any,
         decay: float,
     ) -> None:
-        self._hold_s, self._blend, self._fewest, self._decay = hold_s, blend, fewest, decay
+        self._control_dt, self._blend, self._fewest, self._decay = control_dt, blend, fewest, decay
         self._rate_limit = rate_limit
-        step = np.asarray(rate_limit * hold_s)
+        step = np.asarray(rate_limit * control_dt)
         # The difference of two commands, divided by the interval again, must not come out above the limit.
-        self._step = np.where(step / hold_s > rate_limit, np.nextafter(step, 0.0), step)
+        self._step = np.where(step / control_dt > rate_limit, np.nextafter(step, 0.0), step)
         largest = min(float(np.finfo(dtype).max), float(np.finfo(np.float32).max))
         self._low, self._high = np.maximum(low, -largest), np.minimum(high, largest)
         self._dtype = np.dtype(dtype)
@@ -202,7 +202,7 @@ class ChunkQueue:
             self._sent,
             self._plan,
             fresh,
-            self._hold_s,
+            self._control_dt,
             blend=self._blend,  # type: ignore[arg-type]  # checked by the wrapper
             fewest=self._fewest,
             rate_limit=self._rate_limit,
@@ -234,7 +234,7 @@ class ChunkQueue:
         if bounded.any():
             change = np.abs(target - self._sent[-1])[bounded]
             shortest = float(shortest_latched_blend(change, self._rate_limit[bounded]).max())
-            steps = max(steps, math.ceil(shortest / self._hold_s - _WHOLE) - 1)
+            steps = max(steps, math.ceil(shortest / self._control_dt - _WHOLE) - 1)
         return steps
 
     def _faded(self, control: Array) -> Array:

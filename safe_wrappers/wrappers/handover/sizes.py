@@ -79,7 +79,7 @@ class ChunkSizes(NamedTuple):
 def blend_bounds(
     sizes: ChunkSizes,
     space: gym.spaces.Box,
-    hold_s: float,
+    control_dt: float,
     blend: str,
     blend_time: float | None,
     rate_limit: float | Sequence[float] | None,
@@ -99,20 +99,20 @@ def blend_bounds(
         return 0, np.full(space.shape, np.inf)
     fewest, limits = 0, np.full(space.shape, np.inf)
     if blend_time is not None:
-        fewest = max(math.ceil(positive("blend_time", blend_time, "s") / hold_s - _WHOLE) - 1, 1)
+        fewest = max(math.ceil(positive("blend_time", blend_time, "s") / control_dt - _WHOLE) - 1, 1)
         available = sizes.chunk - sizes.delay[1]
         if fewest >= available and sizes.chunk > 1:
             raise ConfigurationError(
                 f"blend_time = {blend_time} s is longer than what a chunk has left when it takes over, {available} "
-                f"control steps of {hold_s} s: choose a longer chunk_size or a shorter blend_time"
+                f"control steps of {control_dt} s: choose a longer chunk_size or a shorter blend_time"
             )
     if rate_limit is not None:
         limits = _rate_limits(rate_limit, limits.size)
         resolution = _rounding(space)
-        if (limits * hold_s <= resolution).any():
+        if (limits * control_dt <= resolution).any():
             raise ConfigurationError(
-                f"rate_limit = {rate_limit} per second is not above what {space.dtype} resolves in steps of {hold_s} "
-                f"s, {resolution / hold_s:.3g}: choose a larger one"
+                f"rate_limit = {rate_limit} per second is not above what {space.dtype} resolves in steps of "
+                f"{control_dt} s, {resolution / control_dt:.3g}: choose a larger one"
             )
     if blend_time is None and rate_limit is None:
         fewest = sizes.leftover

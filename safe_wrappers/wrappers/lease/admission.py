@@ -18,8 +18,8 @@ Measured = Callable[[gym.Env[Any, Any]], tuple[ArrayLike, ...]]
 
 ARRIVALS: Final = ("moving", "rest")
 _EXPECTED: Final = (
-    'reach is {"max_acceleration": ..., "max_speed": ..., "max_jerk": ..., "arrival": "moving" or "rest"}, all but '
-    "the first at will, the limits each a number or one for each of the"
+    'motion_limits is {"max_acceleration": ..., "max_speed": ..., "max_jerk": ..., "arrival": "moving" or "rest"}, '
+    "all but the first at will, the limits each a number or one for each of the"
 )
 
 
@@ -32,7 +32,7 @@ class Admission:
 
     Args:
         env: What is wrapped.
-        reach: Limits of the motion and the kind of arrival.
+        motion_limits: Limits of the motion and the kind of arrival.
         measured: None reads the lengths and velocities of the MuJoCo actuators.
         controls: m.
 
@@ -42,22 +42,28 @@ class Admission:
     """
 
     def __init__(
-        self, env: gym.Env[Any, Any], reach: Mapping[str, Any], measured: Measured | None, controls: int
+        self,
+        env: gym.Env[Any, Any],
+        motion_limits: Mapping[str, Any],
+        measured: Measured | None,
+        controls: int,
     ) -> None:
         if measured is None and not hasattr(env.unwrapped, "data"):
             raise UnsupportedEnvError(
-                "reach needs to know where the machine is: pass measured, a function of the env that returns the "
-                "positions that the actions are setpoints of, and their velocities"
+                "motion_limits needs to know where the machine is: pass measured, a function of the env that returns "
+                "the positions that the actions are setpoints of, and their velocities"
             )
         try:
-            given = dict(reach)
+            given = dict(motion_limits)
             arrival = given.pop("arrival", "moving")
             self._limits = MotionLimits(**given)
             np.broadcast_to(np.broadcast_arrays(*self._limits.arrays)[0], (controls,))
         except (TypeError, ValueError) as error:
             if isinstance(error, ConfigurationError):
                 raise
-            raise ConfigurationError(f"{_EXPECTED} {controls} action components; got {reach!r}") from None
+            raise ConfigurationError(
+                f"{_EXPECTED} {controls} action components; got {motion_limits!r}"
+            ) from None
         if arrival not in ARRIVALS:
             raise UnknownNameError(f"arrival is {' or '.join(map(repr, ARRIVALS))}, got {arrival!r}")
         self._rest = arrival == "rest"

@@ -75,7 +75,7 @@ class RoundTripWatch:
     Args:
         env: What is wrapped.
         ceiling: What is watched.
-        hold_s: Control interval, s.
+        control_dt: Control interval, s.
         slack_s: Times that are closer are the same.
     """
 
@@ -94,10 +94,10 @@ class RoundTripWatch:
         self,
         env: gym.Env[Any, Any],
         ceiling: RoundTripCeiling,
-        hold_s: float,
+        control_dt: float,
         slack_s: float = 0.0,
     ) -> None:
-        self._ceiling, self._hold_s, self._slack_s = ceiling, hold_s, slack_s
+        self._ceiling, self._control_dt, self._slack_s = ceiling, control_dt, slack_s
         self.budget = BoundBudget(budget_from(ceiling.budget), env)
 
     def reset(self) -> None:
@@ -116,7 +116,7 @@ class RoundTripWatch:
             return
         self.clearance_m = float(budget.clearance.min(initial=math.inf))
         # The next look comes one control step from now.
-        highest_s = budget.longest_round_trip(ceiling.video_s, ceiling.human_s) - self._hold_s
+        highest_s = budget.longest_round_trip(ceiling.video_s, ceiling.human_s) - self._control_dt
         self.ceiling_s = min(max(highest_s, -ceiling.longest_s), ceiling.longest_s)
 
     def judge(self, command: Array, seen_s: float, round_trip_s: float, now_s: float) -> None:
@@ -141,4 +141,4 @@ class RoundTripWatch:
 
     def can_stop_after(self, command: Array) -> bool:
         """Whether the machine can stop by itself after a command for one control step."""
-        return self.budget.can_stop_after(command, self._hold_s)
+        return self.budget.can_stop_after(command, self._control_dt)
