@@ -10,7 +10,7 @@ import pytest
 import safe_wrappers
 
 ROOT = Path(__file__).parents[1]
-ROOMS = {
+LAYERS = {
     "control": ROOT / "safe_wrappers" / "control",
     "appendix": ROOT / "safe_wrappers" / "appendix",
     "plants": ROOT / "safe_wrappers" / "plants",
@@ -22,7 +22,7 @@ ROOMS = {
     "train": ROOT / "train",
 }
 COMMON = {"checks", "deprecation", "errors", "info"}
-"""Single modules at the top that every room may use; `protect` and the package itself are the top."""
+"""Single modules at the top that every layer may use; `protect` and the package itself are the top."""
 BELOW_WRAPPERS = {"control", "plants", "filter", "constraints", "serialize", "stack", *COMMON}
 MAY_USE = {
     "control": {"control", "checks", "errors"},
@@ -49,8 +49,8 @@ FORBIDDEN = {
 }
 
 
-def modules(room):
-    return sorted(ROOMS[room].rglob("*.py"))
+def modules(layer):
+    return sorted(LAYERS[layer].rglob("*.py"))
 
 
 def imports(path, package):
@@ -68,38 +68,38 @@ def imports(path, package):
     return found
 
 
-def dotted(room, path):
-    inside = path.relative_to(ROOMS[room]).parent.parts
-    return ".".join(["safe_wrappers", room, *inside])
+def dotted(layer, path):
+    inside = path.relative_to(LAYERS[layer]).parent.parts
+    return ".".join(["safe_wrappers", layer, *inside])
 
 
-def rooms_used(room, path):
-    """The rooms and top modules that a module imports; "" is a public name of the package itself."""
+def layers_used(layer, path):
+    """The layers and top modules that a module imports; "" is a public name of the package itself."""
     used = set()
-    for name in imports(path, dotted(room, path)):
+    for name in imports(path, dotted(layer, path)):
         top, _, rest = name.partition(".")
         if top == "safe_wrappers":
             second = rest.split(".")[0]
-            known = second in ROOMS or (ROOT / "safe_wrappers" / f"{second}.py").exists()
+            known = second in LAYERS or (ROOT / "safe_wrappers" / f"{second}.py").exists()
             used.add(second if known else "")
     return used
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_no_arrow_points_back_up(room):
-    assert modules(room), f"{room} has no modules: the test looks in the wrong place"
-    for path in modules(room):
-        wrong = rooms_used(room, path) - MAY_USE[room]
+@pytest.mark.parametrize("layer", LAYERS)
+def test_no_arrow_points_back_up(layer):
+    assert modules(layer), f"{layer} has no modules: the test looks in the wrong place"
+    for path in modules(layer):
+        wrong = layers_used(layer, path) - MAY_USE[layer]
         assert not wrong, (
-            f"{path.relative_to(ROOT)} imports {sorted(wrong)}; {room} may use {sorted(MAY_USE[room])}"
+            f"{path.relative_to(ROOT)} imports {sorted(wrong)}; {layer} may use {sorted(MAY_USE[layer])}"
         )
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_heavy_libraries_stay_in_their_rooms(room):
-    for path in modules(room):
-        roots = {name.split(".")[0] for name in imports(path, dotted(room, path))}
-        wrong = roots & FORBIDDEN[room]
+@pytest.mark.parametrize("layer", LAYERS)
+def test_heavy_libraries_stay_in_their_layers(layer):
+    for path in modules(layer):
+        roots = {name.split(".")[0] for name in imports(path, dotted(layer, path))}
+        wrong = roots & FORBIDDEN[layer]
         assert not wrong, f"{path.relative_to(ROOT)} imports {sorted(wrong)}"
 
 
@@ -112,15 +112,15 @@ def test_the_top_imports_no_torch_and_no_training(name):
 
 def test_envs_and_train_are_never_imported_by_their_folder_names():
     # They are safe_wrappers.envs and safe_wrappers.train wherever the package is installed.
-    for room in ROOMS:
-        for path in modules(room):
-            names = imports(path, dotted(room, path))
+    for layer in LAYERS:
+        for path in modules(layer):
+            names = imports(path, dotted(layer, path))
             assert not {n.split(".")[0] for n in names} & {"envs", "train"}, path
 
 
-def test_every_folder_of_the_library_is_a_known_room():
+def test_every_folder_of_the_library_is_a_known_layer():
     folders = {p.name for p in (ROOT / "safe_wrappers").iterdir() if p.is_dir() and any(p.glob("*.py"))}
-    assert folders <= set(ROOMS), "a new room needs its place in the arrows"
+    assert folders <= set(LAYERS), "a new layer needs its place in the arrows"
 
 
 def test_the_parser_sees_what_it_should(tmp_path):
@@ -129,8 +129,8 @@ def test_the_parser_sees_what_it_should(tmp_path):
     path.write_text(source)
     found = imports(path, "safe_wrappers.control")
     assert found == {"torch.nn", "safe_wrappers.wrappers.x", "safe_wrappers.plants.plant.Plant"}
-    assert rooms_used("control", ROOMS["control"] / "watchdog" / "leases.py") == {"errors"}
-    assert rooms_used("plants", ROOMS["plants"] / "analytic.py") == {"deprecation", "errors", "plants"}
+    assert layers_used("control", LAYERS["control"] / "watchdog" / "leases.py") == {"errors"}
+    assert layers_used("plants", LAYERS["plants"] / "analytic.py") == {"deprecation", "errors", "plants"}
 
 
 def test_control_runs_without_gymnasium_and_mujoco():
@@ -149,7 +149,7 @@ import importlib
 for name in sys.argv[2:]:
     importlib.import_module("safe_wrappers.control." + name)
 """
-    relative = [p.relative_to(ROOMS["control"]).with_suffix("") for p in modules("control")]
+    relative = [p.relative_to(LAYERS["control"]).with_suffix("") for p in modules("control")]
     names = [".".join(p.parts) for p in relative if p.stem != "__init__"]
     assert "watchdog.leases" in names
     folder = str(Path(safe_wrappers.__file__).parent)

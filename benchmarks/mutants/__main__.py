@@ -1,7 +1,7 @@
 """Makes one mistake at a time in a copy of the package, runs the tests around it, and says whether they notice.
 
     python -m benchmarks.mutants                 # all; about ten minutes on one core
-    python -m benchmarks.mutants --rooms search  # of the rooms whose name has one of these words
+    python -m benchmarks.mutants --only search  # of the targets whose name has one of these words
 
 A mutant is killed if a test fails, or does not end within two minutes. Exit status 1 if under 90 % of the mutants
 that change behaviour are killed.
@@ -20,8 +20,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.mutants.room import Mutant, Room
-from benchmarks.mutants.rooms import ROOMS
+from benchmarks.mutants.target import Mutant, Target
+from benchmarks.mutants.targets import TARGETS
 
 ROOT = Path(__file__).parents[2]
 NEEDED = 0.9
@@ -81,57 +81,59 @@ def preload() -> None:
         importlib.import_module(name)
 
 
-def check_tests(where: Path, rooms: dict[str, Room]) -> None:
+def check_tests(where: Path, targets: dict[str, Target]) -> None:
     """Stop if a test fails without any mistake."""
     for words in dict.fromkeys(
-        w for room in rooms.values() for w in (room.tests, *(m.tests for m in room.mutants))
+        w for target in targets.values() for w in (target.tests, *(m.tests for m in target.mutants))
     ):
         if words and tests(where, words):
             sys.exit(f"{' '.join(words)} fail without a mutant\n{(where / OUTPUT).read_text()[-3000:]}")
 
 
-def place(package: Path, room: Room, mutant: Mutant) -> Path:
-    """The one file of the room with the mutant's text, once."""
-    found = [(file, file.read_text().count(mutant.old)) for file in sorted(package.glob(room.files))]
+def place(package: Path, target: Target, mutant: Mutant) -> Path:
+    """The one file of the target with the mutant's text, once."""
+    found = [(file, file.read_text().count(mutant.old)) for file in sorted(package.glob(target.files))]
     holding = [file for file, times in found if times]
     if sum(times for _, times in found) != 1:
-        sys.exit(f"{mutant.old!r} is {sum(times for _, times in found)} times in {room.files}, not once")
+        sys.exit(f"{mutant.old!r} is {sum(times for _, times in found)} times in {target.files}, not once")
     return holding[0]
 
 
-def survives(where: Path, file: Path, room: Room, mutant: Mutant, number: int) -> bool:
+def survives(where: Path, file: Path, target: Target, mutant: Mutant, number: int) -> bool:
     """Whether all tests pass with the mistake."""
     text = file.read_text()
     mistaken = text.replace(mutant.old, mutant.new)
-    compile(mistaken, file, "exec")  # what is no Python says nothing about the tests
+    compile(mistaken, file, "exec")  # a syntax error would say nothing about the tests
     try:
         file.write_text(mistaken)
         # Bytecode is kept by size and second of change.
         os.utime(file, (number, number))
-        return tests(where, mutant.tests or room.tests) == 0
+        return tests(where, mutant.tests or target.tests) == 0
     finally:
         file.write_text(text)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="mutants", description=__doc__.splitlines()[0])
-    parser.add_argument("--rooms", nargs="+", metavar="WORD", help=f"only some of {', '.join(ROOMS)}")
+    parser.add_argument("--only", nargs="+", metavar="WORD", help=f"only some of {', '.join(TARGETS)}")
     parser.add_argument("--find", action="store_true", help="only check that every mutant's text is there")
     arguments = parser.parse_args()
-    rooms = {n: r for n, r in ROOMS.items() if not arguments.rooms or any(w in n for w in arguments.rooms)}
+    targets = {n: r for n, r in TARGETS.items() if not arguments.only or any(w in n for w in arguments.only)}
     with tempfile.TemporaryDirectory() as folder:
         where = Path(folder).resolve()
         package = copied(where)
-        jobs = [(n, room, m, place(package, room, m)) for n, room in rooms.items() for m in room.mutants]
+        jobs = [
+            (n, target, m, place(package, target, m)) for n, target in targets.items() for m in target.mutants
+        ]
         if arguments.find:
             print(f"{len(jobs)} mutants")
             return
         preload()
-        check_tests(where, rooms)
-        counts: dict[str, Counter[str]] = {name: Counter() for name in rooms}
-        for number, (name, room, mutant, file) in enumerate(jobs, start=1):
+        check_tests(where, targets)
+        counts: dict[str, Counter[str]] = {name: Counter() for name in targets}
+        for number, (name, target, mutant, file) in enumerate(jobs, start=1):
             began = time.perf_counter()
-            lives = survives(where, file, room, mutant, number)
+            lives = survives(where, file, target, mutant, number)
             verdict = ("equal" if mutant.equal else "SURVIVED") if lives else "killed"
             if mutant.equal and not lives:
                 verdict = "killed, not equal"
@@ -142,7 +144,7 @@ def main() -> None:
 
 
 def report(counts: dict[str, "Counter[str]"]) -> None:
-    """A table by room, and the exit status."""
+    """A table by target, and the exit status."""
     total = sum(counts.values(), Counter[str]())
     print(f"\n{'':18}{'mutants':>9}{'equal':>9}{'killed':>9}{'survived':>9}")
     for name, of in [*counts.items(), ("all", total)]:

@@ -1,10 +1,10 @@
 """Mutants of the four clearances that have a backup manoeuvre."""
 
-from benchmarks.mutants.room import Mutant, Room
+from benchmarks.mutants.target import Mutant, Target
 
 _FORGOTTEN = "Detour(self._memory.side, self._memory.steps - 1)"
 
-HEADING_DRIVE = Room(
+HEADING_DRIVE = Target(
     "constraints/backup/[bh]*.py",
     ("tests/constraints/test_heading_drive_clearance.py", "tests/wrappers/test_closed_loop_point_goal.py"),
     (
@@ -31,7 +31,7 @@ HEADING_DRIVE = Room(
     ),
 )
 
-COASTING = Room(
+COASTING = Target(
     "constraints/backup/[bc]*.py",
     ("tests/constraints/test_coasting_clearance.py", "tests/wrappers/test_closed_loop_car_goal.py"),
     (
@@ -62,7 +62,7 @@ COASTING = Room(
     ),
 )
 
-ESCAPE = Room(
+ESCAPE = Target(
     "constraints/backup/escape_clearance.py",
     ("tests/constraints/test_escape_clearance.py", "tests/wrappers/test_closed_loop_occlusion.py"),
     (
@@ -107,7 +107,7 @@ ESCAPE = Room(
     ),
 )
 
-WALL = Room(
+WALL = Target(
     "constraints/backup/wall_clearance.py",
     ("tests/constraints/test_wall_clearance.py",),
     (

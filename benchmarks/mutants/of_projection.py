@@ -1,8 +1,8 @@
 """Mutants of the projection."""
 
-from benchmarks.mutants.room import Mutant, Room
+from benchmarks.mutants.target import Mutant, Target
 
-PROJECTION = Room(
+PROJECTION = Target(
     "filter/**/*.py",
     ("tests/control/test_projection.py", "tests/control/test_projection_scale.py", "tests/filter"),
     (

@@ -1,10 +1,10 @@
 """Mutants of the search for an admissible action, and of rollout constraints."""
 
-from benchmarks.mutants.room import Mutant, Room
+from benchmarks.mutants.target import Mutant, Target
 
 _FIRST_KEPT = "\n        return next((control for control in every if "
 
-SEARCH = Room(
+SEARCH = Target(
     "filter/**/*.py",
     ("tests/filter",),
     (
@@ -28,8 +28,8 @@ SEARCH = Room(
             "and not contradictory",
         ),
         Mutant(
-            f"in c.candidates(proposal)){_FIRST_KEPT}self._keeps(control, strict)",
-            f"in c.candidates(proposal)){_FIRST_KEPT}self._admitted(control)",
+            f"for control in known){_FIRST_KEPT}self._keeps(control, strict)",
+            f"for control in known){_FIRST_KEPT}self._admitted(control)",
         ),
         Mutant("candidate = self.candidate(proposal, strict)", "candidate = None"),
         Mutant(
@@ -37,7 +37,12 @@ SEARCH = Room(
             f"if control is not None]{_FIRST_KEPT}self._admitted(control)",
         ),
         Mutant(
-            "np.clip(control, self._low, self._high) for control in known", "control for control in known"
+            "every = (np.clip(control, self._low, self._high) for control in known)",
+            "every = (control for control in known)",
+        ),
+        Mutant(
+            "[np.clip(control, self._low, self._high) for control in known if",
+            "[control for control in known if",
         ),
         Mutant(
             "            rows = strict\n            result, control = self._project(proposal, *rows)",
@@ -84,7 +89,7 @@ SEARCH = Room(
     ),
 )
 
-ROLLOUT = Room(
+ROLLOUT = Target(
     "constraints/rollout.py",
     (
         "tests/constraints/test_rollout_response.py",
@@ -105,11 +110,12 @@ ROLLOUT = Room(
         Mutant("_RESOLUTION = 1e-6", "_RESOLUTION = 0.0"),
         Mutant("RECOVERY_S = 0.1", "RECOVERY_S = 0.2"),
         Mutant(
-            "self._least - self._reach >= margin + self.tolerance", "self._least >= margin + self.tolerance"
+            "self._least - self._max_decrease >= margin + self.tolerance",
+            "self._least >= margin + self.tolerance",
         ),
-        Mutant("if fallen > reach + self.tolerance:", "if fallen > 2.0 * reach:"),
+        Mutant("if fallen > max_decrease + self.tolerance:", "if fallen > 2.0 * max_decrease:"),
         Mutant(
-            "                stacklevel=2,\n            )\n            self._reach = None",
+            "                stacklevel=2,\n            )\n            self._max_decrease = None",
             "                stacklevel=2,\n            )",
         ),
         Mutant("(*self._recent, self._least)[-self.spec.horizon :]", "(*self._recent, self._least)[-1:]"),

@@ -1,8 +1,8 @@
 """Mutants of leases and of the handover of chunks."""
 
-from benchmarks.mutants.room import Mutant, Room
+from benchmarks.mutants.target import Mutant, Target
 
-LEASE = Room(
+LEASE = Target(
     "wrappers/lease*/**/*.py",
     (
         "tests/wrappers/test_admission.py",
@@ -63,7 +63,7 @@ LEASE = Room(
     ),
 )
 
-LEASE_EXPIRY = Room(
+LEASE_EXPIRY = Target(
     "wrappers/lease_expiry.py",
     ("tests/wrappers/test_lease_expiry.py", "tests/wrappers/test_authority_stack.py"),
     (
@@ -127,7 +127,7 @@ LEASE_EXPIRY = Room(
     ),
 )
 
-HANDOVER = Room(
+HANDOVER = Target(
     "wrappers/*handover*/**/*.py",
     (
         "tests/wrappers/test_chunk_queue.py",
@@ -177,7 +177,7 @@ HANDOVER = Room(
     ),
 )
 
-CHUNK_HANDOVER = Room(
+CHUNK_HANDOVER = Target(
     "wrappers/chunk_handover.py",
     ("tests/wrappers/test_chunk_handover.py",),
     (

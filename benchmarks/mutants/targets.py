@@ -1,12 +1,12 @@
-"""All rooms, by name."""
+"""What is mutated, by name."""
 
 from benchmarks.mutants.of_backups import COASTING, ESCAPE, HEADING_DRIVE, WALL
 from benchmarks.mutants.of_projection import PROJECTION
 from benchmarks.mutants.of_search import ROLLOUT, SEARCH
 from benchmarks.mutants.of_wrappers import CHUNK_HANDOVER, HANDOVER, LEASE, LEASE_EXPIRY
-from benchmarks.mutants.room import Room
+from benchmarks.mutants.target import Target
 
-ROOMS: dict[str, Room] = {
+TARGETS: dict[str, Target] = {
     "search": SEARCH,
     "projection": PROJECTION,
     "rollout": ROLLOUT,

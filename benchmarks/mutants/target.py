@@ -1,4 +1,4 @@
-"""What a mutant is, and the rooms of the package that they are made in."""
+"""What a mutant is, and which parts of the package they are made in."""
 
 from typing import NamedTuple
 
@@ -7,10 +7,10 @@ class Mutant(NamedTuple):
     """One mistake.
 
     Attributes:
-        old: Text that is there once in the files of its room.
+        old: Text that is there once in the files of its target.
         new: What it becomes.
         equal: Why it changes no behaviour, if it does not.
-        tests: Instead of those of the room.
+        tests: Instead of those of the target.
     """
 
     old: str
@@ -19,7 +19,7 @@ class Mutant(NamedTuple):
     tests: tuple[str, ...] = ()
 
 
-class Room(NamedTuple):
+class Target(NamedTuple):
     """Mutants of some files.
 
     Attributes:
