@@ -75,6 +75,10 @@ class Plant(ABC):
     def observe(self) -> None:
         """Take the env's present state."""
 
+    def step(self, env: gym.Env[Any, Any], action: Any) -> Any:
+        """Step the env with what may be executed; what `env.step` returns."""
+        return env.step(action)
+
     @abstractmethod
     def executed(self, control: Array | None) -> None:
         """Remember what was sent, for the delay; None forgets everything (a new episode)."""

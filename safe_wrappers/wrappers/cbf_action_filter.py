@@ -181,7 +181,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         self.filter.executed(executed)
         self.filter_seconds += time.perf_counter() - started
         self.filter_calls += 1
-        observation, reward, terminated, truncated, info = self.env.step(sent)
+        observation, reward, terminated, truncated, info = self.plant.step(self.env, sent)
         info[keys.CBF_INTERVENED] = intervened
         info[keys.CBF_INFEASIBLE] = decision.infeasible
         info[keys.CBF_FALLBACK] = decision.fallback

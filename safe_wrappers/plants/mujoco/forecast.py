@@ -74,6 +74,10 @@ class Recorder:
     Args:
         model: The plant's own.
         substeps: Physics substeps per control interval.
+
+    Attributes:
+        held: Data at the end of the latest forecast's first control interval.
+        held_control: Bytes of the control of that interval; empty: none from the present state.
     """
 
     settles: ClassVar[bool] = False
@@ -81,6 +85,7 @@ class Recorder:
 
     def __init__(self, model: mujoco.MjModel, substeps: int) -> None:
         self._model, self._substeps = model, substeps
+        self.held, self.held_control = mujoco.MjData(model), b""
         self._still = mujoco.MjData(model)
         limited = model.actuator_ctrllimited.astype(bool)
         self._low = np.where(limited, model.actuator_ctrlrange[:, 0], -np.inf)
@@ -97,20 +102,28 @@ class Recorder:
         self._rest = -bias[:, :2] / np.where(acts, gain, 1.0)[:, None]
         self._damping[bias[:, 2] != 0.0] = 0.0  # it has damping of its own
 
-    def record(self, data: mujoco.MjData, control: Array, horizon: int) -> Forecast:
+    def record(
+        self, data: mujoco.MjData, control: Array, horizon: int, first: Forecast | None = None
+    ) -> Forecast:
         """Hold a control for one control interval; in the others each actuator brakes its own joints.
 
         Args:
-            data: At the present state; it is left at the end of the forecast.
+            data: At the present state; with `first`, anything. It is left at the end of the forecast.
             control: Shape (nu,).
             horizon: Control intervals in all, >= 1.
+            first: The control's forecast over one control interval, to go on from: `held_control` is the control.
         """
         m, n = self._model, self._substeps
         qpos, qvel = np.empty((horizon * n, m.nq)), np.empty((horizon * n, m.nv))
         frames, centres = np.empty((horizon, m.nbody, 3)), np.empty((horizon, m.nbody, 3))
-        data.warning.number[RESETS] = 0
-        self.place(data)
-        for hold in range(horizon):
+        if first is None:
+            data.warning.number[RESETS] = 0
+            self.place(data)
+        else:
+            mujoco.mj_copyData(data, m, self.held)
+            qpos[:n], qvel[:n] = first.qpos, first.qvel
+            frames[:1], centres[:1] = first.published_frames, first.published_centres
+        for hold in range(0 if first is None else 1, horizon):
             self.act(data, self.braking(data) if hold else control)
             for i in range(hold * n, hold * n + n):
                 mujoco.mj_step(m, data)
@@ -119,6 +132,9 @@ class Recorder:
                 self.settle(data)
                 qpos[i], qvel[i] = data.qpos, data.qvel
             frames[hold], centres[hold] = data.xpos, data.xipos
+            if hold == 0:
+                mujoco.mj_copyData(self.held, m, data)
+                self.held_control = control.tobytes()
             if data.warning.number[RESETS].any():
                 # MuJoCo answers numbers out of bounds with a reset, after which all may look well.
                 qpos[hold * n :] = qvel[hold * n :] = frames[hold:] = centres[hold:] = np.nan

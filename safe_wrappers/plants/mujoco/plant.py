@@ -29,6 +29,7 @@ from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
 from safe_wrappers.plants.mujoco.forecast import Forecast, Poses, Recorder
 from safe_wrappers.plants.mujoco.linear_model import drift_and_effect, inertia_diagonal, position_rate
 from safe_wrappers.plants.mujoco.named import frame, named, names
+from safe_wrappers.plants.mujoco.shared_step import SharedStep, can_share
 from safe_wrappers.plants.mujoco.state import MujocoState
 from safe_wrappers.plants.mujoco.timing import control_interval, physics_steps
 from safe_wrappers.plants.plant import Plant
@@ -46,6 +47,9 @@ class MujocoPlant(MujocoState):
         model: The filter's model; None copies the env's. Pass another (other masses) to test mismatch.
         delay_s: Evidence age plus detection plus actuation delay in s; the state is predicted over it with
             the commands in flight, on this plant's model.
+        share_step: Let the rollout of the executed control be the env's step, which saves simulating it twice. None:
+            with envs where that was measured equal bit for bit (Gymnasium's MuJoCo envs and ours on velocity);
+            True: with any env that does not override `MujocoEnv`'s simulation step and leaves its model alone.
 
     Raises:
         UnsupportedEnvError: The env has no MuJoCo model, an actuator that is not affine, or an action space
@@ -55,8 +59,10 @@ class MujocoPlant(MujocoState):
     bounds_are_action_space: ClassVar[bool] = True
     can_brake: ClassVar[bool] = True
 
-    def __init__(self, model: mujoco.MjModel | None = None, delay_s: float = 0.0) -> None:
-        self._given = model
+    def __init__(
+        self, model: mujoco.MjModel | None = None, delay_s: float = 0.0, share_step: bool | None = None
+    ) -> None:
+        self._given, self._share_step = model, share_step
         self.delay_s = seconds("delay_s", delay_s)
         self._pending = deque()
         self._factors = (1.0, 1.0)
@@ -70,6 +76,7 @@ class MujocoPlant(MujocoState):
         self.model = own_model(raw, self._given)
         self._raw, self._env = raw, env
         self.data = mujoco.MjData(self.model)
+        self._shared: SharedStep | None = None
         self.actuators = AffineActuators(self.model)
         self._clamped = bool(self.model.actuator_forcelimited.any())
         self._lower, self._upper = control_range(self.model)
@@ -80,9 +87,27 @@ class MujocoPlant(MujocoState):
         check_delay(self.delay_s)
         self._start()
         self._recorder = self._new_recorder()
+        if self._may_share(env):
+            self._shared = SharedStep(raw, self.substeps)
         self._contact_reader = ContactReader(self.model)
         if self._factors != (1.0, 1.0):
             self.perturb(*self._factors)
+
+    def _may_share(self, env: gym.Env[Any, Any]) -> bool:
+        """Whether rollouts are the env's own steps: its model, its state now, and a step that is known."""
+        exact = self._given is None and not self.delay_s
+        if self._share_step and not (exact and can_share(env, known_only=False)):
+            raise ConfigurationError(
+                "share_step=True needs the env's own model, no delay, and an env that steps as Gymnasium's MujocoEnv "
+                f"does; {env.unwrapped} with model={self._given!r} and delay_s={self.delay_s} is none: leave it out"
+            )
+        return self._share_step is not False and exact and can_share(env, known_only=not self._share_step)
+
+    def step(self, env: gym.Env[Any, Any], action: Any) -> Any:
+        """Step the env; what a rollout of the same controls has simulated already is not simulated again."""
+        if self._shared is None:
+            return env.step(action)
+        return self._shared.step(env, action, self._recorder, self._snapshot)
 
     def _new_recorder(self) -> Recorder:
         return Recorder(self.model, self.substeps)
@@ -98,6 +123,7 @@ class MujocoPlant(MujocoState):
             self._factors = (self._factors[0] * mass, self._factors[1] * damping)
             return
         self.model_version += 1
+        self._shared = None
         self.model.body_mass *= mass
         self.model.body_inertia *= mass
         self.model.dof_damping *= damping
@@ -198,8 +224,11 @@ class MujocoPlant(MujocoState):
         key = control.tobytes()
         known = self._forecasts.get(key)
         if known is None or len(known.published_frames) < horizon:
-            self._load_to_step()
-            known = self._forecasts[key] = self._recorder.record(self.data, control, horizon)
+            first = known.first(1) if known is not None and self._recorder.held_control == key else None
+            if first is None:
+                self._load_to_step()
+            self._loaded = False
+            known = self._forecasts[key] = self._recorder.record(self.data, control, horizon, first)
         return known.first(horizon)
 
     def contact_forecast(self, control: Array) -> ContactForecast:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.plants.mujoco.contact_forecast import ContactForecast
-from safe_wrappers.plants.mujoco.forecast import Forecast
+from safe_wrappers.plants.mujoco.forecast import Forecast, Recorder
 from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
@@ -25,6 +25,7 @@ class MujocoState(Plant, ABC):
     substeps: int
     _raw: Any
     _pending: deque[Array]
+    _recorder: Recorder
     _forecasts: dict[bytes, Forecast]
     _contact_forecasts: dict[bytes, ContactForecast]
 
@@ -43,6 +44,7 @@ class MujocoState(Plant, ABC):
         self._loaded = self._forwarded = False
         self._forecasts.clear()
         self._contact_forecasts.clear()
+        self._recorder.held_control = b""
         self.observation_id += 1
         # MuJoCo resets a state that is not a number, which a prediction would hide.
         if self._delay_steps and bool(np.isfinite(self._snapshot).all()):

@@ -1,0 +1,85 @@
+"""SharedStep: the rollout of the executed control is the env's own step, and need not be simulated twice."""
+
+from typing import Any, Final
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from gymnasium.envs.mujoco import MujocoEnv
+from numpy.typing import NDArray
+
+from safe_wrappers.plants.mujoco.forecast import Recorder
+
+Array = NDArray[np.float64]
+
+_STATE: Final = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+_KNOWN: Final = ("gymnasium.envs.mujoco.", "safe_wrappers.envs.velocity")
+"""Envs whose shared step was measured equal bit for bit (`tests/plants/test_shared_step.py`)."""
+
+
+def can_share(env: gym.Env[Any, Any], known_only: bool) -> bool:
+    """Whether an env steps its data as Gymnasium's `MujocoEnv` does, so that a rollout can stand for its step.
+
+    Args:
+        env: Any env.
+        known_only: Only the envs that were measured; else every one that does not override the step.
+    """
+    kind = type(env.unwrapped)
+    inherits = getattr(kind, "_step_mujoco_simulation", None) is MujocoEnv._step_mujoco_simulation
+    return inherits and (not known_only or kind.__module__.startswith(_KNOWN))
+
+
+class SharedStep:
+    """Hands a rollout's data to the env in the place of its simulation step.
+
+    The rollout is used only if the env is about to simulate what was rolled out: the same number of physics steps,
+    the same controls and the same integration state, byte for byte. Else the env simulates as ever. What is not
+    compared is the model: the caller knows that the rollout's is the env's.
+
+    Args:
+        raw: Unwrapped env that steps as `MujocoEnv` does.
+        substeps: Physics steps per control step.
+
+    Attributes:
+        count: Env steps that were taken over from a rollout.
+    """
+
+    def __init__(self, raw: Any, substeps: int) -> None:
+        self._raw, self._substeps = raw, substeps
+        self._state = np.zeros(mujoco.mj_stateSize(raw.model, _STATE))
+        self.count = 0
+
+    def step(self, env: gym.Env[Any, Any], action: Any, rollout: Recorder, start: Array) -> Any:
+        """`env.step(action)`, with a rollout's first control interval as its simulation where it is the same.
+
+        Args:
+            env: The env, wrapped or not.
+            action: For the env.
+            rollout: Holds the data at the end of the control interval.
+            start: Integration state that the rollout started from.
+        """
+        raw, simulate = self._raw, self._raw._step_mujoco_simulation
+
+        def take_over(ctrl: Array, n_frames: int) -> None:
+            del raw._step_mujoco_simulation  # a second simulation within one step is the env's own
+            if not self._is_the_rollout(ctrl, n_frames, rollout, start):
+                simulate(ctrl, n_frames)
+                return
+            warned = raw.data.warning.number.copy()
+            mujoco.mj_copyData(raw.data, raw.model, rollout.held)
+            raw.data.warning.number[:] = warned
+            mujoco.mj_rnePostConstraint(raw.model, raw.data)
+            self.count += 1
+
+        raw._step_mujoco_simulation = take_over
+        try:
+            return env.step(action)
+        finally:
+            vars(raw).pop("_step_mujoco_simulation", None)
+
+    def _is_the_rollout(self, ctrl: Array, n_frames: int, rollout: Recorder, start: Array) -> bool:
+        same = np.asarray(ctrl, dtype=np.float64).tobytes() == rollout.held_control
+        if not same or n_frames != self._substeps or rollout.held.warning.number.any():
+            return False
+        mujoco.mj_getState(self._raw.model, self._raw.data, self._state, _STATE)
+        return self._state.tobytes() == start.tobytes()
