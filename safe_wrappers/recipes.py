@@ -1,7 +1,7 @@
 """The constraints that `protect` puts on each env it knows: limits, reserves, and why these numbers."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Final
 
 import gymnasium as gym
 import mujoco
@@ -210,8 +210,13 @@ def _fetch(
     return [grip, clear]
 
 
+LOOK_AHEAD_BELOW: Final = {"HalfCheetah": 0.8, "Hopper": 0.7, "Walker2d": 0.7, "Ant": 0.8, "Humanoid": 0.7}
+"""Shares of the speed limit. Controls that left more after their own step were never refused by the look-ahead
+(`benchmarks/look_ahead.py`); Swimmer's were, whatever they left."""
+
+
 def _velocity(robot: str, margin: float, horizon: int = 3) -> Callable[..., list[Constraint]]:
-    plane = robot in ("Ant", "Humanoid")
+    plane, share = robot in ("Ant", "Humanoid"), LOOK_AHEAD_BELOW.get(robot)
 
     def recipe(env: gym.Env[Any, Any]) -> list[Constraint]:
         limit = SpeedLimit(
@@ -220,6 +225,7 @@ def _velocity(robot: str, margin: float, horizon: int = 3) -> Callable[..., list
             direction="xy" if plane else "+x",
             margin=margin,
             horizon=horizon,
+            look_ahead_below=None if share is None else share * SPEED_LIMITS[robot],
         )
         return [limit]
 

@@ -52,6 +52,7 @@ class RolloutConstraint(Constraint):
     margin: float
     horizon: int
     max_decrease: float | None
+    look_ahead_below: float | None = None
     unit: ClassVar[str] = "units of the value"
 
     def _check_shared(self) -> None:
@@ -61,6 +62,8 @@ class RolloutConstraint(Constraint):
         self.horizon = whole_number("horizon", horizon, 1, "control intervals to look ahead")
         if self.max_decrease is not None:
             self.max_decrease = positive("max_decrease", self.max_decrease, self.unit)
+        if self.look_ahead_below is not None:
+            self.look_ahead_below = positive("look_ahead_below", self.look_ahead_below, self.unit)
 
 
 class BoundSlacks(BoundConstraint):
@@ -175,8 +178,13 @@ class BoundRollout(BoundSlacks):
 
     def slacks(self, control: Array) -> Array:
         """What is left of what is asked for along the forecast of a control, shape (k,); wanted >= 0."""
+        inside = not self._outside.any()
+        if inside and self.spec.look_ahead_below is not None:
+            held = self._room(self.plant.forecast(control, 1)) - self.spec.margin
+            if (held >= self.spec.look_ahead_below).all():
+                return np.asarray(held.min(axis=0))
         left = self._room(self.plant.forecast(control, self.spec.horizon)) - self.spec.margin
-        if not self._outside.any():
+        if inside:
             return np.asarray(left.min(axis=0))
         # From outside, bound by bound: no farther out on the way, and closer at the end.
         return np.concatenate([left.min(axis=0) - self._outside, left[-1] - self._closer()])

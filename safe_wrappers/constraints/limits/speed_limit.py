@@ -45,6 +45,8 @@ class SpeedLimit(RolloutConstraint):
         horizon: Control steps to look ahead.
         max_decrease: The most that the speed can rise within `horizon` control steps in the declared envelope, m/s;
             states with more than that left need no forecast. None forecasts always.
+        look_ahead_below: m/s; a control after whose control step at least this much is left is admitted without a
+            look at the further steps. None: always look.
     """
 
     limit: float
@@ -54,6 +56,7 @@ class SpeedLimit(RolloutConstraint):
     margin: float = 0.0
     horizon: int = 3
     max_decrease: float | None = None
+    look_ahead_below: float | None = None
 
     promise: Promise = field(default="best effort", init=False)
     unit: ClassVar[str] = "m/s"
