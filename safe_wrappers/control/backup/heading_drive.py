@@ -1,32 +1,26 @@
 """A planar body driven along its heading: exact prediction of held controls, and its stopping path in closed form.
 
-The body slides in the plane with linear damping, turns about a vertical axis, and is driven along its heading only;
-sideways only damping brakes it. The safety argument rests on two facts, exact also for MuJoCo's semi-implicit Euler
-step:
+The body slides in the plane with linear damping and is driven along its heading only. Without drive it coasts to rest
+at `p + (m / c) v` in a straight line. With the drive braking along a fixed heading, the forward part stops after `T v
+- T v_t log(1 + v / v_t)` (T = m / c, v_t = F_max / c) while the sideways part coasts on to `T v`. The path is convex
+and lies in the triangle of p, the crossing of its tangent with the forward stop, and its end. With uncertain mass and
+damping the longest stops span a trapezoid. The distance of either from an obstacle never falls while the backup
+manoeuvre (brake along the heading, hold the heading) runs. All of this holds for MuJoCo's semi-implicit Euler step
+too.
 
-* Without drive the body coasts to rest at `p + (m / c) v`, whatever the step size, in a straight line.
-* With the drive braking along a fixed heading, the forward part stops after
-  `T v - T v_t log(1 + v / v_t)` (T = m / c, v_t = F_max / c) while the sideways part coasts on to `T v`.
-  The forward part decays faster, so the path is a convex curve from p, tangent to v, to that end point: it lies
-  in the triangle of p, the crossing of the tangent with the forward stop, and the end point.
-
-The clearance of that triangle never falls while the backup manoeuvre (brake along the heading, hold the heading)
-runs. So it is a control barrier that is always feasible, for any number of obstacles at once. With uncertain mass and
-damping the longest forward and sideways stops span a trapezoid with the same property.
-
-Source: appendix "Relative degree and kinetic stopping insets", for this plant. Plain floats: at this size they are
-faster than arrays.
+Source: appendix "Relative degree and kinetic stopping insets", for this plant. The functions are compiled; the
+methods of the tuples call them.
 """
 
 import math
-from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-_WANDER = 0.012
-"""Bound on the lateral deviation of the stopping path, per metre of sideways coasting.
+from safe_wrappers.control.numerics.compiled import compiled, hypot
 
-The drag acts at the turning axis, behind the centre of mass, so it turns a sliding body; the servo, chattering about
-zero, resists only on average. Measured in MuJoCo: 0.0104 at 1.3 m/s, less at lower speeds.
+_WANDER = 0.012
+"""Bound on the lateral deviation of the stopping path, per metre of sideways coasting: drag turns a sliding body.
+
+Measured in MuJoCo: 0.0104 at 1.3 m/s, less at lower speeds.
 """
 
 
@@ -52,7 +46,7 @@ class StoppingPath(NamedTuple):
         sideways: Distance that the sideways motion coasts, m.
         crossing: Sideways distance at which the tangent of the motion reaches `forward`, m.
         radius: Of a circle around the present position that contains the area and its wander, m.
-        spread: Whether mass or damping are uncertain: a trapezoid instead of a triangle.
+        spread: Whether the area is the trapezoid of an uncertain mass or damping.
         wander: Bound on the deviation from the path by drag, m; subtracted from distances.
     """
 
@@ -70,39 +64,50 @@ class StoppingPath(NamedTuple):
     wander: float = 0.0
 
     def distance(self, px: float, py: float) -> float:
-        """Signed distance of a point from the area enlarged by its wander, m: negative inside."""
-        dx, dy = px - self.x, py - self.y
-        a, b = dx * self.ex + dy * self.ey, dx * self.sx + dy * self.sy
-        s, c, e = self.forward, self.crossing, self.sideways
-        near = _to_segment(a, b, 0.0, 0.0, s, c)
-        near = min(near, _to_segment(a, b, s, c, s, e))
-        if self.spread:
-            near = min(near, _to_segment(a, b, s, e, 0.0, e), _to_segment(a, b, 0.0, e, 0.0, 0.0))
-        else:
-            near = min(near, _to_segment(a, b, s, e, 0.0, 0.0))
-        above = b * s >= c * a
-        below = b <= e if self.spread else b * s <= e * a
-        inside = 0.0 <= a <= s and above and below
-        return (-near if inside else near) - self.wander
+        """`path_distance`."""
+        return path_distance(self, px, py)
 
     def end_distance(self, px: float, py: float) -> float:
-        """Distance of a point from the rest position, less the wander, m."""
-        end_x = self.x + self.forward * self.ex + self.sideways * self.sx
-        end_y = self.y + self.forward * self.ey + self.sideways * self.sy
-        return math.hypot(px - end_x, py - end_y) - self.wander
+        """`end_distance`."""
+        return end_distance(self, px, py)
 
 
+@compiled
 def _to_segment(px: float, py: float, ax: float, ay: float, bx: float, by: float) -> float:
     ux, uy = bx - ax, by - ay
     square = ux * ux + uy * uy
     wx, wy = px - ax, py - ay
     along = (wx * ux + wy * uy) / square if square > 0.0 else 0.0
     along = 0.0 if along < 0.0 else min(along, 1.0)
-    return math.hypot(wx - along * ux, wy - along * uy)
+    return hypot(wx - along * ux, wy - along * uy)
 
 
-@dataclass(frozen=True, slots=True)
-class HeadingDrive:
+@compiled
+def path_distance(path: StoppingPath, px: float, py: float) -> float:
+    """Signed distance of a point from the area enlarged by its wander, m: negative inside."""
+    dx, dy = px - path.x, py - path.y
+    a, b = dx * path.ex + dy * path.ey, dx * path.sx + dy * path.sy
+    s, c, e = path.forward, path.crossing, path.sideways
+    near = min(_to_segment(a, b, 0.0, 0.0, s, c), _to_segment(a, b, s, c, s, e))
+    if path.spread:
+        near = min(near, _to_segment(a, b, s, e, 0.0, e), _to_segment(a, b, 0.0, e, 0.0, 0.0))
+    else:
+        near = min(near, _to_segment(a, b, s, e, 0.0, 0.0))
+    above = b * s >= c * a
+    below = b <= e if path.spread else b * s <= e * a
+    inside = 0.0 <= a <= s and above and below
+    return (-near if inside else near) - path.wander
+
+
+@compiled
+def end_distance(path: StoppingPath, px: float, py: float) -> float:
+    """Distance of a point from the rest position, less the wander, m."""
+    end_x = path.x + path.forward * path.ex + path.sideways * path.sx
+    end_y = path.y + path.forward * path.ey + path.sideways * path.sy
+    return hypot(px - end_x, py - end_y) - path.wander
+
+
+class HeadingDrive(NamedTuple):
     """Constants of the body.
 
     Attributes:
@@ -161,8 +166,7 @@ class HeadingDrive:
             return [self]
         factors = (1.0 - self.uncertainty, 1.0 + self.uncertainty)
         return [
-            replace(
-                self,
+            self._replace(
                 mass=self.mass * m,
                 yaw_inertia=self.yaw_inertia * m,
                 damping=self.damping * c,
@@ -173,96 +177,117 @@ class HeadingDrive:
             for c in factors
         ]
 
-    def brake_distance(self, speed: float) -> float:
-        """Longest distance to a stop under full braking, m, for a forward speed in m/s (>= 0).
-
-        The distance is longest for the heaviest and least damped body of the uncertainty. The last hold brakes just
-        enough to end at rest, which adds at most an eighth of a hold's speed change times the hold.
-        """
-        mass, damping = self.mass * (1.0 + self.uncertainty), self.damping * (1.0 - self.uncertainty)
-        time, terminal = mass / damping, self.drive_limit / damping
-        last = 0.125 * self.drive_limit / mass * self.control_dt**2
-        return time * (speed - terminal * math.log1p(speed / terminal)) + min(
-            last, 0.5 * speed * self.control_dt
-        )
-
     def brake_control(self, forward_speed: float) -> float:
-        """The drive control that brakes fully, or just to rest within one hold."""
-        force = -forward_speed * self.mass / self.control_dt
-        return max(-self.drive_limit, min(force, self.drive_limit)) / self.drive_gain
+        """`brake_control`."""
+        return brake_control(self, forward_speed)
 
     def residual_turn_angle(self, yaw_rate: float) -> float:
-        """Angle by which the body still turns while the servo brakes its rotation, rad.
-
-        Simulated step by step: the torque stops the rotation within a few physics steps, and 1 mrad of heading is
-        0.5 mm of stopping path. The oscillation of the servo about zero is left out.
-        """
-        h, m_l = self.timestep, self.mass + self.timestep * self.damping
-        inertia = self.yaw_inertia + h * self.yaw_damping - (self.mass * self.com_offset) ** 2 / m_l
-        rate, angle, full = yaw_rate, 0.0, h * self.yaw_limit / inertia
-        for _ in range(self.substeps):
-            if abs(rate) <= full:
-                break
-            torque = max(-self.yaw_limit, min(self.yaw_feedback * rate, self.yaw_limit))
-            rate += h * (torque - self.yaw_damping * rate) / inertia
-            angle += h * rate
-        return angle
+        """`residual_turn_angle`."""
+        return residual_turn_angle(self, yaw_rate)
 
     def stopping_path(self, motion: Motion, brake: bool = True) -> StoppingPath:
-        """The area that the backup manoeuvre stays in.
-
-        Args:
-            motion: State to stop from.
-            brake: False: coast along the heading too, without the drive, over a longer distance.
-        """
-        heading = motion.heading + self.residual_turn_angle(motion.yaw_rate)
-        cos, sin = math.cos(heading), math.sin(heading)
-        ahead = motion.vx * cos + motion.vy * sin
-        # Sideways the centre of mass coasts, not the turning axis: add the share of the yaw rate.
-        aside = motion.vy * cos - motion.vx * sin + self.com_offset * motion.yaw_rate
-        flip_a, flip_s = (-1.0 if ahead < 0.0 else 1.0), (-1.0 if aside < 0.0 else 1.0)
-        ahead, aside = abs(ahead), abs(aside)
-        coast = self.coast_time
-        forward = self.brake_distance(ahead) if brake else coast * ahead
-        sideways = coast * aside
-        wander = _WANDER * sideways
-        crossing = min(sideways, forward * aside / ahead) if ahead > 1e-9 else 0.0
-        return StoppingPath(
-            motion.x,
-            motion.y,
-            flip_a * cos,
-            flip_a * sin,
-            -flip_s * sin,
-            flip_s * cos,
-            forward,
-            sideways,
-            crossing,
-            math.hypot(forward, sideways) + wander,
-            self.uncertainty > 0.0,
-            wander,
-        )
+        """`stopping_path`."""
+        return stopping_path(self, motion, brake)
 
     def predict(self, motion: Motion, drive: float, turn: float) -> Motion:
-        """Motion after both controls were held for one control step, by semi-implicit Euler steps as in MuJoCo."""
-        x, y, heading, vx, vy, yaw_rate = motion
-        h, r, m = self.timestep, self.com_offset, self.mass
-        push = max(-self.drive_limit, min(self.drive_gain * drive, self.drive_limit))
-        along = 1.0 / (m + h * self.damping)
-        m_l, m_c, m_w = m + h * self.damping, m * r, self.yaw_inertia + h * self.yaw_damping
-        scale = h / (m_l * m_w - m_c * m_c)
-        limit, damping, yaw_damping = self.yaw_limit, self.damping, self.yaw_damping
-        wanted, feedback = self.yaw_gain * turn, self.yaw_feedback
-        for _ in range(self.substeps):
-            cos, sin = math.cos(heading), math.sin(heading)
-            ahead, aside = vx * cos + vy * sin, vy * cos - vx * sin
-            torque = max(-limit, min(wanted + feedback * yaw_rate, limit)) - yaw_damping * yaw_rate
-            drag = -damping * aside
-            d_ahead = h * along * (push - damping * ahead + m_c * yaw_rate * yaw_rate)
-            d_aside = scale * (m_w * drag - m_c * torque)
-            yaw_rate += scale * (m_l * torque - m_c * drag)
-            vx += d_ahead * cos - d_aside * sin
-            vy += d_ahead * sin + d_aside * cos
-            x += h * vx
-            y += h * vy
-            heading += h * yaw_rate
-        return Motion(x, y, heading, vx, vy, yaw_rate)
+        """`predict`."""
+        return predict(self, motion, drive, turn)
+
+
+@compiled
+def brake_distance(body: HeadingDrive, speed: float) -> float:
+    """Longest distance to a stop under full braking, m, for a forward speed >= 0 in m/s, inside the uncertainty.
+
+    The last hold brakes just enough to end at rest: at most an eighth of its speed change times the hold more.
+    """
+    control_dt = body.timestep * body.substeps
+    mass, damping = body.mass * (1.0 + body.uncertainty), body.damping * (1.0 - body.uncertainty)
+    time, terminal = mass / damping, body.drive_limit / damping
+    last = 0.125 * body.drive_limit / mass * control_dt**2
+    last = min(last, 0.5 * speed * control_dt)
+    return time * (speed - terminal * math.log1p(speed / terminal)) + last
+
+
+@compiled
+def brake_control(body: HeadingDrive, forward_speed: float) -> float:
+    """The drive control that brakes fully, or just to rest within one hold."""
+    control_dt = body.timestep * body.substeps
+    force = -forward_speed * body.mass / control_dt
+    return max(-body.drive_limit, min(force, body.drive_limit)) / body.drive_gain
+
+
+@compiled
+def residual_turn_angle(body: HeadingDrive, yaw_rate: float) -> float:
+    """Angle by which the body still turns while the servo brakes its rotation, rad.
+
+    Simulated for one control step; the oscillation of the servo about zero is left out.
+    """
+    h, m_l = body.timestep, body.mass + body.timestep * body.damping
+    inertia = body.yaw_inertia + h * body.yaw_damping - (body.mass * body.com_offset) ** 2 / m_l
+    rate, angle, full = yaw_rate, 0.0, h * body.yaw_limit / inertia
+    for _ in range(body.substeps):
+        if abs(rate) <= full:
+            break
+        torque = max(-body.yaw_limit, min(body.yaw_feedback * rate, body.yaw_limit))
+        rate += h * (torque - body.yaw_damping * rate) / inertia
+        angle += h * rate
+    return angle
+
+
+@compiled
+def stopping_path(body: HeadingDrive, motion: Motion, brake: bool) -> StoppingPath:
+    """The area that the backup manoeuvre stays in; `brake=False`: coasting along the heading too."""
+    heading = motion.heading + residual_turn_angle(body, motion.yaw_rate)
+    cos, sin = math.cos(heading), math.sin(heading)
+    ahead = motion.vx * cos + motion.vy * sin
+    # Sideways the centre of mass coasts, not the turning axis: add the share of the yaw rate.
+    aside = motion.vy * cos - motion.vx * sin + body.com_offset * motion.yaw_rate
+    flip_a, flip_s = (-1.0 if ahead < 0.0 else 1.0), (-1.0 if aside < 0.0 else 1.0)
+    ahead, aside = abs(ahead), abs(aside)
+    coast = body.mass * (1.0 + body.uncertainty) / (body.damping * (1.0 - body.uncertainty))
+    forward = brake_distance(body, ahead) if brake else coast * ahead
+    sideways = coast * aside
+    wander = _WANDER * sideways
+    crossing = min(sideways, forward * aside / ahead) if ahead > 1e-9 else 0.0
+    radius = hypot(forward, sideways) + wander
+    return StoppingPath(
+        motion.x,
+        motion.y,
+        flip_a * cos,
+        flip_a * sin,
+        -flip_s * sin,
+        flip_s * cos,
+        forward,
+        sideways,
+        crossing,
+        radius,
+        body.uncertainty > 0.0,
+        wander,
+    )
+
+
+@compiled
+def predict(body: HeadingDrive, motion: Motion, drive: float, turn: float) -> Motion:
+    """Motion after both controls were held for one control step, by semi-implicit Euler steps as in MuJoCo."""
+    x, y, heading, vx, vy, yaw_rate = motion
+    h, r, m = body.timestep, body.com_offset, body.mass
+    push = max(-body.drive_limit, min(body.drive_gain * drive, body.drive_limit))
+    along = 1.0 / (m + h * body.damping)
+    m_l, m_c, m_w = m + h * body.damping, m * r, body.yaw_inertia + h * body.yaw_damping
+    scale = h / (m_l * m_w - m_c * m_c)
+    limit, damping, yaw_damping = body.yaw_limit, body.damping, body.yaw_damping
+    wanted, feedback = body.yaw_gain * turn, body.yaw_feedback
+    for _ in range(body.substeps):
+        cos, sin = math.cos(heading), math.sin(heading)
+        ahead, aside = vx * cos + vy * sin, vy * cos - vx * sin
+        torque = max(-limit, min(wanted + feedback * yaw_rate, limit)) - yaw_damping * yaw_rate
+        drag = -damping * aside
+        d_ahead = h * along * (push - damping * ahead + m_c * yaw_rate * yaw_rate)
+        d_aside = scale * (m_w * drag - m_c * torque)
+        yaw_rate += scale * (m_l * torque - m_c * drag)
+        vx += d_ahead * cos - d_aside * sin
+        vy += d_ahead * sin + d_aside * cos
+        x += h * vx
+        y += h * vy
+        heading += h * yaw_rate
+    return Motion(x, y, heading, vx, vy, yaw_rate)

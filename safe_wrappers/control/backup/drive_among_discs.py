@@ -1,0 +1,433 @@
+"""A heading drive among discs: which controls leave its stopping path clear, and the closest one that does.
+
+The rules are those of `HeadingDriveClearance`, the order of attempts is that of `SafeActionSearch`.
+"""
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.control.backup.heading_drive import (
+    HeadingDrive,
+    Motion,
+    StoppingPath,
+    brake_control,
+    end_distance,
+    path_distance,
+    predict,
+    stopping_path,
+)
+from safe_wrappers.control.numerics.compiled import compiled, hypot
+from safe_wrappers.control.numerics.plane_projection import project_in_plane
+
+Array = NDArray[np.float64]
+
+RECOVERY_RATE: Final = 1.0
+"""1/s: an unsafe start must shrink its violation at least this fast, where the drive can."""
+DECAY_PER_HOLD: Final = 0.5
+"""The share of the clearance that one hold may use up: the discrete class-K decay, alpha times the hold."""
+ROW_SLACK: Final = 0.02
+"""The share of the needed clearance that prediction may miss of what the linear rows aimed at."""
+HAIR_M: Final = 1e-7
+"""Between two discs at rest the rows of both meet at one control; this much slack lets a solver find it."""
+RESERVE_M: Final = 0.001
+"""Kept free before the boundary for what the closed form leaves out; only the backup may use it."""
+ROWS_SLACK: Final = 1e-9
+"""By how much of a control's range a projected control may break a row; prediction judges it afterwards."""
+OVERSHOOTS: Final = (0.02, 0.1)
+BLENDS: Final = (0.1, 0.25, 0.5, 0.75)
+PROPOSAL, ROWS, CANDIDATE, OVERSHOOT, BLEND, BACKUP, UNRESOLVED = 0, 1, 2, 4, 5, 6, 7
+"""What `closest_admitted` returns: a `Stage` of the search, or that none of these has found an admissible control."""
+
+
+class Look(NamedTuple):
+    """What is known at an observation.
+
+    Attributes:
+        motion: Of the body.
+        path: From there, without any further control but the backup manoeuvre's.
+        discs: Those that one hold can bring into play: x, y and the distance to keep, m, shape (k, 3).
+        least: The least clearance of all discs, m; NaN if one is not a number.
+        loss: The most that one hold can use up, m.
+        swivel: Twice the distance of the centre of mass from the turning axis, m.
+    """
+
+    motion: Motion
+    path: StoppingPath
+    discs: Array
+    least: float
+    loss: float
+    swivel: float
+
+
+@compiled
+def _body(constants: Array) -> HeadingDrive:
+    c = constants
+    return HeadingDrive(c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8], c[9], c[10], int(c[11]), c[12])
+
+
+@compiled
+def _to_disc(path: StoppingPath, swivel: float, x: float, y: float, room: float) -> float:
+    if path.spread:  # it may come to rest anywhere in the area
+        return path_distance(path, x, y) - swivel - room
+    return min(path_distance(path, x, y), end_distance(path, x, y) - swivel) - room
+
+
+@compiled
+def _look(constants: Array, motion: Array, discs: Array, brake: bool) -> Look:
+    """Judge the present state.
+
+    Args:
+        constants: Of a `HeadingDrive`, shape (13,).
+        motion: As `Motion`, shape (6,).
+        discs: x, y and the distance to keep from there, m, shape (n, 3).
+        brake: Whether the backup manoeuvre brakes along the heading.
+    """
+    body = _body(constants)
+    now = Motion(motion[0], motion[1], motion[2], motion[3], motion[4], motion[5])
+    path = stopping_path(body, now, brake)
+    swivel = 2.0 * abs(body.com_offset)
+    control_dt = body.timestep * body.substeps
+    coast = body.mass * (1.0 + body.uncertainty) / (body.damping * (1.0 - body.uncertainty))
+    change = body.drive_limit / (body.mass * (1.0 - body.uncertainty)) * control_dt
+    turn = control_dt * min(body.yaw_limit / max(body.yaw_damping, 1e-12), math.pi / control_dt)
+    speed = hypot(now.vx, now.vy) + abs(body.com_offset * now.yaw_rate)
+    loss = change * (control_dt + coast) + speed * (control_dt + turn * coast)
+    n, kept, best = len(discs), path.radius + swivel, math.inf
+    order, bounds = np.zeros((n, 3)), np.zeros(n)
+    for i in range(n):
+        bound = hypot(discs[i, 0] - now.x, discs[i, 1] - now.y) - discs[i, 2] - kept
+        if bound != bound:
+            return Look(now, path, order[:0], math.nan, loss, swivel)
+        place = i
+        while place > 0 and bounds[place - 1] > bound:
+            bounds[place], order[place] = bounds[place - 1], order[place - 1]
+            place -= 1
+        bounds[place], order[place] = bound, discs[i]
+    for i in range(n):
+        if not bounds[i] < best:
+            break
+        best = min(best, _to_disc(path, swivel, order[i, 0], order[i, 1], order[i, 2]))
+    # Farther discs cannot come into play within one hold, whatever the control.
+    cutoff, close = 2.0 * (loss + RESERVE_M), 0
+    if best < cutoff:
+        while close < n and bounds[close] < cutoff:
+            close += 1
+    return Look(now, path, order[:close], best, loss, swivel)
+
+
+@compiled
+def _least_of(path: StoppingPath, at: Look) -> float:
+    least = math.inf
+    for i in range(len(at.discs)):
+        least = min(least, _to_disc(path, at.swivel, at.discs[i, 0], at.discs[i, 1], at.discs[i, 2]))
+    return least
+
+
+@compiled
+def _after(
+    model: Array, body: HeadingDrive, at: Look, drive: float, turn: float, brake: bool
+) -> StoppingPath:
+    """The stopping path at the end of a held control, predicted with one model of the uncertainty."""
+    return stopping_path(body, predict(_body(model), at.motion, drive, turn), brake)
+
+
+@compiled
+def _least_after(models: Array, at: Look, drive: float, brake: bool) -> float:
+    least, body = math.inf, _body(models[0])
+    for i in range(1, len(models)):
+        least = min(least, _least_of(_after(models[i], body, at, drive, 0.0, brake), at))
+    return least
+
+
+@compiled
+def _ends(body: HeadingDrive, at: Look, brake: bool) -> tuple[float, float]:
+    """The drive controls that brake and that push on, as far as the drive acts."""
+    m = at.motion
+    ahead = m.vx * math.cos(m.heading) + m.vy * math.sin(m.heading)
+    full = body.drive_limit / body.drive_gain
+    return brake_control(body, ahead) if brake else 0.0, math.copysign(full, ahead)
+
+
+@compiled
+def _needed(at: Look, i: int, backup: StoppingPath) -> float:
+    """The clearance that a control must leave of a disc, from inside the safe set: a share of today's."""
+    x, y, room = at.discs[i, 0], at.discs[i, 1], at.discs[i, 2]
+    now = max(_to_disc(at.path, at.swivel, x, y, room), 0.0)
+    target = RESERVE_M + (1.0 - DECAY_PER_HOLD) * max(0.0, now - RESERVE_M)
+    # Never more than the backup manoeuvre leaves: it is what makes the constraint always feasible.
+    return min(target, _to_disc(backup, at.swivel, x, y, room))
+
+
+@compiled
+def _needed_outside(models: Array, at: Look, backup: StoppingPath, brake: bool) -> float:
+    """The least clearance of all discs that a control must leave, once one of them is lost."""
+    body = _body(models[0])
+    full = body.drive_limit / body.drive_gain
+    # As much recovery as the drive can give here: across the heading it can give none.
+    best = max(_least_after(models, at, full, brake), _least_after(models, at, -full, brake))
+    best = max(best, _least_of(backup, at))
+    return min(at.least * (1.0 - RECOVERY_RATE * body.timestep * body.substeps), best)
+
+
+@compiled
+def _admits(models: Array, at: Look, drive: float, turn: float, brake: bool) -> bool:
+    """Whether the end of a held control still has a safe stopping path, for every model of the uncertainty.
+
+    Args:
+        models: Constants of the body, then of each corner of its uncertainty, shape (1 + c, 13).
+        at: The present state.
+        drive: Control along the heading.
+        turn: Control about the axis.
+        brake: Whether the backup manoeuvre brakes along the heading.
+    """
+    if not len(at.discs):
+        return True
+    body = _body(models[0])
+    braking = _ends(body, at, brake)[0]
+    for i in range(1, len(models)):
+        path = _after(models[i], body, at, drive, turn, brake)
+        backup = _after(models[i], body, at, braking, 0.0, brake)
+        if at.least < 0.0:  # recovering: a quarter of what the rows aim at will do
+            if _least_of(path, at) < 0.25 * _needed_outside(models, at, backup, brake) + 0.75 * at.least:
+                return False
+            continue
+        for j in range(len(at.discs)):
+            left = _to_disc(path, at.swivel, at.discs[j, 0], at.discs[j, 1], at.discs[j, 2])
+            if left < at.loss and left < _needed(at, j, backup) * (1.0 - ROW_SLACK):
+                return False
+    return True
+
+
+@compiled
+def _rows(models: Array, at: Look, brake: bool) -> tuple[Array, Array]:
+    """Secants of the clearance after one hold over (drive, turn), one row per model and disc in play.
+
+    Returns:
+        `normals @ (drive, turn) <= offsets`: shapes (k, 2) and (k,), rows that no control can break left out.
+    """
+    near, outside = len(at.discs), at.least < 0.0
+    each = 1 if outside else near
+    normals, offsets, k = np.zeros(((len(models) - 1) * each, 2)), np.zeros((len(models) - 1) * each), 0
+    if near == 0:
+        return normals[:0], offsets[:0]
+    body = _body(models[0])
+    braking, pushing = _ends(body, at, brake)
+    for i in range(1, len(models)):
+        base = _after(models[i], body, at, braking, 0.0, brake)
+        pushed = _after(models[i], body, at, pushing, 0.0, brake)
+        left = _after(models[i], body, at, braking, 1.0, brake)
+        right = _after(models[i], body, at, braking, -1.0, brake)
+        for j in range(each):
+            if outside:
+                needed = _needed_outside(models, at, base, brake)
+                at_brake, by_push = _least_of(base, at), _least_of(pushed, at)
+                by_left, by_right = _least_of(left, at), _least_of(right, at)
+            else:
+                x, y, room = at.discs[j, 0], at.discs[j, 1], at.discs[j, 2]
+                needed = _needed(at, j, base)
+                at_brake, by_push = (
+                    _to_disc(base, at.swivel, x, y, room),
+                    _to_disc(pushed, at.swivel, x, y, room),
+                )
+                by_left, by_right = (
+                    _to_disc(left, at.swivel, x, y, room),
+                    _to_disc(right, at.swivel, x, y, room),
+                )
+            by_drive, by_turn = (by_push - at_brake) / (pushing - braking), 0.5 * (by_left - by_right)
+            if at_brake + min(0.0, by_drive * (pushing - braking)) - abs(by_turn) >= needed:
+                continue
+            normals[k, 0], normals[k, 1] = -by_drive, -by_turn
+            offsets[k] = at_brake - by_drive * braking - needed + HAIR_M
+            k += 1
+    return normals[:k], offsets[:k]
+
+
+@compiled
+def _passing_side(models: Array, at: Look, drive: float, turn: float, brake: bool, side: float) -> float:
+    """The way to turn to get around the disc in the way: 1 left, -1 right, 0 if there is nothing to go around.
+
+    `side` is that of a detour that goes on already, or 0.
+    """
+    if not len(at.discs) or drive == 0.0:
+        return 0.0
+    m, body = at.motion, _body(models[0])
+    ahead, beside = math.cos(m.heading), math.sin(m.heading)
+    if drive < 0.0:
+        ahead, beside = -ahead, -beside
+    path = _after(models[1], body, at, drive, turn, brake)
+    nearest, across, least = False, 0.0, math.inf
+    for i in range(len(at.discs)):
+        x, y, room = at.discs[i, 0], at.discs[i, 1], at.discs[i, 2]
+        if (x - m.x) * ahead + (y - m.y) * beside > 0.0:
+            left = _to_disc(path, at.swivel, x, y, room)
+            if left < least or not nearest:
+                nearest, least, across = True, left, ahead * (y - m.y) - beside * (x - m.x)
+    if not nearest:
+        return 0.0  # driving away from all of them
+    if side != 0.0:
+        return side
+    # A disc to the right of the drive is passed on the left.
+    return 1.0 if across <= 0.0 else -1.0
+
+
+@compiled
+def _backup_drive(models: Array, at: Look, brake: bool) -> float:
+    """The drive control of the backup manoeuvre; from inside a disc the one that leads out best."""
+    body = _body(models[0])
+    best = _ends(body, at, brake)[0]
+    if at.least < 0.0:
+        full = body.drive_limit / body.drive_gain
+        most = _least_after(models, at, best, brake)
+        for other in (full, -full):
+            left = _least_after(models, at, other, brake)
+            if left > most:
+                best, most = other, left
+    return best
+
+
+@compiled
+def _decide(
+    models: Array,
+    at: Look,
+    proposal: Array,
+    side: float,
+    brake: bool,
+    detour: bool,
+    low: Array,
+    high: Array,
+    least: Array,
+    most: Array,
+    out: Array,
+) -> tuple[int, float, Array, Array]:
+    """The closest admissible (drive, turn) that a search finds, in the order of `filter/search.py`.
+
+    Args:
+        models: As for `_admits`.
+        at: The present state.
+        proposal: Inside the box, shape (2,).
+        side: Of a detour that goes on, or 0.
+        brake: Whether the backup manoeuvre brakes along the heading.
+        detour: Whether to try ways around before projecting.
+        low: Of the controls, shape (2,).
+        high: Of the controls, shape (2,).
+        least: The controls between which the forces still change, shape (2,), inside low and high.
+        most: Likewise.
+        out: What to execute, shape (2,).
+
+    Returns:
+        The stage that found it (UNRESOLVED: none did); the side of a detour that was tried, or 0; the rows that the
+        control keeps, shapes (k, 2) and (k,).
+    """
+    drive, turn = proposal[0], proposal[1]
+    out[0], out[1] = drive, turn
+    normals, offsets = np.zeros((0, 2)), np.zeros(0)
+    if _admits(models, at, drive, turn, brake):
+        return PROPOSAL, 0.0, normals, offsets
+    way = 0.0
+    if detour:
+        way = _passing_side(models, at, drive, turn, brake, side)
+        if way != 0.0:
+            around = min(max(way, low[1]), high[1])
+            for ahead in (drive, min(max(0.0, low[0]), high[0])):
+                if _admits(models, at, ahead, around, brake):
+                    out[0], out[1] = ahead, around
+                    return CANDIDATE, way, normals, offsets
+    # Measured in shares of what acts: a control that saturates early must not look cheap to change.
+    unit = np.ones(2)
+    for j in range(2):
+        if most[j] > least[j]:
+            unit[j] = (most[j] - least[j]) / (high[j] - low[j])
+    force = np.minimum(np.maximum(proposal, least), most) / unit
+    inner_low, inner_high = least / unit, most / unit
+    found, exact = _rows(models, at, brake)
+    scaled = found * unit
+    slack = ROWS_SLACK * max(inner_high[0] - inner_low[0], inner_high[1] - inner_low[1])
+    answer, refused = np.zeros(2), np.array([drive, turn])
+    feasible = project_in_plane(force, scaled, exact, inner_low, inner_high, slack, answer)
+    if feasible:
+        normals, offsets = found, exact
+        # A component that saturates as the policy's did stays the policy's: the force is the same.
+        for j in range(2):
+            refused[j] = proposal[j] if answer[j] == force[j] else answer[j] * unit[j]
+        if _admits(models, at, refused[0], refused[1], brake):
+            out[0], out[1] = refused[0], refused[1]
+            return ROWS, way, normals, offsets
+        for share in OVERSHOOTS:
+            tighter = exact.copy()
+            for i in range(tighter.size):
+                tighter[i] -= share * max(found[i, 0] * drive + found[i, 1] * turn - exact[i], 0.0)
+            if project_in_plane(force, scaled, tighter, inner_low, inner_high, slack, answer):
+                ahead = drive if answer[0] == force[0] else answer[0] * unit[0]
+                around = turn if answer[1] == force[1] else answer[1] * unit[1]
+                if _admits(models, at, ahead, around, brake):
+                    out[0], out[1] = ahead, around
+                    return OVERSHOOT, way, normals, offsets
+    none, nothing = np.zeros((0, 2)), np.zeros(0)
+    back = min(max(_backup_drive(models, at, brake), low[0]), high[0])
+    if not _admits(models, at, back, 0.0, brake):
+        return UNRESOLVED, way, none, nothing
+    for share in BLENDS:
+        ahead, around = refused[0] + share * (back - refused[0]), refused[1] + share * (0.0 - refused[1])
+        if _admits(models, at, ahead, around, brake):
+            out[0], out[1] = ahead, around
+            return BLEND, way, none, nothing
+    for mixed in range(2):
+        ahead, around = (refused[0], 0.0) if mixed == 0 else (back, refused[1])
+        if _admits(models, at, ahead, around, brake):
+            out[0], out[1] = ahead, around
+            return BLEND, way, none, nothing
+    out[0], out[1] = back, 0.0
+    return BACKUP, way, none, nothing
+
+
+@compiled
+def least_clearance(models: Array, motion: Array, discs: Array, brake: bool) -> tuple[float, int]:
+    """The stopping path's least clearance of all discs, m (NaN if one is not a number), and how many are in play."""
+    at = _look(models[0], motion, discs, brake)
+    return at.least, len(at.discs)
+
+
+@compiled
+def is_admitted(models: Array, motion: Array, discs: Array, brake: bool, drive: float, turn: float) -> bool:
+    """Whether the end of a held control still has a safe stopping path."""
+    return _admits(models, _look(models[0], motion, discs, brake), drive, turn, brake)
+
+
+@compiled
+def secants(models: Array, motion: Array, discs: Array, brake: bool) -> tuple[Array, Array]:
+    """Half-spaces of (drive, turn) that keep the clearance, about: shapes (k, 2) and (k,)."""
+    return _rows(models, _look(models[0], motion, discs, brake), brake)
+
+
+@compiled
+def way_around(
+    models: Array, motion: Array, discs: Array, brake: bool, drive: float, turn: float, side: float
+) -> float:
+    """1 (left), -1 (right), or 0 with nothing to go around; `side` is that of a detour that goes on, or 0."""
+    return _passing_side(models, _look(models[0], motion, discs, brake), drive, turn, brake, side)
+
+
+@compiled
+def backup_drive(models: Array, motion: Array, discs: Array, brake: bool) -> float:
+    """The drive control of the backup manoeuvre."""
+    return _backup_drive(models, _look(models[0], motion, discs, brake), brake)
+
+
+@compiled
+def closest_admitted(
+    models: Array,
+    motion: Array,
+    discs: Array,
+    brake: bool,
+    proposal: Array,
+    side: float,
+    detour: bool,
+    bounds: Array,
+    out: Array,
+) -> tuple[int, float, Array, Array]:
+    """`_decide` from the present state; `bounds` are low, high, least and most, shape (4, 2)."""
+    at = _look(models[0], motion, discs, brake)
+    return _decide(models, at, proposal, side, brake, detour, bounds[0], bounds[1], bounds[2], bounds[3], out)
