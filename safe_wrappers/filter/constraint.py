@@ -96,6 +96,8 @@ class BoundConstraint:
     """Whether there is a barrier: set for every subclass that overrides `value`."""
     has_backup: bool = False
     """Whether it knows a backup control: set for every subclass that overrides `backup`."""
+    decides: bool = False
+    """Whether `decide` makes the search where this is the only constraint."""
     tolerance: float = 0.0
     """How far below zero a slack may be and count as rounding."""
     info_keys: tuple[str, ...] = ()
@@ -155,6 +157,15 @@ class BoundConstraint:
 
     def backup(self) -> Array | None:
         """A control that the constraint knows to keep it, shape (m,), or None."""
+        return None
+
+    def decide(self, proposal: Array, low: Array, high: Array) -> tuple[Array, int, HalfSpaces] | None:
+        """The search for an admissible control, done by the constraint itself.
+
+        Returns:
+            The control, shape (m,), inside the bounds; the `Stage` that found it; rows that it keeps, for rounding.
+            None: it has found none, and the search goes on as for every constraint.
+        """
         return None
 
     def executed(self, control: Array) -> Memory:

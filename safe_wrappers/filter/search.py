@@ -101,6 +101,7 @@ class SafeActionSearch:
         self._predicting = [c for c in constraints if c.predicts]
         self._rows_only = [c for c in constraints if not c.predicts]
         self._no_rows: Rows = np.zeros((0, low.size)), np.zeros(0)
+        self._sole = constraints[0] if len(self._constraints) == 1 and constraints[0].decides else None
         self._narrower = not plant.bounds_are_action_space
         self._tried: list[Array] = []
 
@@ -116,6 +117,17 @@ class SafeActionSearch:
         return decision
 
     def _decide(self, proposal: Array, last: Array) -> Decision:
+        if self._sole is not None:
+            low, high = np.maximum(self._low, self._plant.lower), np.minimum(self._high, self._plant.upper)
+            found = self._sole.decide(proposal, low, high)
+            if found is not None:
+                control, stage, rows = found
+                return Decision(
+                    control,
+                    Stage(stage),
+                    changed=bool((control != proposal).any()),
+                    rows=(rows.normals, rows.offsets),
+                )
         refused = bool(self._predicting) and not self._admitted(proposal)
         strict = self._rows(self._rows_only) if self._rows_only else self._no_rows
         if not refused:

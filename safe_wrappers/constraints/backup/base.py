@@ -2,7 +2,6 @@
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -110,8 +109,10 @@ class BoundDetourClearance(BoundBackupClearance):
         """The detour that is being made."""
         return Detour(self._memory.side, self._memory.steps - 1)
 
-    def _side(self, choose: Callable[[], float]) -> float:
-        """The side of the present detour, or of a new one."""
-        side = self._memory.side if self._memory.steps > 0 else choose()
+    def _kept_side(self) -> float:
+        """The side of the present detour, or 0."""
+        return self._memory.side if self._memory.steps > 0 else 0.0
+
+    def _keep_side(self, side: float) -> None:
+        """A detour on this side is needed now."""
         self._memory = Detour(side, self.detour_steps)
-        return side

@@ -251,7 +251,8 @@ class BoundCoastingClearance(BoundDetourClearance):
             # What is to the left of the way is passed on its right.
             return -1.0 if way[0] * y - way[1] * x > 0.0 else 1.0
 
-        side = self._side(beside_the_nearest)
+        side = self._kept_side() or beside_the_nearest()
+        self._keep_side(side)
         if self._first_turns_left is None:
             first, second = (self._after(u).turn for u in (np.array([drive, 0.0]), np.array([0.0, drive])))
             self._first_turns_left = (first - second) * drive > 0.0
