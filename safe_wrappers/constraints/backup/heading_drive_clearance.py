@@ -90,8 +90,8 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
 
     def read_constants(self) -> None:
         """The drive, and the bodies at the corners of its uncertainty: each must keep what is needed."""
-        drive = heading_drive(self.plant, self.spec.body, self.spec.uncertainty)
-        self._models = np.array([drive, *drive.corners()], dtype=np.float64)
+        self.drive = heading_drive(self.plant, self.spec.body, self.spec.uncertainty)
+        self._models = np.array([self.drive, *self.drive.corners()], dtype=np.float64)
 
     def clearance(self) -> Array:
         """Of the stopping path from the nearest disc, margin and state error not taken off, m, shape (1,)."""

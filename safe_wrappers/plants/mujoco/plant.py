@@ -103,6 +103,11 @@ class MujocoPlant(MujocoState):
             )
         return self._share_step is not False and exact and can_share(env, known_only=not self._share_step)
 
+    @property
+    def shared_steps(self) -> int:
+        """Env steps that were taken over from a rollout since binding."""
+        return 0 if self._shared is None else self._shared.count
+
     def step(self, env: gym.Env[Any, Any], action: Any) -> Any:
         """Step the env; what a rollout of the same controls has simulated already is not simulated again."""
         if self._shared is None:

@@ -1,0 +1,121 @@
+"""The compiled search of a heading drive among discs: the general search is its oracle."""
+
+import hashlib
+import os
+import subprocess
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import safe_wrappers as sw
+from benchmarks import drivers
+from safe_wrappers.constraints.backup.heading_drive_clearance import BoundHeadingDriveClearance
+from safe_wrappers.control.backup import drive_among_discs as among
+from safe_wrappers.control.numerics.compiled import IS_COMPILED
+
+KINDS = {
+    "detour": {"detour": True},
+    "no detour": {},
+    "coasting": {"detour": True, "brake": False},
+    "uncertain": {"detour": True, "uncertainty": 0.2},
+}
+
+
+def episode(options, driver, steps, seed):
+    """Stages and executed controls of both searches in the same states; the first one's are executed."""
+    clearance = sw.constraints.HeadingDriveClearance(
+        [sw.constraints.Discs("hazard_positions", 0.2)], **options
+    )
+    env = sw.CBFActionFilter(gym.make("SafePointGoal1-v0"), [clearance])
+    env.reset(seed=seed)
+    act = drivers.DRIVERS[driver](env.unwrapped, np.random.default_rng(seed))
+    search = env.filter._search
+    for _ in range(steps):
+        proposal = np.asarray(act(), dtype=np.float64)
+        env.filter.observe()
+        by_itself = env.filter.filter(proposal)
+        env.filter.observe()
+        search._sole = None
+        general = env.filter.filter(proposal)
+        search._sole = env.filter.bound[0]
+        yield by_itself, general
+        env.env.step(by_itself.control)
+        env.filter.executed(by_itself.control)
+
+
+@pytest.mark.parametrize("driver", ["hazard-seeking", "bang-bang"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_stage_and_the_control_are_those_of_the_general_search(kind, driver):
+    seen = set()
+    for by_itself, general in episode(KINDS[kind], driver, 900, seed=1):
+        assert by_itself.stage == general.stage
+        np.testing.assert_allclose(by_itself.control, general.control, atol=1e-9)
+        assert by_itself.changed == general.changed and not by_itself.infeasible
+        seen.add(int(by_itself.stage))
+    assert among.PROPOSAL in seen and len(seen) >= 2
+
+
+def test_from_inside_a_disc_both_searches_lead_out():
+    clearance = sw.constraints.HeadingDriveClearance([sw.constraints.Disc([0.0, 0.0], 0.3)])
+    layout = {"agent": [0.1, 0.05, 0.4], "goal": [1.2, 1.2], "hazards": [[1.0, -1.0]], "vases": []}
+    rng, changed = np.random.default_rng(0), 0
+    env = sw.CBFActionFilter(gym.make("SafePointGoal1-v0"), [clearance])
+    with pytest.warns(sw.UnsafeStateWarning):
+        env.reset(seed=0, options={"layout": layout})
+    for _ in range(60):
+        proposal = rng.uniform(-1.0, 1.0, 2)
+        decisions = []
+        for sole in (env.filter.bound[0], None):
+            env.filter.observe()
+            env.filter._search._sole = sole
+            decisions.append(env.filter.filter(proposal))
+        assert decisions[0].stage == decisions[1].stage
+        np.testing.assert_allclose(decisions[0].control, decisions[1].control, atol=1e-9)
+        changed += decisions[0].changed
+        env.env.step(decisions[0].control)
+        env.filter.executed(decisions[0].control)
+    assert changed > 5
+
+
+def random_scenes(count):
+    """Every function on random scenes, as one digest."""
+    rng, digest = np.random.default_rng(7), hashlib.sha256()
+    env = sw.CBFActionFilter(
+        gym.make("SafePointGoal1-v0"),
+        [sw.constraints.HeadingDriveClearance([sw.constraints.Disc([0.0, 0.0], 0.2)], uncertainty=0.1)],
+    )
+    env.reset(seed=0)
+    bound = env.filter.bound[0]
+    assert isinstance(bound, BoundHeadingDriveClearance)
+    every = np.array([bound.drive, *bound.drive.corners()], dtype=np.float64)
+    certain = every.copy()
+    certain[:, 12] = 0.0
+    bounds, out, stages = np.array([[-1.0, -1.0], [1.0, 1.0], [-0.05, -1.0], [0.05, 1.0]]), np.empty(2), set()
+    for i in range(count):
+        models = certain[[0, 0]] if i % 2 else every
+        motion = rng.uniform(-1.0, 1.0, 6) * [0.1, 0.1, 3.0, 1.0, 1.0, 2.0]
+        discs = np.column_stack([rng.uniform(-0.9, 0.9, (6, 2)), np.full(6, 0.1)])
+        control, brake = rng.uniform(-1.0, 1.0, 2), bool(i % 3)
+        numbers = among.closest_admitted(models, motion, discs, brake, control, 0.0, bool(i % 5), bounds, out)
+        stages.add(numbers[0])
+        for part in (*numbers, out, *among.least_clearance(models, motion, discs, brake)):
+            digest.update(np.asarray(part, dtype=np.float64).tobytes())
+        digest.update(np.float64(among.backup_drive(models, motion, discs, brake)).tobytes())
+    return digest.hexdigest(), sorted(stages)
+
+
+def test_plain_python_gives_the_same_bits():
+    assert IS_COMPILED or os.environ.get("SAFE_WRAPPERS_COMPILED") == "0"
+    code = "import test_drive_among_discs as t; print(t.IS_COMPILED, *t.random_scenes(400))"
+    environment = os.environ | {
+        "SAFE_WRAPPERS_COMPILED": "0",
+        "PYTHONPATH": os.pathsep.join([os.path.dirname(__file__), *sys.path]),
+    }
+    said = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    digest, stages = random_scenes(400)
+    assert said.stdout.split("\n")[0] == f"False {digest} {stages}"
+    assert {among.PROPOSAL, among.ROWS, among.CANDIDATE, among.UNRESOLVED} <= set(stages)
