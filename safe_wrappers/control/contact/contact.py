@@ -1,11 +1,7 @@
-"""Unilateral contact: residuals of the complementarity of gap and force.
+"""Unilateral contact: residuals of `gap >= 0`, `force >= 0`, `gap * force = 0`.
 
-Source: appendix "Rigid Body Contact Mechanics". An ideal contact only pushes, and only when closed:
-
-    gap >= 0,    force >= 0,    gap * force = 0.
-
-Compliant contacts, MuJoCo's among them, violate this by design: their force comes from a penetration (or from a
-margin before the touch). Small residuals do not validate a simulation.
+Source: appendix "Rigid Body Contact Mechanics". Compliant contacts, MuJoCo's among them, violate this by design:
+their force comes from a penetration or a margin. Small residuals do not validate a simulation.
 """
 
 from typing import NamedTuple
@@ -19,13 +15,7 @@ Array = NDArray[np.float64]
 
 
 class ComplementarityResiduals(NamedTuple):
-    """Violations of the three conditions, each shape (...), 0 where they hold.
-
-    Attributes:
-        penetration: Depth, m.
-        tension: Pull, N.
-        product: ``|gap * force|``, N m.
-    """
+    """Violations of the three conditions, each shape (...), 0 where they hold: m, N and N m."""
 
     penetration: Array
     tension: Array

@@ -13,9 +13,6 @@ def series_stiffness(*stiffness: ArrayLike) -> Array:
 
     Args:
         *stiffness: One or more, N/m, > 0, shape (...); inf is rigid.
-
-    Raises:
-        ConfigurationError: For no spring at all, or a stiffness that is not positive.
     """
     if not stiffness:
         raise ConfigurationError("series_stiffness needs at least one stiffness")
@@ -23,11 +20,7 @@ def series_stiffness(*stiffness: ArrayLike) -> Array:
 
 
 def positive(name: str, value: ArrayLike) -> Array:
-    """Positive numbers as float64, inf included.
-
-    Raises:
-        ConfigurationError: For anything else; it names the argument.
-    """
+    """Positive numbers as float64, inf included."""
     array = number_or_inf(name, value)
     if not (array > 0.0).all():
         raise ConfigurationError(f"{name} must be positive, got {array}")
@@ -35,11 +28,7 @@ def positive(name: str, value: ArrayLike) -> Array:
 
 
 def number_or_inf(name: str, value: ArrayLike) -> Array:
-    """Numbers as float64, not checked for infinity.
-
-    Raises:
-        ConfigurationError: For what is no number; it names the argument.
-    """
+    """Numbers as float64, not checked for infinity."""
     try:
         return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):

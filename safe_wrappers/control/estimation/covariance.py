@@ -1,12 +1,9 @@
 """Covariance of an estimate without measurements: exact steps of time, and the time until a tolerance is reached.
 
 The system is linear, x' = A x + b + w, with white noise of the *intensity* Q (covariance kernel Q delta(t - s)), in
-units of x^2 / s. Without measurements the covariance P follows the Lyapunov equation P' = A P + P A' + Q. Matrix
-exponentials over short times are exact; longer times are put together by doubling, which stays positive semidefinite
-and does not overflow where the covariance itself does not.
-
-Growth may be bounded, linear, polynomial or exponential, and need not be monotonic. Covariance alone bounds no error:
-how much probability lies outside k sigma depends on the tail (`safe_wrappers.appendix.estimation.sigma_coverage`).
+units of x^2 / s. Without measurements the covariance follows the Lyapunov equation P' = A P + P A' + Q. Its growth
+need not be monotonic. Covariance alone bounds no error: how much probability lies outside k sigma depends on the tail
+(`safe_wrappers.appendix.estimation.sigma_coverage`).
 
 Source: appendix "Continuous covariance propagation and observability"; Van Loan (1978) for the discretisation.
 """
@@ -32,19 +29,10 @@ _LARGEST = 1e60
 
 
 def checked_covariance(name: str, matrix: ArrayLike, n: int | None = None) -> Array:
-    """A covariance or a noise intensity as float64: symmetric and positive semidefinite.
-
-    Args:
-        name: What the error calls it.
-        matrix: Shape (..., n, n).
-        n: Its size, if that is given.
-
-    Returns:
-        The matrix, its rounding-sized asymmetry removed, shape (..., n, n).
+    """A covariance or a noise intensity as float64, shape (..., n, n), rounding-sized asymmetry removed.
 
     Raises:
-        ConfigurationError: Not a finite square matrix of this size, not symmetric, or with a negative eigenvalue; it
-            names the matrix and says by how much.
+        ConfigurationError: Not a finite square matrix (of size n, if given), not symmetric, or a negative eigenvalue.
     """
     symmetric, smallest, largest = _symmetric(name, matrix, n)
     if smallest < -_SYMMETRY * largest:
@@ -55,11 +43,7 @@ def checked_covariance(name: str, matrix: ArrayLike, n: int | None = None) -> Ar
 
 
 def checked_noise(name: str, matrix: ArrayLike, n: int | None = None) -> Array:
-    """As `checked_covariance`, but positive definite: no measurement is exact.
-
-    Raises:
-        ConfigurationError: As there, and for a singular matrix.
-    """
+    """As `checked_covariance`, but positive definite: no measurement is exact."""
     symmetric, smallest, largest = _symmetric(name, matrix, n)
     if not smallest > 1e-14 * largest:
         raise ConfigurationError(
@@ -70,15 +54,12 @@ def checked_noise(name: str, matrix: ArrayLike, n: int | None = None) -> Array:
 
 
 def discretise(A: ArrayLike, Q: ArrayLike, time_s: ArrayLike) -> Discrete:
-    """The exact step over a time, by Van Loan's block exponential and doubling.
+    """The exact step over a time: transition and noise, shape (..., n, n) each; identity and zero for time 0.
 
     Args:
         A: System matrix, 1/s, shape (n, n).
         Q: Intensity of the process noise, positive semidefinite, shape (n, n).
         time_s: s, at least 0, shape (...).
-
-    Returns:
-        Transition and noise, shape (..., n, n) each; identity and zero for time 0.
 
     Raises:
         ConfigurationError: Bad matrices, a negative time, or a growth that leaves the range of floats.
@@ -91,15 +72,12 @@ def discretise(A: ArrayLike, Q: ArrayLike, time_s: ArrayLike) -> Discrete:
 
 
 def discretise_drift(A: ArrayLike, b: ArrayLike, time_s: ArrayLike) -> Array:
-    """Displacement by a constant drift: the integral of `exp(A s) b` over a time, exact for singular A too.
+    """Displacement by a constant drift, the integral of `exp(A s) b` over a time, shape (k..., ..., n).
 
     Args:
         A: System matrix, 1/s, shape (n, n).
         b: Drift of x' = A x + b, shape (..., n).
         time_s: s, at least 0, shape (k...).
-
-    Returns:
-        Displacement to add to `exp(A t) x`, shape (k..., ..., n).
 
     Raises:
         ConfigurationError: Bad matrices, a negative time, or a growth that leaves the range of floats.
@@ -127,25 +105,19 @@ def blind_time(
     sigmas: float,
     horizon_s: float,
 ) -> float:
-    """The first time without measurements at which `sigmas` standard deviations reach a tolerance.
+    """The first time without measurements, s, at which `sigmas` standard deviations reach a tolerance; never late.
 
-    Growth need not be monotonic (an oscillator's is not), so the search proceeds by windows, each shown to be below
-    the tolerance by a Taylor series with its remainder. The time returned is never late.
+    0 if the tolerance is reached already; inf if it is not reached within the horizon.
 
     Args:
         P0: Covariance when the sensor was lost, shape (n, n).
         A: System matrix, 1/s, shape (n, n).
         Q: Intensity of the process noise, shape (n, n).
-        direction: D, the direction(s) of the state in which the error matters, shape (n,) or (m, n). For several,
-            the largest standard deviation over all unit combinations of them: the square root of the largest
-            eigenvalue of D P D'.
+        direction: D, the direction(s) of the state in which the error matters, shape (n,) or (m, n). For several, the
+            largest standard deviation over all unit combinations of them.
         tolerance: In the units of D x, > 0.
         sigmas: k, > 0; choose it with `safe_wrappers.appendix.estimation.sigma_coverage.sigmas_for`.
         horizon_s: How far to look, s, at least 0.
-
-    Returns:
-        s; `k sigma <= tolerance` holds up to it. 0 if the tolerance is reached already; inf if it is not reached
-        within the horizon.
 
     Raises:
         ConfigurationError: Bad matrices, or a tolerance, k or horizon that is not finite or has the wrong sign.
@@ -185,11 +157,7 @@ def _symmetric(name: str, matrix: ArrayLike, n: int | None) -> tuple[Array, floa
 
 
 def checked_square(name: str, matrix: ArrayLike) -> Array:
-    """A finite square matrix as float64, shape (n, n).
-
-    Raises:
-        ConfigurationError: For any other; it names the matrix.
-    """
+    """A finite square matrix as float64, shape (n, n)."""
     given = finite_array(name, matrix)
     if given.ndim != 2 or given.shape[0] != given.shape[1] or given.size == 0:
         raise ConfigurationError(f"{name} must be a square matrix, got shape {given.shape}")
@@ -197,21 +165,13 @@ def checked_square(name: str, matrix: ArrayLike) -> Array:
 
 
 def checked_system(A: ArrayLike, Q: ArrayLike) -> tuple[Array, Array]:
-    """A and Q as float64, shape (n, n) each, Q symmetric and positive semidefinite.
-
-    Raises:
-        ConfigurationError: For any other.
-    """
+    """A and Q as float64, shape (n, n) each, Q symmetric and positive semidefinite."""
     a = checked_square("A", A)
     return a, checked_covariance("Q", checked_square("Q", Q), len(a))
 
 
 def checked_times(time_s: ArrayLike, name: str = "time_s") -> Array:
-    """Finite times of at least 0 s as float64, shape (...).
-
-    Raises:
-        ConfigurationError: For any other.
-    """
+    """Finite times of at least 0 s as float64, shape (...)."""
     times = finite_array(name, time_s)
     if (times < 0.0).any():
         raise ConfigurationError(f"{name} must be at least 0 s, got {time_s!r}: time does not run backwards")
@@ -219,11 +179,7 @@ def checked_times(time_s: ArrayLike, name: str = "time_s") -> Array:
 
 
 def refuse_overflow(times: Array, *results: Array) -> None:
-    """Refuse results that are not finite.
-
-    Raises:
-        ConfigurationError: It gives the longest of the times.
-    """
+    """Refuse results that are not finite."""
     if not all(np.isfinite(result).all() for result in results):
         raise ConfigurationError(
             f"within time_s = {np.max(times):.6g} s an unstable mode of A grows beyond the range of floats"

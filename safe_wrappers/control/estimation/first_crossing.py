@@ -1,16 +1,12 @@
 """The first time at which a covariance without measurements reaches a bound in some direction, never late.
 
-The growth need not be monotonic: an oscillator's covariance swings, and a correlation may decrease it first. The
-search proceeds by windows, each shown to be below the bound by the better of two estimates:
+The growth need not be monotonic, so the search proceeds by windows, each shown to be below the bound by the better of
+two estimates from the rate X = dP/dt, which obeys X' = A X + X A':
 
-- the Taylor series of the variance with its remainder: tight near the crossing, but only for windows up to 1 over
-  the norm of A;
+- the Taylor series of the variance with its remainder: tight, but only for windows up to 1 over the norm of A;
 - the growth by the positive part of the rate alone: it only rises, and holds for windows of any length.
 
-Both rest on the rate X = dP/dt, which obeys X' = A X + X A'.
-
-The cost grows with the number of swings within the horizon. Arguments are checked by the caller,
-`safe_wrappers.control.estimation.covariance.blind_time`.
+Arguments are checked by the caller, `safe_wrappers.control.estimation.covariance.blind_time`.
 """
 
 import math
@@ -29,7 +25,9 @@ _RESOLUTION = 1e-9
 
 
 def first_crossing(P0: Array, a: Array, q: Array, rows: Array, goal: float, horizon: float) -> float:
-    """The time up to which the largest eigenvalue of `D P(t) D'` stays below a goal, P' = A P + P A' + Q.
+    """The time, s, up to which the largest eigenvalue of `D P(t) D'` stays below a goal, P' = A P + P A' + Q.
+
+    0 if the goal is reached at once, inf if it is not within the horizon.
 
     Args:
         P0: Covariance at time 0, shape (n, n).
@@ -38,9 +36,6 @@ def first_crossing(P0: Array, a: Array, q: Array, rows: Array, goal: float, hori
         rows: D, shape (m, n).
         goal: Bound on the variance, > 0.
         horizon: Latest time that is considered, s.
-
-    Returns:
-        s: 0 if the goal is reached at once, inf if it is not within the horizon.
     """
     if largest_variance(rows, P0) >= goal:
         return 0.0

@@ -1,9 +1,8 @@
 """Observability: which directions of a state outputs determine, named in the user's own state names.
 
-A direction in which two states give the same outputs for ever is one that no filter resolves: an initial error there
-develops as if nothing were measured. The result is structural: about ideal outputs, without noise. Full rank says
-that the state can be determined (near this state if the system is nonlinear), not how accurately or how soon;
-`condition` gives a hint. A missing direction needs another sensor, a motion that excites it, or a restricted task.
+An initial error in an unobservable direction never shows in the outputs, so no filter corrects it. The result is
+structural: about ideal outputs, without noise. Full rank says that the state can be determined, not how accurately or
+how soon; `condition` gives a hint.
 """
 
 import math
@@ -41,8 +40,7 @@ class Observability:
         gap: Factor by which the tolerance could be larger, or smaller, without a change of rank. Below about 10 the
             rank depends on the choice of tolerance.
         unobservable: Orthonormal basis of the unobservable directions, shape (n, n - rank).
-        names: The same subspace as readable combinations of the states, one for each direction: where it is spanned
-            by single states, these.
+        names: The same subspace as readable combinations of the states, one for each direction.
     """
 
     rank: int
@@ -58,9 +56,9 @@ class Observability:
 
     @property
     def condition(self) -> float:
-        """Largest singular value over the smallest nonzero one; infinite for rank 0.
+        """Largest singular value over the smallest nonzero one, after scaling; infinite for rank 0.
 
-        A large one says that some direction shows weakly in the outputs, or late. Free of units, after scaling.
+        A large one says that some direction shows weakly in the outputs, or late.
         """
         smallest = self.singular_values[self.rank - 1] if self.rank else 0.0
         return float(self.singular_values[0] / smallest) if smallest > 0.0 else math.inf
@@ -72,8 +70,7 @@ class LinearObservability(Observability):
 
     Attributes:
         time_scale_s: Time by which A was multiplied to be free of units, s.
-        unobservable_modes: Eigenvalues of A on the unobservable directions, 1/s, shape (n - rank,): an error there
-            decays by itself if their real parts are negative.
+        unobservable_modes: Eigenvalues of A on the unobservable directions, 1/s, shape (n - rank,).
     """
 
     time_scale_s: float
@@ -86,17 +83,11 @@ class LinearObservability(Observability):
 
 
 def observability_matrix(A: ArrayLike, C: ArrayLike) -> Array:
-    """C, C A, ..., C A^(n-1), stacked.
+    """C, C A, ..., C A^(n-1), stacked, shape (m n, n), not scaled; take the rank from `linear_observability`.
 
     Args:
         A: Shape (n, n), 1/s.
         C: Shape (m, n).
-
-    Returns:
-        Shape (m n, n), without any scaling: for hand calculations. Take the rank from `linear_observability`.
-
-    Raises:
-        ConfigurationError: Other shapes, or numbers that are not finite.
     """
     a, c = checked_system(A, C)
     blocks = [c]
@@ -110,9 +101,8 @@ def linear_observability(
 ) -> LinearObservability:
     """Observability of x' = A x from the outputs C x.
 
-    The unobservable subspace is found as the largest one in the kernel of C that A maps into itself, by orthogonal
-    projections; powers of A would lose precision where fast and slow modes mix. Units are removed first: states are
-    scaled so that their couplings are about equally strong, A is divided by its norm and each row of C by its own.
+    The unobservable subspace is the largest one in the kernel of C that A maps into itself, found by orthogonal
+    projections after scaling states, outputs and time to be free of units.
 
     Args:
         A: Shape (n, n), 1/s.
@@ -147,14 +137,9 @@ def linear_observability(
 
 
 def described(direction: ArrayLike, names: Sequence[str]) -> str:
-    """A direction in state space as a readable combination: "p_x - p_y", "0.8 x + 0.6 y".
+    """A direction (n,) in state space as a readable combination of the n states: "p_x - p_y", "0.8 x + 0.6 y".
 
-    Coefficients of equal size are left out, and those below 1e-8 of the largest; as a direction has no sign, the
-    first one is positive.
-
-    Args:
-        direction: Shape (n,), not zero.
-        names: Of the n states.
+    Coefficients of equal size are left out, and those below 1e-8 of the largest; the first one is positive.
 
     Raises:
         ConfigurationError: Names that are not one for each state, a direction that is zero or not finite.
@@ -177,15 +162,7 @@ def described(direction: ArrayLike, names: Sequence[str]) -> str:
 
 
 def described_subspace(basis: Array, names: Sequence[str]) -> tuple[str, ...]:
-    """A readable basis of a subspace: row-reduced, so single states appear as such.
-
-    Args:
-        basis: Columns that span it, independent, shape (n, k).
-        names: Of the n states.
-
-    Returns:
-        One combination for each of the k directions, each with the coefficient 1 for a state of its own.
-    """
+    """A readable, row-reduced basis of the subspace that independent columns, shape (n, k), span."""
     rows = basis.T.copy()
     pivots: list[int] = []
     for i in range(len(rows)):
@@ -224,8 +201,7 @@ def _units(a: Array, c: Array) -> Array:
     """Units of the states, shape (n,), powers of two, in which all couplings between states are about equal.
 
     Least squares of the entries' logarithms (Curtis and Reid, On the automatic scaling of matrices for Gaussian
-    elimination, 1972), with a time scale and a gain for each output free. Unlike LAPACK's balancing it also scales
-    chains without feedback.
+    elimination, 1972), with a time scale and a gain for each output free. It also scales chains without feedback.
     """
     n, m = len(a), len(c)
     couplings = _logarithms(a - np.diag(np.diag(a)), np.abs(a).max())
@@ -280,11 +256,7 @@ def padded(values: NDArray[np.floating[Any]], n: int) -> Array:
 
 
 def checked_system(A: ArrayLike, C: ArrayLike) -> tuple[Array, Array]:
-    """A (n, n) and C (m, n) as float64.
-
-    Raises:
-        ConfigurationError: Other shapes, or numbers that are not finite.
-    """
+    """A (n, n) and C (m, n) as float64."""
     a, c = finite_array("A", A), finite_array("C", C)
     if a.ndim != 2 or a.shape[0] != a.shape[1] or a.size == 0:
         raise ConfigurationError(f"A must be square, of shape (n, n), got {a.shape}")
@@ -296,11 +268,7 @@ def checked_system(A: ArrayLike, C: ArrayLike) -> tuple[Array, Array]:
 
 
 def checked_vector(x: ArrayLike) -> Array:
-    """A finite vector as float64, shape (n,), n > 0.
-
-    Raises:
-        ConfigurationError: For any other.
-    """
+    """A finite vector as float64, shape (n,), n > 0."""
     vector = finite_array("x", x)
     if vector.ndim != 1 or vector.size == 0:
         raise ConfigurationError(f"expected a vector, of shape (n,), got shape {vector.shape}")
@@ -308,11 +276,7 @@ def checked_vector(x: ArrayLike) -> Array:
 
 
 def state_names(names: Sequence[str] | None, n: int) -> tuple[str, ...]:
-    """The names of n states; x0, x1, ... for None.
-
-    Raises:
-        ConfigurationError: Names that are not one for each state.
-    """
+    """The names of n states; x0, x1, ... for None."""
     if names is None:
         return tuple(f"x{i}" for i in range(n))
     if isinstance(names, str) or len(names) != n or len(set(names)) != n:
@@ -321,11 +285,7 @@ def state_names(names: Sequence[str] | None, n: int) -> tuple[str, ...]:
 
 
 def checked_tolerance(tolerance: float | None) -> float:
-    """The tolerance, or `TOLERANCE` for None.
-
-    Raises:
-        ConfigurationError: For one outside (0, 1).
-    """
+    """The tolerance, between 0 and 1, or `TOLERANCE` for None."""
     if tolerance is None:
         return TOLERANCE
     if not 0.0 < tolerance < 1.0:

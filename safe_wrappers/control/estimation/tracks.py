@@ -2,12 +2,10 @@
 
 Each track has the state (position, velocity), of one, two or three coordinates each, with
 
-    p' = v,    v' = (mean_velocity - v) / reversion_s + w,    E[w(t) w(s)'] = q delta(t - s):
+    p' = v,    v' = (mean_velocity - v) / reversion_s + w,    E[w(t) w(s)'] = q delta(t - s).
 
-a double integrator driven by white acceleration noise (`reversion_s` infinite), or one whose velocity reverts to its
-mean. Between measurements the covariance follows the Lyapunov equation, exactly; a measurement is a Kalman update. A
-covariance alone bounds nothing: the coverage of k standard deviations depends on the tail and on the model
-(`safe_wrappers.appendix.estimation.sigma_coverage`).
+Between measurements the covariance follows the Lyapunov equation, exactly; a measurement is a Kalman update. The
+coverage of k standard deviations depends on the tail (`safe_wrappers.appendix.estimation.sigma_coverage`).
 
 Source: appendix "Continuous Lyapunov and Riccati covariance dynamics".
 """
@@ -118,11 +116,7 @@ class Tracks:
         self.mean[which], self.covariance[which] = updated.mean, updated.cov
 
     def ahead(self, times_s: Sequence[float]) -> tuple[Array, Array]:
-        """Predicted positions and their covariances at several times ahead, without measurements until then.
-
-        Returns:
-            Shapes (k, n, d), m, and (k, n, d, d), m^2.
-        """
+        """Positions (k, n, d), m, and covariances (k, n, d, d), m^2, at k times ahead without measurements."""
         over = self._ahead(tuple(times_s))
         positions = (over.transition @ self.mean[:, :, None])[..., 0] + over.drift
         spread = over.transition @ self.covariance @ over.transition.swapaxes(-1, -2)
@@ -158,7 +152,7 @@ class Tracks:
 
 
 def _keep(kept: dict[Any, _Over], key: Any, over: _Over) -> None:
-    """Cache, at most `_KEPT` entries: in an env whose steps all differ in length none is used twice."""
+    """Cache at most `_KEPT` entries."""
     if len(kept) >= _KEPT:
         kept.clear()
     kept[key] = over

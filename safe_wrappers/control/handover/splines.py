@@ -1,13 +1,10 @@
 """Quintic and cubic Hermite segments in closed form.
 
-Boundary values have any shape (...) that broadcasts; the duration is in s, > 0, and broadcasts with them. Times
-of evaluation are common to the whole batch, and their axes come last: times of shape (k,) give (..., k), one time
-gives (...). Positions in any unit q, velocities in q/s, and so on.
-
-A quintic matches position, velocity and acceleration at both ends, so joined segments have no acceleration step.
-Between the ends, check `interior_extrema` and `peak_torque` against the machine's limits. A cubic Hermite spline is
-continuously differentiable only once: the torque steps at every knot (`knot_torque_step`). These three functions are
-in `safe_wrappers.appendix.handover.splines`.
+Boundary values have any shape (...) that broadcasts, the duration (s, > 0) among them. Times of evaluation are common
+to the whole batch, and their axes come last. Positions in any unit q, velocities in q/s, and so on. A quintic matches
+position, velocity and acceleration at both ends; a cubic Hermite spline steps in acceleration at every knot. Neither
+keeps limits between its ends: see `interior_extrema`, `peak_torque` and `knot_torque_step` in
+`safe_wrappers.appendix.handover.splines`.
 
 Source: appendix "Smooth Trajectories and Bumpless Transfer".
 """
@@ -23,11 +20,7 @@ Array = NDArray[np.float64]
 
 
 def positive_duration(duration: ArrayLike) -> Array:
-    """Durations in s as float64, finite and > 0.
-
-    Raises:
-        ConfigurationError: For any other.
-    """
+    """Durations in s as float64, finite and > 0."""
     try:
         span = np.asarray(duration, dtype=np.float64)
     except (TypeError, ValueError):
@@ -63,8 +56,7 @@ def quintic_coefficients(
         duration: T in s, > 0.
 
     Raises:
-        ConfigurationError: For a duration that is not positive, values that are not finite, or shapes that do
-            not broadcast.
+        ConfigurationError: A duration that is not positive, values that are not finite, shapes that do not broadcast.
     """
     span, (q0, v0, a0, q1, v1, a1) = _boundary(duration, q0=q0, v0=v0, a0=a0, q1=q1, v1=v1, a1=a1)
     way, half = q1 - q0, 0.5 * span**2
@@ -104,7 +96,7 @@ _HERMITE = np.array(
 
 
 def hermite_at(ends: tuple[Array, Array, Array, Array], span: Array, since: Array, derivative: int) -> Array:
-    """All arguments broadcast: the state (q0, v0, q1, v1), the duration, and the time since the start."""
+    """The cubic of a state (q0, v0, q1, v1) over a duration, `since` its start, or its derivative; all broadcast."""
     if derivative not in (0, 1, 2, 3):
         raise ConfigurationError(f"derivative of a cubic is 0, 1, 2 or 3, got {derivative!r}")
     h00, h10, h01, h11 = (value(c, since / span) for c in differentiate(_HERMITE, derivative))
@@ -173,11 +165,10 @@ def checked_samples(
 def hermite_series(
     times: ArrayLike, positions: ArrayLike, velocities: ArrayLike, at: ArrayLike, derivative: int = 0
 ) -> Array:
-    """Samples interpolated at other times, for example 30 Hz frames at the ticks of a 1 kHz loop.
+    """Samples interpolated at other times, shape (...) for one time, (..., m) for m.
 
-    Every pair of neighbouring samples is joined by a cubic, so position and velocity are continuous; acceleration
-    is not, and at a knot it is that of the following segment (of the last one at the end). A value between two
-    samples needs the later one, so a real-time loop is late by up to one sample interval.
+    Neighbouring samples are joined by a cubic, so position and velocity are continuous; acceleration at a knot is
+    that of the following segment. A value between two samples needs the later one.
 
     Args:
         times: Sample times in s, strictly rising, evenly spaced or not, shape (k,).
@@ -186,12 +177,8 @@ def hermite_series(
         at: Times, shape () or (m,), within the samples.
         derivative: By time: 0 for position, 1 velocity, 2 acceleration, 3 jerk.
 
-    Returns:
-        Shape (...) for one time, (..., m) for m.
-
     Raises:
-        ConfigurationError: For times that do not rise, shapes that do not fit, values that are not finite, or
-            times before the first or after the last sample.
+        ConfigurationError: As `checked_samples`, and for times before the first or after the last sample.
     """
     knots, q, v = checked_samples(times, positions, velocities)
     asked = np.asarray(at, dtype=np.float64)

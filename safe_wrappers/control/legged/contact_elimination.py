@@ -2,8 +2,7 @@
 
 With qacc = M^-1 (B u + J' f - h), the contacts' accelerations are affine in u and f. Prescribing them determines f up
 to inner forces, which cause no motion (two feet pressing against each other through a rigid ground). So the unknowns
-of a whole-body problem are the control, the misses (errors of the contact accelerations) and the inner forces: few,
-and well conditioned.
+of a whole-body problem are the control, the misses (errors of the contact accelerations) and the inner forces.
 """
 
 from typing import NamedTuple
@@ -96,11 +95,7 @@ def _axes(normals: Array, friction: Array) -> Array:
 
 
 def eliminate(motion: Motion) -> tuple[Elimination, Elimination]:
-    """The forces of contacts that move as wanted, and of contacts that may deviate.
-
-    Returns:
-        One without misses, one with them.
-    """
+    """The forces of contacts that move as wanted (no misses), and of contacts that may deviate (with misses)."""
     nu = motion.by_control.shape[1]
     missing = motion.wanted - motion.held @ motion.free
     if not missing.size:

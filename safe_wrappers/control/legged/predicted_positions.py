@@ -1,11 +1,8 @@
 """Bounds on joint accelerations that keep positions within their ranges until the end of a control step.
 
 Source: appendix "Hierarchical whole-body control quadratic program", its caveat: a bound at the present position does
-not cover the motion between samples. With a constant acceleration the position is a parabola, and the largest
-acceleration that keeps it below a limit has a closed form.
-
-It is a bound for one step. Choose the horizon no shorter than stopping takes, or a later step may find no sufficient
-torque. Real accelerations are not constant over a step; contacts, above all, change them.
+not cover the motion between samples. The acceleration is taken as constant over the step; contacts, above all, change
+it. Choose the horizon no shorter than stopping takes, or a later step may find no sufficient torque.
 """
 
 import numpy as np
@@ -47,7 +44,9 @@ def predicted_position_rows(
     horizon_s: float,
     nv: int,
 ) -> tuple[Array, Array]:
-    """Rows `G qacc <= g` that keep joints within their ranges until the horizon, at a constant acceleration.
+    """Rows `G qacc <= g`, shapes (m, nv) and (m,), that keep joints in range until the horizon, upper limits first.
+
+    The acceleration is constant; there is one row for each finite limit.
 
     Args:
         dofs: Indices of the joints' degrees of freedom (slides and hinges), shape (n,).
@@ -57,9 +56,6 @@ def predicted_position_rows(
         upper: Largest positions, shape (n,); inf is no limit.
         horizon_s: s; a control step, or the time that stopping takes if that is longer.
         nv: Degrees of freedom of the whole model.
-
-    Returns:
-        G, shape (m, nv), and g, shape (m,): one row for each finite limit, the upper ones first.
     """
     q, v = finite_arrays(positions=positions, velocities=velocities)
     which = np.asarray(dofs)

@@ -1,11 +1,11 @@
 """Support plane and support polygon of contacts, and the inset as rows on contact forces.
 
 Source: appendix "Physical contact feasibility constraints", third condition. The zero moment point is where, on the
-plane of support, the contact forces have no tangential moment. Forces that push at points of the plane keep it
-inside the convex hull of these points: the support polygon. An inset keeps a distance from its edges.
+plane of support, the contact forces have no tangential moment. Forces that push keep it inside the support polygon,
+the convex hull of their points; an inset keeps a distance from its edges.
 
-It assumes contacts in one plane that do not slip; contacts at several heights need the feasibility of the wrench
-(`whole_body`). Crossing an edge does not imply a fall: a robot may step, or tip about an edge and come back.
+It assumes contacts in one plane that do not slip; contacts at several heights need `whole_body`. Crossing an edge
+does not imply a fall.
 """
 
 import math
@@ -81,12 +81,9 @@ def common_plane(
 
 
 def support_polygon(points: ArrayLike) -> Array:
-    """Corners of the convex hull of points in a plane, anticlockwise, shape (v, 2).
+    """Corners of the convex hull of points in a plane, shape (k, 2), m, k >= 1: anticlockwise, shape (v, 2).
 
     Points on its edges are left out. Two corners are a line of support, one is a point.
-
-    Args:
-        points: Shape (k, 2), m, k >= 1.
     """
     given = finite_array("points", points)
     if given.ndim != 2 or given.shape[1] != 2 or not len(given):
@@ -120,9 +117,8 @@ def support_polygon(points: ArrayLike) -> Array:
 def support_rows(points: ArrayLike, ground: Plane, inset: float) -> Array:
     """The inset as half-spaces on the stacked contact forces: `rows @ forces.ravel() <= 0`, shape (v, 3 k).
 
-    For each edge: pressure counts for the distance of its point from the inset edge. Together with forces that push,
-    the rows hold where the zero moment point is inside the inset polygon or nothing presses. Contacts on a line or at
-    a point, and an inset that leaves nothing of the polygon, allow no pressure at all.
+    Together with forces that push, the rows hold where the zero moment point is inside the inset polygon or nothing
+    presses. Contacts on a line, and an inset that leaves nothing of the polygon, allow no pressure at all.
 
     Args:
         points: In the plane, shape (k, 3), m.

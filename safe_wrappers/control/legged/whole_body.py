@@ -4,13 +4,12 @@ Source: appendix "Floating-base equations of motion" and "Hierarchical whole-bod
 
     M qacc + h = B u + sum J_k' f_k,
 
-with every f_k in its friction cone, u in the actuators' box, and the contacts' points moving as wanted. With the cone
-replaced by a pyramid inside it (`friction_pyramid`) it is a quadratic program (`solve_pyramid`); with the cone itself
-it is a second-order cone program (`solve_cone`).
+with every f_k in its friction cone, u in the actuators' box, and the contacts' points moving as wanted. With pyramids
+inside the cones it is a quadratic program (`solve_pyramid`), with the cones a second-order cone program
+(`solve_cone`).
 
 A solution says that such forces exist at this instant, for this model, these contacts and this friction. It does not
-show that a foothold carries the load, that the ground has that friction, or that the same holds a control step later;
-and a compliant contact of a simulator needs no exact contact acceleration.
+show that a foothold carries the load, or that the same holds a control step later.
 """
 
 from enum import StrEnum
@@ -90,10 +89,10 @@ class WholeBodySolution(NamedTuple):
         control: Shape (nu,), finite and inside the box.
         acceleration: qacc under it and the forces, shape (nv,).
         forces: At the contacts, shape (k, 3), N, each inside its cone (and pyramid).
-        status: See `WholeBodyStatus`; compares equal to its string.
-        residuals: See `Residuals`.
-        objective: Half the weighted squares that were minimised, of a problem with `contact_softness` its contact
-            term included; it ranks answers to one problem. Infinite where there is none.
+        status: Compares equal to its string.
+        residuals: Evaluated from the answer itself.
+        objective: Half the weighted squares that were minimised; it ranks answers to one problem. Infinite where
+            there is none.
     """
 
     control: Array
@@ -111,10 +110,6 @@ def solve_pyramid(problem: WholeBodyProblem, edges: int = 4, solver: str = "daqp
         problem: The instant.
         edges: Of each pyramid, at least 3.
         solver: "daqp" (an active set: the fast one) or "clarabel" (interior points).
-
-    Raises:
-        ConfigurationError: Too few edges.
-        UnknownNameError: No such solver.
     """
     if solver not in ("daqp", "clarabel"):
         raise UnknownNameError(f"solver {solver!r} is not one of: daqp, clarabel")
@@ -130,13 +125,9 @@ def solve_cone(problem: WholeBodyProblem) -> WholeBodySolution:
 
 
 def rigid_forces(problem: WholeBodyProblem, control: Array) -> tuple[Array, Array]:
-    """The contact forces that give the wanted contact accelerations under a control, feasible or not.
+    """The contact forces that give the wanted contact accelerations under a control (nu,), feasible or not.
 
-    Where they are not unique, the smallest ones. Contradictory accelerations are met as closely as possible.
-
-    Args:
-        problem: The instant.
-        control: Shape (nu,).
+    The smallest ones, where they are not unique. Contradictory accelerations are met as closely as possible.
 
     Returns:
         Forces, shape (k, 3), N, 0 at contacts that are to open, and the acceleration qacc, shape (nv,).
@@ -150,8 +141,8 @@ def rigid_forces(problem: WholeBodyProblem, control: Array) -> tuple[Array, Arra
 def attainable_contact_acceleration(problem: WholeBodyProblem) -> Array:
     """The contact accelerations closest to the wanted ones that do not contradict each other, shape (k, 3), m/s^2.
 
-    Two points of one rigid foot keep their distance, so their accelerations cannot be chosen freely; contradictory
-    ones make a problem without softness infeasible. Only kinematics is considered, not forces and torques.
+    Two points of one rigid foot keep their distance; contradictory accelerations make a problem without softness
+    infeasible. Only kinematics is considered.
     """
     motion = motion_of(problem)
     solution = np.linalg.lstsq(motion.held, motion.wanted, rcond=1e-5)[0]

@@ -7,13 +7,7 @@ Array = NDArray[np.float64]
 
 
 def convex_outline(points: Array) -> Array:
-    """Corners of the smallest convex outline around points, counter-clockwise (Andrew's monotone chain).
-
-    Args:
-        points: Shape (n, 2), m.
-
-    Returns:
-        Shape (c, 2), m, without points on edges.
+    """Corners of the smallest convex outline around points (n, 2), m: counter-clockwise, shape (c, 2), none on edges.
 
     Raises:
         ValueError: All points lie on one line.
@@ -39,15 +33,7 @@ def _turn(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]
 
 
 def distances_to_outline(outline: Array, points: Array) -> Array:
-    """Signed distances of points to a convex outline; negative inside.
-
-    Args:
-        outline: Corners counter-clockwise, shape (c, 2), m.
-        points: Shape (..., 2), m.
-
-    Returns:
-        Shape (...), m.
-    """
+    """Signed distances (...), m, of points (..., 2) to a convex outline with corners (c, 2) counter-clockwise."""
     edges = np.roll(outline, -1, axis=0) - outline
     lengths = np.sqrt((edges**2).sum(axis=1))
     along = edges / lengths[:, None]

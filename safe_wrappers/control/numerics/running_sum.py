@@ -2,11 +2,7 @@
 
 
 class RunningSum:
-    """The sum of the numbers added so far, read as `value`.
-
-    Args:
-        start: Initial value.
-    """
+    """The sum of a start and the numbers added so far, read as `value`."""
 
     def __init__(self, start: float = 0.0) -> None:
         self._sum = start

@@ -5,19 +5,9 @@ rad/s); their product is power, *positive into the component*. A component with 
 
     integral of F.v dt  >=  V(T) - V(0) + dissipated  >=  -V(0)        (the appendix's equation 2)
 
-so no more energy comes out than was stored at the start. Limits of passivity:
-
-- It does not limit force. A loaded mechanism may release all of its storage at once, and hurt.
-- It does not bound displacement; clearances need another bound (`leases.round_trip_ceiling`).
-- Passive parts connected with matching signs are passive together; converging needs more. A human, a powered tool
-  or an active environment is not passive without evidence.
-- Effort and flow sent with a delay form an active two-port at some frequencies; which ones depends on what is
-  connected, not on the phase alone. Measure it (`ChannelLedger`).
-- The wave transform keeps a channel passive for a *fixed* delay. Varying delay, loss, sampling and saturation need
-  the rules of `wave_line` or of `passivity_control`.
-
-A sum of samples is the integral only if one of the two is held over the interval and the other is its mean: a held
-effort times a displacement is exact, a product of two samples is an estimate.
+so no more energy comes out than was stored at the start. That limits neither force nor displacement, and the wave
+transform keeps it for a *fixed* delay only. A sum of samples is the integral only if one of the two is held over the
+interval and the other is its mean; a product of two samples is an estimate.
 
 Efforts, flows and waves are numbers (a port of one component) or arrays of shape (m,); functions without memory also
 take leading batch axes, (..., m). What is not finite raises `ConfigurationError`.
@@ -38,24 +28,14 @@ _EPS = float(np.finfo(np.float64).eps)
 
 
 class Waves(NamedTuple):
-    """A pair of waves, each in sqrt(W).
-
-    Attributes:
-        u: Into the component, shape (..., m).
-        w: Out of the component, shape (..., m).
-    """
+    """A pair of waves, shape (..., m), sqrt(W): u into the component, w out of it."""
 
     u: Array
     w: Array
 
 
 class EffortAndWave(NamedTuple):
-    """Effort and outgoing wave of a side whose flow is known.
-
-    Attributes:
-        effort: F, N, shape (..., m).
-        outgoing: Wave to be sent, sqrt(W), shape (..., m).
-    """
+    """Effort F, N, and outgoing wave, sqrt(W), of a side whose flow is known; shape (..., m)."""
 
     effort: Array
     outgoing: Array
@@ -64,13 +44,12 @@ class EffortAndWave(NamedTuple):
 def to_waves(effort: ArrayLike, flow: ArrayLike, impedance: float) -> Waves:
     """The wave transform, `u = (F + b v) / sqrt(2 b)` and `w = (F - b v) / sqrt(2 b)` (equation 3).
 
+    Their power `(|u|^2 - |w|^2) / 2` is `F.v`.
+
     Args:
         effort: F, N, shape (..., m), or a number.
         flow: v, m/s, of the same shape, positive together with F into the component that u goes into.
         impedance: b > 0, N s/m.
-
-    Returns:
-        The waves; their power `(|u|^2 - |w|^2) / 2` is `F.v`.
     """
     f, v = same_shape(effort=effort, flow=flow)
     b = positive("impedance", impedance)

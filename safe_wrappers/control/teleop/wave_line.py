@@ -1,22 +1,17 @@
 """One direction of a wave channel over a network with delay, jitter, reordering and loss.
 
 A wave sent for one tick carries the energy `|u|^2 / 2 * tick`. The channel stays passive if the energy put out never
-exceeds the energy that has arrived and was not put out before. Holding the last sample while nothing arrives, as is
-common, violates this: it puts the same energy out at every tick. A wave line accounts for all energy it puts out.
-
-Three rules for what is put out:
+exceeds the energy that has arrived and was not put out before; a wave line accounts for all energy it puts out. Three
+rules:
 
 - ``"queue"``: every wave that arrives is put out once, one per tick, in the order of sending; zero while there is
-  none. Neither energy nor the wave's integral is lost to jitter. Every tick with an empty queue adds a tick of delay,
-  up to that of the latest packet.
-- ``"hold"``: the newest wave that has arrived, scaled down to the reserve of energy. Packets that are overtaken or
-  arrive several at once add to the reserve. The shortest delay; the wave's integral, and with it the position of the
-  remote side, drifts.
+  none. Neither energy nor the wave's integral is lost to jitter, but the delay grows to that of the latest packet.
+- ``"hold"``: the newest wave that has arrived, scaled down to the reserve of energy. The shortest delay; the wave's
+  integral, and with it the position of the remote side, drifts.
 - ``"zero"``: the sum of what arrives within the tick, scaled down to the energy that arrived; zero if nothing does.
   No memory; jitter loses signal.
 
-Source: appendix "Passivity preservation via wave variables", extended from a fixed delay. Passivity bounds neither
-force nor displacement.
+Source: appendix "Passivity preservation via wave variables", extended from a fixed delay.
 """
 
 import heapq
@@ -123,13 +118,10 @@ class WaveLine:
         self._lost.add(self._landed(sequence))
 
     def deliver(self, packets: Iterable[tuple[int, ArrayLike]]) -> Array:
-        """The wave put out during this tick. Call it once per tick, also when nothing has arrived.
+        """The wave put out during this tick, sqrt(W), shape (m,). Call it once per tick, arrivals or not.
 
         Args:
             packets: Arrivals since the last tick, (sequence, wave) in any order. Duplicates are ignored.
-
-        Returns:
-            The wave, sqrt(W), shape (m,).
 
         Raises:
             ConfigurationError: For a packet that was never sent, or a wave of another shape or not finite.
