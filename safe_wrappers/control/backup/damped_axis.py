@@ -19,18 +19,13 @@ _FLAT = 1e9
 
 @dataclass(frozen=True)
 class _Stops:
-    """Stopping distances for one direction of motion.
+    """Stopping distances for one direction of motion."""
 
-    Attributes:
-        speeds: The knots, m/s, ascending from 0.
-        ways: Stopping distance at each knot, m.
-        totals: The same plus the part of the preceding hold's displacement that is proportional to the knot's speed,
-            m.
-    """
-
-    speeds: list[float]
-    ways: list[float]
-    totals: list[float]
+    speeds: list[float]  # the knots, m/s, ascending from 0
+    ways: list[float]  # stopping distance at each knot, m
+    totals: list[
+        float
+    ]  # with that part of the preceding hold's displacement that is proportional to the speed, m
 
     def way(self, speed: float) -> float:
         """Stopping distance from a speed >= 0, m; infinite beyond the table."""
@@ -98,9 +93,8 @@ class DampedAxis:
     def _table(self, brake: float) -> _Stops:
         """The table for one direction of motion, up to the clip or to `_MOST_HOLDS` knots."""
         loss, lost_way = self.add * brake, self.shift * brake
-        just_stops = (
-            self.drift - self.shift * self.keep / self.add
-        )  # displacement of the last hold, per speed
+        # Displacement of the last hold, per speed.
+        just_stops = self.drift - self.shift * self.keep / self.add
         speeds, ways = [0.0, loss / self.keep], [0.0, just_stops * loss / self.keep]
         while len(speeds) < _MOST_HOLDS and speeds[-1] < self.clip:
             speed = (speeds[-1] + loss) / self.keep

@@ -133,9 +133,8 @@ class EvasiveManeuvers:
 def _braking(axis: DampedAxis, brake: float, holds: int) -> _Braking:
     """Table for one direction of motion, braked by a control of size `brake`."""
     loss, lost_way = axis.add * brake, axis.shift * brake
-    per_speed = (
-        axis.drift - axis.shift * axis.keep / axis.add
-    )  # displacement of the last hold, which ends at rest
+    # Displacement of the last hold, which ends at rest.
+    per_speed = axis.drift - axis.shift * axis.keep / axis.add
     speeds, ways = [0.0], [np.zeros(holds + 1)]
     speed = loss / axis.keep
     while speeds[-1] < _FASTEST_M_S:

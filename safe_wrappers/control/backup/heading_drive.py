@@ -175,9 +175,8 @@ class HeadingDrive:
         mass, damping = self.mass * (1.0 + self.uncertainty), self.damping * (1.0 - self.uncertainty)
         time, terminal = mass / damping, self.drive_limit / damping
         last = 0.125 * self.drive_limit / mass * self.control_dt**2
-        return time * (speed - terminal * math.log1p(speed / terminal)) + min(
-            last, 0.5 * speed * self.control_dt
-        )
+        last = min(last, 0.5 * speed * self.control_dt)
+        return time * (speed - terminal * math.log1p(speed / terminal)) + last
 
     def brake_control(self, forward_speed: float) -> float:
         """The drive control that brakes fully, or just to rest within one hold."""
@@ -214,20 +213,9 @@ class HeadingDrive:
         sideways = coast * aside
         wander = _WANDER * sideways
         crossing = min(sideways, forward * aside / ahead) if ahead > 1e-9 else 0.0
-        return StoppingPath(
-            motion.x,
-            motion.y,
-            flip_a * cos,
-            flip_a * sin,
-            -flip_s * sin,
-            flip_s * cos,
-            forward,
-            sideways,
-            crossing,
-            math.hypot(forward, sideways) + wander,
-            self.uncertainty > 0.0,
-            wander,
-        )
+        radius = math.hypot(forward, sideways) + wander
+        place = (motion.x, motion.y, flip_a * cos, flip_a * sin, -flip_s * sin, flip_s * cos)
+        return StoppingPath(*place, forward, sideways, crossing, radius, self.uncertainty > 0.0, wander)
 
     def predict(self, motion: Motion, drive: float, turn: float) -> Motion:
         """Motion after both controls were held for one control step, by semi-implicit Euler steps as in MuJoCo."""

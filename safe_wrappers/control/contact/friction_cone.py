@@ -30,7 +30,7 @@ def normal_and_tangential(forces: ArrayLike, normals: ArrayLike) -> tuple[Array,
         forces: On the robot, shape (..., 3), N.
         normals: Unit normals, pointing at the robot, shape (..., 3).
     """
-    f, n = _forces_and_normals(forces, normals)
+    f, n = finite_arrays(forces=forces, normals=_unit(normals))
     along = np.einsum("...i,...i->...", f, n)
     return along, f - along[..., None] * n
 
@@ -89,11 +89,6 @@ def friction_pyramid(
     slope = mu[..., None, None] * math.cos(math.pi / edges) * n[..., None, :]
     sides = facing @ frame - slope
     return np.concatenate([sides, np.broadcast_to(-n, (*sides.shape[:-2], 3))[..., None, :]], axis=-2)
-
-
-def _forces_and_normals(forces: ArrayLike, normals: ArrayLike) -> tuple[Array, Array]:
-    f, n = finite_arrays(forces=forces, normals=_unit(normals))
-    return f, n
 
 
 def _unit(normals: ArrayLike) -> Array:

@@ -2,13 +2,12 @@
 
 An initial error in an unobservable direction never shows in the outputs, so no filter corrects it. The result is
 structural: about ideal outputs, without noise. Full rank says that the state can be determined, not how accurately or
-how soon; `condition` gives a hint.
+how soon.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,110 +29,55 @@ _NEGLIGIBLE = 1e-8
 _PIVOT = 0.1
 
 
-@dataclass(frozen=True, eq=False)
-class Observability:
-    """Which directions of a state the outputs determine.
+class Scaled(NamedTuple):
+    """A dimensionless system: states in `units`, time in `time_s`, rows of C of length one."""
 
-    Attributes:
-        rank: Number of independent observable directions.
-        singular_values: Of the scaled observability matrix, largest first, shape (n,).
-        gap: Factor by which the tolerance could be larger, or smaller, without a change of rank. Below about 10 the
-            rank depends on the choice of tolerance.
-        unobservable: Orthonormal basis of the unobservable directions, shape (n, n - rank).
-        names: The same subspace as readable combinations of the states, one for each direction.
-    """
-
-    rank: int
-    singular_values: Array
-    gap: float
-    unobservable: Array
-    names: tuple[str, ...]
-
-    @property
-    def observable(self) -> bool:
-        """Whether the rank is full."""
-        return not self.names
-
-    @property
-    def condition(self) -> float:
-        """Largest singular value over the smallest nonzero one, after scaling; infinite for rank 0.
-
-        A large one says that some direction shows weakly in the outputs, or late.
-        """
-        smallest = self.singular_values[self.rank - 1] if self.rank else 0.0
-        return float(self.singular_values[0] / smallest) if smallest > 0.0 else math.inf
+    a: Array
+    c: Array
+    units: Array
+    time_s: float
 
 
-@dataclass(frozen=True, eq=False)
-class LinearObservability(Observability):
-    """Observability of x' = A x, y = C x, at every state and over any interval of time.
-
-    Attributes:
-        time_scale_s: Time by which A was multiplied to be free of units, s.
-        unobservable_modes: Eigenvalues of A on the unobservable directions, 1/s, shape (n - rank,).
-    """
-
-    time_scale_s: float
-    unobservable_modes: NDArray[np.complex128]
-
-    @property
-    def detectable(self) -> bool:
-        """Whether unobservable errors decay by themselves."""
-        return bool((self.unobservable_modes.real < 0.0).all())
-
-
-def observability_matrix(A: ArrayLike, C: ArrayLike) -> Array:
-    """C, C A, ..., C A^(n-1), stacked, shape (m n, n), not scaled; take the rank from `linear_observability`.
-
-    Args:
-        A: Shape (n, n), 1/s.
-        C: Shape (m, n).
-    """
-    a, c = checked_system(A, C)
-    blocks = [c]
-    for _ in range(len(a) - 1):
-        blocks.append(blocks[-1] @ a)
-    return np.concatenate(blocks)
-
-
-def linear_observability(
-    A: ArrayLike, C: ArrayLike, names: Sequence[str] | None = None, tolerance: float | None = None
-) -> LinearObservability:
-    """Observability of x' = A x from the outputs C x.
-
-    The unobservable subspace is the largest one in the kernel of C that A maps into itself, found by orthogonal
-    projections after scaling states, outputs and time to be free of units.
+def unobservable_directions(
+    A: ArrayLike, C: ArrayLike, names: Sequence[str] | None = None
+) -> tuple[str, ...]:
+    """The states' combinations that no output C x of x' = A x shows, one for each unobservable direction.
 
     Args:
         A: Shape (n, n), 1/s.
         C: Shape (m, n); a row of zeros measures nothing.
         names: Of the n states; x0, x1, ... if not given.
-        tolerance: Singular values up to this count as zero, in scaled units; `TOLERANCE` if not given.
 
     Raises:
         ConfigurationError: Other shapes, numbers that are not finite, or names that are not one for each state.
 
     >>> # A position that is measured, and a bias on a velocity that is not:
-    >>> A = [[0, 1, 1], [0, 0, 0], [0, 0, 0]]
-    >>> linear_observability(A, [[1, 0, 0]], names=("x", "v", "bias")).names
+    >>> unobservable_directions([[0, 1, 1], [0, 0, 0], [0, 0, 0]], [[1, 0, 0]], names=("x", "v", "bias"))
     ('v - bias',)
     """
     a, c = checked_system(A, C)
-    known = state_names(names, len(a))
-    tolerance = checked_tolerance(tolerance)
-    scaled = scale_system(a, c)
-    values = np.linalg.svd(observability_matrix(scaled.a, scaled.c), compute_uv=False)
-    hidden, gap = _hidden(scaled.a, scaled.c, tolerance)
-    basis, _ = np.linalg.qr(scaled.units[:, None] * hidden)
-    return LinearObservability(
-        rank=len(a) - basis.shape[1],
-        singular_values=padded(values, len(a)),
-        gap=gap,
-        unobservable=basis,
-        names=described_subspace(basis, known),
-        time_scale_s=scaled.time_s,
-        unobservable_modes=np.linalg.eigvals(basis.T @ a @ basis).astype(np.complex128),
-    )
+    basis, _ = unobservable_subspace(scale_system(a, c), TOLERANCE)
+    return described_subspace(basis, state_names(names, len(a)))
+
+
+def unobservable_subspace(scaled: Scaled, tolerance: float) -> tuple[Array, float]:
+    """Orthonormal basis of the unobservable directions in the states' own units, and the tolerance's gap.
+
+    The largest subspace in the kernel of C that A maps into itself, by orthogonal projections; powers of A would lose
+    precision where fast and slow modes mix.
+    """
+    basis, seen = np.eye(len(scaled.a)), scaled.c
+    gap = math.inf
+    while basis.shape[1]:
+        _, values, axes = np.linalg.svd(seen @ basis if seen is scaled.c else seen)
+        rank = int((values > tolerance).sum())
+        gap = min(gap, tolerance_gap(values, tolerance))
+        if rank == 0:
+            break
+        basis = basis @ axes[rank:].T
+        moved = scaled.a @ basis
+        seen = moved - basis @ (basis.T @ moved)
+    return np.linalg.qr(scaled.units[:, None] * basis)[0], gap
 
 
 def described(direction: ArrayLike, names: Sequence[str]) -> str:
@@ -178,23 +122,14 @@ def described_subspace(basis: Array, names: Sequence[str]) -> tuple[str, ...]:
     return tuple(described(rows[i], names) for i in np.argsort(pivots))
 
 
-class _Scaled(NamedTuple):
-    """A dimensionless system: states in `units`, time in `time_s`, rows of C of length one."""
-
-    a: Array
-    c: Array
-    units: Array
-    time_s: float
-
-
-def scale_system(a: Array, c: Array) -> _Scaled:
-    """The system without units, see `linear_observability`."""
+def scale_system(a: Array, c: Array) -> Scaled:
+    """The system without units, states scaled so that their couplings are about equally strong."""
     units = _units(a, c)
     a = a * units / units[:, None]
     c = c * units
     rate = max(float(np.linalg.norm(a, 2)), 1.0 / LONGEST_TIME_SCALE_S)
     lengths = np.linalg.norm(c, axis=1, keepdims=True)
-    return _Scaled(a / rate, c / np.where(lengths > 0.0, lengths, 1.0), units, 1.0 / rate)
+    return Scaled(a / rate, c / np.where(lengths > 0.0, lengths, 1.0), units, 1.0 / rate)
 
 
 def _units(a: Array, c: Array) -> Array:
@@ -224,35 +159,12 @@ def _logarithms(matrix: Array, largest: float) -> list[tuple[tuple[int, int], fl
     return [((int(i), int(j)), float(np.log2(sizes[i, j]))) for i, j in places]
 
 
-def _hidden(a: Array, c: Array, tolerance: float) -> tuple[Array, float]:
-    """Orthonormal basis of the largest subspace in the kernel of C that A maps into itself, and the gap."""
-    basis, seen = np.eye(len(a)), c
-    gap = math.inf
-    while basis.shape[1]:
-        _, values, axes = np.linalg.svd(seen @ basis if seen is c else seen)
-        rank = int((values > tolerance).sum())
-        gap = min(gap, tolerance_gap(values, tolerance))
-        if rank == 0:
-            break
-        basis = basis @ axes[rank:].T
-        moved = a @ basis
-        seen = moved - basis @ (basis.T @ moved)
-    return basis, gap
-
-
 def tolerance_gap(values: Array, tolerance: float) -> float:
     """Factor by which the tolerance could be larger or smaller with the same number of values above it."""
     kept, dropped = values[values > tolerance], values[values <= tolerance]
     largest = dropped.max(initial=0.0)
     below = tolerance / largest if largest > 0.0 else math.inf
     return float(min(kept.min(initial=math.inf) / tolerance, below))
-
-
-def padded(values: NDArray[np.floating[Any]], n: int) -> Array:
-    """The first n values, zeros where there are fewer, shape (n,)."""
-    result = np.zeros(n)
-    result[: len(values)] = values[:n]
-    return result
 
 
 def checked_system(A: ArrayLike, C: ArrayLike) -> tuple[Array, Array]:

@@ -23,9 +23,7 @@ def lie_derivatives(gradient: ArrayLike, f: ArrayLike, g: ArrayLike) -> tuple[Ar
         g: Control matrix, shape (..., n, m), state units per second per control unit.
     """
     dh, drift, effect = (np.asarray(part, dtype=np.float64) for part in (gradient, f, g))
-    if (
-        dh.ndim == drift.ndim == 1 and effect.ndim == 2
-    ):  # a single state, as in the filter: half the time of einsum
+    if dh.ndim == drift.ndim == 1 and effect.ndim == 2:  # half the time of einsum
         return np.asarray(dh @ drift), np.asarray(dh @ effect)
     return np.einsum("...n,...n->...", dh, drift), np.einsum("...n,...nm->...m", dh, effect)
 
@@ -43,9 +41,8 @@ def cbf_rows(lf_h: ArrayLike, lg_h: ArrayLike, decay: ArrayLike) -> tuple[Array,
         lg_h: Control effectiveness on h, shape (..., m).
         decay: alpha(h), shape (...).
     """
-    return -np.asarray(lg_h, dtype=np.float64), np.asarray(lf_h, dtype=np.float64) + np.asarray(
-        decay, dtype=np.float64
-    )
+    lf, lg, alpha = (np.asarray(part, dtype=np.float64) for part in (lf_h, lg_h, decay))
+    return -lg, lf + alpha
 
 
 def numerical_gradient(h: Callable[[Array], float], x: ArrayLike, step: float = 1e-6) -> Array:

@@ -26,7 +26,7 @@ from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
 
-_EPSILON = float(np.finfo(np.float64).eps)
+EPSILON = float(np.finfo(np.float64).eps)
 
 
 def manipulability(jacobian: ArrayLike) -> Array:
@@ -41,43 +41,8 @@ def manipulability(jacobian: ArrayLike) -> Array:
         return np.zeros(j.shape[:-2])
     diagonal = np.abs(np.diagonal(np.linalg.qr(np.swapaxes(j, -1, -2), mode="r"), axis1=-2, axis2=-1))
     # A dependent row leaves rounding on the diagonal, in proportion to its own length.
-    noise = n * _EPSILON * np.linalg.norm(j, axis=-1)
+    noise = n * EPSILON * np.linalg.norm(j, axis=-1)
     return np.asarray(np.prod(np.where(diagonal > noise, diagonal, 0.0), axis=-1))
-
-
-@dataclass(frozen=True, slots=True)
-class VelocityEllipsoid:
-    """The twists that joint rates of norm 1 reach: semi-axes of an ellipsoid in task space.
-
-    Attributes:
-        axes: Unit vectors as columns, the longest first, shape (..., m, m).
-        lengths: Of the semi-axes, task speed per joint rate: J's singular values, shape (..., m).
-    """
-
-    axes: Array
-    lengths: Array
-
-    @property
-    def smallest(self) -> Array:
-        """The smallest singular value, shape (...): the speed in the worst direction per joint rate."""
-        return np.asarray(self.lengths[..., -1])
-
-    @property
-    def condition(self) -> Array:
-        """Longest over shortest, shape (...), >= 1; inf at rank loss, and for a Jacobian of zeros."""
-        longest, shortest = self.lengths[..., 0], self.lengths[..., -1]
-        lost = shortest <= self.lengths.shape[-1] * _EPSILON * longest
-        return np.asarray(np.where(lost, np.inf, longest / np.where(lost, 1.0, shortest)))
-
-
-def velocity_ellipsoid(jacobian: ArrayLike) -> VelocityEllipsoid:
-    """Axes and lengths of the velocity ellipsoid of a Jacobian of shape (..., m, n), by SVD."""
-    j = checked_jacobian(jacobian)
-    m, n = j.shape[-2:]
-    axes, lengths, _ = np.linalg.svd(j, full_matrices=True)
-    if n < m:
-        lengths = np.concatenate([lengths, np.zeros((*lengths.shape[:-1], m - n))], axis=-1)
-    return VelocityEllipsoid(axes, lengths)
 
 
 def manipulability_gradient(jacobian: ArrayLike, derivative: ArrayLike) -> Array:
@@ -128,7 +93,9 @@ def chain_derivative(linear: ArrayLike, angular: ArrayLike) -> Array:
 def worst_joint_rates(jacobian: ArrayLike) -> Array:
     """The largest rate of each joint for any twist of norm 1, shape (..., n); inf at rank loss."""
     j = checked_jacobian(jacobian)
-    lost = np.isinf(velocity_ellipsoid(j).condition)
+    m, n = j.shape[-2:]
+    _, lengths, _ = np.linalg.svd(j)
+    lost = (lengths[..., -1] <= m * EPSILON * lengths[..., 0]) | (n < m)
     return np.asarray(np.where(lost[..., None], np.inf, np.linalg.norm(pseudo_inverse(j), axis=-1)))
 
 
@@ -226,7 +193,7 @@ def validated_threshold(jacobians: ArrayLike, task_speed: float, rate_limit: Arr
 
 def pseudo_inverse(jacobian: Array) -> Array:
     """Pseudo-inverse of a Jacobian (..., m, n), shape (..., n, m)."""
-    return np.asarray(np.linalg.pinv(jacobian, rcond=max(jacobian.shape[-2:]) * _EPSILON))
+    return np.asarray(np.linalg.pinv(jacobian, rcond=max(jacobian.shape[-2:]) * EPSILON))
 
 
 def checked_jacobian(value: ArrayLike) -> Array:

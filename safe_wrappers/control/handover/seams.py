@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.control.handover.smoothstep import smoothstep
-from safe_wrappers.control.handover.splines import evaluate, hermite, quintic_coefficients
+from safe_wrappers.control.handover.splines import hermite_at, quintic_coefficients, value
 
 Array = NDArray[np.float64]
 
@@ -139,16 +139,13 @@ def _weights(first: int, longest: int) -> Array:
 def _basis(order: int, first: int, longest: int) -> Array:
     """Contribution of each boundary value of a bridge of unit duration at every step, (c, longest + 1, 2 order)."""
     unit = np.eye(2 * order)
-    basis = []
-    for n in range(first, longest + 1):
-        s = _phases(n, longest)
-        bridge = (
-            hermite(unit[0], unit[1], unit[2], unit[3], 1.0, s)
-            if order == 2
-            else evaluate(quintic_coefficients(unit[0], unit[1], unit[2], unit[3], unit[4], unit[5], 1.0), s)
-        )
-        basis.append(bridge.T)
-    weights = np.array(basis)
+    phases = np.array([_phases(n, longest) for n in range(first, longest + 1)])[:, :, None]
+    if order == 2:
+        q0, v0, q1, v1 = unit
+        weights = hermite_at((q0, v0, q1, v1), np.ones(()), phases, 0)
+    else:
+        q0, v0, a0, q1, v1, a1 = unit
+        weights = value(quintic_coefficients(q0, v0, a0, q1, v1, a1, 1.0), phases)
     weights.flags.writeable = False
     return weights
 

@@ -13,10 +13,26 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.checks import finite_arrays
-from safe_wrappers.control.numerics.polynomials import differentiate, value
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
+
+
+def differentiate(coefficients: ArrayLike, times: int = 1) -> Array:
+    """Coefficients of the derivative; a constant's is the constant 0."""
+    c = np.asarray(coefficients, dtype=np.float64)
+    for _ in range(times):
+        c = c[..., 1:] * np.arange(1, c.shape[-1]) if c.shape[-1] > 1 else np.zeros_like(c)
+    return c
+
+
+def value(coefficients: Array, x: ArrayLike) -> Array:
+    """The polynomials at x, which broadcasts with the batch axes (Horner's scheme)."""
+    x = np.asarray(x, dtype=np.float64)
+    total = coefficients[..., -1] + 0.0 * x
+    for power in range(coefficients.shape[-1] - 2, -1, -1):
+        total = total * x + coefficients[..., power]
+    return np.asarray(total)
 
 
 def positive_duration(duration: ArrayLike) -> Array:
@@ -28,11 +44,6 @@ def positive_duration(duration: ArrayLike) -> Array:
     if not (np.isfinite(span).all() and (span > 0.0).all()):
         raise ConfigurationError(f"duration is a time in seconds, > 0 and finite; got {span}")
     return span
-
-
-def _boundary(duration: ArrayLike, **values: ArrayLike) -> tuple[Array, list[Array]]:
-    span, *arrays = finite_arrays(duration=positive_duration(duration), **values)
-    return span, arrays
 
 
 def quintic_coefficients(
@@ -58,35 +69,14 @@ def quintic_coefficients(
     Raises:
         ConfigurationError: A duration that is not positive, values that are not finite, shapes that do not broadcast.
     """
-    span, (q0, v0, a0, q1, v1, a1) = _boundary(duration, q0=q0, v0=v0, a0=a0, q1=q1, v1=v1, a1=a1)
+    span, q0, v0, a0, q1, v1, a1 = finite_arrays(
+        duration=positive_duration(duration), q0=q0, v0=v0, a0=a0, q1=q1, v1=v1, a1=a1
+    )
     way, half = q1 - q0, 0.5 * span**2
     c3 = (10.0 * way - (6.0 * v0 + 4.0 * v1) * span - (3.0 * a0 - a1) * half) / span**3
     c4 = (-15.0 * way + (8.0 * v0 + 7.0 * v1) * span + (3.0 * a0 - 2.0 * a1) * half) / span**4
     c5 = (6.0 * way - 3.0 * (v0 + v1) * span - (a0 - a1) * half) / span**5
     return np.stack([q0, v0, 0.5 * a0, c3, c4, c5], axis=-1)
-
-
-def evaluate(coefficients: ArrayLike, t: ArrayLike, derivative: int = 0) -> Array:
-    """A segment, or its derivative of any order, at times t in s from its start.
-
-    Times outside [0, T] are not clamped.
-
-    Args:
-        coefficients: Shape (..., n), lowest power first.
-        t: Times common to the batch, shape () or (k,).
-        derivative: 0 for position, 1 velocity, 2 acceleration, 3 jerk.
-
-    Returns:
-        Shape (...) for one time, (..., k) for k.
-
-    Raises:
-        ConfigurationError: For a derivative that is not an integer >= 0.
-    """
-    if not isinstance(derivative, int | np.integer) or derivative < 0:
-        raise ConfigurationError(f"derivative is an integer >= 0, got {derivative!r}")
-    at = np.asarray(t, dtype=np.float64)
-    c = differentiate(coefficients, int(derivative))
-    return value(c.reshape((*c.shape[:-1], *[1] * at.ndim, c.shape[-1])), at)
 
 
 _HERMITE = np.array(
@@ -103,39 +93,6 @@ def hermite_at(ends: tuple[Array, Array, Array, Array], span: Array, since: Arra
     q0, v0, q1, v1 = ends
     scaled = h00 * q0 + h01 * q1 + span * (h10 * v0 + h11 * v1)
     return np.asarray(scaled / span**derivative)
-
-
-def hermite(
-    q0: ArrayLike,
-    v0: ArrayLike,
-    q1: ArrayLike,
-    v1: ArrayLike,
-    duration: ArrayLike,
-    t: ArrayLike,
-    derivative: int = 0,
-) -> Array:
-    """The cubic through two positions with two velocities, at times t in s from its start, not clamped.
-
-    Args:
-        q0: Position at t = 0, shape (...).
-        v0: Velocity at t = 0.
-        q1: Position at t = duration.
-        v1: Velocity at t = duration.
-        duration: T in s, > 0.
-        t: Times common to the batch, shape () or (k,).
-        derivative: By time: 0 for position, 1 velocity, 2 acceleration, 3 jerk.
-
-    Returns:
-        Shape (...) for one time, (..., k) for k.
-
-    Raises:
-        ConfigurationError: For a duration that is not positive, values that are not finite, shapes that do not
-            broadcast, or another derivative.
-    """
-    span, (q0, v0, q1, v1) = _boundary(duration, q0=q0, v0=v0, q1=q1, v1=v1)
-    at = np.asarray(t, dtype=np.float64)
-    q0, v0, q1, v1, span = (x.reshape((*x.shape, *[1] * at.ndim)) for x in (q0, v0, q1, v1, span))
-    return hermite_at((q0, v0, q1, v1), span, at, derivative)
 
 
 def checked_samples(

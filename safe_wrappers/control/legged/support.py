@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.checks import finite_array, finite_arrays
 from safe_wrappers.control.contact.friction_cone import tangents
+from safe_wrappers.control.numerics.outlines import convex_chain, turn
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -88,26 +89,16 @@ def support_polygon(points: ArrayLike) -> Array:
     given = finite_array("points", points)
     if given.ndim != 2 or given.shape[1] != 2 or not len(given):
         raise ConfigurationError(f"points must have shape (k, 2) with at least one point, got {given.shape}")
-    ordered = np.unique(given, axis=0)  # sorted by x, then y
+    ordered = sorted(set(map(tuple, given.tolist())))
     if len(ordered) < 3:
-        return ordered
-
-    def half(chain: list[Array]) -> list[Array]:
-        kept: list[Array] = []
-        for point in chain:
-            while len(kept) > 1 and _turn(kept[-2], kept[-1], point) <= 0.0:
-                kept.pop()
-            kept.append(point)
-        return kept[:-1]
-
-    chain = list(ordered)
-    corners = half(chain) + half(chain[::-1])
+        return np.array(ordered)
+    corners = convex_chain(ordered) + convex_chain(ordered[::-1])
     # A corner that protrudes by no more than rounding is a point on an edge.
-    least = _ROUNDING * float(np.ptp(ordered, axis=0).max())
+    least = _ROUNDING * float(np.ptp(given, axis=0).max())
     i = 0
     while i < len(corners) > 2:
         before, after = corners[i - 1], corners[(i + 1) % len(corners)]
-        if _turn(before, corners[i], after) <= least * math.dist(before, after):
+        if turn(before, corners[i], after) <= least * math.dist(before, after):
             del corners[i]
         else:
             i += 1
@@ -136,8 +127,3 @@ def support_rows(points: ArrayLike, ground: Plane, inset: float) -> Array:
         inward = np.stack([-edges[:, 1], edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1)[:, None]
         weights = inward @ flat.T - (inward * corners).sum(axis=1)[:, None] - inset
     return np.asarray((-weights[:, :, None] * ground.normal).reshape(len(weights), -1))
-
-
-def _turn(a: Array, b: Array, c: Array) -> float:
-    """Twice the area of a triangle, m^2; positive anticlockwise."""
-    return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))

@@ -19,23 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.control.contact.friction_cone import cone_excess, friction_pyramid
-from safe_wrappers.control.legged.contact_elimination import Elimination, Motion, eliminate, motion_of
-from safe_wrappers.control.legged.whole_body_problem import Task, WholeBodyProblem
-from safe_wrappers.control.legged.whole_body_program import ReducedProgram, reduced_program
+from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem
+from safe_wrappers.control.legged.whole_body_program import (
+    Elimination,
+    Motion,
+    ReducedProgram,
+    eliminate,
+    motion_of,
+    reduced_program,
+)
 from safe_wrappers.control.numerics.conic_program import Candidate, Program, by_clarabel, by_daqp
 from safe_wrappers.errors import UnknownNameError
-
-__all__ = [
-    "Residuals",
-    "Task",
-    "WholeBodyProblem",
-    "WholeBodySolution",
-    "WholeBodyStatus",
-    "attainable_contact_acceleration",
-    "rigid_forces",
-    "solve_cone",
-    "solve_pyramid",
-]
 
 Array = NDArray[np.float64]
 

@@ -4,20 +4,12 @@ A pose is a rotation matrix (3, 3), whose columns are the frame's axes in the ou
 its origin there. Accelerations: `safe_wrappers.appendix.estimation.lever_arm`.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError
 
-if TYPE_CHECKING:
-    pass
-
 Array = NDArray[np.float64]
-
 
 _NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
 

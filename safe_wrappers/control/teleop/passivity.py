@@ -19,8 +19,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.control.numerics.running_sum import RunningSum
-from safe_wrappers.control.teleop.port_checks import energy_j, port_energy, port_vectors, positive, same_shape
+from safe_wrappers.control.teleop.port_checks import (
+    RunningSum,
+    energy_j,
+    port_energy,
+    port_vectors,
+    positive,
+    same_shape,
+)
 
 Array = NDArray[np.float64]
 

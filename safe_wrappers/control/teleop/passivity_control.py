@@ -17,8 +17,8 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.control.numerics.running_sum import RunningSum
 from safe_wrappers.control.teleop.port_checks import (
+    RunningSum,
     energy_j,
     port_energy,
     port_vector,

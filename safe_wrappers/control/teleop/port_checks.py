@@ -1,4 +1,4 @@
-"""Argument checks of energy ports: effort and flow of one step, positive numbers, energies."""
+"""Argument checks and sums of energy ports: effort and flow of one step, positive numbers, energies."""
 
 import math
 
@@ -73,3 +73,25 @@ def energy_j(name: str, value: float) -> float:
     if not (_is_number(value) and math.isfinite(value) and value >= 0.0):
         raise ConfigurationError(f"{name} must be a finite energy of at least 0 J, got {value!r}")
     return float(value)
+
+
+class RunningSum:
+    """The sum of the numbers added so far: compensated (Neumaier), accurate to about one rounding."""
+
+    def __init__(self, start: float = 0.0) -> None:
+        self._sum = start
+        self._lost = 0.0
+
+    def add(self, value: float) -> None:
+        """Add one finite number."""
+        total = self._sum + value
+        if abs(self._sum) >= abs(value):
+            self._lost += (self._sum - total) + value
+        else:
+            self._lost += (value - total) + self._sum
+        self._sum = total
+
+    @property
+    def value(self) -> float:
+        """The sum."""
+        return self._sum + self._lost

@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.checks import whole_number
-from safe_wrappers.control.numerics.running_sum import RunningSum
-from safe_wrappers.control.teleop.port_checks import port_energy, port_vector, positive
+from safe_wrappers.control.teleop.port_checks import RunningSum, port_energy, port_vector, positive
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]

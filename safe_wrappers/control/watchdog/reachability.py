@@ -142,28 +142,17 @@ def admits(
             jerk limit only matters for a start above the speed limit.
     """
     if acceleration is None:
-        lowest, highest = _furthest_unmeasured(duration, velocity, max_speed, max_acceleration, max_jerk)
+        a_max, v_max, jerk = checked_limits(max_acceleration, max_speed, max_jerk)
+        v = np.asarray(velocity, dtype=np.float64)
+        # A start inside the limits stays inside: without a limit on the jerk.
+        _, highest = furthest(duration, v, a_max, v_max, a_max, np.where(v > v_max, jerk, np.inf))
+        lowest, _ = furthest(duration, v, -a_max, v_max, a_max, np.where(v < -v_max, jerk, np.inf))
     else:
         lowest, highest = furthest(duration, velocity, acceleration, max_speed, max_acceleration, max_jerk)
     end, start = np.asarray(goal, dtype=np.float64), np.asarray(position, dtype=np.float64)
     with np.errstate(invalid="ignore"):
         way, slack = end - start, _ROUNDING * (np.abs(end) + np.abs(start))
         return np.asarray((lowest - slack <= way) & (way <= highest + slack) & np.isfinite(way))
-
-
-def _furthest_unmeasured(
-    duration: ArrayLike,
-    velocity: ArrayLike,
-    max_speed: ArrayLike,
-    max_acceleration: ArrayLike,
-    max_jerk: ArrayLike,
-) -> tuple[Array, Array]:
-    """`furthest` for any acceleration at the start; a start inside the limits stays inside."""
-    a_max, v_max, jerk = checked_limits(max_acceleration, max_speed, max_jerk)
-    v = np.asarray(velocity, dtype=np.float64)
-    _, highest = furthest(duration, v, a_max, v_max, a_max, np.where(v > v_max, jerk, np.inf))
-    lowest, _ = furthest(duration, v, -a_max, v_max, a_max, np.where(v < -v_max, jerk, np.inf))
-    return lowest, highest
 
 
 def jerk_limited_time(start: State, end: State, limits: MotionLimits) -> Array:
