@@ -19,12 +19,7 @@ def predicted_approach(
 ) -> tuple[Array, Array]:
     """Clearance (m) and approach speed (m/s), shape (...) each, after a delay with a constant approach acceleration.
 
-    Args:
-        clearance: m, shape (...).
-        speed: Approach speed, m/s, shape (...).
-        delay_s: s.
-        pending: Acceleration in the delay, m/s^2, shape (...): of the commands in flight, or the largest possible
-            one.
+    `pending` is the acceleration in the delay, m/s^2: of the commands in flight, or the largest possible one.
     """
     v = np.asarray(speed, dtype=np.float64)
     a = np.asarray(pending, dtype=np.float64)

@@ -26,9 +26,8 @@ class ComplementarityResiduals(NamedTuple):
 def complementarity_residuals(gap: ArrayLike, force: ArrayLike) -> ComplementarityResiduals:
     """The residuals of contacts, one by one.
 
-    Args:
-        gap: Signed distance, m, shape (...): negative where the bodies penetrate.
-        force: Normal force, N, shape (...): positive pushes the bodies apart.
+    The gap is a signed distance, m, shape (...), negative where the bodies penetrate; the force is along the normal,
+    N, shape (...), positive where it pushes the bodies apart.
     """
     g, f = finite_arrays(gap=gap, force=force)
     return ComplementarityResiduals(np.maximum(-g, 0.0), np.maximum(-f, 0.0), np.abs(g * f))

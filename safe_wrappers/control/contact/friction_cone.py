@@ -26,9 +26,7 @@ _UNIT = 1e-6
 def normal_and_tangential(forces: ArrayLike, normals: ArrayLike) -> tuple[Array, Array]:
     """The part of each force along its normal, shape (...), below 0 where it pulls, and the rest, (..., 3), N.
 
-    Args:
-        forces: On the robot, shape (..., 3), N.
-        normals: Unit normals, pointing at the robot, shape (..., 3).
+    Forces are on the robot, shape (..., 3), N; unit normals point at the robot, shape (..., 3).
     """
     f, n = finite_arrays(forces=forces, normals=_unit(normals))
     along = np.einsum("...i,...i->...", f, n)

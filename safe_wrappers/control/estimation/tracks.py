@@ -117,24 +117,19 @@ class Tracks:
 
     def ahead(self, times_s: Sequence[float]) -> tuple[Array, Array]:
         """Positions (k, n, d), m, and covariances (k, n, d, d), m^2, at k times ahead without measurements."""
-        over = self._ahead(tuple(times_s))
+        key, d = tuple(times_s), self.coordinates
+        over = self._stacked.get(key)
+        if over is None:
+            overs = [self._over(time_s) for time_s in key]
+            over = _Over(
+                np.stack([each.transition[:, :d] for each in overs]),
+                np.stack([each.drift[:, :d] for each in overs]),
+                np.stack([each.noise[:, :d, :d] for each in overs]),
+            )
+            _keep(self._stacked, key, over)
         positions = (over.transition @ self.mean[:, :, None])[..., 0] + over.drift
         spread = over.transition @ self.covariance @ over.transition.swapaxes(-1, -2)
         return positions, spread + over.noise
-
-    def _ahead(self, times_s: tuple[float, ...]) -> _Over:
-        """The rows of positions, over several times at once."""
-        stacked = self._stacked.get(times_s)
-        if stacked is None:
-            d = self.coordinates
-            overs = [self._over(time_s) for time_s in times_s]
-            stacked = _Over(
-                np.stack([over.transition[:, :d] for over in overs]),
-                np.stack([over.drift[:, :d] for over in overs]),
-                np.stack([over.noise[:, :d, :d] for over in overs]),
-            )
-            _keep(self._stacked, times_s, stacked)
-        return stacked
 
     def _over(self, time_s: float) -> _Over:
         over = self._single.get(time_s)

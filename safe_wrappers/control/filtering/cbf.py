@@ -36,10 +36,7 @@ def linear_decay(h: ArrayLike, alpha: float) -> Array:
 def cbf_rows(lf_h: ArrayLike, lg_h: ArrayLike, decay: ArrayLike) -> tuple[Array, Array]:
     """The barrier condition as half-spaces `normals @ u <= offsets`: `-Lg h`, shape (..., m), and `Lf h + alpha(h)`.
 
-    Args:
-        lf_h: Drift of h, shape (...).
-        lg_h: Control effectiveness on h, shape (..., m).
-        decay: alpha(h), shape (...).
+    `lf_h` and `decay`, alpha(h), are of shape (...), `lg_h` of shape (..., m).
     """
     lf, lg, alpha = (np.asarray(part, dtype=np.float64) for part in (lf_h, lg_h, decay))
     return -lg, lf + alpha
@@ -59,13 +56,10 @@ def numerical_gradient(h: Callable[[Array], float], x: ArrayLike, step: float = 
 
 
 def acts(gradient: Array, effect: Array, height: float, share: float) -> bool:
-    """Whether some control enters the derivative of a function, up to a relative tolerance.
+    """Whether some control enters the derivative of a function, up to the relative tolerance `share`.
 
-    Args:
-        gradient: Of the function, shape (n,).
-        effect: Control matrix g, shape (n, m).
-        height: The function's value. A gradient below a hundredth of it may be round-off of finite differences.
-        share: Relative tolerance.
+    The gradient has shape (n,), the effect g shape (n, m). A gradient below a hundredth of the function's value
+    `height` may be round-off of finite differences.
     """
     size = max(float(np.abs(gradient).max(initial=0.0)), 1e-2 * abs(height))
     return bool((np.abs(gradient @ effect) > share * size * np.abs(effect).max(axis=0, initial=0.0)).any())

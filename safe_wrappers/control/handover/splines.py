@@ -55,16 +55,10 @@ def quintic_coefficients(
     a1: ArrayLike,
     duration: ArrayLike,
 ) -> Array:
-    """Coefficients (..., 6), lowest power of t first, of the quintic through two states of q, q', q''.
+    """Coefficients (..., 6), lowest power of t first, of the quintic through two states.
 
-    Args:
-        q0: Position at t = 0, shape (...).
-        v0: Velocity at t = 0.
-        a0: Acceleration at t = 0.
-        q1: Position at t = duration.
-        v1: Velocity at t = duration.
-        a1: Acceleration at t = duration.
-        duration: T in s, > 0.
+    Position q, velocity v and acceleration a, shape (...), at t = 0 (q0, v0, a0) and at t = duration (q1, v1, a1), in
+    s, > 0.
 
     Raises:
         ConfigurationError: A duration that is not positive, values that are not finite, shapes that do not broadcast.

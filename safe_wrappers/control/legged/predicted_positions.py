@@ -15,14 +15,10 @@ Array = NDArray[np.float64]
 
 
 def largest_acceleration(distance: ArrayLike, speed: ArrayLike, horizon_s: float) -> Array:
-    """The largest constant acceleration that stays within a limit until a horizon, shape (...).
+    """The largest constant acceleration that stays within a limit until a horizon > 0, shape (...).
 
-    From beyond the limit (a negative distance): the largest that returns to it by the end of the horizon.
-
-    Args:
-        distance: To the limit, shape (...), m or rad.
-        speed: Towards it, shape (...), m/s or rad/s.
-        horizon_s: Positive.
+    The distance to the limit is in m or rad, the speed towards it in m/s or rad/s. From beyond the limit (a negative
+    distance): the largest that returns to it by the end of the horizon.
     """
     d, v = finite_arrays(distance=distance, speed=speed)
     if not 0.0 < horizon_s < np.inf:
@@ -70,14 +66,8 @@ def predicted_position_rows(
     if not (low <= high).all():
         raise ConfigurationError(f"lower must not exceed upper, got {low} and {high}")
     above, below = np.isfinite(high), np.isfinite(low)
-    rows = np.zeros((int(above.sum() + below.sum()), nv))
-    rows[np.arange(len(rows)), np.concatenate([which[above], which[below]])] = np.concatenate(
-        [np.ones(int(above.sum())), -np.ones(int(below.sum()))]
-    )
-    limits = np.concatenate(
-        [
-            largest_acceleration(high[above] - q[above], v[above], horizon_s),
-            largest_acceleration(q[below] - low[below], -v[below], horizon_s),
-        ]
-    )
-    return rows, limits
+    units = np.eye(nv)[which]
+    rows = np.concatenate([units[above], 0.0 - units[below]])  # 0 - x: no negative zeros
+    upwards = largest_acceleration(high[above] - q[above], v[above], horizon_s)
+    downwards = largest_acceleration(q[below] - low[below], -v[below], horizon_s)
+    return rows, np.concatenate([upwards, downwards])

@@ -149,7 +149,7 @@ def attainable_contact_acceleration(problem: WholeBodyProblem) -> Array:
 def _solve(problem: WholeBodyProblem, sides: Array | None, solver: str) -> WholeBodySolution:
     motion = motion_of(problem)
     rigid, loose = eliminate(motion)
-    consistent = float(np.abs(rigid.contradiction).max(initial=0.0)) <= _acceleration_tolerance(problem)
+    consistent = float(np.abs(rigid.contradiction).max(initial=0.0)) <= _tolerance(problem.wanted)
     soft = problem.contact_softness > 0.0
     reduced = reduced_program(problem, motion, rigid, sides) if consistent else None
     if reduced is not None and not problem.tasks:
@@ -196,12 +196,8 @@ def _nominal(
     return _checked(problem, motion, reduced, y, WholeBodyStatus.INACTIVE)
 
 
-def _acceleration_tolerance(problem: WholeBodyProblem) -> float:
-    return TOLERANCE * (1.0 + float(np.abs(problem.wanted).max(initial=0.0)))
-
-
-def _force_tolerance(forces: Array) -> float:
-    return TOLERANCE * (1.0 + float(np.abs(forces).max(initial=0.0)))
+def _tolerance(sizes: Array) -> float:
+    return TOLERANCE * (1.0 + float(np.abs(sizes).max(initial=0.0)))
 
 
 def _checked(
@@ -213,7 +209,7 @@ def _checked(
     inside[:nu] = np.clip(y[:nu], problem.lower, problem.upper)  # a solver's round-off at the box
     answer = _answer(problem, motion, reduced, inside, status)
     missed = answer.residuals
-    force = _force_tolerance(answer.forces)
+    force = _tolerance(answer.forces)
     exact = problem.contact_softness == 0.0 or status is WholeBodyStatus.INACTIVE
     program, soft = reduced.program, reduced.softenable
     over = program.rows @ inside - program.limits
@@ -223,7 +219,7 @@ def _checked(
         and missed.cone <= force
         and bool((over[soft:] <= force).all())
         and bool((over[:soft] <= TOLERANCE * (1.0 + size)).all())
-        and (not exact or missed.contact <= _acceleration_tolerance(problem))
+        and (not exact or missed.contact <= _tolerance(problem.wanted))
     )
     return answer if fine else None
 
@@ -307,13 +303,9 @@ def _least_violation(
             y = candidate.y[: loose.size].copy()
             y[:nu] = np.clip(y[:nu], problem.lower, problem.upper)
             answer = _answer(problem, motion, plain, y, status)
-            if answer.residuals.cone <= _force_tolerance(answer.forces):
+            if answer.residuals.cone <= _tolerance(answer.forces):
                 return answer
-    return _nothing(problem, motion)
-
-
-def _nothing(problem: WholeBodyProblem, motion: Motion) -> WholeBodySolution:
-    """The failed answer: the nominal control clipped to its box, contacts without force."""
+    # Nothing passed: the nominal control clipped to its box, contacts without force.
     control = np.clip(problem.nominal, problem.lower, problem.upper)
     acceleration, forces = motion.free + motion.by_control @ control, np.zeros(problem.normals.shape)
     missed = _residuals(problem, control, acceleration, forces)

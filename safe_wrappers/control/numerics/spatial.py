@@ -15,12 +15,9 @@ _NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 def lever_arm_velocity(velocity: Array, angular_velocity: Array, arm: Array) -> Array:
-    """Velocity of P, m/s, from that of O, in the same axes: v_P = v_O + ω x r.
+    """Velocity of P, m/s, from that of O, in the same axes: v_P = v_O + ω x r, with the arm r = P - O in m.
 
-    Args:
-        velocity: Of O, shape (..., 3), m/s.
-        angular_velocity: Of the body, shape (..., 3), rad/s.
-        arm: r = P - O, shape (..., 3), m.
+    The velocity (m/s), angular velocity (rad/s) and arm have shape (..., 3).
 
     Raises:
         ConfigurationError: Vectors that are not of three finite numbers.

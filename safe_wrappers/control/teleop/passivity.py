@@ -66,7 +66,7 @@ def to_waves(effort: ArrayLike, flow: ArrayLike, impedance: float) -> Waves:
 def effort_and_outgoing(flow: ArrayLike, incoming: ArrayLike, impedance: float) -> EffortAndWave:
     """The operator's side: effort F and outgoing wave u for a known flow and the incoming wave w.
 
-    `F = b v + sqrt(2 b) w` and `u = sqrt(2 b) v + w`. The operator always feels a damper b.
+    `F = b v + sqrt(2 b) w` and `u = sqrt(2 b) v + w`.
 
     Args:
         flow: v, m/s, shape (..., m), or a number.
@@ -173,8 +173,7 @@ class EnergyLedger:
 class ChannelLedger:
     """Energy of a two-port channel with any coding, `E_ch(T) - E_ch(0) <= integral of (P_m - P_s) dt`.
 
-    Energy goes in at the port m (the operator's) and comes out at the port s (the remote one): F.v is positive into
-    the channel at m, and positive out of it at s.
+    F.v is positive into the channel at the port m (the operator's), and out of it at s (the remote one).
 
     Args:
         initial_storage_j: E_ch(0), or a bound on it, at least 0 J.
@@ -192,16 +191,11 @@ class ChannelLedger:
         time_s: float,
         stored_j: float | None = None,
     ) -> None:
-        """Account one interval.
+        """Account one interval of `time_s` > 0.
 
-        Args:
-            effort_m: At the operator's port, N, shape (m,), or a number.
-            flow_m: m/s, of the same shape.
-            effort_s: At the remote port, N, shape (m,), or a number.
-            flow_s: m/s, of the same shape.
-            time_s: Length of the interval, > 0.
-            stored_j: Energy in flight at its end, if known (`WaveLine.in_flight_j` and `reserve_j` of both
-                directions).
+        Efforts (N) and flows (m/s) at the operator's port m and the remote port s are numbers, or of shape (m,) at
+        each port. `stored_j` is the energy in flight at its end, if known (`WaveLine.in_flight_j` and `reserve_j` of
+        both directions).
         """
         f_m, v_m = port_vectors(effort_m=effort_m, flow_m=flow_m)
         f_s, v_s = port_vectors(effort_s=effort_s, flow_s=flow_s)

@@ -99,7 +99,10 @@ class EnergyReference:
         """The port's effort and flow for the coming interval; arguments as `PassivityController.modify`."""
         interval = self._damper.interval(effort, flow, time_s)
         if self._last is not None:
-            self._settle(self._last, actual)
+            last = self._last.settled(actual)
+            through, damped = last.energy_j, last.damped_j  # both may raise
+            self._dissipated.add(damped)
+            self._book(through)
         owed = max(-interval.energy_j, 0.0) - self.budget_j
         result, self._last = self._damper.dissipate(interval, owed)
         return result
@@ -107,19 +110,11 @@ class EnergyReference:
     def account(self, effort: ArrayLike, flow: ArrayLike, time_s: float) -> None:
         """Account an interval without damping, for callers that keep to `budget_j` by other means than `modify`.
 
-        Args:
-            effort: N, shape (m,), or a number; held over the interval, or its mean.
-            flow: m/s, of the same shape; the mean where the effort is held, and held where it is the mean.
-            time_s: Length of the interval, > 0.
+        Effort (N) and flow (m/s) are numbers or of shape (m,); one is held over the interval of `time_s` > 0, the
+        other its mean.
         """
         f, v = port_vectors(effort=effort, flow=flow)
         self._book(port_energy(f, v, positive("time_s", time_s)))
-
-    def _settle(self, last: "Interval", actual: ArrayLike | None) -> None:
-        interval = last.settled(actual)
-        through, damped = interval.energy_j, interval.damped_j
-        self._dissipated.add(damped)
-        self._book(through)
 
     def _book(self, through_j: float) -> None:
         (self._taken_in if through_j > 0.0 else self._given_out).add(abs(through_j))

@@ -39,10 +39,7 @@ class WaveLine:
     Args:
         time_s: The tick, duration of every wave sent or put out, s, > 0.
         rule: See above.
-        components: m, of a wave.
-
-    Raises:
-        ConfigurationError: For an unknown rule, or a tick or a number of components that is not positive.
+        components: m, of a wave, at least 1.
     """
 
     def __init__(self, time_s: float, rule: Rule = "queue", components: int = 1) -> None:
@@ -87,14 +84,10 @@ class WaveLine:
         return self._lost.value
 
     def send(self, wave: ArrayLike, sequence: int) -> None:
-        """Note a wave that leaves.
-
-        Args:
-            wave: sqrt(W), shape (m,), or a number.
-            sequence: Its number, higher than any before, at least 0.
+        """Note a wave that leaves, sqrt(W), shape (m,) or a number.
 
         Raises:
-            ConfigurationError: For a wave of another shape or not finite, and a number out of order.
+            ConfigurationError: For a wave of another shape or not finite, and a sequence number that does not rise.
         """
         if sequence <= self._last_sent:
             raise ConfigurationError(
@@ -136,7 +129,11 @@ class WaveLine:
                 fresh.append((int(sequence), self._landed(sequence), wave))
         if self.rule == "queue":
             return self._next_in_queue(fresh)
-        wanted = self._sum(fresh) if self.rule == "zero" else self._newest_of(fresh)
+        wanted = (
+            sum((wave for _, _, wave in fresh), np.zeros(self._components))
+            if self.rule == "zero"
+            else self._newest_of(fresh)
+        )
         available = self._reserve + math.fsum(energy for _, energy, _ in fresh)
         put_out, energy = self._affordable(wanted, available)
         self._put_out.add(energy)
@@ -168,12 +165,6 @@ class WaveLine:
         self._put_out.add(energy)
         self._lost.add(available - energy)
         return put_out
-
-    def _sum(self, fresh: list[tuple[int, float, Array]]) -> Array:
-        total = np.zeros(self._components)
-        for _, _, wave in fresh:
-            total = total + wave
-        return total
 
     def _newest_of(self, fresh: list[tuple[int, float, Array]]) -> Array:
         for sequence, _, wave in fresh:

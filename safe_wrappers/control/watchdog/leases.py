@@ -160,21 +160,10 @@ def round_trip_ceiling(
     """The longest network round trip, s, shape (...), at which a remote operator can still stop the machine in time.
 
     The largest T_RTT, downlink and uplink together, with `T_RTT <= (D_clear - d_brake) / v - (T_video + T_human +
-    T_act)`. Values, errors and the arguments not listed are those of `longest_lease`. It bounds displacement, not
-    energy or contact force, and has to be computed at every control step.
-
-    Args:
-        clearance: D_clear as measured by the machine, m, shape (...).
-        speed: Approach speed v, m/s, positive towards the obstacle, shape (...).
-        braking: Verified lower bound on the deceleration a_brake, m/s^2, shape (...).
-        video_s: T_video, from the exposure to the operator's display, s, shape (...). Where the downlink is part of
-            it, it must not be counted in the round trip as well.
-        human_s: T_human, the operator's reaction, s, shape (...); 0.15 to 0.25 s in the appendix.
-        act_s: T_act, until full deceleration, s, shape (...).
-        localisation: Bound on the error of the clearance, m, shape (...).
-        margin: Clearance at rest, m, shape (...).
-        acceleration: Largest approach acceleration until full braking, m/s^2; 0 is the appendix's constant speed.
-        top_speed: Bound on the speed that this may lead to, m/s; inf: none.
+    T_act)`. `video_s` lasts from the exposure to the operator's display (a downlink in it must not be counted twice),
+    `human_s` is the reaction (0.15 to 0.25 s in the appendix), `act_s` lasts until full deceleration; s, at least 0,
+    shape (...). Other arguments, values and errors are those of `longest_lease`. It bounds displacement, not energy
+    or contact force, and has to be computed at every control step.
     """
     _not_negative(video_s=video_s, human_s=human_s, act_s=act_s)
     video, human, act = (np.asarray(late, dtype=np.float64) for late in (video_s, human_s, act_s))

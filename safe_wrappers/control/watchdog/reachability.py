@@ -127,19 +127,10 @@ def admits(
 ) -> NDArray[np.bool_]:
     """Whether a position may be reached within a time, at any speed, axis by axis: a necessary condition.
 
-    False: no admissible motion gets there (`furthest`), anything is not finite, or the duration is negative. True is
-    not sufficient: path, torque and stopping remain to be checked.
-
-    Args:
-        goal: m, shape (...).
-        position: At the start, m, shape (...).
-        velocity: At the start, m/s, shape (...).
-        duration: s, shape (...).
-        max_speed: m/s, shape (...); inf: none.
-        max_acceleration: m/s^2, shape (...), finite.
-        max_jerk: m/s^3, shape (...); inf: none.
-        acceleration: At the start, m/s^2, shape (...). None: not measured; then the largest one is assumed, and the
-            jerk limit only matters for a start above the speed limit.
+    False: no admissible motion gets there, anything is not finite, or the duration is negative. True is not
+    sufficient: path, torque and stopping remain to be checked. `goal` and `position` are in m, shape (...), the other
+    arguments those of `furthest`. An acceleration of None is not measured: the largest one is assumed, and the jerk
+    limit only matters for a start above the speed limit.
     """
     if acceleration is None:
         a_max, v_max, jerk = checked_limits(max_acceleration, max_speed, max_jerk)
