@@ -68,14 +68,10 @@ class DampedAxis:
     high: float
     clip: float = math.inf
 
-    keep: float = field(init=False)
-    """A: share of the speed that one hold keeps."""
-    add: float = field(init=False)
-    """B: speed that one hold adds per control, m/s."""
-    drift: float = field(init=False)
-    """P: displacement in one hold per speed, s."""
-    shift: float = field(init=False)
-    """Q: displacement in one hold per control, m."""
+    keep: float = field(init=False)  # A: share of the speed that one hold keeps
+    add: float = field(init=False)  # B: speed that one hold adds per control, m/s
+    drift: float = field(init=False)  # P: displacement in one hold per speed, s
+    shift: float = field(init=False)  # Q: displacement in one hold per control, m
     _up: _Stops = field(init=False, repr=False)
     _down: _Stops = field(init=False, repr=False)
 

@@ -17,10 +17,9 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 _WANDER = 0.012
-"""Bound on the lateral deviation of the stopping path, per metre of sideways coasting.
+"""Bound on the lateral deviation of the stopping path, per metre of sideways coasting: drag turns a sliding body.
 
-The drag acts at the turning axis, behind the centre of mass, so it turns a sliding body; the servo, chattering about
-zero, resists only on average. Measured in MuJoCo: 0.0104 at 1.3 m/s, less at lower speeds.
+Measured in MuJoCo: 0.0104 at 1.3 m/s, less at lower speeds.
 """
 
 

@@ -172,9 +172,7 @@ def _first_crossing(P0: Array, a: Array, q: Array, rows: Array, goal: float, hor
         curve.append(rest / math.factorial(_ORDER + 1))
         room = horizon - time
         longest = room if rest == 0.0 else min(room, 1.0 / speed)
-        free = _free_by_series(
-            rows @ now @ rows.T, rows @ rate @ rows.T, curve, goal, _RESOLUTION * time, longest
-        )
+        free = _free_by_series(rows @ now @ rows.T, rows @ rate @ rows.T, curve, goal, longest)
         if free == longest < room:
             free = _free_by_rise(rows @ now @ rows.T, rate, a, rows, goal, longest, room)
         if free == room:
@@ -189,9 +187,7 @@ def _largest_variance(rows: Array, covariance: Array) -> float:
     return float(np.linalg.eigvalsh(rows @ covariance @ rows.T)[-1])
 
 
-def _free_by_series(
-    value: Array, slope: Array, curve: list[float], goal: float, shortest: float, longest: float
-) -> float:
+def _free_by_series(value: Array, slope: Array, curve: list[float], goal: float, longest: float) -> float:
     """The longest window in which `value + slope t + sum of curve[k] t^k` stays below the goal, as `value` does."""
 
     def peak(time: float) -> float:

@@ -17,13 +17,9 @@ Array = NDArray[np.float64]
 
 
 class Updated(NamedTuple):
-    """State of the filter after a measurement.
+    """Mean (..., n) and covariance (..., n, n) after a measurement, innovation (..., m) and its covariance.
 
-    Attributes:
-        mean: Estimate, shape (..., n).
-        cov: Its covariance, shape (..., n, n).
-        innovation: Measured minus expected measurement, shape (..., m).
-        innovation_cov: Covariance of the innovation, shape (..., m, m).
+    The innovation is the measured minus the expected measurement.
     """
 
     mean: Array

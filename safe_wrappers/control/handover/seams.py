@@ -94,12 +94,10 @@ def join(
 
 
 def limit_rate(commands: Array, before: Array | None, step: Array | float) -> tuple[Array, NDArray[np.bool_]]:
-    """Limit the difference of neighbouring commands to `step`; returns them and which were changed.
+    """Limit the difference of neighbouring commands, shape (n, m), to `step`; returns them and which were changed.
 
-    Args:
-        commands: Shape (n, m); returned bit for bit where they are within the limit.
-        before: The command before the first, shape (m,), or None.
-        step: Largest difference of neighbours, action units, a number or shape (m,); may be infinite.
+    The step is in action units, a number or shape (m,), and may be infinite; `before` is the command before the
+    first, shape (m,), or None. Commands within the limit are returned bit for bit.
     """
     limited = np.zeros(len(commands), dtype=bool)
     whole = commands if before is None else np.concatenate([before[None], commands])

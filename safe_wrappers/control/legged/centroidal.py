@@ -21,14 +21,9 @@ Array = NDArray[np.float64]
 
 
 class CentroidalMomentum(NamedTuple):
-    """Momentum of several bodies.
+    """Momentum of several bodies: mass (...), kg; centre of mass and its velocity (..., 3), m and m/s.
 
-    Attributes:
-        mass: Shape (...), kg.
-        com: Centre of mass, shape (..., 3), m.
-        com_velocity: Shape (..., 3), m/s.
-        linear: `mass * com_velocity`, shape (..., 3), kg m/s.
-        angular: About the centre of mass, shape (..., 3), kg m^2/s.
+    `linear` is `mass * com_velocity`, kg m/s, `angular` is about the centre of mass, kg m^2/s; shape (..., 3).
     """
 
     mass: Array

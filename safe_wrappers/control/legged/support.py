@@ -29,13 +29,7 @@ _ROUNDING = 1e-12
 
 
 class Plane(NamedTuple):
-    """A plane of support.
-
-    Attributes:
-        origin: A point on it, shape (3,), m.
-        normal: Unit normal, pointing at the robot, shape (3,).
-        axes: Two unit tangents, shape (2, 3), right-handed with the normal.
-    """
+    """A point of a plane of support (3,), m, its unit normal (3,) towards the robot, two unit tangents (2, 3)."""
 
     origin: Array
     normal: Array

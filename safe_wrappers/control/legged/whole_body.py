@@ -38,11 +38,7 @@ TOLERANCE = 1e-6
 _INNER_IN_LEAST_VIOLATION = 1e-8
 """Cost of a squared newton of inner force in a least violation; a smaller one would be ill-conditioned."""
 _OBJECTIVE_IN_LEAST_VIOLATION = 1e-3
-"""Largest cost of half the range of a control in a least violation, in squared units of the violations.
-
-It chooses among answers of nearly equal violation. A much smaller one costs accuracy at the cones: with 1e-6 some
-answers were half a newton outside.
-"""
+"""Largest cost of half a control's range in a least violation; with 1e-6 answers were up to 0.5 N outside cones."""
 
 
 class WholeBodyStatus(StrEnum):
@@ -121,10 +117,8 @@ def solve_cone(problem: WholeBodyProblem) -> WholeBodySolution:
 def rigid_forces(problem: WholeBodyProblem, control: Array) -> tuple[Array, Array]:
     """The contact forces that give the wanted contact accelerations under a control (nu,), feasible or not.
 
-    The smallest ones, where they are not unique. Contradictory accelerations are met as closely as possible.
-
-    Returns:
-        Forces, shape (k, 3), N, 0 at contacts that are to open, and the acceleration qacc, shape (nv,).
+    Forces (k, 3), N, the smallest ones where they are not unique and 0 at contacts that are to open, and qacc (nv,).
+    Contradictory accelerations are met as closely as possible.
     """
     motion = motion_of(problem)
     rigid, _ = eliminate(motion)
@@ -150,13 +144,12 @@ def _solve(problem: WholeBodyProblem, sides: Array | None, solver: str) -> Whole
     motion = motion_of(problem)
     rigid, loose = eliminate(motion)
     consistent = float(np.abs(rigid.contradiction).max(initial=0.0)) <= _tolerance(problem.wanted)
-    soft = problem.contact_softness > 0.0
     reduced = reduced_program(problem, motion, rigid, sides) if consistent else None
     if reduced is not None and not problem.tasks:
         unchanged = _nominal(problem, motion, reduced, solver)
         if unchanged is not None:
             return unchanged
-    if soft:
+    if problem.contact_softness > 0.0:
         reduced = reduced_program(problem, motion, loose, sides, 1.0 / problem.contact_softness)
     verdict = "infeasible"
     if reduced is not None:
@@ -258,9 +251,7 @@ def _residuals(problem: WholeBodyProblem, control: Array, acceleration: Array, f
         normals = problem.normals[problem.opening]
         short = -np.einsum("ki,ki->k", normals, missed[problem.opening])
         contact = max(contact, float(short.max()))
-    cone = (
-        float(cone_excess(forces, problem.normals, problem.friction).max(initial=0.0)) if len(forces) else 0.0
-    )
+    cone = float(cone_excess(forces, problem.normals, problem.friction).max(initial=0.0))
     outside = np.maximum(problem.lower - control, control - problem.upper)
     rows = 0.0
     if problem.acceleration_rows is not None and problem.acceleration_limits is not None:

@@ -18,12 +18,7 @@ _TERMS = 24
 
 
 class Discrete(NamedTuple):
-    """x -> F x plus noise of covariance Q_d: the system over one step of time.
-
-    Attributes:
-        transition: F = exp(A t), shape (..., n, n).
-        noise: Q_d, symmetric, shape (..., n, n).
-    """
+    """x -> F x plus noise of covariance Q_d over one step of time: F = exp(A t) and Q_d, shape (..., n, n) each."""
 
     transition: Array
     noise: Array

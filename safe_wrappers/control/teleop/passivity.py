@@ -89,7 +89,8 @@ class EnergyLedger:
     """
 
     def __init__(self, initial_storage_j: float = 0.0) -> None:
-        self._initial = energy_j("initial_storage_j", initial_storage_j)
+        self.initial_storage_j = energy_j("initial_storage_j", initial_storage_j)
+        """V(0), J."""
         self._absorbed = RunningSum()
         self._dissipated = RunningSum()
         self._rounding = 0.0
@@ -123,13 +124,8 @@ class EnergyLedger:
         exchanged = float(np.abs(f) @ np.abs(v)) * time + dissipated
         self._rounding += (f.size + 4) * _EPS * (exchanged + stored)
         self._lowest = min(self._lowest, self._absorbed.value)
-        missing = stored + self._dissipated.value - self._absorbed.value - self._initial
+        missing = stored + self._dissipated.value - self._absorbed.value - self.initial_storage_j
         self._created = max(self._created, missing)
-
-    @property
-    def initial_storage_j(self) -> float:
-        """V(0), J."""
-        return self._initial
 
     @property
     def absorbed_j(self) -> float:
@@ -149,20 +145,17 @@ class EnergyLedger:
     @property
     def extractable_j(self) -> float:
         """Largest energy that may still come out, `V(0) + absorbed - dissipated`, J; below 0: not passive."""
-        return self._initial + self.absorbed_j - self.dissipated_j
+        return self.initial_storage_j + self.absorbed_j - self.dissipated_j
 
     @property
     def created_j(self) -> float:
-        """Largest violation of equation 2 so far, J.
-
-        Its right side uses the storage and dissipation that `add` was given; without them it is -V(0).
-        """
+        """Largest violation of equation 2 so far, J, with the storage and dissipation that `add` was given."""
         return self._created
 
     @property
     def rounding_j(self) -> float:
         """Bound on the rounding of these sums and of the storage that `add` was given, J."""
-        return self._rounding + 4.0 * _EPS * self._initial
+        return self._rounding + 4.0 * _EPS * self.initial_storage_j
 
     @property
     def passive(self) -> bool:

@@ -59,9 +59,6 @@ class EnergyReference:
         causality: Which of the two this end changes, see above.
         initial_storage_j: Energy that this end may give out without any report, at least 0 J.
         limit: Largest size of what is added, N (m/s in admittance causality), > 0; None: none.
-
-    Raises:
-        ConfigurationError: For an unknown causality, negative storage, or a limit that is not positive.
     """
 
     def __init__(

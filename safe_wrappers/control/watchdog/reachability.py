@@ -36,16 +36,12 @@ class MotionLimits:
     max_acceleration: float | Sequence[float]
     max_speed: float | Sequence[float] = math.inf
     max_jerk: float | Sequence[float] = math.inf
-    _arrays: tuple[Array, Array, Array] = field(init=False, repr=False, compare=False)
+    arrays: tuple[Array, Array, Array] = field(init=False, repr=False, compare=False)
+    """Acceleration, speed, jerk."""
 
     def __post_init__(self) -> None:
         checked = checked_limits(self.max_acceleration, self.max_speed, self.max_jerk)
-        object.__setattr__(self, "_arrays", checked)
-
-    @property
-    def arrays(self) -> tuple[Array, Array, Array]:
-        """Acceleration, speed, jerk."""
-        return self._arrays
+        object.__setattr__(self, "arrays", checked)
 
 
 def furthest(
