@@ -1,18 +1,12 @@
 """A planar body driven along its heading: exact prediction of held controls, and its stopping path in closed form.
 
-The body slides in the plane with linear damping, turns about a vertical axis, and is driven along its heading only;
-sideways only damping brakes it. The safety argument rests on two facts, exact also for MuJoCo's semi-implicit Euler
-step:
-
-* Without drive the body coasts to rest at `p + (m / c) v`, whatever the step size, in a straight line.
-* With the drive braking along a fixed heading, the forward part stops after
-  `T v - T v_t log(1 + v / v_t)` (T = m / c, v_t = F_max / c) while the sideways part coasts on to `T v`.
-  The forward part decays faster, so the path is a convex curve from p, tangent to v, to that end point: it lies
-  in the triangle of p, the crossing of the tangent with the forward stop, and the end point.
-
-The clearance of that triangle never falls while the backup manoeuvre (brake along the heading, hold the heading)
-runs. So it is a control barrier that is always feasible, for any number of obstacles at once. With uncertain mass and
-damping the longest forward and sideways stops span a trapezoid with the same property.
+The body slides in the plane with linear damping and is driven along its heading only. Without drive it coasts to rest
+at `p + (m / c) v` in a straight line. With the drive braking along a fixed heading, the forward part stops after `T v
+- T v_t log(1 + v / v_t)` (T = m / c, v_t = F_max / c) while the sideways part coasts on to `T v`. The path is convex
+and lies in the triangle of p, the crossing of its tangent with the forward stop, and its end. With uncertain mass and
+damping the longest stops span a trapezoid. The distance of either from an obstacle never falls while the backup
+manoeuvre (brake along the heading, hold the heading) runs. All of this holds for MuJoCo's semi-implicit Euler step
+too.
 
 Source: appendix "Relative degree and kinetic stopping insets", for this plant. Plain floats: at this size they are
 faster than arrays.
@@ -23,10 +17,9 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 _WANDER = 0.012
-"""Bound on the lateral deviation of the stopping path, per metre of sideways coasting.
+"""Bound on the lateral deviation of the stopping path, per metre of sideways coasting: drag turns a sliding body.
 
-The drag acts at the turning axis, behind the centre of mass, so it turns a sliding body; the servo, chattering about
-zero, resists only on average. Measured in MuJoCo: 0.0104 at 1.3 m/s, less at lower speeds.
+Measured in MuJoCo: 0.0104 at 1.3 m/s, less at lower speeds.
 """
 
 
@@ -52,7 +45,7 @@ class StoppingPath(NamedTuple):
         sideways: Distance that the sideways motion coasts, m.
         crossing: Sideways distance at which the tangent of the motion reaches `forward`, m.
         radius: Of a circle around the present position that contains the area and its wander, m.
-        spread: Whether mass or damping are uncertain: a trapezoid instead of a triangle.
+        spread: Whether the area is the trapezoid of an uncertain mass or damping.
         wander: Bound on the deviation from the path by drag, m; subtracted from distances.
     """
 
@@ -174,17 +167,15 @@ class HeadingDrive:
         ]
 
     def brake_distance(self, speed: float) -> float:
-        """Longest distance to a stop under full braking, m, for a forward speed in m/s (>= 0).
+        """Longest distance to a stop under full braking, m, for a forward speed >= 0 in m/s, inside the uncertainty.
 
-        The distance is longest for the heaviest and least damped body of the uncertainty. The last hold brakes just
-        enough to end at rest, which adds at most an eighth of a hold's speed change times the hold.
+        The last hold brakes just enough to end at rest: at most an eighth of its speed change times the hold more.
         """
         mass, damping = self.mass * (1.0 + self.uncertainty), self.damping * (1.0 - self.uncertainty)
         time, terminal = mass / damping, self.drive_limit / damping
         last = 0.125 * self.drive_limit / mass * self.control_dt**2
-        return time * (speed - terminal * math.log1p(speed / terminal)) + min(
-            last, 0.5 * speed * self.control_dt
-        )
+        last = min(last, 0.5 * speed * self.control_dt)
+        return time * (speed - terminal * math.log1p(speed / terminal)) + last
 
     def brake_control(self, forward_speed: float) -> float:
         """The drive control that brakes fully, or just to rest within one hold."""
@@ -194,8 +185,7 @@ class HeadingDrive:
     def residual_turn_angle(self, yaw_rate: float) -> float:
         """Angle by which the body still turns while the servo brakes its rotation, rad.
 
-        Simulated step by step: the torque stops the rotation within a few physics steps, and 1 mrad of heading is
-        0.5 mm of stopping path. The oscillation of the servo about zero is left out.
+        Simulated for one control step; the oscillation of the servo about zero is left out.
         """
         h, m_l = self.timestep, self.mass + self.timestep * self.damping
         inertia = self.yaw_inertia + h * self.yaw_damping - (self.mass * self.com_offset) ** 2 / m_l
@@ -209,12 +199,7 @@ class HeadingDrive:
         return angle
 
     def stopping_path(self, motion: Motion, brake: bool = True) -> StoppingPath:
-        """The area that the backup manoeuvre stays in.
-
-        Args:
-            motion: State to stop from.
-            brake: False: coast along the heading too, without the drive, over a longer distance.
-        """
+        """The area that the backup manoeuvre stays in; `brake=False`: coasting along the heading too."""
         heading = motion.heading + self.residual_turn_angle(motion.yaw_rate)
         cos, sin = math.cos(heading), math.sin(heading)
         ahead = motion.vx * cos + motion.vy * sin
@@ -227,20 +212,9 @@ class HeadingDrive:
         sideways = coast * aside
         wander = _WANDER * sideways
         crossing = min(sideways, forward * aside / ahead) if ahead > 1e-9 else 0.0
-        return StoppingPath(
-            motion.x,
-            motion.y,
-            flip_a * cos,
-            flip_a * sin,
-            -flip_s * sin,
-            flip_s * cos,
-            forward,
-            sideways,
-            crossing,
-            math.hypot(forward, sideways) + wander,
-            self.uncertainty > 0.0,
-            wander,
-        )
+        radius = math.hypot(forward, sideways) + wander
+        place = (motion.x, motion.y, flip_a * cos, flip_a * sin, -flip_s * sin, flip_s * cos)
+        return StoppingPath(*place, forward, sideways, crossing, radius, self.uncertainty > 0.0, wander)
 
     def predict(self, motion: Motion, drive: float, turn: float) -> Motion:
         """Motion after both controls were held for one control step, by semi-implicit Euler steps as in MuJoCo."""
