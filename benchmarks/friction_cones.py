@@ -31,12 +31,12 @@ import numpy as np
 import safe_wrappers as sw
 from benchmarks.whole_body import learned
 from safe_wrappers.control.legged.whole_body import (
-    WholeBodyProblem,
     WholeBodySolution,
     attainable_contact_acceleration,
     solve_cone,
     solve_pyramid,
 )
+from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem
 from safe_wrappers.errors import SafeWrappersError
 from safe_wrappers.plants.queries.floating_base import equations_of_motion
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from safe_wrappers.control.vehicle.traction_curves import MAGIC_FORMULA, MagicFormula
+from safe_wrappers.appendix.vehicle.traction_curves import MAGIC_FORMULA, MagicFormula
 
 GROUNDS: Final = tuple(MAGIC_FORMULA)
 """Names of the grounds, from the best grip to the least."""

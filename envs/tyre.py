@@ -3,7 +3,7 @@
 import math
 from typing import Final
 
-from safe_wrappers.control.vehicle.traction_curves import TractionCurve
+from safe_wrappers.appendix.vehicle.traction_curves import TractionCurve
 
 SLOWEST: Final = 0.5
 """Speed below which slip counts against this speed, m/s: at rest there is no ratio."""

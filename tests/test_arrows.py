@@ -32,7 +32,7 @@ MAY_USE = {
     "constraints": {"control", "plants", "filter", "constraints", *COMMON},
     "wrappers": {"wrappers", *BELOW_WRAPPERS},
     "sb3": {"wrappers", "sb3", *BELOW_WRAPPERS},
-    "envs": {"control", "constraints", "envs", *COMMON},
+    "envs": {"appendix", "control", "constraints", "envs", *COMMON},
     "train": {"wrappers", "sb3", "envs", "train", "protect", "", *BELOW_WRAPPERS},
 }
 LEARNERS = {"torch", "stable_baselines3"}

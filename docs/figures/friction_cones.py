@@ -12,12 +12,12 @@ import safe_wrappers as sw
 from _style import FORBIDDEN, INK, OFF, ON, OTHER, SAFE, panels
 from safe_wrappers.control.contact.friction_cone import normal_and_tangential
 from safe_wrappers.control.legged.whole_body import (
-    WholeBodyProblem,
     attainable_contact_acceleration,
     rigid_forces,
     solve_cone,
     solve_pyramid,
 )
+from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem
 from safe_wrappers.plants.queries.floating_base import equations_of_motion
 
 SHARE, EDGES, REACH = 0.7, (4, 6, 8, 12, 16, 24, 32), 1.6

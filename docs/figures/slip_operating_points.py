@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 from _rover import FULL_THROTTLE, rover
 from _style import FORBIDDEN, INK, OFF, ON, panels
 from safe_wrappers.appendix.vehicle.burckhardt import peak
-from safe_wrappers.control.vehicle.traction_curves import MAGIC_FORMULA
+from safe_wrappers.appendix.vehicle.traction_curves import MAGIC_FORMULA
 
 GROUNDS = ("dry", "wet", "ice")
 STEPS, FIRST, EVERY = 150, 20, 10

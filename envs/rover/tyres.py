@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.control.vehicle.traction_curves import TractionCurve
+from safe_wrappers.appendix.vehicle.traction_curves import TractionCurve
 
 from ..tyre import tyre_force
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.control.estimation.covariance import blind_time
-from safe_wrappers.control.estimation.observability import linear_observability
+from safe_wrappers.control.estimation.observability import unobservable_directions
 from safe_wrappers.control.estimation.tracks import Tracks, largest_deviation
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError
 from safe_wrappers.plants.env_checks import read_attribute
@@ -199,7 +199,7 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         directions: list[list[str]] = []
         for track, count in self._counted:
             a, _, _ = track.motion(self._d).matrices()
-            directions += [list(linear_observability(a, self._matrix, names).names)] * count
+            directions += [list(unobservable_directions(a, self._matrix, names))] * count
         return dict(zip(self.track_names, directions, strict=True))
 
     def _truth(self) -> tuple[Array, Array | None]:

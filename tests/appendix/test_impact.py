@@ -20,7 +20,7 @@ from safe_wrappers.appendix.contact.impact import (
     speed_limit,
     time_to_peak,
 )
-from safe_wrappers.control.contact.stiffness import series_stiffness
+from safe_wrappers.control.contact.contact import series_stiffness
 from safe_wrappers.errors import ConfigurationError
 
 speeds, masses = st.floats(0.01, 10.0), st.floats(0.05, 100.0)

@@ -11,7 +11,8 @@ import pytest
 import safe_wrappers as sw
 from benchmarks import friction_cones
 from benchmarks.friction_cones import EXACT, SHARE, SOLVERS, at, compare, record, table
-from safe_wrappers.control.legged.whole_body import WholeBodyProblem, rigid_forces
+from safe_wrappers.control.legged.whole_body import rigid_forces
+from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem
 
 
 def foot(nominal, wanted=0.0):

@@ -20,7 +20,7 @@ from benchmarks.traction import (
     tables,
 )
 from safe_wrappers.appendix.vehicle.burckhardt import peak
-from safe_wrappers.control.vehicle.traction_curves import MAGIC_FORMULA
+from safe_wrappers.appendix.vehicle.traction_curves import MAGIC_FORMULA
 
 HARD = ("full throttle", "panic brake", "pulse")
 G = 9.81

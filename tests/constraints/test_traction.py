@@ -10,8 +10,8 @@ from vehicles import Trolley
 
 import safe_wrappers as sw
 from safe_wrappers.appendix.vehicle.burckhardt import peak
+from safe_wrappers.appendix.vehicle.traction_curves import MAGIC_FORMULA
 from safe_wrappers.control.vehicle.slip import slip_ratio
-from safe_wrappers.control.vehicle.traction_curves import MAGIC_FORMULA
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 
 FULL = np.array([1.0, 1.0, 1.0, 1.0, 0.0], dtype=np.float32)

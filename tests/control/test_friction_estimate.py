@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from safe_wrappers.appendix.vehicle.burckhardt import BURCKHARDT, peak
+from safe_wrappers.appendix.vehicle.traction_curves import MAGIC_FORMULA, MagicFormula
 from safe_wrappers.control.vehicle.friction_estimate import PEAK_SLIPS, FrictionEstimate
-from safe_wrappers.control.vehicle.traction_curves import MAGIC_FORMULA, MagicFormula
 
 
 def learn(estimate, curve, slips, noise=0.02, seed=0, travel=0.01):

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from safe_wrappers.appendix.vehicle.traction_curves import MagicFormula
 from safe_wrappers.control.vehicle.friction_estimate import FrictionEstimate
-from safe_wrappers.control.vehicle.traction_curves import MagicFormula
 
 NOISE = 0.02
 EARLY = MagicFormula.from_peak(peak_friction=0.3, peak_slip=0.05)

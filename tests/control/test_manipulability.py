@@ -8,13 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from safe_wrappers.appendix.filtering.manipulability import joint_rates, reframed, task_jacobian
+from safe_wrappers.appendix.filtering.manipulability import (
+    joint_rates,
+    reframed,
+    task_jacobian,
+    velocity_ellipsoid,
+)
 from safe_wrappers.control.filtering.manipulability import (
     chain_derivative,
     manipulability,
     manipulability_gradient,
     validated_threshold,
-    velocity_ellipsoid,
     worst_joint_rates,
 )
 from safe_wrappers.errors import ConfigurationError

@@ -18,12 +18,11 @@ from safe_wrappers.appendix.vehicle import slip as appendix_slip
 from safe_wrappers.appendix.watchdog import reachability as appendix_reachability
 from safe_wrappers.appendix.watchdog import sampling
 from safe_wrappers.control.backup import stopping
-from safe_wrappers.control.contact import contact, friction_cone, stiffness
+from safe_wrappers.control.contact import contact, friction_cone
 from safe_wrappers.control.estimation import covariance, kalman, observability
 from safe_wrappers.control.filtering import cbf, manipulability
 from safe_wrappers.control.handover import smoothstep, splines
 from safe_wrappers.control.legged import predicted_positions, support
-from safe_wrappers.control.numerics import polynomials
 from safe_wrappers.control.teleop import passivity
 from safe_wrappers.control.vehicle import slip
 from safe_wrappers.control.watchdog import leases
@@ -67,7 +66,7 @@ CALLS = {
     "normal_impulse": (impact.normal_impulse, [2, -3, 1]),
     "effective_mass": (impact.effective_mass, [EYE, [[1, 1]]]),
     "reduced_mass": (impact.reduced_mass, [2, 6]),
-    "series_stiffness": (stiffness.series_stiffness, [2, 6]),
+    "series_stiffness": (contact.series_stiffness, [2, 6]),
     "peak_deflection": (impact.peak_deflection, [2, 4, 100]),
     "peak_force": (impact.peak_force, [2, 4, 100]),
     "speed_limit": (impact.speed_limit, [2, 4, 100]),
@@ -87,8 +86,15 @@ CALLS = {
     "manipulability": (manipulability.manipulability, [[[1, 2], [0, 3]]]),
     "joint_rates": (appendix_manipulability.joint_rates, [[[1, 2], [0, 3]], [1, 1]]),
     "worst_joint_rates": (manipulability.worst_joint_rates, [[[1, 2], [0, 3]]]),
-    "observability_matrix": (observability.observability_matrix, [CHAIN, [[1, 0]]]),
-    "linear_observability": (lambda a, c: observability.linear_observability(a, c).rank, [CHAIN, [[1, 0]]]),
+    "observability_matrix": (appendix_observability.observability_matrix, [CHAIN, [[1, 0]]]),
+    "unobservable_directions": (
+        lambda a, c: len(observability.unobservable_directions(a, c)),
+        [CHAIN, [[1, 0]]],
+    ),
+    "linear_observability": (
+        lambda a, c: appendix_observability.linear_observability(a, c).rank,
+        [CHAIN, [[1, 0]]],
+    ),
     "pbh_test": (lambda a, c: appendix_observability.pbh_test(a, c)[1], [CHAIN, [[1, 0]]]),
     "port_power": (waves.port_power, [2, 3]),
     "to_waves": (passivity.to_waves, [2, 3, 4]),
@@ -99,7 +105,7 @@ CALLS = {
     "EnergyLedger": (lambda *a: filled(passivity.EnergyLedger(a[0]), a[1:]), [1, 2, 3, 1, 4, 1]),
     "ChannelLedger": (lambda *a: filled(passivity.ChannelLedger(a[0]), a[1:]), [1, 2, 3, 1, 4, 1, 2]),
     "PassivityObserver": (lambda *a: observed(*a), [1, 2, 3, 1]),
-    "differentiate": (polynomials.differentiate, [[1, 2, 3]]),
+    "differentiate": (splines.differentiate, [[1, 2, 3]]),
     "extrema": (appendix_polynomials.extrema, [[0, 3, -1], 2]),
     "largest_acceleration": (predicted_positions.largest_acceleration, [2, 1, 1]),
     "project, one row": (lambda *a: projection.project(*a)[0], [[1, 1], [[1, 1]], [1], -1, 1]),
@@ -116,7 +122,7 @@ CALLS = {
     "blend": (blends.blend, [[1, 2], [3, 4], 1]),
     "shortest_latched_blend": (smoothstep.shortest_latched_blend, [2, 3]),
     "quintic_system": (appendix_splines.quintic_system, [2]),
-    "evaluate": (splines.evaluate, [[1, 2, 3, 4, 5, 6], 2]),
+    "evaluate": (appendix_splines.evaluate, [[1, 2, 3, 4, 5, 6], 2]),
     "hermite_series": (splines.hermite_series, [[0, 1, 3], [0, 2, 1], [1, 0, 1], 2]),
     "kinetic_inset": (barriers.kinetic_inset, [5, 2, 1]),
     "kinetic_row": (barriers.kinetic_row, [5, 2, 1, 3]),

@@ -11,14 +11,15 @@ from hypothesis.extra.numpy import arrays
 from scipy.linalg import subspace_angles
 
 from safe_wrappers.appendix.estimation.observability import (
+    linear_observability,
     nonlinear_observability,
+    observability_matrix,
     pbh_test,
 )
 from safe_wrappers.control.estimation.observability import (
     described,
     described_subspace,
-    linear_observability,
-    observability_matrix,
+    unobservable_directions,
 )
 from safe_wrappers.errors import ConfigurationError
 
@@ -189,6 +190,7 @@ def test_what_is_not_seen_of_a_point_in_the_plane_is_named(c, names):
     assert found.names == names
     assert found.rank == 4 - len(names)
     assert found.observable == (not names)
+    assert unobservable_directions(POSITION_VELOCITY, c, PLANE) == names
 
 
 def test_a_hidden_mode_that_decays_is_detectable():

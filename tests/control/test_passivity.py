@@ -8,13 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from safe_wrappers.appendix.teleop.waves import flow_and_outgoing, from_waves, port_power, wave_power
-from safe_wrappers.control.numerics.running_sum import RunningSum
 from safe_wrappers.control.teleop.passivity import (
     ChannelLedger,
     EnergyLedger,
     effort_and_outgoing,
     to_waves,
 )
+from safe_wrappers.control.teleop.port_checks import RunningSum
 from safe_wrappers.errors import ConfigurationError
 
 NUMBERS = st.floats(-1e4, 1e4, allow_subnormal=False)

@@ -14,8 +14,8 @@ from safe_wrappers.appendix.vehicle.slip import (
     spins_out,
     wheel_acceleration,
 )
+from safe_wrappers.appendix.vehicle.traction_curves import MAGIC_FORMULA
 from safe_wrappers.control.vehicle.slip import slip_ratio, slip_window
-from safe_wrappers.control.vehicle.traction_curves import MAGIC_FORMULA
 from safe_wrappers.errors import ConfigurationError
 
 speeds = st.floats(-30.0, 30.0)

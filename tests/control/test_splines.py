@@ -9,6 +9,8 @@ from scipy.interpolate import BPoly, CubicHermiteSpline
 
 from safe_wrappers.appendix.handover import splines as appendix_splines
 from safe_wrappers.appendix.handover.splines import (
+    evaluate,
+    hermite,
     interior_extrema,
     knot_acceleration_step,
     knot_torque_step,
@@ -16,12 +18,7 @@ from safe_wrappers.appendix.handover.splines import (
     quintic_reduced_system,
     quintic_system,
 )
-from safe_wrappers.control.handover.splines import (
-    evaluate,
-    hermite,
-    hermite_series,
-    quintic_coefficients,
-)
+from safe_wrappers.control.handover.splines import hermite_series, quintic_coefficients
 from safe_wrappers.errors import ConfigurationError
 
 DURATION = st.floats(0.02, 10.0)

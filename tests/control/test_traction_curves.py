@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
 from safe_wrappers.appendix.vehicle.burckhardt import BURCKHARDT, BURCKHARDT_PUBLISHED, Burckhardt, peak
-from safe_wrappers.control.vehicle.traction_curves import MAGIC_FORMULA, MagicFormula
+from safe_wrappers.appendix.vehicle.traction_curves import MAGIC_FORMULA, MagicFormula
 from safe_wrappers.errors import ConfigurationError
 
 SETS = {"Magic Formula": MAGIC_FORMULA, "Burckhardt": BURCKHARDT}

@@ -15,13 +15,12 @@ from safe_wrappers.control.contact.friction_cone import friction_pyramid
 from safe_wrappers.control.legged import whole_body
 from safe_wrappers.control.legged.support import plane, support_rows
 from safe_wrappers.control.legged.whole_body import (
-    Task,
-    WholeBodyProblem,
     attainable_contact_acceleration,
     rigid_forces,
     solve_cone,
     solve_pyramid,
 )
+from safe_wrappers.control.legged.whole_body_problem import Task, WholeBodyProblem
 from safe_wrappers.control.numerics.conic_program import Candidate
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from safe_wrappers.appendix.vehicle.burckhardt import peak
+from safe_wrappers.appendix.vehicle.traction_curves import MAGIC_FORMULA
 from safe_wrappers.control.vehicle.slip import slip_ratio
-from safe_wrappers.control.vehicle.traction_curves import MAGIC_FORMULA
 from safe_wrappers.envs import EPISODE_STEPS, SAFE_ROVER_ID
 from safe_wrappers.envs.ground import GROUNDS, Ground, Patch
 from safe_wrappers.envs.safe_rover import WHEELS

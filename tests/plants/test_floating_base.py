@@ -18,7 +18,8 @@ from safe_wrappers.appendix.legged.centroidal import (
 from safe_wrappers.appendix.legged.moving_bodies import moving_bodies
 from safe_wrappers.control.contact.friction_cone import friction_pyramid
 from safe_wrappers.control.legged.centroidal import centroidal_momentum
-from safe_wrappers.control.legged.whole_body import WholeBodyProblem, rigid_forces, solve_cone, solve_pyramid
+from safe_wrappers.control.legged.whole_body import rigid_forces, solve_cone, solve_pyramid
+from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.queries.floating_base import (
     contact_points,

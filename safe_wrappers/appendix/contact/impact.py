@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.checks import finite_array, finite_arrays
-from safe_wrappers.control.contact.stiffness import in_series, number_or_inf, positive
+from safe_wrappers.control.contact.contact import in_series, number_or_inf, positive
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]

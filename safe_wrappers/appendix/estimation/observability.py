@@ -1,12 +1,12 @@
-"""Observability of nonlinear systems by Lie derivatives, and the PBH test of linear ones.
+"""Observability of linear systems, with its numbers and the PBH test, and of nonlinear ones by Lie derivatives.
 
-`safe_wrappers.control.estimation.observability` has the test of linear systems that the library uses.
+`safe_wrappers.control.estimation.observability` finds the unobservable directions of linear systems.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,15 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 from safe_wrappers.appendix.estimation.taylor import Function, output_series
 from safe_wrappers.control.estimation.observability import (
     LONGEST_TIME_SCALE_S,
-    Observability,
     checked_system,
     checked_tolerance,
     checked_vector,
     described_subspace,
-    padded,
     scale_system,
     state_names,
     tolerance_gap,
+    unobservable_subspace,
 )
 from safe_wrappers.errors import ConfigurationError
 
@@ -40,6 +39,110 @@ _PROBES = 4
 
 
 _LARGEST_COLUMN_SCALE = 1e3
+
+
+@dataclass(frozen=True, eq=False)
+class Observability:
+    """Which directions of a state the outputs determine.
+
+    Attributes:
+        rank: Number of independent observable directions.
+        singular_values: Of the scaled observability matrix, largest first, shape (n,).
+        gap: Factor by which the tolerance could be larger, or smaller, without a change of rank. Below about 10 the
+            rank depends on the choice of tolerance.
+        unobservable: Orthonormal basis of the unobservable directions, shape (n, n - rank).
+        names: The same subspace as readable combinations of the states, one for each direction.
+    """
+
+    rank: int
+    singular_values: Array
+    gap: float
+    unobservable: Array
+    names: tuple[str, ...]
+
+    @property
+    def observable(self) -> bool:
+        """Whether the rank is full."""
+        return not self.names
+
+    @property
+    def condition(self) -> float:
+        """Largest singular value over the smallest nonzero one, after scaling; infinite for rank 0.
+
+        A large one says that some direction shows weakly in the outputs, or late.
+        """
+        smallest = self.singular_values[self.rank - 1] if self.rank else 0.0
+        return float(self.singular_values[0] / smallest) if smallest > 0.0 else math.inf
+
+
+@dataclass(frozen=True, eq=False)
+class LinearObservability(Observability):
+    """Observability of x' = A x, y = C x, at every state and over any interval of time.
+
+    Attributes:
+        time_scale_s: Time by which A was multiplied to be free of units, s.
+        unobservable_modes: Eigenvalues of A on the unobservable directions, 1/s, shape (n - rank,).
+    """
+
+    time_scale_s: float
+    unobservable_modes: NDArray[np.complex128]
+
+    @property
+    def detectable(self) -> bool:
+        """Whether unobservable errors decay by themselves."""
+        return bool((self.unobservable_modes.real < 0.0).all())
+
+
+def observability_matrix(A: ArrayLike, C: ArrayLike) -> Array:
+    """C, C A, ..., C A^(n-1), stacked, shape (m n, n), not scaled; take the rank from `linear_observability`.
+
+    Args:
+        A: Shape (n, n), 1/s.
+        C: Shape (m, n).
+    """
+    a, c = checked_system(A, C)
+    blocks = [c]
+    for _ in range(len(a) - 1):
+        blocks.append(blocks[-1] @ a)
+    return np.concatenate(blocks)
+
+
+def linear_observability(
+    A: ArrayLike, C: ArrayLike, names: Sequence[str] | None = None, tolerance: float | None = None
+) -> LinearObservability:
+    """Observability of x' = A x from the outputs C x.
+
+    The unobservable subspace is the largest one in the kernel of C that A maps into itself, found by orthogonal
+    projections after scaling states, outputs and time to be free of units.
+
+    Args:
+        A: Shape (n, n), 1/s.
+        C: Shape (m, n); a row of zeros measures nothing.
+        names: Of the n states; x0, x1, ... if not given.
+        tolerance: Singular values up to this count as zero, in scaled units; `TOLERANCE` if not given.
+
+    Raises:
+        ConfigurationError: Other shapes, numbers that are not finite, or names that are not one for each state.
+
+    >>> # A position that is measured, and a bias on a velocity that is not:
+    >>> A = [[0, 1, 1], [0, 0, 0], [0, 0, 0]]
+    >>> linear_observability(A, [[1, 0, 0]], names=("x", "v", "bias")).names
+    ('v - bias',)
+    """
+    a, c = checked_system(A, C)
+    known = state_names(names, len(a))
+    scaled = scale_system(a, c)
+    values = np.linalg.svd(observability_matrix(scaled.a, scaled.c), compute_uv=False)
+    basis, gap = unobservable_subspace(scaled, checked_tolerance(tolerance))
+    return LinearObservability(
+        rank=len(a) - basis.shape[1],
+        singular_values=_padded(values, len(a)),
+        gap=gap,
+        unobservable=basis,
+        names=described_subspace(basis, known),
+        time_scale_s=scaled.time_s,
+        unobservable_modes=np.linalg.eigvals(basis.T @ a @ basis).astype(np.complex128),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +248,7 @@ def nonlinear_observability(
     ranks = tuple(_count(np.linalg.svd(m, compute_uv=False), tolerance) for m in by_order)
     _, values, axes = np.linalg.svd(by_order[-1])
     basis, _ = np.linalg.qr(units[:, None] * axes[ranks[-1] :].T)
-    values = padded(values, len(state))
+    values = _padded(values, len(state))
     return NonlinearObservability(
         rank=ranks[-1],
         singular_values=values,
@@ -154,6 +257,13 @@ def nonlinear_observability(
         names=described_subspace(basis, known),
         rank_by_order=ranks,
     )
+
+
+def _padded(values: NDArray[np.floating[Any]], n: int) -> Array:
+    """The first n values, zeros where there are fewer, shape (n,)."""
+    result = np.zeros(n)
+    result[: len(values)] = values[:n]
+    return result
 
 
 def _certain_series(f: Function, h: Function, x: Array, order: int) -> Array:

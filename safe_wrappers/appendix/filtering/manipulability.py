@@ -1,14 +1,17 @@
-"""Least-norm joint rates, and Jacobians in other frames.
+"""The velocity ellipsoid, least-norm joint rates, and Jacobians in other frames.
 
 Source: appendix "Forward kinematics and singularities". See `safe_wrappers.control.filtering.manipulability` for
 conventions and caveats.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.checks import finite_array
 from safe_wrappers.control.filtering.manipulability import (
+    EPSILON,
     checked_jacobian,
     pseudo_inverse,
     task_rows,
@@ -17,6 +20,41 @@ from safe_wrappers.control.numerics.spatial import cross
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class VelocityEllipsoid:
+    """The twists that joint rates of norm 1 reach: semi-axes of an ellipsoid in task space.
+
+    Attributes:
+        axes: Unit vectors as columns, the longest first, shape (..., m, m).
+        lengths: Of the semi-axes, task speed per joint rate: J's singular values, shape (..., m).
+    """
+
+    axes: Array
+    lengths: Array
+
+    @property
+    def smallest(self) -> Array:
+        """The smallest singular value, shape (...): the speed in the worst direction per joint rate."""
+        return np.asarray(self.lengths[..., -1])
+
+    @property
+    def condition(self) -> Array:
+        """Longest over shortest, shape (...), >= 1; inf at rank loss, and for a Jacobian of zeros."""
+        longest, shortest = self.lengths[..., 0], self.lengths[..., -1]
+        lost = shortest <= self.lengths.shape[-1] * EPSILON * longest
+        return np.asarray(np.where(lost, np.inf, longest / np.where(lost, 1.0, shortest)))
+
+
+def velocity_ellipsoid(jacobian: ArrayLike) -> VelocityEllipsoid:
+    """Axes and lengths of the velocity ellipsoid of a Jacobian of shape (..., m, n), by SVD."""
+    j = checked_jacobian(jacobian)
+    m, n = j.shape[-2:]
+    axes, lengths, _ = np.linalg.svd(j, full_matrices=True)
+    if n < m:
+        lengths = np.concatenate([lengths, np.zeros((*lengths.shape[:-1], m - n))], axis=-1)
+    return VelocityEllipsoid(axes, lengths)
 
 
 def joint_rates(jacobian: ArrayLike, twist: ArrayLike) -> Array:

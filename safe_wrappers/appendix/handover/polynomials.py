@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.control.numerics.polynomials import differentiate, value
+from safe_wrappers.control.handover.splines import differentiate, value
 
 Array = NDArray[np.float64]
 

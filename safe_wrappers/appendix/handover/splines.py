@@ -1,4 +1,4 @@
-"""Quintic and cubic segments: linear systems, extrema inside a segment, steps of torque at the knots.
+"""Quintic and cubic segments: values, linear systems, extrema inside a segment, steps of torque at the knots.
 
 Source: appendix "Smooth Trajectories and Bumpless Transfer".
 """
@@ -7,11 +7,73 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.appendix.handover.polynomials import Extrema, extrema
-from safe_wrappers.control.handover.splines import checked_samples, hermite_at, positive_duration
-from safe_wrappers.control.numerics.polynomials import differentiate
+from safe_wrappers.checks import finite_arrays
+from safe_wrappers.control.handover.splines import (
+    checked_samples,
+    differentiate,
+    hermite_at,
+    positive_duration,
+    value,
+)
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
+
+
+def evaluate(coefficients: ArrayLike, t: ArrayLike, derivative: int = 0) -> Array:
+    """A segment, or its derivative of any order, at times t in s from its start.
+
+    Times outside [0, T] are not clamped.
+
+    Args:
+        coefficients: Shape (..., n), lowest power first.
+        t: Times common to the batch, shape () or (k,).
+        derivative: 0 for position, 1 velocity, 2 acceleration, 3 jerk.
+
+    Returns:
+        Shape (...) for one time, (..., k) for k.
+
+    Raises:
+        ConfigurationError: For a derivative that is not an integer >= 0.
+    """
+    if not isinstance(derivative, int | np.integer) or derivative < 0:
+        raise ConfigurationError(f"derivative is an integer >= 0, got {derivative!r}")
+    at = np.asarray(t, dtype=np.float64)
+    c = differentiate(coefficients, int(derivative))
+    return value(c.reshape((*c.shape[:-1], *[1] * at.ndim, c.shape[-1])), at)
+
+
+def hermite(
+    q0: ArrayLike,
+    v0: ArrayLike,
+    q1: ArrayLike,
+    v1: ArrayLike,
+    duration: ArrayLike,
+    t: ArrayLike,
+    derivative: int = 0,
+) -> Array:
+    """The cubic through two positions with two velocities, at times t in s from its start, not clamped.
+
+    Args:
+        q0: Position at t = 0, shape (...).
+        v0: Velocity at t = 0.
+        q1: Position at t = duration.
+        v1: Velocity at t = duration.
+        duration: T in s, > 0.
+        t: Times common to the batch, shape () or (k,).
+        derivative: By time: 0 for position, 1 velocity, 2 acceleration, 3 jerk.
+
+    Returns:
+        Shape (...) for one time, (..., k) for k.
+
+    Raises:
+        ConfigurationError: For a duration that is not positive, values that are not finite, shapes that do not
+            broadcast, or another derivative.
+    """
+    span, q0, v0, q1, v1 = finite_arrays(duration=positive_duration(duration), q0=q0, v0=v0, q1=q1, v1=v1)
+    at = np.asarray(t, dtype=np.float64)
+    q0, v0, q1, v1, span = (x.reshape((*x.shape, *[1] * at.ndim)) for x in (q0, v0, q1, v1, span))
+    return hermite_at((q0, v0, q1, v1), span, at, derivative)
 
 
 def quintic_system(duration: ArrayLike) -> Array:

@@ -7,9 +7,8 @@ negative, and none otherwise. See `safe_wrappers.control.teleop.passivity_contro
 
 from numpy.typing import ArrayLike
 
-from safe_wrappers.control.numerics.running_sum import RunningSum
 from safe_wrappers.control.teleop.passivity_control import Causality, Damper, Interval, Passivated
-from safe_wrappers.control.teleop.port_checks import energy_j, port_energy, port_vectors, positive
+from safe_wrappers.control.teleop.port_checks import RunningSum, energy_j, port_energy, port_vectors, positive
 
 
 class PassivityObserver:

@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.control.vehicle.traction_curves import TractionCurve, check_range, clipped
+from safe_wrappers.appendix.vehicle.traction_curves import TractionCurve, check_range, clipped
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]

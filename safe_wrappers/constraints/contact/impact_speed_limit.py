@@ -12,7 +12,7 @@ from safe_wrappers.checks import name_list, positive
 from safe_wrappers.constraints.contact.geom_gaps import GeomGaps
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.control.contact.body_regions import body_region
-from safe_wrappers.control.contact.stiffness import series_stiffness
+from safe_wrappers.control.contact.contact import series_stiffness
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Promise

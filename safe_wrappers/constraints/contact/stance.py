@@ -15,7 +15,6 @@ from safe_wrappers.control.contact.friction_cone import cone_excess
 from safe_wrappers.control.legged.predicted_positions import predicted_position_rows
 from safe_wrappers.control.legged.support import common_plane, support_polygon, support_rows
 from safe_wrappers.control.legged.whole_body import (
-    WholeBodyProblem,
     WholeBodySolution,
     WholeBodyStatus,
     attainable_contact_acceleration,
@@ -23,6 +22,7 @@ from safe_wrappers.control.legged.whole_body import (
     solve_cone,
     solve_pyramid,
 )
+from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, Memory, Promise
 from safe_wrappers.plants.mujoco.contact_forecast import can_touch_the_world

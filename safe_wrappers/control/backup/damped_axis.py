@@ -1,18 +1,10 @@
 """One axis of a damped point mass under a held force: exact step, stopping distance and its inverse.
 
 A physics step maps speed v and control u to `v' = decay v + gain u` and moves by `timestep v'` (MuJoCo's
-semi-implicit Euler step with implicit joint damping; decay = 1 without damping). A control is held for `substeps`
-of them. These maps are linear, so three results are exact and cheap:
-
-* A hold: `v_end = A v + B u`, `x_end = x + P v + Q u`.
-* Braking: the full opposing control for as many holds as needed, and in the last one the control `-A v / B` that
-  ends it at rest (full braking held to its end would reverse the motion). Within each of these holds the speed falls
-  monotonically to zero, so the body never turns back.
-* The stopping distance: for a fixed number n of full holds every map is linear in v, so the distance is piecewise
-  linear in v, with a knot at each speed that n full holds remove exactly. It is tabulated once.
-
-An env may clip the speed at the start of every control step (PointMaze: 5 m/s). Braking from above the clip is
-then braking from the clip: the table is flat there.
+semi-implicit Euler step with implicit joint damping). A control is held for `substeps` of them, so a hold is linear:
+`v_end = A v + B u`, `x_end = x + P v + Q u`. Braking is the full opposing control for as many holds as needed, and in
+the last hold `-A v / B`, which ends it at rest. The motion never turns back, and the stopping distance is piecewise
+linear in v, with a knot at each speed that n full holds remove; it is tabulated once.
 """
 
 import bisect
@@ -27,18 +19,13 @@ _FLAT = 1e9
 
 @dataclass(frozen=True)
 class _Stops:
-    """Stopping distance over speed for one direction of motion.
+    """Stopping distances for one direction of motion."""
 
-    Attributes:
-        speeds: The knots, m/s, ascending from 0.
-        ways: Stopping distance at each knot, m.
-        totals: Stopping distance plus that part of the preceding hold's displacement that is proportional to the
-            knot's speed, m.
-    """
-
-    speeds: list[float]
-    ways: list[float]
-    totals: list[float]
+    speeds: list[float]  # the knots, m/s, ascending from 0
+    ways: list[float]  # stopping distance at each knot, m
+    totals: list[
+        float
+    ]  # with that part of the preceding hold's displacement that is proportional to the speed, m
 
     def way(self, speed: float) -> float:
         """Stopping distance from a speed >= 0, m; infinite beyond the table."""
@@ -81,14 +68,10 @@ class DampedAxis:
     high: float
     clip: float = math.inf
 
-    keep: float = field(init=False)
-    """A: share of the speed that one hold keeps."""
-    add: float = field(init=False)
-    """B: speed that one hold adds per control, m/s."""
-    drift: float = field(init=False)
-    """P: displacement in one hold per speed, s."""
-    shift: float = field(init=False)
-    """Q: displacement in one hold per control, m."""
+    keep: float = field(init=False)  # A: share of the speed that one hold keeps
+    add: float = field(init=False)  # B: speed that one hold adds per control, m/s
+    drift: float = field(init=False)  # P: displacement in one hold per speed, s
+    shift: float = field(init=False)  # Q: displacement in one hold per control, m
     _up: _Stops = field(init=False, repr=False)
     _down: _Stops = field(init=False, repr=False)
 
@@ -106,9 +89,8 @@ class DampedAxis:
     def _table(self, brake: float) -> _Stops:
         """The table for one direction of motion, up to the clip or to `_MOST_HOLDS` knots."""
         loss, lost_way = self.add * brake, self.shift * brake
-        just_stops = (
-            self.drift - self.shift * self.keep / self.add
-        )  # displacement of the last hold, per speed
+        # Displacement of the last hold, per speed.
+        just_stops = self.drift - self.shift * self.keep / self.add
         speeds, ways = [0.0, loss / self.keep], [0.0, just_stops * loss / self.keep]
         while len(speeds) < _MOST_HOLDS and speeds[-1] < self.clip:
             speed = (speeds[-1] + loss) / self.keep
@@ -169,8 +151,7 @@ class DampedAxis:
     def control_to_rest_at(self, x: float, v: float, target: float) -> float:
         """The control whose hold, and braking after it, comes to rest at `target`; it may be out of bounds.
 
-        The rest point grows with the control, so this is the bound on controls that stop before the target. `v` is
-        already clipped.
+        The rest point grows with the control. `v` is already clipped.
         """
         per_speed = self.shift / self.add
         way = target - x - (self.drift - per_speed * self.keep) * v

@@ -1,10 +1,8 @@
 """Positions of a point mass along evasive manoeuvres: drive in some direction, then brake to rest.
 
-A manoeuvre holds a full (or no) control along each axis for some control steps (the drive phase), then brakes each
-axis separately: fully, and in its last hold just enough to end at rest (`damped_axis.py`). Along one axis the
-displacement of the drive phase is linear in the present state. The displacement of braking is piecewise linear in the
-speed at which it begins, with a knot at each speed that whole holds of full braking remove exactly; it is tabulated
-once. So every manoeuvre from many states takes a few array operations, exact to rounding.
+A manoeuvre holds one control along each axis for some control steps (the drive phase), then brakes each axis
+separately (`damped_axis.py`). The displacement of the drive phase is linear in the present state; that of braking is
+piecewise linear in the speed at which it begins, and tabulated once. The result is exact to rounding.
 """
 
 from typing import NamedTuple
@@ -29,12 +27,7 @@ class Maneuver(NamedTuple):
 
 
 class _Braking(NamedTuple):
-    """Displacement of braking over time, for one direction of motion.
-
-    Attributes:
-        speeds: Knots, m/s, ascending from 0, shape (k,).
-        ways: Displacement after 0, 1, ... holds, m, shape (k, holds + 1).
-    """
+    """Displacement of braking for one direction of motion: knots of speed (k,), m/s, and ways (k, holds + 1), m."""
 
     speeds: Array
     ways: Array
@@ -109,15 +102,12 @@ class EvasiveManeuvers:
         )
 
     def paths(self, position: Array, velocity: Array, which: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Positions at the instants.
+        """Positions along x and along y at the instants, shape (c, m, instants) each, m.
 
         Args:
             position: Shape (c, 2), m.
             velocity: Shape (c, 2), m/s.
             which: Indices of manoeuvres, shape (m,).
-
-        Returns:
-            Along x and along y, shapes (c, m, instants), m.
         """
         along = []
         for i, p in enumerate(self._parts):
@@ -143,9 +133,8 @@ class EvasiveManeuvers:
 def _braking(axis: DampedAxis, brake: float, holds: int) -> _Braking:
     """Table for one direction of motion, braked by a control of size `brake`."""
     loss, lost_way = axis.add * brake, axis.shift * brake
-    per_speed = (
-        axis.drift - axis.shift * axis.keep / axis.add
-    )  # displacement of the last hold, which ends at rest
+    # Displacement of the last hold, which ends at rest.
+    per_speed = axis.drift - axis.shift * axis.keep / axis.add
     speeds, ways = [0.0], [np.zeros(holds + 1)]
     speed = loss / axis.keep
     while speeds[-1] < _FASTEST_M_S:

@@ -1,14 +1,10 @@
 """A point mass on two axes among rectangular walls: the area swept by one control step and the braking after it.
 
-Braking treats each axis separately: fully, and in its last hold just enough to end at rest (`damped_axis.py`). The
-path is covered by rectangles, one per hold: within a hold of braking the motion along each axis has one sign, so the
-rectangle between its ends contains it, between physics substeps too. After one hold of braking the remaining
-rectangles are a subset of the former ones, so the distance from the walls never falls.
-
-An env may clip the speed at the start of a control step, which bends the path. If the level is known, braking starts
-from the clipped speed and the above holds. If not, a single rectangle from the present position to the rest point is
-used: less speed along an axis never leads farther along it, so the rectangle contains the path for every clip above
-what one hold of full force can reverse.
+Each axis brakes separately (`damped_axis.py`). The path is covered by one rectangle per hold: within a hold of
+braking the motion along each axis has one sign. After one hold the remaining rectangles are a subset of the former
+ones, so the distance from the walls never falls. If the level of the env's speed clip is not known, a single
+rectangle from the present position to the rest point is used: it contains the path for every clip above what one hold
+of full force can reverse.
 """
 
 import math

@@ -1,12 +1,8 @@
-"""Kinetic stopping insets in one dimension, continuous and sampled.
+"""Kinetic stopping insets in one dimension, for commands that are held between samples.
 
-Source: appendix "Relative degree and kinetic stopping insets" and its footnote 1. A clearance D has relative
-degree two under an acceleration command, so the barrier is the clearance left after braking,
-`h = D - v^2 / (2 a_brake)` with approach speed v. The appendix's caveat is a requirement here: state error,
-hold interval and delay are reserves inside the barrier, so that the guarantee holds between samples too.
-
-`a_brake` is a *validated lower bound* on the deceleration that the actuators can give in every state of the
-declared envelope. It is not checked here; the constraint that uses it says where its bound comes from.
+Source: appendix "Relative degree and kinetic stopping insets" and its footnote 1. The barrier is the clearance left
+after braking, `h = D - v^2 / (2 a_brake)` with approach speed v; state error, hold interval and delay are reserves
+inside it. `a_brake` is a *validated lower bound* on the deceleration and is not checked here.
 """
 
 import numpy as np
@@ -21,17 +17,9 @@ _RETREAT_RATE = 1.0
 def predicted_approach(
     clearance: ArrayLike, speed: ArrayLike, delay_s: float, pending: ArrayLike
 ) -> tuple[Array, Array]:
-    """Clearance and approach speed after a delay with a constant approach acceleration.
+    """Clearance (m) and approach speed (m/s), shape (...) each, after a delay with a constant approach acceleration.
 
-    Args:
-        clearance: m, shape (...).
-        speed: Approach speed, m/s, shape (...).
-        delay_s: s.
-        pending: Approach acceleration during the delay, m/s^2, shape (...): of the commands in flight, or the largest
-            possible one.
-
-    Returns:
-        Clearance, m, and approach speed, m/s, shape (...) each.
+    `pending` is the acceleration in the delay, m/s^2: of the commands in flight, or the largest possible one.
     """
     v = np.asarray(speed, dtype=np.float64)
     a = np.asarray(pending, dtype=np.float64)
@@ -42,11 +30,10 @@ def predicted_approach(
 
 
 def held_stopping_distance(speed: ArrayLike, brake: float, control_dt: float) -> Array:
-    """The shortest stopping distance when every deceleration, at most `brake`, is held for a whole interval.
+    """The shortest stopping distance, m, if every deceleration (m/s^2) is held for a whole interval.
 
-    Full braking for as many holds as needed, the last one just strong enough to end at rest: the chord of
-    `v^2 / (2 a_brake)` between whole multiples of the speed that one hold removes. It exceeds the continuous distance
-    by at most `a_brake hold^2 / 8`, and braking along it never reverses the motion.
+    The chord of `v^2 / (2 a_brake)` between whole multiples of the speed (m/s) that one hold removes. It exceeds the
+    continuous distance by at most `a_brake hold^2 / 8`, and braking along it never reverses the motion.
     """
     loss = brake * control_dt
     holds = np.maximum(np.asarray(speed, dtype=np.float64), 0.0) / loss
@@ -65,13 +52,12 @@ def sampled_acceleration_limit(
     state_error: float = 0.0,
     margin: float = 0.0,
 ) -> Array:
-    """The largest approach acceleration that may be *held* for a whole control interval.
+    """The largest approach acceleration, m/s^2, shape (...), that may be *held* for a whole control interval.
 
-    Over the delay the commands in flight act, over the hold the new one, and from there on held braking must stop
-    the machine inside the room (clearance less reserves): `distance in the hold + held_stopping_distance(v_end) <=
-    room`, solved exactly for v_end. No sampling reserve is needed, and it is valid at standstill. From outside the
-    set the limit is the braking that halts inside the remaining room and, without room, a retreat that shrinks the
-    violation by 1/e in about a second.
+    Over the delay the commands in flight act, over the hold the new one; from there on held braking must stop the
+    machine inside the room (clearance less reserves). From outside the set it is the braking that halts inside the
+    remaining room and, without room, a retreat that shrinks the violation by 1/e in about a second. It is at least
+    `-brake` wherever `sampled_inset` is not negative; below that no admissible command may exist.
 
     Args:
         clearance: Measured clearance D in m, shape (...).
@@ -82,10 +68,6 @@ def sampled_acceleration_limit(
         pending: Approach acceleration of the commands in flight during the delay, m/s^2, shape (...).
         state_error: Bound on the error of the measured clearance, in m.
         margin: Fixed protective distance, in m.
-
-    Returns:
-        Limit in m/s^2, shape (...). It is at least `-brake` wherever `sampled_inset` is not negative; below
-        that no admissible command may exist.
     """
     room0, v = predicted_approach(clearance, speed, delay_s, pending)
     room = room0 - state_error - margin
@@ -114,10 +96,9 @@ def sampled_inset(
     state_error: float = 0.0,
     margin: float = 0.0,
 ) -> Array:
-    """The barrier that `sampled_acceleration_limit` keeps non-negative: room left after delay and held braking.
+    """The barrier that `sampled_acceleration_limit` keeps non-negative: room left after delay and held braking, m.
 
-    Full braking is admissible at every sample where it is not negative, and never makes it smaller. Units of
-    the clearance.
+    Full braking is admissible at every sample where it is not negative, and never makes it smaller.
     """
     room, v = predicted_approach(clearance, speed, delay_s, pending)
     return np.asarray(room - state_error - margin - held_stopping_distance(v, brake, control_dt))

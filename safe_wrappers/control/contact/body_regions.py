@@ -1,20 +1,10 @@
 """What ISO/TS 15066 lets a robot do to each region of the body: permissible forces, and the body's spring and mass.
 
-Source: ISO/TS 15066:2016, Annex A (informative), Tables A.2 (forces) and A.3 (springs and effective masses); ISO
-10218-2:2025 has taken them over. **Written down from memory and compared with secondary sources where there were any
-(springs and masses of most regions), not with the standard's text**: before a machine meets a person, check every
-number that you use against the edition that applies to you. The limits are of pain onset in healthy adults.
-
-What the numbers leave out, and a risk assessment must not: pressure (a sharp edge exceeds it far below these forces),
-where in the region the contact is, repeated contact, and other people than healthy adults.
-
-Two kinds of contact:
-
-- *transient*: the region is free to recoil. The limit is twice the quasi-static one, and the body gives way with its
-  effective mass;
-- *quasi-static*: the region is clamped between the robot and something fixed.
-
-For skull, forehead and face there is no multiple: contact with them is not foreseen (`transient_force` is None).
+Source: ISO/TS 15066:2016, Annex A, Tables A.2 and A.3; ISO 10218-2:2025 has taken them over. **Written down from
+memory and compared with secondary sources where there were any, not with the standard's text**: before a machine
+meets a person, check every number that you use against the edition that applies to you. The limits are of pain onset
+in healthy adults. They leave out pressure (a sharp edge exceeds it far below these forces), the place in the region,
+repeated contact, and other people.
 """
 
 from dataclasses import dataclass
@@ -27,8 +17,8 @@ class BodyRegion:
     """One row of the tables.
 
     Attributes:
-        quasi_static_force: Permissible force while clamped, N.
-        transient_force: Permissible peak force of a free impact, N; None where the standard has none.
+        quasi_static_force: Permissible force while clamped between the robot and something fixed, N.
+        transient_force: Permissible peak force on a region free to recoil, N; None where contact is not foreseen.
         stiffness: Spring constant, N/m (the standard's is in N/mm).
         mass: Effective mass, kg.
     """
@@ -57,7 +47,7 @@ BODY_REGIONS: dict[str, BodyRegion] = {
 
 
 def body_region(name: str) -> BodyRegion:
-    """The row of a region; an unknown name is refused with the list.
+    """The row of a region.
 
     Raises:
         UnknownNameError: No region of that name.

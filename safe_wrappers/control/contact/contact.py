@@ -1,11 +1,7 @@
-"""Unilateral contact: residuals of the complementarity of gap and force.
+"""Contacts: residuals of `gap >= 0`, `force >= 0`, `gap * force = 0` (unilateral contact), and springs in series.
 
-Source: appendix "Rigid Body Contact Mechanics". An ideal contact only pushes, and only when closed:
-
-    gap >= 0,    force >= 0,    gap * force = 0.
-
-Compliant contacts, MuJoCo's among them, violate this by design: their force comes from a penetration (or from a
-margin before the touch). Small residuals do not validate a simulation.
+Source: appendix "Rigid Body Contact Mechanics". Compliant contacts, MuJoCo's among them, violate this by design:
+their force comes from a penetration or a margin. Small residuals do not validate a simulation.
 """
 
 from typing import NamedTuple
@@ -14,18 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.checks import finite_arrays
+from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
 
 
 class ComplementarityResiduals(NamedTuple):
-    """Violations of the three conditions, each shape (...), 0 where they hold.
-
-    Attributes:
-        penetration: Depth, m.
-        tension: Pull, N.
-        product: ``|gap * force|``, N m.
-    """
+    """Violations of the three conditions, each shape (...), 0 where they hold: m, N and N m."""
 
     penetration: Array
     tension: Array
@@ -35,9 +26,44 @@ class ComplementarityResiduals(NamedTuple):
 def complementarity_residuals(gap: ArrayLike, force: ArrayLike) -> ComplementarityResiduals:
     """The residuals of contacts, one by one.
 
-    Args:
-        gap: Signed distance, m, shape (...): negative where the bodies penetrate.
-        force: Normal force, N, shape (...): positive pushes the bodies apart.
+    The gap is a signed distance, m, shape (...), negative where the bodies penetrate; the force is along the normal,
+    N, shape (...), positive where it pushes the bodies apart.
     """
     g, f = finite_arrays(gap=gap, force=force)
     return ComplementarityResiduals(np.maximum(-g, 0.0), np.maximum(-f, 0.0), np.abs(g * f))
+
+
+def series_stiffness(*stiffness: ArrayLike) -> Array:
+    """Stiffness of springs in series, `1 / k = 1/k1 + 1/k2 + ...`, shape (...), N/m.
+
+    Args:
+        *stiffness: One or more, N/m, > 0, shape (...); inf is rigid.
+    """
+    if not stiffness:
+        raise ConfigurationError("series_stiffness needs at least one stiffness")
+    return in_series(*(positive("stiffness", k) for k in stiffness))
+
+
+def positive(name: str, value: ArrayLike) -> Array:
+    """Positive numbers as float64, inf included."""
+    array = number_or_inf(name, value)
+    if not (array > 0.0).all():
+        raise ConfigurationError(f"{name} must be positive, got {array}")
+    return array
+
+
+def number_or_inf(name: str, value: ArrayLike) -> Array:
+    """Numbers as float64, not checked for infinity."""
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ConfigurationError(f"{name} is a number or an array of numbers, got {value!r}") from None
+
+
+def in_series(*parts: Array) -> Array:
+    """`1 / (1/p1 + 1/p2 + ...)`, shape (...); inf for a sum of zero."""
+    total: Array = np.zeros(())
+    for part in parts:
+        total = total + 1.0 / part
+    with np.errstate(divide="ignore"):
+        return np.asarray(1.0 / total)

@@ -5,8 +5,8 @@ Source: appendix "Physical contact feasibility constraints". A force f on the ro
 
     f_n = f . n >= 0    and    |f - f_n n| <= mu f_n.
 
-This is Coulomb's law for a point with one coefficient in every direction. The coefficient is measured with an error,
-changes with the ground, and drops once something slides. Nor does the cone say that a foothold carries the load.
+This is Coulomb's law with one coefficient in every direction, and the coefficient is uncertain. The cone does not say
+that a foothold carries the load.
 """
 
 import math
@@ -24,16 +24,11 @@ _UNIT = 1e-6
 
 
 def normal_and_tangential(forces: ArrayLike, normals: ArrayLike) -> tuple[Array, Array]:
-    """The part of each force along its normal, and the rest.
+    """The part of each force along its normal, shape (...), below 0 where it pulls, and the rest, (..., 3), N.
 
-    Args:
-        forces: On the robot, shape (..., 3), N.
-        normals: Unit normals, pointing at the robot, shape (..., 3).
-
-    Returns:
-        Normal force, shape (...), N, negative where the contact pulls; tangential force, shape (..., 3), N.
+    Forces are on the robot, shape (..., 3), N; unit normals point at the robot, shape (..., 3).
     """
-    f, n = _forces_and_normals(forces, normals)
+    f, n = finite_arrays(forces=forces, normals=_unit(normals))
     along = np.einsum("...i,...i->...", f, n)
     return along, f - along[..., None] * n
 
@@ -71,9 +66,8 @@ def friction_pyramid(
 ) -> Array:
     """Half-spaces inside the friction cone: `rows @ f <= 0` is a pyramid whose edges lie on the cone.
 
-    An inner approximation for any number of edges. Halfway between two edges it allows `cos(pi / edges)` of the
-    friction; it covers the share `sin(2 pi / edges) / (2 pi / edges)` of the cone's cross-section. Four edges: 71 %
-    and 64 %, eight: 92 % and 90 %.
+    An inner approximation: halfway between two edges it allows `cos(pi / edges)` of the friction (four edges: 71 %,
+    eight: 92 %).
 
     Args:
         normals: Unit normals, pointing at the robot, shape (..., 3).
@@ -83,8 +77,7 @@ def friction_pyramid(
             first axis of a contact frame of MuJoCo, the pyramid is MuJoCo's own.
 
     Returns:
-        Shape (..., edges + 1, 3): one row for each side, then `-normal`, which asks that the ground does not pull.
-        (The sides ask for it too, unless mu is 0.)
+        Shape (..., edges + 1, 3): one row for each side, then `-normal`.
     """
     edges = whole_number("edges", edges, 3)
     n, mu = _unit(normals), checked_friction(friction)
@@ -94,11 +87,6 @@ def friction_pyramid(
     slope = mu[..., None, None] * math.cos(math.pi / edges) * n[..., None, :]
     sides = facing @ frame - slope
     return np.concatenate([sides, np.broadcast_to(-n, (*sides.shape[:-2], 3))[..., None, :]], axis=-2)
-
-
-def _forces_and_normals(forces: ArrayLike, normals: ArrayLike) -> tuple[Array, Array]:
-    f, n = finite_arrays(forces=forces, normals=_unit(normals))
-    return f, n
 
 
 def _unit(normals: ArrayLike) -> Array:
@@ -112,11 +100,7 @@ def _unit(normals: ArrayLike) -> Array:
 
 
 def checked_friction(friction: ArrayLike) -> Array:
-    """Friction coefficients as float64.
-
-    Raises:
-        ConfigurationError: For a coefficient that is negative or not finite.
-    """
+    """Friction coefficients as float64, finite and at least 0."""
     mu = finite_array("friction", friction)
     if not (mu >= 0.0).all():
         raise ConfigurationError(f"friction must be 0 or more, got {mu}")

@@ -1,12 +1,9 @@
 """Covariance of an estimate without measurements: exact steps of time, and the time until a tolerance is reached.
 
 The system is linear, x' = A x + b + w, with white noise of the *intensity* Q (covariance kernel Q delta(t - s)), in
-units of x^2 / s. Without measurements the covariance P follows the Lyapunov equation P' = A P + P A' + Q. Matrix
-exponentials over short times are exact; longer times are put together by doubling, which stays positive semidefinite
-and does not overflow where the covariance itself does not.
-
-Growth may be bounded, linear, polynomial or exponential, and need not be monotonic. Covariance alone bounds no error:
-how much probability lies outside k sigma depends on the tail (`safe_wrappers.appendix.estimation.sigma_coverage`).
+units of x^2 / s. Without measurements the covariance follows the Lyapunov equation P' = A P + P A' + Q. Its growth
+need not be monotonic. Covariance alone bounds no error: how much probability lies outside k sigma depends on the tail
+(`safe_wrappers.appendix.estimation.sigma_coverage`).
 
 Source: appendix "Continuous covariance propagation and observability"; Van Loan (1978) for the discretisation.
 """
@@ -17,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.checks import finite_array
-from safe_wrappers.control.estimation.first_crossing import first_crossing
 from safe_wrappers.control.numerics.block_exponentials import Discrete, integral, van_loan
 from safe_wrappers.errors import ConfigurationError
 
@@ -29,22 +25,17 @@ _GOAL = 1e-12
 """Relative reserve below the tolerance, so that rounding never makes a time late."""
 _LARGEST = 1e60
 """Larger tolerances are replaced by this one, so that the covariance does not overflow before it is reached."""
+_ORDER = 12
+"""Terms of the Taylor series: at the longest window the remainder is 1e-5 of the rate's norm times the window."""
+_RESOLUTION = 1e-9
+"""Relative to the time: the search ends where no longer window is free."""
 
 
 def checked_covariance(name: str, matrix: ArrayLike, n: int | None = None) -> Array:
-    """A covariance or a noise intensity as float64: symmetric and positive semidefinite.
-
-    Args:
-        name: What the error calls it.
-        matrix: Shape (..., n, n).
-        n: Its size, if that is given.
-
-    Returns:
-        The matrix, its rounding-sized asymmetry removed, shape (..., n, n).
+    """A covariance or a noise intensity as float64, shape (..., n, n), rounding-sized asymmetry removed.
 
     Raises:
-        ConfigurationError: Not a finite square matrix of this size, not symmetric, or with a negative eigenvalue; it
-            names the matrix and says by how much.
+        ConfigurationError: Not a finite square matrix (of size n, if given), not symmetric, or a negative eigenvalue.
     """
     symmetric, smallest, largest = _symmetric(name, matrix, n)
     if smallest < -_SYMMETRY * largest:
@@ -55,11 +46,7 @@ def checked_covariance(name: str, matrix: ArrayLike, n: int | None = None) -> Ar
 
 
 def checked_noise(name: str, matrix: ArrayLike, n: int | None = None) -> Array:
-    """As `checked_covariance`, but positive definite: no measurement is exact.
-
-    Raises:
-        ConfigurationError: As there, and for a singular matrix.
-    """
+    """As `checked_covariance`, but positive definite: no measurement is exact."""
     symmetric, smallest, largest = _symmetric(name, matrix, n)
     if not smallest > 1e-14 * largest:
         raise ConfigurationError(
@@ -70,15 +57,12 @@ def checked_noise(name: str, matrix: ArrayLike, n: int | None = None) -> Array:
 
 
 def discretise(A: ArrayLike, Q: ArrayLike, time_s: ArrayLike) -> Discrete:
-    """The exact step over a time, by Van Loan's block exponential and doubling.
+    """The exact step over a time: transition and noise, shape (..., n, n) each; identity and zero for time 0.
 
     Args:
         A: System matrix, 1/s, shape (n, n).
         Q: Intensity of the process noise, positive semidefinite, shape (n, n).
         time_s: s, at least 0, shape (...).
-
-    Returns:
-        Transition and noise, shape (..., n, n) each; identity and zero for time 0.
 
     Raises:
         ConfigurationError: Bad matrices, a negative time, or a growth that leaves the range of floats.
@@ -91,15 +75,12 @@ def discretise(A: ArrayLike, Q: ArrayLike, time_s: ArrayLike) -> Discrete:
 
 
 def discretise_drift(A: ArrayLike, b: ArrayLike, time_s: ArrayLike) -> Array:
-    """Displacement by a constant drift: the integral of `exp(A s) b` over a time, exact for singular A too.
+    """Displacement by a constant drift, the integral of `exp(A s) b` over a time, shape (k..., ..., n).
 
     Args:
         A: System matrix, 1/s, shape (n, n).
         b: Drift of x' = A x + b, shape (..., n).
         time_s: s, at least 0, shape (k...).
-
-    Returns:
-        Displacement to add to `exp(A t) x`, shape (k..., ..., n).
 
     Raises:
         ConfigurationError: Bad matrices, a negative time, or a growth that leaves the range of floats.
@@ -127,25 +108,20 @@ def blind_time(
     sigmas: float,
     horizon_s: float,
 ) -> float:
-    """The first time without measurements at which `sigmas` standard deviations reach a tolerance.
+    """The first time without measurements, s, at which `sigmas` standard deviations reach a tolerance; never late.
 
-    Growth need not be monotonic (an oscillator's is not), so the search proceeds by windows, each shown to be below
-    the tolerance by a Taylor series with its remainder. The time returned is never late.
+    0 if the tolerance is reached already; inf if it is not reached within the horizon. Growth need not be monotonic,
+    so the search proceeds by windows, each shown to be below the tolerance.
 
     Args:
         P0: Covariance when the sensor was lost, shape (n, n).
         A: System matrix, 1/s, shape (n, n).
         Q: Intensity of the process noise, shape (n, n).
-        direction: D, the direction(s) of the state in which the error matters, shape (n,) or (m, n). For several,
-            the largest standard deviation over all unit combinations of them: the square root of the largest
-            eigenvalue of D P D'.
+        direction: D, the direction(s) of the state in which the error matters, shape (n,) or (m, n). For several, the
+            largest standard deviation over all unit combinations of them.
         tolerance: In the units of D x, > 0.
         sigmas: k, > 0; choose it with `safe_wrappers.appendix.estimation.sigma_coverage.sigmas_for`.
         horizon_s: How far to look, s, at least 0.
-
-    Returns:
-        s; `k sigma <= tolerance` holds up to it. 0 if the tolerance is reached already; inf if it is not reached
-        within the horizon.
 
     Raises:
         ConfigurationError: Bad matrices, or a tolerance, k or horizon that is not finite or has the wrong sign.
@@ -163,7 +139,91 @@ def blind_time(
             raise ConfigurationError(f"{name} must be finite and above 0, got {value!r}")
     horizon = float(checked_times(horizon_s, "horizon_s"))
     goal = min(float(tolerance) / float(sigmas), _LARGEST) ** 2 * (1.0 - _GOAL)
-    return first_crossing(start, a, q, rows, goal, horizon)
+    return _first_crossing(start, a, q, rows, goal, horizon)
+
+
+def _first_crossing(P0: Array, a: Array, q: Array, rows: Array, goal: float, horizon: float) -> float:
+    """The time up to which the largest eigenvalue of `D P(t) D'` stays below a goal; inf if up to the horizon.
+
+    Each window is shown to be free by the better of two estimates from the rate X = dP/dt, which obeys X' = A X + X
+    A': the Taylor series of the variance with its remainder (tight, for windows up to 1 over the norm of A), or the
+    growth by the positive part of the rate alone (for windows of any length).
+    """
+    if _largest_variance(rows, P0) >= goal:
+        return 0.0
+    # The remainder is bounded by norms, which are tightest in balanced coordinates.
+    from scipy.linalg import matrix_balance  # here: SciPy takes a while to import
+
+    a, scales = matrix_balance(a, permute=False)
+    inverse = np.linalg.inv(scales)
+    P0, q, rows = inverse @ P0 @ inverse.T, inverse @ q @ inverse.T, rows @ scales
+    speed, length = float(np.linalg.norm(a, 2)), float(np.linalg.norm(rows, 2))
+    time = 0.0
+    while True:
+        step = van_loan(a, q, np.asarray(time))
+        now = step.transition @ P0 @ step.transition.T + step.noise
+        rate = derivative = _rate(now, a) + q
+        curve = [0.0, 0.0]
+        for order in range(2, _ORDER + 1):
+            derivative = _rate(derivative, a)
+            curve.append(max(0.0, _largest_variance(rows, derivative)) / math.factorial(order))
+        # |exp(A s) X exp(A s)'| <= e^2 |X| while |A| s <= 1.
+        rest = math.exp(2.0) * length**2 * float(np.linalg.norm(_rate(derivative, a), 2))
+        curve.append(rest / math.factorial(_ORDER + 1))
+        room = horizon - time
+        longest = room if rest == 0.0 else min(room, 1.0 / speed)
+        free = _free_by_series(rows @ now @ rows.T, rows @ rate @ rows.T, curve, goal, longest)
+        if free == longest < room:
+            free = _free_by_rise(rows @ now @ rows.T, rate, a, rows, goal, longest, room)
+        if free == room:
+            return math.inf
+        if free <= _RESOLUTION * (time + free):
+            return time
+        time += free
+
+
+def _largest_variance(rows: Array, covariance: Array) -> float:
+    """Largest eigenvalue of `D P D'`: of D x, over all unit combinations of its entries."""
+    return float(np.linalg.eigvalsh(rows @ covariance @ rows.T)[-1])
+
+
+def _free_by_series(value: Array, slope: Array, curve: list[float], goal: float, longest: float) -> float:
+    """The longest window in which `value + slope t + sum of curve[k] t^k` stays below the goal, as `value` does."""
+
+    def peak(time: float) -> float:
+        # The largest eigenvalue of value + slope t is convex in t: over a window it is largest at an end.
+        bound = 0.0
+        for factor in reversed(curve):
+            bound = bound * time + factor
+        return bound + float(np.linalg.eigvalsh(value + time * slope)[-1])
+
+    if peak(longest) < goal:
+        return longest
+    free, crossed = 0.0, longest
+    while crossed - free > 1e-6 * crossed:
+        middle = 0.5 * (free + crossed)
+        free, crossed = (middle, crossed) if peak(middle) < goal else (free, middle)
+    return free
+
+
+def _free_by_rise(
+    value: Array, rate: Array, a: Array, rows: Array, goal: float, shortest: float, room: float
+) -> float:
+    """A window, of at least the shortest, in which the positive part of the rate alone stays below the goal."""
+    signs, vectors = np.linalg.eigh(rate)
+    rising = (vectors * np.maximum(signs, 0.0)) @ vectors.T
+    windows = np.minimum(shortest * 4.0 ** np.arange(1, 11), room)
+    free = shortest
+    for window, rise in zip(windows, van_loan(a, rising, windows).noise, strict=True):
+        if not (np.isfinite(rise).all() and np.linalg.eigvalsh(value + rows @ rise @ rows.T)[-1] < goal):
+            break
+        free = float(window)
+    return free
+
+
+def _rate(covariance: Array, a: Array) -> Array:
+    flow = a @ covariance
+    return np.asarray(flow + flow.T)
 
 
 def _symmetric(name: str, matrix: ArrayLike, n: int | None) -> tuple[Array, float, float]:
@@ -185,11 +245,7 @@ def _symmetric(name: str, matrix: ArrayLike, n: int | None) -> tuple[Array, floa
 
 
 def checked_square(name: str, matrix: ArrayLike) -> Array:
-    """A finite square matrix as float64, shape (n, n).
-
-    Raises:
-        ConfigurationError: For any other; it names the matrix.
-    """
+    """A finite square matrix as float64, shape (n, n)."""
     given = finite_array(name, matrix)
     if given.ndim != 2 or given.shape[0] != given.shape[1] or given.size == 0:
         raise ConfigurationError(f"{name} must be a square matrix, got shape {given.shape}")
@@ -197,21 +253,13 @@ def checked_square(name: str, matrix: ArrayLike) -> Array:
 
 
 def checked_system(A: ArrayLike, Q: ArrayLike) -> tuple[Array, Array]:
-    """A and Q as float64, shape (n, n) each, Q symmetric and positive semidefinite.
-
-    Raises:
-        ConfigurationError: For any other.
-    """
+    """A and Q as float64, shape (n, n) each, Q symmetric and positive semidefinite."""
     a = checked_square("A", A)
     return a, checked_covariance("Q", checked_square("Q", Q), len(a))
 
 
 def checked_times(time_s: ArrayLike, name: str = "time_s") -> Array:
-    """Finite times of at least 0 s as float64, shape (...).
-
-    Raises:
-        ConfigurationError: For any other.
-    """
+    """Finite times of at least 0 s as float64, shape (...)."""
     times = finite_array(name, time_s)
     if (times < 0.0).any():
         raise ConfigurationError(f"{name} must be at least 0 s, got {time_s!r}: time does not run backwards")
@@ -219,11 +267,7 @@ def checked_times(time_s: ArrayLike, name: str = "time_s") -> Array:
 
 
 def refuse_overflow(times: Array, *results: Array) -> None:
-    """Refuse results that are not finite.
-
-    Raises:
-        ConfigurationError: It gives the longest of the times.
-    """
+    """Refuse results that are not finite."""
     if not all(np.isfinite(result).all() for result in results):
         raise ConfigurationError(
             f"within time_s = {np.max(times):.6g} s an unstable mode of A grows beyond the range of floats"

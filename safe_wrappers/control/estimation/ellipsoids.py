@@ -27,33 +27,26 @@ _MOST_STEPS = 100
 
 
 def ellipsoid_gap(offset: Array, shape: Array) -> tuple[Array, Array]:
-    """Signed distances of points to ellipsoids, and the unit normals along which they grow.
+    """Signed distances (n,), m, of points to ellipsoids, and the unit normals (n, d) along which they grow.
 
     The ellipsoid is {S^(1/2) u : |u| <= 1}, filled. S may be singular or zero: then it is flat, a segment or a point,
-    which has no inside. The signed distance is the largest of `n @ offset - sqrt(n @ S @ n)` over unit vectors n, so
-    any n bounds it from below, and what is returned is that expression at the normal returned: outside, the Euclidean
-    distance and the direction from the nearest point of the set to the point; inside, minus the distance to the
-    boundary and the shortest way out (one of them where several are equally short); on a flat set, zero and a normal
-    across it.
+    which has no inside. The signed distance is the largest of `n @ offset - sqrt(n @ S @ n)` over unit vectors n;
+    what is returned is that expression at the normal returned. Outside it is the Euclidean distance, inside minus the
+    distance to the boundary.
 
     The distance is never overestimated, save by rounding (1e-15 of the lengths involved). It is underestimated by at
-    most 5e-8 of the longest half-axis, and that only for a shape that is (nearly) singular and not diagonal: its
-    width, the root of an eigenvalue, is lost in rounding and taken at its largest.
+    most 5e-8 of the longest half-axis, and that only for a shape that is (nearly) singular and not diagonal.
 
-    The normal comes from the secular equation in the eigenbasis, by Newton's method on its inverse root, which
-    approaches from one side without overshooting (Moré and Sorensen, Computing a trust region step, 1983). Plain
-    floats: for the few obstacles of a control step they are faster than arrays.
+    Source: Moré and Sorensen, Computing a trust region step (1983), for Newton's method on the secular equation.
+    Plain floats: for the few obstacles of a control step they are faster than arrays.
 
     Args:
         offset: Point minus centre, shape (n, d), m; d is 2 or 3.
         shape: S, symmetric positive semidefinite, shape (n, d, d), m²: for k sigma of a covariance P it is k² P.
 
-    Returns:
-        Distances, shape (n,), m, and unit normals, shape (n, d).
-
     Raises:
-        ConfigurationError: Other shapes, numbers that are not finite, or an S that is not symmetric or has a negative
-            eigenvalue.
+        ConfigurationError: Other shapes, numbers that are not finite, an S that is not symmetric positive
+            semidefinite.
     """
     d = _dimension(offset, shape)
     squares, bases = np.linalg.eigh(shape)

@@ -1,10 +1,8 @@
 """The sampled Kalman filter for many tracks at once.
 
-It runs at every step of an env and checks nothing. Check the matrices once, beforehand, with
-`safe_wrappers.control.estimation.covariance.checked_covariance` and `checked_noise`; take `transition` and `noise`
-from its `discretise`, so that steps of any length agree with the model in continuous time.
-
-The update has Joseph's form: symmetric and positive semidefinite for any gain, rounding included.
+It runs at every step and checks nothing: check the matrices once with `checked_covariance` and `checked_noise` of
+`safe_wrappers.control.estimation.covariance`; take `transition` and `noise` from its `discretise`. The update has
+Joseph's form: symmetric and positive semidefinite for any gain, rounding included.
 
 Source: Kalman (1960); Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001),
 section 5.2. The consistency test: `safe_wrappers.appendix.estimation.consistency`.
@@ -19,13 +17,9 @@ Array = NDArray[np.float64]
 
 
 class Updated(NamedTuple):
-    """State of the filter after a measurement.
+    """Mean (..., n) and covariance (..., n, n) after a measurement, innovation (..., m) and its covariance.
 
-    Attributes:
-        mean: Estimate after it, shape (..., n).
-        cov: Its covariance, shape (..., n, n).
-        innovation: Measured minus expected measurement, shape (..., m).
-        innovation_cov: Covariance of the innovation, shape (..., m, m).
+    The innovation is the measured minus the expected measurement.
     """
 
     mean: Array
@@ -37,7 +31,7 @@ class Updated(NamedTuple):
 def predict(
     mean: Array, cov: Array, transition: Array, noise: Array, drift: Array | None = None
 ) -> tuple[Array, Array]:
-    """One step without a measurement: `x -> F x + d`, `P -> F P F' + Q_d`.
+    """Mean and covariance after one step without a measurement: `x -> F x + d`, `P -> F P F' + Q_d`.
 
     Args:
         mean: Estimate, shape (..., n).
@@ -45,9 +39,6 @@ def predict(
         transition: F, shape (n, n), or one per track.
         noise: Q_d, shape (n, n), or one per track.
         drift: d, known displacement in this step, shape (n,) or (..., n); None for none.
-
-    Returns:
-        mean, shape (..., n), and cov, shape (..., n, n).
     """
     moved = (transition @ mean[..., None])[..., 0]
     if drift is not None:

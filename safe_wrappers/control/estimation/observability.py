@@ -1,15 +1,13 @@
 """Observability: which directions of a state outputs determine, named in the user's own state names.
 
-A direction in which two states give the same outputs for ever is one that no filter resolves: an initial error there
-develops as if nothing were measured. The result is structural: about ideal outputs, without noise. Full rank says
-that the state can be determined (near this state if the system is nonlinear), not how accurately or how soon;
-`condition` gives a hint. A missing direction needs another sensor, a motion that excites it, or a restricted task.
+An initial error in an unobservable direction never shows in the outputs, so no filter corrects it. The result is
+structural: about ideal outputs, without noise. Full rank says that the state can be determined, not how accurately or
+how soon.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,130 +29,61 @@ _NEGLIGIBLE = 1e-8
 _PIVOT = 0.1
 
 
-@dataclass(frozen=True, eq=False)
-class Observability:
-    """Which directions of a state the outputs determine.
+class Scaled(NamedTuple):
+    """A dimensionless system: states in `units`, time in `time_s`, rows of C of length one."""
 
-    Attributes:
-        rank: Number of independent observable directions.
-        singular_values: Of the scaled observability matrix, largest first, shape (n,).
-        gap: Factor by which the tolerance could be larger, or smaller, without a change of rank. Below about 10 the
-            rank depends on the choice of tolerance.
-        unobservable: Orthonormal basis of the unobservable directions, shape (n, n - rank).
-        names: The same subspace as readable combinations of the states, one for each direction: where it is spanned
-            by single states, these.
-    """
-
-    rank: int
-    singular_values: Array
-    gap: float
-    unobservable: Array
-    names: tuple[str, ...]
-
-    @property
-    def observable(self) -> bool:
-        """Whether the rank is full."""
-        return not self.names
-
-    @property
-    def condition(self) -> float:
-        """Largest singular value over the smallest nonzero one; infinite for rank 0.
-
-        A large one says that some direction shows weakly in the outputs, or late. Free of units, after scaling.
-        """
-        smallest = self.singular_values[self.rank - 1] if self.rank else 0.0
-        return float(self.singular_values[0] / smallest) if smallest > 0.0 else math.inf
+    a: Array
+    c: Array
+    units: Array
+    time_s: float
 
 
-@dataclass(frozen=True, eq=False)
-class LinearObservability(Observability):
-    """Observability of x' = A x, y = C x, at every state and over any interval of time.
-
-    Attributes:
-        time_scale_s: Time by which A was multiplied to be free of units, s.
-        unobservable_modes: Eigenvalues of A on the unobservable directions, 1/s, shape (n - rank,): an error there
-            decays by itself if their real parts are negative.
-    """
-
-    time_scale_s: float
-    unobservable_modes: NDArray[np.complex128]
-
-    @property
-    def detectable(self) -> bool:
-        """Whether unobservable errors decay by themselves."""
-        return bool((self.unobservable_modes.real < 0.0).all())
-
-
-def observability_matrix(A: ArrayLike, C: ArrayLike) -> Array:
-    """C, C A, ..., C A^(n-1), stacked.
-
-    Args:
-        A: Shape (n, n), 1/s.
-        C: Shape (m, n).
-
-    Returns:
-        Shape (m n, n), without any scaling: for hand calculations. Take the rank from `linear_observability`.
-
-    Raises:
-        ConfigurationError: Other shapes, or numbers that are not finite.
-    """
-    a, c = checked_system(A, C)
-    blocks = [c]
-    for _ in range(len(a) - 1):
-        blocks.append(blocks[-1] @ a)
-    return np.concatenate(blocks)
-
-
-def linear_observability(
-    A: ArrayLike, C: ArrayLike, names: Sequence[str] | None = None, tolerance: float | None = None
-) -> LinearObservability:
-    """Observability of x' = A x from the outputs C x.
-
-    The unobservable subspace is found as the largest one in the kernel of C that A maps into itself, by orthogonal
-    projections; powers of A would lose precision where fast and slow modes mix. Units are removed first: states are
-    scaled so that their couplings are about equally strong, A is divided by its norm and each row of C by its own.
+def unobservable_directions(
+    A: ArrayLike, C: ArrayLike, names: Sequence[str] | None = None
+) -> tuple[str, ...]:
+    """The states' combinations that no output C x of x' = A x shows, one for each unobservable direction.
 
     Args:
         A: Shape (n, n), 1/s.
         C: Shape (m, n); a row of zeros measures nothing.
         names: Of the n states; x0, x1, ... if not given.
-        tolerance: Singular values up to this count as zero, in scaled units; `TOLERANCE` if not given.
 
     Raises:
         ConfigurationError: Other shapes, numbers that are not finite, or names that are not one for each state.
 
     >>> # A position that is measured, and a bias on a velocity that is not:
-    >>> A = [[0, 1, 1], [0, 0, 0], [0, 0, 0]]
-    >>> linear_observability(A, [[1, 0, 0]], names=("x", "v", "bias")).names
+    >>> unobservable_directions([[0, 1, 1], [0, 0, 0], [0, 0, 0]], [[1, 0, 0]], names=("x", "v", "bias"))
     ('v - bias',)
     """
     a, c = checked_system(A, C)
-    known = state_names(names, len(a))
-    tolerance = checked_tolerance(tolerance)
-    scaled = scale_system(a, c)
-    values = np.linalg.svd(observability_matrix(scaled.a, scaled.c), compute_uv=False)
-    hidden, gap = _hidden(scaled.a, scaled.c, tolerance)
-    basis, _ = np.linalg.qr(scaled.units[:, None] * hidden)
-    return LinearObservability(
-        rank=len(a) - basis.shape[1],
-        singular_values=padded(values, len(a)),
-        gap=gap,
-        unobservable=basis,
-        names=described_subspace(basis, known),
-        time_scale_s=scaled.time_s,
-        unobservable_modes=np.linalg.eigvals(basis.T @ a @ basis).astype(np.complex128),
-    )
+    basis, _ = unobservable_subspace(scale_system(a, c), TOLERANCE)
+    return described_subspace(basis, state_names(names, len(a)))
+
+
+def unobservable_subspace(scaled: Scaled, tolerance: float) -> tuple[Array, float]:
+    """Orthonormal basis of the unobservable directions in the states' own units, and the tolerance's gap.
+
+    The largest subspace in the kernel of C that A maps into itself, by orthogonal projections; powers of A would lose
+    precision where fast and slow modes mix.
+    """
+    basis, seen = np.eye(len(scaled.a)), scaled.c
+    gap = math.inf
+    while basis.shape[1]:
+        _, values, axes = np.linalg.svd(seen @ basis if seen is scaled.c else seen)
+        rank = int((values > tolerance).sum())
+        gap = min(gap, tolerance_gap(values, tolerance))
+        if rank == 0:
+            break
+        basis = basis @ axes[rank:].T
+        moved = scaled.a @ basis
+        seen = moved - basis @ (basis.T @ moved)
+    return np.linalg.qr(scaled.units[:, None] * basis)[0], gap
 
 
 def described(direction: ArrayLike, names: Sequence[str]) -> str:
-    """A direction in state space as a readable combination: "p_x - p_y", "0.8 x + 0.6 y".
+    """A direction (n,) in state space as a readable combination of the n states: "p_x - p_y", "0.8 x + 0.6 y".
 
-    Coefficients of equal size are left out, and those below 1e-8 of the largest; as a direction has no sign, the
-    first one is positive.
-
-    Args:
-        direction: Shape (n,), not zero.
-        names: Of the n states.
+    Coefficients of equal size are left out, and those below 1e-8 of the largest; the first one is positive.
 
     Raises:
         ConfigurationError: Names that are not one for each state, a direction that is zero or not finite.
@@ -177,15 +106,7 @@ def described(direction: ArrayLike, names: Sequence[str]) -> str:
 
 
 def described_subspace(basis: Array, names: Sequence[str]) -> tuple[str, ...]:
-    """A readable basis of a subspace: row-reduced, so single states appear as such.
-
-    Args:
-        basis: Columns that span it, independent, shape (n, k).
-        names: Of the n states.
-
-    Returns:
-        One combination for each of the k directions, each with the coefficient 1 for a state of its own.
-    """
+    """A readable, row-reduced basis of the subspace that independent columns, shape (n, k), span."""
     rows = basis.T.copy()
     pivots: list[int] = []
     for i in range(len(rows)):
@@ -201,31 +122,21 @@ def described_subspace(basis: Array, names: Sequence[str]) -> tuple[str, ...]:
     return tuple(described(rows[i], names) for i in np.argsort(pivots))
 
 
-class _Scaled(NamedTuple):
-    """A dimensionless system: states in `units`, time in `time_s`, rows of C of length one."""
-
-    a: Array
-    c: Array
-    units: Array
-    time_s: float
-
-
-def scale_system(a: Array, c: Array) -> _Scaled:
-    """The system without units, see `linear_observability`."""
+def scale_system(a: Array, c: Array) -> Scaled:
+    """The system without units, states scaled so that their couplings are about equally strong."""
     units = _units(a, c)
     a = a * units / units[:, None]
     c = c * units
     rate = max(float(np.linalg.norm(a, 2)), 1.0 / LONGEST_TIME_SCALE_S)
     lengths = np.linalg.norm(c, axis=1, keepdims=True)
-    return _Scaled(a / rate, c / np.where(lengths > 0.0, lengths, 1.0), units, 1.0 / rate)
+    return Scaled(a / rate, c / np.where(lengths > 0.0, lengths, 1.0), units, 1.0 / rate)
 
 
 def _units(a: Array, c: Array) -> Array:
     """Units of the states, shape (n,), powers of two, in which all couplings between states are about equal.
 
     Least squares of the entries' logarithms (Curtis and Reid, On the automatic scaling of matrices for Gaussian
-    elimination, 1972), with a time scale and a gain for each output free. Unlike LAPACK's balancing it also scales
-    chains without feedback.
+    elimination, 1972), with a time scale and a gain for each output free. It also scales chains without feedback.
     """
     n, m = len(a), len(c)
     couplings = _logarithms(a - np.diag(np.diag(a)), np.abs(a).max())
@@ -248,22 +159,6 @@ def _logarithms(matrix: Array, largest: float) -> list[tuple[tuple[int, int], fl
     return [((int(i), int(j)), float(np.log2(sizes[i, j]))) for i, j in places]
 
 
-def _hidden(a: Array, c: Array, tolerance: float) -> tuple[Array, float]:
-    """Orthonormal basis of the largest subspace in the kernel of C that A maps into itself, and the gap."""
-    basis, seen = np.eye(len(a)), c
-    gap = math.inf
-    while basis.shape[1]:
-        _, values, axes = np.linalg.svd(seen @ basis if seen is c else seen)
-        rank = int((values > tolerance).sum())
-        gap = min(gap, tolerance_gap(values, tolerance))
-        if rank == 0:
-            break
-        basis = basis @ axes[rank:].T
-        moved = a @ basis
-        seen = moved - basis @ (basis.T @ moved)
-    return basis, gap
-
-
 def tolerance_gap(values: Array, tolerance: float) -> float:
     """Factor by which the tolerance could be larger or smaller with the same number of values above it."""
     kept, dropped = values[values > tolerance], values[values <= tolerance]
@@ -272,19 +167,8 @@ def tolerance_gap(values: Array, tolerance: float) -> float:
     return float(min(kept.min(initial=math.inf) / tolerance, below))
 
 
-def padded(values: NDArray[np.floating[Any]], n: int) -> Array:
-    """The first n values, zeros where there are fewer, shape (n,)."""
-    result = np.zeros(n)
-    result[: len(values)] = values[:n]
-    return result
-
-
 def checked_system(A: ArrayLike, C: ArrayLike) -> tuple[Array, Array]:
-    """A (n, n) and C (m, n) as float64.
-
-    Raises:
-        ConfigurationError: Other shapes, or numbers that are not finite.
-    """
+    """A (n, n) and C (m, n) as float64."""
     a, c = finite_array("A", A), finite_array("C", C)
     if a.ndim != 2 or a.shape[0] != a.shape[1] or a.size == 0:
         raise ConfigurationError(f"A must be square, of shape (n, n), got {a.shape}")
@@ -296,11 +180,7 @@ def checked_system(A: ArrayLike, C: ArrayLike) -> tuple[Array, Array]:
 
 
 def checked_vector(x: ArrayLike) -> Array:
-    """A finite vector as float64, shape (n,), n > 0.
-
-    Raises:
-        ConfigurationError: For any other.
-    """
+    """A finite vector as float64, shape (n,), n > 0."""
     vector = finite_array("x", x)
     if vector.ndim != 1 or vector.size == 0:
         raise ConfigurationError(f"expected a vector, of shape (n,), got shape {vector.shape}")
@@ -308,11 +188,7 @@ def checked_vector(x: ArrayLike) -> Array:
 
 
 def state_names(names: Sequence[str] | None, n: int) -> tuple[str, ...]:
-    """The names of n states; x0, x1, ... for None.
-
-    Raises:
-        ConfigurationError: Names that are not one for each state.
-    """
+    """The names of n states; x0, x1, ... for None."""
     if names is None:
         return tuple(f"x{i}" for i in range(n))
     if isinstance(names, str) or len(names) != n or len(set(names)) != n:
@@ -321,11 +197,7 @@ def state_names(names: Sequence[str] | None, n: int) -> tuple[str, ...]:
 
 
 def checked_tolerance(tolerance: float | None) -> float:
-    """The tolerance, or `TOLERANCE` for None.
-
-    Raises:
-        ConfigurationError: For one outside (0, 1).
-    """
+    """The tolerance, between 0 and 1, or `TOLERANCE` for None."""
     if tolerance is None:
         return TOLERANCE
     if not 0.0 < tolerance < 1.0:

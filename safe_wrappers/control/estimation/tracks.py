@@ -2,12 +2,10 @@
 
 Each track has the state (position, velocity), of one, two or three coordinates each, with
 
-    p' = v,    v' = (mean_velocity - v) / reversion_s + w,    E[w(t) w(s)'] = q delta(t - s):
+    p' = v,    v' = (mean_velocity - v) / reversion_s + w,    E[w(t) w(s)'] = q delta(t - s).
 
-a double integrator driven by white acceleration noise (`reversion_s` infinite), or one whose velocity reverts to its
-mean. Between measurements the covariance follows the Lyapunov equation, exactly; a measurement is a Kalman update. A
-covariance alone bounds nothing: the coverage of k standard deviations depends on the tail and on the model
-(`safe_wrappers.appendix.estimation.sigma_coverage`).
+Between measurements the covariance follows the Lyapunov equation, exactly; a measurement is a Kalman update. The
+coverage of k standard deviations depends on the tail (`safe_wrappers.appendix.estimation.sigma_coverage`).
 
 Source: appendix "Continuous Lyapunov and Riccati covariance dynamics".
 """
@@ -118,29 +116,20 @@ class Tracks:
         self.mean[which], self.covariance[which] = updated.mean, updated.cov
 
     def ahead(self, times_s: Sequence[float]) -> tuple[Array, Array]:
-        """Predicted positions and their covariances at several times ahead, without measurements until then.
-
-        Returns:
-            Shapes (k, n, d), m, and (k, n, d, d), m^2.
-        """
-        over = self._ahead(tuple(times_s))
+        """Positions (k, n, d), m, and covariances (k, n, d, d), m^2, at k times ahead without measurements."""
+        key, d = tuple(times_s), self.coordinates
+        over = self._stacked.get(key)
+        if over is None:
+            overs = [self._over(time_s) for time_s in key]
+            over = _Over(
+                np.stack([each.transition[:, :d] for each in overs]),
+                np.stack([each.drift[:, :d] for each in overs]),
+                np.stack([each.noise[:, :d, :d] for each in overs]),
+            )
+            _keep(self._stacked, key, over)
         positions = (over.transition @ self.mean[:, :, None])[..., 0] + over.drift
         spread = over.transition @ self.covariance @ over.transition.swapaxes(-1, -2)
         return positions, spread + over.noise
-
-    def _ahead(self, times_s: tuple[float, ...]) -> _Over:
-        """The rows of positions, over several times at once."""
-        stacked = self._stacked.get(times_s)
-        if stacked is None:
-            d = self.coordinates
-            overs = [self._over(time_s) for time_s in times_s]
-            stacked = _Over(
-                np.stack([over.transition[:, :d] for over in overs]),
-                np.stack([over.drift[:, :d] for over in overs]),
-                np.stack([over.noise[:, :d, :d] for over in overs]),
-            )
-            _keep(self._stacked, times_s, stacked)
-        return stacked
 
     def _over(self, time_s: float) -> _Over:
         over = self._single.get(time_s)
@@ -158,7 +147,7 @@ class Tracks:
 
 
 def _keep(kept: dict[Any, _Over], key: Any, over: _Over) -> None:
-    """Cache, at most `_KEPT` entries: in an env whose steps all differ in length none is used twice."""
+    """Cache at most `_KEPT` entries."""
     if len(kept) >= _KEPT:
         kept.clear()
     kept[key] = over

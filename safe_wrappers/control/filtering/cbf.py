@@ -1,9 +1,9 @@
 """Barrier conditions on a control: Lie derivatives, class-K decay, relative degree.
 
-Source: appendix "Safety and Control Barrier Functions" (Lie derivatives and forward invariance; Nagumo's
-viability theorem). A barrier `h` is positive inside the safe set. For `x' = f(x) + g(x) u` the condition
-`Lf h + Lg h u >= -alpha(h)` is sufficient, in continuous time, for a barrier of relative degree one, and only
-while some admissible control satisfies it; `control/backup/stopping.py` has the forms that hold between samples.
+Source: appendix "Safety and Control Barrier Functions". A barrier `h` is positive inside the safe set. For `x' = f(x)
++ g(x) u` the condition `Lf h + Lg h u >= -alpha(h)` is sufficient, in continuous time, for a barrier of relative
+degree one, and only while some admissible control satisfies it; `control/backup/stopping.py` has the forms that hold
+between samples.
 """
 
 from collections.abc import Callable
@@ -15,20 +15,15 @@ Array = NDArray[np.float64]
 
 
 def lie_derivatives(gradient: ArrayLike, f: ArrayLike, g: ArrayLike) -> tuple[Array, Array]:
-    """Split `h'` into drift and control effectiveness.
+    """Split `h'` into drift `Lf h`, shape (...), and control effectiveness `Lg h`, shape (..., m).
 
     Args:
         gradient: dh/dx, shape (..., n).
         f: Drift x' at zero control, shape (..., n), state units per second.
         g: Control matrix, shape (..., n, m), state units per second per control unit.
-
-    Returns:
-        `Lf h` of shape (...) and `Lg h` of shape (..., m).
     """
     dh, drift, effect = (np.asarray(part, dtype=np.float64) for part in (gradient, f, g))
-    if (
-        dh.ndim == drift.ndim == 1 and effect.ndim == 2
-    ):  # a single state, as in the filter: half the time of einsum
+    if dh.ndim == drift.ndim == 1 and effect.ndim == 2:  # half the time of einsum
         return np.asarray(dh @ drift), np.asarray(dh @ effect)
     return np.einsum("...n,...n->...", dh, drift), np.einsum("...n,...nm->...m", dh, effect)
 
@@ -39,19 +34,12 @@ def linear_decay(h: ArrayLike, alpha: float) -> Array:
 
 
 def cbf_rows(lf_h: ArrayLike, lg_h: ArrayLike, decay: ArrayLike) -> tuple[Array, Array]:
-    """The barrier condition as half-spaces `normals @ u <= offsets`.
+    """The barrier condition as half-spaces `normals @ u <= offsets`: `-Lg h`, shape (..., m), and `Lf h + alpha(h)`.
 
-    Args:
-        lf_h: Drift of h, shape (...).
-        lg_h: Control effectiveness on h, shape (..., m).
-        decay: alpha(h), shape (...).
-
-    Returns:
-        Normals `-Lg h` (..., m) and offsets `Lf h + alpha(h)` (...).
+    `lf_h` and `decay`, alpha(h), are of shape (...), `lg_h` of shape (..., m).
     """
-    return -np.asarray(lg_h, dtype=np.float64), np.asarray(lf_h, dtype=np.float64) + np.asarray(
-        decay, dtype=np.float64
-    )
+    lf, lg, alpha = (np.asarray(part, dtype=np.float64) for part in (lf_h, lg_h, decay))
+    return -lg, lf + alpha
 
 
 def numerical_gradient(h: Callable[[Array], float], x: ArrayLike, step: float = 1e-6) -> Array:
@@ -68,13 +56,10 @@ def numerical_gradient(h: Callable[[Array], float], x: ArrayLike, step: float = 
 
 
 def acts(gradient: Array, effect: Array, height: float, share: float) -> bool:
-    """Whether some control enters the derivative of a function, up to a relative tolerance.
+    """Whether some control enters the derivative of a function, up to the relative tolerance `share`.
 
-    Args:
-        gradient: Of the function, shape (n,).
-        effect: Control matrix g, shape (n, m).
-        height: The function's value. A gradient below a hundredth of it may be round-off of finite differences.
-        share: Relative tolerance.
+    The gradient has shape (n,), the effect g shape (n, m). A gradient below a hundredth of the function's value
+    `height` may be round-off of finite differences.
     """
     size = max(float(np.abs(gradient).max(initial=0.0)), 1e-2 * abs(height))
     return bool((np.abs(gradient @ effect) > share * size * np.abs(effect).max(axis=0, initial=0.0)).any())
@@ -88,15 +73,11 @@ def relative_degree(
     max_degree: int = 3,
     tolerance: float = 1e-6,
 ) -> int | None:
-    """The number of time derivatives of h until the control appears, at one state.
+    """The number of time derivatives of h until the control appears, at one state; None if it is above `max_degree`.
 
-    Lie derivatives are nested central differences, so the test is numerical: `tolerance` is relative to the
-    sizes of h (its gradient, or a hundredth of its value, whichever is larger) and of each control's column of g, and
-    each level widens the step to keep round-off below it. Neither the unit of h nor that of a control matters; states
-    should be of order one.
-
-    Returns:
-        1, 2, ... up to `max_degree`, or None if the control appears in none of them.
+    Lie derivatives are nested central differences, so the test is numerical: `tolerance` is relative to the sizes of
+    h and of each control's column of g, and each level widens the step. Units of h and of controls do not matter;
+    states should be of order one.
     """
     point = np.asarray(x, dtype=np.float64)
     effect = np.asarray(g(point), dtype=np.float64)

@@ -1,22 +1,18 @@
 """Manipulability: distance of a pose from a singularity of its task, and the joint rates needed near it.
 
 Source: appendix "Forward kinematics and singularities", and its footnote 3 (Yoshikawa's measure). For a task Jacobian
-J of shape (m, n), twist = J @ joint rates, `w = sqrt(det(J J'))` is the product of J's singular values: the volume of
-the velocity ellipsoid up to a constant of m. w = 0 is rank loss. Limits of w:
+J of shape (m, n), twist = J @ joint rates, `w = sqrt(det(J J'))` is the product of J's singular values. w = 0 is rank
+loss.
 
-* **w does not bound the smallest singular value**, and so no joint rate: an ellipsoid of the same volume may be long
-  and thin. A threshold on w has to be validated for the machine (`validated_threshold`).
-* Near rank loss an inverse-kinematics command can exceed the limits of rate and torque: actuators saturate, and the
-  tool leaves its path.
-* **Units.** Rows of translation (m/rad for a hinge) and of rotation (rad/rad) do not add up. A task that has both
-  needs a length that weighs rotations (`task_rows`), and w depends on it by a constant factor,
-  length^rotations, which moves no singularity. Singular values, condition and axes of the ellipsoid do change.
-  A joint that slides beside one that turns mixes units in the columns likewise.
-* **Frames.** w of all six rows is the same in each frame, because the adjoint has determinant 1
-  (`safe_wrappers.appendix.filtering.manipulability.reframed`). w of some rows and singular values are not.
+* **w does not bound the smallest singular value**, and so no joint rate. A threshold on w has to be validated for the
+  machine (`validated_threshold`).
+* Rows of translation (m/rad for a hinge) and of rotation (rad/rad) do not add up. A task that has both needs a length
+  that weighs rotations (`task_rows`); w depends on it by a constant factor. A joint that slides beside one that turns
+  mixes units in the columns likewise.
+* w of all six rows is the same in each frame (`safe_wrappers.appendix.filtering.manipulability.reframed`). w of some
+  rows and singular values are not.
 
-Arrays have leading batch axes (...). Jacobians are of shape (..., m, n); what is not finite raises
-`ConfigurationError`.
+Jacobians are of shape (..., m, n); what is not finite raises `ConfigurationError`.
 """
 
 from dataclasses import dataclass
@@ -30,20 +26,14 @@ from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
 
-_EPSILON = float(np.finfo(np.float64).eps)
+EPSILON = float(np.finfo(np.float64).eps)
 
 
 def manipulability(jacobian: ArrayLike) -> Array:
-    """`w = sqrt(det(J J'))`, shape (...), never below zero; exactly zero where rows depend on each other.
+    """`w = sqrt(det(J J'))`, shape (...), never below zero; exactly zero where rows depend on each other, or n < m.
 
-    By a QR factorisation of J', as accurate as an SVD in a quarter of the time. The determinant of `J J'` itself
-    would square the condition, and be negative near rank loss.
-
-    Args:
-        jacobian: Shape (..., m, n). With fewer joints than task directions w is zero everywhere.
-
-    Returns:
-        In (m/s)^m per (rad/s)^m for m translations and hinges.
+    By a QR factorisation of J', as accurate as an SVD in a quarter of the time. In (m/s)^m per (rad/s)^m for m
+    translations and hinges.
     """
     j = checked_jacobian(jacobian)
     m, n = j.shape[-2:]
@@ -51,44 +41,8 @@ def manipulability(jacobian: ArrayLike) -> Array:
         return np.zeros(j.shape[:-2])
     diagonal = np.abs(np.diagonal(np.linalg.qr(np.swapaxes(j, -1, -2), mode="r"), axis1=-2, axis2=-1))
     # A dependent row leaves rounding on the diagonal, in proportion to its own length.
-    noise = n * _EPSILON * np.linalg.norm(j, axis=-1)
+    noise = n * EPSILON * np.linalg.norm(j, axis=-1)
     return np.asarray(np.prod(np.where(diagonal > noise, diagonal, 0.0), axis=-1))
-
-
-@dataclass(frozen=True, slots=True)
-class VelocityEllipsoid:
-    """The twists that joint rates of norm 1 reach: semi-axes of an ellipsoid in task space.
-
-    Attributes:
-        axes: Unit vectors as columns, the longest first, shape (..., m, m).
-        lengths: Of the semi-axes, task speed per joint rate: J's singular values, with zeros where there are fewer
-            joints than directions, shape (..., m).
-    """
-
-    axes: Array
-    lengths: Array
-
-    @property
-    def smallest(self) -> Array:
-        """The smallest singular value, shape (...): the speed in the worst direction per joint rate."""
-        return np.asarray(self.lengths[..., -1])
-
-    @property
-    def condition(self) -> Array:
-        """Longest over shortest, shape (...), >= 1; inf at rank loss, and for a Jacobian of zeros."""
-        longest, shortest = self.lengths[..., 0], self.lengths[..., -1]
-        lost = shortest <= self.lengths.shape[-1] * _EPSILON * longest
-        return np.asarray(np.where(lost, np.inf, longest / np.where(lost, 1.0, shortest)))
-
-
-def velocity_ellipsoid(jacobian: ArrayLike) -> VelocityEllipsoid:
-    """Axes and lengths of the velocity ellipsoid of a Jacobian of shape (..., m, n), by SVD."""
-    j = checked_jacobian(jacobian)
-    m, n = j.shape[-2:]
-    axes, lengths, _ = np.linalg.svd(j, full_matrices=True)
-    if n < m:
-        lengths = np.concatenate([lengths, np.zeros((*lengths.shape[:-1], m - n))], axis=-1)
-    return VelocityEllipsoid(axes, lengths)
 
 
 def manipulability_gradient(jacobian: ArrayLike, derivative: ArrayLike) -> Array:
@@ -115,14 +69,12 @@ def manipulability_gradient(jacobian: ArrayLike, derivative: ArrayLike) -> Array
 
 
 def chain_derivative(linear: ArrayLike, angular: ArrayLike) -> Array:
-    """dJ/dq of a chain of hinges and slides, from its own Jacobian alone: shape (..., n, 6, n).
+    """dJ/dq of a chain of hinges and slides, from its own Jacobian alone: shape (..., n, 6, n), exact.
 
-    `out[..., k, :, j]` is the derivative of column j by joint k: `w_k x column` for joints k before j, whose motion
-    carries joint j along, else `w_j x v_k`, by the motion of the tip. Exact.
+    `out[..., k, :, j]` is the derivative of column j by joint k.
 
     Args:
-        linear: Velocity of the tip per joint, shape (..., 3, n), in fixed axes; joints in their order
-            from the base.
+        linear: Velocity of the tip per joint, shape (..., 3, n), in fixed axes; joints in their order from the base.
         angular: Angular velocity of the last link per joint, likewise; zeros for slides.
     """
     v, w = finite_arrays(linear=linear, angular=angular)
@@ -139,13 +91,11 @@ def chain_derivative(linear: ArrayLike, angular: ArrayLike) -> Array:
 
 
 def worst_joint_rates(jacobian: ArrayLike) -> Array:
-    """The largest rate of each joint for any twist of norm 1, shape (..., n); inf at rank loss.
-
-    The norm of the joint's row of the pseudo-inverse. None of them exceeds `1 / smallest singular value`, which is
-    the largest norm of all rates together.
-    """
+    """The largest rate of each joint for any twist of norm 1, shape (..., n); inf at rank loss."""
     j = checked_jacobian(jacobian)
-    lost = np.isinf(velocity_ellipsoid(j).condition)
+    m, n = j.shape[-2:]
+    _, lengths, _ = np.linalg.svd(j)
+    lost = (lengths[..., -1] <= m * EPSILON * lengths[..., 0]) | (n < m)
     return np.asarray(np.where(lost[..., None], np.inf, np.linalg.norm(pseudo_inverse(j), axis=-1)))
 
 
@@ -153,8 +103,8 @@ def task_rows(directions: str, rotations: str, length: float | None) -> tuple[ND
     """Which of a twist's six rows a task is about, shape (m,), and what they are multiplied by, shape (m,).
 
     Raises:
-        ConfigurationError: Other letters than x, y, z, one of them twice, none at all; translations and rotations
-            together without a length, or a length without both.
+        ConfigurationError: Letters other than x, y, z, or repeated; none at all; translations and rotations together
+            without a length, or a length without both.
     """
     for name, given in (("directions", directions), ("rotations", rotations)):
         if not (isinstance(given, str) and set(given) <= set("xyz") and len(set(given)) == len(given)):
@@ -182,8 +132,8 @@ class ValidatedThreshold:
     """A threshold on w, validated on a sample of configurations.
 
     Attributes:
-        threshold: No sampled configuration with w above it needs more than the rate limit. The smallest such number;
-            the smallest w that was sampled if none needs more.
+        threshold: The smallest number above which no sampled w needs more than the rate limit; the smallest sampled w
+            if none needs more.
         samples: Number of configurations.
         above: Number with a w above the threshold.
         exceeding: Number that need more than the limit, all at or below the threshold.
@@ -197,9 +147,7 @@ class ValidatedThreshold:
     def unseen(self, confidence: float = 0.95) -> float:
         """Upper bound on the share of configurations above the threshold that exceed the limit.
 
-        Holds with that confidence for independent samples of the distribution that configurations have in use: with a
-        larger share, all samples would miss it with a probability of at most `(1 - share)^samples`. It does not hold
-        for configurations chosen by an adversary.
+        Holds with that confidence for independent samples of the distribution in use, not for an adversary's choice.
         """
         if not 0.0 < confidence < 1.0:
             raise ConfigurationError(f"confidence is between 0 and 1, got {confidence!r}")
@@ -210,7 +158,7 @@ def validated_threshold(jacobians: ArrayLike, task_speed: float, rate_limit: Arr
     """The smallest threshold on w above which no sampled configuration needs more than the joints' rate limit.
 
     It holds for the samples, this task speed, direction weighting, frame and joint selection, and controllers that
-    invert J by least norm; torques are not considered. `ValidatedThreshold.unseen` bounds the rest statistically.
+    invert J by least norm. `ValidatedThreshold.unseen` bounds the rest statistically.
 
     Args:
         jacobians: Task Jacobians of sampled configurations, shape (samples, m, n).
@@ -245,15 +193,11 @@ def validated_threshold(jacobians: ArrayLike, task_speed: float, rate_limit: Arr
 
 def pseudo_inverse(jacobian: Array) -> Array:
     """Pseudo-inverse of a Jacobian (..., m, n), shape (..., n, m)."""
-    return np.asarray(np.linalg.pinv(jacobian, rcond=max(jacobian.shape[-2:]) * _EPSILON))
+    return np.asarray(np.linalg.pinv(jacobian, rcond=max(jacobian.shape[-2:]) * EPSILON))
 
 
 def checked_jacobian(value: ArrayLike) -> Array:
-    """A finite Jacobian as float64, shape (..., m, n).
-
-    Raises:
-        ConfigurationError: For another shape, or numbers that are not finite.
-    """
+    """A finite Jacobian as float64, shape (..., m, n)."""
     j = finite_array("jacobian", value)
     if j.ndim < 2 or 0 in j.shape[-2:]:
         raise ConfigurationError(f"a Jacobian has the shape (..., directions, joints), got {j.shape}")

@@ -1,10 +1,9 @@
 """The seam between two streams of held commands: the blend from one into the other.
 
-A stream is a policy's commands for the next control steps, shape (n, m): one per step, in action units.
-Source: appendix "Smooth Trajectories and Bumpless Transfer". Its bounds are for continuous commands; here the
-commands are held between samples, so that what is bounded is the difference of neighbours: with `rate_limit` in
-action units per second no two neighbours differ by more than `rate_limit * control_dt`. The mean of a rate over a
-step is at most its peak, so a blend that keeps the continuous bound keeps this one too.
+A stream is a policy's commands for the next control steps, shape (n, m): one per step, in action units. With
+`rate_limit` in action units per second no two neighbours differ by more than `rate_limit * control_dt`.
+
+Source: appendix "Smooth Trajectories and Bumpless Transfer", whose bounds are for continuous commands.
 """
 
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.control.handover.smoothstep import smoothstep
-from safe_wrappers.control.handover.splines import evaluate, hermite, quintic_coefficients
+from safe_wrappers.control.handover.splines import hermite_at, quintic_coefficients, value
 
 Array = NDArray[np.float64]
 
@@ -32,9 +31,8 @@ class Seam:
 
     Attributes:
         plan: The commands from the seam on, shape (n, m): the blend, then the new stream bit for bit.
-        steps: Control steps of the blend: the first `steps` commands are mixed. 0: the new stream at once.
-        limited: Which commands were rate-limited in addition to the blend, shape (n,): the new stream is too short
-            for a blend that keeps the limit, or exceeds it by itself.
+        steps: Control steps of the blend: the first `steps` commands are mixed.
+        limited: Which commands were rate-limited in addition to the blend, shape (n,).
     """
 
     plan: Array
@@ -56,14 +54,11 @@ def join(
 ) -> Seam:
     """The shortest blend from what was sent into a new stream that keeps the rate limit.
 
-    "smoothstep" mixes the two streams with the weight `smoothstep((i + 1) / (n + 1))` at step i of n. The remainder
-    of the prior stream is used if it lasts for the whole blend; otherwise the last command is held.
-    "quintic" and "hermite" need no prior: they bridge from the last command to the new stream with matching first
-    (hermite) and second (quintic) derivatives at both ends, from differences of the commands; a bridge that leaves
-    the box is clipped.
-
+    "smoothstep" mixes the two streams; the remainder of the prior stream is used if it lasts for the whole blend,
+    otherwise the last command is held. "quintic" and "hermite" bridge from the last command to the new stream with
+    matching first (hermite) and second (quintic) derivatives at both ends; a bridge that leaves the box is clipped.
     If no blend that ends inside the new stream keeps the limit, the one that exceeds it least is rate-limited step by
-    step: the limit holds, and the commands lag behind.
+    step.
 
     Args:
         sent: The latest commands, oldest first, shape (k, m), k >= 0; with none there is no seam.
@@ -99,14 +94,10 @@ def join(
 
 
 def limit_rate(commands: Array, before: Array | None, step: Array | float) -> tuple[Array, NDArray[np.bool_]]:
-    """Limit the difference of neighbouring commands to `step`; returns them and which were changed.
+    """Limit the difference of neighbouring commands, shape (n, m), to `step`; returns them and which were changed.
 
-    Commands within the limit are returned bit for bit.
-
-    Args:
-        commands: Shape (n, m).
-        before: The command before the first, shape (m,), or None.
-        step: Largest difference of neighbours, action units, a number or shape (m,); may be infinite.
+    The step is in action units, a number or shape (m,), and may be infinite; `before` is the command before the
+    first, shape (m,), or None. Commands within the limit are returned bit for bit.
     """
     limited = np.zeros(len(commands), dtype=bool)
     whole = commands if before is None else np.concatenate([before[None], commands])
@@ -122,10 +113,7 @@ def limit_rate(commands: Array, before: Array | None, step: Array | float) -> tu
 
 
 def _peaks(candidates: Array, before: Array, first: int, step: Array) -> Array:
-    """The largest difference inside each blend, in units of the largest allowed one, shape (c,).
-
-    From the last command to the first one that is not mixed any more.
-    """
+    """The largest difference inside each blend, in units of the largest allowed one, shape (c,)."""
     start = np.broadcast_to(before, (len(candidates), 1, before.size))
     steps = (np.abs(np.diff(np.concatenate([start, candidates], axis=1), axis=1)) / step).max(axis=2)
     mixed = np.arange(steps.shape[1]) <= first + np.arange(len(candidates))[:, None]
@@ -147,21 +135,15 @@ def _weights(first: int, longest: int) -> Array:
 
 @lru_cache(maxsize=256)
 def _basis(order: int, first: int, longest: int) -> Array:
-    """Contribution of each boundary value of a bridge of unit duration at every step, (c, longest + 1, 2 order).
-
-    Order 2: value and rate at the start, value and rate at the end (hermite). Order 3: with the second derivatives.
-    """
+    """Contribution of each boundary value of a bridge of unit duration at every step, (c, longest + 1, 2 order)."""
     unit = np.eye(2 * order)
-    basis = []
-    for n in range(first, longest + 1):
-        s = _phases(n, longest)
-        bridge = (
-            hermite(unit[0], unit[1], unit[2], unit[3], 1.0, s)
-            if order == 2
-            else evaluate(quintic_coefficients(unit[0], unit[1], unit[2], unit[3], unit[4], unit[5], 1.0), s)
-        )
-        basis.append(bridge.T)
-    weights = np.array(basis)
+    phases = np.array([_phases(n, longest) for n in range(first, longest + 1)])[:, :, None]
+    if order == 2:
+        q0, v0, q1, v1 = unit
+        weights = hermite_at((q0, v0, q1, v1), np.ones(()), phases, 0)
+    else:
+        q0, v0, a0, q1, v1, a1 = unit
+        weights = value(quintic_coefficients(q0, v0, a0, q1, v1, a1, 1.0), phases)
     weights.flags.writeable = False
     return weights
 
@@ -177,10 +159,7 @@ def _mixed(sent: Array, prior: Array, new: Array, first: int) -> Array:
 
 
 def _bridged(sent: Array, new: Array, blend: Blend, first: int) -> Array:
-    """Every candidate bridge, shape (c, n, m); from its end on the new stream.
-
-    Derivatives are per control step: a bridge of n steps lasts n + 1 of them.
-    """
+    """Every candidate bridge, shape (c, n, m). Derivatives are per control step: n steps last n + 1 of them."""
     n = len(new)
     ends = np.arange(first, n)
     order = 2 if blend == "hermite" else 3

@@ -1,8 +1,7 @@
 """Bumpless transfer: the smoothstep, and the shortest blend of two commands that a rate limit allows.
 
-Everything is element by element, with NumPy's broadcasting. The blended quantity u is any command; the limit
-bounds its time derivative, in units of u per second. Only where u is a commanded acceleration is that derivative
-the commanded jerk. It bounds the command, not the plant's response.
+Element by element, with NumPy's broadcasting. The limit bounds the time derivative of a command u, in units of u per
+second, not the plant's response.
 
 Source: appendix "Bumpless transfer and smoothstep blending".
 """
@@ -23,11 +22,7 @@ ROUND_UP = 1.0 + 1e-12
 
 
 def check_positive(name: str, values: Array) -> None:
-    """Refuse values that are not all > 0.
-
-    Raises:
-        ConfigurationError: It names the argument.
-    """
+    """Refuse values that are not all > 0."""
     if not (values > 0.0).all():
         raise ConfigurationError(f"{name} must be > 0, got {values}")
 
@@ -35,15 +30,9 @@ def check_positive(name: str, values: Array) -> None:
 def smoothstep(s: ArrayLike, derivative: int = 0) -> Array:
     """alpha(s) = 6 s^5 - 15 s^4 + 10 s^3 for s in [0, 1], 0 before it and 1 after it; or its derivative by s.
 
-    The clamped function is twice continuously differentiable on the whole line: alpha' and alpha'' vanish at both
-    ends.
-
     Args:
         s: Normalised time, any shape.
         derivative: 0, 1 or 2.
-
-    Raises:
-        ConfigurationError: For another derivative.
     """
     s = np.clip(np.asarray(s, dtype=np.float64), 0.0, 1.0)
     if derivative == 0:
@@ -58,10 +47,9 @@ def smoothstep(s: ArrayLike, derivative: int = 0) -> Array:
 
 
 def shortest_latched_blend(step: ArrayLike, rate_limit: ArrayLike) -> Array:
-    """Shortest blend time in s between two constant commands: 1.875 |step| / rate_limit.
+    """Shortest blend time in s between two constant commands: 1.875 |step| / rate_limit, rounded up.
 
-    Holds for fixed endpoints only; for moving ones see
-    `safe_wrappers.appendix.handover.blends.shortest_moving_blend`. Rounded up in the twelfth digit; 0 without a step.
+    For moving endpoints see `safe_wrappers.appendix.handover.blends.shortest_moving_blend`.
 
     Raises:
         ConfigurationError: For a limit that is not positive, or input that is not finite.

@@ -1,13 +1,10 @@
 """Quintic and cubic Hermite segments in closed form.
 
-Boundary values have any shape (...) that broadcasts; the duration is in s, > 0, and broadcasts with them. Times
-of evaluation are common to the whole batch, and their axes come last: times of shape (k,) give (..., k), one time
-gives (...). Positions in any unit q, velocities in q/s, and so on.
-
-A quintic matches position, velocity and acceleration at both ends, so joined segments have no acceleration step.
-Between the ends, check `interior_extrema` and `peak_torque` against the machine's limits. A cubic Hermite spline is
-continuously differentiable only once: the torque steps at every knot (`knot_torque_step`). These three functions are
-in `safe_wrappers.appendix.handover.splines`.
+Boundary values have any shape (...) that broadcasts, the duration (s, > 0) among them. Times of evaluation are common
+to the whole batch, and their axes come last. Positions in any unit q, velocities in q/s, and so on. A quintic matches
+position, velocity and acceleration at both ends; a cubic Hermite spline steps in acceleration at every knot. Neither
+keeps limits between its ends: see `interior_extrema`, `peak_torque` and `knot_torque_step` in
+`safe_wrappers.appendix.handover.splines`.
 
 Source: appendix "Smooth Trajectories and Bumpless Transfer".
 """
@@ -16,18 +13,30 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.checks import finite_arrays
-from safe_wrappers.control.numerics.polynomials import differentiate, value
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
 
 
-def positive_duration(duration: ArrayLike) -> Array:
-    """Durations in s as float64, finite and > 0.
+def differentiate(coefficients: ArrayLike, times: int = 1) -> Array:
+    """Coefficients of the derivative; a constant's is the constant 0."""
+    c = np.asarray(coefficients, dtype=np.float64)
+    for _ in range(times):
+        c = c[..., 1:] * np.arange(1, c.shape[-1]) if c.shape[-1] > 1 else np.zeros_like(c)
+    return c
 
-    Raises:
-        ConfigurationError: For any other.
-    """
+
+def value(coefficients: Array, x: ArrayLike) -> Array:
+    """The polynomials at x, which broadcasts with the batch axes (Horner's scheme)."""
+    x = np.asarray(x, dtype=np.float64)
+    total = coefficients[..., -1] + 0.0 * x
+    for power in range(coefficients.shape[-1] - 2, -1, -1):
+        total = total * x + coefficients[..., power]
+    return np.asarray(total)
+
+
+def positive_duration(duration: ArrayLike) -> Array:
+    """Durations in s as float64, finite and > 0."""
     try:
         span = np.asarray(duration, dtype=np.float64)
     except (TypeError, ValueError):
@@ -35,11 +44,6 @@ def positive_duration(duration: ArrayLike) -> Array:
     if not (np.isfinite(span).all() and (span > 0.0).all()):
         raise ConfigurationError(f"duration is a time in seconds, > 0 and finite; got {span}")
     return span
-
-
-def _boundary(duration: ArrayLike, **values: ArrayLike) -> tuple[Array, list[Array]]:
-    span, *arrays = finite_arrays(duration=positive_duration(duration), **values)
-    return span, arrays
 
 
 def quintic_coefficients(
@@ -51,50 +55,22 @@ def quintic_coefficients(
     a1: ArrayLike,
     duration: ArrayLike,
 ) -> Array:
-    """Coefficients (..., 6), lowest power of t first, of the quintic through two states of q, q', q''.
+    """Coefficients (..., 6), lowest power of t first, of the quintic through two states.
 
-    Args:
-        q0: Position at t = 0, shape (...).
-        v0: Velocity at t = 0.
-        a0: Acceleration at t = 0.
-        q1: Position at t = duration.
-        v1: Velocity at t = duration.
-        a1: Acceleration at t = duration.
-        duration: T in s, > 0.
+    Position q, velocity v and acceleration a, shape (...), at t = 0 (q0, v0, a0) and at t = duration (q1, v1, a1), in
+    s, > 0.
 
     Raises:
-        ConfigurationError: For a duration that is not positive, values that are not finite, or shapes that do
-            not broadcast.
+        ConfigurationError: A duration that is not positive, values that are not finite, shapes that do not broadcast.
     """
-    span, (q0, v0, a0, q1, v1, a1) = _boundary(duration, q0=q0, v0=v0, a0=a0, q1=q1, v1=v1, a1=a1)
+    span, q0, v0, a0, q1, v1, a1 = finite_arrays(
+        duration=positive_duration(duration), q0=q0, v0=v0, a0=a0, q1=q1, v1=v1, a1=a1
+    )
     way, half = q1 - q0, 0.5 * span**2
     c3 = (10.0 * way - (6.0 * v0 + 4.0 * v1) * span - (3.0 * a0 - a1) * half) / span**3
     c4 = (-15.0 * way + (8.0 * v0 + 7.0 * v1) * span + (3.0 * a0 - 2.0 * a1) * half) / span**4
     c5 = (6.0 * way - 3.0 * (v0 + v1) * span - (a0 - a1) * half) / span**5
     return np.stack([q0, v0, 0.5 * a0, c3, c4, c5], axis=-1)
-
-
-def evaluate(coefficients: ArrayLike, t: ArrayLike, derivative: int = 0) -> Array:
-    """A segment, or its derivative of any order, at times t in s from its start.
-
-    Times outside [0, T] are not clamped.
-
-    Args:
-        coefficients: Shape (..., n), lowest power first.
-        t: Times common to the batch, shape () or (k,).
-        derivative: 0 for position, 1 velocity, 2 acceleration, 3 jerk.
-
-    Returns:
-        Shape (...) for one time, (..., k) for k.
-
-    Raises:
-        ConfigurationError: For a derivative that is not an integer >= 0.
-    """
-    if not isinstance(derivative, int | np.integer) or derivative < 0:
-        raise ConfigurationError(f"derivative is an integer >= 0, got {derivative!r}")
-    at = np.asarray(t, dtype=np.float64)
-    c = differentiate(coefficients, int(derivative))
-    return value(c.reshape((*c.shape[:-1], *[1] * at.ndim, c.shape[-1])), at)
 
 
 _HERMITE = np.array(
@@ -104,46 +80,13 @@ _HERMITE = np.array(
 
 
 def hermite_at(ends: tuple[Array, Array, Array, Array], span: Array, since: Array, derivative: int) -> Array:
-    """All arguments broadcast: the state (q0, v0, q1, v1), the duration, and the time since the start."""
+    """The cubic of a state (q0, v0, q1, v1) over a duration, `since` its start, or its derivative; all broadcast."""
     if derivative not in (0, 1, 2, 3):
         raise ConfigurationError(f"derivative of a cubic is 0, 1, 2 or 3, got {derivative!r}")
     h00, h10, h01, h11 = (value(c, since / span) for c in differentiate(_HERMITE, derivative))
     q0, v0, q1, v1 = ends
     scaled = h00 * q0 + h01 * q1 + span * (h10 * v0 + h11 * v1)
     return np.asarray(scaled / span**derivative)
-
-
-def hermite(
-    q0: ArrayLike,
-    v0: ArrayLike,
-    q1: ArrayLike,
-    v1: ArrayLike,
-    duration: ArrayLike,
-    t: ArrayLike,
-    derivative: int = 0,
-) -> Array:
-    """The cubic through two positions with two velocities, at times t in s from its start, not clamped.
-
-    Args:
-        q0: Position at t = 0, shape (...).
-        v0: Velocity at t = 0.
-        q1: Position at t = duration.
-        v1: Velocity at t = duration.
-        duration: T in s, > 0.
-        t: Times common to the batch, shape () or (k,).
-        derivative: By time: 0 for position, 1 velocity, 2 acceleration, 3 jerk.
-
-    Returns:
-        Shape (...) for one time, (..., k) for k.
-
-    Raises:
-        ConfigurationError: For a duration that is not positive, values that are not finite, shapes that do not
-            broadcast, or another derivative.
-    """
-    span, (q0, v0, q1, v1) = _boundary(duration, q0=q0, v0=v0, q1=q1, v1=v1)
-    at = np.asarray(t, dtype=np.float64)
-    q0, v0, q1, v1, span = (x.reshape((*x.shape, *[1] * at.ndim)) for x in (q0, v0, q1, v1, span))
-    return hermite_at((q0, v0, q1, v1), span, at, derivative)
 
 
 def checked_samples(
@@ -173,11 +116,10 @@ def checked_samples(
 def hermite_series(
     times: ArrayLike, positions: ArrayLike, velocities: ArrayLike, at: ArrayLike, derivative: int = 0
 ) -> Array:
-    """Samples interpolated at other times, for example 30 Hz frames at the ticks of a 1 kHz loop.
+    """Samples interpolated at other times, shape (...) for one time, (..., m) for m.
 
-    Every pair of neighbouring samples is joined by a cubic, so position and velocity are continuous; acceleration
-    is not, and at a knot it is that of the following segment (of the last one at the end). A value between two
-    samples needs the later one, so a real-time loop is late by up to one sample interval.
+    Neighbouring samples are joined by a cubic, so position and velocity are continuous; acceleration at a knot is
+    that of the following segment. A value between two samples needs the later one.
 
     Args:
         times: Sample times in s, strictly rising, evenly spaced or not, shape (k,).
@@ -186,12 +128,8 @@ def hermite_series(
         at: Times, shape () or (m,), within the samples.
         derivative: By time: 0 for position, 1 velocity, 2 acceleration, 3 jerk.
 
-    Returns:
-        Shape (...) for one time, (..., m) for m.
-
     Raises:
-        ConfigurationError: For times that do not rise, shapes that do not fit, values that are not finite, or
-            times before the first or after the last sample.
+        ConfigurationError: As `checked_samples`, and for times before the first or after the last sample.
     """
     knots, q, v = checked_samples(times, positions, velocities)
     asked = np.asarray(at, dtype=np.float64)

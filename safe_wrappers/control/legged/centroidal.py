@@ -4,12 +4,9 @@ Source: appendix "Centroidal momentum dynamics". Only forces from outside change
 
     d(h_lin)/dt = m c'' = sum f_k + m g,    d(h_ang)/dt = sum [(p_k - c) x f_k + tau_k].
 
-Conventions, of everything here: vectors are in the world's axes; forces and moments are those on the robot;
-`h_lin = m c'`; `h_ang` is about the (moving) centre of mass, so that gravity does not appear in its rate; where both
-are stacked, the linear part comes first (Orin and Goswami put the angular part first).
-
-The momentum's rate is the external wrench that a motion needs. Whether contacts (`friction_cone`) and motors
-(`whole_body`) can produce it has to be checked separately; a model of the linear part alone mispredicts the moments.
+Vectors are in the world's axes; forces and moments are those on the robot; `h_lin = m c'`; `h_ang` is about the
+moving centre of mass; where both are stacked, the linear part comes first (Orin and Goswami put the angular part
+first).
 """
 
 from typing import NamedTuple
@@ -24,14 +21,9 @@ Array = NDArray[np.float64]
 
 
 class CentroidalMomentum(NamedTuple):
-    """Momentum of several bodies.
+    """Momentum of several bodies: mass (...), kg; centre of mass and its velocity (..., 3), m and m/s.
 
-    Attributes:
-        mass: Shape (...), kg.
-        com: Centre of mass, shape (..., 3), m.
-        com_velocity: Shape (..., 3), m/s.
-        linear: `mass * com_velocity`, shape (..., 3), kg m/s.
-        angular: About the centre of mass, shape (..., 3), kg m^2/s.
+    `linear` is `mass * com_velocity`, kg m/s, `angular` is about the centre of mass, kg m^2/s; shape (..., 3).
     """
 
     mass: Array
@@ -68,11 +60,7 @@ def centroidal_momentum(
 
 
 def checked_masses(masses: ArrayLike, positions: ArrayLike) -> tuple[Array, Array, Array, Array]:
-    """Masses (..., n), their sum (...), positions (..., n, 3), centre of mass (..., 3).
-
-    Raises:
-        ConfigurationError: Other shapes, negative or only zero masses, numbers that are not finite.
-    """
+    """Masses (..., n), at least 0, their positive sum (...), positions (..., n, 3), centre of mass (..., 3)."""
     m, p = finite_array("masses", masses), finite_array("positions", positions)
     if m.ndim == 0 or p.ndim < 2 or p.shape[-1] != 3 or p.shape[-2] != m.shape[-1]:
         raise ConfigurationError(
@@ -85,11 +73,7 @@ def checked_masses(masses: ArrayLike, positions: ArrayLike) -> tuple[Array, Arra
 
 
 def checked_inertias(inertias: ArrayLike) -> Array:
-    """Inertias as float64, shape (..., n, 3, 3).
-
-    Raises:
-        ConfigurationError: Another shape, or numbers that are not finite.
-    """
+    """Inertias as float64, shape (..., n, 3, 3)."""
     inertia = finite_array("inertias", inertias)
     if inertia.ndim < 3 or inertia.shape[-2:] != (3, 3):
         raise ConfigurationError(f"inertias must have shape (..., n, 3, 3), got {inertia.shape}")

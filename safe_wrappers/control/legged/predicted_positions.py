@@ -1,11 +1,8 @@
 """Bounds on joint accelerations that keep positions within their ranges until the end of a control step.
 
 Source: appendix "Hierarchical whole-body control quadratic program", its caveat: a bound at the present position does
-not cover the motion between samples. With a constant acceleration the position is a parabola, and the largest
-acceleration that keeps it below a limit has a closed form.
-
-It is a bound for one step. Choose the horizon no shorter than stopping takes, or a later step may find no sufficient
-torque. Real accelerations are not constant over a step; contacts, above all, change them.
+not cover the motion between samples. The acceleration is taken as constant over the step; contacts, above all, change
+it. Choose the horizon no shorter than stopping takes, or a later step may find no sufficient torque.
 """
 
 import numpy as np
@@ -18,14 +15,10 @@ Array = NDArray[np.float64]
 
 
 def largest_acceleration(distance: ArrayLike, speed: ArrayLike, horizon_s: float) -> Array:
-    """The largest constant acceleration that stays within a limit until a horizon, shape (...).
+    """The largest constant acceleration that stays within a limit until a horizon > 0, shape (...).
 
-    From beyond the limit (a negative distance): the largest that returns to it by the end of the horizon.
-
-    Args:
-        distance: To the limit, shape (...), m or rad.
-        speed: Towards it, shape (...), m/s or rad/s.
-        horizon_s: Positive.
+    The distance to the limit is in m or rad, the speed towards it in m/s or rad/s. From beyond the limit (a negative
+    distance): the largest that returns to it by the end of the horizon.
     """
     d, v = finite_arrays(distance=distance, speed=speed)
     if not 0.0 < horizon_s < np.inf:
@@ -47,7 +40,9 @@ def predicted_position_rows(
     horizon_s: float,
     nv: int,
 ) -> tuple[Array, Array]:
-    """Rows `G qacc <= g` that keep joints within their ranges until the horizon, at a constant acceleration.
+    """Rows `G qacc <= g`, shapes (m, nv) and (m,), that keep joints in range until the horizon, upper limits first.
+
+    The acceleration is constant; there is one row for each finite limit.
 
     Args:
         dofs: Indices of the joints' degrees of freedom (slides and hinges), shape (n,).
@@ -57,9 +52,6 @@ def predicted_position_rows(
         upper: Largest positions, shape (n,); inf is no limit.
         horizon_s: s; a control step, or the time that stopping takes if that is longer.
         nv: Degrees of freedom of the whole model.
-
-    Returns:
-        G, shape (m, nv), and g, shape (m,): one row for each finite limit, the upper ones first.
     """
     q, v = finite_arrays(positions=positions, velocities=velocities)
     which = np.asarray(dofs)
@@ -74,14 +66,8 @@ def predicted_position_rows(
     if not (low <= high).all():
         raise ConfigurationError(f"lower must not exceed upper, got {low} and {high}")
     above, below = np.isfinite(high), np.isfinite(low)
-    rows = np.zeros((int(above.sum() + below.sum()), nv))
-    rows[np.arange(len(rows)), np.concatenate([which[above], which[below]])] = np.concatenate(
-        [np.ones(int(above.sum())), -np.ones(int(below.sum()))]
-    )
-    limits = np.concatenate(
-        [
-            largest_acceleration(high[above] - q[above], v[above], horizon_s),
-            largest_acceleration(q[below] - low[below], -v[below], horizon_s),
-        ]
-    )
-    return rows, limits
+    units = np.eye(nv)[which]
+    rows = np.concatenate([units[above], 0.0 - units[below]])  # 0 - x: no negative zeros
+    upwards = largest_acceleration(high[above] - q[above], v[above], horizon_s)
+    downwards = largest_acceleration(q[below] - low[below], -v[below], horizon_s)
+    return rows, np.concatenate([upwards, downwards])

@@ -1,11 +1,11 @@
 """Support plane and support polygon of contacts, and the inset as rows on contact forces.
 
 Source: appendix "Physical contact feasibility constraints", third condition. The zero moment point is where, on the
-plane of support, the contact forces have no tangential moment. Forces that push at points of the plane keep it
-inside the convex hull of these points: the support polygon. An inset keeps a distance from its edges.
+plane of support, the contact forces have no tangential moment. Forces that push keep it inside the support polygon,
+the convex hull of their points; an inset keeps a distance from its edges.
 
-It assumes contacts in one plane that do not slip; contacts at several heights need the feasibility of the wrench
-(`whole_body`). Crossing an edge does not imply a fall: a robot may step, or tip about an edge and come back.
+It assumes contacts in one plane that do not slip; contacts at several heights need `whole_body`. Crossing an edge
+does not imply a fall.
 """
 
 import math
@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.checks import finite_array, finite_arrays
 from safe_wrappers.control.contact.friction_cone import tangents
+from safe_wrappers.control.numerics.outlines import convex_chain, turn
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -28,13 +29,7 @@ _ROUNDING = 1e-12
 
 
 class Plane(NamedTuple):
-    """A plane of support.
-
-    Attributes:
-        origin: A point on it, shape (3,), m.
-        normal: Unit normal, pointing at the robot, shape (3,).
-        axes: Two unit tangents, shape (2, 3), right-handed with the normal.
-    """
+    """A point of a plane of support (3,), m, its unit normal (3,) towards the robot, two unit tangents (2, 3)."""
 
     origin: Array
     normal: Array
@@ -81,36 +76,23 @@ def common_plane(
 
 
 def support_polygon(points: ArrayLike) -> Array:
-    """Corners of the convex hull of points in a plane, anticlockwise, shape (v, 2).
+    """Corners of the convex hull of points in a plane, shape (k, 2), m, k >= 1: anticlockwise, shape (v, 2).
 
     Points on its edges are left out. Two corners are a line of support, one is a point.
-
-    Args:
-        points: Shape (k, 2), m, k >= 1.
     """
     given = finite_array("points", points)
     if given.ndim != 2 or given.shape[1] != 2 or not len(given):
         raise ConfigurationError(f"points must have shape (k, 2) with at least one point, got {given.shape}")
-    ordered = np.unique(given, axis=0)  # sorted by x, then y
+    ordered = sorted(set(map(tuple, given.tolist())))
     if len(ordered) < 3:
-        return ordered
-
-    def half(chain: list[Array]) -> list[Array]:
-        kept: list[Array] = []
-        for point in chain:
-            while len(kept) > 1 and _turn(kept[-2], kept[-1], point) <= 0.0:
-                kept.pop()
-            kept.append(point)
-        return kept[:-1]
-
-    chain = list(ordered)
-    corners = half(chain) + half(chain[::-1])
+        return np.array(ordered)
+    corners = convex_chain(ordered) + convex_chain(ordered[::-1])
     # A corner that protrudes by no more than rounding is a point on an edge.
-    least = _ROUNDING * float(np.ptp(ordered, axis=0).max())
+    least = _ROUNDING * float(np.ptp(given, axis=0).max())
     i = 0
     while i < len(corners) > 2:
         before, after = corners[i - 1], corners[(i + 1) % len(corners)]
-        if _turn(before, corners[i], after) <= least * math.dist(before, after):
+        if turn(before, corners[i], after) <= least * math.dist(before, after):
             del corners[i]
         else:
             i += 1
@@ -120,9 +102,8 @@ def support_polygon(points: ArrayLike) -> Array:
 def support_rows(points: ArrayLike, ground: Plane, inset: float) -> Array:
     """The inset as half-spaces on the stacked contact forces: `rows @ forces.ravel() <= 0`, shape (v, 3 k).
 
-    For each edge: pressure counts for the distance of its point from the inset edge. Together with forces that push,
-    the rows hold where the zero moment point is inside the inset polygon or nothing presses. Contacts on a line or at
-    a point, and an inset that leaves nothing of the polygon, allow no pressure at all.
+    Together with forces that push, the rows hold where the zero moment point is inside the inset polygon or nothing
+    presses. Contacts on a line, and an inset that leaves nothing of the polygon, allow no pressure at all.
 
     Args:
         points: In the plane, shape (k, 3), m.
@@ -140,8 +121,3 @@ def support_rows(points: ArrayLike, ground: Plane, inset: float) -> Array:
         inward = np.stack([-edges[:, 1], edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1)[:, None]
         weights = inward @ flat.T - (inward * corners).sum(axis=1)[:, None] - inset
     return np.asarray((-weights[:, :, None] * ground.normal).reshape(len(weights), -1))
-
-
-def _turn(a: Array, b: Array, c: Array) -> float:
-    """Twice the area of a triangle, m^2; positive anticlockwise."""
-    return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))

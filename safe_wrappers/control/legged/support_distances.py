@@ -1,9 +1,9 @@
 """The zero moment point's distance from the edge of the support polygon, at many instants at once.
 
-The same numbers as `safe_wrappers.appendix.legged.balance` gives instant by instant, without building polygons. For a
-point inside a convex hull, the distance to its boundary is the least of `max_k (p_k - x) . u` over directions u,
-attained across an edge. An edge joins two of the points, and pairs that are no edge give no smaller distance, so the
-minimum is taken over all pairs.
+The same numbers as `safe_wrappers.appendix.legged.balance` gives instant by instant, without building polygons. The
+distance of a point inside a convex hull from its boundary is the least of `max_k (p_k - x) . u` over directions u,
+attained across an edge, and pairs of points that are no edge give no smaller one. So the minimum is taken over all
+pairs.
 """
 
 import numpy as np
@@ -30,7 +30,9 @@ def support_distances(
     tolerance_m: float = COPLANAR_M,
     tolerance_rad: float = COPLANAR_RAD,
 ) -> Array:
-    """Distances where there are three contact points of one plane, not on a line, and something presses on it.
+    """Distances, m, negative outside, where three or more contacts of one plane, not on a line, are pressed.
+
+    One for each of these instants in turn; the others have none.
 
     Args:
         instant: To which instant each contact belongs, whole numbers, shape (n,); in any order.
@@ -39,12 +41,6 @@ def support_distances(
         forces: On the robot, shape (n, 3), N.
         tolerance_m: Largest distance of a point from its instant's plane.
         tolerance_rad: Largest angle between a normal and the mean of its instant.
-
-    Returns:
-        One for each of these instants in turn, m; negative outside. The others have none.
-
-    Raises:
-        ConfigurationError: Not finite, or not of these shapes.
     """
     p, n, f = finite_arrays(points=points, normals=normals, forces=forces)
     when = np.asarray(instant)

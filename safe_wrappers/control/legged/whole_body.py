@@ -4,13 +4,12 @@ Source: appendix "Floating-base equations of motion" and "Hierarchical whole-bod
 
     M qacc + h = B u + sum J_k' f_k,
 
-with every f_k in its friction cone, u in the actuators' box, and the contacts' points moving as wanted. With the cone
-replaced by a pyramid inside it (`friction_pyramid`) it is a quadratic program (`solve_pyramid`); with the cone itself
-it is a second-order cone program (`solve_cone`).
+with every f_k in its friction cone, u in the actuators' box, and the contacts' points moving as wanted. With pyramids
+inside the cones it is a quadratic program (`solve_pyramid`), with the cones a second-order cone program
+(`solve_cone`).
 
 A solution says that such forces exist at this instant, for this model, these contacts and this friction. It does not
-show that a foothold carries the load, that the ground has that friction, or that the same holds a control step later;
-and a compliant contact of a simulator needs no exact contact acceleration.
+show that a foothold carries the load, or that the same holds a control step later.
 """
 
 from enum import StrEnum
@@ -20,23 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.control.contact.friction_cone import cone_excess, friction_pyramid
-from safe_wrappers.control.legged.contact_elimination import Elimination, Motion, eliminate, motion_of
-from safe_wrappers.control.legged.whole_body_problem import Task, WholeBodyProblem
-from safe_wrappers.control.legged.whole_body_program import ReducedProgram, reduced_program
+from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem
+from safe_wrappers.control.legged.whole_body_program import (
+    Elimination,
+    Motion,
+    ReducedProgram,
+    eliminate,
+    motion_of,
+    reduced_program,
+)
 from safe_wrappers.control.numerics.conic_program import Candidate, Program, by_clarabel, by_daqp
 from safe_wrappers.errors import UnknownNameError
-
-__all__ = [
-    "Residuals",
-    "Task",
-    "WholeBodyProblem",
-    "WholeBodySolution",
-    "WholeBodyStatus",
-    "attainable_contact_acceleration",
-    "rigid_forces",
-    "solve_cone",
-    "solve_pyramid",
-]
 
 Array = NDArray[np.float64]
 
@@ -45,11 +38,7 @@ TOLERANCE = 1e-6
 _INNER_IN_LEAST_VIOLATION = 1e-8
 """Cost of a squared newton of inner force in a least violation; a smaller one would be ill-conditioned."""
 _OBJECTIVE_IN_LEAST_VIOLATION = 1e-3
-"""Largest cost of half the range of a control in a least violation, in squared units of the violations.
-
-It chooses among answers of nearly equal violation. A much smaller one costs accuracy at the cones: with 1e-6 some
-answers were half a newton outside.
-"""
+"""Largest cost of half a control's range in a least violation; with 1e-6 answers were up to 0.5 N outside cones."""
 
 
 class WholeBodyStatus(StrEnum):
@@ -90,10 +79,10 @@ class WholeBodySolution(NamedTuple):
         control: Shape (nu,), finite and inside the box.
         acceleration: qacc under it and the forces, shape (nv,).
         forces: At the contacts, shape (k, 3), N, each inside its cone (and pyramid).
-        status: See `WholeBodyStatus`; compares equal to its string.
-        residuals: See `Residuals`.
-        objective: Half the weighted squares that were minimised, of a problem with `contact_softness` its contact
-            term included; it ranks answers to one problem. Infinite where there is none.
+        status: Compares equal to its string.
+        residuals: Evaluated from the answer itself.
+        objective: Half the weighted squares that were minimised; it ranks answers to one problem. Infinite where
+            there is none.
     """
 
     control: Array
@@ -111,10 +100,6 @@ def solve_pyramid(problem: WholeBodyProblem, edges: int = 4, solver: str = "daqp
         problem: The instant.
         edges: Of each pyramid, at least 3.
         solver: "daqp" (an active set: the fast one) or "clarabel" (interior points).
-
-    Raises:
-        ConfigurationError: Too few edges.
-        UnknownNameError: No such solver.
     """
     if solver not in ("daqp", "clarabel"):
         raise UnknownNameError(f"solver {solver!r} is not one of: daqp, clarabel")
@@ -130,16 +115,10 @@ def solve_cone(problem: WholeBodyProblem) -> WholeBodySolution:
 
 
 def rigid_forces(problem: WholeBodyProblem, control: Array) -> tuple[Array, Array]:
-    """The contact forces that give the wanted contact accelerations under a control, feasible or not.
+    """The contact forces that give the wanted contact accelerations under a control (nu,), feasible or not.
 
-    Where they are not unique, the smallest ones. Contradictory accelerations are met as closely as possible.
-
-    Args:
-        problem: The instant.
-        control: Shape (nu,).
-
-    Returns:
-        Forces, shape (k, 3), N, 0 at contacts that are to open, and the acceleration qacc, shape (nv,).
+    Forces (k, 3), N, the smallest ones where they are not unique and 0 at contacts that are to open, and qacc (nv,).
+    Contradictory accelerations are met as closely as possible.
     """
     motion = motion_of(problem)
     rigid, _ = eliminate(motion)
@@ -150,8 +129,8 @@ def rigid_forces(problem: WholeBodyProblem, control: Array) -> tuple[Array, Arra
 def attainable_contact_acceleration(problem: WholeBodyProblem) -> Array:
     """The contact accelerations closest to the wanted ones that do not contradict each other, shape (k, 3), m/s^2.
 
-    Two points of one rigid foot keep their distance, so their accelerations cannot be chosen freely; contradictory
-    ones make a problem without softness infeasible. Only kinematics is considered, not forces and torques.
+    Two points of one rigid foot keep their distance; contradictory accelerations make a problem without softness
+    infeasible. Only kinematics is considered.
     """
     motion = motion_of(problem)
     solution = np.linalg.lstsq(motion.held, motion.wanted, rcond=1e-5)[0]
@@ -164,14 +143,13 @@ def attainable_contact_acceleration(problem: WholeBodyProblem) -> Array:
 def _solve(problem: WholeBodyProblem, sides: Array | None, solver: str) -> WholeBodySolution:
     motion = motion_of(problem)
     rigid, loose = eliminate(motion)
-    consistent = float(np.abs(rigid.contradiction).max(initial=0.0)) <= _acceleration_tolerance(problem)
-    soft = problem.contact_softness > 0.0
+    consistent = float(np.abs(rigid.contradiction).max(initial=0.0)) <= _tolerance(problem.wanted)
     reduced = reduced_program(problem, motion, rigid, sides) if consistent else None
     if reduced is not None and not problem.tasks:
         unchanged = _nominal(problem, motion, reduced, solver)
         if unchanged is not None:
             return unchanged
-    if soft:
+    if problem.contact_softness > 0.0:
         reduced = reduced_program(problem, motion, loose, sides, 1.0 / problem.contact_softness)
     verdict = "infeasible"
     if reduced is not None:
@@ -211,12 +189,8 @@ def _nominal(
     return _checked(problem, motion, reduced, y, WholeBodyStatus.INACTIVE)
 
 
-def _acceleration_tolerance(problem: WholeBodyProblem) -> float:
-    return TOLERANCE * (1.0 + float(np.abs(problem.wanted).max(initial=0.0)))
-
-
-def _force_tolerance(forces: Array) -> float:
-    return TOLERANCE * (1.0 + float(np.abs(forces).max(initial=0.0)))
+def _tolerance(sizes: Array) -> float:
+    return TOLERANCE * (1.0 + float(np.abs(sizes).max(initial=0.0)))
 
 
 def _checked(
@@ -228,7 +202,7 @@ def _checked(
     inside[:nu] = np.clip(y[:nu], problem.lower, problem.upper)  # a solver's round-off at the box
     answer = _answer(problem, motion, reduced, inside, status)
     missed = answer.residuals
-    force = _force_tolerance(answer.forces)
+    force = _tolerance(answer.forces)
     exact = problem.contact_softness == 0.0 or status is WholeBodyStatus.INACTIVE
     program, soft = reduced.program, reduced.softenable
     over = program.rows @ inside - program.limits
@@ -238,7 +212,7 @@ def _checked(
         and missed.cone <= force
         and bool((over[soft:] <= force).all())
         and bool((over[:soft] <= TOLERANCE * (1.0 + size)).all())
-        and (not exact or missed.contact <= _acceleration_tolerance(problem))
+        and (not exact or missed.contact <= _tolerance(problem.wanted))
     )
     return answer if fine else None
 
@@ -277,9 +251,7 @@ def _residuals(problem: WholeBodyProblem, control: Array, acceleration: Array, f
         normals = problem.normals[problem.opening]
         short = -np.einsum("ki,ki->k", normals, missed[problem.opening])
         contact = max(contact, float(short.max()))
-    cone = (
-        float(cone_excess(forces, problem.normals, problem.friction).max(initial=0.0)) if len(forces) else 0.0
-    )
+    cone = float(cone_excess(forces, problem.normals, problem.friction).max(initial=0.0))
     outside = np.maximum(problem.lower - control, control - problem.upper)
     rows = 0.0
     if problem.acceleration_rows is not None and problem.acceleration_limits is not None:
@@ -322,13 +294,9 @@ def _least_violation(
             y = candidate.y[: loose.size].copy()
             y[:nu] = np.clip(y[:nu], problem.lower, problem.upper)
             answer = _answer(problem, motion, plain, y, status)
-            if answer.residuals.cone <= _force_tolerance(answer.forces):
+            if answer.residuals.cone <= _tolerance(answer.forces):
                 return answer
-    return _nothing(problem, motion)
-
-
-def _nothing(problem: WholeBodyProblem, motion: Motion) -> WholeBodySolution:
-    """The failed answer: the nominal control clipped to its box, contacts without force."""
+    # Nothing passed: the nominal control clipped to its box, contacts without force.
     control = np.clip(problem.nominal, problem.lower, problem.upper)
     acceleration, forces = motion.free + motion.by_control @ control, np.zeros(problem.normals.shape)
     missed = _residuals(problem, control, acceleration, forces)

@@ -1,9 +1,4 @@
-"""The whole-body control problem at one instant of a robot in contact.
-
-Source: appendix "Floating-base equations of motion" and "Hierarchical whole-body control quadratic program":
-
-    M qacc + h = B u + sum J_k' f_k.
-"""
+"""The whole-body control problem at one instant of a robot in contact: `M qacc + h = B u + sum J_k' f_k`."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -44,17 +39,15 @@ class WholeBodyProblem:
         jacobians: J_k of the contact points, shape (k, 3, nv); k may be 0.
         drift: `dJ/dt qvel` of the contact points, shape (k, 3), m/s^2.
         normals: Unit normals, pointing at the body that the forces push, shape (k, 3).
-        friction: Coefficients, at least 0, shape (k,). At 0 a contact gives force, and has a wanted acceleration,
-            along its normal only.
+        friction: Coefficients, at least 0, shape (k,). At 0 a contact acts along its normal only.
         lower: Smallest control, shape (nu,).
         upper: Largest control, shape (nu,).
         nominal: The control whose distance is minimised, shape (nu,).
         contact_acceleration: Wanted at the contact points, shape (k, 3), m/s^2; None is zero.
         control_weight: Of the squared distance from the nominal, positive, a number or shape (nu,).
-        force_weight: Of the squared contact forces, positive, per N^2. It chooses among forces of equal effect; a
-            large one moves the control away from the nominal.
-        contact_softness: 0 requires the wanted contact accelerations exactly. Larger: a miss r (m/s^2) costs
-            `r^2 / contact_softness` instead; a nominal without misses stays unchanged.
+        force_weight: Of the squared contact forces, positive, per N^2. It chooses among forces of equal effect.
+        contact_softness: 0 requires the wanted contact accelerations exactly. Larger: a miss r (m/s^2) costs `r^2 /
+            contact_softness` instead; a nominal without misses stays unchanged.
         breaking: Contacts that are to open, shape (k,): their force is 0 and their acceleration along the normal is
             at least the wanted one. None: no contact opens.
         first_tangents: Direction of each pyramid's first edge, shape (k, 3); None for a default.

@@ -3,8 +3,7 @@
 The exponential is taken over a time so short that it is well conditioned; doubling extends it to the full time.
 Arguments are checked by `safe_wrappers.control.estimation.covariance`. Results that overflow are not finite.
 
-Source: Van Loan, "Computing integrals involving the matrix exponential" (1978); Anderson and Moore, "Optimal
-Filtering" (1979), section 6.7, for doubling.
+Source: Van Loan (1978); Anderson and Moore, "Optimal Filtering" (1979), section 6.7, for doubling.
 """
 
 from typing import NamedTuple
@@ -19,12 +18,7 @@ _TERMS = 24
 
 
 class Discrete(NamedTuple):
-    """x -> F x plus noise of covariance Q_d: the system over one step of time.
-
-    Attributes:
-        transition: F = exp(A t), shape (..., n, n).
-        noise: Q_d, symmetric, shape (..., n, n).
-    """
+    """x -> F x plus noise of covariance Q_d over one step of time: F = exp(A t) and Q_d, shape (..., n, n) each."""
 
     transition: Array
     noise: Array
@@ -73,10 +67,7 @@ def norm_or_one(matrix: Array) -> float:
 
 
 def short_exponential(matrix: Array) -> Array:
-    """The exponential of matrices of norm 2 at most, by its series.
-
-    Faster than `scipy.linalg.expm`, which waits for BLAS threads even for a 4 x 4 matrix.
-    """
+    """The exponential of matrices of norm 2 at most, by its series: faster than `scipy.linalg.expm` at this size."""
     term = np.eye(matrix.shape[-1])
     total = np.broadcast_to(term, matrix.shape).copy()
     for order in range(1, _TERMS + 1):

@@ -28,27 +28,16 @@ _FAILED, _INFEASIBLE, _SOLVED = "failed", "infeasible", "solved"
 
 
 class Program(NamedTuple):
-    """The program above.
+    """The program above; H is positive definite."""
 
-    Attributes:
-        hessian: Shape (n, n), positive definite.
-        linear: Shape (n,).
-        rows: Shape (k, n).
-        limits: Shape (k,).
-        lower: Shape (n,), -inf is no bound.
-        upper: Shape (n,), inf is no bound.
-        cones: C_i, shape (m, d, n).
-        cone_offsets: c_i, shape (m, d).
-    """
-
-    hessian: Array
-    linear: Array
-    rows: Array
-    limits: Array
-    lower: Array
-    upper: Array
-    cones: Array | None = None
-    cone_offsets: Array | None = None
+    hessian: Array  # (n, n)
+    linear: Array  # (n,)
+    rows: Array  # (k, n)
+    limits: Array  # (k,)
+    lower: Array  # (n,), -inf is no bound
+    upper: Array  # (n,), inf is no bound
+    cones: Array | None = None  # C_i, (m, d, n)
+    cone_offsets: Array | None = None  # c_i, (m, d)
 
     def with_first(self, values: Array) -> "Program":
         """The program in the remaining unknowns, with the first ones fixed."""
@@ -103,14 +92,9 @@ class Program(NamedTuple):
 
 
 class Candidate(NamedTuple):
-    """Answer of a solver.
+    """Answer of a solver: y, shape (n,), or None and why ("infeasible" is the solver's claim)."""
 
-    Attributes:
-        verdict: "solved", "infeasible" (claimed by the solver) or "failed".
-        y: The answer, shape (n,); None unless solved.
-    """
-
-    verdict: str
+    verdict: str  # "solved", "infeasible" or "failed"
     y: Array | None
 
 

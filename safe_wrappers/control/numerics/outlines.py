@@ -4,50 +4,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Point = tuple[float, float]
 
 
 def convex_outline(points: Array) -> Array:
-    """Corners of the smallest convex outline around points, counter-clockwise (Andrew's monotone chain).
-
-    Args:
-        points: Shape (n, 2), m.
-
-    Returns:
-        Shape (c, 2), m, without points on edges.
+    """Corners of the smallest convex outline around points (n, 2), m: counter-clockwise, shape (c, 2), none on edges.
 
     Raises:
         ValueError: All points lie on one line.
     """
     ordered = sorted({(float(x), float(y)) for x, y in points})
-    corners = _chain(ordered)[:-1] + _chain(ordered[::-1])[:-1]
+    corners = convex_chain(ordered) + convex_chain(ordered[::-1])
     if len(corners) < 3:
         raise ValueError(f"an outline needs three points that are not on one line, got {points.tolist()}")
     return np.array(corners)
 
 
-def _chain(ordered: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    chain: list[tuple[float, float]] = []
+def convex_chain(ordered: list[Point]) -> list[Point]:
+    """Corners of one side of the convex hull of sorted points, without the last one."""
+    chain: list[Point] = []
     for point in ordered:
-        while len(chain) >= 2 and _turn(chain[-2], chain[-1], point) <= 0.0:
+        while len(chain) >= 2 and turn(chain[-2], chain[-1], point) <= 0.0:
             chain.pop()
         chain.append(point)
-    return chain
+    return chain[:-1]
 
 
-def _turn(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> float:
+def turn(a: Point, b: Point, c: Point) -> float:
+    """Twice the area of a triangle; positive counter-clockwise."""
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
 def distances_to_outline(outline: Array, points: Array) -> Array:
-    """Signed distances of points to a convex outline; negative inside.
-
-    Args:
-        outline: Corners counter-clockwise, shape (c, 2), m.
-        points: Shape (..., 2), m.
-
-    Returns:
-        Shape (...), m.
-    """
+    """Signed distances (...), m, of points (..., 2) to a convex outline with corners (c, 2) counter-clockwise."""
     edges = np.roll(outline, -1, axis=0) - outline
     lengths = np.sqrt((edges**2).sum(axis=1))
     along = edges / lengths[:, None]

@@ -1,35 +1,23 @@
 """Frames in space: points in a sensor's frame, and velocity at a lever arm.
 
 A pose is a rotation matrix (3, 3), whose columns are the frame's axes in the outer frame, and a position (3,), m, of
-its origin there. The sensor sits at P, the body turns about O, the lever arm is r = P - O; then v_P = v_O + ω x r,
-all in the same axes. Accelerations: `safe_wrappers.appendix.estimation.lever_arm`.
+its origin there. Accelerations: `safe_wrappers.appendix.estimation.lever_arm`.
 """
-
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError
 
-if TYPE_CHECKING:
-    pass
-
 Array = NDArray[np.float64]
-
 
 _NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 def lever_arm_velocity(velocity: Array, angular_velocity: Array, arm: Array) -> Array:
-    """Velocity of P, m/s, from that of O.
+    """Velocity of P, m/s, from that of O, in the same axes: v_P = v_O + ω x r, with the arm r = P - O in m.
 
-    Args:
-        velocity: Of O, shape (..., 3), m/s.
-        angular_velocity: Of the body, shape (..., 3), rad/s.
-        arm: P - O, shape (..., 3), m, in the same axes as the others.
+    The velocity (m/s), angular velocity (rad/s) and arm have shape (..., 3).
 
     Raises:
         ConfigurationError: Vectors that are not of three finite numbers.
@@ -39,13 +27,7 @@ def lever_arm_velocity(velocity: Array, angular_velocity: Array, arm: Array) -> 
 
 
 def to_sensor(points: Array, rotation: Array, position: Array) -> Array:
-    """World points in a sensor's frame, shape (..., 3), m. Runs at every step: checks nothing.
-
-    Args:
-        points: Shape (..., 3), m.
-        rotation: Of the sensor in the world, shape (3, 3).
-        position: Of the sensor in the world, shape (3,), m.
-    """
+    """World points (..., 3), m, in the frame of a sensor with a rotation (3, 3) and position (3,) in the world."""
     return np.asarray((points - position) @ rotation)
 
 
@@ -60,22 +42,14 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def check_vectors(*vectors: Array) -> None:
-    """Refuse arrays that are not of shape (..., 3).
-
-    Raises:
-        ConfigurationError: For other shapes.
-    """
+    """Refuse arrays that are not of shape (..., 3)."""
     if any(np.shape(vector)[-1:] != (3,) for vector in vectors):
         shapes = ", ".join(str(np.shape(vector)) for vector in vectors)
         raise ConfigurationError(f"expected vectors of three numbers, of shape (..., 3), got shapes {shapes}")
 
 
 def finite_result(result: Array, *vectors: Array) -> Array:
-    """The result, refused where it is not finite.
-
-    Raises:
-        ConfigurationError: For a result that is not finite; it shows the vectors it was made of.
-    """
+    """The result, refused where it is not finite; the error shows the vectors it was made of."""
     if not np.isfinite(result).all():
         given = ", ".join(str(np.asarray(vector).tolist()) for vector in vectors)
         raise ConfigurationError(f"expected vectors of finite numbers, got {given}")

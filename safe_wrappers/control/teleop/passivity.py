@@ -5,19 +5,9 @@ rad/s); their product is power, *positive into the component*. A component with 
 
     integral of F.v dt  >=  V(T) - V(0) + dissipated  >=  -V(0)        (the appendix's equation 2)
 
-so no more energy comes out than was stored at the start. Limits of passivity:
-
-- It does not limit force. A loaded mechanism may release all of its storage at once, and hurt.
-- It does not bound displacement; clearances need another bound (`leases.round_trip_ceiling`).
-- Passive parts connected with matching signs are passive together; converging needs more. A human, a powered tool
-  or an active environment is not passive without evidence.
-- Effort and flow sent with a delay form an active two-port at some frequencies; which ones depends on what is
-  connected, not on the phase alone. Measure it (`ChannelLedger`).
-- The wave transform keeps a channel passive for a *fixed* delay. Varying delay, loss, sampling and saturation need
-  the rules of `wave_line` or of `passivity_control`.
-
-A sum of samples is the integral only if one of the two is held over the interval and the other is its mean: a held
-effort times a displacement is exact, a product of two samples is an estimate.
+so no more energy comes out than was stored at the start. That limits neither force nor displacement, and the wave
+transform keeps it for a *fixed* delay only. A sum of samples is the integral only if one of the two is held over the
+interval and the other is its mean; a product of two samples is an estimate.
 
 Efforts, flows and waves are numbers (a port of one component) or arrays of shape (m,); functions without memory also
 take leading batch axes, (..., m). What is not finite raises `ConfigurationError`.
@@ -29,8 +19,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.control.numerics.running_sum import RunningSum
-from safe_wrappers.control.teleop.port_checks import energy_j, port_energy, port_vectors, positive, same_shape
+from safe_wrappers.control.teleop.port_checks import (
+    RunningSum,
+    energy_j,
+    port_energy,
+    port_vectors,
+    positive,
+    same_shape,
+)
 
 Array = NDArray[np.float64]
 
@@ -38,24 +34,14 @@ _EPS = float(np.finfo(np.float64).eps)
 
 
 class Waves(NamedTuple):
-    """A pair of waves, each in sqrt(W).
-
-    Attributes:
-        u: Into the component, shape (..., m).
-        w: Out of the component, shape (..., m).
-    """
+    """A pair of waves, shape (..., m), sqrt(W): u into the component, w out of it."""
 
     u: Array
     w: Array
 
 
 class EffortAndWave(NamedTuple):
-    """Effort and outgoing wave of a side whose flow is known.
-
-    Attributes:
-        effort: F, N, shape (..., m).
-        outgoing: Wave to be sent, sqrt(W), shape (..., m).
-    """
+    """Effort F, N, and outgoing wave, sqrt(W), of a side whose flow is known; shape (..., m)."""
 
     effort: Array
     outgoing: Array
@@ -64,13 +50,12 @@ class EffortAndWave(NamedTuple):
 def to_waves(effort: ArrayLike, flow: ArrayLike, impedance: float) -> Waves:
     """The wave transform, `u = (F + b v) / sqrt(2 b)` and `w = (F - b v) / sqrt(2 b)` (equation 3).
 
+    Their power `(|u|^2 - |w|^2) / 2` is `F.v`.
+
     Args:
         effort: F, N, shape (..., m), or a number.
         flow: v, m/s, of the same shape, positive together with F into the component that u goes into.
         impedance: b > 0, N s/m.
-
-    Returns:
-        The waves; their power `(|u|^2 - |w|^2) / 2` is `F.v`.
     """
     f, v = same_shape(effort=effort, flow=flow)
     b = positive("impedance", impedance)
@@ -81,7 +66,7 @@ def to_waves(effort: ArrayLike, flow: ArrayLike, impedance: float) -> Waves:
 def effort_and_outgoing(flow: ArrayLike, incoming: ArrayLike, impedance: float) -> EffortAndWave:
     """The operator's side: effort F and outgoing wave u for a known flow and the incoming wave w.
 
-    `F = b v + sqrt(2 b) w` and `u = sqrt(2 b) v + w`. The operator always feels a damper b.
+    `F = b v + sqrt(2 b) w` and `u = sqrt(2 b) v + w`.
 
     Args:
         flow: v, m/s, shape (..., m), or a number.
@@ -104,7 +89,8 @@ class EnergyLedger:
     """
 
     def __init__(self, initial_storage_j: float = 0.0) -> None:
-        self._initial = energy_j("initial_storage_j", initial_storage_j)
+        self.initial_storage_j = energy_j("initial_storage_j", initial_storage_j)
+        """V(0), J."""
         self._absorbed = RunningSum()
         self._dissipated = RunningSum()
         self._rounding = 0.0
@@ -138,13 +124,8 @@ class EnergyLedger:
         exchanged = float(np.abs(f) @ np.abs(v)) * time + dissipated
         self._rounding += (f.size + 4) * _EPS * (exchanged + stored)
         self._lowest = min(self._lowest, self._absorbed.value)
-        missing = stored + self._dissipated.value - self._absorbed.value - self._initial
+        missing = stored + self._dissipated.value - self._absorbed.value - self.initial_storage_j
         self._created = max(self._created, missing)
-
-    @property
-    def initial_storage_j(self) -> float:
-        """V(0), J."""
-        return self._initial
 
     @property
     def absorbed_j(self) -> float:
@@ -164,20 +145,17 @@ class EnergyLedger:
     @property
     def extractable_j(self) -> float:
         """Largest energy that may still come out, `V(0) + absorbed - dissipated`, J; below 0: not passive."""
-        return self._initial + self.absorbed_j - self.dissipated_j
+        return self.initial_storage_j + self.absorbed_j - self.dissipated_j
 
     @property
     def created_j(self) -> float:
-        """Largest violation of equation 2 so far, J.
-
-        Its right side uses the storage and dissipation that `add` was given; without them it is -V(0).
-        """
+        """Largest violation of equation 2 so far, J, with the storage and dissipation that `add` was given."""
         return self._created
 
     @property
     def rounding_j(self) -> float:
         """Bound on the rounding of these sums and of the storage that `add` was given, J."""
-        return self._rounding + 4.0 * _EPS * self._initial
+        return self._rounding + 4.0 * _EPS * self.initial_storage_j
 
     @property
     def passive(self) -> bool:
@@ -188,8 +166,7 @@ class EnergyLedger:
 class ChannelLedger:
     """Energy of a two-port channel with any coding, `E_ch(T) - E_ch(0) <= integral of (P_m - P_s) dt`.
 
-    Energy goes in at the port m (the operator's) and comes out at the port s (the remote one): F.v is positive into
-    the channel at m, and positive out of it at s.
+    F.v is positive into the channel at the port m (the operator's), and out of it at s (the remote one).
 
     Args:
         initial_storage_j: E_ch(0), or a bound on it, at least 0 J.
@@ -207,16 +184,11 @@ class ChannelLedger:
         time_s: float,
         stored_j: float | None = None,
     ) -> None:
-        """Account one interval.
+        """Account one interval of `time_s` > 0.
 
-        Args:
-            effort_m: At the operator's port, N, shape (m,), or a number.
-            flow_m: m/s, of the same shape.
-            effort_s: At the remote port, N, shape (m,), or a number.
-            flow_s: m/s, of the same shape.
-            time_s: Length of the interval, > 0.
-            stored_j: Energy in flight at its end, if known (`WaveLine.in_flight_j` and `reserve_j` of both
-                directions).
+        Efforts (N) and flows (m/s) at the operator's port m and the remote port s are numbers, or of shape (m,) at
+        each port. `stored_j` is the energy in flight at its end, if known (`WaveLine.in_flight_j` and `reserve_j` of
+        both directions).
         """
         f_m, v_m = port_vectors(effort_m=effort_m, flow_m=flow_m)
         f_s, v_s = port_vectors(effort_s=effort_s, flow_s=flow_s)

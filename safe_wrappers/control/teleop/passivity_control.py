@@ -1,21 +1,14 @@
 """Time-domain passivity control: damping as soon as a port has given out more energy than allowed.
 
 Ryu, Artigas and Preusche (2010), "A passive bilateral control scheme for a teleoperator with time-varying
-communication delay": over a network each side sends the energy that it has taken in, and gives out no more than what
-the other side has reported; that holds for any delay, jitter, reordering and loss. The damping is that of Hannaford
-and Ryu (2002), "Time-domain passivity control of haptic interfaces"; their observer and controller of one port are in
-`safe_wrappers.appendix.teleop.passivity_controller`.
+communication delay"; the damping is that of Hannaford and Ryu (2002), "Time-domain passivity control of haptic
+interfaces", whose observer and controller of one port are in `safe_wrappers.appendix.teleop.passivity_controller`.
 
-Power is positive into the component (the virtual wall, the channel). In *impedance* causality the component answers
-a flow with an effort, so damping adds effort along the flow; in *admittance* causality it answers an effort with a
-flow, and damping adds flow along the effort.
-
-Nothing is dissipated without flow (without effort), or beyond a limit on the damping. The rest is a debt: reported,
-carried over, and dissipated as soon as possible. Without a limit the damping at a small flow is a large effort for
-one tick; a real drive saturates, so declare its limit. Damping is computed for the sampled flow; the actual one is
-accounted one tick later (`actual`), so errors do not accumulate, but the energy may be slightly negative in between.
-
-Passivity bounds neither force nor clearance.
+In *impedance* causality a component answers a flow with an effort, so damping adds effort along the flow; in
+*admittance* causality it answers an effort with a flow, and damping adds flow along the effort. What cannot be
+dissipated (no flow, or a limit on the damping) is a debt: reported, carried over, and dissipated as soon as possible.
+Damping is computed for the sampled flow and accounted for the actual one a tick later, so the energy may be slightly
+negative in between. Passivity bounds neither force nor clearance.
 """
 
 import math
@@ -24,8 +17,8 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.control.numerics.running_sum import RunningSum
 from safe_wrappers.control.teleop.port_checks import (
+    RunningSum,
     energy_j,
     port_energy,
     port_vector,
@@ -59,19 +52,13 @@ class EnergyReference:
     """One end of a two-port channel that gives out no more energy than the other end reports as taken in.
 
     At every tick both ends `receive` what has arrived, `modify`, and send `message_j`. The sum of both ports'
-    energies is then never below minus the initial storages (and debts), for any network: the number sent never falls,
-    and only the largest received one counts. Power is positive into the channel at *both* ends.
-
-    Without initial storage two such ends may never start: an end that moves something needs energy, and the other
-    takes none in while it feels no force.
+    energies is then never below minus the initial storages (and debts), for any delay, reordering and loss. Power is
+    positive into the channel at *both* ends. Without initial storage two such ends may never start.
 
     Args:
         causality: Which of the two this end changes, see above.
         initial_storage_j: Energy that this end may give out without any report, at least 0 J.
         limit: Largest size of what is added, N (m/s in admittance causality), > 0; None: none.
-
-    Raises:
-        ConfigurationError: For an unknown causality, negative storage, or a limit that is not positive.
     """
 
     def __init__(
@@ -99,11 +86,7 @@ class EnergyReference:
         return self._initial + self._heard + self._dissipated.value - self._given_out.value
 
     def receive(self, *messages_j: float) -> None:
-        """Take messages from the other end, in any order, duplicates included.
-
-        Args:
-            *messages_j: Values of its `message_j`.
-        """
+        """Take values of the other end's `message_j`, in any order, duplicates included."""
         for message in messages_j:
             self._heard = max(self._heard, energy_j("message_j", message))
 
@@ -113,7 +96,10 @@ class EnergyReference:
         """The port's effort and flow for the coming interval; arguments as `PassivityController.modify`."""
         interval = self._damper.interval(effort, flow, time_s)
         if self._last is not None:
-            self._settle(self._last, actual)
+            last = self._last.settled(actual)
+            through, damped = last.energy_j, last.damped_j  # both may raise
+            self._dissipated.add(damped)
+            self._book(through)
         owed = max(-interval.energy_j, 0.0) - self.budget_j
         result, self._last = self._damper.dissipate(interval, owed)
         return result
@@ -121,19 +107,11 @@ class EnergyReference:
     def account(self, effort: ArrayLike, flow: ArrayLike, time_s: float) -> None:
         """Account an interval without damping, for callers that keep to `budget_j` by other means than `modify`.
 
-        Args:
-            effort: N, shape (m,), or a number; held over the interval, or its mean.
-            flow: m/s, of the same shape; the mean where the effort is held, and held where it is the mean.
-            time_s: Length of the interval, > 0.
+        Effort (N) and flow (m/s) are numbers or of shape (m,); one is held over the interval of `time_s` > 0, the
+        other its mean.
         """
         f, v = port_vectors(effort=effort, flow=flow)
         self._book(port_energy(f, v, positive("time_s", time_s)))
-
-    def _settle(self, last: "Interval", actual: ArrayLike | None) -> None:
-        interval = last.settled(actual)
-        through, damped = interval.energy_j, interval.damped_j
-        self._dissipated.add(damped)
-        self._book(through)
 
     def _book(self, through_j: float) -> None:
         (self._taken_in if through_j > 0.0 else self._given_out).add(abs(through_j))
@@ -179,11 +157,7 @@ class Damper:
         self._limit = math.inf if limit is None else positive("limit", limit)
 
     def interval(self, effort: ArrayLike, flow: ArrayLike, time_s: float) -> Interval:
-        """The port as sampled, without damping.
-
-        Raises:
-            ConfigurationError: For sizes that differ, energy that is not finite, or a time that is not positive.
-        """
+        """The port as sampled, without damping."""
         f, v = port_vectors(effort=effort, flow=flow)
         answer, seen = (f, v) if self._answers_effort else (v, f)
         time = positive("time_s", time_s)

@@ -1,4 +1,4 @@
-"""Argument checks of energy ports: effort and flow of one step, positive numbers, energies."""
+"""Argument checks and sums of energy ports: effort and flow of one step, positive numbers, energies."""
 
 import math
 
@@ -12,11 +12,7 @@ Array = NDArray[np.float64]
 
 
 def same_shape(**values: ArrayLike) -> tuple[Array, Array]:
-    """Two finite arrays of one shape, without broadcasting.
-
-    Raises:
-        ConfigurationError: What is no number, not finite, or of two shapes.
-    """
+    """Two finite arrays of one shape, without broadcasting."""
     first, second = (finite_array(name, value) for name, value in values.items())
     if first.shape != second.shape:
         a, b = values
@@ -25,11 +21,7 @@ def same_shape(**values: ArrayLike) -> tuple[Array, Array]:
 
 
 def port_vector(name: str, value: ArrayLike) -> Array:
-    """One quantity of a port as (m,); a number is (1,). `port_energy` checks that it is finite.
-
-    Raises:
-        ConfigurationError: What is no number, of more than one axis, or empty.
-    """
+    """One quantity of a port as (m,); a number is (1,). `port_energy` checks that it is finite."""
     try:
         vector = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -40,11 +32,7 @@ def port_vector(name: str, value: ArrayLike) -> Array:
 
 
 def port_vectors(**values: ArrayLike) -> tuple[Array, Array]:
-    """Effort and flow of one port, see `port_vector`, of one size.
-
-    Raises:
-        ConfigurationError: What is no such vector, or of another size.
-    """
+    """Effort and flow of one port, see `port_vector`, of one size."""
     first, second = (port_vector(name, value) for name, value in values.items())
     if first.size != second.size:
         a, b = values
@@ -55,11 +43,7 @@ def port_vectors(**values: ArrayLike) -> tuple[Array, Array]:
 
 
 def port_energy(effort: Array, flow: Array, time_s: float) -> float:
-    """`F.v dt`, J.
-
-    Raises:
-        ConfigurationError: For a product that is not finite.
-    """
+    """`F.v dt`, J; a product that is not finite is refused."""
     # Checking the product instead of both factors saves time at every tick.
     with np.errstate(over="ignore", invalid="ignore"):
         energy = float(effort @ flow) * time_s
@@ -78,22 +62,36 @@ def _is_number(value: object) -> bool:
 
 
 def positive(name: str, value: float) -> float:
-    """A finite number above 0.
-
-    Raises:
-        ConfigurationError: For any other.
-    """
+    """A finite number above 0."""
     if not (_is_number(value) and math.isfinite(value) and value > 0.0):
         raise ConfigurationError(f"{name} must be a finite number above 0, got {value!r}")
     return float(value)
 
 
 def energy_j(name: str, value: float) -> float:
-    """A finite energy, at least 0.
-
-    Raises:
-        ConfigurationError: For any other.
-    """
+    """A finite energy, at least 0."""
     if not (_is_number(value) and math.isfinite(value) and value >= 0.0):
         raise ConfigurationError(f"{name} must be a finite energy of at least 0 J, got {value!r}")
     return float(value)
+
+
+class RunningSum:
+    """The sum of the numbers added so far: compensated (Neumaier), accurate to about one rounding."""
+
+    def __init__(self, start: float = 0.0) -> None:
+        self._sum = start
+        self._lost = 0.0
+
+    def add(self, value: float) -> None:
+        """Add one finite number."""
+        total = self._sum + value
+        if abs(self._sum) >= abs(value):
+            self._lost += (self._sum - total) + value
+        else:
+            self._lost += (value - total) + self._sum
+        self._sum = total
+
+    @property
+    def value(self) -> float:
+        """The sum."""
+        return self._sum + self._lost

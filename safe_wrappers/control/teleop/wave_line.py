@@ -1,22 +1,17 @@
 """One direction of a wave channel over a network with delay, jitter, reordering and loss.
 
 A wave sent for one tick carries the energy `|u|^2 / 2 * tick`. The channel stays passive if the energy put out never
-exceeds the energy that has arrived and was not put out before. Holding the last sample while nothing arrives, as is
-common, violates this: it puts the same energy out at every tick. A wave line accounts for all energy it puts out.
-
-Three rules for what is put out:
+exceeds the energy that has arrived and was not put out before; a wave line accounts for all energy it puts out. Three
+rules:
 
 - ``"queue"``: every wave that arrives is put out once, one per tick, in the order of sending; zero while there is
-  none. Neither energy nor the wave's integral is lost to jitter. Every tick with an empty queue adds a tick of delay,
-  up to that of the latest packet.
-- ``"hold"``: the newest wave that has arrived, scaled down to the reserve of energy. Packets that are overtaken or
-  arrive several at once add to the reserve. The shortest delay; the wave's integral, and with it the position of the
-  remote side, drifts.
+  none. Neither energy nor the wave's integral is lost to jitter, but the delay grows to that of the latest packet.
+- ``"hold"``: the newest wave that has arrived, scaled down to the reserve of energy. The shortest delay; the wave's
+  integral, and with it the position of the remote side, drifts.
 - ``"zero"``: the sum of what arrives within the tick, scaled down to the energy that arrived; zero if nothing does.
   No memory; jitter loses signal.
 
-Source: appendix "Passivity preservation via wave variables", extended from a fixed delay. Passivity bounds neither
-force nor displacement.
+Source: appendix "Passivity preservation via wave variables", extended from a fixed delay.
 """
 
 import heapq
@@ -28,8 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.checks import whole_number
-from safe_wrappers.control.numerics.running_sum import RunningSum
-from safe_wrappers.control.teleop.port_checks import port_energy, port_vector, positive
+from safe_wrappers.control.teleop.port_checks import RunningSum, port_energy, port_vector, positive
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -45,10 +39,7 @@ class WaveLine:
     Args:
         time_s: The tick, duration of every wave sent or put out, s, > 0.
         rule: See above.
-        components: m, of a wave.
-
-    Raises:
-        ConfigurationError: For an unknown rule, or a tick or a number of components that is not positive.
+        components: m, of a wave, at least 1.
     """
 
     def __init__(self, time_s: float, rule: Rule = "queue", components: int = 1) -> None:
@@ -93,14 +84,10 @@ class WaveLine:
         return self._lost.value
 
     def send(self, wave: ArrayLike, sequence: int) -> None:
-        """Note a wave that leaves.
-
-        Args:
-            wave: sqrt(W), shape (m,), or a number.
-            sequence: Its number, higher than any before, at least 0.
+        """Note a wave that leaves, sqrt(W), shape (m,) or a number.
 
         Raises:
-            ConfigurationError: For a wave of another shape or not finite, and a number out of order.
+            ConfigurationError: For a wave of another shape or not finite, and a sequence number that does not rise.
         """
         if sequence <= self._last_sent:
             raise ConfigurationError(
@@ -123,13 +110,10 @@ class WaveLine:
         self._lost.add(self._landed(sequence))
 
     def deliver(self, packets: Iterable[tuple[int, ArrayLike]]) -> Array:
-        """The wave put out during this tick. Call it once per tick, also when nothing has arrived.
+        """The wave put out during this tick, sqrt(W), shape (m,). Call it once per tick, arrivals or not.
 
         Args:
             packets: Arrivals since the last tick, (sequence, wave) in any order. Duplicates are ignored.
-
-        Returns:
-            The wave, sqrt(W), shape (m,).
 
         Raises:
             ConfigurationError: For a packet that was never sent, or a wave of another shape or not finite.
@@ -145,7 +129,11 @@ class WaveLine:
                 fresh.append((int(sequence), self._landed(sequence), wave))
         if self.rule == "queue":
             return self._next_in_queue(fresh)
-        wanted = self._sum(fresh) if self.rule == "zero" else self._newest_of(fresh)
+        wanted = (
+            sum((wave for _, _, wave in fresh), np.zeros(self._components))
+            if self.rule == "zero"
+            else self._newest_of(fresh)
+        )
         available = self._reserve + math.fsum(energy for _, energy, _ in fresh)
         put_out, energy = self._affordable(wanted, available)
         self._put_out.add(energy)
@@ -177,12 +165,6 @@ class WaveLine:
         self._put_out.add(energy)
         self._lost.add(available - energy)
         return put_out
-
-    def _sum(self, fresh: list[tuple[int, float, Array]]) -> Array:
-        total = np.zeros(self._components)
-        for _, _, wave in fresh:
-            total = total + wave
-        return total
 
     def _newest_of(self, fresh: list[tuple[int, float, Array]]) -> Array:
         for sequence, _, wave in fresh:

@@ -1,14 +1,11 @@
 """Online estimate of a traction curve's peak: its height, its slip, and their uncertainty.
 
-Every measured pair of slip and friction coefficient lies on the ground's curve. At small slip it shows the slope
-only, which fits a high peak at large slip as well as a low one at small slip. So there is a hypothesis per slip of
-the peak, each with a Gaussian estimate of the peak's height (a Kalman filter: the coefficient is linear in it),
-weighted by its likelihood. Height and weights fade with the distance travelled, because the ground changes; a
-measurement that no hypothesis explains resets them.
+At small slip a measured pair of slip and friction shows the curve's slope only. So there is a hypothesis per slip of
+the peak, each with a Kalman filter of the peak's height, weighted by its likelihood. Height and weights fade with the
+distance travelled; a measurement that no hypothesis explains resets them.
 
-Source: appendix "Wheel slip ratio and friction boundaries" (peak and falling slope); the curve's shape is the Magic
-Formula's. The bank of hypotheses is textbook multiple-model estimation. The standard deviations hold for noise
-that is white and curves of this shape; neither is guaranteed, so they are no error bound.
+Source: appendix "Wheel slip ratio and friction boundaries"; the curve's shape is the Magic Formula's. The standard
+deviations hold for white noise and curves of this shape: they are no error bound.
 """
 
 import copy
@@ -33,11 +30,7 @@ _SURPRISE: Final = 4.0
 
 
 class FrictionEstimate:
-    """Peak friction under each of n wheels.
-
-    Args:
-        wheels: n.
-    """
+    """Peak friction under each of n wheels."""
 
     def __init__(self, wheels: int) -> None:
         peaks = np.array(PEAK_SLIPS)

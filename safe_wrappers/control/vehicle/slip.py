@@ -1,12 +1,10 @@
 """Longitudinal slip of a driven wheel: the slip ratio, and the wheel speeds that keep it within a limit.
 
-Speeds are signed along the wheel's heading: the wheel's circumferential speed `r w` (radius times angular rate)
-and the ground speed `v_x` of its centre. Slip has the sign of the force on the vehicle: positive when the wheel
-is faster than the ground. Reversing mirrors everything.
+Speeds are signed along the wheel's heading: the circumferential speed `r w` and the ground speed `v_x` of the wheel's
+centre. Slip is positive when the wheel is faster than the ground, and normalised: 1 is a wheel that spins on the spot
+and -1 a locked one. The unbounded piecewise form is in `safe_wrappers.appendix.vehicle.slip`.
 
-Source: appendix "Wheel slip ratio and friction boundaries". Slip here is in the normalised form: the denominator is
-the faster of the two speeds, so 1 is a wheel that spins on the spot and -1 a locked one. The unbounded piecewise form
-is in `safe_wrappers.appendix.vehicle.slip`.
+Source: appendix "Wheel slip ratio and friction boundaries".
 """
 
 import numpy as np
@@ -19,18 +17,12 @@ Array = NDArray[np.float64]
 
 
 def slip_ratio(wheel_speed: ArrayLike, ground_speed: ArrayLike, regularization: float) -> Array:
-    """Normalised slip `(r w - v) / max(|v|, |r w|, regularization)`.
+    """Normalised slip `(r w - v) / max(|v|, |r w|, regularization)`, in size at most 1 (2 in opposite directions).
 
     Args:
         wheel_speed: r w, m/s, any shape.
         ground_speed: v_x, m/s, broadcast against it.
         regularization: Least denominator, m/s, > 0: near rest the slip is proportional to the sliding speed.
-
-    Returns:
-        Slip, in [-1, 1] while wheel and ground move the same way; up to 2 in size in opposite directions.
-
-    Raises:
-        ConfigurationError: Numbers that are not finite, or a regularization that is not positive.
     """
     wheel, ground = finite_arrays(wheel_speed=wheel_speed, ground_speed=ground_speed)
     positive("regularization", regularization, "m/s")
@@ -40,18 +32,12 @@ def slip_ratio(wheel_speed: ArrayLike, ground_speed: ArrayLike, regularization: 
 
 
 def slip_window(ground_speed: ArrayLike, max_slip: ArrayLike, regularization: float) -> tuple[Array, Array]:
-    """The circumferential speeds whose slip is at most `max_slip` in size.
+    """The smallest and largest circumferential speed r w, m/s, whose slip is at most `max_slip` in size.
 
     Args:
         ground_speed: v_x, m/s, any shape.
         max_slip: In (0, 1), broadcast against it.
         regularization: As in `slip_ratio`, m/s.
-
-    Returns:
-        Smallest and largest r w, m/s, at which the slip is `-max_slip` and `max_slip`.
-
-    Raises:
-        ConfigurationError: A number out of its range.
     """
     ground, slip = finite_arrays(ground_speed=ground_speed, max_slip=max_slip)
     positive("regularization", regularization, "m/s")

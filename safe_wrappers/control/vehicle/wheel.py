@@ -1,11 +1,10 @@
 """A driven wheel over one control interval: its rate under drive torque and traction force.
 
 `I w' = tau - k w - b w - r F`, with torque and force constant over the interval and k the feedback of a speed servo,
-stepped as a physics engine steps it (damping implicit, as MuJoCo's Euler, implicit and implicitfast do):
-`w+ = decay w + gain (tau - r F)`, exactly. Other integrators (Runge-Kutta) differ by a relative rate of half the time
-step over the wheel's time constant I / b, per time constant: little, unless the axle is strongly damped. Solved for F
-it is the traction-force observer of traction control, without force sensor and friction model. Other torques on the
-axle (dry friction, a spring) appear in F.
+stepped with implicit damping as MuJoCo's Euler integrators do: `w+ = decay w + gain (tau - r F)`, exactly.
+Runge-Kutta differs by a relative rate of half the time step over the time constant I / b, per time constant. Solved
+for F it is a traction-force observer without force sensor and friction model; other torques on the axle (dry
+friction, a spring) appear in F.
 
 Source: appendix "Wheel slip ratio and friction boundaries" (the wheel's equation).
 """
@@ -22,12 +21,7 @@ Array = NDArray[np.float64]
 
 
 class Response(NamedTuple):
-    """`w+ = decay w + gain (tau - r F)`.
-
-    Attributes:
-        decay: Share of the rate that remains after damping and feedback, at most 1.
-        gain: Rate per torque, rad/(s N m).
-    """
+    """`w+ = decay w + gain (tau - r F)`: share of the rate that remains, and rate per torque, rad/(s N m)."""
 
     decay: Array
     gain: Array

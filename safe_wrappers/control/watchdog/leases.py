@@ -1,18 +1,13 @@
 """Watchdog leases: how long a command may stay in force without renewal.
 
-Source: appendix "Kinematic derivation of watchdog validity leases". From the reading of the clearance until full
-braking, five intervals pass: the lease, the detection of its end, a confirmation window, the age of the reading and
-the onset of the actuator. The distance travelled in them, and the stopping distance, must fit into the clearance:
+Source: appendix "Kinematic derivation of watchdog validity leases" and "Teleoperation network round-trip time
+bounds". The distance travelled from the reading of the clearance until full braking, and the stopping distance, must
+fit into the clearance:
 
     travel(lease + detect + hold + age + act) + stopping distance + localisation + margin <= clearance
 
-In the appendix the machine keeps its speed until it brakes. With `acceleration` it may speed up until then, as a
-machine whose policy fails at full throttle does.
-
-`braking` is a *verified lower bound* on the deceleration; it is not checked here.
-
-A remote operator has the delays of video, reaction and network round trip instead. `round_trip_ceiling` bounds the
-round trip (appendix "Teleoperation network round-trip time bounds").
+In the appendix the machine keeps its speed until it brakes; with `acceleration` it may speed up until then. `braking`
+is a *verified lower bound* on the deceleration; it is not checked here.
 
 A lease of zero or less means: revoke now. Rounding only shortens a lease, and inputs that are not finite revoke.
 """
@@ -37,16 +32,13 @@ _LONGEST = 1e300
 
 @dataclass(frozen=True)
 class LeaseDelays:
-    """Delays in addition to the lease, in s.
+    """Delays in addition to the lease, in s, finite and at least 0.
 
     Attributes:
         detect_s: T_detect, until the end of the lease is recognised.
         hold_s: T_hold, a confirmation window in which the last command continues.
         age_s: t_age, age of the clearance's reading when the lease is granted.
         act_s: T_act, until full deceleration.
-
-    Raises:
-        ConfigurationError: For a delay that is negative or not finite.
     """
 
     detect_s: float = 0.0
@@ -76,17 +68,15 @@ def longest_lease(
     acceleration: ArrayLike = 0.0,
     top_speed: ArrayLike = np.inf,
 ) -> Array:
-    """The longest T_lease after which a machine without renewal still stops inside the clearance.
+    """The longest T_lease, s, shape (...), after which a machine without renewal still stops inside the clearance.
 
     The largest tau = T_lease + delays_s with, for approach speed v, acceleration a and braking b,
 
         v tau + a tau^2 / 2 + (v + a tau)^2 / (2 b) + localisation + margin <= clearance
 
-    (a = 0 is the appendix's formula), where the speed v + a tau stops growing at `top_speed`. It is solved exactly:
-    with w the speed at brake onset, `w^2 = (2 a room + v^2) b / (a + b)`.
-
-    The lease is inf for a machine that recedes or stands still, cannot accelerate and has room left. With
-    acceleration a receding machine may reverse, which is counted.
+    where the speed v + a tau stops growing at `top_speed`; solved exactly. Zero or less: revoke. inf for a machine
+    that recedes or stands still, cannot accelerate and has room left; -inf where an input (but `top_speed`) is not
+    finite, where the braking is not positive, and where a machine that does not approach has no room left. Never NaN.
 
     Args:
         clearance: D_clear as measured `age` ago, m, shape (...).
@@ -98,10 +88,6 @@ def longest_lease(
         acceleration: Largest approach acceleration that any command may cause until the brakes hold, m/s^2.
         top_speed: Bound on the approach speed that this acceleration may lead to, m/s; a measured speed above it
             counts as the bound. inf: none.
-
-    Returns:
-        Lease in s, shape (...). Zero or less: revoke. -inf where an input (but `top_speed`) is not finite, where the
-        braking is not positive, and where a machine that does not approach has no room left. Never NaN.
 
     Raises:
         ConfigurationError: For a negative delay, localisation bound, margin, acceleration or top speed.
@@ -171,35 +157,13 @@ def round_trip_ceiling(
     acceleration: ArrayLike = 0.0,
     top_speed: ArrayLike = np.inf,
 ) -> Array:
-    """The longest network round trip at which a remote operator can still stop the machine inside the clearance.
+    """The longest network round trip, s, shape (...), at which a remote operator can still stop the machine in time.
 
-    The largest T_RTT, downlink and uplink together, with
-
-        T_RTT <= (D_clear - d_brake) / v - (T_video + T_human + T_act),    d_brake = v^2 / (2 a_brake)
-
-    Above it the operator cannot brake in time, and the machine has to brake by itself. It holds for the given
-    clearance and speed, so it has to be computed at every control step. It bounds displacement, not energy or contact
-    force.
-
-    Args:
-        clearance: D_clear as measured by the machine, m, shape (...).
-        speed: Approach speed v, m/s, positive towards the obstacle, shape (...).
-        braking: Verified lower bound on the deceleration a_brake, m/s^2, shape (...).
-        video_s: T_video, from the exposure to the operator's display, s, shape (...). Where the downlink is part of
-            it, it must not be counted in the round trip as well.
-        human_s: T_human, the operator's reaction, s, shape (...); 0.15 to 0.25 s in the appendix.
-        act_s: T_act, until full deceleration, s, shape (...).
-        localisation: Bound on the error of the clearance, m, shape (...).
-        margin: Clearance at rest, m, shape (...).
-        acceleration: Largest approach acceleration until full braking, m/s^2; 0 is the appendix's constant speed.
-        top_speed: Bound on the speed that this may lead to, m/s; inf: none.
-
-    Returns:
-        Ceiling in s, shape (...). Zero or less: no round trip is short enough, revoke. inf where nothing approaches;
-        -inf as in `longest_lease`. Rounded down, never NaN.
-
-    Raises:
-        ConfigurationError: For a negative delay, localisation bound, margin, acceleration or top speed.
+    The largest T_RTT, downlink and uplink together, with `T_RTT <= (D_clear - d_brake) / v - (T_video + T_human +
+    T_act)`. `video_s` lasts from the exposure to the operator's display (a downlink in it must not be counted twice),
+    `human_s` is the reaction (0.15 to 0.25 s in the appendix), `act_s` lasts until full deceleration; s, at least 0,
+    shape (...). Other arguments, values and errors are those of `longest_lease`. It bounds displacement, not energy
+    or contact force, and has to be computed at every control step.
     """
     _not_negative(video_s=video_s, human_s=human_s, act_s=act_s)
     video, human, act = (np.asarray(late, dtype=np.float64) for late in (video_s, human_s, act_s))
@@ -209,19 +173,15 @@ def round_trip_ceiling(
 
 
 def longest_lease_of_room(room: ArrayLike, closing_speed: ArrayLike, delays_s: ArrayLike) -> Array:
-    """The longest lease from a barrier that includes the stopping distance: `room / closing - delays`.
+    """The longest lease, s, shape (...), from a barrier that includes the stopping distance: `h / closing - delays`.
+
+    inf where h cannot fall (closing speed <= 0) and is positive; -inf where it cannot fall and is not, and where an
+    input is not finite.
 
     Args:
         room: Value h of the barrier, the clearance left after braking, in any unit U, shape (...).
         closing_speed: Bound on how fast h may fall under any command until the brakes hold, U/s, shape (...).
-        delays_s: The other four delays, s, shape (...).
-
-    Returns:
-        Lease in s, shape (...). inf where h cannot fall (closing speed <= 0) and is positive; -inf where it cannot
-        fall and is not, and where an input is not finite.
-
-    Raises:
-        ConfigurationError: For a negative delay.
+        delays_s: The other four delays, s, at least 0, shape (...).
     """
     h, closing, delays = np.broadcast_arrays(
         *(np.asarray(x, dtype=np.float64) for x in (room, closing_speed, delays_s))

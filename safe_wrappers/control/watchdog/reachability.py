@@ -1,15 +1,8 @@
 """Reachability in time: bounds on the displacement within a time, and jerk-limited motion times.
 
-Source: appendix "Trajectory transit time and reachable distance".
-
-* `furthest` and `admits` are necessary bounds: further limits only shrink the reachable set, so a goal outside is
-  refused before anything else is computed, and no reachable goal is.
-* `jerk_limited_time` is the duration of the constrained profile itself, solved by ruckig for the given velocity and
-  acceleration at both ends.
-
-`safe_wrappers.appendix.watchdog.reachability` has moves from rest to rest, and displacements with limited jerk.
-
-Metres stand for any unit of length: radians do as well.
+Source: appendix "Trajectory transit time and reachable distance". `furthest` and `admits` are necessary bounds: no
+reachable goal is refused. `jerk_limited_time` is the duration of the constrained profile itself, solved by ruckig.
+Moves from rest to rest: `safe_wrappers.appendix.watchdog.reachability`. Metres stand for any unit of length.
 """
 
 import math
@@ -32,30 +25,23 @@ _ROUNDING = 32.0 * float(np.finfo(np.float64).eps)
 
 @dataclass(frozen=True)
 class MotionLimits:
-    """Symmetric limits of every axis; scalars apply to all of them.
+    """Symmetric limits of every axis, positive; scalars apply to all of them.
 
     Attributes:
         max_acceleration: m/s^2, finite.
         max_speed: m/s; inf: none.
         max_jerk: m/s^3; inf: none.
-
-    Raises:
-        ConfigurationError: For a limit that is not positive, or an acceleration that is not finite.
     """
 
     max_acceleration: float | Sequence[float]
     max_speed: float | Sequence[float] = math.inf
     max_jerk: float | Sequence[float] = math.inf
-    _arrays: tuple[Array, Array, Array] = field(init=False, repr=False, compare=False)
+    arrays: tuple[Array, Array, Array] = field(init=False, repr=False, compare=False)
+    """Acceleration, speed, jerk."""
 
     def __post_init__(self) -> None:
         checked = checked_limits(self.max_acceleration, self.max_speed, self.max_jerk)
-        object.__setattr__(self, "_arrays", checked)
-
-    @property
-    def arrays(self) -> tuple[Array, Array, Array]:
-        """Acceleration, speed, jerk."""
-        return self._arrays
+        object.__setattr__(self, "arrays", checked)
 
 
 def furthest(
@@ -66,27 +52,20 @@ def furthest(
     max_acceleration: ArrayLike,
     max_jerk: ArrayLike = np.inf,
 ) -> tuple[Array, Array]:
-    """Bounds on the displacement at any moment within a time, from a moving start to any speed at the end.
+    """Bounds on the displacement, m, at any moment within a time, from a moving start to any speed at the end.
 
-    Upwards the acceleration grows by the largest jerk up to its limit, and the speed up to its limit, without the
-    decrease of acceleration that a real machine needs before it: no admissible motion gets farther, and the bound is
-    exact where the speed limit is not reached or the jerk not limited. A start outside the limits widens them to its
-    speed, or to the speed that its acceleration leads to.
+    The lowest (<= 0) and the highest (>= 0), shape (...) each; (inf, -inf) where the duration is negative or anything
+    is not finite. No admissible motion gets farther; the bound is exact where the speed limit is not reached or the
+    jerk not limited. A start outside the limits widens them to its speed, or to the speed that its acceleration leads
+    to.
 
     Args:
         duration: s, shape (...).
         velocity: At the start, m/s, shape (...).
         acceleration: At the start, m/s^2, shape (...); without effect if the jerk is not limited.
         max_speed: m/s, shape (...); inf: none.
-        max_acceleration: m/s^2, shape (...).
+        max_acceleration: m/s^2, shape (...), finite.
         max_jerk: m/s^3, shape (...); inf: none.
-
-    Returns:
-        Lowest (<= 0) and highest (>= 0) displacement in m, shape (...). Where the duration is negative or anything
-        is not finite, the empty interval (inf, -inf).
-
-    Raises:
-        ConfigurationError: For a limit that is not positive, or an acceleration limit that is not finite.
     """
     a_max, v_max, jerk = checked_limits(max_acceleration, max_speed, max_jerk)
     time, v, a = (np.asarray(x, dtype=np.float64) for x in (duration, velocity, acceleration))
@@ -142,30 +121,19 @@ def admits(
     max_jerk: ArrayLike = np.inf,
     acceleration: ArrayLike | None = 0.0,
 ) -> NDArray[np.bool_]:
-    """Whether a position may be reached within a time, at any speed: a necessary condition, axis by axis.
+    """Whether a position may be reached within a time, at any speed, axis by axis: a necessary condition.
 
-    False: no admissible motion gets there (`furthest`). True is not sufficient: path, torque and stopping remain to
-    be checked.
-
-    Args:
-        goal: m, shape (...).
-        position: At the start, m, shape (...).
-        velocity: At the start, m/s, shape (...).
-        duration: s, shape (...).
-        max_speed: m/s, shape (...); inf: none.
-        max_acceleration: m/s^2, shape (...).
-        max_jerk: m/s^3, shape (...); inf: none.
-        acceleration: At the start, m/s^2, shape (...). None: not measured; then the largest one is assumed, and the
-            jerk limit only matters for a start above the speed limit.
-
-    Returns:
-        Shape (...). False where anything is not finite or the duration is negative.
-
-    Raises:
-        ConfigurationError: For a limit that is not positive, or an acceleration limit that is not finite.
+    False: no admissible motion gets there, anything is not finite, or the duration is negative. True is not
+    sufficient: path, torque and stopping remain to be checked. `goal` and `position` are in m, shape (...), the other
+    arguments those of `furthest`. An acceleration of None is not measured: the largest one is assumed, and the jerk
+    limit only matters for a start above the speed limit.
     """
     if acceleration is None:
-        lowest, highest = _furthest_unmeasured(duration, velocity, max_speed, max_acceleration, max_jerk)
+        a_max, v_max, jerk = checked_limits(max_acceleration, max_speed, max_jerk)
+        v = np.asarray(velocity, dtype=np.float64)
+        # A start inside the limits stays inside: without a limit on the jerk.
+        _, highest = furthest(duration, v, a_max, v_max, a_max, np.where(v > v_max, jerk, np.inf))
+        lowest, _ = furthest(duration, v, -a_max, v_max, a_max, np.where(v < -v_max, jerk, np.inf))
     else:
         lowest, highest = furthest(duration, velocity, acceleration, max_speed, max_acceleration, max_jerk)
     end, start = np.asarray(goal, dtype=np.float64), np.asarray(position, dtype=np.float64)
@@ -174,35 +142,17 @@ def admits(
         return np.asarray((lowest - slack <= way) & (way <= highest + slack) & np.isfinite(way))
 
 
-def _furthest_unmeasured(
-    duration: ArrayLike,
-    velocity: ArrayLike,
-    max_speed: ArrayLike,
-    max_acceleration: ArrayLike,
-    max_jerk: ArrayLike,
-) -> tuple[Array, Array]:
-    """`furthest` for any acceleration at the start; a start inside the limits stays inside."""
-    a_max, v_max, jerk = checked_limits(max_acceleration, max_speed, max_jerk)
-    v = np.asarray(velocity, dtype=np.float64)
-    _, highest = furthest(duration, v, a_max, v_max, a_max, np.where(v > v_max, jerk, np.inf))
-    lowest, _ = furthest(duration, v, -a_max, v_max, a_max, np.where(v < -v_max, jerk, np.inf))
-    return lowest, highest
-
-
 def jerk_limited_time(start: State, end: State, limits: MotionLimits) -> Array:
-    """The shortest time in which all axes arrive at their end state together.
+    """The shortest time, s, shape (...), in which all axes arrive at their end state together.
 
-    Between states of rest it is the slowest axis's own time; with moving ends it may be longer, since an axis cannot
-    wait. A start outside the limits is first brought back inside, as fast as they allow.
+    Between states of rest it is the slowest axis's own time; with moving ends it may be longer. A start outside the
+    limits is first brought back inside. inf where a state is not finite, and where the end state violates the limits:
+    too fast, too strongly accelerated, or reached only from above the speed limit.
 
     Args:
         start: Position, velocity, acceleration.
         end: Likewise; the last axis holds the axes of the machine (a scalar is one axis), those before it the batch.
         limits: Of every axis.
-
-    Returns:
-        Time in s, shape (...). inf where a state is not finite, and where the end state violates the limits: too
-        fast, too strongly accelerated, or reached only from above the speed limit.
 
     Raises:
         ConfigurationError: Where the shapes do not fit together, or ruckig finds no profile for other reasons.
@@ -262,11 +212,7 @@ def _told(values: tuple[Array, ...]) -> str:
 def checked_limits(
     max_acceleration: ArrayLike, max_speed: ArrayLike, max_jerk: ArrayLike
 ) -> tuple[Array, Array, Array]:
-    """Acceleration, speed and jerk limits as float64.
-
-    Raises:
-        ConfigurationError: For a limit that is not positive, or an acceleration that is not finite.
-    """
+    """Acceleration (finite), speed and jerk limits as float64, all positive."""
     named = {"max_acceleration": max_acceleration, "max_speed": max_speed, "max_jerk": max_jerk}
     checked = []
     for name, value in named.items():

@@ -6,10 +6,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.control.numerics.running_sum import RunningSum
 from safe_wrappers.control.teleop.passivity import ChannelLedger
 from safe_wrappers.control.teleop.passivity_control import EnergyReference
-from safe_wrappers.control.teleop.port_checks import port_energy
+from safe_wrappers.control.teleop.port_checks import RunningSum, port_energy
 from safe_wrappers.wrappers.teleop.link import Packet
 from safe_wrappers.wrappers.teleop.port import PortReading
 

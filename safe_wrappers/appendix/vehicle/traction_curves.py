@@ -1,7 +1,6 @@
 """Traction curves: longitudinal friction over slip, with a peak and a falling slope beyond it.
 
-Pacejka's Magic Formula, odd in slip. `MAGIC_FORMULA` holds one curve per ground, with the peak between slips of 0.10
-and 0.15. Burckhardt's curve is in `safe_wrappers.appendix.vehicle.burckhardt`.
+Pacejka's Magic Formula, odd in slip. Burckhardt's curve is in `safe_wrappers.appendix.vehicle.burckhardt`.
 
 Source: appendix "Wheel slip ratio and friction boundaries"; H. Pacejka, Tire and Vehicle Dynamics. The curves are of
 tyres on roads: a robot's wheel has its own, to be measured.
@@ -59,13 +58,7 @@ class MagicFormula:
 
     @classmethod
     def from_peak(cls, peak_friction: float, peak_slip: float, shape: float = 1.65) -> "MagicFormula":
-        """The curve with E = 0 and a given peak.
-
-        Args:
-            peak_friction: > 0.
-            peak_slip: In (0, 1).
-            shape: C, in (1, 2).
-        """
+        """The curve with E = 0 and a given peak at a slip in (0, 1)."""
         check_range("peak_slip", peak_slip, 0.0, 1.0)
         check_range("shape", shape, 1.0, 2.0)
         return cls(math.tan(math.pi / (2.0 * shape)) / peak_slip, shape, peak_friction)
@@ -99,11 +92,7 @@ def clipped(slip: ArrayLike) -> Array:
 
 
 def check_range(name: str, value: float, low: float, high: float) -> None:
-    """Refuse a number that is not in the open interval.
-
-    Raises:
-        ConfigurationError: It names the number.
-    """
+    """Refuse a number that is not in the open interval."""
     if not (math.isfinite(value) and low < value < high):
         raise ConfigurationError(f"{name} must be a finite number in ({low:g}, {high:g}), got {value!r}")
 
