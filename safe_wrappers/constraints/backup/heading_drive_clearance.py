@@ -85,6 +85,7 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
             plant, "HeadingDriveClearance needs a MujocoPlant: it reads the robot's model"
         )
         self._frame = PlanarFrame(machine, spec.body)
+        self._discs = np.zeros((0, 3))
         self._turns_first = self._frame.turn_index == 0
         super().__init__(spec, machine)
 
@@ -96,13 +97,13 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
     def clearance(self) -> Array:
         """Of the stopping path from the nearest disc, margin and state error not taken off, m, shape (1,)."""
         reserve = self.spec.margin + self.spec.state_error
-        self._motion = np.array(self._frame.motion(self.plant))
-        discs = [
-            (*center, obstacle.radius + reserve)
-            for obstacle in self.spec.obstacles
-            for center in obstacle.centers(self.plant)[:, :2].tolist()
-        ]
-        self._scene = self._models, self._motion, np.array(discs).reshape(-1, 3), self.spec.brake
+        centers = [obstacle.centers(self.plant)[:, :2] for obstacle in self.spec.obstacles]
+        if sum(map(len, centers)) != len(self._discs):
+            sizes = [o.radius + reserve for o in self.spec.obstacles]
+            self._discs = np.zeros((sum(map(len, centers)), 3))
+            self._discs[:, 2] = np.repeat(sizes, [*map(len, centers)])
+        np.concatenate(centers, out=self._discs[:, :2])
+        self._scene = self._models, np.array(self._frame.motion(self.plant)), self._discs, self.spec.brake
         least, self._in_play = among.least_clearance(*self._scene)
         return np.array([least + reserve])
 
