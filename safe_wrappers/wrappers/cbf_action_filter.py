@@ -5,7 +5,7 @@ import math
 import time
 import warnings
 from collections.abc import Sequence
-from typing import Any, ClassVar, SupportsFloat
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -23,9 +23,10 @@ from safe_wrappers.filter.search import Stage
 from safe_wrappers.plants.default import default_plant
 from safe_wrappers.plants.env_checks import check_actions, wrappers_of
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.template import PlantTemplate, own_plant
+from safe_wrappers.plants.template import own_plant
 from safe_wrappers.serialize import constraint_from, plain_data
-from safe_wrappers.stack import Layer, refuse_order
+from safe_wrappers.stack import Layer
+from safe_wrappers.wrappers.common.layer import LayerWrapper, Reset, Step
 
 Array = NDArray[np.float64]
 
@@ -33,23 +34,21 @@ _SAFE_TOLERANCE = 1e-6
 """h below zero by less is rounding (of float32 actions, too), in the constraints' own units."""
 
 
-class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
+class CBFActionFilter(LayerWrapper):
     """Filters actions through constraints, all of them in one projection.
 
-    At every step: read the plant; if every constraint admits the policy's action, execute it bit for bit; else
-    project it onto the rows of all constraints and the actuator box at once, check the answer against the rows
-    and, where a constraint can, by prediction; if nothing admissible is found, run the fallback and say so.
+    At every step: if every constraint admits the policy's action, execute it bit for bit; else project it onto the
+    rows of all constraints and the actuator box at once, and check the answer against the rows and, where a
+    constraint can, by prediction; if nothing admissible is found, run the fallback and say so.
 
     **What it guarantees.** No non-finite action, and none outside the action space, reaches the env. The executed
     action satisfies every constraint's rows (to 1e-8 of half the box) or, where a constraint predicts the held
     step, its prediction; else `cbf/infeasible` or `cbf/fallback` is True. If every constraint's `promise` is
     "proved" and the plant is right within the constraints' margins, episodes that start safe stay safe at every
-    physics substep, whatever the fallback: a proved stopping control is tried before it.
+    physics substep, whatever the fallback.
 
     **What it does not.** A "best effort" constraint, a plant outside its margins, or a start that is already
-    unsafe (warned of once per episode, counted in `cbf/unsafe`) void that. It does not clip rewards or end
-    episodes. A learner that stores the policy's action learns from "naive" replays (Krasowski et al., 2023);
-    `AdaptionPenalty` and `safe_wrappers.sb3.ExecutedActionReplayBuffer` are the other choices.
+    unsafe (warned of once per episode, counted in `cbf/unsafe`) void that. It does not clip rewards or end episodes.
 
     Args:
         env: With a one-dimensional Box action space.
@@ -91,7 +90,8 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         solver: str = "daqp",
         margin: float = 0.0,
     ) -> None:
-        refuse_order(env, self.layer, type(self).__name__)
+        arguments = dict(locals())
+        LayerWrapper.__init__(self, env)
         space = check_actions(env)
         plant = own_plant(plant)
         if isinstance(constraints, str | dict) or not isinstance(constraints, Sequence) or not constraints:
@@ -99,15 +99,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         own = [copy.deepcopy(c) for c in [*map(constraint_from, constraints)]]
         margin = non_negative("margin", margin, "the constraints' own units")
         check_solver(solver)
-        gym.utils.RecordConstructorArgs.__init__(
-            self,
-            constraints=[plain_data(c) for c in own],
-            plant=None if plant is None else PlantTemplate(plant),
-            fallback=fallback,
-            solver=solver,
-            margin=margin,
-        )
-        gym.Wrapper.__init__(self, env)
+        self._record(arguments, constraints=[plain_data(c) for c in own], plant=plant, margin=margin)
         self.constraints: list[Constraint] = [c.widened(margin) for c in own] if margin else own
         self.constraint_names = _unique([type(c).__name__ for c in self.constraints])
         self.plant: Plant = plant if plant is not None else default_plant(env)
@@ -120,9 +112,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         self.filter_seconds = 0.0
         self.filter_calls = 0
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env and forget the episode: commands in flight, the last action, the warning."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._warned.discard("unsafe")
@@ -139,7 +129,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         info[keys.CBF_STAGE] = int(Stage.PROPOSAL)
         return observation, info | self.filter.info(None, None)
 
-    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> Step:
         """Filter the action and step the env with what may be executed."""
         started = time.perf_counter()
         proposed = self._checked(action)

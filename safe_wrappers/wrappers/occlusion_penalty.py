@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar, SupportsFloat
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import mujoco
@@ -14,64 +14,54 @@ from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.control.estimation.covariance import blind_time
 from safe_wrappers.control.estimation.observability import linear_observability
 from safe_wrappers.control.estimation.tracks import Tracks, largest_deviation
-from safe_wrappers.errors import ConfigurationError, SafeWrappersError
+from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import read_attribute
 from safe_wrappers.plants.mujoco.timing import control_interval
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight
-from safe_wrappers.stack import Layer, refuse_order
+from safe_wrappers.stack import Layer
+from safe_wrappers.wrappers.common.layer import LayerWrapper, Reset, Step
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
-from safe_wrappers.wrappers.occlusion.measured import measured
 from safe_wrappers.wrappers.occlusion.sensor import Sensor, sensor_from
-from safe_wrappers.wrappers.occlusion.things import check_env, tracked_things, with_tracks
-from safe_wrappers.wrappers.occlusion.track import Track, track_from
+from safe_wrappers.wrappers.occlusion.track import Track, track_from, tracked_things
 
 Array = NDArray[np.float64]
 
 _AXES = ("x", "y", "z")
 
 
-class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
+class OcclusionPenalty(LayerWrapper):
     """Estimates what a sensor on the robot sees, and sees no more, and takes a penalty off the reward for not seeing.
 
-    After every step it casts a ray to each tracked point, all in one call. What is in sight is measured, with noise,
-    and updates the track's Kalman estimate; what is not grows less certain, as the Lyapunov equation says, exactly.
-    Four things come of it, each of which can be used without the others:
+    After every step it casts a ray to each tracked point. What is in sight is measured, with noise, and updates the
+    track's Kalman estimate; what is not grows less certain, as the Lyapunov equation says, exactly. A track's
+    permission to be relied on expires before ``sigmas * sigma`` crosses `tolerance`, one control step ahead;
+    `TrackPermission` stops the machine then. `TrackedDiscs` are obstacles that grow with the uncertainty. The filter
+    belongs outside; it reads the estimates.
 
-    - **Reward**: `weight` times the mean, over the tracks within the sensor's range, of
-      ``min(1, sigmas * sigma / tolerance) ** 2``, is taken off. `weight=0` leaves the reward alone.
-    - **Observation** (`observe`): for each track the estimated position relative to the sensor's body (m, world
-      axes), the estimated velocity (m/s) and the standard deviation along each axis (m), appended to a flat Box, or
-      under the key "tracks" of a Dict. The tracks' true states are not in it.
-    - **Permission**: a track's permission to be relied on expires *before* ``sigmas * sigma`` crosses `tolerance`,
-      one control step ahead, and comes back when it is seen. `TrackPermission` stops the machine then; `permissions`
-      says for how long they would last.
-    - **The filter around it**: `TrackedDiscs` are obstacles that are as much larger as the estimates are uncertain,
-      so `Clearance` and the like keep k sigma more distance and the robot that sees less moves more carefully.
+    **What it guarantees.** If the tracked things move as declared, the sensor's noise is as declared, and nothing
+    else is measured than what is in sight, then the errors have the covariances that are given.
 
-    **What it promises.** If the tracked things move as declared, the sensor's noise is as declared, and nothing else
-    is measured than what is in sight, then the errors have the covariances that are given: see the tails in
-    `appendix.estimation.sigma_coverage` for what k sigma means. It is no hard bound, and not about things that are
-    not tracked. An estimate that is one step old is never used: the estimate is of the state that the action acts on.
-
-    **Order.** Inside the filter, which reads the estimates: ``CBFActionFilter(OcclusionPenalty(env, ...), ...)``.
-    Returns that are recorded outside hold the penalty; `RecordInterventions` adds it back.
+    **What it does not.** A covariance is no hard bound (`appendix.estimation.sigma_coverage` has the tails), and says
+    nothing of things that are not tracked.
 
     Args:
         env: Its unwrapped env has MuJoCo's `.model` and `.data`.
         tracks: Each a `Track`, or the dict of a recorded one.
         sensor: A `Sensor`, or the name of a camera in the model.
         tolerance: Position error that the task can bear, m.
-        weight: Of the penalty, in units of the task's reward per step.
+        weight: Of the penalty, in units of the task's reward per step: it is taken off times the mean, over the
+            tracks within the sensor's range, of ``min(1, sigmas * sigma / tolerance) ** 2``.
         sigmas: k of the bound that is compared with the tolerance.
         axes: "xy" tracks in the plane, "xyz" in space.
-        observe: Whether the observation gains the estimates.
+        observe: Whether the observation gains, for each track, the estimated position relative to the sensor's body
+            (m, world axes), the estimated velocity (m/s) and the standard deviation along each axis (m): appended to
+            a flat Box, or under the key "tracks" of a Dict.
 
     Info, at every step and at reset: ``occlusion/visible``, ``occlusion/expired`` (bool arrays, one per track),
     ``occlusion/sigma`` (m, array), ``occlusion/penalty``, ``occlusion/task_reward`` (float).
 
     Attributes:
-        tracking: The `control.estimation.tracks.Tracks`: positions, velocities, covariances, and those ahead. What
-            `TrackedDiscs` read.
+        tracking: The `control.estimation.tracks.Tracks`: positions, velocities, covariances, and those ahead.
         track_names: One per track: the body's name, or the attribute's with an index.
         last_seen_positions: Where each was measured to be last, shape (n, d), m; before that, the initial fix.
         permitted: Tracks that may be relied on, bool (n,).
@@ -81,8 +71,7 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
     Raises:
         UnsupportedEnvError: No MuJoCo model, or with `observe` neither a flat Box nor a Dict observation.
         UnknownNameError: No such camera, site, body or attribute; the message lists those there are.
-        ConfigurationError: A number outside its range, a covariance that is none, no track, a second
-            OcclusionPenalty, or a filter or `ChunkHandover` inside.
+        ConfigurationError: A number outside its range, a covariance that is none, no track, or a wrong order.
         SafeWrappersError: At a step: the simulation's time ran backwards.
 
     Example:
@@ -96,9 +85,6 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         (6,)
 
     Source: appendix "Continuous Covariance Propagation and Observability".
-
-    Change log:
-        * v0.1.0: added.
     """
 
     layer: ClassVar = Layer.OCCLUSION
@@ -114,9 +100,13 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         axes: str = "xy",
         observe: bool = True,
     ) -> None:
+        arguments = dict(locals())
         raw: Any = env.unwrapped
-        check_env(env)
-        refuse_order(env, self.layer, type(self).__name__)
+        if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
+            raise UnsupportedEnvError(
+                f"OcclusionPenalty casts rays in MuJoCo: it needs an env with .model and .data; {raw} has none"
+            )
+        LayerWrapper.__init__(self, env)
         if isinstance(tracks, str | dict) or not isinstance(tracks, Sequence) or not tracks:
             raise ConfigurationError(f"tracks is a list with at least one Track, got {tracks!r}")
         self.tracks = [track_from(t) for t in tracks]
@@ -132,17 +122,15 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
             raise ConfigurationError(f"axes is 'xy' or 'xyz', got {axes!r}")
         if not isinstance(observe, bool | np.bool_):
             raise ConfigurationError(f"observe is True or False, got {observe!r}")
-        gym.utils.RecordConstructorArgs.__init__(
-            self,
+        self._record(
+            arguments,
             tracks=[t.data() for t in self.tracks],
             sensor=self.sensor.data(),
             tolerance=self.tolerance,
             weight=self.weight,
             sigmas=self.sigmas,
-            axes=axes,
             observe=bool(observe),
         )
-        gym.Wrapper.__init__(self, env)
         self._raw, self._d, self._random = raw, len(axes), WrapperRng("OcclusionPenalty")
         self._control_dt = control_interval(raw)
         self._matrix, self._noise = self.sensor.matrices(self._d)
@@ -158,9 +146,7 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         self.permitted = np.zeros(len(self.track_names), dtype=bool)
         self.observe = bool(observe)
         if observe:
-            self.observation_space = with_tracks(env.observation_space, 3 * self._d * len(self.track_names))
-
-    # What is tracked, and from where --------------------------------------------------------------------------
+            self.observation_space = _with_tracks(env.observation_space, 3 * self._d * len(self.track_names))
 
     def _look_at(self, model: mujoco.MjModel) -> None:
         """Resolve names on a model."""
@@ -228,11 +214,7 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
             at += count
         return positions, velocities
 
-    # Gymnasium --------------------------------------------------------------------------------------------------
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env, start every track from its initial fix, and look once."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._random.reset(self.env, seed)
@@ -246,7 +228,7 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         self._tell(info)
         return self._observed(observation), info
 
-    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> Step:
         """Step the env with the action as it is, and look."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self.tracking.advance(self._elapsed())
@@ -261,10 +243,10 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         return self._observed(observation), reward, terminated, truncated, info
 
     def permissions(self, horizon_s: float = 60.0) -> Array:
-        """How long each track may still be relied on if nothing is seen from now on, s, shape (n,).
+        """How long each track may be relied on if nothing is seen from now on, s, shape (n,).
 
-        Until the bound is at the tolerance: `permitted` ends a control step before. 0 where it is there already; inf
-        where it is not reached within the horizon.
+        Until the bound is at the tolerance; inf where that is beyond the horizon. `permitted` ends a control step
+        before.
         """
         direction = np.eye(self._d, 2 * self._d)
         times = []
@@ -273,8 +255,6 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
             covariance = self.tracking.covariance[i]
             times.append(blind_time(covariance, a, q, direction, self.tolerance, self.sigmas, horizon_s))
         return np.array(times)
-
-    # Estimating ---------------------------------------------------------------------------------------------------
 
     def _elapsed(self) -> float:
         now = float(self._raw.data.time)
@@ -314,7 +294,7 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         which = np.flatnonzero(seen)
         if which.size:
             among = None if velocities is None else velocities[which]
-            measurements = measured(self.sensor, self._sight, d, truth[which], among)
+            measurements = self.sensor.measured(self._sight, d, truth[which], among)
             measurements += noise[which]
             self.tracking.see(which, measurements, self._matrix, self._noise)
             if self.sensor.position_std is not None:
@@ -348,3 +328,27 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         if isinstance(observation, dict):
             return observation | {"tracks": flat}
         return np.concatenate([observation, flat.astype(observation.dtype)])
+
+
+def _with_tracks(space: gym.Space[Any], size: int) -> gym.Space[Any]:
+    """The observation space with so many numbers more."""
+    if isinstance(space, gym.spaces.Dict):
+        if "tracks" in space.spaces:
+            raise UnsupportedEnvError(
+                "the observation has an entry 'tracks' already, which the estimates would replace; rename it inside, "
+                "or pass observe=False"
+            )
+        more = gym.spaces.Box(-np.inf, np.inf, (size,), dtype=np.float64)
+        return gym.spaces.Dict({**space.spaces, "tracks": more})
+    if (
+        isinstance(space, gym.spaces.Box)
+        and len(space.shape) == 1
+        and np.issubdtype(space.dtype, np.floating)
+    ):
+        bound = np.full(size, np.inf)
+        low, high = np.concatenate([space.low, -bound]), np.concatenate([space.high, bound])
+        return gym.spaces.Box(low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype.type)
+    raise UnsupportedEnvError(
+        f"with observe=True the observation must be a flat Box of floats or a Dict, got {space}; flatten it inside, "
+        "or pass observe=False"
+    )

@@ -17,7 +17,7 @@ from safe_wrappers.errors import ConfigurationError, UnknownNameError, Unsupport
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.template import PlantTemplate, own_plant
+from safe_wrappers.plants.template import own_plant
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 
 TOLERANCE = 0.01
@@ -31,34 +31,27 @@ class WholeBodyFilter(CBFActionFilter):
     """Keeps a legged robot's contact forces inside their friction cones and its joints off their stops.
 
     The executed torques are close to the policy's, inside the actuators' range, and such that contact forces and
-    predicted joint positions are in bounds. What "contact forces" means is a choice:
-
-    - ``contacts="forecast"``: those that the plant's simulation gives, at every evaluation of the physics of the
-      whole control step, touch-downs included: `ContactFeasibility`, `JointPositionLimit` with braking and, if asked
-      for, `SupportMargin`. It costs a rollout per step, and tens of them where it acts.
-    - ``contacts="pyramid"`` or ``"cone"``: those with which the feet that stand now could stay: the textbook's
-      whole-body program, `Stance`, as a quadratic program with friction pyramids or with the exact cones. It costs
-      a millisecond, and knows nothing of what happens after the first instant.
-
-    To hold other constraints as well, in one projection, put these into a filter's list.
+    predicted joint positions are in bounds. With ``contacts="forecast"`` the forces are those that the plant's
+    simulation gives at every evaluation of the physics of the control step (`ContactFeasibility`,
+    `JointPositionLimit` and, if asked for, `SupportMargin`); with "pyramid" or "cone" those with which the feet that
+    stand now could stay (`Stance`).
 
     **What it guarantees.** What `CBFActionFilter` does. With forecasts and a plant that is right, a step that is not
     flagged infeasible or fallback has its contact forces within cone and tolerance, and its joints in range, at every
     evaluation of the physics.
 
     **What it does not.** All of these constraints are *best effort*, for contact: a foot that comes down sideways
-    slides whatever the torques; then the step is counted infeasible, and the control that fails least runs. It does
-    not keep a robot on its feet, and it knows of no ground that the model does not have. With the programs an
-    unflagged step can slide. Feet that must not slide are another gait: a policy that hops and slides stops walking.
+    slides whatever the torques, and the step is counted infeasible. It does not keep a robot on its feet. With
+    "pyramid" and "cone" an unflagged step can slide.
 
     Args:
         env: Of MuJoCo, with a Box action space that is its model's control range.
         contacts: "forecast", "pyramid" or "cone", see above.
         friction_share: Of the model's friction coefficient that may be counted on, in (0, 1].
-        joint_tolerance: How far a joint may press its stop, rad or m: stops in MuJoCo are soft, and policies lean on
-            them. None leaves the joints alone.
+        joint_tolerance: How far a joint may press its stop, rad or m: stops in MuJoCo are soft. None leaves the
+            joints alone.
         zmp_inset: Distance of the zero moment point from the edge of the support polygon, m, positive, wherever
-            there is a polygon. None does not ask.
+            there is a polygon. None sets no bound.
         tolerance: By how much a forecast contact force may miss its cone, as a share of the robot's weight; None is
             0.01. For forecasts only.
         bodies: Names of the bodies whose contacts count; None is every moving body. For forecasts only.
@@ -83,9 +76,6 @@ class WholeBodyFilter(CBFActionFilter):
         >>> info = env.step(env.action_space.sample())[4]
         >>> bool(info["whole_body/cone_margin"] >= -0.01 or info["cbf/infeasible"])
         True
-
-    Change log:
-        * v0.1.0: added.
     """
 
     def __init__(
@@ -102,24 +92,13 @@ class WholeBodyFilter(CBFActionFilter):
         fallback: str | FallbackFunction = "brake",
         solver: str = "daqp",
     ) -> None:
+        arguments = dict(locals())
         constraints = _constraints(
             env, contacts, friction_share, tolerance, joint_tolerance, zmp_inset, bodies, horizon
         )
         plant = own_plant(plant)
-        gym.utils.RecordConstructorArgs.__init__(
-            self,
-            contacts=contacts,
-            friction_share=friction_share,
-            joint_tolerance=joint_tolerance,
-            zmp_inset=zmp_inset,
-            tolerance=tolerance,
-            bodies=None if bodies is None else list(bodies),
-            horizon=horizon,
-            plant=None if plant is None else PlantTemplate(plant),
-            fallback=fallback,
-            solver=solver,
-        )
-        super().__init__(env, constraints, plant=plant, fallback=fallback, solver=solver)
+        self._record(arguments, bodies=None if bodies is None else list(bodies), plant=plant)
+        CBFActionFilter.__init__(self, env, constraints, plant=plant, fallback=fallback, solver=solver)
 
 
 def _constraints(

@@ -6,9 +6,8 @@ from teleop_worlds import Energies, ceiling, channel, clamp, place
 
 import safe_wrappers as sw
 from safe_wrappers.envs.teleop_operator import TeleopOperator
-from safe_wrappers.wrappers.teleop.coding import Up
+from safe_wrappers.wrappers.teleop.coding import Up, WaveCoding
 from safe_wrappers.wrappers.teleop.link import Packet
-from safe_wrappers.wrappers.teleop.wave_coding import WaveCoding
 
 B = 40.0
 NETWORKS = {

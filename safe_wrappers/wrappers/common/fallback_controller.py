@@ -23,14 +23,6 @@ class FallbackController:
         choice: "brake", "hold", "zero", or a function of the plant.
         plant: None reads the env's MuJoCo model where the choice needs one.
         constraint: Bound here; "brake" is its backup control, if it has one.
-
-    Attributes:
-        plant: Bound to the env; None where none is needed.
-        constraint: On the plant.
-
-    Raises:
-        ConfigurationError: "brake" on a plant that does not say what moves.
-        UnsupportedEnvError: No MuJoCo env, and no plant given.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """CommandReceiver: a wrapper that is told how old a command is."""
 
 import math
-from typing import Any
+from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
@@ -11,12 +11,20 @@ from safe_wrappers.deprecation import deprecated_attribute, deprecated_method
 from safe_wrappers.errors import ActionError
 from safe_wrappers.plants.env_checks import wrappers_of
 
+SAME_STEP: Final = 1e-6
+"""Control steps: times that are closer count as the same."""
+
+
+def whole_steps(time_s: float, control_dt: float) -> int:
+    """Control steps that cover a time, rounded up."""
+    return math.ceil(time_s / control_dt - SAME_STEP)
+
 
 class CommandReceiver:
     """Base of `ChunkHandover`, `LeaseExpiry`, `TeleopChannel` and the faults.
 
     An action of Gymnasium carries no time stamp, so a policy that repeats itself cannot be told from one that works.
-    Whoever carries actions (a fault, a queue, a network) calls `set_observation_time` before `step`; without a call
+    What carries actions (a fault, a queue, a network) calls `set_observation_time` before `step`; without a call
     the action was made from the newest observation.
     """
 
@@ -46,7 +54,7 @@ class CommandReceiver:
         self._observed_s = observed_s
 
     def admits(self, end: NDArray[np.float64], steps: int) -> bool:
-        """Whether a chunk may be executed; `ChunkHandover` asks before it takes one over.
+        """Whether a chunk may be executed; `ChunkHandover` calls it before a chunk takes over.
 
         Args:
             end: The chunk's last command, shape (m,).
@@ -63,11 +71,7 @@ def receiver_inside(env: gym.Env[Any, Any]) -> CommandReceiver | None:
 
 
 def action_array(action: Any, shape: tuple[int, ...]) -> NDArray[Any]:
-    """A copy of an action, in its own dtype: a policy may reuse its buffer.
-
-    Raises:
-        ActionError: No numbers, or another shape.
-    """
+    """A copy of an action in its own dtype, or an `ActionError` for another shape or no numbers."""
     try:
         given = np.array(action)
         given.astype(np.float64)

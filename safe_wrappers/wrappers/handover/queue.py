@@ -1,6 +1,5 @@
 """ChunkQueue: which command a robot executes while chunks arrive late, broken or not at all."""
 
-import math
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
@@ -9,6 +8,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES, join
 from safe_wrappers.control.handover.smoothstep import shortest_latched_blend, smoothstep
+from safe_wrappers.wrappers.common.receiver import whole_steps
 
 Array = NDArray[np.float64]
 
@@ -17,9 +17,6 @@ ENSEMBLE: Final = "ensemble"
 BASELINES: Final = (REPLACE, ENSEMBLE)
 """What is done without a bound on the seam: the new chunk at once, or the mean of all chunks at hand."""
 
-_WHOLE: Final = 1e-6
-"""Control steps: a time that is longer than whole steps by less is meant to be those."""
-
 
 class Command(NamedTuple):
     """What to send in a control step.
@@ -27,7 +24,7 @@ class Command(NamedTuple):
     Attributes:
         control: Shape (m,), in the env's dtype and inside its box.
         observed: Control step whose observation the command was made from; -1 before there was any.
-        starved: The queue is dry: the fallback gave it.
+        starved: The queue is empty: the fallback gave it.
         limited: It was held back beyond the blend to keep the rate limit.
         took_over: A chunk took over with it.
         seam: There is a seam before it: another chunk, another source, or the fallback began.
@@ -66,16 +63,11 @@ class _Fade(NamedTuple):
 
 
 class ChunkQueue:
-    """Which command comes next. It counts control steps; it knows no clock and no env.
+    """Which command comes next, counted in control steps.
 
-    A chunk's entry j is meant for the j-th control step after its observation. A chunk that was observed at step k
-    and is there at step t is consumed from its entry t - k on: latency is what has been consumed, never an
-    estimate. It takes over from the left-over of the chunk before it, over a seam (`control/handover/seams.py`);
-    "replace" takes the new chunk at once, and "ensemble" averages what all chunks at hand ask for at a step. A queue
-    that has run dry asks the fallback.
-
-    A chunk of one has no left-over to blend with: what it asks for is sent as it is, and only a change of its
-    source (`switch`), to and from the fallback too, is faded over.
+    A chunk that was observed at step k and is there at step t is consumed from its entry t - k on: latency is
+    measured, not estimated. A chunk of one has no left-over to blend with: it is sent as it is, and only a change of
+    its source (`switch`), to and from the fallback too, is faded over.
 
     Args:
         controls: m.
@@ -83,9 +75,8 @@ class ChunkQueue:
         blend: A blend of `control/handover/seams.py`, "replace" or "ensemble".
         fewest: A blend takes at least so many control steps.
         rate_limit: Largest |du/dt| of every component, shape (m,), action units per second; infinite for none.
-        low: Action box, shape (m,); what is outside of it is clipped to it. Where it is infinite it ends at the
-            largest number of the dtype.
-        high: Likewise.
+        low: Lower end of the action box, shape (m,); an infinite one becomes the largest number of the dtype.
+        high: Upper end, likewise.
         dtype: Of the commands.
         decay: Ensembling weighs the i-th oldest chunk by exp(-decay i).
     """
@@ -128,15 +119,10 @@ class ChunkQueue:
         self._fade: _Fade | None = None
 
     def submit(self, commands: Array, observed: int, due: int) -> bool:
-        """A chunk is on its way; False if it is refused.
+        """A chunk, shape (h, m), observed at a control step, is on its way; False if it is refused.
 
-        Refused are a chunk with an entry that is not finite, and one whose observation is not newer than the
-        newest one heard of (a repeat), or lies in the future.
-
-        Args:
-            commands: Shape (h, m).
-            observed: Control step of its observation.
-            due: Control step at which it is there.
+        Refused are a chunk with an entry that is not finite, and one whose observation is in the future or not newer
+        than all before it.
         """
         newest = max([self._observed, *(c.observed for c in self._coming)])
         if not newest < observed <= self.now or not np.isfinite(commands).all():
@@ -162,8 +148,8 @@ class ChunkQueue:
 
         Args:
             admitted: Of the chunks that have `arrived` those that may take over, the newest first; the others are
-                refused, or overtaken.
-            fallback: Asked when nothing is planned; returns a finite control of shape (m,).
+                refused.
+            fallback: Called when nothing is planned; returns a finite control of shape (m,).
         """
         newest = self._observed
         self._coming = [c for c in self._coming if c.due > self.now]
@@ -234,7 +220,7 @@ class ChunkQueue:
         if bounded.any():
             change = np.abs(target - self._sent[-1])[bounded]
             shortest = float(shortest_latched_blend(change, self._rate_limit[bounded]).max())
-            steps = max(steps, math.ceil(shortest / self._control_dt - _WHOLE) - 1)
+            steps = max(steps, whole_steps(shortest, self._control_dt) - 1)
         return steps
 
     def _faded(self, control: Array) -> Array:

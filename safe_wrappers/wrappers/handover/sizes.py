@@ -1,8 +1,7 @@
-"""The sizes of chunks and the bounds on their blends, checked against each other at construction."""
+"""The sizes of chunks and the bounds on their blends, checked against each other; and chunks at a slower rate."""
 
-import math
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -10,11 +9,10 @@ from numpy.typing import NDArray
 
 from safe_wrappers.checks import positive, whole_number
 from safe_wrappers.control.handover.seams import BLENDS
+from safe_wrappers.control.handover.splines import hermite_series
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.common.receiver import whole_steps
 from safe_wrappers.wrappers.handover.queue import BASELINES
-
-_WHOLE: Final = 1e-6
-"""Control steps: a time that is longer than whole steps by less is meant to be those."""
 
 Array = NDArray[np.float64]
 
@@ -84,12 +82,7 @@ def blend_bounds(
     blend_time: float | None,
     rate_limit: float | Sequence[float] | None,
 ) -> tuple[int, Array]:
-    """The fewest steps of a blend, and the rate limit of every component, shape (m,), infinite where there is none.
-
-    Raises:
-        ConfigurationError: Bounds for a baseline, that are not positive, that do not fit into a chunk, or nothing to
-            blend over.
-    """
+    """The fewest steps of a blend, and the rate limit of every component, shape (m,), infinite for none."""
     if blend in BASELINES:
         if blend_time is not None or rate_limit is not None:
             raise ConfigurationError(
@@ -99,7 +92,7 @@ def blend_bounds(
         return 0, np.full(space.shape, np.inf)
     fewest, limits = 0, np.full(space.shape, np.inf)
     if blend_time is not None:
-        fewest = max(math.ceil(positive("blend_time", blend_time, "s") / control_dt - _WHOLE) - 1, 1)
+        fewest = max(whole_steps(positive("blend_time", blend_time, "s"), control_dt) - 1, 1)
         available = sizes.chunk - sizes.delay[1]
         if fewest >= available and sizes.chunk > 1:
             raise ConfigurationError(
@@ -156,3 +149,31 @@ def _rounding(space: gym.spaces.Box) -> float:
     largest = float(ends[np.isfinite(ends)].max(initial=1.0))
     dtype: Any = space.dtype
     return 2.0 * float(np.finfo(dtype).eps) * largest
+
+
+class Upsampling:
+    """Chunks whose entries lie some control steps apart, as commands on a cubic Hermite spline through the entries.
+
+    A chunk ends with its last entry. Between entries the spline may overshoot their range.
+
+    Args:
+        entries: H.
+        steps: Control steps from one entry to the next; 1 changes nothing.
+    """
+
+    def __init__(self, entries: int, steps: int) -> None:
+        self._steps = steps
+        if steps > 1:
+            times = np.arange(entries) * float(steps)
+            unit = np.eye(entries)
+            rates = np.asarray(np.gradient(unit, axis=1)) / steps
+            # The spline is linear in the entries: one matrix for all chunks.
+            self._weights = hermite_series(times, unit, rates, np.arange((entries - 1) * steps + 1)).T
+
+    def commands(self, chunk: Array) -> Array:
+        """The commands of a chunk (H, m), shape ((H - 1) steps + 1, m); at the entries these bit for bit."""
+        if self._steps == 1:
+            return chunk
+        commands = self._weights @ chunk
+        commands[:: self._steps] = chunk
+        return commands

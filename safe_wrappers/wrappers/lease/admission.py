@@ -24,11 +24,10 @@ _EXPECTED: Final = (
 
 
 class Admission:
-    """Refuses chunks that no motion within the limits could follow to their end.
+    """Refuses chunks that no motion within the limits could follow to their end; a necessary condition only.
 
-    Necessary only: what is admitted still needs its path and its stopping checked. By "moving" the end may be passed
-    at any speed (`admits`, an idealised bound); by "rest" the machine must be able to stand there in time
-    (`jerk_limited_time`, the constrained profile from the measured state).
+    With arrival "moving" the end may be passed at any speed; with "rest" the machine must be able to stand there in
+    time.
 
     Args:
         env: What is wrapped.
@@ -75,12 +74,7 @@ class Admission:
         self._env, self._measured = env, measured
 
     def admits(self, end: Array, duration_s: float) -> bool:
-        """Whether a chunk may be executed.
-
-        Args:
-            end: Its last command, shape (m,).
-            duration_s: From now to the end of that command, s.
-        """
+        """Whether a chunk may be executed that ends with a command (m,) after so many seconds."""
         position, velocity, acceleration = self._state()
         a_max, v_max, jerk = self._limits.arrays
         if not self._rest:

@@ -31,19 +31,18 @@ _ROW_TOLERANCE = 1e-9
 class StoppingBudget:
     """Clearance, bounds on the motion and reserves from which a stop is worked out; shared by lease and ceiling.
 
-    For an approach speed v, worked out at every reading:
+    For an approach speed v, at every reading:
 
         way(time) + v'^2 / (2 braking) + localisation + margin <= clearance
 
     with the way and the speed v' after the time that a command goes on, `act_s` included, at full `acceleration`.
-    Plain data if its clearance is.
 
     Args:
         clearance: A `Clearance` or the dict of one; any other constraint, with `closing_speed`; or a function of the
             env that returns clearances in m and approach speeds in m/s, shapes (k,).
         braking: Verified lower bound on the deceleration of the fallback, m/s^2; None takes the constraint's own.
-        acceleration: Largest approach acceleration that any command may cause, m/s^2; 0 for a machine that cruises.
-            The fallback's commands count too: braking a machine that recedes pushes it towards the obstacle.
+        acceleration: Largest approach acceleration that any command may cause, the fallback's too, m/s^2; 0 for a
+            machine that cruises.
         closing_speed: For constraints other than Clearance: the fastest that their value may fall, in its unit per
             second, stopping distance and all, under any command.
         top_speed: Bound on the approach speed, m/s; None: none.
@@ -129,10 +128,6 @@ def budget_from(given: Any) -> StoppingBudget:
 class BoundBudget:
     """A budget that measures an env.
 
-    Args:
-        budget: What is measured, and what a stop takes.
-        env: What is wrapped.
-
     Attributes:
         constraint: The clearance, if it is a constraint: with the budget's own reserves, to be bound to the plant.
     """
@@ -165,14 +160,11 @@ class BoundBudget:
         return default_plant(self._env) if plant is None and self.constraint is not None else plant
 
     def bind(self, plant: Plant | None, bound: BoundConstraint | None = None) -> None:
-        """Measure on a plant that is bound to the env.
+        """Measure on a plant that is bound to the env: None if the clearance is a function.
 
         Args:
-            plant: None if the clearance is a function.
+            plant: The plant.
             bound: The constraint on it, if it has been bound already.
-
-        Raises:
-            ConfigurationError: A constraint without a value.
         """
         self._bound = bound
         if bound is None and self.constraint is not None and plant is not None:
@@ -214,10 +206,7 @@ class BoundBudget:
     def longest_time(self, delays_s: float = 0.0) -> float:
         """The longest time that the worst command may go on from the measured state, s; zero or less: stop now.
 
-        NaN where the measurement is not finite; inf without obstacles near.
-
-        Args:
-            delays_s: All delays but `act_s` that pass besides, s.
+        NaN where the measurement is not finite; inf without obstacles near. `delays_s` are all delays but `act_s`, s.
         """
         if not self.readable:
             return math.nan
@@ -247,9 +236,8 @@ class BoundBudget:
     def can_stop_after(self, command: Array, duration_s: float) -> bool:
         """Whether the machine can stop by itself after a command of so many seconds.
 
-        First by the declared bounds, whatever the command is; else by the rows of a `Clearance`, which know how the
-        machine answers this command. With `act_s`, and with other clearances, there are no such rows: next to the
-        limit no command is admitted then, not even one that leads away.
+        Either by the declared bounds, whatever the command is, or by the rows of a `Clearance`, which depend on the
+        command. There are none with `act_s` or with other clearances: next to the limit no command is admitted then.
         """
         if self.longest_time() >= duration_s:
             return True

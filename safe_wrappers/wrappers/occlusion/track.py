@@ -1,16 +1,18 @@
 """Track: something that moves, and what is known of how it moves."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence, Sized
 from dataclasses import asdict, dataclass
+from fnmatch import fnmatchcase
 from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import non_negative, positive, settings_from
 from safe_wrappers.control.estimation.covariance import checked_covariance
 from safe_wrappers.control.estimation.tracks import Motion
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.serialize import plain_numbers
 
 Array = NDArray[np.float64]
@@ -18,20 +20,17 @@ Array = NDArray[np.float64]
 
 @dataclass
 class Track:
-    """What an `OcclusionPenalty` follows: bodies of the model, or points that the env publishes.
+    """What an `OcclusionPenalty` follows: bodies of the model, or points that the env publishes, and how they move.
 
-    Its motion is a model, and everything that is promised later rests on it: acceleration is white noise of a known
-    intensity, and the velocity either wanders freely or goes back to a mean.
-
-    At a reset the track starts from an initial fix of the declared accuracy: the true position plus noise of
-    `start_position_std`, and the mean velocity, which is known to `start_velocity_std`.
+    Acceleration is white noise of a known intensity, and the velocity either wanders freely or goes back to a mean.
+    At a reset the track starts from the true position plus noise of `start_position_std`, and from the mean velocity.
 
     Args:
         bodies: Name of a body, or a pattern ("car*", "car[012]") for every body that fits, in the model's order.
         published: Instead of bodies: name of an attribute of the env, positions of shape (k, 2) or (k, 3), m.
         acceleration_noise: Intensity q of the white acceleration noise, m^2/s^3: after t seconds unseen it adds
             q t^3 / 3 to the variance of a position. A number, one per coordinate (0 along a coordinate that does not
-            wander), or a matrix, d x d. It has no default: a guess would be a promise.
+            wander), or a matrix, d x d. It has no default.
         reversion_s: Time constant with which the velocity goes back to `mean_velocity`, s; None: it does not.
         mean_velocity: m/s, one per coordinate; zeros if left out. What the velocity is taken for at a reset, too.
         start_position_std: m, a number or one per coordinate.
@@ -70,11 +69,7 @@ class Track:
             setattr(self, name, plain_numbers(getattr(self, name)))
 
     def motion(self, coordinates: int) -> Motion:
-        """The motion model for d coordinates.
-
-        Raises:
-            ConfigurationError: Numbers of the wrong count or range.
-        """
+        """The motion model for d coordinates."""
         mean = self.mean_velocity
         return Motion(
             _intensity(self.acceleration_noise, coordinates),
@@ -128,3 +123,26 @@ def track_from(given: Any) -> Track:
         f"expected a Track, such as sw.occlusion.Track({given!r}, acceleration_noise=0.1) with the intensity in "
         f"m^2/s^3: a name alone does not say how it moves; got {given!r}"
     )
+
+
+def tracked_things(
+    model: mujoco.MjModel, tracks: Sequence[Track], published: Callable[[Track], Sized]
+) -> tuple[list[int], list[str], list[int]]:
+    """Body (-1: a published point) and name of every tracked thing, and how many each track follows."""
+    bodies: list[int] = []
+    names: list[str] = []
+    counts: list[int] = []
+    there = {model.body(b).name: b for b in range(1, model.nbody) if model.body(b).name}
+    for track in tracks:
+        if track.bodies is not None:
+            found = [name for name in there if fnmatchcase(name, track.bodies)]
+            if not found:
+                listed = ", ".join(there) or "none"
+                raise UnknownNameError(f"the model has no body {track.bodies!r}; it has: {listed}")
+            bodies += [there[name] for name in found]
+        else:
+            found = [f"{track.published}[{i}]" for i in range(len(published(track)))]
+            bodies += [-1] * len(found)
+        names += found
+        counts.append(len(found))
+    return bodies, names, counts

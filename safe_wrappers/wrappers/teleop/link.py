@@ -10,8 +10,7 @@ import gymnasium as gym
 from safe_wrappers.checks import check_fields, non_negative, positive, settings_from
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
-from safe_wrappers.wrappers.faults.on_off import OnOffProcess
-from safe_wrappers.wrappers.faults.parameters import probability
+from safe_wrappers.wrappers.faults.kinds import OnOffProcess, probability
 
 LONGEST_DELAY_S: Final = 10.0
 """What a line remembers, s."""
@@ -67,24 +66,14 @@ class Link:
 
 
 def link_from(name: str, given: Any) -> Link:
-    """A link itself, from the dict of one, or with that number of seconds as its delay.
-
-    Raises:
-        ConfigurationError: None of these.
-        UnknownNameError: A key that no link has.
-    """
+    """A link itself, from the dict of one, or with that number of seconds as its delay."""
     if isinstance(given, int | float) and not isinstance(given, bool):
         return Link(delay_s=given)
     return settings_from(Link, given, name, ", or a delay in s")
 
 
 class Packet(NamedTuple):
-    """A packet; packets compare by their numbers.
-
-    Attributes:
-        sequence: Counts the packets of a line, from 0.
-        load: What it carries.
-    """
+    """A packet, by its number on the line (from 0), which packets compare by, and what it carries."""
 
     sequence: int
     load: Any
@@ -96,7 +85,7 @@ class Line:
     Args:
         link: What happens to them.
         stream: A name, which keeps its random numbers apart from those of other lines.
-        slack_s: Times that are closer are the same.
+        slack_s: Times that are closer are the same, s.
     """
 
     def __init__(self, link: Link, stream: str, slack_s: float) -> None:

@@ -52,12 +52,7 @@ class TeleopPort:
 
 
 def port_from(given: Any, env: gym.Env[Any, Any]) -> TeleopPort | None:
-    """A port itself, from the dict of one, or what the env publishes; None if it publishes none.
-
-    Raises:
-        ConfigurationError: Neither of these, or indices that the spaces do not have.
-        UnknownNameError: A key that no port has.
-    """
+    """A port itself, from the dict of one, or what the env publishes; None if it publishes none."""
     if given is not None:
         port = settings_from(TeleopPort, given, "port")
     elif env.has_wrapper_attr("port_flow"):
@@ -88,12 +83,7 @@ def _check_spaces(port: TeleopPort, env: gym.Env[Any, Any]) -> None:
 
 
 class PortReading:
-    """The effort at a port: as observed, as foreseen, and as the env says that it acted.
-
-    Args:
-        env: What is wrapped.
-        port: Its port.
-    """
+    """The effort at a port of an env: as observed, as foreseen, and as the env says that it acted."""
 
     def __init__(self, env: gym.Env[Any, Any], port: TeleopPort) -> None:
         self._env, self._port = env, port

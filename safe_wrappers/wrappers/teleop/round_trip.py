@@ -76,7 +76,7 @@ class RoundTripWatch:
         env: What is wrapped.
         ceiling: What is watched.
         control_dt: Control interval, s.
-        slack_s: Times that are closer are the same.
+        slack_s: Times that are closer are the same, s.
     """
 
     budget: BoundBudget

@@ -1,15 +1,23 @@
-"""Faults that strike each command by itself: lost, repeated, delayed, or with a wrong observation time."""
+"""The faults: some strike each command by itself, others last for a while."""
 
 import math
 from typing import Any
 
 import gymnasium as gym
 
-from safe_wrappers.checks import positive
+from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 from safe_wrappers.wrappers.faults.fault import Carried, Fault
-from safe_wrappers.wrappers.faults.parameters import probability
+
+
+def probability(name: str, value: float) -> float:
+    """A number from 0 to 1, or an error that names the parameter."""
+    number = non_negative(name, value, "a probability")
+    if number > 1.0:
+        raise ConfigurationError(f"{name} is a probability from 0 to 1, got {value!r}")
+    return number
 
 
 @deprecated_parameters(renamed={"hold_s": "control_dt"})
@@ -40,9 +48,9 @@ class DroppedRefreshes(ShareFault):
 
 
 class RepeatedCommands(ShareFault):
-    """Loses a share of the commands, and sends the one that arrived last once more. Arguments: see `ShareFault`.
+    """Loses a share of the commands, and sends the one that arrived last once more, with its old observation time.
 
-    It keeps its old observation time.
+    Arguments: see `ShareFault`.
     """
 
     def begin(self) -> None:
@@ -59,7 +67,7 @@ class RepeatedCommands(ShareFault):
 
 @deprecated_parameters(renamed={"hold_s": "control_dt"})
 class Jitter(Fault):
-    """Delays every command by a random time, uniform from 0 to the longest, each by itself.
+    """Delays every command by a random time, uniform from 0 to the longest, drawn for each by itself.
 
     At every step the newest command arrives that is there and newer than all that came before; if there is none,
     nothing arrives. So commands that were overtaken are lost.
@@ -94,12 +102,9 @@ class Jitter(Fault):
 class ClockSkew(Fault):
     """Gives the observation times of a clock that is off, and runs at another rate: `(1 + drift) t + offset_s`.
 
-    A clock that is ahead makes commands look younger than they are, or from the future; one that is behind makes
-    them look old.
-
     Args:
         env: See `Fault`.
-        offset_s: s, positive for a clock that is ahead.
+        offset_s: s, positive for a clock that is ahead: its commands look younger than they are, or from the future.
         drift: Seconds per second.
         control_dt: See `Fault`.
     """
@@ -124,3 +129,85 @@ class ClockSkew(Fault):
         if given is None:
             return None
         return Carried(given.action, (1.0 + self._drift) * given.observed_s + self._offset_s)
+
+
+class OnOffProcess:
+    """A process that is off and on by turns, both for exponentially distributed times; an episode begins off.
+
+    Args:
+        mean_between_s: Mean time off, s.
+        mean_length_s: Mean time on, s.
+    """
+
+    def __init__(self, mean_between_s: float, mean_length_s: float) -> None:
+        self._between = positive("mean_between_s", mean_between_s, "s")
+        self._length = positive("mean_length_s", mean_length_s, "s")
+
+    def begin(self, random: WrapperRng) -> None:
+        """A new episode."""
+        self._on = False
+        self._until_s = random.draw.exponential(self._between)
+
+    def is_on(self, now_s: float, random: WrapperRng) -> bool:
+        """Whether it is on now; times must not run backwards."""
+        while now_s >= self._until_s:
+            self._on = not self._on
+            self._until_s += random.draw.exponential(self._length if self._on else self._between)
+        return self._on
+
+
+@deprecated_parameters(renamed={"hold_s": "control_dt"})
+class OnOffFault(Fault):
+    """Base of the faults that are on for a while at a time.
+
+    Args:
+        env: See `Fault`.
+        mean_between_s: Mean time from the end of the fault to its next start, s.
+        mean_length_s: Mean time that it lasts, s.
+        control_dt: See `Fault`.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        mean_between_s: float,
+        mean_length_s: float,
+        control_dt: float | None = None,
+    ) -> None:
+        self._process = OnOffProcess(mean_between_s, mean_length_s)
+        super().__init__(env, control_dt, mean_between_s=mean_between_s, mean_length_s=mean_length_s)
+
+    def begin(self) -> None:
+        """An episode begins without the fault."""
+        self._process.begin(self.random)
+
+    def is_on(self, now_s: float) -> bool:
+        """Whether the fault is on now."""
+        return self._process.is_on(now_s, self.random)
+
+
+class Outages(OnOffFault):
+    """Loses all commands during outages of random length, at random times. Arguments: see `OnOffFault`."""
+
+    def carry(self, given: Carried | None, now_s: float) -> Carried | None:
+        """The command, or nothing."""
+        return None if self.is_on(now_s) else given
+
+
+class FrozenPolicy(OnOffFault):
+    """Repeats, for random lengths of time, the last command from before, with its old observation time.
+
+    Arguments: see `OnOffFault`.
+    """
+
+    def begin(self) -> None:
+        """An episode begins with a policy that works."""
+        super().begin()
+        self._frozen: Carried | None = None
+
+    def carry(self, given: Carried | None, now_s: float) -> Carried | None:
+        """The command, or the one from before."""
+        if self.is_on(now_s):
+            return self._frozen
+        self._frozen = given if given is not None else self._frozen
+        return given
