@@ -2,14 +2,12 @@
 
 from typing import Any, ClassVar
 
-import gymnasium as gym
-
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.cbf_action_filter import is_filtered
-from safe_wrappers.wrappers.common.layer import LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
 
 
 class AdaptionPenalty(LayerWrapper):
@@ -43,7 +41,7 @@ class AdaptionPenalty(LayerWrapper):
 
     layer: ClassVar = Layer.ADAPTION
 
-    def __init__(self, env: gym.Env[Any, Any], penalty: float = 0.0, per_correction: float = 0.0) -> None:
+    def __init__(self, env: Env, penalty: float = 0.0, per_correction: float = 0.0) -> None:
         LayerWrapper.__init__(self, env)
         if not is_filtered(env):
             raise ConfigurationError(

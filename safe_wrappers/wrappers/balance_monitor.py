@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from typing import Any, ClassVar, Final
 
-import gymnasium as gym
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from safe_wrappers.errors import ConfigurationError, UnknownNameError, Unsupport
 from safe_wrappers.plants.mujoco.contact_forecast import ContactForecast, ContactReader, can_touch_the_world
 from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
 from safe_wrappers.plants.queries.momentum import MomentumReader
-from safe_wrappers.wrappers.common.layer import Reset
+from safe_wrappers.wrappers.common.layer import Env, Reset
 from safe_wrappers.wrappers.common.step_monitor import StepMonitor
 
 PRESSING: Final = 0.01
@@ -73,11 +72,7 @@ class BalanceMonitor(StepMonitor):
     partial: ClassVar = keys.BALANCE_PARTIAL
 
     def __init__(
-        self,
-        env: gym.Env[Any, Any],
-        friction_share: float = 1.0,
-        inset: float = 0.0,
-        bodies: Sequence[str] | None = None,
+        self, env: Env, friction_share: float = 1.0, inset: float = 0.0, bodies: Sequence[str] | None = None
     ) -> None:
         StepMonitor.__init__(self, env)
         raw: Any = env.unwrapped

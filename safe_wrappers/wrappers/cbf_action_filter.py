@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,7 +25,7 @@ from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.template import own_plant
 from safe_wrappers.serialize import constraint_from, plain_data
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.layer import LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
 
 Array = NDArray[np.float64]
 
@@ -83,7 +82,7 @@ class CBFActionFilter(LayerWrapper):
 
     def __init__(
         self,
-        env: gym.Env[Any, Any],
+        env: Env,
         constraints: Sequence[Constraint | dict[str, Any]],
         plant: Plant | None = None,
         fallback: str | FallbackFunction = "brake",
@@ -235,6 +234,6 @@ def _unique(kinds: list[str]) -> list[str]:
     ]
 
 
-def is_filtered(env: gym.Env[Any, Any]) -> bool:
+def is_filtered(env: Env) -> bool:
     """Whether there is a filter among an env's wrappers."""
     return any(isinstance(inner, CBFActionFilter) for inner in wrappers_of(env))

@@ -21,7 +21,7 @@ from safe_wrappers.plants.template import own_plant
 from safe_wrappers.serialize import plain_numbers
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.layer import LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
 from safe_wrappers.wrappers.common.receiver import SAME_STEP, CommandReceiver, receiver_inside
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 from safe_wrappers.wrappers.handover.queue import BASELINES, ENSEMBLE, Chunk, ChunkQueue, Command
@@ -105,7 +105,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
 
     def __init__(
         self,
-        env: gym.Env[Any, Any],
+        env: Env,
         chunk_size: int,
         execution_horizon: int,
         inference_delay: int | Sequence[int] = 0,

@@ -4,14 +4,13 @@ import math
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-import gymnasium as gym
 import mujoco
 import numpy as np
 
 from safe_wrappers import info as keys
 from safe_wrappers.control.contact.contact import complementarity_residuals
 from safe_wrappers.plants.mujoco.contacts import Contacts
-from safe_wrappers.wrappers.common.layer import Reset
+from safe_wrappers.wrappers.common.layer import Env, Reset
 from safe_wrappers.wrappers.common.step_monitor import StepMonitor
 
 
@@ -55,10 +54,7 @@ class ContactMonitor(StepMonitor):
     partial: ClassVar = keys.CONTACT_PARTIAL
 
     def __init__(
-        self,
-        env: gym.Env[Any, Any],
-        bodies: Sequence[str] | None = None,
-        against: Sequence[str] | None = None,
+        self, env: Env, bodies: Sequence[str] | None = None, against: Sequence[str] | None = None
     ) -> None:
         StepMonitor.__init__(self, env)
         raw: Any = env.unwrapped

@@ -4,13 +4,12 @@ import pkgutil
 from collections.abc import Callable
 from typing import Any, ClassVar
 
-import gymnasium as gym
 import numpy as np
 
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.layer import LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
 
 Judge = Callable[[Any], float]
 """Takes the unwrapped env, returns the cost of the step that it has just made."""
@@ -48,7 +47,7 @@ class CostFunction(LayerWrapper):
 
     layer: ClassVar = Layer.COST
 
-    def __init__(self, env: gym.Env[Any, Any], fn: Judge | str) -> None:
+    def __init__(self, env: Env, fn: Judge | str) -> None:
         LayerWrapper.__init__(self, env)
         function = _imported(fn) if isinstance(fn, str) else fn
         if not callable(function):

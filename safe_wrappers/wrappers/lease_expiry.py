@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,7 +22,7 @@ from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.command_gate import CommandGate
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.layer import Reset, Step
+from safe_wrappers.wrappers.common.layer import Env, Reset, Step
 from safe_wrappers.wrappers.common.receiver import action_array, whole_steps
 from safe_wrappers.wrappers.lease.admission import Admission, Measured
 from safe_wrappers.wrappers.lease.stopping_budget import (
@@ -108,7 +107,7 @@ class LeaseExpiry(CommandGate):
 
     def __init__(
         self,
-        env: gym.Env[Any, Any],
+        env: Env,
         budget: StoppingBudget | dict[str, Any] | Constraint | ClearanceFunction,
         *,
         detect_s: float = 0.0,

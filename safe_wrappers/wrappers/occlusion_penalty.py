@@ -19,7 +19,7 @@ from safe_wrappers.plants.env_checks import read_attribute
 from safe_wrappers.plants.mujoco.timing import control_interval
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.layer import LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 from safe_wrappers.wrappers.occlusion.sensor import Sensor, sensor_from
 from safe_wrappers.wrappers.occlusion.track import Track, track_from, tracked_things
@@ -91,7 +91,7 @@ class OcclusionPenalty(LayerWrapper):
 
     def __init__(
         self,
-        env: gym.Env[Any, Any],
+        env: Env,
         tracks: Sequence[Track | dict[str, Any]],
         sensor: Sensor | str | dict[str, Any],
         tolerance: float,

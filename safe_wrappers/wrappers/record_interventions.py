@@ -7,13 +7,12 @@ import os
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
-import gymnasium as gym
 import numpy as np
 
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.layer import LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
 
 COLUMNS: Final = ("length", "return", *(figure.name for figure in keys.EPISODE))
 """The CSV file's columns. Cells stay empty where the task or the stack does not report what they hold."""
@@ -128,7 +127,7 @@ class RecordInterventions(LayerWrapper):
 
     layer: ClassVar = Layer.RECORDER
 
-    def __init__(self, env: gym.Env[Any, Any], path: str | os.PathLike[str] | None = None) -> None:
+    def __init__(self, env: Env, path: str | os.PathLike[str] | None = None) -> None:
         LayerWrapper.__init__(self, env)
         text = None if path is None else os.fspath(path)
         if text is not None:

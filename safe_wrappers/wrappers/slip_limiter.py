@@ -1,15 +1,13 @@
 """SlipLimiter: the filter with Traction alone."""
 
 from collections.abc import Sequence
-from typing import Any
-
-import gymnasium as gym
 
 from safe_wrappers.constraints.traction import Traction
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.template import own_plant
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
+from safe_wrappers.wrappers.common.layer import Env
 
 
 class SlipLimiter(CBFActionFilter):
@@ -51,7 +49,7 @@ class SlipLimiter(CBFActionFilter):
 
     def __init__(
         self,
-        env: gym.Env[Any, Any],
+        env: Env,
         wheels: Sequence[str],
         max_slip: float = 0.15,
         friction: float | None = None,

@@ -4,7 +4,6 @@ import copy
 import math
 from typing import Any, ClassVar, Literal, get_args
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +20,7 @@ from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.command_gate import CommandGate
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.layer import Reset, Step
+from safe_wrappers.wrappers.common.layer import Env, Reset, Step
 from safe_wrappers.wrappers.common.receiver import SAME_STEP, action_array
 from safe_wrappers.wrappers.teleop.coding import Coding, Down, Passivity, Up, coding_from
 from safe_wrappers.wrappers.teleop.link import Line, Link, link_from
@@ -95,7 +94,7 @@ class TeleopChannel(CommandGate):
 
     def __init__(
         self,
-        env: gym.Env[Any, Any],
+        env: Env,
         uplink: Link | dict[str, Any] | float,
         downlink: Link | dict[str, Any] | float,
         coding: Coding = "plain",

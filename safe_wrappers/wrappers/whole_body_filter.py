@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from typing import Any
 
-import gymnasium as gym
 import mujoco
 
 from safe_wrappers.checks import non_negative
@@ -19,6 +18,7 @@ from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.template import own_plant
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
+from safe_wrappers.wrappers.common.layer import Env
 
 TOLERANCE = 0.01
 """By how much a contact force may miss its cone unless told otherwise, as a share of the robot's weight."""
@@ -80,7 +80,7 @@ class WholeBodyFilter(CBFActionFilter):
 
     def __init__(
         self,
-        env: gym.Env[Any, Any],
+        env: Env,
         contacts: str = "forecast",
         friction_share: float = 0.7,
         joint_tolerance: float | None = 0.1,
@@ -102,7 +102,7 @@ class WholeBodyFilter(CBFActionFilter):
 
 
 def _constraints(
-    env: gym.Env[Any, Any],
+    env: Env,
     contacts: str,
     friction_share: float,
     tolerance: float | None,

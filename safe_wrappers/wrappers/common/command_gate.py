@@ -3,7 +3,6 @@
 import warnings
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,7 +10,7 @@ from safe_wrappers import info as keys
 from safe_wrappers.plants.env_checks import check_actions, check_timing
 from safe_wrappers.wrappers.cbf_action_filter import is_filtered
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.layer import LayerWrapper, Step
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Step
 from safe_wrappers.wrappers.common.receiver import SAME_STEP, CommandReceiver
 
 Array = NDArray[np.float64]
@@ -27,7 +26,7 @@ class CommandGate(LayerWrapper, CommandReceiver):
 
     _fallback: FallbackController | None
 
-    def __init__(self, env: gym.Env[Any, Any], control_dt: float | None) -> None:
+    def __init__(self, env: Env, control_dt: float | None) -> None:
         LayerWrapper.__init__(self, env)
         space = check_actions(env)
         self.control_dt = check_timing(env, control_dt)

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,6 +10,7 @@ from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.fallback import Fallback, FallbackFunction
 from safe_wrappers.plants.default import default_plant
 from safe_wrappers.plants.plant import Plant
+from safe_wrappers.wrappers.common.layer import Env
 
 Array = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ class FallbackController:
 
     def __init__(
         self,
-        env: gym.Env[Any, Any],
+        env: Env,
         choice: str | FallbackFunction,
         plant: Plant | None,
         constraint: Constraint | None = None,

@@ -9,6 +9,7 @@ from safe_wrappers.plants.template import PlantTemplate
 from safe_wrappers.serialize import recorded
 from safe_wrappers.stack import Layer, refuse_order
 
+Env = gym.Env[Any, Any]
 Reset = tuple[Any, dict[str, Any]]
 """What `reset` returns: observation and info."""
 Step = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
@@ -20,7 +21,7 @@ class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
 
     layer: ClassVar[Layer]
 
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
+    def __init__(self, env: Env) -> None:
         refuse_order(env, self.layer, type(self).__name__)
         gym.Wrapper.__init__(self, env)
 

@@ -3,13 +3,13 @@
 import math
 from typing import Any, Final
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.deprecation import deprecated_attribute, deprecated_method
 from safe_wrappers.errors import ActionError
 from safe_wrappers.plants.env_checks import wrappers_of
+from safe_wrappers.wrappers.common.layer import Env
 
 SAME_STEP: Final = 1e-6
 """Control steps: times that are closer count as the same."""
@@ -65,7 +65,7 @@ class CommandReceiver:
     deliver = deprecated_method("deliver", "set_observation_time")
 
 
-def receiver_inside(env: gym.Env[Any, Any]) -> CommandReceiver | None:
+def receiver_inside(env: Env) -> CommandReceiver | None:
     """The outermost receiver among an env's wrappers."""
     return next((inner for inner in wrappers_of(env) if isinstance(inner, CommandReceiver)), None)
 

@@ -4,13 +4,12 @@ import warnings
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
-import gymnasium as gym
 import mujoco
 
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.replay import Replay
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.layer import LayerWrapper, Step
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Step
 
 
 class StepMonitor(LayerWrapper, ABC):
@@ -25,7 +24,7 @@ class StepMonitor(LayerWrapper, ABC):
     partial: ClassVar[str]
     """Its info key for steps that could not be replayed."""
 
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
+    def __init__(self, env: Env) -> None:
         raw: Any = env.unwrapped
         name = type(self).__name__
         if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):

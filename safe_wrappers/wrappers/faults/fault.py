@@ -12,7 +12,7 @@ from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.env_checks import check_timing, wrappers_of
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.layer import LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
 from safe_wrappers.wrappers.common.receiver import CommandReceiver, receiver_inside
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 
@@ -48,7 +48,7 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
 
     _last: Any
 
-    def __init__(self, env: gym.Env[Any, Any], control_dt: float | None = None, **arguments: Any) -> None:
+    def __init__(self, env: Env, control_dt: float | None = None, **arguments: Any) -> None:
         self._record({"control_dt": control_dt, **arguments})
         LayerWrapper.__init__(self, env)
         if not isinstance(env.action_space, gym.spaces.Box):

@@ -1,13 +1,11 @@
 """The faults: some strike each command by itself, others last for a while."""
 
 import math
-from typing import Any
-
-import gymnasium as gym
 
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.common.layer import Env
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 from safe_wrappers.wrappers.faults.fault import Carried, Fault
 
@@ -30,7 +28,7 @@ class ShareFault(Fault):
         control_dt: See `Fault`.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], share: float, control_dt: float | None = None) -> None:
+    def __init__(self, env: Env, share: float, control_dt: float | None = None) -> None:
         self._share = probability("share", share)
         super().__init__(env, control_dt, share=self._share)
 
@@ -78,7 +76,7 @@ class Jitter(Fault):
         control_dt: See `Fault`.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], longest_s: float, control_dt: float | None = None) -> None:
+    def __init__(self, env: Env, longest_s: float, control_dt: float | None = None) -> None:
         self._longest_s = positive("longest_s", longest_s, "s")
         super().__init__(env, control_dt, longest_s=self._longest_s)
 
@@ -110,11 +108,7 @@ class ClockSkew(Fault):
     """
 
     def __init__(
-        self,
-        env: gym.Env[Any, Any],
-        offset_s: float = 0.0,
-        drift: float = 0.0,
-        control_dt: float | None = None,
+        self, env: Env, offset_s: float = 0.0, drift: float = 0.0, control_dt: float | None = None
     ) -> None:
         for name, value in (("offset_s", offset_s), ("drift", drift)):
             if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
@@ -168,11 +162,7 @@ class OnOffFault(Fault):
     """
 
     def __init__(
-        self,
-        env: gym.Env[Any, Any],
-        mean_between_s: float,
-        mean_length_s: float,
-        control_dt: float | None = None,
+        self, env: Env, mean_between_s: float, mean_length_s: float, control_dt: float | None = None
     ) -> None:
         self._process = OnOffProcess(mean_between_s, mean_length_s)
         super().__init__(env, control_dt, mean_between_s=mean_between_s, mean_length_s=mean_length_s)

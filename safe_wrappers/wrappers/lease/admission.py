@@ -3,16 +3,16 @@
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.control.watchdog.reachability import MotionLimits, admits, jerk_limited_time
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.wrappers.common.layer import Env
 
 Array = NDArray[np.float64]
 
-Measured = Callable[[gym.Env[Any, Any]], tuple[ArrayLike, ...]]
+Measured = Callable[[Env], tuple[ArrayLike, ...]]
 """Takes the env; returns what the actions are setpoints of, its velocity and, if known, its acceleration, shapes
 (m,)."""
 
@@ -41,11 +41,7 @@ class Admission:
     """
 
     def __init__(
-        self,
-        env: gym.Env[Any, Any],
-        motion_limits: Mapping[str, Any],
-        measured: Measured | None,
-        controls: int,
+        self, env: Env, motion_limits: Mapping[str, Any], measured: Measured | None, controls: int
     ) -> None:
         if measured is None and not hasattr(env.unwrapped, "data"):
             raise UnsupportedEnvError(

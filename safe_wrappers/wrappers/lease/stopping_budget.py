@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -17,10 +16,11 @@ from safe_wrappers.filter.constraint import BoundConstraint, Constraint
 from safe_wrappers.plants.default import default_plant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import constraint_from
+from safe_wrappers.wrappers.common.layer import Env
 
 Array = NDArray[np.float64]
 
-ClearanceFunction = Callable[[gym.Env[Any, Any]], tuple[ArrayLike, ArrayLike]]
+ClearanceFunction = Callable[[Env], tuple[ArrayLike, ArrayLike]]
 """Takes the env; returns clearances (m) and the approach speeds towards them (m/s), shapes (k,)."""
 
 _ROW_TOLERANCE = 1e-9
@@ -137,7 +137,7 @@ class BoundBudget:
     speed: Array
     """Approach speeds, m/s, shape (k,)."""
 
-    def __init__(self, budget: StoppingBudget, env: gym.Env[Any, Any]) -> None:
+    def __init__(self, budget: StoppingBudget, env: Env) -> None:
         self._budget, self._env = budget, env
         self._measures_approach = budget.measures_approach
         given: Any = budget.clearance

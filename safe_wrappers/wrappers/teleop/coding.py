@@ -4,7 +4,6 @@ import heapq
 import math
 from typing import Any, Final, Literal, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +15,7 @@ from safe_wrappers.control.teleop.port_checks import port_energy
 from safe_wrappers.control.teleop.wave_line import Rule, WaveLine
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.env_checks import refuse_changed_actions
+from safe_wrappers.wrappers.common.layer import Env
 from safe_wrappers.wrappers.teleop.link import Packet
 from safe_wrappers.wrappers.teleop.port import PortReading, TeleopPort
 
@@ -320,7 +320,7 @@ class WaveCoding(PlainCoding):
 
 
 def coding_from(
-    env: gym.Env[Any, Any],
+    env: Env,
     port: TeleopPort | None,
     tick_s: float,
     coding: Coding,

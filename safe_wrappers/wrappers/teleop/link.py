@@ -5,10 +5,9 @@ import math
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
-import gymnasium as gym
-
 from safe_wrappers.checks import check_fields, non_negative, positive, settings_from
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.common.layer import Env
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 from safe_wrappers.wrappers.faults.kinds import OnOffProcess, probability
 
@@ -101,7 +100,7 @@ class Line:
     late: int
     """How many packets of the last `receive` were overtaken."""
 
-    def reset(self, env: gym.Env[Any, Any], seed: int | None, first: Any = None) -> None:
+    def reset(self, env: Env, seed: int | None, first: Any = None) -> None:
         """Nothing is on its way, and `first` has arrived; call it after the env's own reset."""
         self._random.reset(env, seed)
         if self._outages is not None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers.checks import check_fields, non_negative, settings_from
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.common.layer import Env
 
 Array = NDArray[np.float64]
 
@@ -51,7 +52,7 @@ class TeleopPort:
         check_fields(self, non_negative, ["feedthrough"], "N s/m")
 
 
-def port_from(given: Any, env: gym.Env[Any, Any]) -> TeleopPort | None:
+def port_from(given: Any, env: Env) -> TeleopPort | None:
     """A port itself, from the dict of one, or what the env publishes; None if it publishes none."""
     if given is not None:
         port = settings_from(TeleopPort, given, "port")
@@ -67,7 +68,7 @@ def port_from(given: Any, env: gym.Env[Any, Any]) -> TeleopPort | None:
     return port
 
 
-def _check_spaces(port: TeleopPort, env: gym.Env[Any, Any]) -> None:
+def _check_spaces(port: TeleopPort, env: Env) -> None:
     action, observation = env.action_space, env.observation_space
     box = isinstance(observation, gym.spaces.Box) and len(observation.shape) == 1
     if not box or not np.issubdtype(observation.dtype or np.int64, np.floating):
@@ -85,7 +86,7 @@ def _check_spaces(port: TeleopPort, env: gym.Env[Any, Any]) -> None:
 class PortReading:
     """The effort at a port of an env: as observed, as foreseen, and as the env says that it acted."""
 
-    def __init__(self, env: gym.Env[Any, Any], port: TeleopPort) -> None:
+    def __init__(self, env: Env, port: TeleopPort) -> None:
         self._env, self._port = env, port
         self._publishes = env.has_wrapper_attr("port_effort_acted")
 

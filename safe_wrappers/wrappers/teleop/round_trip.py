@@ -4,7 +4,6 @@ import math
 from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +11,7 @@ from safe_wrappers.checks import check_fields, non_negative, positive
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint
+from safe_wrappers.wrappers.common.layer import Env
 from safe_wrappers.wrappers.lease.stopping_budget import (
     BoundBudget,
     ClearanceFunction,
@@ -90,13 +90,7 @@ class RoundTripWatch:
     ceiling_s: float
     """The longest admissible round trip then, s, within `longest_s` of 0; the lowest there is where unreadable."""
 
-    def __init__(
-        self,
-        env: gym.Env[Any, Any],
-        ceiling: RoundTripCeiling,
-        control_dt: float,
-        slack_s: float = 0.0,
-    ) -> None:
+    def __init__(self, env: Env, ceiling: RoundTripCeiling, control_dt: float, slack_s: float = 0.0) -> None:
         self._ceiling, self._control_dt, self._slack_s = ceiling, control_dt, slack_s
         self.budget = BoundBudget(budget_from(ceiling.budget), env)
 
