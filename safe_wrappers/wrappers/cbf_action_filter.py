@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative
-from safe_wrappers.errors import ActionError, ConfigurationError, UnsafeStateWarning
+from safe_wrappers.errors import ConfigurationError, UnsafeStateWarning
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.engine import SafetyFilter
 from safe_wrappers.filter.fallback import FallbackFunction
@@ -26,6 +26,7 @@ from safe_wrappers.plants.template import own_plant
 from safe_wrappers.serialize import constraint_from, plain_data
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.common.receiver import action_array
 
 Array = NDArray[np.float64]
 
@@ -95,7 +96,7 @@ class CBFActionFilter(LayerWrapper):
         plant = own_plant(plant)
         if isinstance(constraints, str | dict) or not isinstance(constraints, Sequence) or not constraints:
             raise ConfigurationError(f"constraints is a list with at least one, got {constraints!r}")
-        own = [copy.deepcopy(c) for c in [*map(constraint_from, constraints)]]
+        own = [copy.deepcopy(constraint_from(c)) for c in constraints]
         margin = non_negative("margin", margin, "the constraints' own units")
         check_solver(solver)
         self._record(arguments, constraints=[plain_data(c) for c in own], plant=plant, margin=margin)
@@ -131,7 +132,7 @@ class CBFActionFilter(LayerWrapper):
     def step(self, action: Any) -> Step:
         """Filter the action and step the env with what may be executed."""
         started = time.perf_counter()
-        proposed = self._checked(action)
+        proposed: Array = action_array(action, self._shape, np.float64)
         self.filter.observe()
         margin, unsafe = self._margin()
         readable = self.filter.margin == self.filter.margin
@@ -176,9 +177,9 @@ class CBFActionFilter(LayerWrapper):
         info[keys.CBF_FALLBACK] = decision.fallback
         info[keys.CBF_NONFINITE] = not finite
         info[keys.CBF_UNSAFE] = unsafe
-        refused = decision.refused
+        no_refusal = decision.refused is None
         info[keys.CBF_REFUSED] = (
-            refused if refused is not None else np.zeros(len(self.constraints), dtype=bool)
+            np.zeros(len(self.constraints), dtype=bool) if no_refusal else decision.refused
         )
         info[keys.CBF_CORRECTION] = correction
         info[keys.CBF_CLIPPED] = clipped
@@ -190,32 +191,20 @@ class CBFActionFilter(LayerWrapper):
             info |= self.filter.info(proposed, executed)
         return observation, reward, terminated, truncated, info
 
-    def _checked(self, action: Any) -> Array:
-        try:
-            proposed = np.array(action, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise ActionError(f"expected an action of shape {self._shape}, got {action!r}") from None
-        if proposed.shape != self._shape:
-            raise ActionError(f"expected an action of shape {self._shape}, got shape {proposed.shape}")
-        return proposed
-
     def _margin(self) -> tuple[float, bool]:
         """`cbf/margin` and `cbf/unsafe`: 0 where no h is finite, unsafe where the state or an h is not a number."""
         lowest = self.filter.margin
         unsafe = not lowest >= -_SAFE_TOLERANCE
         margin = lowest if math.isfinite(lowest) else 0.0
         if unsafe:
-            self._warn_unsafe(margin)
+            self._warn_once(
+                "unsafe",
+                f"the state is outside the safe set (cbf/margin = {margin:.3g}); the filter drives it "
+                "back where it can, and promises nothing until it is inside",
+                UnsafeStateWarning,
+                stacklevel=4,
+            )
         return margin, unsafe
-
-    def _warn_unsafe(self, margin: float) -> None:
-        self._warn_once(
-            "unsafe",
-            f"the state is outside the safe set (cbf/margin = {margin:.3g}); the filter drives it "
-            "back where it can, and promises nothing until it is inside",
-            UnsafeStateWarning,
-            stacklevel=5,
-        )
 
     def _warn_once(
         self, what: str, message: str, category: type[Warning] = UserWarning, stacklevel: int = 3

@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -24,21 +24,10 @@ from safe_wrappers.wrappers.common.fallback_controller import FallbackController
 from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
 from safe_wrappers.wrappers.common.receiver import SAME_STEP, CommandReceiver, receiver_inside
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
-from safe_wrappers.wrappers.handover.queue import BASELINES, ENSEMBLE, Chunk, ChunkQueue, Command
+from safe_wrappers.wrappers.handover.queue import BASELINES, ChunkQueue, Command
 from safe_wrappers.wrappers.handover.sizes import ChunkSizes, Upsampling, blend_bounds
 
 Array = NDArray[np.float64]
-
-_REST: Final = {
-    keys.HANDOVER_PEAK_JERK: 0.0,
-    keys.HANDOVER_BLEND_TIME: 0.0,
-    keys.HANDOVER_STARVED: 0,
-    keys.HANDOVER_LIMITED: 0,
-    keys.HANDOVER_STEPS: 0,
-    keys.HANDOVER_REFUSED: False,
-    keys.HANDOVER_LATENCY: -1,
-}
-"""What a reset reports beside `handover/seam_jump`."""
 
 
 @deprecated_parameters(renamed={"jerk_limit": "rate_limit", "hold_s": "control_dt"})
@@ -154,15 +143,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self._fallback = FallbackController(env, fallback, plant)
         fewest, rate_limits = blend_bounds(sizes, space, self.control_dt, blend, blend_time, rate_limit)
         self._queue = ChunkQueue(
-            self._controls,
-            self.control_dt,
-            blend=blend,
-            fewest=fewest,
-            rate_limit=rate_limits,
-            low=np.asarray(space.low, np.float64),
-            high=np.asarray(space.high, np.float64),
-            dtype=space.dtype,
-            decay=decay,
+            space, self.control_dt, blend=blend, fewest=fewest, rate_limit=rate_limits, decay=decay
         )
         self._inside = receiver_inside(env)
         self._random = WrapperRng(type(self).__name__)
@@ -176,8 +157,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self._fallback.reset()
         self._queue.reset()
         self._start()
-        info.update(_REST)
-        info[keys.HANDOVER_SEAM_JUMP] = np.zeros(DIFFERENCES)
+        info.update(self._measured([], False, -1))
         return observation, info
 
     def step(self, action: Any) -> Step:
@@ -187,9 +167,8 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         terminated = truncated = False
         for _ in range(self.execution_horizon):
             now = self._queue.now
-            admitted, one_refused = self._admitted()
-            refused |= one_refused
-            command = self._queue.next(admitted, self._fallback.command)
+            command = self._queue.next(self._admits, self._fallback.command)
+            refused |= command.refused
             if command.took_over:
                 latency = now - command.observed
             if self._inside is not None:
@@ -207,9 +186,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
                 break
         self._observed_s = self.now_s
         info = macro_info(infos)
-        info.update(self._measured(commands))
-        info[keys.HANDOVER_REFUSED] = refused
-        info[keys.HANDOVER_LATENCY] = latency
+        info.update(self._measured(commands, refused, latency))
         return observation, total, terminated, truncated, info
 
     @property
@@ -236,22 +213,8 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             )
         return chunk
 
-    def _admitted(self) -> tuple[list[Chunk], bool]:
-        """The chunks that may take over now, the newest first; and whether one was refused."""
-        admitted: list[Chunk] = []
-        refused = False
-        for chunk in self._queue.arrived():
-            left, inside = self._queue.left(chunk), self._inside
-            admits = len(left) > 0  # it came in time
-            if admits and inside is not None:
-                admits = inside.admits(left[-1], len(left))
-            if not admits:
-                refused = True
-                continue
-            admitted.append(chunk)
-            if self.blend != ENSEMBLE:
-                break
-        return admitted, refused
+    def _admits(self, end: Array, steps: int) -> bool:
+        return self._inside is None or self._inside.admits(end, steps)
 
     def _submit(self, chunk: Array) -> bool:
         """Send the chunk on its way; False if one came and was refused."""
@@ -278,10 +241,9 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             self._seam_until = now + command.blend_steps + DIFFERENCES - 1  # it ends a blend under way
         return now <= self._seam_until
 
-    def _measured(self, commands: list[Command]) -> dict[str, Any]:
-        counted = np.array(self._in_seam)
-        jump = np.zeros(DIFFERENCES)
-        peak = 0.0
+    def _measured(self, commands: list[Command], refused: bool, latency: int) -> dict[str, Any]:
+        counted = np.array(self._in_seam, dtype=bool)
+        jump, peak = np.zeros(DIFFERENCES), 0.0
         for order in range(1, DIFFERENCES + 1):
             steps = np.abs(np.diff(self._executed, n=order, axis=0))[-len(counted) :].max(axis=1, initial=0.0)
             at_seam = steps[counted[len(counted) - len(steps) :]]
@@ -306,6 +268,8 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             keys.HANDOVER_STARVED: sum(c.starved for c in commands),
             keys.HANDOVER_LIMITED: limited,
             keys.HANDOVER_STEPS: len(commands),
+            keys.HANDOVER_REFUSED: refused,
+            keys.HANDOVER_LATENCY: latency,
         }
 
 

@@ -70,11 +70,11 @@ def receiver_inside(env: Env) -> CommandReceiver | None:
     return next((inner for inner in wrappers_of(env) if isinstance(inner, CommandReceiver)), None)
 
 
-def action_array(action: Any, shape: tuple[int, ...]) -> NDArray[Any]:
-    """A copy of an action in its own dtype, or an `ActionError` for another shape or no numbers."""
+def action_array(action: Any, shape: tuple[int, ...], dtype: type | None = None) -> NDArray[Any]:
+    """A copy of an action, in its own dtype unless told; an `ActionError` for another shape or no numbers."""
     try:
-        given = np.array(action)
-        given.astype(np.float64)
+        given = np.array(action, dtype)
+        given.astype(np.float64, copy=False)
     except (TypeError, ValueError):
         raise ActionError(f"expected an action of shape {shape}, got {action!r}") from None
     if given.shape != shape:

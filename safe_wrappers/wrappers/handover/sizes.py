@@ -18,31 +18,23 @@ Array = NDArray[np.float64]
 
 
 class ChunkSizes(NamedTuple):
-    """In control steps, by the names of real-time chunking: H, s, and the least and the most of d.
+    """In control steps, by the names of real-time chunking: H, s, and the least and the most of d."""
 
-    Attributes:
-        entries: chunk_size.
-        steps_per_entry: Control steps from one entry to the next.
-        chunk: H, the control steps that a chunk has a command for; with one step per entry its entries.
-        horizon: execution_horizon s.
-        delay: The least and the largest inference_delay d; `d <= s <= H - d` holds for the largest.
-    """
-
-    entries: int
-    steps_per_entry: int
-    chunk: int
-    horizon: int
-    delay: tuple[int, int]
+    entries: int  # chunk_size
+    steps_per_entry: int  # control steps from one entry to the next
+    chunk: int  # H, the control steps that a chunk has a command for; with one step per entry its entries
+    horizon: int  # execution_horizon s
+    delay: tuple[
+        int, int
+    ]  # the least and the largest inference_delay d; d <= s <= H - d holds for the largest
 
     @classmethod
     def checked(
         cls, chunk_size: Any, execution_horizon: Any, inference_delay: Any, steps_per_entry: Any
     ) -> "ChunkSizes":
         """The sizes as the user gave them, or an error that says what would fit."""
-        entries, horizon = (
-            whole_number("chunk_size", chunk_size, 1, "control steps"),
-            whole_number("execution_horizon", execution_horizon, 1, "control steps"),
-        )
+        entries = whole_number("chunk_size", chunk_size, 1, "control steps")
+        horizon = whole_number("execution_horizon", execution_horizon, 1, "control steps")
         apart = whole_number("steps_per_entry", steps_per_entry, 1, "control steps")
         if entries == 1 and apart > 1:
             raise ConfigurationError(

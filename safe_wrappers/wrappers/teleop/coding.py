@@ -29,37 +29,26 @@ Passivity = Literal["none", "controller"]
 
 
 class Up(NamedTuple):
-    """What goes from the operator to the machine.
+    """What goes from the operator to the machine."""
 
-    Attributes:
-        action: As the operator gave it.
-        seen_s: When the image was taken that it was made from, s.
-        extra: What the coding adds.
-    """
-
-    action: Any
-    seen_s: float
-    extra: Any
+    action: Any  # as the operator gave it
+    seen_s: float  # when the image was taken that it was made from, s
+    extra: Any  # what the coding adds
 
 
 class Down(NamedTuple):
-    """What comes back: the env's observation, when it was taken (s), and what the coding adds."""
+    """What comes back."""
 
-    observation: Any
-    taken_s: float
-    extra: Any
+    observation: Any  # the env's
+    taken_s: float  # when, s
+    extra: Any  # what the coding adds
 
 
 class Order(NamedTuple):
-    """What is to be executed at the machine.
+    """What is to be executed at the machine."""
 
-    Attributes:
-        flow: To replace the port's entries of what would be executed; None: as it is.
-        seen_s: When the image was taken that it was made from, s.
-    """
-
-    flow: Array | None
-    seen_s: float
+    flow: Array | None  # to replace the port's entries of what would be executed; None: as it is
+    seen_s: float  # when the image was taken that it was made from, s
 
 
 class Given(NamedTuple):
