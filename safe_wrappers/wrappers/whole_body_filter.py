@@ -93,66 +93,51 @@ class WholeBodyFilter(CBFActionFilter):
         solver: str = "daqp",
     ) -> None:
         arguments = dict(locals())
-        constraints = _constraints(
-            env, contacts, friction_share, tolerance, joint_tolerance, zmp_inset, bodies, horizon
-        )
+        model = getattr(env.unwrapped, "model", None)
+        if not isinstance(model, mujoco.MjModel):
+            raise UnsupportedEnvError(
+                f"WholeBodyFilter needs an env with MuJoCo's .model and .data; {env} has none"
+            )
+        if joint_tolerance is not None:
+            joint_tolerance = non_negative("joint_tolerance", joint_tolerance, "rad or m")
+            refuse_uncovered_stops(model)
+            if not stops(model)[0]:
+                raise UnsupportedEnvError(
+                    "no driven joint of this model has a range: joint_tolerance=None leaves the joints alone"
+                )
+        elif horizon is not None:
+            raise ConfigurationError(
+                "horizon is how far to look ahead for the joints, which joint_tolerance=None leaves alone"
+            )
+        constraints: list[Constraint]
+        if contacts in ("pyramid", "cone"):
+            for name in ("tolerance", "bodies", "horizon"):
+                if arguments[name] is not None:
+                    raise ConfigurationError(
+                        f'{name} is for contacts="forecast"; the whole-body program of contacts={contacts!r} has none'
+                    )
+            cone: Any = "exact" if contacts == "cone" else "pyramid"
+            constraints = [Stance(friction_share, cone, joint_tolerance=joint_tolerance, zmp_inset=zmp_inset)]
+        elif contacts == "forecast":
+            tolerance = TOLERANCE if tolerance is None else tolerance
+            constraints = [ContactFeasibility(friction_share, tolerance, bodies)]
+            if zmp_inset is not None:
+                constraints.append(SupportMargin(zmp_inset))
+            if joint_tolerance is not None:
+                constraints.append(_within(model, joint_tolerance, HOLDS if horizon is None else horizon))
+        else:
+            raise UnknownNameError(f'contacts is "forecast", "pyramid" or "cone", got {contacts!r}')
         plant = own_plant(plant)
         self._record(arguments, bodies=None if bodies is None else list(bodies), plant=plant)
         CBFActionFilter.__init__(self, env, constraints, plant=plant, fallback=fallback, solver=solver)
 
 
-def _constraints(
-    env: Env,
-    contacts: str,
-    friction_share: float,
-    tolerance: float | None,
-    joint_tolerance: float | None,
-    zmp_inset: float | None,
-    bodies: Sequence[str] | None,
-    horizon: int | None,
-) -> list[Constraint]:
-    model = getattr(env.unwrapped, "model", None)
-    if not isinstance(model, mujoco.MjModel):
-        raise UnsupportedEnvError(
-            f"WholeBodyFilter needs an env with MuJoCo's .model and .data; {env} has none"
-        )
+def _within(model: mujoco.MjModel, tolerance: float, horizon: int) -> JointPositionLimit:
+    """The joints' own ranges, widened by the tolerance, rad or m."""
     joints, low, high = stops(model)
-    if joint_tolerance is not None:
-        joint_tolerance = non_negative("joint_tolerance", joint_tolerance, "rad or m")
-        refuse_uncovered_stops(model)
-        if not joints:
-            raise UnsupportedEnvError(
-                "no driven joint of this model has a range: joint_tolerance=None leaves the joints alone"
-            )
-    elif horizon is not None:
-        raise ConfigurationError(
-            "horizon is how far to look ahead for the joints, which joint_tolerance=None leaves alone"
-        )
-    if contacts in ("pyramid", "cone"):
-        _only_for_forecasts(contacts, tolerance=tolerance, bodies=bodies, horizon=horizon)
-        cone: Any = "exact" if contacts == "cone" else "pyramid"
-        return [Stance(friction_share, cone, joint_tolerance=joint_tolerance, zmp_inset=zmp_inset)]
-    if contacts != "forecast":
-        raise UnknownNameError(f'contacts is "forecast", "pyramid" or "cone", got {contacts!r}')
-    found: list[Constraint] = [
-        ContactFeasibility(friction_share, TOLERANCE if tolerance is None else tolerance, bodies)
-    ]
-    if zmp_inset is not None:
-        found.append(SupportMargin(zmp_inset))
-    if joint_tolerance is not None:
-        within = JointPositionLimit(
-            lower=(low - joint_tolerance).tolist(),
-            upper=(high + joint_tolerance).tolist(),
-            joints=[model.joint(j).name for j in joints],
-            horizon=HOLDS if horizon is None else horizon,
-        )
-        found.append(within)
-    return found
-
-
-def _only_for_forecasts(contacts: str, **given: Any) -> None:
-    for name, value in given.items():
-        if value is not None:
-            raise ConfigurationError(
-                f'{name} is for contacts="forecast"; the whole-body program of contacts={contacts!r} has none'
-            )
+    return JointPositionLimit(
+        lower=(low - tolerance).tolist(),
+        upper=(high + tolerance).tolist(),
+        joints=[model.joint(j).name for j in joints],
+        horizon=horizon,
+    )

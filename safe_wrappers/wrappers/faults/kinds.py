@@ -1,6 +1,7 @@
 """The faults: some strike each command by itself, others last for a while."""
 
 import math
+from abc import abstractmethod
 
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.deprecation import deprecated_parameters
@@ -18,8 +19,16 @@ def probability(name: str, value: float) -> float:
     return number
 
 
+class Struck(Fault):
+    """A fault that strikes some of the commands."""
+
+    @abstractmethod
+    def strikes(self, now_s: float) -> bool:
+        """Whether it strikes the command of now; called once per step."""
+
+
 @deprecated_parameters(renamed={"hold_s": "control_dt"})
-class ShareFault(Fault):
+class ShareFault(Struck):
     """Base of the faults that strike a share of the commands.
 
     Args:
@@ -32,35 +41,9 @@ class ShareFault(Fault):
         self._share = probability("share", share)
         super().__init__(env, control_dt, share=self._share)
 
-    def strikes(self) -> bool:
+    def strikes(self, now_s: float) -> bool:
         """Whether it strikes the next command."""
         return bool(self.random.draw.random() < self._share)
-
-
-class DroppedRefreshes(ShareFault):
-    """Loses a share of the commands. Arguments: see `ShareFault`."""
-
-    def carry(self, given: Carried | None, now_s: float) -> Carried | None:
-        """The command, or nothing."""
-        return None if self.strikes() else given
-
-
-class RepeatedCommands(ShareFault):
-    """Loses a share of the commands, and sends the one that arrived last once more, with its old observation time.
-
-    Arguments: see `ShareFault`.
-    """
-
-    def begin(self) -> None:
-        """Nothing has arrived that could be repeated."""
-        self._before: Carried | None = None
-
-    def carry(self, given: Carried | None, now_s: float) -> Carried | None:
-        """The command, or the one before."""
-        if self.strikes():
-            return self._before
-        self._before = given if given is not None else self._before
-        return given
 
 
 @deprecated_parameters(renamed={"hold_s": "control_dt"})
@@ -151,7 +134,7 @@ class OnOffProcess:
 
 
 @deprecated_parameters(renamed={"hold_s": "control_dt"})
-class OnOffFault(Fault):
+class OnOffFault(Struck):
     """Base of the faults that are on for a while at a time.
 
     Args:
@@ -171,33 +154,52 @@ class OnOffFault(Fault):
         """An episode begins without the fault."""
         self._process.begin(self.random)
 
-    def is_on(self, now_s: float) -> bool:
+    def strikes(self, now_s: float) -> bool:
         """Whether the fault is on now."""
         return self._process.is_on(now_s, self.random)
 
 
-class Outages(OnOffFault):
-    """Loses all commands during outages of random length, at random times. Arguments: see `OnOffFault`."""
+class Loses(Struck):
+    """Base of the faults that lose the commands that they strike."""
 
     def carry(self, given: Carried | None, now_s: float) -> Carried | None:
         """The command, or nothing."""
-        return None if self.is_on(now_s) else given
+        return None if self.strikes(now_s) else given
 
 
-class FrozenPolicy(OnOffFault):
+class Repeats(Struck):
+    """Base of the faults that send the command from before instead, with its old observation time."""
+
+    def begin(self) -> None:
+        """Nothing has arrived that could be repeated."""
+        super().begin()
+        self._before: Carried | None = None
+
+    def carry(self, given: Carried | None, now_s: float) -> Carried | None:
+        """The command, or the one from before."""
+        if self.strikes(now_s):
+            return self._before
+        self._before = given if given is not None else self._before
+        return given
+
+
+class DroppedRefreshes(Loses, ShareFault):
+    """Loses a share of the commands. Arguments: see `ShareFault`."""
+
+
+class RepeatedCommands(Repeats, ShareFault):
+    """Loses a share of the commands, and sends the one that arrived last once more, with its old observation time.
+
+    Arguments: see `ShareFault`.
+    """
+
+
+class Outages(Loses, OnOffFault):
+    """Loses all commands during outages of random length, at random times. Arguments: see `OnOffFault`."""
+
+
+class FrozenPolicy(Repeats, OnOffFault):
     """Repeats, for random lengths of time, the last command from before, with its old observation time.
 
     Arguments: see `OnOffFault`.
     """
-
-    def begin(self) -> None:
-        """An episode begins with a policy that works."""
-        super().begin()
-        self._frozen: Carried | None = None
-
-    def carry(self, given: Carried | None, now_s: float) -> Carried | None:
-        """The command, or the one from before."""
-        if self.is_on(now_s):
-            return self._frozen
-        self._frozen = given if given is not None else self._frozen
-        return given

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import non_negative, positive, settings_from
+from safe_wrappers.checks import check_fields, non_negative, positive, settings_from
 from safe_wrappers.control.estimation.covariance import checked_noise
 from safe_wrappers.control.numerics.spatial import from_sensor, lever_arm_velocity, to_sensor
 from safe_wrappers.errors import ConfigurationError
@@ -62,11 +62,9 @@ class Sensor:
         for name in ("camera", "site"):
             if not isinstance(getattr(self, name), str | None):
                 raise ConfigurationError(f"{name} is a name, got {getattr(self, name)!r}")
-        if self.view_deg is not None:
-            self.view_deg = positive("view_deg", self.view_deg, "degrees")
-        if self.range_m is not None:
-            self.range_m = positive("range_m", self.range_m, "m")
-        self.dropout = non_negative("dropout", self.dropout, "probability per step")
+        check_fields(self, positive, ["view_deg"], "degrees")
+        check_fields(self, positive, ["range_m"], "m")
+        check_fields(self, non_negative, ["dropout"], "probability per step")
         if self.dropout >= 1.0:
             raise ConfigurationError(
                 f"dropout is a probability below 1: nothing would ever be measured at {self.dropout}"

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import non_negative, positive, settings_from
+from safe_wrappers.checks import check_fields, non_negative, positive, settings_from
 from safe_wrappers.control.estimation.covariance import checked_covariance
 from safe_wrappers.control.estimation.tracks import Motion
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
@@ -63,8 +63,7 @@ class Track:
                 "say how it moves: acceleration_noise, the intensity of its white acceleration noise in m^2/s^3 (0: "
                 "it keeps its velocity exactly)"
             )
-        if self.reversion_s is not None:
-            self.reversion_s = positive("reversion_s", self.reversion_s, "s")
+        check_fields(self, positive, ["reversion_s"], "s")
         for name in ("acceleration_noise", "mean_velocity", "start_position_std", "start_velocity_std"):
             setattr(self, name, plain_numbers(getattr(self, name)))
 
@@ -74,25 +73,22 @@ class Track:
         return Motion(
             _intensity(self.acceleration_noise, coordinates),
             np.inf if self.reversion_s is None else self.reversion_s,
-            np.zeros(coordinates) if mean is None else _each("mean_velocity", mean, coordinates, "m/s"),
+            np.zeros(coordinates)
+            if mean is None
+            else _each("mean_velocity", mean, coordinates, "m/s", signed=True),
         )
 
     def start(self, coordinates: int) -> tuple[Array, Array]:
         """Standard deviations of position and velocity at a reset, shapes (d,)."""
-        deviations = []
-        for name, unit in (("start_position_std", "m"), ("start_velocity_std", "m/s")):
-            values = _each(name, getattr(self, name), coordinates, unit)
-            for value in values:
-                non_negative(name, value, unit)
-            deviations.append(values)
-        return deviations[0], deviations[1]
+        position = _each("start_position_std", self.start_position_std, coordinates, "m")
+        return position, _each("start_velocity_std", self.start_velocity_std, coordinates, "m/s")
 
     def data(self) -> dict[str, Any]:
         """Plain data, from which it can be made again."""
         return asdict(self)
 
 
-def _each(name: str, given: Any, coordinates: int, unit: str) -> Array:
+def _each(name: str, given: Any, coordinates: int, unit: str, signed: bool = False) -> Array:
     """One number per coordinate."""
     try:
         values = np.asarray(given, dtype=np.float64)
@@ -103,16 +99,15 @@ def _each(name: str, given: Any, coordinates: int, unit: str) -> Array:
         ) from None
     if not np.isfinite(values).all():
         raise ConfigurationError(f"{name} must be finite, in {unit}, got {given!r}")
+    for value in () if signed else values:
+        non_negative(name, value, unit)
     return values
 
 
 def _intensity(given: Any, coordinates: int) -> Array:
     if isinstance(given, list) and any(isinstance(row, list) for row in given):
         return checked_covariance("acceleration_noise", given, coordinates)
-    values = _each("acceleration_noise", given, coordinates, "m^2/s^3")
-    for value in values:
-        non_negative("acceleration_noise", value, "m^2/s^3")
-    return np.diag(values)
+    return np.diag(_each("acceleration_noise", given, coordinates, "m^2/s^3"))
 
 
 def track_from(given: Any) -> Track:
