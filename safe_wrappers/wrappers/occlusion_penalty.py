@@ -136,12 +136,15 @@ class OcclusionPenalty(LayerWrapper):
         self._matrix, self._noise = self.sensor.matrices(self._d)
         self._noise_root = np.linalg.cholesky(self._noise)
         self._look_at(raw.model)
-        self.tracking = Tracks([m for t, count in self._counted for m in [t.motion(self._d)] * count])
-        self._start_std = [
-            np.concatenate([np.tile(t.start(self._d)[k], (count, 1)) for t, count in self._counted])
-            for k in (0, 1)
-        ]
-        self.unobservable = self._unobservable(axes)
+        owners = [thing.track for thing in self._things]
+        self.track_names = [thing.name for thing in self._things]
+        self.tracking = Tracks([track.motion(self._d) for track in owners])
+        self._start_std = [np.stack(stds) for stds in zip(*(t.start(self._d) for t in owners), strict=True)]
+        names = [*axes, *(f"v{axis}" for axis in axes)]
+        self.unobservable = {
+            name: list(linear_observability(motion.matrices()[0], self._matrix, names).names)
+            for name, motion in zip(self.track_names, self.tracking.motions, strict=True)
+        }
         self.last_seen_positions = np.zeros((len(self.track_names), self._d))
         self.permitted = np.zeros(len(self.track_names), dtype=bool)
         self.observe = bool(observe)
@@ -153,23 +156,9 @@ class OcclusionPenalty(LayerWrapper):
         s = self.sensor
         range_m = math.inf if s.range_m is None else s.range_m
         self._sight = LineOfSight(model, s.camera, s.site, s.view_deg, range_m, s.occluder_groups)
-        bodies, self.track_names, counts = tracked_things(model, self.tracks, self._published)
-        self._counted = list(zip(self.tracks, counts, strict=True))
-        if len(set(self.track_names)) < len(self.track_names):
-            twice = sorted({n for n in self.track_names if self.track_names.count(n) > 1})
-            raise ConfigurationError(f"each thing is tracked once; these are named twice: {', '.join(twice)}")
-        self._bodies = np.array(bodies, dtype=np.intp)
+        self._things = tracked_things(model, self.tracks, self._published)
+        self._bodies = np.array([thing.body for thing in self._things], dtype=np.intp)
         self._in_model = self._bodies >= 0
-
-    def _look_at_another(self, model: mujoco.MjModel) -> None:
-        """The env has another model now; the tracks must be the same."""
-        before = self.track_names
-        self._look_at(model)
-        if self.track_names != before:
-            raise ConfigurationError(
-                f"the env has another model than when the wrapper was made, with other things to track: "
-                f"{', '.join(self.track_names)} and not {', '.join(before)}"
-            )
 
     def _published(self, track: Track) -> Array:
         points = np.asarray(read_attribute(self.env, track.published or ""), dtype=np.float64)
@@ -179,14 +168,6 @@ class OcclusionPenalty(LayerWrapper):
                 f"{points.shape}; how many there are is read when the wrapper is made"
             )
         return points
-
-    def _unobservable(self, axes: str) -> dict[str, list[str]]:
-        names = [*axes, *(f"v{axis}" for axis in axes)]
-        directions: list[list[str]] = []
-        for track, count in self._counted:
-            a, _, _ = track.motion(self._d).matrices()
-            directions += [list(linear_observability(a, self._matrix, names).names)] * count
-        return dict(zip(self.track_names, directions, strict=True))
 
     def _truth(self) -> tuple[Array, Array | None]:
         """True positions, shape (n, 3), m, and velocities, (n, d), m/s, if the sensor measures them."""
@@ -199,19 +180,17 @@ class OcclusionPenalty(LayerWrapper):
             velocities = np.empty((len(positions), self._d))
             for i in np.flatnonzero(self._in_model):
                 velocities[i] = sight.velocity(int(self._bodies[i]))[0][: self._d]
-        at = 0
-        for track, count in self._counted:
+        for track in self.tracks:
             if track.published is not None:
                 points = self._published(track)
-                if len(points) != count:
+                which = [i for i, thing in enumerate(self._things) if thing.track is track]
+                if len(points) != len(which):
                     raise ConfigurationError(
-                        f"the env's {track.published} had {count} points when the wrapper was made, and has "
+                        f"the env's {track.published} had {len(which)} points when the wrapper was made, and has "
                         f"{len(points)} now; things that come and go cannot be tracked"
                     )
-                there = positions[at : at + count]
-                there[:, 2] = sight.position[2]  # a point of the plane is looked at level
-                there[:, : points.shape[1]] = points
-            at += count
+                positions[which, 2] = sight.position[2]  # a point of the plane is looked at level
+                positions[which, : points.shape[1]] = points
         return positions, velocities
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
@@ -219,13 +198,18 @@ class OcclusionPenalty(LayerWrapper):
         observation, info = self.env.reset(seed=seed, options=options)
         self._random.reset(self.env, seed)
         if self._sight.model is not self._raw.model:
-            self._look_at_another(self._raw.model)
+            self._look_at(self._raw.model)
+            names = [thing.name for thing in self._things]
+            if names != self.track_names:
+                raise ConfigurationError(
+                    f"the env has another model than when the wrapper was made, with other things to track: "
+                    f"{', '.join(names)} and not {', '.join(self.track_names)}"
+                )
         self._time = float(self._raw.data.time)
         self._sight.read(self._raw.data)
         self._start()
-        self._look()
+        info.update(self._look())
         info[keys.OCCLUSION_PENALTY] = info[keys.OCCLUSION_TASK_REWARD] = 0.0
-        self._tell(info)
         return self._observed(observation), info
 
     def step(self, action: Any) -> Step:
@@ -233,11 +217,10 @@ class OcclusionPenalty(LayerWrapper):
         observation, reward, terminated, truncated, info = self.env.step(action)
         self.tracking.advance(self._elapsed())
         self._sight.read(self._raw.data)
-        self._look()
+        info.update(self._look())
         penalty = self.weight * self._uncertainty() if self.weight else 0.0
         info[keys.OCCLUSION_TASK_REWARD] = float(reward)
         info[keys.OCCLUSION_PENALTY] = penalty
-        self._tell(info)
         if penalty:
             reward = float(reward) - penalty
         return self._observed(observation), reward, terminated, truncated, info
@@ -282,8 +265,8 @@ class OcclusionPenalty(LayerWrapper):
         self.tracking.start(mean, covariance)
         self.last_seen_positions = mean[:, :d].copy()
 
-    def _look(self) -> None:
-        """Measure what is in sight, and say what may be relied on."""
+    def _look(self) -> dict[str, Any]:
+        """Measure what is in sight, and report what may be relied on."""
         d, n = self._d, len(self.track_names)
         truth, velocities = self._truth()
         seen = self._sight.sees(truth, self._bodies)
@@ -299,10 +282,14 @@ class OcclusionPenalty(LayerWrapper):
             self.tracking.see(which, measurements, self._matrix, self._noise)
             if self.sensor.position_std is not None:
                 self.last_seen_positions[which] = measurements[:, :d]
-        self._visible = seen
         self._sigma = largest_deviation(self.tracking.position_covariances)
         soon = largest_deviation(self.tracking.ahead([self._control_dt])[1][0])
         self.permitted = self.sigmas * np.maximum(self._sigma, soon) <= self.tolerance
+        return {
+            keys.OCCLUSION_VISIBLE: seen,
+            keys.OCCLUSION_SIGMA: self._sigma.copy(),
+            keys.OCCLUSION_EXPIRED: ~self.permitted,
+        }
 
     def _uncertainty(self) -> float:
         """Mean share of the tolerated variance that is used up, over the tracks within range."""
@@ -312,11 +299,6 @@ class OcclusionPenalty(LayerWrapper):
         away = self.tracking.positions - self._sight.position[: self._d]
         near = (away * away).sum(axis=1) <= self.sensor.range_m**2
         return float(share[near].mean()) if near.any() else 0.0
-
-    def _tell(self, info: dict[str, Any]) -> None:
-        info[keys.OCCLUSION_VISIBLE] = self._visible.copy()
-        info[keys.OCCLUSION_SIGMA] = self._sigma.copy()
-        info[keys.OCCLUSION_EXPIRED] = ~self.permitted
 
     def _observed(self, observation: Any) -> Any:
         if not self.observe:

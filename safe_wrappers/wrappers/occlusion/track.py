@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence, Sized
 from dataclasses import asdict, dataclass
 from fnmatch import fnmatchcase
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -120,24 +120,32 @@ def track_from(given: Any) -> Track:
     )
 
 
+class Tracked(NamedTuple):
+    """One thing that is tracked."""
+
+    track: Track  # which it belongs to
+    name: str  # the body's, or the attribute's with an index
+    body: int  # in the model; -1 for a published point
+
+
 def tracked_things(
     model: mujoco.MjModel, tracks: Sequence[Track], published: Callable[[Track], Sized]
-) -> tuple[list[int], list[str], list[int]]:
-    """Body (-1: a published point) and name of every tracked thing, and how many each track follows."""
-    bodies: list[int] = []
-    names: list[str] = []
-    counts: list[int] = []
+) -> list[Tracked]:
+    """All that the tracks follow, in their order."""
+    things: list[Tracked] = []
     there = {model.body(b).name: b for b in range(1, model.nbody) if model.body(b).name}
     for track in tracks:
-        if track.bodies is not None:
-            found = [name for name in there if fnmatchcase(name, track.bodies)]
-            if not found:
-                listed = ", ".join(there) or "none"
-                raise UnknownNameError(f"the model has no body {track.bodies!r}; it has: {listed}")
-            bodies += [there[name] for name in found]
-        else:
-            found = [f"{track.published}[{i}]" for i in range(len(published(track)))]
-            bodies += [-1] * len(found)
-        names += found
-        counts.append(len(found))
-    return bodies, names, counts
+        if track.bodies is None:
+            things += [Tracked(track, f"{track.published}[{i}]", -1) for i in range(len(published(track)))]
+            continue
+        found = [Tracked(track, name, b) for name, b in there.items() if fnmatchcase(name, track.bodies)]
+        if not found:
+            raise UnknownNameError(
+                f"the model has no body {track.bodies!r}; it has: {', '.join(there) or 'none'}"
+            )
+        things += found
+    names = [thing.name for thing in things]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ConfigurationError(f"each thing is tracked once; these are named twice: {', '.join(twice)}")
+    return things
