@@ -217,7 +217,7 @@ class TeleopChannel(CommandGate):
             return
         step = min(max(math.floor(observed_s / self.control_dt + SAME_STEP), 0), len(self._images) - 1)
         sequence, lost = self._up.send(Up(action, self._images[step], extra), now_s)
-        self._coding.sent_up(sequence, extra, lost)
+        self._coding.sent(True, sequence, extra, lost)
         self._lost += lost
 
     def _in_force(self) -> tuple[Any, bool]:
@@ -255,7 +255,7 @@ class TeleopChannel(CommandGate):
         flow = executed[list(self.port.flow)] if self.port is not None else executed
         extra, given = coding.settle(flow, observation, obeyed)
         sequence, lost = self._down.send(Down(_copy(observation), now_s, extra), now_s)
-        coding.sent_down(sequence, extra, lost)
+        coding.sent(False, sequence, extra, lost)
         self._lost += lost
         arrived = self._down.receive(now_s)
         newest = self._down.newest.load

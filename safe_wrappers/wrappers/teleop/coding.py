@@ -61,8 +61,8 @@ class Given(NamedTuple):
 class PlainCoding:
     """Actions and observations as they are; the base of the others.
 
-    In each tick, in this order: `near` (the operator moves), `sent_up`, `far` (what arrived is decoded), the env's
-    step, `settle` (what truly happened), `sent_down`, `shown`.
+    In each tick, in this order: `near` (the operator moves), `sent`, `far` (what arrived is decoded), the env's
+    step, `settle` (what truly happened), `sent`, `shown`.
 
     Args:
         reading: Of the machine's port; None: there is none, and no energies are known.
@@ -88,8 +88,8 @@ class PlainCoding:
         """The operator moves with this flow, or is not there; returns what the packet up carries besides."""
         return None
 
-    def sent_up(self, sequence: int, extra: Any, lost: bool) -> None:
-        """The packet left."""
+    def sent(self, up: bool, sequence: int, extra: Any, lost: bool) -> None:
+        """A packet left, up or down."""
 
     def far(self, arrived: list[Packet], newest: Up | None, flow: Array | None) -> Order:
         """Decode what has arrived.
@@ -115,9 +115,6 @@ class PlainCoding:
             return None, None
         acted = self._reading.acted(flow, observation)
         return None, Given(acted, flow) if obeyed else Given(self._still, self._still)
-
-    def sent_down(self, sequence: int, extra: Any, lost: bool) -> None:
-        """The packet left."""
 
     def shown(self, arrived: list[Packet], observation: Any) -> Any:
         """The observation that the operator gets, with the effort felt in this tick."""
@@ -234,16 +231,23 @@ class WaveCoding(PlainCoding):
         self._felt, outgoing = effort_and_outgoing(flow, incoming, self._impedance)
         return outgoing
 
-    def sent_up(self, sequence: int, extra: Any, lost: bool) -> None:
-        """As `PlainCoding.sent_up`."""
-        self._up.send(extra, sequence)
+    def sent(self, up: bool, sequence: int, extra: Any, lost: bool) -> None:
+        """As `PlainCoding.sent`."""
+        line = self._up if up else self._down
+        line.send(extra, sequence)
         if lost:
-            self._up.lose(sequence)
+            line.lose(sequence)
 
     def far(self, arrived: list[Packet], newest: Up | None, flow: Array | None) -> Order:
         """As `PlainCoding.far`, from the waves alone."""
         wave = self._up.deliver([(packet.sequence, packet.load.extra) for packet in arrived])
-        self._note_age(arrived, newest)
+        if self._rule != "queue":
+            super().far(arrived, newest, flow)  # seen as late as the newest
+        else:  # as late as the wave that is put out now, or the last one
+            for packet in arrived:
+                heapq.heappush(self._waiting, (packet.sequence, packet.load.seen_s))
+            if self._waiting:
+                self._seen_s = heapq.heappop(self._waiting)[1]
         # What the machine took beyond what had arrived is paid first.
         energy = self._energy(wave)
         paid = min(self._owed_j, energy)
@@ -277,12 +281,6 @@ class WaveCoding(PlainCoding):
             outgoing = outgoing * (math.sqrt(left / energy) * (1.0 - 1e-15))
         return outgoing, given
 
-    def sent_down(self, sequence: int, extra: Any, lost: bool) -> None:
-        """As `PlainCoding.sent_down`."""
-        self._down.send(extra, sequence)
-        if lost:
-            self._down.lose(sequence)
-
     def shown(self, arrived: list[Packet], observation: Any) -> Any:
         """As `PlainCoding.shown`: what the operator felt stands where the machine's effort was."""
         self._back += [(packet.sequence, packet.load.extra) for packet in arrived]
@@ -295,17 +293,6 @@ class WaveCoding(PlainCoding):
 
     def _energy(self, wave: Array) -> float:
         return 0.5 * port_energy(wave, wave, self._tick_s)
-
-    def _note_age(self, arrived: list[Packet], newest: Up | None) -> None:
-        """How old the wave is that is put out now; the last one's age goes on while there is none."""
-        if self._rule != "queue":
-            if newest is not None:
-                self._seen_s = newest.seen_s
-            return
-        for packet in arrived:
-            heapq.heappush(self._waiting, (packet.sequence, packet.load.seen_s))
-        if self._waiting:
-            self._seen_s = heapq.heappop(self._waiting)[1]
 
 
 def coding_from(

@@ -93,12 +93,9 @@ class Line:
         outage = link.outage_between_s, link.outage_length_s
         self._outages = None if outage[0] is None or outage[1] is None else OnOffProcess(outage[0], outage[1])
 
-    newest: Packet
-    """Of all that have arrived the one that was sent last."""
-    fresh: bool
-    """Whether it arrived at the last `receive`."""
-    late: int
-    """How many packets of the last `receive` were overtaken."""
+    newest: Packet  # of all that have arrived the one that was sent last
+    fresh: bool  # whether it arrived at the last `receive`
+    late: int  # how many packets of the last `receive` were overtaken
 
     def reset(self, env: Env, seed: int | None, first: Any = None) -> None:
         """Nothing is on its way, and `first` has arrived; call it after the env's own reset."""

@@ -88,36 +88,25 @@ class PortReading:
 
     def __init__(self, env: Env, port: TeleopPort) -> None:
         self._env, self._port = env, port
+        self.feedthrough = port.feedthrough  # N s/m
         self._publishes = env.has_wrapper_attr("port_effort_acted")
 
     def reset(self, observation: Array) -> None:
         """At rest, the effort as observed."""
         self._last_flow = np.zeros(len(self._port.flow))
-        self.effort = self.of(observation)
-
-    @property
-    def feedthrough(self) -> float:
-        """N s/m."""
-        return self._port.feedthrough
-
-    effort: Array
-    """At the present state and the last command, N."""
-
-    def effort_at(self, flow: Array) -> Array:
-        """What the effort would be in the coming step with another flow, N."""
-        return self.effort + self._port.feedthrough * (flow - self._last_flow)
+        self.effort = self.of(observation)  # at the present state and the last command, N
 
     @property
     def base(self) -> Array:
-        """The same without flow, N."""
-        return self.effort - self._port.feedthrough * self._last_flow
+        """The effort without flow, N."""
+        return self.effort - self.feedthrough * self._last_flow
 
     def acted(self, flow: Array, observation: Array) -> Array:
         """The effort during the step that was made with this flow: as the env publishes it, else as foreseen, N."""
         if self._publishes:
             acted = np.array(self._env.get_wrapper_attr("port_effort_acted"), dtype=np.float64)
         else:
-            acted = self.effort_at(flow)
+            acted = self.effort + self.feedthrough * (flow - self._last_flow)
         self._last_flow = flow
         self.effort = self.of(observation)
         return acted

@@ -79,16 +79,13 @@ class RoundTripWatch:
         slack_s: Times that are closer are the same, s.
     """
 
-    budget: BoundBudget
-    """To be bound to a plant."""
-    revoked: bool
-    """Whether authority is revoked, as `judge` left it."""
-    readable: bool
-    """Whether clearance and speed were numbers when `look` was called."""
-    clearance_m: float
-    """The smallest clearance then, m; inf where there is nothing near, 0 where it cannot be read."""
-    ceiling_s: float
-    """The longest admissible round trip then, s, within `longest_s` of 0; the lowest there is where unreadable."""
+    budget: BoundBudget  # to be bound to a plant
+    revoked: bool  # whether authority is revoked, as `judge` left it
+    readable: bool  # whether clearance and speed were finite when `look` was called
+    clearance_m: (
+        float  # the smallest clearance then, m; inf where there is nothing near, 0 where it cannot be read
+    )
+    ceiling_s: float  # the longest round trip then, s, within `longest_s` of 0; the lowest where unreadable
 
     def __init__(self, env: Env, ceiling: RoundTripCeiling, control_dt: float, slack_s: float = 0.0) -> None:
         self._ceiling, self._control_dt, self._slack_s = ceiling, control_dt, slack_s
@@ -128,11 +125,7 @@ class RoundTripWatch:
         trusted = self.readable and round_trip_s <= allowed_s + self._slack_s
         if self.revoked:
             trusted = trusted and seen_s >= self._revoked_s - self._slack_s
-        trusted = trusted and self.can_stop_after(command)
+        trusted = trusted and self.budget.can_stop_after(command, self._control_dt)
         if not trusted and not self.revoked:
             self._revoked_s = now_s
         self.revoked = not trusted
-
-    def can_stop_after(self, command: Array) -> bool:
-        """Whether the machine can stop by itself after a command for one control step."""
-        return self.budget.can_stop_after(command, self._control_dt)
