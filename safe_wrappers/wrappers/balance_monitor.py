@@ -37,21 +37,15 @@ class BalanceMonitor(StepMonitor):
         env: Its unwrapped env has MuJoCo's `.model` and `.data`.
         friction_share: Of the model's friction coefficient that is taken as the whole, in (0, 1].
         inset: Kept inside the support polygon, m.
-        bodies: Names of bodies; the robot is they and all that hangs from them. None is everything that moves, which
-            may be more than the robot: name its trunk where something loose lies about.
+        bodies: Names of bodies; the robot is they and all that hangs from them. None is everything that moves.
 
-    Info, at every step (0 and False after a reset):
-
-    - ``balance/linear_momentum`` (float64 array (3,), kg m/s): of the robot after the step.
-    - ``balance/angular_momentum`` (float64 array (3,), kg m^2/s): the same about its centre of mass.
-    - ``balance/friction_used`` (float): the largest ``|f_t| / (friction_share mu f_n)``, against the round cone, of a
-      contact that carries at least 1 % of the robot's weight.
-    - ``balance/zmp_margin`` (float, m): least distance of the zero moment point from the edge of the support polygon,
-      minus the inset; negative within the inset. 0 where there is no polygon.
-    - ``balance/supported`` (float): share of the evaluations with a polygon.
-    - ``balance/airborne`` (float): share of the evaluations without a contact point.
-    - ``balance/partial`` (bool): the step could not be replayed, and the others are of the contacts that it has left
-      behind; or it held numbers that are not finite, which are reported as 0.
+    Info, at every step (0 and False after a reset): of the robot after the step ``balance/linear_momentum`` (kg m/s)
+    and ``balance/angular_momentum`` about its centre of mass (kg m^2/s), arrays (3,); ``balance/friction_used``, the
+    largest ``|f_t| / (friction_share mu f_n)`` of a contact that carries at least 1 % of the weight;
+    ``balance/zmp_margin`` (m), from the edge of the support polygon minus the inset, 0 without a polygon;
+    ``balance/supported`` and ``balance/airborne``, shares of the evaluations with a polygon and without a contact
+    point; ``balance/partial`` (bool): the step could not be replayed, and the figures are those of the contacts that
+    it has left behind (0 if not finite).
 
     Raises:
         UnsupportedEnvError: No MuJoCo model, or nothing of the robot can touch the fixed world with friction.

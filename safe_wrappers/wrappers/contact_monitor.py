@@ -19,8 +19,8 @@ class ContactMonitor(StepMonitor):
 
     It sees every physics substep, and every stage of a Runge-Kutta step: each control step is made once more on data
     of its own, from the state before it and with the inputs (controls, applied forces) that the env has left. An env
-    that changes its inputs or its state between substeps cannot be replayed; `contact/partial` is True for such a
-    step, and a warning says so once. Put it inside `ChunkHandover`; elsewhere its place does not matter.
+    that changes its inputs or its state between substeps cannot be replayed. Put it inside `ChunkHandover`; elsewhere
+    its place does not matter.
 
     Args:
         env: Its unwrapped env has MuJoCo's `.model` and `.data`.
@@ -29,13 +29,10 @@ class ContactMonitor(StepMonitor):
             bodies is in each list.
 
     Info, at every step (0 and False after a reset; not finite where the simulation's contacts are not):
-
-    - ``contact/peak_force`` (float, N): the largest normal force between two bodies, summed over their contacts.
-    - ``contact/impulse`` (float, N s): normal forces of all watched contacts, summed and integrated over the step.
-    - ``contact/penetration`` (float, m): the deepest.
-    - ``contact/residual`` (float, N m): the largest ``|gap * force|`` of a contact, 0 for rigid contacts.
-    - ``contact/partial`` (bool): the step could not be replayed; the others are of the contacts that it has left
-      behind, for one substep.
+    ``contact/peak_force`` (N), the largest normal force between two bodies, summed over their contacts;
+    ``contact/impulse`` (N s) of all watched contacts; ``contact/penetration`` (m), the deepest; ``contact/residual``
+    (N m), the largest ``|gap * force|``, 0 for rigid contacts; ``contact/partial`` (bool): the step could not be
+    replayed, and the figures are those of the contacts that it has left behind, for one substep.
 
     Raises:
         UnsupportedEnvError: No MuJoCo model.

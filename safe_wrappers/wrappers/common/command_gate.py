@@ -17,12 +17,7 @@ Array = NDArray[np.float64]
 
 
 class CommandGate(LayerWrapper, CommandReceiver):
-    """Base of `LeaseExpiry` and `TeleopChannel`.
-
-    Args:
-        env: With a one-dimensional Box action space.
-        control_dt: Control interval, s; None reads the env's `dt`.
-    """
+    """Base of `LeaseExpiry` and `TeleopChannel`; the env has a one-dimensional Box action space."""
 
     _fallback: FallbackController | None
 

@@ -16,13 +16,10 @@ Array = NDArray[np.float64]
 
 
 class FallbackController:
-    """A fallback with the plant that it needs, bound to an env.
+    """A fallback ("brake", "hold", "zero" or a function of the plant) with the plant that it needs, bound to an env.
 
-    Args:
-        env: What is wrapped.
-        choice: "brake", "hold", "zero", or a function of the plant.
-        plant: None reads the env's MuJoCo model where the choice needs one.
-        constraint: Bound here; "brake" is its backup control, if it has one.
+    `plant` None reads the env's MuJoCo model where the choice needs one. A constraint is bound here; "brake" is then
+    its backup control, if it has one.
     """
 
     def __init__(

@@ -10,10 +10,7 @@ import numpy as np
 class WrapperRng:
     """Random numbers apart from the env's, which paired runs need unchanged; a reset's seed starts them anew.
 
-    The env's first seed is used where none was ever given.
-
-    Args:
-        stream: A name, such as the wrapper's, that keeps it apart from other generators of the same seed.
+    The env's first seed is used where none was ever given. `stream` keeps it apart from others of the same seed.
     """
 
     def __init__(self, stream: str) -> None:

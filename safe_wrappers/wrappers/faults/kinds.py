@@ -109,12 +109,7 @@ class ClockSkew(Fault):
 
 
 class OnOffProcess:
-    """A process that is off and on by turns, both for exponentially distributed times; an episode begins off.
-
-    Args:
-        mean_between_s: Mean time off, s.
-        mean_length_s: Mean time on, s.
-    """
+    """A process that is off and on by turns, both for exponentially distributed times (means in s); it begins off."""
 
     def __init__(self, mean_between_s: float, mean_length_s: float) -> None:
         self._between = positive("mean_between_s", mean_between_s, "s")
@@ -188,10 +183,7 @@ class DroppedRefreshes(Loses, ShareFault):
 
 
 class RepeatedCommands(Repeats, ShareFault):
-    """Loses a share of the commands, and sends the one that arrived last once more, with its old observation time.
-
-    Arguments: see `ShareFault`.
-    """
+    """Loses a share of the commands, and sends the last one once more. Arguments: see `ShareFault`."""
 
 
 class Outages(Loses, OnOffFault):
@@ -199,7 +191,4 @@ class Outages(Loses, OnOffFault):
 
 
 class FrozenPolicy(Repeats, OnOffFault):
-    """Repeats, for random lengths of time, the last command from before, with its old observation time.
-
-    Arguments: see `OnOffFault`.
-    """
+    """Repeats the last command from before for random lengths of time. Arguments: see `OnOffFault`."""

@@ -144,13 +144,9 @@ def _rounding(space: gym.spaces.Box) -> float:
 
 
 class Upsampling:
-    """Chunks whose entries lie some control steps apart, as commands on a cubic Hermite spline through the entries.
+    """Chunks of entries that lie some control steps apart, as commands on a cubic Hermite spline through the entries.
 
     A chunk ends with its last entry. Between entries the spline may overshoot their range.
-
-    Args:
-        entries: H.
-        steps: Control steps from one entry to the next; 1 changes nothing.
     """
 
     def __init__(self, entries: int, steps: int) -> None:

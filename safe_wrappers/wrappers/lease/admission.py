@@ -27,17 +27,7 @@ class Admission:
     """Refuses chunks that no motion within the limits could follow to their end; a necessary condition only.
 
     With arrival "moving" the end may be passed at any speed; with "rest" the machine must be able to stand there in
-    time.
-
-    Args:
-        env: What is wrapped.
-        motion_limits: Limits of the motion and the kind of arrival.
-        measured: None reads the lengths and velocities of the MuJoCo actuators.
-        controls: m.
-
-    Raises:
-        ConfigurationError: Limits that are none, or an acceleration that is needed and not measured.
-        UnsupportedEnvError: Nothing says where the machine is.
+    time. `measured` None reads the lengths and velocities of the MuJoCo actuators; `controls` is m.
     """
 
     def __init__(

@@ -78,17 +78,19 @@ class StoppingBudget:
         check_fields(self, positive, ["braking"], "m/s^2")
         check_fields(self, positive, ["top_speed"], "m/s")
         check_fields(self, positive, ["closing_speed"], "the constraint's unit per second")
-        if self.measures_approach:
-            self._check_bounds_on_approach()
-        else:
-            self._check_closing_speed()
-
-    @property
-    def measures_approach(self) -> bool:
-        """Whether approach speeds are measured, and not only bounded by `closing_speed`."""
-        return not isinstance(self.clearance, Constraint) or self.clearance.measures_approach
-
-    def _check_bounds_on_approach(self) -> None:
+        name = type(self.clearance).__name__
+        if not self.measures_approach and self.closing_speed is None:
+            raise ConfigurationError(
+                f"{name} does not say how fast it is approached: give closing_speed, the fastest that its value may "
+                "fall, in its unit per second"
+            )
+        if not self.measures_approach and (self.braking, self.acceleration, self.top_speed) != (None,) * 3:
+            raise ConfigurationError(
+                f"the value of {name} counts braking already: give closing_speed alone, without braking, "
+                "acceleration and top_speed"
+            )
+        if not self.measures_approach:
+            return
         if self.braking is None and not isinstance(self.clearance, Clearance):
             raise ConfigurationError(
                 "braking is missing: a verified lower bound on the deceleration of the fallback, in m/s^2"
@@ -104,18 +106,10 @@ class StoppingBudget:
                 "measured: give acceleration (and top_speed)"
             )
 
-    def _check_closing_speed(self) -> None:
-        name = type(self.clearance).__name__
-        if self.closing_speed is None:
-            raise ConfigurationError(
-                f"{name} does not say how fast it is approached: give closing_speed, the fastest that its value may "
-                "fall, in its unit per second"
-            )
-        if any(given is not None for given in (self.braking, self.acceleration, self.top_speed)):
-            raise ConfigurationError(
-                f"the value of {name} counts braking already: give closing_speed alone, without braking, "
-                "acceleration and top_speed"
-            )
+    @property
+    def measures_approach(self) -> bool:
+        """Whether approach speeds are measured, and not only bounded by `closing_speed`."""
+        return not isinstance(self.clearance, Constraint) or self.clearance.measures_approach
 
 
 def budget_from(given: Any) -> StoppingBudget:
@@ -126,16 +120,10 @@ def budget_from(given: Any) -> StoppingBudget:
 
 
 class BoundBudget:
-    """A budget that measures an env.
+    """A budget that measures an env."""
 
-    Attributes:
-        constraint: The clearance, if it is a constraint: with the budget's own reserves, to be bound to the plant.
-    """
-
-    clearance: Array
-    """Clearances at the last `measure`, m, shape (k,); the values of a constraint that measures no approach."""
-    speed: Array
-    """Approach speeds, m/s, shape (k,)."""
+    clearance: Array  # at the last `measure`, m, shape (k,); values of a constraint that measures no approach
+    speed: Array  # approach speeds, m/s, shape (k,)
 
     def __init__(self, budget: StoppingBudget, env: Env) -> None:
         self._budget, self._env = budget, env
@@ -150,22 +138,15 @@ class BoundBudget:
             braking = budget.braking if budget.braking is not None else float(given.braking)
             self._stop["braking"] = braking
             if isinstance(self.constraint, Clearance):
-                # Its rows are then those of this budget.
-                self.constraint = replace(
-                    self.constraint, braking=braking, margin=margin, state_error=localisation
-                )
+                own_bounds = {"braking": braking, "margin": margin, "state_error": localisation}
+                self.constraint = replace(self.constraint, **own_bounds)  # its rows are those of this budget
 
     def plant_of(self, plant: Plant | None) -> Plant | None:
         """The plant given, else the env's MuJoCo model where the constraint needs one; to be bound before `bind`."""
         return default_plant(self._env) if plant is None and self.constraint is not None else plant
 
     def bind(self, plant: Plant | None, bound: BoundConstraint | None = None) -> None:
-        """Measure on a plant that is bound to the env: None if the clearance is a function.
-
-        Args:
-            plant: The plant.
-            bound: The constraint on it, if it has been bound already.
-        """
+        """Measure on a plant that is bound to the env, and on the constraint if it is bound already."""
         self._bound = bound
         if bound is None and self.constraint is not None and plant is not None:
             self._bound = self.constraint.bind(plant)
@@ -223,14 +204,8 @@ class BoundBudget:
 
     def longest_round_trip(self, video_s: float, human_s: float) -> float:
         """The longest round trip from which an operator can stop in time, s; inf where nothing approaches."""
-        ceilings = round_trip_ceiling(
-            self.clearance,
-            self.speed,
-            video_s=video_s,
-            human_s=human_s,
-            act_s=self._budget.act_s,
-            **self._stop,
-        )
+        delays = {"video_s": video_s, "human_s": human_s, "act_s": self._budget.act_s}
+        ceilings = round_trip_ceiling(self.clearance, self.speed, **delays, **self._stop)
         return float(ceilings[self.speed > 0.0].min(initial=math.inf))
 
     def can_stop_after(self, command: Array, duration_s: float) -> bool:

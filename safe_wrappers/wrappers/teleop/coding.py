@@ -61,12 +61,8 @@ class Given(NamedTuple):
 class PlainCoding:
     """Actions and observations as they are; the base of the others.
 
-    In each tick, in this order: `near` (the operator moves), `sent`, `far` (what arrived is decoded), the env's
-    step, `settle` (what truly happened), `sent`, `shown`.
-
-    Args:
-        reading: Of the machine's port; None: there is none, and no energies are known.
-        tick_s: s.
+    In each tick of `tick_s`, in this order: `near` (the operator moves), `sent`, `far` (what arrived is decoded), the
+    env's step, `settle` (what truly happened), `sent`, `shown`. Without a reading of a port no energies are known.
     """
 
     storage_j = 0.0
@@ -136,13 +132,9 @@ class PlainCoding:
 
 
 class PaidCoding(PlainCoding):
-    """Plain, but each end gives out no more energy than it has heard the other took in (`EnergyReference`).
+    """Plain, but each end gives out at most `storage_j` more energy than it has heard the other took in.
 
-    Args:
-        reading: See `PlainCoding`; needed.
-        tick_s: s.
-        limit: Of the damping force at the operator's end, N; None: none.
-        storage_j: What each end may give out beyond what it has heard of, J.
+    `limit` is of the damping force at the operator's end, N; None: none.
     """
 
     def __init__(self, reading: PortReading, tick_s: float, limit: float | None, storage_j: float) -> None:
@@ -198,14 +190,7 @@ class PaidCoding(PlainCoding):
 
 
 class WaveCoding(PlainCoding):
-    """Flow and effort as waves, each of which pays for what it does at the other end.
-
-    Args:
-        reading: See `PlainCoding`; needed.
-        tick_s: s.
-        impedance: N s/m.
-        rule: Of both `WaveLine`s.
-    """
+    """Flow and effort as waves (`impedance` in N s/m), each of which pays for what it does at the other end."""
 
     def __init__(self, reading: PortReading, tick_s: float, impedance: float, rule: Rule) -> None:
         super().__init__(reading, tick_s)

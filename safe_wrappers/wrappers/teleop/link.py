@@ -79,13 +79,7 @@ class Packet(NamedTuple):
 
 
 class Line:
-    """The packets of one direction.
-
-    Args:
-        link: What happens to them.
-        stream: A name, which keeps its random numbers apart from those of other lines.
-        slack_s: Times that are closer are the same, s.
-    """
+    """The packets of one direction, with random numbers of their own; times closer than `slack_s` are the same."""
 
     def __init__(self, link: Link, stream: str, slack_s: float) -> None:
         self._link, self._slack_s = link, slack_s

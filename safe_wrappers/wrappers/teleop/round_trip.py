@@ -70,14 +70,7 @@ class RoundTripCeiling:
 
 
 class RoundTripWatch:
-    """Measures clearance and approach, and decides whether the operator is obeyed in the coming control step.
-
-    Args:
-        env: What is wrapped.
-        ceiling: What is watched.
-        control_dt: Control interval, s.
-        slack_s: Times that are closer are the same, s.
-    """
+    """Measures clearance and approach, and decides whether the operator is obeyed in the coming control step."""
 
     budget: BoundBudget  # to be bound to a plant
     revoked: bool  # whether authority is revoked, as `judge` left it
