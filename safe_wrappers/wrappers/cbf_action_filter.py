@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative
@@ -25,10 +24,8 @@ from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.template import own_plant
 from safe_wrappers.serialize import constraint_from, plain_data
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step
 from safe_wrappers.wrappers.common.receiver import action_array
-
-Array = NDArray[np.float64]
 
 _SAFE_TOLERANCE = 1e-6
 """h below zero by less is rounding (of float32 actions, too), in the constraints' own units."""

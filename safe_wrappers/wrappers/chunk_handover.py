@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative
@@ -21,13 +20,11 @@ from safe_wrappers.plants.template import own_plant
 from safe_wrappers.serialize import plain_numbers
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step
 from safe_wrappers.wrappers.common.receiver import SAME_STEP, CommandReceiver, receiver_inside
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 from safe_wrappers.wrappers.handover.queue import BASELINES, ChunkQueue, Command
 from safe_wrappers.wrappers.handover.sizes import ChunkSizes, Upsampling, blend_bounds
-
-Array = NDArray[np.float64]
 
 
 @deprecated_parameters(renamed={"jerk_limit": "rate_limit", "hold_s": "control_dt"})

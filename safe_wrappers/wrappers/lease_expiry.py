@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
@@ -22,7 +21,7 @@ from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.command_gate import CommandGate
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.layer import Env, Reset, Step
+from safe_wrappers.wrappers.common.layer import Array, Env, Reset, Step
 from safe_wrappers.wrappers.common.receiver import action_array, whole_steps
 from safe_wrappers.wrappers.lease.admission import Admission, Measured
 from safe_wrappers.wrappers.lease.stopping_budget import (
@@ -31,8 +30,6 @@ from safe_wrappers.wrappers.lease.stopping_budget import (
     StoppingBudget,
     budget_from,
 )
-
-Array = NDArray[np.float64]
 
 
 @deprecated_parameters(

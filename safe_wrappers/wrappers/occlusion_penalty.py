@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative, positive
@@ -19,12 +18,10 @@ from safe_wrappers.plants.env_checks import read_attribute
 from safe_wrappers.plants.mujoco.timing import control_interval
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 from safe_wrappers.wrappers.occlusion.sensor import Sensor, sensor_from
 from safe_wrappers.wrappers.occlusion.track import Track, track_from, tracked_things
-
-Array = NDArray[np.float64]
 
 _AXES = ("x", "y", "z")
 
@@ -34,23 +31,20 @@ class OcclusionPenalty(LayerWrapper):
 
     After every step it casts a ray to each tracked point. What is in sight is measured, with noise, and updates the
     track's Kalman estimate; what is not grows less certain, as the Lyapunov equation says, exactly. A track's
-    permission to be relied on expires before ``sigmas * sigma`` crosses `tolerance`, one control step ahead;
-    `TrackPermission` stops the machine then. `TrackedDiscs` are obstacles that grow with the uncertainty. The filter
-    belongs outside; it reads the estimates.
+    permission to be relied on expires before ``sigmas * sigma`` crosses `tolerance`, one control step ahead. The
+    filter belongs outside: its `TrackPermission` and `TrackedDiscs` read the estimates.
 
     **What it guarantees.** If the tracked things move as declared, the sensor's noise is as declared, and nothing
-    else is measured than what is in sight, then the errors have the covariances that are given.
-
-    **What it does not.** A covariance is no hard bound (`appendix.estimation.sigma_coverage` has the tails), and says
-    nothing of things that are not tracked.
+    else is measured than what is in sight, then the errors have the covariances that are given. **What it does not.**
+    A covariance is no hard bound, and says nothing of things that are not tracked.
 
     Args:
         env: Its unwrapped env has MuJoCo's `.model` and `.data`.
         tracks: Each a `Track`, or the dict of a recorded one.
         sensor: A `Sensor`, or the name of a camera in the model.
         tolerance: Position error that the task can bear, m.
-        weight: Of the penalty, in units of the task's reward per step: it is taken off times the mean, over the
-            tracks within the sensor's range, of ``min(1, sigmas * sigma / tolerance) ** 2``.
+        weight: Of the penalty, in units of the task's reward per step: times the mean, over the tracks within the
+            sensor's range, of ``min(1, sigmas * sigma / tolerance) ** 2``.
         sigmas: k of the bound that is compared with the tolerance.
         axes: "xy" tracks in the plane, "xyz" in space.
         observe: Whether the observation gains, for each track, the estimated position relative to the sensor's body
@@ -65,14 +59,11 @@ class OcclusionPenalty(LayerWrapper):
         track_names: One per track: the body's name, or the attribute's with an index.
         last_seen_positions: Where each was measured to be last, shape (n, d), m; before that, the initial fix.
         permitted: Tracks that may be relied on, bool (n,).
-        unobservable: Track name -> directions of its state that this sensor cannot resolve even in sight, in the
-            names of the state ("x", "vy"); empty for a sensor that measures positions.
+        unobservable: Track name -> directions of its state ("x", "vy") that the sensor cannot resolve even in sight.
 
     Raises:
         UnsupportedEnvError: No MuJoCo model, or with `observe` neither a flat Box nor a Dict observation.
-        UnknownNameError: No such camera, site, body or attribute; the message lists those there are.
-        ConfigurationError: A number outside its range, a covariance that is none, no track, or a wrong order.
-        SafeWrappersError: At a step: the simulation's time ran backwards.
+        ConfigurationError: A number outside its range, a name that the model does not have, or a wrong order.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw

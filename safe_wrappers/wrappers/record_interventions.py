@@ -97,14 +97,13 @@ class RecordInterventions(LayerWrapper):
     """Counts interventions, corrections and costs; changes neither actions, rewards nor observations.
 
     Put it outside the filter, `LeaseExpiry`, `TeleopChannel` and `OcclusionPenalty`, and inside `ChunkHandover` and
-    SB3's `Monitor`. What nobody reported is not zero: it is NaN in the running keys, missing in the episode's
-    summary, and an empty cell in the file. The same holds for a 0 that was not reported at every step; a count above
-    0 is given, as a lower bound.
+    SB3's `Monitor`. At every step `info` gains the keys of `safe_wrappers.info.RUNNING` (float64, the episode so
+    far), and at an episode's last step `info["interventions"]`, a dict: `length`, `return` (of the task: penalties
+    that a wrapper inside has taken off are added back), and the figures of `safe_wrappers.info.EPISODE`. A mean is
+    over all steps of the episode, `margin_min` the smallest finite `cbf/margin`.
 
-    At every step `info` gains the keys of `safe_wrappers.info.RUNNING` (float64, the episode so far), and at an
-    episode's last step `info["interventions"]`, a dict: `length`, `return` (of the task: what an `OcclusionPenalty`
-    or `AdaptionPenalty` inside has taken off is added back), and the figures of `safe_wrappers.info.EPISODE`. A mean
-    is over all steps of the episode, `margin_min` the smallest finite `cbf/margin`.
+    What nobody reported is not zero: it is NaN in the running keys, missing in the summary, and an empty cell in the
+    file. The same holds for a 0 that was not reported at every step; a count above 0 is a lower bound.
 
     Args:
         env: The env to record.

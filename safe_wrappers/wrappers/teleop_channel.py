@@ -20,14 +20,12 @@ from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.command_gate import CommandGate
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.layer import Env, Reset, Step
+from safe_wrappers.wrappers.common.layer import Array, Env, Reset, Step
 from safe_wrappers.wrappers.common.receiver import SAME_STEP, action_array
 from safe_wrappers.wrappers.teleop.coding import Coding, Down, Passivity, Up, coding_from
 from safe_wrappers.wrappers.teleop.link import Line, Link, link_from
 from safe_wrappers.wrappers.teleop.port import TeleopPort, port_from
 from safe_wrappers.wrappers.teleop.round_trip import RoundTripCeiling, RoundTripWatch
-
-Array = NDArray[np.float64]
 
 Missing = Literal["hold", "zero", "fallback"]
 """What acts while no command arrives."""
@@ -38,17 +36,15 @@ class TeleopChannel(CommandGate):
     """Puts a network between the policy, as a remote operator, and the machine.
 
     `step(action)` sends the action up, executes what has arrived at the machine, sends the observation down, and
-    returns the newest that has arrived at the operator. Reward, termination and info are not delayed. With wave
-    coding and a *port* (flow entries of the action, effort entries of the observation) the channel is passive. With a
-    ceiling, authority is revoked and the local brake (`fallback`) acts when the round trip is too long for the
-    clearance and approach speed of the moment, or when the machine could not stop by itself after the command.
+    returns the newest that has arrived at the operator. Reward, termination and info are not delayed. With a ceiling,
+    authority is revoked and the local brake (`fallback`) acts when the round trip is too long for the clearance and
+    approach speed of the moment, or when the machine could not stop by itself after the command.
 
     **What it guarantees.** With a ceiling whose bounds are what they are declared to be, the machine stops inside the
     clearance whatever the operator and the network do, from a start where it can: proved where the clearance is a
     distance along a line that the brake acts along, best effort elsewhere or with a fallback that nobody has
     verified. With wave coding the energy that has come out of the channel is never above what went in, less what is
-    in flight, as long as the effort is what the port says; what misses it is ``teleop/created_j``. An ideal channel
-    (no delay, plain) changes nothing, bit for bit.
+    in flight, as long as the effort is what the port says. Without delay, plain coding changes nothing, bit for bit.
 
     **What it does not.** Passivity limits neither force nor displacement. Plain coding bounds no energy. In a step in
     which the brake acts, or a filter inside changes the action, the channel's port counts as still.
@@ -62,8 +58,8 @@ class TeleopChannel(CommandGate):
         passivity: "none", or "controller" with plain coding and a port: each end gives out no more energy than it has
             heard the other took in.
         ceiling: A `RoundTripCeiling`, the dict of one, or None: authority is never revoked.
-        missing: What acts while no command has arrived in a control step: "hold" the last one, "zero", or "fallback".
-            Before the first one "hold" is zero. The entries of a wave-coded flow follow `wave_rule`.
+        missing: What acts while no command has arrived in a control step: "hold" the last one (at first zero),
+            "zero", or "fallback". The entries of a wave-coded flow follow `wave_rule`.
         wave_rule: "queue", "hold" or "zero": what a wave line puts out when packets are late.
         port: A `TeleopPort` or the dict of one; None: what the env publishes, if it does.
         damping_limit: Of the passivity controller's damping force at the operator, N; None: none.

@@ -30,26 +30,21 @@ HOLDS = 3
 class WholeBodyFilter(CBFActionFilter):
     """Keeps a legged robot's contact forces inside their friction cones and its joints off their stops.
 
-    The executed torques are close to the policy's, inside the actuators' range, and such that contact forces and
-    predicted joint positions are in bounds. With ``contacts="forecast"`` the forces are those that the plant's
-    simulation gives at every evaluation of the physics of the control step (`ContactFeasibility`,
-    `JointPositionLimit` and, if asked for, `SupportMargin`); with "pyramid" or "cone" those with which the feet that
-    stand now could stay (`Stance`).
+    With ``contacts="forecast"`` the forces are those that the plant's simulation gives at every evaluation of the
+    physics of the control step (`ContactFeasibility`, `JointPositionLimit` and, if asked for, `SupportMargin`); with
+    "pyramid" or "cone" those with which the feet that stand now could stay (`Stance`).
 
     **What it guarantees.** What `CBFActionFilter` does. With forecasts and a plant that is right, a step that is not
     flagged infeasible or fallback has its contact forces within cone and tolerance, and its joints in range, at every
-    evaluation of the physics.
-
-    **What it does not.** All of these constraints are *best effort*, for contact: a foot that comes down sideways
-    slides whatever the torques, and the step is counted infeasible. It does not keep a robot on its feet. With
-    "pyramid" and "cone" an unflagged step can slide.
+    evaluation of the physics. **What it does not.** All of these constraints are *best effort*, for contact: a foot
+    that comes down sideways slides whatever the torques, and the step is counted infeasible. It does not keep a robot
+    on its feet. With "pyramid" and "cone" an unflagged step can slide.
 
     Args:
         env: Of MuJoCo, with a Box action space that is its model's control range.
         contacts: "forecast", "pyramid" or "cone", see above.
         friction_share: Of the model's friction coefficient that may be counted on, in (0, 1].
-        joint_tolerance: How far a joint may press its stop, rad or m: stops in MuJoCo are soft. None leaves the
-            joints alone.
+        joint_tolerance: How far a joint may press its stop, rad or m. None leaves the joints alone.
         zmp_inset: Distance of the zero moment point from the edge of the support polygon, m, positive, wherever
             there is a polygon. None sets no bound.
         tolerance: By how much a forecast contact force may miss its cone, as a share of the robot's weight; None is
@@ -66,7 +61,6 @@ class WholeBodyFilter(CBFActionFilter):
 
     Raises:
         ConfigurationError: A share outside (0, 1], a negative tolerance, or a body that does not move.
-        UnknownNameError: No body of that name.
         UnsupportedEnvError: Not a MuJoCo env, or a robot that touches nothing.
 
     Example:

@@ -10,10 +10,8 @@ from safe_wrappers import info as keys
 from safe_wrappers.plants.env_checks import check_actions, check_timing
 from safe_wrappers.wrappers.cbf_action_filter import is_filtered
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Step
+from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Step
 from safe_wrappers.wrappers.common.receiver import SAME_STEP, CommandReceiver
-
-Array = NDArray[np.float64]
 
 
 class CommandGate(LayerWrapper, CommandReceiver):

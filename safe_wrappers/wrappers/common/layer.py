@@ -4,11 +4,14 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, SupportsFloat
 
 import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
 
 from safe_wrappers.plants.template import PlantTemplate
 from safe_wrappers.serialize import recorded
 from safe_wrappers.stack import Layer, refuse_order
 
+Array = NDArray[np.float64]
 Env = gym.Env[Any, Any]
 Reset = tuple[Any, dict[str, Any]]
 """What `reset` returns: observation and info."""

@@ -29,13 +29,7 @@ class Struck(Fault):
 
 @deprecated_parameters(renamed={"hold_s": "control_dt"})
 class ShareFault(Struck):
-    """Base of the faults that strike a share of the commands.
-
-    Args:
-        env: See `Fault`.
-        share: Probability that a command is struck, independently of the others, from 0 to 1.
-        control_dt: See `Fault`.
-    """
+    """Base of the faults that strike a share of the commands: the probability, from 0 to 1, for each by itself."""
 
     def __init__(self, env: Env, share: float, control_dt: float | None = None) -> None:
         self._share = probability("share", share)
@@ -48,15 +42,10 @@ class ShareFault(Struck):
 
 @deprecated_parameters(renamed={"hold_s": "control_dt"})
 class Jitter(Fault):
-    """Delays every command by a random time, uniform from 0 to the longest, drawn for each by itself.
+    """Delays every command by a random time, uniform from 0 to `longest_s`, drawn for each by itself.
 
-    At every step the newest command arrives that is there and newer than all that came before; if there is none,
-    nothing arrives. So commands that were overtaken are lost.
-
-    Args:
-        env: See `Fault`.
-        longest_s: s.
-        control_dt: See `Fault`.
+    At every step the newest command arrives that is there and newer than all that came before; commands that were
+    overtaken are lost.
     """
 
     def __init__(self, env: Env, longest_s: float, control_dt: float | None = None) -> None:
@@ -83,11 +72,7 @@ class Jitter(Fault):
 class ClockSkew(Fault):
     """Gives the observation times of a clock that is off, and runs at another rate: `(1 + drift) t + offset_s`.
 
-    Args:
-        env: See `Fault`.
-        offset_s: s, positive for a clock that is ahead: its commands look younger than they are, or from the future.
-        drift: Seconds per second.
-        control_dt: See `Fault`.
+    A clock that is ahead (`offset_s` > 0) makes commands look younger than they are, or from the future.
     """
 
     def __init__(
@@ -179,11 +164,11 @@ class Repeats(Struck):
 
 
 class DroppedRefreshes(Loses, ShareFault):
-    """Loses a share of the commands. Arguments: see `ShareFault`."""
+    """Loses a `share` of the commands, from 0 to 1, each by itself."""
 
 
 class RepeatedCommands(Repeats, ShareFault):
-    """Loses a share of the commands, and sends the last one once more. Arguments: see `ShareFault`."""
+    """Loses a `share` of the commands, from 0 to 1, each by itself, and sends the last one once more."""
 
 
 class Outages(Loses, OnOffFault):

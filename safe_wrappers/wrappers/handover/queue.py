@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES, join
 from safe_wrappers.control.handover.smoothstep import shortest_latched_blend, smoothstep
+from safe_wrappers.wrappers.common.layer import Array
 from safe_wrappers.wrappers.common.receiver import whole_steps
-
-Array = NDArray[np.float64]
 
 REPLACE: Final = "replace"
 ENSEMBLE: Final = "ensemble"
@@ -80,8 +79,9 @@ class ChunkQueue:
         step = np.asarray(rate_limit * control_dt)
         # The difference of two commands, divided by the interval again, must not come out above the limit.
         self._step = np.where(step / control_dt > rate_limit, np.nextafter(step, 0.0), step)
-        self._dtype: Any = space.dtype
-        largest = min(float(np.finfo(self._dtype).max), float(np.finfo(np.float32).max))
+        dtype: Any = space.dtype
+        self._dtype = np.dtype(dtype)
+        largest = min(float(np.finfo(dtype).max), float(np.finfo(np.float32).max))
         self._low = np.maximum(np.asarray(space.low, np.float64), -largest)
         self._high = np.minimum(np.asarray(space.high, np.float64), largest)
         self._none = np.zeros((0, self._low.size))

@@ -5,16 +5,14 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import positive, whole_number
 from safe_wrappers.control.handover.seams import BLENDS
 from safe_wrappers.control.handover.splines import hermite_series
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.common.layer import Array
 from safe_wrappers.wrappers.common.receiver import whole_steps
 from safe_wrappers.wrappers.handover.queue import BASELINES
-
-Array = NDArray[np.float64]
 
 
 class ChunkSizes(NamedTuple):

@@ -4,13 +4,11 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from safe_wrappers.control.watchdog.reachability import MotionLimits, admits, jerk_limited_time
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.wrappers.common.layer import Env
-
-Array = NDArray[np.float64]
+from safe_wrappers.wrappers.common.layer import Array, Env
 
 Measured = Callable[[Env], tuple[ArrayLike, ...]]
 """Takes the env; returns what the actions are setpoints of, its velocity and, if known, its acceleration, shapes

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import check_fields, non_negative, positive, settings_from
 from safe_wrappers.constraints.clearance import Clearance
@@ -16,9 +16,7 @@ from safe_wrappers.filter.constraint import BoundConstraint, Constraint
 from safe_wrappers.plants.default import default_plant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import constraint_from
-from safe_wrappers.wrappers.common.layer import Env
-
-Array = NDArray[np.float64]
+from safe_wrappers.wrappers.common.layer import Array, Env
 
 ClearanceFunction = Callable[[Env], tuple[ArrayLike, ArrayLike]]
 """Takes the env; returns clearances (m) and the approach speeds towards them (m/s), shapes (k,)."""
@@ -138,7 +136,7 @@ class BoundBudget:
             braking = budget.braking if budget.braking is not None else float(given.braking)
             self._stop["braking"] = braking
             if isinstance(self.constraint, Clearance):
-                own_bounds = {"braking": braking, "margin": margin, "state_error": localisation}
+                own_bounds: dict[str, Any] = {"braking": braking, "margin": margin, "state_error": localisation}
                 self.constraint = replace(self.constraint, **own_bounds)  # its rows are those of this budget
 
     def plant_of(self, plant: Plant | None) -> Plant | None:

@@ -6,7 +6,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import check_fields, non_negative, positive, settings_from
 from safe_wrappers.control.estimation.covariance import checked_noise
@@ -14,8 +13,7 @@ from safe_wrappers.control.numerics.spatial import from_sensor, lever_arm_veloci
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight
 from safe_wrappers.serialize import plain_numbers
-
-Array = NDArray[np.float64]
+from safe_wrappers.wrappers.common.layer import Array
 
 
 @dataclass

@@ -5,7 +5,6 @@ import math
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.control.numerics.running_sum import RunningSum
@@ -15,11 +14,9 @@ from safe_wrappers.control.teleop.port_checks import port_energy
 from safe_wrappers.control.teleop.wave_line import Rule, WaveLine
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.env_checks import refuse_changed_actions
-from safe_wrappers.wrappers.common.layer import Env
+from safe_wrappers.wrappers.common.layer import Array, Env
 from safe_wrappers.wrappers.teleop.link import Packet
 from safe_wrappers.wrappers.teleop.port import PortReading, TeleopPort
-
-Array = NDArray[np.float64]
 
 _STORAGE_J: Final = 0.02
 """What each end of a passivity controller may give out unpaid, unless it is said."""

@@ -6,13 +6,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import check_fields, non_negative, settings_from
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.common.layer import Env
-
-Array = NDArray[np.float64]
+from safe_wrappers.wrappers.common.layer import Array, Env
 
 
 @dataclass(frozen=True)

@@ -4,22 +4,17 @@ import math
 from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from safe_wrappers.checks import check_fields, non_negative, positive
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint
-from safe_wrappers.wrappers.common.layer import Env
+from safe_wrappers.wrappers.common.layer import Array, Env
 from safe_wrappers.wrappers.lease.stopping_budget import (
     BoundBudget,
     ClearanceFunction,
     StoppingBudget,
     budget_from,
 )
-
-Array = NDArray[np.float64]
 
 
 @deprecated_parameters(moved={"budget": StoppingBudget}, positional=("braking", "acceleration", "top_speed"))
