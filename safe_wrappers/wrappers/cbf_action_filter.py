@@ -93,7 +93,7 @@ class CBFActionFilter(LayerWrapper):
         plant = own_plant(plant)
         if isinstance(constraints, str | dict) or not isinstance(constraints, Sequence) or not constraints:
             raise ConfigurationError(f"constraints is a list with at least one, got {constraints!r}")
-        own = [copy.deepcopy(constraint_from(c)) for c in constraints]
+        own = [copy.deepcopy(c) for c in [*map(constraint_from, constraints)]]
         margin = non_negative("margin", margin, "the constraints' own units")
         check_solver(solver)
         self._record(arguments, constraints=[plain_data(c) for c in own], plant=plant, margin=margin)
@@ -119,8 +119,7 @@ class CBFActionFilter(LayerWrapper):
         info[keys.CBF_MARGIN] = margin
         info[keys.CBF_UNSAFE] = unsafe
         info[keys.CBF_REFUSED] = np.zeros(len(self.constraints), dtype=bool)
-        # Nothing was proposed or executed yet. But when all sub-envs of a vector env reset at once, its infos hold
-        # these keys only if a reset reports them, and a loop reads them at every step.
+        # When all sub-envs of a vector env reset at once, its infos hold only the keys that a reset reports.
         info[keys.PROPOSED_ACTION] = np.zeros(self._shape)
         info[keys.EXECUTED_ACTION] = np.zeros(self._shape)
         info[keys.CBF_STAGE] = int(Stage.PROPOSAL)
@@ -137,23 +136,18 @@ class CBFActionFilter(LayerWrapper):
         inside = bool(((proposed >= self._low) & (proposed <= self._high)).all())
         finite = inside or bool(np.isfinite(proposed).all())
         clipped = 0.0
-        if not readable:
-            proposed = np.where(np.isfinite(proposed), proposed, 0.0)
-            decision = self.filter.filter(None)
-        elif inside:
-            decision = self.filter.filter(proposed)
-        elif finite:
-            boxed = np.clip(proposed, self._low, self._high)
-            clipped = float(np.linalg.norm(boxed - proposed))
-            self._warn_once(
-                "clipped",
-                f"the policy's action left the action space by {clipped:.3g}; it is boxed (cbf/clipped)",
-            )
-            decision = self.filter.filter(boxed)
-        else:
-            self._warn_once("nonfinite", f"the policy's action is not finite ({proposed}); the fallback acts")
-            proposed = np.where(np.isfinite(proposed), proposed, 0.0)
-            decision = self.filter.filter(None)
+        usable: Array | None = proposed
+        if not (readable and finite):
+            if readable:
+                message = f"the policy's action is not finite ({proposed}); the fallback acts"
+                self._warn_once("nonfinite", message)
+            usable, proposed = None, np.where(np.isfinite(proposed), proposed, 0.0)
+        elif not inside:
+            usable = np.clip(proposed, self._low, self._high)
+            clipped = float(np.linalg.norm(usable - proposed))
+            message = f"the policy's action left the action space by {clipped:.3g}; it is boxed (cbf/clipped)"
+            self._warn_once("clipped", message)
+        decision = self.filter.filter(usable)
         intervened = decision.changed
         if inside and not decision.changed:
             # Bit for bit the policy's own action wherever the filter has nothing to say.
@@ -174,10 +168,8 @@ class CBFActionFilter(LayerWrapper):
         info[keys.CBF_FALLBACK] = decision.fallback
         info[keys.CBF_NONFINITE] = not finite
         info[keys.CBF_UNSAFE] = unsafe
-        no_refusal = decision.refused is None
-        info[keys.CBF_REFUSED] = (
-            np.zeros(len(self.constraints), dtype=bool) if no_refusal else decision.refused
-        )
+        none = np.zeros(len(self.constraints), dtype=bool)
+        info[keys.CBF_REFUSED] = none if decision.refused is None else decision.refused
         info[keys.CBF_CORRECTION] = correction
         info[keys.CBF_CLIPPED] = clipped
         info[keys.CBF_MARGIN] = margin
@@ -214,10 +206,8 @@ class CBFActionFilter(LayerWrapper):
 
 def _unique(kinds: list[str]) -> list[str]:
     """A number behind every kind that occurs more than once."""
-    return [
-        kind if kinds.count(kind) == 1 else f"{kind} {kinds[: i + 1].count(kind)}"
-        for i, kind in enumerate(kinds)
-    ]
+    places = [kinds[: i + 1].count(kind) for i, kind in enumerate(kinds)]
+    return [k if kinds.count(k) == 1 else f"{k} {place}" for k, place in zip(kinds, places, strict=True)]
 
 
 def is_filtered(env: Env) -> bool:

@@ -30,10 +30,10 @@ class FallbackController:
         self._low, self._high = np.asarray(space.low, np.float64), np.asarray(space.high, np.float64)
         if plant is None and (callable(choice) or choice == "brake"):
             plant = default_plant(env)
+        self.plant, self.constraint = plant, None
         if plant is not None:
             plant.bind(env)
-        self.constraint = constraint.bind(plant) if constraint is not None and plant is not None else None
-        if plant is not None:
+            self.constraint = None if constraint is None else constraint.bind(plant)
             known = self.constraint is not None and self.constraint.has_backup
             if choice == "brake" and not (known or plant.can_brake):
                 raise ConfigurationError(
@@ -41,7 +41,6 @@ class FallbackController:
                     '"hold", "zero" or a function of the plant'
                 )
         self._fallback = Fallback(choice, [] if self.constraint is None else [self.constraint])
-        self.plant = plant
         self.reset()
 
     def reset(self) -> None:

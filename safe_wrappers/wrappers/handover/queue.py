@@ -152,7 +152,7 @@ class ChunkQueue:
         admitted: list[Chunk] = []
         refused = False
         for chunk in reversed([c for c in self._coming if c.due <= self.now]):
-            left = self._left(chunk)
+            left = chunk.commands[self.now - chunk.observed :]
             if not (len(left) and admits(left[-1], len(left))):  # it came too late, or must not
                 refused = True
                 continue
@@ -160,10 +160,6 @@ class ChunkQueue:
             if self._blend != ENSEMBLE:
                 break
         return admitted, refused
-
-    def _left(self, chunk: Chunk) -> Array:
-        """The commands of a chunk from now on, shape (k, m); none if it comes too late."""
-        return chunk.commands[self.now - chunk.observed :]
 
     def _take_over(self, admitted: list[Chunk]) -> tuple[bool, int]:
         """Let the newest of these take over, or all in an ensemble: whether it is a seam, and its blend's steps."""
@@ -173,7 +169,7 @@ class ChunkQueue:
         if self._blend == ENSEMBLE:
             self._averaged += reversed(admitted)
             return len(self._sent) > 0, 0
-        fresh = self._left(newest)
+        fresh = newest.commands[self.now - newest.observed :]
         if self._blend == REPLACE or len(newest.commands) == 1:
             self._plan, self._limited = fresh, np.zeros(len(fresh), dtype=bool)
             return self._blend == REPLACE and len(self._sent) > 0, 0

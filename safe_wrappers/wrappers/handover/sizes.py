@@ -22,9 +22,7 @@ class ChunkSizes(NamedTuple):
     steps_per_entry: int  # control steps from one entry to the next
     chunk: int  # H, the control steps that a chunk has a command for; with one step per entry its entries
     horizon: int  # execution_horizon s
-    delay: tuple[
-        int, int
-    ]  # the least and the largest inference_delay d; d <= s <= H - d holds for the largest
+    delay: tuple[int, int]  # the least and the largest inference_delay d; d <= s <= H - d holds for both
 
     @classmethod
     def checked(

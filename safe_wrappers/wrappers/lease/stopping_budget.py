@@ -136,7 +136,11 @@ class BoundBudget:
             braking = budget.braking if budget.braking is not None else float(given.braking)
             self._stop["braking"] = braking
             if isinstance(self.constraint, Clearance):
-                own_bounds: dict[str, Any] = {"braking": braking, "margin": margin, "state_error": localisation}
+                own_bounds: dict[str, Any] = {
+                    "braking": braking,
+                    "margin": margin,
+                    "state_error": localisation,
+                }
                 self.constraint = replace(self.constraint, **own_bounds)  # its rows are those of this budget
 
     def plant_of(self, plant: Plant | None) -> Plant | None:
