@@ -72,7 +72,7 @@ class Jitter(Fault):
 class ClockSkew(Fault):
     """Gives the observation times of a clock that is off, and runs at another rate: `(1 + drift) t + offset_s`.
 
-    A clock that is ahead (`offset_s` > 0) makes commands look younger than they are, or from the future.
+    A clock that is ahead (`offset_s` > 0, in s; `drift` is in s/s) makes commands look younger, or from the future.
     """
 
     def __init__(

@@ -136,12 +136,10 @@ class BoundBudget:
             braking = budget.braking if budget.braking is not None else float(given.braking)
             self._stop["braking"] = braking
             if isinstance(self.constraint, Clearance):
-                own_bounds: dict[str, Any] = {
-                    "braking": braking,
-                    "margin": margin,
-                    "state_error": localisation,
-                }
-                self.constraint = replace(self.constraint, **own_bounds)  # its rows are those of this budget
+                # Its rows are then those of this budget.
+                self.constraint = replace(
+                    self.constraint, braking=braking, margin=margin, state_error=localisation
+                )
 
     def plant_of(self, plant: Plant | None) -> Plant | None:
         """The plant given, else the env's MuJoCo model where the constraint needs one; to be bound before `bind`."""
