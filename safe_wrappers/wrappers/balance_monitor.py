@@ -149,14 +149,8 @@ class _Robot:
         """Its contacts with the fixed world that have been read; None where they are no finite numbers."""
         found = self.contacts.forecast(finite=True)
         mine = self._own[found.body]
-        found = found._replace(
-            step=found.step[mine],
-            body=found.body[mine],
-            point=found.point[mine],
-            normal=found.normal[mine],
-            force=found.force[mine],
-            friction=found.friction[mine],
-        )
+        arrays = ("step", "body", "point", "normal", "force", "friction")
+        found = found._replace(**{name: getattr(found, name)[mine] for name in arrays})
         finite = all(np.isfinite(array).all() for array in (found.point, found.normal, found.force))
         return found if finite else None
 

@@ -215,12 +215,7 @@ class LeaseExpiry(CommandGate):
         return answer
 
     def admits(self, end: Array, steps: int) -> bool:
-        """Whether the end of a chunk of setpoints is within `motion_limits`; a refusal is in the next step's info.
-
-        Args:
-            end: The chunk's last command, shape (m,).
-            steps: Control steps from now to the end of that command.
-        """
+        """Whether the end of a chunk of setpoints is within `motion_limits`; a refusal is in the next step's info."""
         admitted = self._admission is None or self._admission.admits(end, steps * self.control_dt)
         self._chunk_refused |= not admitted
         return admitted

@@ -217,11 +217,7 @@ class OcclusionPenalty(LayerWrapper):
         return self._observed(observation), reward, terminated, truncated, info
 
     def permissions(self, horizon_s: float = 60.0) -> Array:
-        """How long each track may be relied on if nothing is seen from now on, s, shape (n,).
-
-        Until the bound is at the tolerance; inf where that is beyond the horizon. `permitted` ends a control step
-        before.
-        """
+        """How long each track may be relied on if nothing is seen from now on, s, (n,); inf beyond the horizon."""
         direction = np.eye(self._d, 2 * self._d)
         times = []
         for i, motion in enumerate(self.tracking.motions):

@@ -54,12 +54,7 @@ class CommandReceiver:
         self._observed_s = observed_s
 
     def admits(self, end: NDArray[np.float64], steps: int) -> bool:
-        """Whether a chunk may be executed; `ChunkHandover` calls it before a chunk takes over.
-
-        Args:
-            end: The chunk's last command, shape (m,).
-            steps: Control steps from now to the end of that command.
-        """
+        """Whether a chunk may be executed that ends with this command, shape (m,), so many control steps from now."""
         return True
 
     deliver = deprecated_method("deliver", "set_observation_time")

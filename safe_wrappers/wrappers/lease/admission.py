@@ -1,7 +1,7 @@
 """Admission: whether a chunk of position setpoints may be executed at all: is its end within reach, in its time?"""
 
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,14 +11,7 @@ from safe_wrappers.errors import ConfigurationError, UnknownNameError, Unsupport
 from safe_wrappers.wrappers.common.layer import Array, Env
 
 Measured = Callable[[Env], tuple[ArrayLike, ...]]
-"""Takes the env; returns what the actions are setpoints of, its velocity and, if known, its acceleration, shapes
-(m,)."""
-
-ARRIVALS: Final = ("moving", "rest")
-_EXPECTED: Final = (
-    'motion_limits is {"max_acceleration": ..., "max_speed": ..., "max_jerk": ..., "arrival": "moving" or "rest"}, '
-    "all but the first at will, the limits each a number or one for each of the"
-)
+"""Takes the env; returns what the actions are setpoints of, velocities and, if known, accelerations, shapes (m,)."""
 
 
 class Admission:
@@ -45,12 +38,15 @@ class Admission:
             if isinstance(error, ConfigurationError):
                 raise
             raise ConfigurationError(
-                f"{_EXPECTED} {controls} action components; got {motion_limits!r}"
+                'motion_limits is {"max_acceleration": ..., "max_speed": ..., "max_jerk": ..., "arrival": "moving" '
+                'or "rest"}, all but the first at will, the limits each a number or one for each of the '
+                f"{controls} action components; got {motion_limits!r}"
             ) from None
-        if arrival not in ARRIVALS:
-            raise UnknownNameError(f"arrival is {' or '.join(map(repr, ARRIVALS))}, got {arrival!r}")
+        if arrival not in ("moving", "rest"):
+            raise UnknownNameError(f"arrival is 'moving' or 'rest', got {arrival!r}")
         self._rest = arrival == "rest"
-        if self._rest and measured is None and np.isfinite(self._limits.arrays[2]).any():
+        self._needs_acceleration = self._rest and bool(np.isfinite(self._limits.arrays[2]).any())
+        if self._needs_acceleration and measured is None:
             raise ConfigurationError(
                 "arrival at rest with limited jerk starts from the measured acceleration, which MuJoCo's actuators "
                 "do not give: pass measured, a function of the env that returns positions, velocities, accelerations"
@@ -73,11 +69,9 @@ class Admission:
             data: Any = getattr(self._env.unwrapped, "data")  # noqa: B009
             return data.actuator_length, data.actuator_velocity, None
         state = self._measured(self._env)
-        if len(state) == 3:
-            return state[0], state[1], state[2]
-        if len(state) != 2 or (self._rest and np.isfinite(self._limits.arrays[2]).any()):
+        if len(state) != 3 and (len(state) != 2 or self._needs_acceleration):
             raise ConfigurationError(
                 "measured returns positions and velocities, and for an arrival at rest with limited jerk also "
                 f"accelerations; got {len(state)} values"
             )
-        return state[0], state[1], None
+        return state[0], state[1], state[2] if len(state) == 3 else None

@@ -29,12 +29,6 @@ _ROW_TOLERANCE = 1e-9
 class StoppingBudget:
     """Clearance, bounds on the motion and reserves from which a stop is worked out; shared by lease and ceiling.
 
-    For an approach speed v, at every reading:
-
-        way(time) + v'^2 / (2 braking) + localisation + margin <= clearance
-
-    with the way and the speed v' after the time that a command goes on, `act_s` included, at full `acceleration`.
-
     Args:
         clearance: A `Clearance` or the dict of one; any other constraint, with `closing_speed`; or a function of the
             env that returns clearances in m and approach speeds in m/s, shapes (k,).

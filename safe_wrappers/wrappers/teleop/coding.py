@@ -62,8 +62,7 @@ class PlainCoding:
     env's step, `settle` (what truly happened), `sent`, `shown`. Without a reading of a port no energies are known.
     """
 
-    storage_j = 0.0
-    """What each end may give out unpaid, J."""
+    storage_j = 0.0  # what each end may give out unpaid, J
 
     def __init__(self, reading: PortReading | None, tick_s: float) -> None:
         self._reading, self._tick_s = reading, tick_s
@@ -85,24 +84,19 @@ class PlainCoding:
         """A packet left, up or down."""
 
     def far(self, arrived: list[Packet], newest: Up | None, flow: Array | None) -> Order:
-        """Decode what has arrived.
+        """Decode what has arrived in this tick.
 
-        Args:
-            arrived: In this tick.
-            newest: The newest command that ever has.
-            flow: What would be executed as it is, shape (m,); None: nothing of the operator's.
+        `newest` is the newest command that ever has, `flow` (m,) what would be executed as it is, None if not the
+        operator's.
         """
         if newest is not None:
             self._seen_s = newest.seen_s
         return Order(None, self._seen_s)
 
     def settle(self, flow: Array, observation: Any, obeyed: bool) -> tuple[Any, Given | None]:
-        """After the env's step: what the packet down carries besides, and what the machine was given.
+        """After the env's step with a flow (m,): what the packet down carries, and what the machine was given.
 
-        Args:
-            flow: That was executed, shape (m,).
-            observation: The env's new one.
-            obeyed: Whether it was the operator's. If not, the channel's far port was still.
+        Where the operator was not obeyed, the channel's far port was still.
         """
         if self._reading is None:
             return None, None

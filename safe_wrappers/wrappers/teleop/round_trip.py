@@ -22,10 +22,8 @@ from safe_wrappers.wrappers.lease.stopping_budget import (
 class RoundTripCeiling:
     """The longest round trip at which an operator may still be relied on, from the clearance and speed of the moment.
 
-        T_RTT <= (D_clear - reserves - v^2 / (2 braking)) / v - (T_video + T_human + T_act)
-
-    (`control.watchdog.leases.round_trip_ceiling`.) Whatever the round trip, an operator's command is executed only if
-    the machine can still stop by itself inside the clearance after it.
+    See `control.watchdog.leases.round_trip_ceiling`. Whatever the round trip, an operator's command is executed only
+    if the machine can still stop by itself inside the clearance after it.
 
     Args:
         budget: A `StoppingBudget` or the dict of one. Its clearance measures the approach: a `Clearance`, or a
@@ -99,14 +97,7 @@ class RoundTripWatch:
         self.ceiling_s = min(max(highest_s, -ceiling.longest_s), ceiling.longest_s)
 
     def judge(self, command: Array, seen_s: float, round_trip_s: float, now_s: float) -> None:
-        """Revoke authority, or give it back.
-
-        Args:
-            command: What would be executed, inside the action box, shape (m,).
-            seen_s: When the image was taken that it was made from, s.
-            round_trip_s: The age of that image, s.
-            now_s: Seconds of the episode so far.
-        """
+        """Revoke authority, or give it back, for a command (m,) made from the image that was taken at `seen_s`."""
         allowed_s = self.ceiling_s
         if self.revoked and allowed_s > 0.0:
             allowed_s *= self._ceiling.release
