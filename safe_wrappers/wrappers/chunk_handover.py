@@ -196,18 +196,15 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self._queue.switch(source)
 
     def _checked(self, action: Any) -> Array:
+        expected = f"expected a chunk of shape {self.action_space.shape}"
         try:
             chunk = np.array(action, dtype=np.float64)
         except (TypeError, ValueError):
-            raise ActionError(
-                f"expected a chunk of shape {self.action_space.shape}, got {action!r}"
-            ) from None
+            raise ActionError(f"{expected}, got {action!r}") from None
         if self.chunk_size == 1 and chunk.shape == (self._controls,):
             return chunk[None]  # an ordinary policy's action
         if chunk.shape != self.action_space.shape:
-            raise ActionError(
-                f"expected a chunk of shape {self.action_space.shape} (chunk_size, controls), got {chunk.shape}"
-            )
+            raise ActionError(f"{expected} (chunk_size, controls), got {chunk.shape}")
         return chunk
 
     def _admits(self, end: Array, steps: int) -> bool:

@@ -51,9 +51,7 @@ class CostFunction(LayerWrapper):
         LayerWrapper.__init__(self, env)
         function = _imported(fn) if isinstance(fn, str) else fn
         if not callable(function):
-            raise ConfigurationError(
-                f"fn is a function of the env, or its name 'module:function'; got {fn!r}"
-            )
+            raise ConfigurationError(f"fn is a function of the env or its name 'module:function'; got {fn!r}")
         self._record({"fn": _reference(function)})
         self.fn: Judge = function
 

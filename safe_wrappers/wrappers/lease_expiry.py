@@ -133,7 +133,14 @@ class LeaseExpiry(CommandGate):
                 f"max_lease_s = {max_lease_s} s is less than one control step, {self.control_dt} s: no command would "
                 "ever be executed"
             )
-        self._min_lease_s = self._checked_min_lease(min_lease_s)
+        self._min_lease_s = non_negative("min_lease_s", min_lease_s, "s")
+        if self._min_lease_s > self._max_lease_s:
+            raise ConfigurationError(f"min_lease_s = {min_lease_s} s is above max_lease_s = {max_lease_s} s")
+        if self._min_lease_s > 0.0 and not self._filtered:
+            raise ConfigurationError(
+                f"min_lease_s = {min_lease_s} s without a CBFActionFilter inside would let a command drive into the "
+                "obstacle: leave it 0, or put the filter inside, LeaseExpiry(sw.protect(env), ...)"
+            )
         self._blend_steps = whole_steps(non_negative("blend_time", blend_time, "s"), self.control_dt)
         brake_blend_time = non_negative("brake_blend_time", brake_blend_time, "s")
         self._brake_steps = whole_steps(brake_blend_time, self.control_dt)
@@ -152,19 +159,6 @@ class LeaseExpiry(CommandGate):
             None if motion_limits is None else Admission(env, motion_limits, measured, self._low.size)
         )
         self._start({})
-
-    def _checked_min_lease(self, min_lease_s: float) -> float:
-        min_lease_s = non_negative("min_lease_s", min_lease_s, "s")
-        if min_lease_s > self._max_lease_s:
-            raise ConfigurationError(
-                f"min_lease_s = {min_lease_s} s is more than max_lease_s = {self._max_lease_s} s"
-            )
-        if min_lease_s > 0.0 and not self._filtered:
-            raise ConfigurationError(
-                f"min_lease_s = {min_lease_s} s without a CBFActionFilter inside would let a command drive into the "
-                "obstacle: leave it 0, or put the filter inside, LeaseExpiry(sw.protect(env), ...)"
-            )
-        return min_lease_s
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env; no command is in force."""

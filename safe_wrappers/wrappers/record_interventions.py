@@ -192,9 +192,7 @@ def _whole_lines(data: bytes) -> bytes:
 
 def _continue_file(path: Path) -> None:
     if path.is_dir():
-        raise ConfigurationError(
-            f"RecordInterventions: path {str(path)!r} is a folder; give a file name in it."
-        )
+        raise ConfigurationError(f"RecordInterventions: {str(path)!r} is a folder; give a file name in it.")
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         return

@@ -111,9 +111,7 @@ class TeleopChannel(CommandGate):
         CommandGate.__init__(self, env, control_dt)
         plant = own_plant(plant)
         self.uplink, self.downlink = link_from("uplink", uplink), link_from("downlink", downlink)
-        watched = (
-            None if ceiling is None else settings_from(RoundTripCeiling, ceiling, "ceiling", ", or None")
-        )
+        limit = None if ceiling is None else settings_from(RoundTripCeiling, ceiling, "ceiling", ", or None")
         choices = {"coding": Coding, "passivity": Passivity, "missing": Missing, "wave_rule": Rule}
         for name, known in choices.items():
             if arguments[name] not in get_args(known):
@@ -126,7 +124,7 @@ class TeleopChannel(CommandGate):
             arguments,
             uplink=plain_data(self.uplink),
             downlink=plain_data(self.downlink),
-            ceiling=plain_data(watched),
+            ceiling=plain_data(limit),
             port=plain_data(port),
             plant=plant,
         )
@@ -140,10 +138,10 @@ class TeleopChannel(CommandGate):
         self._missing: Missing = missing
         self._watch: RoundTripWatch | None = None
         self._fallback: FallbackController | None = None
-        if watched is not None:
-            self._watch = RoundTripWatch(env, watched, self.control_dt, self._same_s)
+        if limit is not None:
+            self._watch = RoundTripWatch(env, limit, self.control_dt, self._same_s)
             plant = self._watch.budget.plant_of(plant)
-        if watched is not None or missing == "fallback":
+        if limit is not None or missing == "fallback":
             refuse_changed_actions(env)
             self._fallback = FallbackController(env, fallback, plant)
         if self._watch is not None:
@@ -235,9 +233,7 @@ class TeleopChannel(CommandGate):
 
     def _flow_of(self, command: Any) -> Array | None:
         """In the box, as the machine will take it."""
-        if self.port is None:
-            return None
-        return self._boxed(command)[list(self.port.flow)]
+        return None if self.port is None else self._boxed(command)[list(self.port.flow)]
 
     def _with_flow(self, command: Any, flow: Array) -> Any:
         assert self.port is not None

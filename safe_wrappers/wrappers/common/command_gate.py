@@ -25,9 +25,7 @@ class CommandGate(LayerWrapper, CommandReceiver):
         self.control_dt = check_timing(env, control_dt)
         self._same_s = SAME_STEP * self.control_dt
         self._shape, self._dtype = space.shape, space.dtype
-        self._low, self._high = (
-            np.nan_to_num(np.asarray(end)).astype(np.float64) for end in (space.low, space.high)
-        )
+        self._low, self._high = (np.nan_to_num(end).astype(np.float64) for end in (space.low, space.high))
         self._filtered = is_filtered(env)  # then the filter reports what was executed
         self._warned = False
 
@@ -52,9 +50,8 @@ class CommandGate(LayerWrapper, CommandReceiver):
         finite = bool(np.isfinite(numbers).all())
         if not finite and not self._warned:
             self._warned = True
-            warnings.warn(
-                f"the {whose} action is not finite ({numbers}); {consequence}", UserWarning, stacklevel=4
-            )
+            message = f"the {whose} action is not finite ({numbers}); {consequence}"
+            warnings.warn(message, UserWarning, stacklevel=4)
         return finite
 
     def _execute(self, command: NDArray[Any]) -> tuple[Array, Step]:

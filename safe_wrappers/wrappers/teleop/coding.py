@@ -289,9 +289,7 @@ def coding_from(
     if damping_limit is not None:
         damping_limit = positive("damping_limit", damping_limit, "N")
     if coding == "wave" and passivity == "controller":
-        raise ConfigurationError(
-            'waves pay for their energy already: passivity="controller" is for plain coding'
-        )
+        raise ConfigurationError('waves pay for their energy: passivity="controller" is for plain coding')
     if coding == "plain" and impedance is not None:
         raise ConfigurationError(f'impedance is for coding="wave"; got {impedance!r} with plain coding')
     reading = None if port is None else PortReading(env, port)

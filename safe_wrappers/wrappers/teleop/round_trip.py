@@ -57,9 +57,7 @@ class RoundTripCeiling:
         check_fields(self, positive, ["longest_s"], "s")
         check_fields(self, positive, ["release"], "a share of the ceiling")
         if self.release > 1.0:
-            raise ConfigurationError(
-                f"release is a share of the ceiling, above 0 and at most 1; got {self.release}"
-            )
+            raise ConfigurationError(f"release is a share of the ceiling, at most 1; got {self.release}")
 
 
 class RoundTripWatch:
@@ -68,9 +66,7 @@ class RoundTripWatch:
     budget: BoundBudget  # to be bound to a plant
     revoked: bool  # whether authority is revoked, as `judge` left it
     readable: bool  # whether clearance and speed were finite when `look` was called
-    clearance_m: (
-        float  # the smallest clearance then, m; inf where there is nothing near, 0 where it cannot be read
-    )
+    clearance_m: float  # the smallest clearance then, m; inf where nothing is near, 0 where unreadable
     ceiling_s: float  # the longest round trip then, s, within `longest_s` of 0; the lowest where unreadable
 
     def __init__(self, env: Env, ceiling: RoundTripCeiling, control_dt: float, slack_s: float = 0.0) -> None:
