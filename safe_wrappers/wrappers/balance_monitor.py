@@ -19,9 +19,7 @@ from safe_wrappers.wrappers.common.layer import Env, Reset
 from safe_wrappers.wrappers.common.step_monitor import StepMonitor
 
 PRESSING: Final = 0.01
-"""Share of the robot's weight from which on a contact counts in `balance/friction_used`. Feet that come down or lift
-off scrape with next to no pressure, at any ratio, and such a touch carries nothing that could slip. It is what
-`ContactFeasibility` tolerates as well."""
+"""Share of the robot's weight from which on a contact counts in `balance/friction_used`: lighter ones only scrape."""
 
 
 class BalanceMonitor(StepMonitor):

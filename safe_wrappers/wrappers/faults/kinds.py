@@ -176,4 +176,4 @@ class Outages(Loses, OnOffFault):
 
 
 class FrozenPolicy(Repeats, OnOffFault):
-    """Repeats the last command from before for random lengths of time. Arguments: see `OnOffFault`."""
+    """Repeats the last command from before for `mean_length_s`, then works for `mean_between_s`, on average, s."""

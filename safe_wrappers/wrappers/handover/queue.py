@@ -55,8 +55,7 @@ class ChunkQueue:
     its source (`switch`), to and from the fallback too, is faded over.
 
     Args:
-        space: Of single commands, shape (m,); what is outside is clipped. An infinite end becomes the largest number
-            of the dtype.
+        space: Of single commands, shape (m,); what is outside is clipped, at most to the largest number of the dtype.
         control_dt: Control interval, s.
         blend: A blend of `control/handover/seams.py`, "replace" or "ensemble".
         fewest: A blend takes at least so many control steps.

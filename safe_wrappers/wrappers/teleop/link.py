@@ -19,13 +19,10 @@ LONGEST_DELAY_S: Final = 10.0
 class Link:
     """What a network does to packets in one direction; plain data.
 
-    Every packet takes `delay_s` and a random time between 0 and `jitter_s` more, drawn for each by itself. A packet
-    is lost with the probability `loss`, and surely if it is sent during an outage.
-
     Args:
         delay_s: Shortest time that a packet takes, s.
-        jitter_s: How much longer it may take, s, uniform.
-        loss: Probability that a packet is lost, from 0 to 1.
+        jitter_s: How much longer it may take, s, uniform, drawn for each packet by itself.
+        loss: Probability that a packet is lost, from 0 to 1; during an outage every one is.
         in_order: Whether a packet waits for those that were sent before it and are not lost, as in a stream. False:
             it may overtake them, as datagrams do.
         outage_between_s: Mean time from the end of an outage to the start of the next, s; None: there are none.
