@@ -115,14 +115,7 @@ class OnOffProcess:
 
 @deprecated_parameters(renamed={"hold_s": "control_dt"})
 class OnOffFault(Struck):
-    """Base of the faults that are on for a while at a time.
-
-    Args:
-        env: See `Fault`.
-        mean_between_s: Mean time from the end of the fault to its next start, s.
-        mean_length_s: Mean time that it lasts, s.
-        control_dt: See `Fault`.
-    """
+    """Base of the faults that are on for `mean_length_s` at a time, then off for `mean_between_s`, on average, s."""
 
     def __init__(
         self, env: Env, mean_between_s: float, mean_length_s: float, control_dt: float | None = None
@@ -172,7 +165,7 @@ class RepeatedCommands(Repeats, ShareFault):
 
 
 class Outages(Loses, OnOffFault):
-    """Loses all commands during outages of random length, at random times. Arguments: see `OnOffFault`."""
+    """Loses all commands during outages of `mean_length_s`, `mean_between_s` apart, s on average."""
 
 
 class FrozenPolicy(Repeats, OnOffFault):
