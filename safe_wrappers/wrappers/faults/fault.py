@@ -18,10 +18,10 @@ from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 
 
 class Carried(NamedTuple):
-    """A command on its way."""
+    """A command on its way: what the policy gave, and when the observation was returned that it was made from, s."""
 
-    action: Any  # what the policy gave
-    observed_s: float  # when the observation was returned that it was made from, s
+    action: Any
+    observed_s: float
 
 
 class Fault(LayerWrapper, CommandReceiver, ABC):
