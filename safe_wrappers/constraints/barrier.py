@@ -1,10 +1,10 @@
 """Barrier: the user's own h on the plant's state."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.control.filtering.cbf import (
@@ -16,12 +16,10 @@ from safe_wrappers.control.filtering.cbf import (
     relative_degree,
 )
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory, Promise
+from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.filter.linearize import linearize
 from safe_wrappers.filter.projection import keeps_rows
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 _ROUNDING = 1e-9
 """Round-off, as a share of h's size: of its value and its gradient together."""
@@ -60,8 +58,6 @@ class Barrier(Constraint):
     alpha: float | Callable[[float], float] = 1.0
     margin: float = 0.0
     curvature: float = 0.0
-
-    promise: Promise = field(default="best effort", init=False)
 
     def __post_init__(self) -> None:
         if not callable(self.h):

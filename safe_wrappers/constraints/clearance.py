@@ -1,22 +1,19 @@
 """Clearance: keep points of the machine away from obstacles, with room to brake."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import name_list, non_negative, positive
 from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
 from safe_wrappers.constraints.obstacles.obstacles import Nearest
 from safe_wrappers.control.backup.stopping import sampled_acceleration_limit, sampled_inset
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory, Promise
+from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.points import Points
-
-Array = NDArray[np.float64]
 
 
 class _Seen(NamedTuple):
@@ -70,7 +67,6 @@ class Clearance(Constraint):
     margin: float = 0.0
     state_error: float = 0.0
 
-    promise: Promise = field(default="best effort", init=False)
     measures_approach: ClassVar[bool] = True
 
     def __post_init__(self) -> None:

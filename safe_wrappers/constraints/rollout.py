@@ -5,16 +5,13 @@ from abc import abstractmethod
 from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import non_negative, positive, whole_number
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory
+from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.filter.linearize import linearize, tangent_rows
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 _STEP = 1e-4
 """Width of the differences about braking, as a share of the control's range."""

@@ -1,19 +1,16 @@
 """TrackPermission: stop while the permission of a track has expired."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import name_list, non_negative, positive
 from safe_wrappers.errors import UnknownNameError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Promise
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 @dataclass
@@ -43,7 +40,6 @@ class TrackPermission(Constraint):
     creep: float = 0.0
     tracks: Sequence[str] | None = None
 
-    promise: Promise = field(default="best effort", init=False)
     needs_acceleration: ClassVar[bool] = True
 
     def __post_init__(self) -> None:

@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -11,16 +11,13 @@ from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import name_list, non_negative, positive
-from safe_wrappers.constraints.traction_memory import TractionMemory
 from safe_wrappers.control.vehicle.friction_estimate import FrictionEstimate
 from safe_wrappers.control.vehicle.slip import slip_ratio, slip_window
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory, Promise
+from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.driven_wheels import DrivenWheels
-
-Array = NDArray[np.float64]
 
 _CAUTION = 0.5
 """Standard deviations of the estimated peak's slip by which the limit stays on the rising side of it."""
@@ -107,8 +104,6 @@ class Traction(Constraint):
     regularization: float = 0.5
     margin: float = 0.0
 
-    promise: Promise = field(default="best effort", init=False)
-
     def __post_init__(self) -> None:
         self.wheels = name_list("wheels", self.wheels, "joint names", least=0)
         self.max_slip = positive("max_slip", self.max_slip, "slip, in (0, 1)")
@@ -123,6 +118,40 @@ class Traction(Constraint):
     def bind(self, plant: Plant) -> "BoundTraction":
         """On a plant."""
         return BoundTraction(self, plant)
+
+
+class TractionMemory(NamedTuple):
+    """What Traction remembers of an episode; arrays of shape (wheels,), before the last control.
+
+    Attributes:
+        estimate: Of the ground's friction.
+        rate: Turning rates, rad/s; None: nothing was measured.
+        time: s.
+        ground: Speeds of the ground below, m/s.
+        slip: Slip ratios along the heading.
+        across: And across it.
+        load: Forces on the ground, N.
+        most_load: The largest so far, N.
+        faster: Recent error of the predicted ground speed, upwards, m/s.
+        slower: Downwards, m/s.
+        ahead: By how much the ground speed is predicted to change, m/s.
+        traction: Force of the ground in the last control step, N.
+        present: Of the ground at its end, N.
+    """
+
+    estimate: FrictionEstimate
+    rate: Array | None
+    time: float
+    ground: Array
+    slip: Array
+    across: Array
+    load: Array
+    most_load: Array
+    faster: Array
+    slower: Array
+    ahead: Array
+    traction: Array
+    present: Array
 
 
 class BoundTraction(BoundConstraint):

@@ -5,15 +5,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint
+from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint
 from safe_wrappers.filter.fallback import Fallback, FallbackFunction
 from safe_wrappers.filter.search import Decision, SafeActionSearch
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 class SafetyFilter:

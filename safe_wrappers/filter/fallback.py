@@ -4,14 +4,12 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.filter.constraint import BoundConstraint
+from safe_wrappers.filter.constraint import Array, BoundConstraint
 from safe_wrappers.filter.projection import box_least_squares
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 FallbackFunction = Callable[[Plant], ArrayLike]
 """The user's own: takes the plant at its present state, returns a control of shape (m,)."""

@@ -3,11 +3,8 @@
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from safe_wrappers.filter.constraint import HalfSpaces
-
-Array = NDArray[np.float64]
+from safe_wrappers.filter.constraint import Array, HalfSpaces
 
 _STEP = 1e-4
 """Width of the differences, as a share of the control's range."""

@@ -11,7 +11,7 @@ Solvers know only absolute tolerances; they get the problem divided by a power o
 """
 
 import math
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,6 +34,7 @@ __all__ = [
     "Projection",
     "Status",
     "box_least_squares",
+    "cast_inside",
     "check_solver",
     "keeps_rows",
     "project",
@@ -177,6 +178,22 @@ def keeps_rows(control: Array, normals: Array, offsets: Array, lower: Array, upp
     size = residual_scales(control, normals, offsets, length, box_size(lower.tobytes(), upper.tobytes()))
     kept = normals @ control - offsets <= 10.0 * FEASIBILITY_TOLERANCE * size
     return bool((kept & np.isfinite(length)).all())  # what overflows would be allowed anything
+
+
+def cast_inside(control: Array, dtype: Any, normals: Array, offsets: Array, low: Array, high: Array) -> Any:
+    """A control inside its rows and a box that is exact in `dtype`, cast to it.
+
+    Where rounding broke a row, each component moves by one unit in the last place towards feasibility.
+    """
+    sent = np.clip(control, low, high).astype(dtype)
+    if not offsets.size or dtype == np.float64:
+        return sent
+    excess = normals @ sent.astype(np.float64) - np.maximum(offsets, normals @ control)
+    worst = int(excess.argmax())
+    if excess[worst] <= 0.0:
+        return sent
+    towards = np.where(normals[worst] > 0.0, -np.inf, np.where(normals[worst] < 0.0, np.inf, sent))
+    return np.clip(np.nextafter(sent, towards.astype(dtype)), low.astype(dtype), high.astype(dtype))
 
 
 def _careful(

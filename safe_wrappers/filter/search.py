@@ -11,12 +11,11 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.filter.constraint import BoundConstraint, HalfSpaces
+from safe_wrappers.filter.constraint import Array, BoundConstraint, HalfSpaces
 from safe_wrappers.filter.fallback import Fallback
 from safe_wrappers.filter.projection import Projection, Status, keeps_rows, project_unchecked
 from safe_wrappers.plants.plant import Plant
 
-Array = NDArray[np.float64]
 Rows = tuple[Array, Array]
 """`normals @ u <= offsets`: shapes (k, m) and (k,)."""
 _NO_ROWS: Rows = (np.zeros((0, 0)), np.zeros(0))

@@ -5,13 +5,8 @@ from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from safe_wrappers.filter.constraint import BoundConstraint, Memory
+from safe_wrappers.filter.constraint import Array, BoundConstraint, Memory
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 class BoundBackupClearance(BoundConstraint):

@@ -3,12 +3,11 @@
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundDetourClearance, Detour
@@ -17,12 +16,10 @@ from safe_wrappers.constraints.obstacles.obstacles import Disc, Discs
 from safe_wrappers.control.numerics.outlines import convex_outline, distances_to_outline
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Constraint, Promise
+from safe_wrappers.filter.constraint import Array, Constraint
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.coasting import Coasting, Course
-
-Array = NDArray[np.float64]
 
 _SAME_M = 1e-6
 """Rounding of a rollout: a smaller loss of clearance is none."""
@@ -90,7 +87,7 @@ class CoastingClearance(Constraint):
     max_decrease_per_speed: float = 0.0
     detour: bool = False
 
-    promise: Promise = field(default="proved", init=False)
+    promise = "proved"
 
     def __post_init__(self) -> None:
         for name in ("keep_out", "untouched"):

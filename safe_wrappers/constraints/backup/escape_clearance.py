@@ -6,7 +6,7 @@ obstacles may be by then.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,12 +19,10 @@ from safe_wrappers.constraints.obstacles.obstacles import Discs, distances
 from safe_wrappers.constraints.obstacles.tracked_discs import TrackedDiscs
 from safe_wrappers.control.backup.evasive_maneuvers import EvasiveManeuvers, Maneuver
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Constraint, Memory, Promise
+from safe_wrappers.filter.constraint import Array, Constraint, Memory
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.planar_point import planar_point
-
-Array = NDArray[np.float64]
 
 _EVERY = 2
 """Holds between the instants at which ways are checked."""
@@ -75,8 +73,6 @@ class EscapeClearance(Constraint):
     radius: float = 0.0
     margin: float = 0.05
     horizon_s: float = 2.5
-
-    promise: Promise = field(default="best effort", init=False)
 
     def __post_init__(self) -> None:
         self.obstacles = obstacles_from(self.obstacles)

@@ -3,11 +3,10 @@
 import functools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import non_negative
 from safe_wrappers.constraints.backup.base import BoundDetourClearance
@@ -15,12 +14,10 @@ from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
 from safe_wrappers.constraints.obstacles.obstacles import Disc, Discs
 from safe_wrappers.control.backup.heading_drive import StoppingPath
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Promise
+from safe_wrappers.filter.constraint import Array, Constraint, HalfSpaces
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.planar_robot import PlanarFrame, heading_drive
-
-Array = NDArray[np.float64]
 
 _Circle = tuple[float, float, float]
 """Centre x, y and the radius to keep out of, margins included, m."""
@@ -72,7 +69,7 @@ class HeadingDriveClearance(Constraint):
     brake: bool = True
     detour: bool = False
 
-    promise: Promise = field(default="proved", init=False)
+    promise = "proved"
 
     def __post_init__(self) -> None:
         self.obstacles = obstacles_from(self.obstacles, kinds=(Disc, Discs))

@@ -9,22 +9,19 @@ Source: appendix "Relative degree and kinetic stopping insets", in two dimension
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundBackupClearance
 from safe_wrappers.control.backup.point_among_walls import PointAmongWalls, PointMotion
 from safe_wrappers.control.numerics.rectangles import Rectangle, gaps, nearest
-from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Promise
+from safe_wrappers.filter.constraint import Array, Constraint, HalfSpaces
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.planar_point import planar_point
 from safe_wrappers.plants.queries.walls import walls
-
-Array = NDArray[np.float64]
 
 _Control = tuple[float, float]
 """Along x and along y, in the actuators' units."""
@@ -75,7 +72,7 @@ class WallClearance(Constraint):
     margin: float = 0.001
     velocity_clip: float | None = None
 
-    promise: Promise = field(default="proved", init=False)
+    promise = "proved"
 
     def __post_init__(self) -> None:
         self.margin = non_negative("margin", self.margin, "m")

@@ -1,7 +1,7 @@
 """ContactFeasibility: the ground's forces on the robot stay inside their friction cones."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,13 +12,11 @@ from safe_wrappers.checks import name_list, non_negative, positive
 from safe_wrappers.constraints.rollout import BoundSlacks
 from safe_wrappers.control.contact.friction_cone import normal_and_tangential
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import Constraint, Promise
+from safe_wrappers.filter.constraint import Array, Constraint
 from safe_wrappers.plants.mujoco.contact_forecast import can_touch_the_world
 from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 @dataclass
@@ -49,8 +47,6 @@ class ContactFeasibility(Constraint):
     tolerance: float = 0.01
     bodies: Sequence[str] | None = None
     margin: float = 0.0
-
-    promise: Promise = field(default="best effort", init=False)
 
     def __post_init__(self) -> None:
         self.friction_share = positive(

@@ -4,13 +4,11 @@ from collections.abc import Iterator, Sequence
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
-
-Array = NDArray[np.float64]
 
 _FAR = 1e6
 """Largest distance that is measured, m."""

@@ -6,7 +6,6 @@ from typing import ClassVar
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import name_list, positive
 from safe_wrappers.constraints.contact.geom_gaps import GeomGaps
@@ -15,11 +14,9 @@ from safe_wrappers.control.contact.body_regions import body_region
 from safe_wrappers.control.contact.stiffness import series_stiffness
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Promise
+from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 _FIXED = 1e-12
 """Mobility along the normal, 1/kg, below which a geom cannot move into contact."""
@@ -79,7 +76,6 @@ class ImpactSpeedLimit(RolloutConstraint):
     horizon: int = 5
 
     max_decrease: float | None = field(default=None, init=False, repr=False)
-    promise: Promise = field(default="best effort", init=False)
     unit: ClassVar[str] = "N"
 
     def __post_init__(self) -> None:

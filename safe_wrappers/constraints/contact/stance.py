@@ -1,7 +1,7 @@
 """Stance: the whole-body program as a constraint on torques."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import mujoco
@@ -24,14 +24,12 @@ from safe_wrappers.control.legged.whole_body import (
     solve_pyramid,
 )
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, Memory, Promise
+from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, Memory
 from safe_wrappers.plants.mujoco.contact_forecast import can_touch_the_world
 from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.floating_base import equations_of_motion
-
-Array = NDArray[np.float64]
 
 _SAME = 1e-9
 """Distance from the program's answer that is rounding, control units."""
@@ -67,8 +65,6 @@ class Stance(Constraint):
     joint_tolerance: float | None = 0.1
     zmp_inset: float | None = None
     settle_s: float = 0.05
-
-    promise: Promise = field(default="best effort", init=False)
 
     def __post_init__(self) -> None:
         self.friction_share = positive(

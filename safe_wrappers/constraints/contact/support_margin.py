@@ -1,21 +1,18 @@
 """SupportMargin: the zero moment point stays inside the support polygon, by an inset."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.constraints.contact.contact_feasibility import require_contacts
 from safe_wrappers.constraints.rollout import BoundSlacks
 from safe_wrappers.control.legged.support_distances import support_distances
-from safe_wrappers.filter.constraint import Constraint, Memory, Promise
+from safe_wrappers.filter.constraint import Array, Constraint, Memory
 from safe_wrappers.plants.mujoco.contact_forecast import ContactForecast
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 @dataclass
@@ -41,8 +38,6 @@ class SupportMargin(Constraint):
 
     inset: float
     margin: float = 0.0
-
-    promise: Promise = field(default="best effort", init=False)
 
     def __post_init__(self) -> None:
         self.inset = positive("inset", self.inset, "m: forces that push keep the point inside by themselves")

@@ -1,23 +1,20 @@
 """JointPositionLimit: hinges and slides stay inside a range, with room to brake."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import name_list
 from safe_wrappers.constraints.limits.joints import scalar_joints
 from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Promise
+from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 @deprecated_parameters(renamed=RENAMED)
@@ -52,7 +49,6 @@ class JointPositionLimit(RolloutConstraint):
     horizon: int = 5
     max_decrease: float | None = None
 
-    promise: Promise = field(default="best effort", init=False)
     unit: ClassVar[str] = "rad or m"
 
     def __post_init__(self) -> None:

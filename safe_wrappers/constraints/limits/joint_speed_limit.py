@@ -1,23 +1,20 @@
 """JointSpeedLimit: a bound on hinge and slide speeds, held at every physics substep."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import name_list, positive
 from safe_wrappers.constraints.limits.joints import scalar_joints
 from safe_wrappers.constraints.rollout import RECOVERY_S, RENAMED, BoundRollout, RolloutConstraint
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import HalfSpaces, Promise
+from safe_wrappers.filter.constraint import Array, HalfSpaces
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.mujoco.plant import require_mujoco
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 @deprecated_parameters(renamed=RENAMED)
@@ -49,7 +46,6 @@ class JointSpeedLimit(RolloutConstraint):
     horizon: int = 1
     max_decrease: float | None = None
 
-    promise: Promise = field(default="best effort", init=False)
     unit: ClassVar[str] = "rad/s or m/s"
 
     def __post_init__(self) -> None:

@@ -5,13 +5,12 @@ from typing import Literal
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.constraints.limits.joints import driven_joints, refuse_uncovered, scalar_joints
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
-Array = NDArray[np.float64]
 FrameKind = Literal["site", "body", "geom"]
 
 _HINGE_OR_SLIDE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import name_list, positive
 from safe_wrappers.constraints.limits.serial_chain import FrameKind, SerialChain
@@ -20,11 +19,9 @@ from safe_wrappers.control.filtering.manipulability import (
 )
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import HalfSpaces, Promise
+from safe_wrappers.filter.constraint import Array, HalfSpaces
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 _SAMPLES = 2000
 """Configurations that say which manipulability can be reached."""
@@ -100,7 +97,6 @@ class SingularityMargin(RolloutConstraint):
     horizon: int = 5
     max_decrease: float | None = None
 
-    promise: Promise = field(default="best effort", init=False)
     validated: ValidatedThreshold | None = field(default=None, init=False, repr=False, compare=False)
     unit: ClassVar[str] = "shares of the threshold"
 

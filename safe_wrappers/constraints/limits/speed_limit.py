@@ -1,20 +1,17 @@
 """SpeedLimit: how fast a body, or the machine's centre of mass, may move."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import positive
 from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint, RolloutMemory
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.filter.constraint import Memory, Promise
+from safe_wrappers.filter.constraint import Array, Memory
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 DIRECTIONS = ("+x", "-x", "x", "+y", "-y", "y", "+z", "-z", "z", "xy", "xyz")
 
@@ -55,7 +52,6 @@ class SpeedLimit(RolloutConstraint):
     horizon: int = 3
     max_decrease: float | None = None
 
-    promise: Promise = field(default="best effort", init=False)
     unit: ClassVar[str] = "m/s"
 
     def __post_init__(self) -> None:

@@ -1,21 +1,18 @@
 """Upright: a body stays above a height and within a tilt."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import positive
 from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Promise
+from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 @deprecated_parameters(renamed=RENAMED)
@@ -47,7 +44,6 @@ class Upright(RolloutConstraint):
     horizon: int = 5
     max_decrease: float | None = None
 
-    promise: Promise = field(default="best effort", init=False)
     unit: ClassVar[str] = "m or rad"
 
     def __post_init__(self) -> None:

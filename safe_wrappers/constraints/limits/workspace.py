@@ -1,11 +1,10 @@
 """Workspace: named points stay inside a box, and out of what stands in it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import name_list, non_negative
 from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
@@ -13,11 +12,9 @@ from safe_wrappers.constraints.obstacles.obstacles import distances
 from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Promise
+from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 @deprecated_parameters(renamed=RENAMED)
@@ -58,7 +55,6 @@ class Workspace(RolloutConstraint):
     horizon: int = 5
     max_decrease: float | None = None
 
-    promise: Promise = field(default="best effort", init=False)
     unit: ClassVar[str] = "m"
 
     def __post_init__(self) -> None:

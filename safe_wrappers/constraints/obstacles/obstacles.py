@@ -10,13 +10,11 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import positive
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 class Nearest(NamedTuple):

@@ -3,16 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.constraints.obstacles.obstacles import Nearest, refuse_more_dimensions
 from safe_wrappers.control.estimation.ellipsoids import ellipsoid_gap
 from safe_wrappers.control.estimation.tracks import Tracks
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 _SHARES = (1e-4, 0.1, 0.25, 0.5, 1.0)
 """Of the horizon, at which the growth is looked at; the first of them for its rate now."""
