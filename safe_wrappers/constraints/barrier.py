@@ -21,33 +21,25 @@ from safe_wrappers.filter.linearize import linearize
 from safe_wrappers.filter.projection import keeps_rows
 from safe_wrappers.plants.plant import Plant
 
-_ROUNDING = 1e-9
-"""Round-off, as a share of h's size: of its value and its gradient together."""
-_NO_EFFECT = 1e-7
-"""Error of differences, as a share of h's size and of the control's effect on the state: a smaller effect on h' may
-be none."""
+_ROUNDING = 1e-9  # round-off, as a share of h's size: of its value and its gradient together
+_NO_EFFECT = 1e-7  # error of differences, as a share of h's size and of the control's effect on the state
 
 
 @dataclass
 class Barrier(Constraint):
     """Keep `h(x) >= 0` by `Lf h + Lg h u >= -alpha (h - margin) + curvature * hold / 2`.
 
-    What it promises: in continuous time the set `h >= margin` is invariant while the row is feasible. A held
-    control is predicted as well: h must not be negative at the half and at the end of the hold (AnalyticPlant; the
-    end by Runge-Kutta and by one Euler step), or at every physics substep (MujocoPlant); else the constraint is
-    linearised about the refused control. So a control that is not flagged keeps h at those instants, for a plant
-    and an integration that are right; `margin` covers errors of both and of the state. `curvature` adds a reserve to
-    the row. Feasibility depends on h and the actuators: infeasible steps are counted and the fallback runs. Hence
-    best effort.
+    Best effort: in continuous time the set `h >= margin` is invariant while the row is feasible. The held control is
+    predicted as well: one that is not flagged keeps h at the half and at the end of the hold (AnalyticPlant) or at
+    every physics substep (MujocoPlant), for a plant and an integration that are right.
 
     Args:
-        h: Takes the plant's state (n,), returns a number, positive inside the safe set. Its relative degree
-            must be one: the control must act on h', so a position under a force needs its braking distance in
-            h (see `Clearance`). This is checked at the first reset.
+        h: Takes the plant's state (n,), returns a number, positive inside the safe set. The control must act on h'
+            (relative degree one); this is checked at the first reset.
         gradient: Takes the state, returns dh/dx (n,). None differentiates by central differences.
-        alpha: Decay gain in 1/s (`alpha * h`), at most `1 / hold`; or an increasing function of h, with
-            alpha(0) = 0, in h units per second (extended class K).
-        margin: Reserve for state error and model error, in units of h.
+        alpha: Decay gain in 1/s (`alpha * h`), at most `1 / hold`; or an increasing function of h, with alpha(0) = 0,
+            in h units per second (extended class K).
+        margin: Reserve for errors of state, model and integration, in units of h.
         curvature: Bound on -h'' while a control is held, in units of h per s^2.
 
     Source: appendix "Lie derivatives and forward invariance" and footnote 1.
@@ -78,7 +70,6 @@ class Barrier(Constraint):
         self.curvature = non_negative("curvature", self.curvature, "units of h per s^2")
 
     def bind(self, plant: Plant) -> "BoundBarrier":
-        """On a plant."""
         return BoundBarrier(self, plant)
 
 
@@ -99,7 +90,6 @@ class BoundBarrier(BoundConstraint):
         self._degree_checked = False
 
     def observe(self, memory: Memory) -> None:
-        """Nothing is known of this state yet."""
         self._row: HalfSpaces | None = None
 
     def value(self) -> Array:
@@ -116,7 +106,6 @@ class BoundBarrier(BoundConstraint):
         return float(h.reshape(()))
 
     def rows(self) -> HalfSpaces:
-        """The barrier condition as one half-space."""
         if self._row is None:
             self._row = self._condition()
         return self._row
@@ -148,7 +137,6 @@ class BoundBarrier(BoundConstraint):
         return all(self._height(x) >= floor for x in self.plant.path(control))
 
     def linearize(self, control: Array) -> HalfSpaces:
-        """The predicted h, linearised about a refused control."""
         self.rows()
         floor = min(self._now, 0.0)
 

@@ -31,19 +31,19 @@ class _Seen(NamedTuple):
 class Clearance(Constraint):
     """Keep `distance - (stopping distance) >= 0` from every point to every obstacle, also between samples.
 
-    The row bounds the acceleration towards the obstacle that may be held for a control interval, so that full
-    braking afterwards still stops in front of it (`control/backup/stopping.py`). Delay is the plant's: the state is
-    predicted over it.
+    The row bounds the acceleration towards the obstacle that may be held for a control interval, so that full braking
+    afterwards still stops in front of it (`control/backup/stopping.py`). The state is predicted over the plant's
+    delay.
 
-    What it promises: in one dimension, and head on, the bound is exact for the declared `braking`. Elsewhere
-    `margin` must cover that the direction to the obstacle and the drift change within a hold; and several obstacles,
-    or joint limits, can ask for more than the actuators have. Hence best effort: infeasible steps are counted and
-    the fallback runs. A machine that cannot brake in every direction needs `HeadingDriveClearance`.
+    Best effort: head on, and in one dimension, the bound is exact for the declared `braking`. Elsewhere `margin` must
+    cover that the direction to the obstacle and the drift change within a hold; and several obstacles, or joint
+    limits, can ask for more than the actuators have. A machine that cannot brake in every direction needs
+    `HeadingDriveClearance`.
 
     Args:
         obstacles: `Disc`, `Sphere`, `Box`, `Plane`, `Discs`.
-        braking: Validated lower bound on the deceleration that the actuators can give in any direction
-            and every state of the envelope, m/s^2.
+        braking: Validated lower bound on the deceleration that the actuators can give in any direction and every
+            state of the envelope, m/s^2.
         bodies: Names of bodies whose frame origins are kept clear (MujocoPlant).
         sites: Names of sites, likewise.
         geoms: Names of geoms: their centres, likewise.
@@ -84,7 +84,6 @@ class Clearance(Constraint):
             )
 
     def bind(self, plant: Plant) -> "BoundClearance":
-        """On a plant."""
         return BoundClearance(self, plant)
 
 
@@ -99,7 +98,6 @@ class BoundClearance(BoundConstraint):
         self._points = Points(plant, spec.bodies, spec.sites, spec.geoms, spec.position, spec.velocity)
 
     def observe(self, memory: Memory) -> None:
-        """Nothing is seen of this state yet."""
         self._observed: list[_Seen] | None = None
 
     def _gaps(self, p: Array, v: Array) -> tuple[Nearest, Array, Array, Array]:
@@ -129,10 +127,7 @@ class BoundClearance(BoundConstraint):
         )
 
     def approach(self) -> tuple[Array, Array]:
-        """Clearances (m) and approach speeds (m/s, towards the obstacle), one per point and surface.
-
-        As measured: neither margin, nor state error, nor the way of braking is taken off.
-        """
+        """Clearances (m) and approach speeds (m/s, towards the obstacle), as measured, one per point and surface."""
         # Not through `_seen`: the accelerations, which only the rows need, are most of its work.
         gaps = [self._gaps(p, v) for p, v in self._points.motions()]
         return np.concatenate([g[1] for g in gaps]), np.concatenate([g[2] for g in gaps])

@@ -13,16 +13,12 @@ from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 
-_STEP = 1e-4
-"""Width of the differences about braking, as a share of the control's range."""
+_STEP = 1e-4  # width of the differences about braking, as a share of the control's range
 _INSTANTS = (1, 2, 3, 5, 8, 13, 21, 34, 55)
 """Instants of a control interval that get rows, beside its last; forecasts are judged at all instants."""
-_KEPT = 10
-"""Control steps for which a response is kept: it is a guess that forecasts check, and costs a forecast a control."""
-_SAME_RESPONSE = 1
-"""Linearisations of one step that use the kept response."""
-_RESOLUTION = 1e-6
-"""Rounding of controls, as a share of half their range, for which rows are tightened."""
+_KEPT = 10  # control steps for which a response is kept: a guess that forecasts check
+_SAME_RESPONSE = 1  # linearisations of one step that use the kept response
+_RESOLUTION = 1e-6  # rounding of controls, as a share of half their range, for which rows are tightened
 RECOVERY_S = 0.1
 """Time constant of recovery from a violation, s."""
 
@@ -30,8 +26,7 @@ RECOVERY_S = 0.1
 def mujoco_rollouts(plant: Plant, asker: str) -> MujocoPlant:
     """The plant, if it has a MuJoCo model to forecast with."""
     return require_mujoco(
-        plant,
-        f"{asker} forecasts with a MuJoCo model; on an AnalyticPlant use Barrier(h) or Clearance(...)",
+        plant, f"{asker} forecasts with a MuJoCo model; on an AnalyticPlant use Barrier(h) or Clearance(...)"
     )
 
 
@@ -40,10 +35,10 @@ RENAMED: Final = {"holds": "horizon", "reach": "max_decrease"}
 
 
 class RolloutConstraint(Constraint):
-    """A requirement along a rollout: the held control first, braking after it.
+    """A requirement along a forecast of the held control, and then of the actuated joints braking.
 
-    Attributes of a subclass (dataclass fields): `margin` (units of the value), `horizon` (control intervals to
-    look ahead), `max_decrease` (units of the value, or None: always forecast).
+    A subclass is a dataclass with the fields `margin` (in `unit`), `horizon` (control intervals to look ahead) and
+    `max_decrease` (in `unit`, or None: every control is forecast).
     """
 
     margin: float
@@ -77,7 +72,6 @@ class BoundSlacks(BoundConstraint):
         return least if least == least else -np.inf
 
     def linearize(self, control: Array) -> HalfSpaces:
-        """The slacks, linearised about a refused control."""
         return linearize(self.slacks, control, self.plant.lower, self.plant.upper)
 
     def rows(self) -> HalfSpaces:
@@ -90,7 +84,7 @@ class RolloutMemory(NamedTuple):
 
     Attributes:
         least: What was left at the last states, the newest last, at most `horizon` of them.
-        response: How what is left at every instant changes with a control, and the observation until which it is
+        response: How what is left at every instant changes with a control, and the observation until which that is
             kept; None: not known.
     """
 
@@ -99,16 +93,13 @@ class RolloutMemory(NamedTuple):
 
 
 class BoundRollout(BoundSlacks):
-    """A requirement `room >= margin` along a forecast: the held control first, braking after it.
+    """A requirement `room >= margin` along a forecast of the held control, and then of braking.
 
-    A subclass says what is left of its limit at the present state (`_now`) and along a forecast (`_room`).
-    This class decides from it (`admits`), linearises about a refused control (`linearize`) and says what a control
-    leaves (`slack`).
+    A subclass says what is left of its limit at the present state (`now`) and along a forecast (`room`).
 
-    A forecast costs at least as much as a step of the env. So `max_decrease` may declare how far `value` can fall at
-    most
-    within the forecast, for any control: a state with more than that left needs none. The declaration is checked at
-    every step, and dropped with a warning when broken.
+    A forecast costs at least as much as a step of the env. A state with more than `max_decrease` left, the most that
+    `value` can fall within it, needs none. The declaration is checked at every step, and dropped with a warning when
+    broken.
     """
 
     spec: Any
@@ -120,20 +111,18 @@ class BoundRollout(BoundSlacks):
         self._max_decrease = spec.max_decrease
 
     @abstractmethod
-    def _room(self, forecast: Forecast) -> Array:
+    def room(self, forecast: Forecast) -> Array:
         """What is left of the limit along a forecast, in time: shape (instants, n)."""
 
     @abstractmethod
-    def _now(self) -> Array:
+    def now(self) -> Array:
         """What is left of the limit at the present state, shape (n,)."""
 
     def start(self) -> Memory:
-        """Nothing is known yet."""
         return RolloutMemory()
 
     def observe(self, memory: RolloutMemory) -> None:
-        """Take what is left at the present state, and whether a forecast is needed."""
-        self._value = self._now()
+        self._value = self.now()
         self._linear: HalfSpaces | None = None
         self._linearized = 0
         self._least = float(self._value.min(initial=np.inf))
@@ -158,12 +147,10 @@ class BoundRollout(BoundSlacks):
             self._max_decrease = None
 
     def executed(self, control: Array) -> Memory:
-        """What was left in the last `horizon` states, and the response if it is known."""
         recent = (*self._recent, self._least)[-self.spec.horizon :] if self._max_decrease is not None else ()
         return RolloutMemory(recent, self._response)
 
     def value(self) -> Array:
-        """What is left of the limit at the present state, margin not taken off."""
         return self._value
 
     def _violation(self, value: Array) -> Array:
@@ -172,7 +159,7 @@ class BoundRollout(BoundSlacks):
 
     def slacks(self, control: Array) -> Array:
         """What is left of what is asked for along the forecast of a control, shape (k,); wanted >= 0."""
-        left = self._room(self.plant.forecast(control, self.spec.horizon)) - self.spec.margin
+        left = self.room(self.plant.forecast(control, self.spec.horizon)) - self.spec.margin
         if not self._outside.any():
             return np.asarray(left.min(axis=0))
         # From outside, bound by bound: no farther out on the way, and closer at the end.
@@ -187,7 +174,6 @@ class BoundRollout(BoundSlacks):
         return self._far or self.slack(control) >= -self.tolerance
 
     def linearize(self, control: Array) -> HalfSpaces:
-        """The forecast, linearised about a refused control."""
         if self.plant.has_acceleration:
             return super().linearize(control)
         self._linearized += 1
@@ -196,10 +182,9 @@ class BoundRollout(BoundSlacks):
         return self._instants(control)
 
     def rows(self) -> HalfSpaces:
-        """None: the forecast is linearised about a refused control.
+        """Where controls are displacements: the forecast linearised about braking, instant by instant; else none.
 
-        Where controls are displacements: the forecast linearised about braking, instant by instant. A refused
-        displacement may press the machine against something, and then says little about others.
+        A refused displacement may press the machine against something, and then says little about others.
         """
         if self.plant.has_acceleration or self._far:
             return super().rows()
@@ -213,9 +198,9 @@ class BoundRollout(BoundSlacks):
     def _respond(self, control: Array) -> None:
         """How what is left at every instant changes with a control, by differences, shape (instants, n, nu)."""
         plant, horizon = self.plant, self.spec.horizon
-        room = self._room(plant.forecast(control, horizon))
+        room = self.room(plant.forecast(control, horizon))
         step = np.where(control < 0.0, _STEP, -_STEP) * (plant.upper - plant.lower)
-        changed = [self._room(plant.forecast(control + part, horizon)) for part in np.diag(step)]
+        changed = [self.room(plant.forecast(control + part, horizon)) for part in np.diag(step)]
         parts = [(other - room) / width for other, width in zip(changed, step, strict=True)]
         self._response = np.stack(parts, axis=-1), plant.observation_id + _KEPT
 
@@ -223,7 +208,7 @@ class BoundRollout(BoundSlacks):
         """A row for every bound that some control could break, at a few instants of a control's forecast."""
         assert self._response is not None  # `rows` is asked first
         plant, horizon = self.plant, self.spec.horizon
-        left = self._room(plant.forecast(control, horizon)) - self.spec.margin - self._outside
+        left = self.room(plant.forecast(control, horizon)) - self.spec.margin - self._outside
         left[-1] += self._outside - self._closer()
         each = len(left) // horizon
         chosen = [i for i in range(len(left)) if i % each + 1 in (*_INSTANTS, each)]

@@ -17,13 +17,11 @@ from safe_wrappers.plants.plant import Plant
 class TrackPermission(Constraint):
     """While the permission of a track has expired, slow down to `creep` (rest), at least as hard as `braking`.
 
-    An `OcclusionPenalty` inside the filter says which tracks may be relied on. The rows bound the speed along an axis
-    at the end of the control step: it falls by `braking` times the control interval, shared as the velocity is, down
-    to `creep`. With all permissions in force there are no rows.
+    An `OcclusionPenalty` inside the filter says which tracks may be relied on. With all permissions in force there
+    are no rows.
 
-    What it promises: executed controls brake as declared, or the step is flagged infeasible. Where standing still is
-    not safe, add `Clearance` with `TrackedDiscs`. Best effort: the drift changes within a held step, and another
-    constraint may ask for the opposite.
+    Best effort: executed controls brake as declared, or the step is flagged infeasible; the drift changes within a
+    held step. Where standing still is not safe, add `EscapeClearance` with `TrackedDiscs`.
 
     Args:
         body: Name of the body whose frame origin is stopped.
@@ -31,8 +29,7 @@ class TrackPermission(Constraint):
         creep: Speed that stays allowed, m/s.
         tracks: Names of the tracks that count (`track_names` of the OcclusionPenalty); None: all.
 
-    Source: appendix "Continuous Lyapunov and Riccati covariance dynamics": expire tracking permission before the
-    declared error bound crosses the physical tolerance.
+    Source: appendix "Continuous Lyapunov and Riccati covariance dynamics".
     """
 
     body: str
@@ -49,7 +46,6 @@ class TrackPermission(Constraint):
             self.tracks = name_list("tracks", self.tracks, also="None for all")
 
     def bind(self, plant: Plant) -> "BoundTrackPermission":
-        """On a plant."""
         return BoundTrackPermission(self, plant)
 
 

@@ -19,30 +19,28 @@ from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.driven_wheels import DrivenWheels
 
-_CAUTION = 0.5
-"""Standard deviations of the estimated peak's slip by which the limit stays on the rising side of it."""
-_NOISE = 0.02
-"""Standard deviation of a measured friction coefficient while the slip stands still."""
-_NOISE_PER_SLIP = 1.5
-"""And what a slip that changed within the interval adds to it: at which slip the force acted is not known."""
-_LEAST_LIMIT = 0.1
-"""Share of `max_slip` that is always allowed: without any slip there is no force."""
-_SPEED_ERROR_FACTOR = 2.0
-"""Times the ground speed's recent error of prediction: what is kept free for the next one."""
-_SPEED_ERROR_IGNORED = 0.05
-"""Share of the room below the limit that such an error may take without being counted."""
-_SPEED_ERROR_FADE = 0.9
-"""Share of such an error that still counts one control step later."""
-_LEAST_SHARE = 0.3
-"""Of the slip that must be along the heading: the force across is not measured."""
-_UNBOUNDED = 1e9
-"""Stands for the control of an actuator without limits."""
-_LEAST_LOAD = 0.05
-"""Share of the largest load seen below which a wheel counts as in the air: it measures nothing."""
-_MOST_FRICTION = 3.0
-"""Force over load beyond which something else than the ground held the wheel: it says nothing about the curve."""
-_ROUNDING = 1e-6
-"""Share of a control below which its change is the action space's own rounding (float32)."""
+_CAUTION = (
+    0.5  # standard deviations of the estimated peak's slip by which the limit stays on the rising side of it
+)
+_NOISE = 0.02  # standard deviation of a measured friction coefficient while the slip stands still
+_NOISE_PER_SLIP = (
+    1.5  # and what a slip that changed within the interval adds: the slip at the force is not known
+)
+_LEAST_LIMIT = 0.1  # share of `max_slip` that is always allowed: without any slip there is no force
+_SPEED_ERROR_FACTOR = (
+    2.0  # times the ground speed's recent error of prediction: what is kept free for the next one
+)
+_SPEED_ERROR_IGNORED = (
+    0.05  # share of the room below the limit that such an error may take without being counted
+)
+_SPEED_ERROR_FADE = 0.9  # share of such an error that still counts one control step later
+_LEAST_SHARE = 0.3  # of the slip that must be along the heading: the force across is not measured
+_UNBOUNDED = 1e9  # stands for the control of an actuator without limits
+_LEAST_LOAD = (
+    0.05  # share of the largest load seen below which a wheel counts as in the air: it measures nothing
+)
+_MOST_FRICTION = 3.0  # force over load beyond which something else than the ground held the wheel
+_ROUNDING = 1e-6  # share of a control below which its change is the action space's own rounding (float32)
 _SOLVERS_NOISE = 1e-9
 
 
@@ -55,43 +53,22 @@ class Traction(Constraint):
     """Keep the slip ratio of every driven wheel within `max_slip`, and below where its ground's curve seems to peak.
 
     The wheel's own equation says which torque takes the slip to its limit by the end of the held control step. The
-    force of the ground in it is not modelled but measured, from how the wheel answered the last torque; so no
-    friction has to be known. From slip and force over load the peak of the traction curve is estimated for each
-    wheel, with its uncertainty (`control/vehicle/friction_estimate.py`); where it is believed to lie below
-    `max_slip`, the limit is half a standard deviation below it. Accelerating and braking, forward and in reverse are
-    the same rows.
+    force of the ground in it is measured, from how the wheel answered the last torque, so no friction has to be
+    known. From slip and force over load the peak of the traction curve is estimated for each wheel, with its
+    uncertainty (`control/vehicle/friction_estimate.py`); the limit is half a standard deviation below it, or
+    `max_slip`. A wheel in the air is held within the limit of its ground speed.
 
-    What it promises: a wheel whose ground stays the same for a control step ends it within the limit, up to what
-    its force and its speed over ground change otherwise than predicted. At the edge of another ground, and where a
-    wheel is unloaded or hits something, the measured force is one control step old: the slip overshoots for one or
-    two steps, and comes back as fast as the drives can bring it. The speed over ground is predicted to change as in
-    the step before, which it does not where the other wheels' commands have changed: that overshoots on any ground.
-    So twice the largest recent error of this prediction (faded by a tenth at every step, less a twentieth of the
-    window) is kept free on the side on which it was wrong, up to nine tenths of the window. A first change of the
-    other wheels' commands after a calm drive is not foreseen, and overshoots for up to three steps.
-
-    A wheel that slides sideways has less left to slip along its heading (a friction circle), so that driving and
-    braking leave the grip to the turn; but a turn that is too fast for the ground still slides, and a vehicle that
-    spins about its own axis turns its wheels faster than any drive follows. Hence best effort. An overshoot is no
-    unsafe state, so there is no `value`, and `slip/ratio` alone shows it. From outside the limit the rows ask for no
-    more than the drives can give: the way back is not called infeasible.
-
-    The estimate believes in curves of one shape, the Magic Formula's. On others it may take the peak for a later one:
-    on Burckhardt's snow (peak at 0.06, nearly flat behind it) a wheel is held at 0.11, for 2 % less force.
-    What else holds an axle (dry friction, a spring) is measured as force of the ground: the limit keeps, the friction
-    estimate is too high. A state that is set from outside within an episode looks like a force, too, for one step,
-    and like a ground speed that cannot be predicted, for some twenty.
-
-    A wheel in the air has no force: its circumferential speed is held within the limit of its ground speed, so
-    that it touches down rolling, and its estimate stays as it is. At a standstill slip is counted against
-    `regularization`.
+    Best effort: a wheel whose ground stays the same for a control step ends it within the limit, up to what its force
+    and its speed over ground change otherwise than predicted. At the edge of another ground, where a wheel is
+    unloaded or hits something, and after a change of the other wheels' commands, the slip overshoots for one to three
+    steps, and comes back as fast as the drives can bring it. An overshoot is no unsafe state, so there is no `value`:
+    `slip/ratio` shows it.
 
     Args:
         wheels: Names of the wheels' hinges; each must be driven by actuators on that joint and nothing else.
         max_slip: Largest slip ratio, normalised, in (0, 1).
         friction: Declared lower bound on the peak friction coefficient under every wheel, > 0: the ground is then
-            counted on for that much force at once, instead of only for what it gave in the last control step. A bound
-            that is too high lets wheels spin. None counts on nothing.
+            counted on for that much force at once. A bound that is too high lets wheels spin. None counts on nothing.
         regularization: Speed below which slip is counted against it, m/s.
         margin: Slip kept free below the limit.
 
@@ -116,7 +93,6 @@ class Traction(Constraint):
             raise ConfigurationError(f"margin must be below max_slip = {self.max_slip}, got {self.margin}")
 
     def bind(self, plant: Plant) -> "BoundTraction":
-        """On a plant."""
         return BoundTraction(self, plant)
 
 
@@ -157,12 +133,7 @@ class TractionMemory(NamedTuple):
 class BoundTraction(BoundConstraint):
     """Traction on a plant."""
 
-    info_keys: tuple[str, ...] = (
-        keys.SLIP_RATIO,
-        keys.SLIP_LIMITED,
-        keys.SLIP_MU_ESTIMATE,
-        keys.SLIP_MU_STD,
-    )
+    info_keys: tuple[str, ...] = (keys.SLIP_RATIO, keys.SLIP_LIMITED, keys.SLIP_MU_ESTIMATE, keys.SLIP_MU_STD)
     spec: Traction
     plant: MujocoPlant
 
@@ -189,12 +160,10 @@ class BoundTraction(BoundConstraint):
         )
 
     def start(self) -> Memory:
-        """Nothing is known of the ground, and nothing was measured."""
         n = len(self.spec.wheels)
         return TractionMemory(FrictionEstimate(n), None, math.nan, *(np.zeros(n) for _ in range(10)))
 
     def executed(self, control: Array) -> Memory:
-        """What was measured, and the estimate from it."""
         now = (self._rate, self._time, self._ground, self._slip, self._across, self._load, self._most_load)
         return TractionMemory(
             self._estimate, *now, self._faster, self._slower, self._ahead, self._traction, self._present
@@ -258,12 +227,7 @@ class BoundTraction(BoundConstraint):
         return np.minimum(counted, (1.0 - _LEAST_LIMIT) * room)
 
     def _learn(
-        self,
-        ground: Array,
-        slip: Array,
-        across: Array,
-        load: Array,
-        rolls: NDArray[np.bool_],
+        self, ground: Array, slip: Array, across: Array, load: Array, rolls: NDArray[np.bool_]
     ) -> None:
         """Give the estimate the slip and the friction of the last control step, where it showed any."""
         mean_load, along = 0.5 * (load + self._load), 0.5 * (slip + self._slip)

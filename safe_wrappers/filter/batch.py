@@ -21,14 +21,10 @@ from safe_wrappers.filter.projection import check_solver, project_unchecked
 
 Mask = NDArray[np.bool_]
 
-_CLEAR = 1e-6
-"""Share of a tolerance by which a residual must differ from it to be judged here: `project` judges the others."""
-_FEW = 16
-"""Fewer problems that a nominal does not solve are faster one by one."""
-_SPARE = 1e3
-"""Tolerances by which every other row must be kept where the projection on one of them is taken for that on all."""
-_LARGEST = 1e150
-"""Larger numbers may overflow when squared: left to `project`."""
+_CLEAR = 1e-6  # share of a tolerance by which a residual must differ from it to be judged here
+_FEW = 16  # fewer problems that a nominal does not solve are faster one by one
+_SPARE = 1e3  # tolerances by which all other rows must be kept where the projection on one row is the answer
+_LARGEST = 1e150  # larger numbers may overflow when squared: left to `project`
 
 
 class BatchProjection(NamedTuple):
@@ -55,7 +51,9 @@ def project_batch(
     upper: ArrayLike,
     solver: str = "daqp",
 ) -> BatchProjection:
-    """Project B nominal controls, each onto its own half-spaces and box; the answers are those of `project`.
+    """Project B nominal controls, each onto its own half-spaces and box; statuses and answers are those of `project`.
+
+    Inactive controls are the nominal ones bit for bit, the others equal within the accuracy of the solver.
 
     Args:
         u_nom: Nominal controls, shape (B, m), finite.
@@ -65,10 +63,6 @@ def project_batch(
         lower: Box, shape (m,) or (B, m); -inf is no bound.
         upper: Box, shape (m,) or (B, m); +inf is no bound.
         solver: As in `project`.
-
-    Returns:
-        A `BatchProjection`. The statuses are those that `project` gives, problem by problem; inactive controls are
-        the nominal ones bit for bit, the others equal within the accuracy of the solver.
 
     Raises:
         ConfigurationError: Shapes do not match, bounds cross, or an argument that must be finite is not.

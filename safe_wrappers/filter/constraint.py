@@ -59,7 +59,7 @@ class Constraint(ABC):
         """The constraint on a plant that is bound to its env.
 
         Raises:
-            UnsupportedEnvError: The plant cannot answer what the constraint asks of it.
+            UnsupportedEnvError: The plant does not have what the constraint needs.
             ConfigurationError: Names or numbers that do not fit the plant.
         """
 
@@ -77,13 +77,13 @@ class Constraint(ABC):
 class BoundConstraint:
     """A constraint on one plant. Every method has a default; a subclass overrides what it can answer.
 
-    In every control step the filter calls `observe` once, after the plant has taken the env's state, then asks
-    questions, and closes the step with `executed`. What lasts from step to step is a value: `start` gives that of a
-    new episode, `observe` takes it, `executed` returns the next one. A constraint may keep what it has computed until
-    the next `observe`, and must not change anything else.
+    In every control step the filter calls `observe` once, after the plant has taken the env's state, then the other
+    methods, and closes the step with `executed`. What lasts from step to step is a value: `start` gives that of a new
+    episode, `observe` takes it, `executed` returns the next one. A constraint may keep what it has computed until the
+    next `observe`, and must not change anything else.
 
     A constraint that says its requirement as rows overrides `rows` alone. One that predicts a held control sets
-    `predicts` and overrides `slack`, or `admits`: the filter asks it about controls, and takes its rows for a guess.
+    `predicts` and overrides `slack`, or `admits`; its rows are then a guess.
 
     Args:
         spec: The specification.

@@ -30,11 +30,7 @@ def duck_typed(given: Any) -> Constraint:
 
 
 class DuckTyped(Constraint):
-    """An object with `rows(plant)` and, if it has them, the methods of its time.
-
-    Args:
-        given: The object; its methods take the plant first.
-    """
+    """An object with `rows(plant)` and, if it has them, the other methods of its time; they take the plant first."""
 
     def __init__(self, given: Any) -> None:
         self.given = given
@@ -43,11 +39,9 @@ class DuckTyped(Constraint):
         self.margin, self.state_error = (getattr(given, name, 0.0) for name in ("margin", "state_error"))
 
     def bind(self, plant: Plant) -> "BoundDuckTyped":
-        """A copy of the object, bound if it wants to be."""
         return BoundDuckTyped(self, plant)
 
     def widened(self, margin: float) -> Self:
-        """With a wider margin of the object's own."""
         if not hasattr(self.given, "margin"):
             return super().widened(margin)
         wider = copy.deepcopy(self)
@@ -56,7 +50,7 @@ class DuckTyped(Constraint):
 
 
 class BoundDuckTyped(BoundConstraint):
-    """Its methods on a plant."""
+    """A copy of such an object on a plant."""
 
     def __init__(self, spec: DuckTyped, plant: Plant) -> None:
         super().__init__(spec, plant)
@@ -74,33 +68,26 @@ class BoundDuckTyped(BoundConstraint):
 
     @property
     def scale(self) -> float:
-        """Its own, or 1."""
         return float(getattr(self._given, "scale", 1.0))
 
     def start(self) -> Memory:
-        """What lasts is the object's own affair."""
         self._ask("reset", None)
 
     def check(self) -> None:
-        """Its own check."""
         self._ask("check", None, self.plant)
 
     def value(self) -> Array:
-        """Its barriers."""
         return np.asarray(self._ask("value", np.zeros(0), self.plant))
 
     def approach(self) -> tuple[Array, Array] | None:
-        """Its clearances and speeds."""
         found: tuple[Array, Array] | None = self._ask("approach", None, self.plant)
         return found
 
     def rows(self) -> HalfSpaces:
-        """Its rows."""
         rows: HalfSpaces = self._given.rows(self.plant)
         return rows
 
     def slack(self, control: Array) -> float:
-        """Its shortfall, or whether it admits the control, or its rows."""
         if not self.predicts:
             return super().slack(control)
         if hasattr(self._given, "shortfall"):
@@ -108,26 +95,21 @@ class BoundDuckTyped(BoundConstraint):
         return 0.0 if self.admits(control) else -np.inf
 
     def admits(self, control: Array) -> bool:
-        """Its own answer, or that of its rows."""
         return bool(self._given.admits(self.plant, control)) if self.predicts else super().admits(control)
 
     def linearize(self, control: Array) -> HalfSpaces:
-        """Its cut."""
         rows: HalfSpaces = self._ask("cut", super().linearize(control), self.plant, control)
         return rows
 
     def candidates(self, control: Array) -> Iterable[Array]:
-        """Its suggestions."""
         every: Iterable[Array] = self._ask("suggestions", (), self.plant, control)
         return every
 
     def backup(self) -> Array | None:
-        """Its backup."""
         control: Array | None = self._ask("backup", None, self.plant)
         return control
 
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
-        """Its report; after a reset of two zero actions."""
         zero = np.zeros(self.plant.lower.size)
         both = [zero if action is None else action for action in (proposed, executed)]
         found: dict[str, Any] = self._ask("report", {}, *both)

@@ -21,12 +21,10 @@ class Fallback:
     """Chooses a finite control inside the box, whatever happens.
 
     Args:
-        choice: "brake" takes the motion away as fast as the actuators can: by a constraint's own proved
-            stopping control where one has it, else by `brake` on a MujocoPlant; an AnalyticPlant does not say
-            which states are velocities, so there it is the control that violates the rows least. Where all
-            constraints forecast and none admits it, the filter takes, of all that it has tried, the control that
-            fails least. "hold" repeats the last executed action; "zero" is no control; or a function of the plant.
-        constraints: "brake" uses the first one's `backup` that there is.
+        choice: "brake" takes the motion away as fast as the actuators can: by the first `backup` of a constraint,
+            else by `brake` on a MujocoPlant, else by the control that violates the rows least. "hold" repeats the
+            last executed action; "zero" is no control; or a function of the plant.
+        constraints: Whose backups "brake" uses.
 
     Raises:
         UnknownNameError: No fallback of that name.
@@ -58,7 +56,7 @@ class Fallback:
             low: Action box, shape (m,).
             high: Likewise.
             least: The control that violates the rows least, if one is known.
-            readable: False if the state is not a number: braking is then no control, for want of a motion to brake.
+            readable: False if the state is not a number: then there is no motion to brake.
         """
         if callable(self._choice):
             assert plant is not None
@@ -87,11 +85,11 @@ class Fallback:
 
 
 def brake(plant: Any) -> Array:
-    """The control that leaves the least kinetic energy at the end of the hold, in the linear model.
+    """The control that leaves the least kinetic energy at the end of the hold, in the linear model, shape (m,).
 
-    Energies are counted joint by joint (the diagonal of the inertia). A small weight on the control settles
-    actuators that do not matter. Best effort: it opposes motion, it does not balance. A plant whose controls are no
-    forces brakes as its forecasts do.
+    Energies are counted joint by joint (the diagonal of the inertia). A small weight on the control settles actuators
+    that do not matter. Best effort: it does not balance. A plant whose controls are no forces brakes as its forecasts
+    do.
     """
     if not plant.has_acceleration:
         return np.asarray(plant.braking())

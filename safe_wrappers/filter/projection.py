@@ -1,13 +1,10 @@
 """The minimal intervention: the control closest to the nominal one inside every half-space and the box.
 
-Source: appendix "Minimal-intervention quadratic program" and Systems Perspective 1.1: feasibility comes before
-invariance, and clamping a projection afterwards is not the projection with a box.
+Source: appendix "Minimal-intervention quadratic program" and Systems Perspective 1.1.
 
 The ways through, cheapest first: the nominal is feasible (returned bit for bit, no solver); one row and a box
-(exact, by the breakpoints of a piecewise linear function); else a QP backend. Every answer is checked with
-our own residual, whatever the solver says of it. Calls share no state, so a failed solve cannot spoil the next.
-
-Solvers know only absolute tolerances; they get the problem divided by a power of two, which rounds nothing.
+(exact); else a QP backend. Every answer is checked with our own residual. Calls share no state. Solvers know only
+absolute tolerances; they get the problem divided by a power of two, which rounds nothing.
 """
 
 import math
@@ -41,10 +38,8 @@ __all__ = [
     "project_unchecked",
 ]
 
-_SHORTEST = 1e-6
-"""Rows shorter than this, or longer than its inverse, are looked at one by one before a solver sees them."""
-_OVERFLOWING = 1e300
-"""Where a sum is not finite, numbers from here on are taken as infinite."""
+_SHORTEST = 1e-6  # rows shorter than this, or longer than its inverse, are looked at one by one
+_OVERFLOWING = 1e300  # where a sum is not finite, numbers from here on are taken as infinite
 
 
 def project(
@@ -57,22 +52,19 @@ def project(
 ) -> Projection:
     """Project a nominal control onto `{u : normals @ u <= offsets, lower <= u <= upper}`.
 
+    A nominal that misses a row by up to 1e-9 of what half of the box changes of it counts as admissible; an answer
+    may miss it by ten times as much. Where the box is wide (more than 16 control units) or open, the numbers that the
+    row compares take its place. An infeasible problem gives the least violation: the smallest sum of squared,
+    normalised violations, and among those the control closest to `u_nom`.
+
     Args:
         u_nom: Nominal control, shape (m,), finite.
-        normals: Row normals, shape (k, m); k may be 0. Rows may be degenerate: a zero normal with a
-            non-negative offset is dropped, with a negative one it makes the problem infeasible.
+        normals: Row normals, shape (k, m); k may be 0. A zero normal with a non-negative offset is dropped, with a
+            negative one it makes the problem infeasible.
         offsets: Shape (k,).
         lower: Box, shape (m,); -inf is no bound.
         upper: Box, shape (m,); +inf is no bound.
         solver: "daqp" (called directly) or any installed qpsolvers backend by name.
-
-    A nominal that misses a row by up to 1e-9 of what half of the box changes of it counts as admissible; an answer
-    may miss it by ten times as much. Where the box is wide (more than 16 control units) or open, the numbers that the
-    row compares take its place.
-
-    Returns:
-        A `Projection`. Infeasible problems give the least-violation control: the smallest sum of squared,
-        normalised violations, and among those the control closest to `u_nom`.
 
     Raises:
         ConfigurationError: Shapes do not match, bounds cross, or an argument that must be finite is not.
@@ -197,15 +189,7 @@ def cast_inside(control: Array, dtype: Any, normals: Array, offsets: Array, low:
 
 
 def _careful(
-    u: Array,
-    a: Array,
-    b: Array,
-    lo: Array,
-    hi: Array,
-    length: Array,
-    slack: Array,
-    unit: float,
-    solver: str,
+    u: Array, a: Array, b: Array, lo: Array, hi: Array, length: Array, slack: Array, unit: float, solver: str
 ) -> Projection:
     """Row by row: which matter, which are degenerate, which cannot be met; then a backend on unit rows."""
     # What the box alone can reach decides which rows matter; a zero normal is the extreme case.

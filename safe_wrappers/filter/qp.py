@@ -15,12 +15,9 @@ from numpy.typing import NDArray
 
 from safe_wrappers.filter.problem import EXACT_SHARE, UNBOUNDED, Array
 
-_OPTIMALITY_TOLERANCE = 1e-4
-"""Largest distance between a backend's answer and the one its multipliers stand for, in units of `control_unit`."""
-_SOLVERS_TOLERANCE = 1e-11
-"""Of daqp, in units of `control_unit`: rows at a small angle multiply a residual by the inverse of the angle."""
-_SOFT = 1e-8
-"""Weight of the distance from the nominal beside squared violations."""
+_OPTIMALITY_TOLERANCE = 1e-4  # between a backend's answer and the one of its multipliers, in `control_unit`s
+_SOLVERS_TOLERANCE = 1e-11  # of daqp, in `control_unit`s: rows at a small angle multiply a residual
+_SOFT = 1e-8  # weight of the distance from the nominal beside squared violations
 Backend = Callable[[Array, Array, Array, Array, Array, Array], tuple[Array, Array, int] | None]
 """(P, q, G, h, lower, upper) -> (x, row multipliers, iterations), or None when it gave up."""
 
@@ -133,9 +130,9 @@ def _by_distance(
 ) -> tuple[Array, Array, int] | None:
     """The projection by non-negative least squares (Lawson and Hanson, Solving Least Squares Problems, ch. 23).
 
-    Where rows oppose each other at a small angle, a small residual can be far from every admissible control, and a
-    solver that works with residuals takes the rows for contradictory. Here the residual of the least squares is
-    `1 / sqrt(1 + distance^2)`, so whether a control exists is decided by how far away it is.
+    Where rows oppose each other at a small angle, a small residual can be far from every admissible control. The
+    residual of these least squares is `1 / sqrt(1 + distance^2)`: whether a control exists is decided by how far away
+    it is.
     """
     from scipy.optimize import nnls  # here: few need it, and it takes a while to import
 

@@ -1,7 +1,6 @@
 """From a boxed proposal to an admissible action: a ladder of stages, the cheapest first.
 
-Each stage is a method of `SafeActionSearch` that returns the control it has found, or None; `Decision.stage` names
-the one that answered.
+Each stage is a method that returns the control it has found, or None; `Decision.stage` names the one that answered.
 """
 
 from collections.abc import Sequence
@@ -20,12 +19,15 @@ Rows = tuple[Array, Array]
 """`normals @ u <= offsets`: shapes (k, m) and (k,)."""
 _NO_ROWS: Rows = (np.zeros((0, 0)), np.zeros(0))
 
-_LINEARIZATIONS = 6
-"""How often a refused control is answered by linearising anew about it."""
+_LINEARIZATIONS = 6  # how often a refused control is answered by linearising anew about it
 _OVERSHOOTS = (0.02, 0.1)
 """Shares by which a refused correction is made larger where no constraint can linearise anew."""
-_BLENDS = (0.1, 0.25, 0.5, 0.75)
-"""How far a refused control is moved towards the backup control, step by step."""
+_BLENDS = (
+    0.1,
+    0.25,
+    0.5,
+    0.75,
+)  # how far a refused control is moved towards the backup control, step by step
 
 
 class Stage(IntEnum):

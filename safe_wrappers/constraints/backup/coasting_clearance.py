@@ -21,14 +21,12 @@ from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.coasting import Coasting, Course
 
-_SAME_M = 1e-6
-"""Rounding of a rollout: a smaller loss of clearance is none."""
-_STILL = 1e-9
-"""States (m, rad, m/s, rad/s) and places of discs that differ by less are the same."""
-_WAY_OUT_M = 1e-3
-"""Clearance that a control has to gain at its end where zero control leaves less than the margin."""
-_RECOVERED = 0.5
-"""Share of the best gain of clearance that a control has to reach from inside an obstacle."""
+_SAME_M = 1e-6  # rounding of a rollout: a smaller loss of clearance is none
+_STILL = 1e-9  # states (m, rad, m/s, rad/s) and places of discs that differ by less are the same
+_WAY_OUT_M = (
+    1e-3  # clearance that a control has to gain at its end where zero control leaves less than the margin
+)
+_RECOVERED = 0.5  # share of the best gain of clearance that a control has to reach from inside an obstacle
 _AROUND = ((1.0, 0.5), (1.0, 0.0), (1.0, -1.0), (-0.5, -1.0))
 """Shares of the drive for the outer and the inner actuator of a detour, as they are tried."""
 
@@ -45,32 +43,27 @@ _AROUND = ((1.0, 0.5), (1.0, 0.0), (1.0, -1.0), (-0.5, -1.0))
 class CoastingClearance(Constraint):
     """Keep a free-moving machine out of discs, counting its whole way until it rests without control.
 
-    For machines that friction and damping stop within a few steps, for example on wheels. The backup manoeuvre is
-    zero control. A control is rolled out on the machine's model, substep by substep: held for one control interval,
-    then zero, until rest. It is admitted if the machine rests within `horizon` control intervals, and if on the whole
-    way the body's origin stays out of `keep_out` and the outline out of `untouched`, each by `margin`.
+    For machines that friction and damping stop within a few steps, for example on wheels. A control is forecast on
+    the machine's model: held for one control interval, then zero. It is admitted if the machine rests within
+    `horizon` control intervals, and if on the whole way the body's origin stays out of `keep_out` and the outline out
+    of `untouched`. From inside an obstacle controls are admitted that gain at least half of what full drive gains at
+    best.
 
-    What it promises: proved, for obstacles that stand still, and as far as `margin` covers the rollout's error. From
-    a state whose way to rest is clear there is always an admissible control, and every physics substep is clear. With
-    Safety-Gymnasium's car the next step is predicted to 0.2 mm, rest to 0.8 mm, and a tilted outline reaches out by
-    1.5 mm (measured): a margin of 5 mm is twice their sum.
-
-    From inside an obstacle (an unsafe start) controls are admitted that gain at least half of the clearance that full
-    drive gains at best.
+    Proved, for obstacles that stand still, and as far as `margin` covers the forecast's error: from a state whose way
+    to rest is clear there is always an admissible control, and every physics substep is clear.
 
     Args:
         keep_out: `Disc` and `Discs` for the body's origin.
         untouched: `Disc` and `Discs` for the outline.
         outline: Points [x, y] in the body's frame, m; the outline is their convex hull.
         body: Name of the machine's body, on a free joint.
-        robot_model_attr: Name of an attribute of the env that holds a model of the machine alone, for the rollouts;
+        robot_model_attr: Name of an attribute of the env that holds a model of the machine alone, for the forecasts;
             None takes the plant's model.
-        margin: Kept free, m: covers the rollout's error and the tilt of the outline.
+        margin: Kept free, m: covers the forecast's error and the tilt of the outline.
         horizon: Control intervals within which the machine has to rest.
         max_decrease: Bound on the way of the origin or a corner of the outline until rest, m, for any control held
-            for one
-            interval from rest; states with more clearance need no rollout. Checked at every rollout, and dropped
-            with a warning when broken. None: always roll out.
+            for one interval from rest; states with more clearance need no forecast. Checked at every forecast, and
+            dropped with a warning when broken.
         max_decrease_per_speed: What the speed of the origin or a corner adds to that, m per m/s.
         detour: When a driving action of a machine with two actuators is refused, first try to turn while driving, or
             to reverse while turning, around the obstacle. No safety measure.
@@ -113,7 +106,6 @@ class CoastingClearance(Constraint):
         )
 
     def bind(self, plant: Plant) -> "BoundCoastingClearance":
-        """On a plant."""
         return BoundCoastingClearance(self, plant)
 
 
@@ -143,7 +135,6 @@ class BoundCoastingClearance(BoundDetourClearance):
         self._known: dict[bytes, _Outcome] = {}
 
     def start(self) -> Detour:
-        """No detour is being made, and no forecast is known."""
         self._seen = np.zeros(0)
         return Detour()
 
@@ -278,12 +269,7 @@ class _Outcome(NamedTuple):
 
 
 class _Group:
-    """Discs that one part of the machine keeps clear of.
-
-    Args:
-        obstacles: `Disc` and `Discs`.
-        plant: To read where they are.
-        outline: Corners in the body's frame, shape (c, 2); None means its origin.
+    """Discs that the outline, corners (c, 2) in the body's frame, or the body's origin keeps clear of.
 
     Attributes:
         centers: Of all discs, shape (n, 2), m.

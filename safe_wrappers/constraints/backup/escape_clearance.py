@@ -1,9 +1,4 @@
-"""EscapeClearance: keep an escape manoeuvre clear of moving obstacles, for a point mass on two axes.
-
-Standing still is not safe in front of something that approaches. So a control is admitted if, held for one control
-step, it leaves at least one manoeuvre (go in some direction, brake, stay) whose whole way keeps clear of where the
-obstacles may be by then.
-"""
+"""EscapeClearance: keep an escape manoeuvre clear of moving obstacles, for a point mass on two axes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,37 +19,29 @@ from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.planar_point import planar_point
 
-_EVERY = 2
-"""Holds between the instants at which ways are checked."""
-_GOING_S = (0.3, 0.8)
-"""For how long the manoeuvres go before they brake, s."""
+_EVERY = 2  # holds between the instants at which ways are checked
+_GOING_S = (0.3, 0.8)  # for how long the manoeuvres go before they brake, s
 _DIRECTIONS = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
-_RECOVERY_S = 0.4
-"""Time constant, s, with which the way out of a violation must come clear."""
-_BLENDS = (0.2, 0.4, 0.6, 0.8)
-"""Shares of the way from a refused control to one that leaves a way out."""
-_APPROACHED = 2
-"""How many of those are approached."""
+_RECOVERY_S = 0.4  # time constant, s, with which the way out of a violation must come clear
+_BLENDS = (0.2, 0.4, 0.6, 0.8)  # shares of the way from a refused control to one that leaves a way out
+_APPROACHED = 2  # how many of those are approached
 
 
 @dataclass
 class EscapeClearance(Constraint):
     """Keep a point mass on two axes out of obstacles, moving ones above all, by keeping an escape open.
 
-    The manoeuvres: brake at once; or go along +x, -x, +y or -y with full force for 0.3 s or 0.8 s, and brake. Each is
-    followed for `horizon_s`, exactly as the plant moves. Moving obstacles are where they are expected to be by then
-    (`Discs` at constant velocity), `TrackedDiscs` anywhere inside the bound of their estimate as it grows if nothing
-    more is seen, boxed in along x and y. So the less is known, the earlier the machine keeps off.
+    The manoeuvres: brake at once; or go along +x, -x, +y or -y with full force for 0.3 s or 0.8 s, and brake. A
+    control is admitted if, held for one control step, it leaves one whose whole way keeps clear of where the
+    obstacles may be by then: `Discs` at constant velocity, `TrackedDiscs` anywhere inside the bound of their estimate
+    as it grows.
 
-    What it promises: from a state with a clear manoeuvre, the executed control leaves one, or the step is flagged.
-    While every obstacle stays inside its declared bound, that manoeuvre keeps clear for the rest of the horizon. Best
-    effort: nine manoeuvres are tried, and the one that was clear before; estimates move (up to `margin` of that is
-    not flagged); ways are checked at every second control step (for a relative speed v and steps of h, they miss
-    `(v h)^2 / 2` over the distance); obstacles count up to the horizon.
+    Best effort: from a state with a clear manoeuvre, the executed control leaves one, or the step is flagged; while
+    every obstacle stays inside its declared bound, that manoeuvre keeps clear until the horizon. Ways are checked at
+    every second control step, and estimates move (up to `margin` of that is not flagged).
 
     Args:
-        body: Name of the body on its two slides along x and y, each with a force actuator of its own. What else the
-            body or the model can do must not act on these.
+        body: Name of the body on its two slides along x and y, each with a force actuator of its own.
         obstacles: `TrackedDiscs`, `Discs`, and what stands still: `Disc`, `Box`, `Plane`.
         radius: Of the machine around the body's origin, m.
         margin: Fixed protective distance, m.
@@ -92,7 +79,6 @@ class EscapeClearance(Constraint):
                 )
 
     def bind(self, plant: Plant) -> "BoundEscapeClearance":
-        """On a plant."""
         return BoundEscapeClearance(self, plant)
 
 
@@ -117,7 +103,6 @@ class BoundEscapeClearance(BoundBackupClearance):
         super().__init__(spec, machine)
 
     def read_constants(self) -> None:
-        """The point's motion, and the manoeuvres that it can make."""
         self._point = point = planar_point(self.plant, np.inf, self.spec.body)
         # What one hold makes of a state; x and y.
         self._hold = np.array([(a.low, a.high, a.drift, a.shift, a.keep, a.add) for a in point.axes]).T

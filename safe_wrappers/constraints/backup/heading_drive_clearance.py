@@ -21,33 +21,33 @@ from safe_wrappers.plants.queries.planar_robot import PlanarFrame, heading_drive
 
 _Circle = tuple[float, float, float]
 """Centre x, y and the radius to keep out of, margins included, m."""
-_RECOVERY_RATE = 1.0
-"""1/s: an unsafe start must shrink its violation at least this fast, where the drive can."""
+_RECOVERY_RATE = 1.0  # 1/s: an unsafe start must shrink its violation at least this fast, where the drive can
 _DECAY_PER_HOLD = 0.5
 """The share of the clearance that one hold may use up: the discrete class-K decay, alpha times the hold."""
-_ROW_SLACK = 0.02
-"""The share of the needed clearance that prediction may miss of what the linear rows aimed at."""
-_HAIR_M = 1e-7
-"""Between two discs at rest the rows of both meet at one control; this much slack lets a solver find it."""
-_RESERVE_M = 0.001
-"""Kept free before the boundary for what the closed form leaves out; only the backup may use it."""
+_ROW_SLACK = (
+    0.02  # the share of the needed clearance that prediction may miss of what the linear rows aimed at
+)
+_HAIR_M = (
+    1e-7  # between two discs at rest the rows of both meet at one control; slack for a solver to find it
+)
+_RESERVE_M = (
+    0.001  # kept free before the boundary for what the closed form leaves out; only the backup may use it
+)
 
 
 @dataclass
 class HeadingDriveClearance(Constraint):
     """Keep the stopping path of a planar robot out of every disc.
 
-    The robot slides on two joints with equal damping, turns on a hinge, and its drive pushes along the heading
-    only: nothing brakes it sideways. The backup manoeuvre brakes along the heading and holds it; clearance is counted
-    from the area that it sweeps until rest (`control/backup/heading_drive.py`), and never shrinks under it. A control
-    is admitted if one control step of it uses up at most half of the clearance.
+    The robot slides on two joints with equal damping, turns on a hinge, and its drive pushes along the heading only.
+    The backup manoeuvre brakes along the heading and holds it; clearance is counted from the area that it sweeps
+    until rest (`control/backup/heading_drive.py`), and never shrinks under it. A control is admitted if one control
+    step of it uses up at most half of the clearance.
 
-    What it promises: proved, up to what `margin` covers. From a safe state the backup is admissible, for any
-    number of discs, and the discs stay clear at every physics substep, while mass and damping are right to
-    within `uncertainty`, the measured position is right to within `state_error`, discs stand still and nothing
-    hits the robot. `margin` covers what the closed form leaves out: the curvature of the path within a step and the
-    turning servo's chatter, under 2 mm for the Point robot (measured, `tests/control`); a pushed vase adds 0.1 mm
-    a step.
+    Proved: from a safe state the backup is admissible, for any number of discs, and the discs stay clear at every
+    physics substep, while mass and damping are right to within `uncertainty`, the measured position to within
+    `state_error`, discs stand still and nothing hits the robot. `margin` covers what the closed form leaves out,
+    under 2 mm for the Point robot.
 
     Args:
         obstacles: `Disc` and `Discs`; they stand still.
@@ -56,9 +56,8 @@ class HeadingDriveClearance(Constraint):
         state_error: Bound on the error of the measured position, m.
         uncertainty: Relative uncertainty of mass and of damping, in [0, 1).
         brake: False: the backup coasts along the heading, too; it needs no drive, and more room.
-        detour: When a driving action is refused, first try the same drive while turning towards the nearer
-            tangent of the disc in the way, then turning alone; both only if admitted. No safety measure: a driver
-            that does not see the discs gets around them.
+        detour: When a driving action is refused, first try the same drive while turning towards the nearer tangent of
+            the disc in the way, then turning alone; both only if admitted. No safety measure.
     """
 
     obstacles: Sequence[Any]
@@ -80,7 +79,6 @@ class HeadingDriveClearance(Constraint):
             raise ConfigurationError(f"uncertainty is a fraction in [0, 1), got {self.uncertainty}")
 
     def bind(self, plant: Plant) -> "BoundHeadingDriveClearance":
-        """On a plant."""
         return BoundHeadingDriveClearance(self, plant)
 
 
@@ -99,7 +97,6 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         super().__init__(spec, machine)
 
     def read_constants(self) -> None:
-        """The drive, and what one control interval can change."""
         self.drive = drive = heading_drive(self.plant, self.spec.body, self.spec.uncertainty)
         # Predictions are made for the corners of the uncertainty: each must keep what is needed.
         self._models = drive.corners()

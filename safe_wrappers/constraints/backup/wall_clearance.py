@@ -1,12 +1,4 @@
-"""WallClearance: keep a point mass on two axes out of walls, counting its whole braking path.
-
-The backup manoeuvre brakes each axis by itself, fully, and in its last hold just to rest
-(`control/backup/point_among_walls.py`). From a safe state braking is admitted: after one hold of it the manoeuvre is
-the rest of the one that was clear before. At rest the braking control is zero. By induction the point never touches
-a wall, for any number of walls at once.
-
-Source: appendix "Relative degree and kinetic stopping insets", in two dimensions with box walls.
-"""
+"""WallClearance: keep a point mass on two axes out of walls, counting its whole braking path."""
 
 import math
 from dataclasses import dataclass
@@ -26,41 +18,41 @@ from safe_wrappers.plants.queries.walls import walls
 _Control = tuple[float, float]
 """Along x and along y, in the actuators' units."""
 
-_HAIR_M = 1e-7
-"""Extra distance of corrections, for rounding to float32; a state that has lost no more of it is inside."""
-_NOISE_M = 1e-12
-"""Rounding of float64 between a path and the rest of it."""
-_RECOVERY_S = 0.1
-"""Time constant, s, with which a violation must shrink from outside; less where the backup cannot."""
-_TURNS = 4
-"""How many walls, one after another, a correction may have to turn away from."""
-_HALVINGS = 5
-"""How finely a correction is moved back towards the proposal where the path fits and its rectangle does not."""
+_HAIR_M = (
+    1e-7  # extra distance of corrections, for rounding to float32; a state that has lost no more is inside
+)
+_NOISE_M = 1e-12  # rounding of float64 between a path and the rest of it
+_RECOVERY_S = (
+    0.1  # time constant, s, with which a violation must shrink from outside; less where the backup cannot
+)
+_TURNS = 4  # how many walls, one after another, a correction may have to turn away from
+_HALVINGS = 5  # steps that move a correction back towards the proposal where the path fits, not its rectangle
 
 
 @dataclass
 class WallClearance(Constraint):
     """Keep a point mass that is pushed along two axes out of every wall of a maze (PointMaze).
 
-    Walls and point are found in the MuJoCo model: the body on its two slides, and every fixed box, along x and y,
-    that it can collide with. A control is admitted if, held for one control step and followed by braking, it
-    keeps the point clear of them. A refused one is replaced by a control that slides along the wall.
+    Walls and point are found in the MuJoCo model. A control is admitted if, held for one control step and followed by
+    full braking of each axis, it keeps the point clear of every fixed box. A refused one is replaced by a control
+    that slides along the wall.
 
-    What it promises: proved. From a safe state the point never touches a wall, at any substep or in between. The
-    plant's mass, damping and gears must be the machine's (they are measured on its model; one that moves otherwise is
-    refused), walls stand still, and `velocity_clip` is the env's. `margin` covers rounding (under a micrometre) and
-    the expected position error. Under a plant's `delay_s` the state is predicted without the clip: proved up to that
-    speed.
+    Proved: from a safe state the point never touches a wall, at any substep or in between. The plant's mass, damping
+    and gears must be the machine's, walls stand still, and `velocity_clip` is the env's. Under a plant's `delay_s`
+    the state is predicted without the clip: proved up to that speed.
 
     Args:
-        margin: Fixed protective distance, beyond that at which MuJoCo reports a contact, m.
-        velocity_clip: Speed along each axis to which the env clips the motion at the start of every control step,
-            m/s (PointMaze: 5). None: not known; every clip is covered, by a more cautious count at corners.
+        margin: Fixed protective distance, beyond that at which MuJoCo reports a contact, m; covers rounding (under a
+            micrometre) and the position error.
+        velocity_clip: Speed along each axis to which the env clips the motion at the start of every control step, m/s
+            (PointMaze: 5). None: not known; every clip is covered, by a more cautious count at corners.
 
     Raises:
-        ConfigurationError: A number that is not one, or is negative.
-        UnsupportedEnvError: At binding: not a `MujocoPlant`, not a point on two slides with a force of its own
-            on each, or walls that are not boxes along x and y.
+        ConfigurationError: A number that is negative or not finite.
+        UnsupportedEnvError: At binding: not a `MujocoPlant`, not a point on two slides with a force of its own on
+            each, or walls that are not boxes along x and y.
+
+    Source: appendix "Relative degree and kinetic stopping insets", in two dimensions with box walls.
 
     Example:
         >>> import safe_wrappers as sw
@@ -80,7 +72,6 @@ class WallClearance(Constraint):
             self.velocity_clip = positive("velocity_clip", self.velocity_clip, "m/s")
 
     def bind(self, plant: Plant) -> "BoundWallClearance":
-        """On a plant."""
         return BoundWallClearance(self, plant)
 
 
@@ -98,7 +89,6 @@ class BoundWallClearance(BoundBackupClearance):
         super().__init__(spec, require_mujoco(plant, f"{needed} {hint}"))
 
     def read_constants(self) -> None:
-        """The point's motion, and the walls."""
         clip = self.spec.velocity_clip if self.spec.velocity_clip is not None else math.inf
         self._point = point = planar_point(self.plant, clip)
         around, reach = walls(self.plant.model, point.body)
@@ -106,10 +96,7 @@ class BoundWallClearance(BoundBackupClearance):
         self._room = reach + self.spec.margin
 
     def clearance(self) -> Array:
-        """Distance of the braking path from touching the nearest wall, margin not taken off, m, shape (1,).
-
-        No walls, no value: shape (0,).
-        """
+        """Distance of the braking path from touching a wall, margin not taken off, m, shape (1,); no walls: (0,)."""
         (i, j), (x, y), q, v = self._point.joints, self._point.origin, self.plant.qpos, self.plant.qvel
         motion = PointMotion(float(q[i]) + x, float(q[j]) + y, float(v[i]), float(v[j]))
         self._motion = self._among.clipped(motion)

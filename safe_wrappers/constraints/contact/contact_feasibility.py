@@ -26,16 +26,13 @@ class ContactFeasibility(Constraint):
     In a simulator forces are inside the model's cone by construction, and a foot whose force is on the cone slides.
     So the required cone is narrower by `friction_share`. Forces that pull are outside.
 
-    MuJoCo's default cones are pyramids inside the round one: in some directions a foot slides at 0.71 of the
-    friction. A share of 0.7 is below that in every direction; with a larger one a foot may slide within its share.
-
-    What it promises: for a plant that is right, an executed control that is not flagged keeps every contact force
-    of its control step, at every evaluation of the physics, within the cone and the tolerance. Such a control need
-    not exist, now (a foot that lands sideways slides) or in the next step. It is no balance: a robot may fall over on
-    feet that do not slide. Hence best effort.
+    Best effort: an executed control that is not flagged keeps every contact force of its control step, at every
+    evaluation of the physics, within cone and tolerance, for a plant that is right. Such a control need not exist: a
+    foot that lands sideways slides. It is no balance: a robot may fall over on feet that do not slide.
 
     Args:
-        friction_share: Of the model's friction coefficient, in (0, 1].
+        friction_share: Of the model's friction coefficient, in (0, 1]. MuJoCo's default cones are pyramids: above
+            0.71 a foot may slide within its share.
         tolerance: By how much a force may miss its cone, as a share of the robot's weight: light touches scrape.
         bodies: Names of the bodies whose contacts count; None is every moving body.
         margin: Kept free inside the cone, as a share of the weight. More than the tolerance refuses light touches.
@@ -63,7 +60,6 @@ class ContactFeasibility(Constraint):
             self.bodies = name_list("bodies", self.bodies, also="None for every body")
 
     def bind(self, plant: Plant) -> "BoundContactFeasibility":
-        """On a plant."""
         return BoundContactFeasibility(self, plant)
 
 
@@ -99,7 +95,7 @@ class BoundContactFeasibility(BoundSlacks):
     def insides(self, control: Array) -> Array:
         """By how much each body's contact forces stay inside the cone, at worst, shape (k,), shares of the weight.
 
-        Infinite for a body that touches nothing; not a number where the simulation is none.
+        Infinite for a body that touches nothing; NaN where the simulation has diverged.
         """
         found = self.plant.contact_forecast(control)
         if not found.finite:

@@ -18,8 +18,7 @@ from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 
-_FIXED = 1e-12
-"""Mobility along the normal, 1/kg, below which a geom cannot move into contact."""
+_FIXED = 1e-12  # mobility along the normal, 1/kg, below which a geom cannot move into contact
 
 
 @deprecated_parameters(renamed={"holds": "horizon"})
@@ -27,30 +26,23 @@ _FIXED = 1e-12
 class ImpactSpeedLimit(RolloutConstraint):
     """Keep the approach speed at every contact so low that its peak force stays below a limit.
 
-    A mass m that meets a spring k at the speed v, under a push F_p, presses with at most
-    `F_p + sqrt(F_p^2 + k m v^2)`. So the speed allowed at the first touch is `sqrt(F (F - 2 F_p) / (k m))`. F_p is
-    the push towards the obstacle (motors, gravity, centrifugal forces); a pull does not count: braking after contact
-    comes too late (`appendix.contact.impact.attenuation_after_delay`). m is the machine's effective mass at the
-    contact point and along its normal, by the model's Jacobian and inertia.
+    A mass m that meets a spring k at the speed v, under a push F_p, presses with at most `F_p + sqrt(F_p^2 + k m
+    v^2)`. m is the machine's effective mass at the contact point and along its normal; F_p is the push of motors,
+    gravity and centrifugal forces towards the obstacle; a pull does not count. A forecast of the held control, and
+    then of the actuated joints braking, is judged at every physics substep. In contact, the deflection counts as
+    stored energy.
 
-    The plant's model is stepped through the held action, and then with the actuated joints braking, for `horizon`
-    control steps in all; every contact on the way has to be slow enough. In contact already, the deflection that the
-    model shows counts as stored energy. Distances are MuJoCo's, between the declared geoms, at every physics substep.
+    Best effort: along the held step of an executed control that is not flagged every first touch keeps the limit, for
+    a plant that is right, a contact that is a linear spring of the declared stiffness, and one pair of geoms at a
+    time; friction, and forces through other contacts and joint stops, are not counted. Obstacles are taken where they
+    are. The physics step should be at most a tenth of `appendix.contact.impact.time_to_peak`.
 
-    What it promises: along the held step of an executed control that is not flagged every first touch keeps the
-    limit, for a plant that is right, a contact that is a linear spring of the declared stiffness, and one pair of
-    geoms at a time; friction, and forces through other contacts and joint stops, are not counted. Braking can keep it
-    afterwards if it takes no more than `horizon` control steps, or if `braking` is true. Obstacles are taken where
-    they are. The physics step should be at most a tenth of `appendix.contact.impact.time_to_peak`. Hence best effort.
-
-    `value`, N: the limit less the peak that a contact at the present speed would have. Before contact, without
-    `braking`, it is not below zero, since the machine may still slow down; with it, the speed counts that this
-    deceleration leaves at the contact.
+    `value`, N: the limit less the peak that a contact at the present speed would have; before contact not below zero,
+    unless `braking` is declared.
 
     Args:
         bodies: Names of the machine's bodies (all their geoms that can collide, or all if none can) or geoms.
-        against: Names of bodies or geoms of the world. Moving ones (mocap, free) are taken at their present place;
-            the speed of free ones counts.
+        against: Names of bodies or geoms of the world; the speed of free ones counts.
         force_limit: Largest peak force, N, of each pair of geoms. None takes the region's.
         region: Of a human body (`control.contact.body_regions`, ISO/TS 15066:2016, to be checked against its text):
             its spring, its effective mass, and its transient force limit.
@@ -59,9 +51,9 @@ class ImpactSpeedLimit(RolloutConstraint):
             region's; None is a rigid robot then.
         effective_mass: Of the machine, kg; None has it computed at every contact.
         braking: Deceleration, m/s^2, that the machine can give every declared point towards every obstacle from
-            everywhere: makes up for a look-ahead that ends before the machine stands. None relies on the forecast.
+            everywhere: makes up for a forecast that ends before the machine stands. None relies on the forecast.
         margin: Kept free below the limit, N.
-        horizon: Control steps to look ahead; cover the time that braking takes, and that of a contact.
+        horizon: Control steps to forecast; cover the time that braking takes, and that of a contact.
     """
 
     bodies: Sequence[str]
@@ -115,7 +107,6 @@ class ImpactSpeedLimit(RolloutConstraint):
         return force, float(series_stiffness(pad, region.stiffness)), np.inf if self.clamped else region.mass
 
     def bind(self, plant: Plant) -> "BoundImpactSpeedLimit":
-        """On a plant."""
         return BoundImpactSpeedLimit(self, plant)
 
 
@@ -126,7 +117,6 @@ class BoundImpactSpeedLimit(BoundRollout):
 
     @property
     def scale(self) -> float:
-        """The limit."""
         return self.spec._force
 
     def __init__(self, spec: ImpactSpeedLimit, plant: Plant) -> None:
@@ -211,7 +201,7 @@ class BoundImpactSpeedLimit(BoundRollout):
         """The braking with which every forecast goes on: what was admitted for its sake stays admissible."""
         return self.plant.braking()
 
-    def _now(self) -> Array:
+    def now(self) -> Array:
         m, d = self.plant.model, self._probe
         self._known: dict[tuple[int, bytes], Array] = {}
         data, what = self.plant.pose(), int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -249,14 +239,13 @@ class BoundImpactSpeedLimit(BoundRollout):
         return self._lost
 
     def slacks(self, control: Array) -> Array:
-        """What is left along the forecast of a control; see `BoundRollout`."""
         key = self.plant.model_version, control.tobytes()
         if key not in self._known:
             self._control = control
             self._known[key] = super().slacks(control)
         return self._known[key]
 
-    def _room(self, forecast: Forecast) -> Array:
+    def room(self, forecast: Forecast) -> Array:
         k, pairs = len(forecast.qpos), len(self._gaps.pairs)
         if not np.isfinite(forecast.qpos[-1]).all():
             return np.full((k, pairs), np.nan)  # MuJoCo's simulation has diverged

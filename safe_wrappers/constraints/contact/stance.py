@@ -31,22 +31,20 @@ from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.floating_base import equations_of_motion
 
-_SAME = 1e-9
-"""Distance from the program's answer that is rounding, control units."""
+_SAME = 1e-9  # distance from the program's answer that is rounding, control units
 
 
 @dataclass
 class Stance(Constraint):
     """Keep to torques under which standing feet could stay: the whole-body program at one instant.
 
-    The contacts with the fixed world that carry force under the policy's torques are to come to rest and stay; those
-    that carry none open. A control is admitted if forces inside the narrowed friction cones can hold the former, with
-    the driven joints predicted to stay in range at a constant acceleration until the control step ends. Else the
-    closest such control is the answer of a quadratic program (pyramids) or of a second-order cone program.
+    Contacts with the fixed world that carry force under the policy's torques are to come to rest and stay; the others
+    open. A control is admitted if forces inside the narrowed friction cones can hold them, with the driven joints
+    predicted to stay in range. Else the closest such control answers, by a quadratic program (pyramids) or a
+    second-order cone program.
 
-    What it promises: at this instant, for rigid contacts and a plant that is right, such forces exist. Landing feet,
-    soft contacts and changes of the configuration within the control step are not in it (`ContactFeasibility`
-    forecasts them). Where no control is admitted the step is infeasible. Hence best effort.
+    Best effort: at this instant, for rigid contacts and a plant that is right, such forces exist. Landing feet, soft
+    contacts and changes within the control step are not in it (`ContactFeasibility` forecasts them).
 
     Args:
         friction_share: Of the model's friction coefficient, in (0, 1].
@@ -82,7 +80,6 @@ class Stance(Constraint):
         self.settle_s = positive("settle_s", self.settle_s, "s")
 
     def bind(self, plant: Plant) -> "BoundStance":
-        """On a plant."""
         return BoundStance(self, plant)
 
 
@@ -112,7 +109,6 @@ class BoundStance(BoundConstraint):
         self._dofs = self.plant.model.jnt_dofadr[self._joints]
 
     def observe(self, memory: Memory) -> None:
-        """Nothing is known of this state yet."""
         self._known = False
         self._problem: WholeBodyProblem | None = None
         self._answer: WholeBodySolution | None = None

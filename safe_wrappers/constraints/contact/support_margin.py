@@ -19,18 +19,16 @@ from safe_wrappers.plants.plant import Plant
 class SupportMargin(Constraint):
     """Keep the zero moment point of the contact forces inside the hull of the contact points, by an inset.
 
-    It applies while there are at least three contact points in one plane that are not on a line; the robot starts to
-    tip about an edge where the point reaches it. On two point feet, in the air, or on contacts at several heights
-    there is no polygon and no requirement.
+    It applies while there are at least three contact points in one plane that are not on a line. On two point feet,
+    in the air, or on contacts at several heights there is no polygon and no requirement.
 
-    What it promises: for a plant that is right, an executed control that is not flagged keeps the inset at every
-    evaluation of the physics of its control step at which there is a polygon. Such a control need not exist, now or
-    in the next step; and crossing an edge predicts no particular fall. Hence best effort.
+    Best effort: an executed control that is not flagged keeps the inset at every evaluation of the physics of its
+    control step at which there is a polygon, for a plant that is right. Such a control need not exist; and crossing
+    an edge predicts no particular fall.
 
     Args:
-        inset: m, positive: pushing forces alone keep the point inside the hull, and on its edge while the robot tips.
-            An inset of millimetres can be crossed between two evaluations; and beyond the edge the distance does not
-            grow, so the answer may be the fallback where a closer one exists.
+        inset: m, positive: pushing forces alone keep the point inside the hull. An inset of millimetres can be
+            crossed between two evaluations.
         margin: Kept free inside the inset, m.
 
     Source: appendix "Physical contact feasibility constraints", third condition and footnote 8.
@@ -44,7 +42,6 @@ class SupportMargin(Constraint):
         self.margin = non_negative("margin", self.margin, "m")
 
     def bind(self, plant: Plant) -> "BoundSupportMargin":
-        """On a plant."""
         return BoundSupportMargin(self, plant)
 
 
@@ -58,7 +55,6 @@ class BoundSupportMargin(BoundSlacks):
         super().__init__(spec, require_contacts(plant, "SupportMargin"))
 
     def observe(self, memory: Memory) -> None:
-        """Nothing is known of this state yet."""
         self._known: list[tuple[ContactForecast, list[float]]] = []
 
     def _distances(self, found: ContactForecast) -> list[float]:

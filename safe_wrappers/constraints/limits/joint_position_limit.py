@@ -22,24 +22,20 @@ from safe_wrappers.plants.plant import Plant
 class JointPositionLimit(RolloutConstraint):
     """Keep joint positions in a range that may be narrower than the model's own.
 
-    Position under a force has relative degree two: a joint that is inside may be too fast to stay. So the
-    forecast goes on after the held control, braking every actuated joint, for `horizon` control steps in all;
-    the range has to hold at every physics substep of it.
+    A forecast of the held control, and then of every actuated joint braking, has to keep the range at every substep.
 
-    What it promises: an executed control that is not flagged keeps the range at every substep of its step, for
-    a plant that is right, and as long as braking takes no more than `horizon` steps leaves one that stops in time.
-    Gravity, coupling, contacts and passive joints can be stronger than the actuators. Hence best effort.
+    Best effort: an executed control that is not flagged keeps the range at every physics substep of its step, for a
+    plant that is right. Gravity, coupling, contacts and passive joints can be stronger than the actuators.
 
     Args:
-        lower: Smallest position, rad for hinges, m for slides; one number, or one per joint. None is the
-            model's own range.
+        lower: Smallest position, rad for hinges, m for slides; one, or one per joint. None: the model's own range.
         upper: Largest, likewise.
-        joints: Names. None takes every hinge and slide that an actuator drives directly, and is refused where an
-            action moves others as well.
-        margin: Kept free inside the range, in the same units.
-        horizon: Control steps to look ahead; cover the time that braking takes.
-        max_decrease: The farthest that a joint can move within `horizon` control steps in the declared envelope, rad
-            or m; states with more than that left need no forecast. None forecasts always.
+        joints: Names. None: every hinge and slide that an actuator drives directly; refused where an action moves
+            others as well.
+        margin: Kept free inside the range, rad or m.
+        horizon: Control steps to forecast; cover the braking time.
+        max_decrease: The farthest that a joint can move within `horizon` control steps, rad or m; states with more
+            than that left need no forecast.
     """
 
     lower: float | Sequence[float] | None = None
@@ -59,7 +55,6 @@ class JointPositionLimit(RolloutConstraint):
             self.joints = name_list("joints", self.joints, also="None for every driven joint")
 
     def bind(self, plant: Plant) -> "BoundJointPositionLimit":
-        """On a plant."""
         return BoundJointPositionLimit(self, plant)
 
 
@@ -88,7 +83,7 @@ class BoundJointPositionLimit(BoundRollout):
         if not (self._below.any() or self._above.any()):
             raise ConfigurationError("none of these joints has a range in the model: pass lower and upper")
 
-    def _now(self) -> Array:
+    def now(self) -> Array:
         return self._left(self.plant.qpos)
 
     def _left(self, qpos: Array) -> Array:
@@ -98,7 +93,7 @@ class BoundJointPositionLimit(BoundRollout):
             [(q - self._low)[..., self._below], (self._high - q)[..., self._above]], axis=-1
         )
 
-    def _room(self, forecast: Forecast) -> Array:
+    def room(self, forecast: Forecast) -> Array:
         return self._left(forecast.qpos)
 
 

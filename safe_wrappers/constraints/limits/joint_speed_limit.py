@@ -22,22 +22,19 @@ from safe_wrappers.plants.plant import Plant
 class JointSpeedLimit(RolloutConstraint):
     """Keep `|joint speed| <= limit`.
 
-    Speed under a force has relative degree one, so no stopping inset is needed: the rows bound the speed at
-    the end of the held control step, and a rollout of that step on the plant's model checks every physics
-    substep, contacts and joint limits included.
+    Rows bound the speed at the end of the held control step; a forecast of that step checks every physics substep.
 
-    What it promises: an executed control that is not flagged infeasible or fallback keeps the limit at every
-    substep of its step, exactly, for a plant that is right. Gravity, coupling, contacts or joint stops can be
-    stronger than the actuators: then the step is infeasible and the fallback runs. Hence best effort.
+    Best effort: an executed control that is not flagged keeps the limit at every physics substep of its step, for a
+    plant that is right. Gravity, coupling, contacts and joint stops can be stronger than the actuators.
 
     Args:
         limit: In rad/s for hinges, m/s for slides; one number, or one per named joint.
-        joints: Joint names. None takes every hinge and slide that an actuator drives directly, and is refused where
-            an action moves others as well.
-        margin: Kept free below the limit, for model and state error, in the same units.
-        horizon: Control steps to look ahead; the actuated joints are braked after the first.
-        max_decrease: The most that a joint's speed can rise within `horizon` control steps in the declared envelope,
-            rad/s or m/s; states with more than that left need no forecast. None forecasts always.
+        joints: Names. None: every hinge and slide that an actuator drives directly; refused where an action moves
+            others as well.
+        margin: Kept free below the limit, rad/s or m/s.
+        horizon: Control steps to forecast; the actuated joints brake after the first.
+        max_decrease: The most that a joint's speed can rise within `horizon` control steps, rad/s or m/s; states with
+            more than that left need no forecast.
     """
 
     limit: float | Sequence[float]
@@ -62,7 +59,6 @@ class JointSpeedLimit(RolloutConstraint):
             raise ConfigurationError(f"the margin {self.margin} leaves nothing of the limit {self.limit}")
 
     def bind(self, plant: Plant) -> "BoundJointSpeedLimit":
-        """On a plant."""
         return BoundJointSpeedLimit(self, plant)
 
 
@@ -73,7 +69,6 @@ class BoundJointSpeedLimit(BoundRollout):
 
     @property
     def scale(self) -> float:
-        """The limit."""
         return float(np.min(self.spec.limit))
 
     def __init__(self, spec: JointSpeedLimit, plant: Plant) -> None:
@@ -89,17 +84,17 @@ class BoundJointSpeedLimit(BoundRollout):
         self._bound = limits - self.spec.margin
         self._limits = limits
 
-    def _now(self) -> Array:
+    def now(self) -> Array:
         """Speed left below the limit, per joint, rad/s or m/s."""
         self._speeds = np.abs(self.plant.qvel[self._dofs])
         return np.asarray(self._limits - self._speeds)
 
-    def _room(self, forecast: Forecast) -> Array:
+    def room(self, forecast: Forecast) -> Array:
         return np.asarray(self._limits - np.abs(forecast.qvel[:, self._dofs]))
 
     def slacks(self, control: Array) -> Array:
         """What is left below the bound along the forecast and at its end, per joint, shape (2 k,)."""
-        left = self._room(self.plant.forecast(control, self.spec.horizon)) - self.spec.margin
+        left = self.room(self.plant.forecast(control, self.spec.horizon)) - self.spec.margin
         over = np.maximum(self._speeds - self._bound, 0.0)
         # From above the bound, joint by joint: never faster on the way, and closer at the end.
         decay = np.exp(-self.spec.horizon * self.plant.control_dt / RECOVERY_S)

@@ -26,14 +26,14 @@ def _direct(model: mujoco.MjModel) -> list[int]:
 def refuse_uncovered(model: mujoco.MjModel, joints: Iterable[int], remedy: str, forces: bool = True) -> None:
     """Refuse to take the driven joints for all where an action moves others of these joints as well.
 
-    It does where it is no force, where an actuator pulls at a tendon or a site, and where
-    one drives a ball joint. A joint that nothing drives in any other machine is passive, and no action's.
+    It does where it is no force, pulls at a tendon or a site, or drives a ball joint. In other machines a joint that
+    nothing drives is passive.
 
     Args:
         model: The machine's.
         joints: Ids of the joints in question.
-        remedy: What to do instead.
-        forces: Whether actions are forces, and not displacements (a `DisplacementPlant`'s).
+        remedy: What to do instead, for the error's message.
+        forces: Whether actions are forces; False: displacements.
 
     Raises:
         ConfigurationError: With the joints that would be covered, and those that would not.
@@ -66,8 +66,7 @@ def scalar_joints(plant: MujocoPlant, names: Sequence[str] | None) -> list[int]:
     """Ids of the named joints, or of every hinge and slide that an actuator drives directly.
 
     Raises:
-        ConfigurationError: A named joint is neither hinge nor slide; or no actuator drives one directly, or an
-            action moves others, too.
+        ConfigurationError: No hinge or slide is driven, an action moves others as well, or a named joint is neither.
         UnknownNameError: No joint of that name.
     """
     model = plant.model

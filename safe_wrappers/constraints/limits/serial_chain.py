@@ -19,8 +19,7 @@ _HINGE_OR_SLIDE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_S
 class SerialChain:
     """Hinges and slides that carry a frame, and what their speeds do to it.
 
-    Jacobians come from the joints' axes and anchors after forward kinematics alone, on data of its own, so that a
-    forecast of many states costs little.
+    Jacobians come from the joints' axes and anchors, by forward kinematics on data of its own.
 
     Args:
         plant: Bound.
@@ -31,7 +30,7 @@ class SerialChain:
         joints: Ids of the n hinges and slides between the world and the frame, from the base on, shape (n,).
         qpos: Their addresses in qpos, shape (n,).
         dofs: Their addresses in qvel, shape (n,).
-        scalar: Nothing else carries the frame: no ball, no free joint.
+        scalar: No ball and no free joint carries the frame.
 
     Raises:
         UnknownNameError: No frame of that name.
@@ -68,7 +67,7 @@ class SerialChain:
 
         Raises:
             UnknownNameError: No joint of that name.
-            ConfigurationError: One that does not carry the frame, or is named twice; or none that is driven.
+            ConfigurationError: A joint that does not carry the frame, or is named twice; or none is driven.
         """
         model = self._model
         there = ", ".join(str(model.joint(j).name) for j in self.joints)
@@ -99,7 +98,7 @@ class SerialChain:
         return str(self._model.joint(self.joints[column]).name)
 
     def place(self, data: mujoco.MjData) -> None:
-        """Put the bodies that the env moves by hand (mocap) where they are, for Jacobians from now on."""
+        """Take over the poses of the bodies that the env moves by hand (mocap), for Jacobians from now on."""
         if self._model.nmocap:
             self._data.mocap_pos[:], self._data.mocap_quat[:] = data.mocap_pos, data.mocap_quat
 
@@ -107,8 +106,8 @@ class SerialChain:
         """At finite positions of shape (k, nq).
 
         Returns:
-            Jacobians, shape (k, 6, n): velocity of the frame's origin and angular velocity, in the world's axes, per
-            joint; and the frame's axes as columns, shape (k, 3, 3).
+            Jacobians, shape (k, 6, n), velocity of the frame's origin over angular velocity, in the world's axes; and
+            the frame's axes as columns, shape (k, 3, 3).
         """
         model, data, joints, k = self._model, self._data, self.joints, len(qpos)
         arms, axes = np.empty((k, len(joints), 3)), np.empty((k, len(joints), 3))
@@ -129,10 +128,6 @@ class SerialChain:
         """Configurations with these joints uniform in their ranges, shape (count, nq).
 
         A hinge without a range turns once; a slide without one, and every other joint, stays at the model's zero.
-
-        Args:
-            rng: Draws them.
-            count: How many.
         """
         model = self._model
         zero = model.qpos0[self.qpos][:, None]

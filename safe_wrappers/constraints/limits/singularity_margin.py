@@ -23,14 +23,11 @@ from safe_wrappers.filter.constraint import Array, HalfSpaces
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 
-_SAMPLES = 2000
-"""Configurations that say which manipulability can be reached."""
-_STILL = 1e-9
-"""Columns with a smaller norm are zero, m or rad per rad."""
+_SAMPLES = 2000  # configurations that say which manipulability can be reached
+_STILL = 1e-9  # columns with a smaller norm are zero, m or rad per rad
 _DECAY_HOLDS = 2.0
-"""Time constant of the rows, control intervals: longer brakes early, shorter is refused by the forecast."""
-_ALONG_S = 1e-5
-"""Width of the difference for the curvature of w along the motion, s."""
+"""Time constant of the rows, control intervals: longer brakes early, shorter is refused by forecasts."""
+_ALONG_S = 1e-5  # width of the difference for the curvature of w along the motion, s
 
 
 @deprecated_parameters(renamed=RENAMED)
@@ -38,26 +35,14 @@ _ALONG_S = 1e-5
 class SingularityMargin(RolloutConstraint):
     """Keep the manipulability `w = sqrt(det(J J'))` of a frame, for declared task directions, above a threshold.
 
-    Near a singular pose a Cartesian command needs unbounded joint rates. w by itself bounds no joint rate, so a
-    threshold has to be *validated* for the machine. Given `task_speed` and `rate_limit` instead of a threshold, it is
-    the smallest w above which none of 2,000 sampled configurations needs more than the limit at that speed in any
-    direction; `control.filtering.manipulability.validated_threshold` says what that proves, and does it for other
-    samples.
+    w bounds no joint rate, so a threshold has to be validated for the machine. With `task_speed` and `rate_limit` it
+    is the smallest w above which none of 2,000 sampled configurations needs more than the limit at that speed. With
+    as many joints as directions the sign of the determinant counts as well. `value` is w over the threshold, less 1.
 
-    A torque changes w through two integrations. So the forecast goes on after the held control, braking every
-    actuated joint, for `horizon` control steps in all; w has to stay at every physics substep of it. Where controls
-    are
-    forces, rows `w'' + 2 a w' + a^2 (w - threshold) >= 0` are the first guess. With as many joints as directions the
-    determinant's sign counts, too: an arm does not pass through the singular pose between two substeps.
-
-    What it promises: an executed control that is not flagged keeps the threshold at every substep of its step, for a
-    plant that is right, and as long as braking takes no more than `horizon` steps leaves one that stops in time.
-    Gravity, contacts and coupling can be stronger than the actuators. Hence best effort. It limits neither joint
-    rates (`JointSpeedLimit`) nor torques.
-
-    `value`, and so `cbf/margin`, is w over the threshold, less 1: -1 is singular. w itself has no fixed scale (at
-    most 0.01 m^2 for Reacher, 0.003 m^6 for Fetch's hand). A start below the threshold (Reacher's and Pusher's arms
-    begin stretched) counts as `cbf/unsafe`; the filter brings w up again.
+    Best effort: a forecast of the held control, and then of every actuated joint braking, keeps w. An executed
+    control that is not flagged keeps the threshold at every physics substep of its step, for a plant that is right.
+    Gravity, contacts and coupling can be stronger than the actuators. Joint rates (`JointSpeedLimit`) and torques are
+    not limited.
 
     Args:
         threshold: Smallest w, in m^k for k translations and hinges (times `length` to the number of rotations). None
@@ -69,14 +54,14 @@ class SingularityMargin(RolloutConstraint):
         rotations: About these axes, some of "xyz".
         length: Length that weighs a rotation against a translation, m; needed if there are both.
         frame: Axes of directions and rotations: the "world"'s or the frame's "own".
-        joints: Names of the joints that do the task. None takes those that an actuator drives directly, if they move
-            the frame. Where none does (Fetch's arm is pulled by its hand) name them.
+        joints: Names of the joints that do the task. None: those that an actuator drives directly and that move the
+            frame.
         task_speed: Speed that has to be possible in every direction, m/s (rad/s for rotations alone).
         rate_limit: Largest rate of each joint at that speed, rad/s for hinges, m/s for slides.
         margin: Kept free above the threshold, as a share of it.
-        horizon: Control steps to look ahead; cover the time that braking takes.
-        max_decrease: The most that w can fall within `horizon` control steps in the declared envelope, in shares of
-            the threshold; states with more than that left need no forecast. None forecasts always.
+        horizon: Control steps to forecast; cover the braking time.
+        max_decrease: The most that w can fall within `horizon` control steps, in shares of the threshold; states with
+            more than that left need no forecast.
 
     Attributes:
         validated: What the sample said of the threshold; None if it was given, or before the constraint is bound.
@@ -129,7 +114,6 @@ class SingularityMargin(RolloutConstraint):
         self._rows, self._weights = task_rows(self.directions, self.rotations, self.length)
 
     def bind(self, plant: Plant) -> "BoundSingularityMargin":
-        """On a plant."""
         return BoundSingularityMargin(self, plant)
 
 
@@ -201,14 +185,14 @@ class BoundSingularityMargin(BoundRollout):
         return np.concatenate([back @ jacobians[..., :3, :], back @ jacobians[..., 3:, :]], axis=-2)
 
     def _measure(self, qpos: Array) -> Array:
-        """w, shape (k,), below zero beyond the singular pose; NaN where a position is no number."""
+        """w, shape (k,), below zero beyond the singular pose; NaN where a position is not finite."""
         w = np.full(len(qpos), np.nan)
         finite = np.isfinite(qpos).all(axis=1)
         task = self._task(qpos[finite])
         w[finite] = self._side * np.linalg.det(task) if self._signed else manipulability(task)
         return w
 
-    def _now(self) -> Array:
+    def now(self) -> Array:
         self._chain.place(self.plant.pose())
         self._side = 1.0
         w = self._measure(self.plant.qpos[None])
@@ -216,7 +200,7 @@ class BoundSingularityMargin(BoundRollout):
             self._side, w = -1.0, -w
         return np.asarray(w / self._threshold - 1.0)
 
-    def _room(self, forecast: Forecast) -> Array:
+    def room(self, forecast: Forecast) -> Array:
         return np.asarray(self._measure(forecast.qpos) / self._threshold - 1.0)[:, None]
 
     def _slope(self, qpos: Array) -> Array:
@@ -236,9 +220,9 @@ class BoundSingularityMargin(BoundRollout):
         )
 
     def rows(self) -> HalfSpaces:
-        """One row, a first guess for the forecast.
+        """One row `w'' + 2 a w' + a^2 (w - threshold) >= 0`, a first guess for the forecast, which decides.
 
-        Where a ball or free joint carries the frame as well, or controls are no forces, it is that of every forecast.
+        Where a ball or free joint carries the frame as well, or controls are no forces: those of `BoundRollout`.
         """
         if not (self._chain.scalar and self.plant.has_acceleration):
             return super().rows()

@@ -20,10 +20,10 @@ from safe_wrappers.plants.plant import Plant
 class Upright(RolloutConstraint):
     """Keep a body's height in a range and its own z axis within an angle of the vertical.
 
-    What it promises: an executed control that is not flagged keeps both at every physics substep of its step,
-    for a plant that is right. It looks `horizon` control steps ahead, with the actuated joints braked after the
-    first: that refuses controls shortly before a fall, and does not balance. A robot on legs can be unrecoverable
-    long before it falls. Hence best effort.
+    A forecast of the held control, and then of the actuated joints braking, has to keep both at every substep.
+
+    Best effort: an executed control that is not flagged keeps both at every physics substep of its step, for a plant
+    that is right. It does not balance: a robot on legs can be unrecoverable long before it falls.
 
     Args:
         body: Its name.
@@ -31,9 +31,9 @@ class Upright(RolloutConstraint):
         highest: Likewise.
         tilt: Largest angle between the body's z axis and the world's, rad; None: no bound.
         margin: Kept free, m for the heights and rad for the tilt.
-        horizon: Control steps to look ahead.
-        max_decrease: The most that height (m) and tilt (rad) can change within `horizon` control steps in the
-            declared envelope; states with more than that left need no forecast. None forecasts always.
+        horizon: Control steps to forecast.
+        max_decrease: The most that height (m) and tilt (rad) can change within `horizon` control steps; states with
+            more than that left need no forecast.
     """
 
     body: str = "torso"
@@ -72,7 +72,6 @@ class Upright(RolloutConstraint):
         return low, math.inf if self.highest is None else self.highest
 
     def bind(self, plant: Plant) -> "BoundUpright":
-        """On a plant."""
         return BoundUpright(self, plant)
 
 
@@ -85,7 +84,7 @@ class BoundUpright(BoundRollout):
         super().__init__(spec, plant)
         self._body = self.plant.named("body", self.spec.body)
 
-    def _now(self) -> Array:
+    def now(self) -> Array:
         pose = self.plant.pose()
         return self._left(pose.xpos[self._body, 2], pose.xmat[self._body, 8])
 
@@ -100,7 +99,7 @@ class BoundUpright(BoundRollout):
             left.append(self.spec.tilt - np.arccos(np.clip(cosine, -1.0, 1.0)))
         return np.array(left)
 
-    def _room(self, forecast: Forecast) -> Array:
+    def room(self, forecast: Forecast) -> Array:
         poses = forecast.poses()
         left = self._left(poses.frames[:, self._body, 2], poses.axes[:, self._body, 2, 2])
         return np.asarray(left.T)

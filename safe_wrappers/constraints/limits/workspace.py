@@ -22,13 +22,11 @@ from safe_wrappers.plants.plant import Plant
 class Workspace(RolloutConstraint):
     """Keep points of the machine inside an axis-aligned box and outside obstacles, in world coordinates.
 
-    Position under a force has relative degree two: a point that is inside may be too fast to stay. So the
-    forecast goes on after the held control, braking every actuated joint, for `horizon` control steps in all; the
-    workspace has to hold at every physics substep of it. Moving obstacles are taken where they are.
+    A forecast of the held control, and then of every actuated joint braking, has to keep them at every substep.
+    Moving obstacles are taken where they are.
 
-    What it promises: an executed control that is not flagged keeps the workspace at every substep of its step,
-    for a plant that is right, and as long as braking takes no more than `horizon` steps leaves one that stops in
-    time. Near a singular pose, or under loads stronger than the actuators, a point can move on. Hence best effort.
+    Best effort: an executed control that is not flagged keeps the workspace at every physics substep of its step, for
+    a plant that is right. Near a singular pose, or under loads stronger than the actuators, a point can move on.
 
     Args:
         low: Smallest x, y, z, m; None is no bound, for all or for one: `[None, -0.5, None]`.
@@ -39,9 +37,9 @@ class Workspace(RolloutConstraint):
         geoms: Names of geoms: their centres.
         radius: Of the machine around each point, m.
         margin: Kept free, m.
-        horizon: Control steps to look ahead; cover the time that braking takes.
-        max_decrease: The farthest that a point can move within `horizon` control steps in the declared envelope, m;
-            states with more than that left need no forecast. None forecasts always.
+        horizon: Control steps to forecast; cover the braking time.
+        max_decrease: The farthest that a point can move within `horizon` control steps, m; states with more than that
+            left need no forecast.
     """
 
     low: Sequence[float | None] | None = None
@@ -76,7 +74,6 @@ class Workspace(RolloutConstraint):
             )
 
     def bind(self, plant: Plant) -> "BoundWorkspace":
-        """On a plant."""
         return BoundWorkspace(self, plant)
 
 
@@ -120,12 +117,12 @@ class BoundWorkspace(BoundRollout):
             left.append(surfaces.reshape(k, points.shape[1] * surfaces.shape[1]))
         return np.concatenate(left, axis=1) - self.spec.radius
 
-    def _now(self) -> Array:
+    def now(self) -> Array:
         pose = self.plant.pose()
         points = self._points(pose.xpos[None], pose.xmat.reshape(1, -1, 3, 3))
         return np.asarray(self._left(points)[0])
 
-    def _room(self, forecast: Forecast) -> Array:
+    def room(self, forecast: Forecast) -> Array:
         poses = forecast.poses()
         return self._left(self._points(poses.frames, poses.axes))
 

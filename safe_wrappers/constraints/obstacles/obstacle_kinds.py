@@ -31,16 +31,10 @@ def obstacle_from(data: Any) -> Obstacle:
 def obstacles_from(
     given: Any, name: str = "obstacles", kinds: tuple[type[Any], ...] = (), optional: bool = False
 ) -> list[Any]:
-    """A list of obstacles, each itself or as its dict.
-
-    Args:
-        given: What the user gave.
-        name: Of the parameter, for messages.
-        kinds: Of obstacles that fit; none: all.
-        optional: Whether the list may be empty.
+    """A list of obstacles, each itself or as its dict, of these kinds (none: all); it may be empty if `optional`.
 
     Raises:
-        ConfigurationError: It is no such list.
+        ConfigurationError: It is no such list; the message names the parameter.
     """
     fitting = " and ".join(kind.__name__ for kind in kinds) or "obstacles"
     if isinstance(given, dict | str) or not isinstance(given, Sequence) or not (given or optional):

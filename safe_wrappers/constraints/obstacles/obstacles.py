@@ -1,7 +1,6 @@
 """Things to keep clear of: discs, spheres, boxes and planes; what moves is published by the env (`Discs`).
 
-Each answers, for a point, how far its surface is and in which direction it lies. Plain data, so that a wrapper
-that is given obstacles can be recorded and rebuilt.
+They are plain data, so that a wrapper that is given obstacles can be recorded and rebuilt.
 """
 
 from abc import ABC, abstractmethod
@@ -80,7 +79,6 @@ class _Round(ABC):
         return 0.0
 
     def nearest(self, point: Array, plant: Plant) -> Nearest:
-        """One surface per centre."""
         centers = self.centers(plant)
         d = centers.shape[1]
         refuse_more_dimensions(d, point.size)
@@ -97,7 +95,6 @@ class _Round(ABC):
         return Nearest(length - self.radius, normal, moving, curvature)
 
     def distances(self, points: Array, plant: Plant) -> Array:
-        """Shape (k, n), m."""
         centers = self.centers(plant)
         d = centers.shape[1]
         refuse_more_dimensions(d, points.shape[1])
@@ -117,7 +114,6 @@ class Disc(_Round):
         self.radius = positive("radius", self.radius, "m")
 
     def centers(self, plant: Plant) -> Array:
-        """The centre, shape (1, 2), m."""
         return np.array([self.center])
 
 
@@ -133,7 +129,6 @@ class Sphere(_Round):
         self.radius = positive("radius", self.radius, "m")
 
     def centers(self, plant: Plant) -> Array:
-        """The centre, shape (1, 3), m."""
         return np.array([self.center])
 
 
@@ -153,7 +148,6 @@ class Plane:
         self.normal = [n / length for n in self.normal]
 
     def nearest(self, point: Array, plant: Plant) -> Nearest:
-        """One surface."""
         d = len(self.point)
         refuse_more_dimensions(d, point.size)
         normal = np.zeros((1, point.size))
@@ -162,7 +156,6 @@ class Plane:
         return Nearest(np.array([distance]), normal, np.zeros_like(normal), np.zeros_like(normal))
 
     def distances(self, points: Array, plant: Plant) -> Array:
-        """Shape (k, 1), m."""
         offsets = points[:, : len(self.point)] - np.asarray(self.point)
         return np.asarray((offsets @ np.asarray(self.normal))[:, None])
 
@@ -202,7 +195,6 @@ class Box:
         return Nearest(np.array([distance]), normal, np.zeros_like(normal), curvature)
 
     def distances(self, points: Array, plant: Plant) -> Array:
-        """Shape (k, 1), m."""
         offsets = points[:, : len(self.center)] - np.asarray(self.center)
         beyond = np.abs(offsets) - np.asarray(self.half_size)
         outside = np.sqrt((np.maximum(beyond, 0.0) ** 2).sum(axis=1))
@@ -227,7 +219,6 @@ class Discs(_Round):
         self.radius = positive("radius", self.radius, "m")
 
     def centers(self, plant: Plant) -> Array:
-        """Where they are now, shape (k, 2) or (k, 3), m."""
         where = np.asarray(plant.attribute(self.attribute), dtype=np.float64)
         if where.ndim != 2 or where.shape[1] not in (2, 3):
             raise ConfigurationError(

@@ -20,14 +20,12 @@ _SHARES = (1e-4, 0.1, 0.25, 0.5, 1.0)
 class TrackedDiscs:
     """Discs (or balls) that an `OcclusionPenalty` inside the filter tracks.
 
-    Each is the ellipsoid of `sigmas` standard deviations about its estimate: uncertainty counts in the direction of
-    the machine only. The surface moves with the estimated velocity, and grows: its speed towards the machine is the
-    fastest at which the bound comes nearer within `horizon_s` without further measurements.
+    Each is the ellipsoid of `sigmas` standard deviations about its estimate. The surface moves with the estimated
+    velocity, and grows: its speed towards the machine is the fastest at which the bound comes nearer within
+    `horizon_s` without further measurements. `Workspace` uses the distances alone, without growth.
 
-    What it promises: a centre leaves its ellipsoid with the probability of the tail of `sigmas` (for Gaussian noise
-    and a true motion model: 32 %, 4.6 % and 0.27 % of the time for 1, 2 and 3 in one dimension, 61 %, 14 % and 1.1 %
-    in the plane), for each obstacle at each moment; moments are not independent. It is no hard bound. `Workspace`
-    uses the distances alone, without growth.
+    A centre leaves its ellipsoid with the probability of the tail of `sigmas` (for Gaussian noise, a true motion
+    model and 3: 0.27 % of the time on a line, 1.1 % in the plane), each obstacle at each moment. It is no hard bound.
 
     Args:
         radius: m; the machine's own radius is the constraint's business.
