@@ -17,8 +17,7 @@ from safe_wrappers.constraints.limits.singularity_margin import SingularityMargi
 from safe_wrappers.constraints.limits.speed_limit import SpeedLimit
 from safe_wrappers.constraints.limits.upright import Upright
 from safe_wrappers.constraints.limits.workspace import Workspace
-from safe_wrappers.constraints.obstacles.obstacles import Box, Disc, Discs, Plane, Sphere
-from safe_wrappers.constraints.obstacles.tracked_discs import TrackedDiscs
+from safe_wrappers.constraints.obstacles import Box, Disc, Discs, Plane, Sphere, TrackedDiscs
 from safe_wrappers.constraints.track_permission import TrackPermission
 from safe_wrappers.constraints.traction import Traction
 

@@ -7,8 +7,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from safe_wrappers.checks import name_list, non_negative, positive
-from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
-from safe_wrappers.constraints.obstacles.obstacles import Nearest
+from safe_wrappers.constraints.obstacles import Nearest, obstacles_from
 from safe_wrappers.control.backup.stopping import sampled_acceleration_limit, sampled_inset
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, HalfSpaces, Memory

@@ -19,26 +19,16 @@ from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.driven_wheels import DrivenWheels
 
-_CAUTION = (
-    0.5  # standard deviations of the estimated peak's slip by which the limit stays on the rising side of it
-)
+_CAUTION = 0.5  # standard deviations of the believed peak's slip by which the limit stays below it
 _NOISE = 0.02  # standard deviation of a measured friction coefficient while the slip stands still
-_NOISE_PER_SLIP = (
-    1.5  # and what a slip that changed within the interval adds: the slip at the force is not known
-)
+_NOISE_PER_SLIP = 1.5  # what a slip that changed within the interval adds to it
 _LEAST_LIMIT = 0.1  # share of `max_slip` that is always allowed: without any slip there is no force
-_SPEED_ERROR_FACTOR = (
-    2.0  # times the ground speed's recent error of prediction: what is kept free for the next one
-)
-_SPEED_ERROR_IGNORED = (
-    0.05  # share of the room below the limit that such an error may take without being counted
-)
+_SPEED_ERROR_FACTOR = 2.0  # times the recent error of the predicted ground speed: kept free for the next
+_SPEED_ERROR_IGNORED = 0.05  # share of the room below the limit that such an error may take uncounted
 _SPEED_ERROR_FADE = 0.9  # share of such an error that still counts one control step later
 _LEAST_SHARE = 0.3  # of the slip that must be along the heading: the force across is not measured
 _UNBOUNDED = 1e9  # stands for the control of an actuator without limits
-_LEAST_LOAD = (
-    0.05  # share of the largest load seen below which a wheel counts as in the air: it measures nothing
-)
+_LEAST_LOAD = 0.05  # share of the largest load seen below which a wheel counts as in the air
 _MOST_FRICTION = 3.0  # force over load beyond which something else than the ground held the wheel
 _ROUNDING = 1e-6  # share of a control below which its change is the action space's own rounding (float32)
 _SOLVERS_NOISE = 1e-9

@@ -7,9 +7,7 @@ import numpy as np
 from safe_wrappers.filter.constraint import Array, HalfSpaces
 
 _STEP = 1e-4  # width of the differences, as a share of the control's range
-_INWARD = (
-    0.01  # aim this share of the violation beyond the boundary, so that repeated linearisations end inside it
-)
+_INWARD = 0.01  # aim this share of the violation beyond the boundary, to end inside it
 
 
 def linearize(slacks: Callable[[Array], Array], control: Array, low: Array, high: Array) -> HalfSpaces:

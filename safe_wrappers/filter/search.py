@@ -20,14 +20,8 @@ Rows = tuple[Array, Array]
 _NO_ROWS: Rows = (np.zeros((0, 0)), np.zeros(0))
 
 _LINEARIZATIONS = 6  # how often a refused control is answered by linearising anew about it
-_OVERSHOOTS = (0.02, 0.1)
-"""Shares by which a refused correction is made larger where no constraint can linearise anew."""
-_BLENDS = (
-    0.1,
-    0.25,
-    0.5,
-    0.75,
-)  # how far a refused control is moved towards the backup control, step by step
+_OVERSHOOTS = (0.02, 0.1)  # shares by which a refused correction is made larger
+_BLENDS = (0.1, 0.25, 0.5, 0.75)  # shares of the way from a refused control to the backup control
 
 
 class Stage(IntEnum):

@@ -11,8 +11,7 @@ import numpy as np
 
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundDetourClearance, Detour
-from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
-from safe_wrappers.constraints.obstacles.obstacles import Disc, Discs
+from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.numerics.outlines import convex_outline, distances_to_outline
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
@@ -23,9 +22,7 @@ from safe_wrappers.plants.queries.coasting import Coasting, Course
 
 _SAME_M = 1e-6  # rounding of a rollout: a smaller loss of clearance is none
 _STILL = 1e-9  # states (m, rad, m/s, rad/s) and places of discs that differ by less are the same
-_WAY_OUT_M = (
-    1e-3  # clearance that a control has to gain at its end where zero control leaves less than the margin
-)
+_WAY_OUT_M = 1e-3  # gain of clearance that is asked for where zero control leaves less than the margin
 _RECOVERED = 0.5  # share of the best gain of clearance that a control has to reach from inside an obstacle
 _AROUND = ((1.0, 0.5), (1.0, 0.0), (1.0, -1.0), (-0.5, -1.0))
 """Shares of the drive for the outer and the inner actuator of a detour, as they are tried."""

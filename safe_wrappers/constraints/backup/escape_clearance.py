@@ -9,9 +9,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundBackupClearance
-from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
-from safe_wrappers.constraints.obstacles.obstacles import Discs, distances
-from safe_wrappers.constraints.obstacles.tracked_discs import TrackedDiscs
+from safe_wrappers.constraints.obstacles import Discs, TrackedDiscs, distances, obstacles_from
 from safe_wrappers.control.backup.evasive_maneuvers import EvasiveManeuvers, Maneuver
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, Constraint, Memory

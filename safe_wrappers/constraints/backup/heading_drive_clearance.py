@@ -10,8 +10,7 @@ import numpy as np
 
 from safe_wrappers.checks import non_negative
 from safe_wrappers.constraints.backup.base import BoundDetourClearance
-from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
-from safe_wrappers.constraints.obstacles.obstacles import Disc, Discs
+from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.backup.heading_drive import StoppingPath
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, Constraint, HalfSpaces
@@ -24,15 +23,9 @@ _Circle = tuple[float, float, float]
 _RECOVERY_RATE = 1.0  # 1/s: an unsafe start must shrink its violation at least this fast, where the drive can
 _DECAY_PER_HOLD = 0.5
 """The share of the clearance that one hold may use up: the discrete class-K decay, alpha times the hold."""
-_ROW_SLACK = (
-    0.02  # the share of the needed clearance that prediction may miss of what the linear rows aimed at
-)
-_HAIR_M = (
-    1e-7  # between two discs at rest the rows of both meet at one control; slack for a solver to find it
-)
-_RESERVE_M = (
-    0.001  # kept free before the boundary for what the closed form leaves out; only the backup may use it
-)
+_ROW_SLACK = 0.02  # share of the needed clearance that prediction may miss of what the rows aimed at
+_HAIR_M = 1e-7  # slack for a solver where the rows of two discs meet at one control
+_RESERVE_M = 0.001  # kept free for what the closed form leaves out; only the backup may use it
 
 
 @dataclass

@@ -18,13 +18,9 @@ from safe_wrappers.plants.queries.walls import walls
 _Control = tuple[float, float]
 """Along x and along y, in the actuators' units."""
 
-_HAIR_M = (
-    1e-7  # extra distance of corrections, for rounding to float32; a state that has lost no more is inside
-)
+_HAIR_M = 1e-7  # extra distance of corrections, for rounding to float32
 _NOISE_M = 1e-12  # rounding of float64 between a path and the rest of it
-_RECOVERY_S = (
-    0.1  # time constant, s, with which a violation must shrink from outside; less where the backup cannot
-)
+_RECOVERY_S = 0.1  # time constant, s, with which a violation must shrink from outside
 _TURNS = 4  # how many walls, one after another, a correction may have to turn away from
 _HALVINGS = 5  # steps that move a correction back towards the proposal where the path fits, not its rectangle
 

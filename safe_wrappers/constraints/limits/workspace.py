@@ -7,8 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from safe_wrappers.checks import name_list, non_negative
-from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
-from safe_wrappers.constraints.obstacles.obstacles import distances
+from safe_wrappers.constraints.obstacles import distances, obstacles_from
 from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
