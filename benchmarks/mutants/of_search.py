@@ -105,11 +105,12 @@ ROLLOUT = Room(
         Mutant("_RESOLUTION = 1e-6", "_RESOLUTION = 0.0"),
         Mutant("RECOVERY_S = 0.1", "RECOVERY_S = 0.2"),
         Mutant(
-            "self._least - self._reach >= margin + self.tolerance", "self._least >= margin + self.tolerance"
+            "self._least - most >= self.spec.margin + self.tolerance",
+            "self._least >= self.spec.margin + self.tolerance",
         ),
-        Mutant("if fallen > reach + self.tolerance:", "if fallen > 2.0 * reach:"),
+        Mutant("fallen > most + self.tolerance:", "fallen > 2.0 * most:"),
         Mutant(
-            "                stacklevel=2,\n            )\n            self._reach = None",
+            "                stacklevel=2,\n            )\n            self._max_decrease = most = None",
             "                stacklevel=2,\n            )",
         ),
         Mutant("(*self._recent, self._least)[-self.spec.horizon :]", "(*self._recent, self._least)[-1:]"),

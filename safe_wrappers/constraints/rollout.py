@@ -23,13 +23,6 @@ RECOVERY_S = 0.1
 """Time constant of recovery from a violation, s."""
 
 
-def mujoco_rollouts(plant: Plant, asker: str) -> MujocoPlant:
-    """The plant, if it has a MuJoCo model to forecast with."""
-    return require_mujoco(
-        plant, f"{asker} forecasts with a MuJoCo model; on an AnalyticPlant use Barrier(h) or Clearance(...)"
-    )
-
-
 RENAMED: Final = {"holds": "horizon", "reach": "max_decrease"}
 """Old names of parameters of its subclasses."""
 
@@ -74,10 +67,6 @@ class BoundSlacks(BoundConstraint):
     def linearize(self, control: Array) -> HalfSpaces:
         return linearize(self.slacks, control, self.plant.lower, self.plant.upper)
 
-    def rows(self) -> HalfSpaces:
-        """None: what counts is the prediction, linearised where a control has been refused."""
-        return HalfSpaces.none(self.plant.lower.size)
-
 
 class RolloutMemory(NamedTuple):
     """What a rollout constraint remembers of an episode.
@@ -107,7 +96,8 @@ class BoundRollout(BoundSlacks):
     _response: tuple[Array, int] | None
 
     def __init__(self, spec: RolloutConstraint, plant: Plant) -> None:
-        super().__init__(spec, mujoco_rollouts(plant, type(spec).__name__))
+        hint = "forecasts with a MuJoCo model; on an AnalyticPlant use Barrier(h) or Clearance(...)"
+        super().__init__(spec, require_mujoco(plant, f"{type(spec).__name__} {hint}"))
         self._max_decrease = spec.max_decrease
 
     @abstractmethod
@@ -127,24 +117,17 @@ class BoundRollout(BoundSlacks):
         self._linearized = 0
         self._least = float(self._value.min(initial=np.inf))
         self._recent, self._response = memory
-        if self._max_decrease is not None:
-            self._check_max_decrease(self._max_decrease)
         self._outside = self._violation(self._value)
-        margin = self.spec.margin
-        self._far = (
-            self._max_decrease is not None and self._least - self._max_decrease >= margin + self.tolerance
-        )
-
-    def _check_max_decrease(self, max_decrease: float) -> None:
-        fallen = max(self._recent, default=-np.inf) - self._least
-        if fallen > max_decrease + self.tolerance:
+        most, fallen = self._max_decrease, max(self._recent, default=-np.inf) - self._least
+        if most is not None and fallen > most + self.tolerance:
             warnings.warn(
                 f"{type(self.spec).__name__}: what is left of the limit fell by {fallen:.3g} {self.spec.unit} within "
-                f"{len(self._recent)} control steps, farther than the declared max_decrease of {max_decrease:g}; "
-                "from now on every control is forecast",
+                f"{len(self._recent)} control steps, farther than the declared max_decrease of {most:g}; from now on "
+                "every control is forecast",
                 stacklevel=2,
             )
-            self._max_decrease = None
+            self._max_decrease = most = None
+        self._far = most is not None and self._least - most >= self.spec.margin + self.tolerance
 
     def executed(self, control: Array) -> Memory:
         recent = (*self._recent, self._least)[-self.spec.horizon :] if self._max_decrease is not None else ()
@@ -171,7 +154,7 @@ class BoundRollout(BoundSlacks):
 
     def admits(self, control: Array) -> bool:
         """Whether the forecast keeps the margin (from outside: whether it comes back towards it)."""
-        return self._far or self.slack(control) >= -self.tolerance
+        return self._far or super().admits(control)
 
     def linearize(self, control: Array) -> HalfSpaces:
         if self.plant.has_acceleration:
