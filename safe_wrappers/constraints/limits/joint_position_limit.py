@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import mujoco
 import numpy as np
 
 from safe_wrappers.checks import name_list
-from safe_wrappers.constraints.limits.joints import scalar_joints
+from safe_wrappers.constraints.limits.joints import per_joint, scalar_joints
 from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
@@ -70,8 +70,9 @@ class BoundJointPositionLimit(BoundRollout):
         self._qpos = np.array([int(model.jnt_qposadr[j]) for j in ids])
         limited = model.jnt_limited[ids].astype(bool)
         own = np.where(limited[:, None], model.jnt_range[ids], [-np.inf, np.inf])
-        self._low = _per_joint("lower", self.spec.lower, own[:, 0])
-        self._high = _per_joint("upper", self.spec.upper, own[:, 1])
+        lower, upper = self.spec.lower, self.spec.upper
+        self._low = own[:, 0] if lower is None else per_joint("lower", lower, len(ids))
+        self._high = own[:, 1] if upper is None else per_joint("upper", upper, len(ids))
         narrow = ~(self._high - self._low > 2.0 * self.spec.margin)
         if narrow.any():
             j = int(np.flatnonzero(narrow)[0])
@@ -100,23 +101,11 @@ class BoundJointPositionLimit(BoundRollout):
 def _positions(name: str, given: float | Sequence[float] | None) -> float | list[float] | None:
     if given is None:
         return None
-    per_joint = isinstance(given, Sequence | np.ndarray) and not isinstance(given, str)
-    listed: list[Any] = list(given) if per_joint else [given]  # type: ignore[arg-type]
     try:
-        many = [float(v) for v in listed]
+        found = np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ConfigurationError(
-            f"{name} is a position in rad or m, or one per joint; got {given!r}"
-        ) from None
-    if not many or np.isnan(many).any():
+        found = np.array(np.nan)
+    if found.ndim > 1 or not found.size or np.isnan(found).any():
         raise ConfigurationError(f"{name} is a position in rad or m, or one per joint; got {given!r}")
-    return many if per_joint else many[0]
-
-
-def _per_joint(name: str, given: float | Sequence[float] | None, own: Array) -> Array:
-    if given is None:
-        return own
-    try:
-        return np.broadcast_to(np.asarray(given, dtype=np.float64), own.shape)
-    except ValueError:
-        raise ConfigurationError(f"expected one {name} or {own.size}, got {given}") from None
+    listed: float | list[float] = found.tolist()
+    return listed

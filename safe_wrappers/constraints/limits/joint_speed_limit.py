@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from safe_wrappers.checks import name_list, positive
-from safe_wrappers.constraints.limits.joints import scalar_joints
+from safe_wrappers.constraints.limits.joints import per_joint, scalar_joints
 from safe_wrappers.constraints.rollout import RECOVERY_S, RENAMED, BoundRollout, RolloutConstraint
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
@@ -47,14 +47,13 @@ class JointSpeedLimit(RolloutConstraint):
 
     def __post_init__(self) -> None:
         self._check_shared()
-        many = isinstance(self.limit, Sequence | np.ndarray)
-        limits = list(self.limit) if isinstance(self.limit, Sequence | np.ndarray) else [self.limit]
+        limits = self.limit if isinstance(self.limit, Sequence | np.ndarray) else [self.limit]
         checked = [positive("limit", one, "rad/s or m/s") for one in limits]
         if self.joints is not None:
             self.joints = name_list("joints", self.joints, also="None for every driven joint")
         if not checked:
             raise ConfigurationError("limit is one number, or a list with one per joint; got []")
-        self.limit = checked if many else checked[0]
+        self.limit = checked if limits is self.limit else checked[0]
         if min(checked) <= self.margin:
             raise ConfigurationError(f"the margin {self.margin} leaves nothing of the limit {self.limit}")
 
@@ -77,12 +76,8 @@ class BoundJointSpeedLimit(BoundRollout):
         super().__init__(spec, plant)
         ids = scalar_joints(self.plant, self.spec.joints)
         self._dofs = np.array([int(self.plant.model.jnt_dofadr[j]) for j in ids])
-        try:
-            limits = np.broadcast_to(np.asarray(self.spec.limit, dtype=np.float64), (len(ids),))
-        except ValueError:
-            raise ConfigurationError(f"expected one limit or {len(ids)}, got {self.spec.limit}") from None
-        self._bound = limits - self.spec.margin
-        self._limits = limits
+        self._limits = per_joint("limit", self.spec.limit, len(ids))
+        self._bound = self._limits - self.spec.margin
 
     def now(self) -> Array:
         """Speed left below the limit, per joint, rad/s or m/s."""
@@ -104,9 +99,7 @@ class BoundJointSpeedLimit(BoundRollout):
         """Two rows per joint that could reach its limit within the hold; none where controls are no forces."""
         if not self.plant.has_acceleration:
             return super().rows()
-        drift, effect = self.plant.acceleration
-        v = self.plant.qvel[self._dofs]
-        a0, a = drift[self._dofs], effect[self._dofs]
+        v, (a0, a) = self.plant.qvel[self._dofs], (part[self._dofs] for part in self.plant.acceleration)
         strongest = np.maximum(np.abs(self.plant.lower), np.abs(self.plant.upper))
         # No push, not NaN, where an actuator without effect is infinitely strong.
         pushes = np.abs(a) * np.where(a == 0.0, 0.0, strongest)

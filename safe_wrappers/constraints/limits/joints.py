@@ -4,18 +4,26 @@ from collections.abc import Iterable, Sequence
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
-_HINGE_OR_SLIDE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+HINGE_OR_SLIDE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 _DRIVES = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
 def driven_joints(model: mujoco.MjModel) -> list[int]:
     """The hinges and slides that an actuator drives directly."""
-    return [j for j in _direct(model) if model.jnt_type[j] in _HINGE_OR_SLIDE]
+    return [j for j in _direct(model) if model.jnt_type[j] in HINGE_OR_SLIDE]
+
+
+def per_joint(name: str, given: float | Sequence[float], count: int) -> Array:
+    """One value for all joints, or one for each, as an array of shape (count,)."""
+    try:
+        return np.broadcast_to(np.asarray(given, dtype=np.float64), (count,))
+    except ValueError:
+        raise ConfigurationError(f"expected one {name} or {count}, got {given}") from None
 
 
 def _direct(model: mujoco.MjModel) -> list[int]:
@@ -49,7 +57,7 @@ def refuse_uncovered(model: mujoco.MjModel, joints: Iterable[int], remedy: str, 
         )
 
 
-def stops(model: mujoco.MjModel) -> tuple[list[int], NDArray[np.float64], NDArray[np.float64]]:
+def stops(model: mujoco.MjModel) -> tuple[list[int], Array, Array]:
     """The driven hinges and slides that have a range, and its ends, rad or m."""
     limited = [j for j in driven_joints(model) if model.jnt_limited[j]]
     low, high = model.jnt_range[limited].T
@@ -83,6 +91,6 @@ def scalar_joints(plant: MujocoPlant, names: Sequence[str] | None) -> list[int]:
         return ids
     ids = [plant.named("joint", name) for name in names]
     for j, name in zip(ids, names, strict=True):
-        if model.jnt_type[j] not in _HINGE_OR_SLIDE:
+        if model.jnt_type[j] not in HINGE_OR_SLIDE:
             raise ConfigurationError(f"joint {name!r} is neither a hinge nor a slide")
     return ids

@@ -6,14 +6,17 @@ from typing import Literal
 import mujoco
 import numpy as np
 
-from safe_wrappers.constraints.limits.joints import driven_joints, refuse_uncovered, scalar_joints
+from safe_wrappers.constraints.limits.joints import (
+    HINGE_OR_SLIDE,
+    driven_joints,
+    refuse_uncovered,
+    scalar_joints,
+)
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
 FrameKind = Literal["site", "body", "geom"]
-
-_HINGE_OR_SLIDE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 class SerialChain:
@@ -47,7 +50,7 @@ class SerialChain:
             first = int(model.body_jntadr[body])
             carriers += range(first, first + int(model.body_jntnum[body])) if first >= 0 else []
             body = int(model.body_parentid[body])
-        self.joints = np.array(sorted(j for j in carriers if model.jnt_type[j] in _HINGE_OR_SLIDE), dtype=int)
+        self.joints = np.array(sorted(j for j in carriers if model.jnt_type[j] in HINGE_OR_SLIDE), dtype=int)
         if not self.joints.size:
             raise ConfigurationError(
                 f"no hinge or slide moves {self._what}: it has no manipulability; the model has the joints "

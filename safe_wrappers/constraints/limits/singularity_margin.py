@@ -125,6 +125,7 @@ class BoundSingularityMargin(BoundRollout):
     def __init__(self, spec: SingularityMargin, plant: Plant) -> None:
         super().__init__(spec, plant)
         name = getattr(spec, spec._kind)
+        what = f"the {spec._kind} {name!r}"
         self._chain = SerialChain(self.plant, self.spec._kind, name)
         self._columns = self._chain.columns(self.spec.joints)
         sampled = self._chain.sample(np.random.default_rng(0), _SAMPLES)
@@ -132,35 +133,31 @@ class BoundSingularityMargin(BoundRollout):
         if self.spec.joints is not None and idle.any():
             still = self._chain.name(self._columns[int(np.argmax(idle))])
             raise ConfigurationError(
-                f"the joint {still!r} moves the {self.spec._kind} {name!r} in none of the task's directions: "
-                "leave it out"
+                f"the joint {still!r} moves {what} in none of the task's directions: leave it out"
             )
         self._columns = [c for c, does_nothing in zip(self._columns, idle, strict=True) if not does_nothing]
         task = f"directions={self.spec.directions!r}, rotations={self.spec.rotations!r}"
-        count = len(self._columns)
-        if count < len(self.spec._rows):
+        count, wanted = len(self._columns), len(self.spec._rows)
+        if count < wanted:
+            there = ", ".join(map(self._chain.name, self._columns)) or "none"
             raise ConfigurationError(
-                f"{count} joints cannot move the {self.spec._kind} {name!r} in {len(self.spec._rows)} directions at "
-                f"once ({task}); the joints are "
-                + (", ".join(map(self._chain.name, self._columns)) or "none")
+                f"{count} joints cannot move {what} in {wanted} directions at once ({task}); the joints are {there}"
             )
         # With as many joints as directions w is the determinant but for its sign, which turns at a singular pose.
-        self._signed, self._side = count == len(self.spec._rows), 1.0
+        self._signed, self._side = count == wanted, 1.0
         found = np.abs(self._measure(sampled))
         most = float(found.max())
         if most < _STILL:
             raise ConfigurationError(
-                f"the {self.spec._kind} {name!r} cannot be moved in all of these directions at once in any "
-                f"configuration: {task}, frame={self.spec.frame!r}"
+                f"{what} cannot be moved in all of these directions at once in any configuration: {task}, "
+                f"frame={self.spec.frame!r}"
             )
-        if self.spec.threshold is None:
-            assert self.spec.task_speed is not None and self.spec.rate_limit is not None
-            self.spec.validated = validated_threshold(
-                self._task(sampled), self.spec.task_speed, self.spec.rate_limit
-            )
-            self._threshold = self.spec.validated.threshold
+        if spec.threshold is not None:
+            self._threshold = spec.threshold
         else:
-            self._threshold = self.spec.threshold
+            assert spec.task_speed is not None and spec.rate_limit is not None
+            spec.validated = validated_threshold(self._task(sampled), spec.task_speed, spec.rate_limit)
+            self._threshold = spec.validated.threshold
         if self._threshold * (1.0 + self.spec.margin) >= most:
             raise ConfigurationError(
                 f"no configuration has a manipulability above {self._threshold:g} with a margin of "
@@ -171,9 +168,12 @@ class BoundSingularityMargin(BoundRollout):
     def _task(self, qpos: Array) -> Array:
         """Shape (k, m, n)."""
         jacobians, axes = self._chain.jacobians(qpos)
-        return (
-            self._in_frame(jacobians, axes)[:, self.spec._rows][:, :, self._columns]
-            * self.spec._weights[:, None]
+        return self._chosen(self._in_frame(jacobians, axes))
+
+    def _chosen(self, jacobians: Array) -> Array:
+        """The task's directions, weighed, and the joints that do it, shape (..., m, n)."""
+        return np.asarray(
+            jacobians[..., self.spec._rows, :][..., self._columns] * self.spec._weights[:, None]
         )
 
     def _in_frame(self, jacobians: Array, axes: Array) -> Array:
@@ -213,11 +213,8 @@ class BoundSingularityMargin(BoundRollout):
             blocks = np.swapaxes(jacobians.reshape(len(qpos), 2, 3, -1), 2, 3)[:, None]
             carried = np.swapaxes(np.cross(turning, blocks), 3, 4)
             change = change - carried.reshape(change.shape)
-        task = self._in_frame(jacobians, axes)[:, self.spec._rows][:, :, self._columns]
-        moved = self._in_frame(change, axes)[:, :, self.spec._rows][..., self._columns]
-        return manipulability_gradient(
-            task * self.spec._weights[:, None], moved * self.spec._weights[:, None]
-        )
+        moved = self._in_frame(change, axes)
+        return manipulability_gradient(self._chosen(self._in_frame(jacobians, axes)), self._chosen(moved))
 
     def rows(self) -> HalfSpaces:
         """One row `w'' + 2 a w' + a^2 (w - threshold) >= 0`, a first guess for the forecast, which decides.

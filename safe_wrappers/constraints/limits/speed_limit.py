@@ -81,16 +81,10 @@ class BoundSpeedLimit(BoundRollout):
 
     def __init__(self, spec: SpeedLimit, plant: Plant) -> None:
         super().__init__(spec, plant)
-        self._body = None if self.spec.body is None else self.plant.named("body", self.spec.body)
+        self._body = None if spec.body is None else self.plant.named("body", spec.body)
         self._axes = ["xyz".index(letter) for letter in spec.direction.strip("+-")]
         self._sign = {"+": 1.0, "-": -1.0}.get(spec.direction[0])
-        self._model_version = self.plant.model_version
-        self._weigh()
         self._window = self.plant.substeps if self.spec.average == "step" else 1
-
-    def _weigh(self) -> None:
-        mass = self.plant.model.body_mass
-        self._shares = mass / mass.sum()
 
     def start(self) -> Memory:
         return SpeedMemory(super().start())
@@ -108,9 +102,8 @@ class BoundSpeedLimit(BoundRollout):
         return np.asarray(frames[..., self._body, :][..., self._axes])
 
     def now(self) -> Array:
-        if self._model_version != self.plant.model_version:
-            self._model_version = self.plant.model_version
-            self._weigh()
+        mass = self.plant.model.body_mass
+        self._shares = mass / mass.sum()
         pose = self.plant.pose()
         data = self.plant.published()
         self._shown = None if data is None else self._point(data.xpos, data.xipos)

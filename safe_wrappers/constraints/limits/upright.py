@@ -50,8 +50,7 @@ class Upright(RolloutConstraint):
         self._check_shared()
         if self.lowest is None and self.highest is None and self.tilt is None:
             raise ConfigurationError("give at least one of lowest (m), highest (m) and tilt (rad)")
-        for name in ("lowest", "highest"):
-            height = getattr(self, name)
+        for name, height in (("lowest", self.lowest), ("highest", self.highest)):
             if height is not None and not (isinstance(height, int | float) and math.isfinite(height)):
                 raise ConfigurationError(f"{name} is a height in m or None, got {height!r}")
         if self.tilt is not None:
@@ -60,16 +59,12 @@ class Upright(RolloutConstraint):
                 raise ConfigurationError(
                     f"tilt is an angle above the margin ({self.margin}) and at most pi, got {self.tilt}"
                 )
-        low, high = self._heights()
-        if not high - low > 2.0 * self.margin:
+        low, high = self.lowest, self.highest
+        if low is not None and high is not None and not high - low > 2.0 * self.margin:
             raise ConfigurationError(
                 f"nothing is left between lowest = {self.lowest} m and highest = {self.highest} m with a margin "
                 f"of {self.margin} m at both ends"
             )
-
-    def _heights(self) -> tuple[float, float]:
-        low = -math.inf if self.lowest is None else self.lowest
-        return low, math.inf if self.highest is None else self.highest
 
     def bind(self, plant: Plant) -> "BoundUpright":
         return BoundUpright(self, plant)
@@ -89,12 +84,11 @@ class BoundUpright(BoundRollout):
         return self._left(pose.xpos[self._body, 2], pose.xmat[self._body, 8])
 
     def _left(self, height: Array, cosine: Array) -> Array:
-        low, high = self.spec._heights()
         left = []
         if self.spec.lowest is not None:
-            left.append(height - low)
+            left.append(height - self.spec.lowest)
         if self.spec.highest is not None:
-            left.append(high - height)
+            left.append(self.spec.highest - height)
         if self.spec.tilt is not None:
             left.append(self.spec.tilt - np.arccos(np.clip(cosine, -1.0, 1.0)))
         return np.array(left)

@@ -63,8 +63,7 @@ class Workspace(RolloutConstraint):
             setattr(self, name, name_list(name, getattr(self, name), least=0))
         self._low = np.array([-np.inf if v is None else v for v in self.low or [None] * 3])
         self._high = np.array([np.inf if v is None else v for v in self.high or [None] * 3])
-        bounded = bool(np.isfinite(self._low).any() or np.isfinite(self._high).any())
-        if not (bounded or self.keep_out):
+        if not (np.isfinite([self._low, self._high]).any() or self.keep_out):
             raise ConfigurationError("give a bound in low or high (m), or something to keep_out of")
         if (self._high - self._low <= 2.0 * (self.margin + self.radius)).any():
             raise ConfigurationError(
@@ -84,18 +83,16 @@ class BoundWorkspace(BoundRollout):
     def __init__(self, spec: Workspace, plant: Plant) -> None:
         super().__init__(spec, plant)
         if not (self.spec.bodies or self.spec.sites or self.spec.geoms):
+            there = ", ".join(self.plant.names("body"))
             raise ConfigurationError(
-                "name the bodies, sites or geoms to keep inside; the model has the bodies "
-                + ", ".join(self.plant.names("body"))
+                f"name the bodies, sites or geoms to keep inside; the bodies are {there}"
             )
         m = self.plant.model
-        found = [(self.plant.named("body", name), np.zeros(3)) for name in self.spec.bodies]
-        for kind, names in (("site", self.spec.sites), ("geom", self.spec.geoms)):
-            for name in names:
-                i = self.plant.named(kind, name)
-                found.append((int(getattr(m, f"{kind}_bodyid")[i]), np.array(getattr(m, f"{kind}_pos")[i])))
-        self._bodies = np.array([body for body, _ in found])
-        self._offsets = np.array([offset for _, offset in found])
+        bodies = [self.plant.named("body", name) for name in self.spec.bodies]
+        sites = [self.plant.named("site", name) for name in self.spec.sites]
+        geoms = [self.plant.named("geom", name) for name in self.spec.geoms]
+        self._bodies = np.array([*bodies, *m.site_bodyid[sites], *m.geom_bodyid[geoms]], dtype=int)
+        self._offsets = np.vstack([np.zeros((len(bodies), 3)), m.site_pos[sites], m.geom_pos[geoms]])
 
     def _points(self, frames: Array, axes: Array) -> Array:
         """World positions, shape (k, points, 3)."""
