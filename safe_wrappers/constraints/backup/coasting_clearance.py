@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.checks import check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundDetourClearance, Detour
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.numerics.outlines import convex_outline, distances_to_outline
@@ -87,20 +87,16 @@ class CoastingClearance(Constraint):
             setattr(self, name, found)
         if not (self.keep_out or self.untouched):
             raise ConfigurationError(
-                "give obstacles in keep_out (for the origin) or untouched (for the outline)"
+                "give obstacles in keep_out (of the origin) or untouched (by the outline)"
             )
         self.outline = _checked_outline(self.outline, needed=bool(self.untouched))
-        self.margin = non_negative("margin", self.margin, "m")
         if isinstance(self.horizon, bool) or self.horizon != int(self.horizon) or self.horizon < 2:
-            raise ConfigurationError(
-                f"horizon is a whole number of control intervals >= 2, got {self.horizon!r}"
-            )
+            wanted = "horizon is a whole number of control intervals >= 2"
+            raise ConfigurationError(f"{wanted}, got {self.horizon!r}")
         self.horizon = int(self.horizon)
-        if self.max_decrease is not None:
-            self.max_decrease = positive("max_decrease", self.max_decrease, "m")
-        self.max_decrease_per_speed = non_negative(
-            "max_decrease_per_speed", self.max_decrease_per_speed, "m per m/s"
-        )
+        check_fields(self, non_negative, ("margin",), "m")
+        check_fields(self, positive, ("max_decrease",), "m")
+        check_fields(self, non_negative, ("max_decrease_per_speed",), "m per m/s")
 
     def bind(self, plant: Plant) -> "BoundCoastingClearance":
         return BoundCoastingClearance(self, plant)
@@ -116,10 +112,11 @@ class BoundCoastingClearance(BoundDetourClearance):
     def __init__(self, spec: CoastingClearance, plant: Plant) -> None:
         hint = "CoastingClearance needs a MujocoPlant: it forecasts with the machine's model"
         super().__init__(spec, require_mujoco(plant, hint))
-        alone = None if spec.robot_model_attr is None else plant.attribute(spec.robot_model_attr)
+        name = spec.robot_model_attr
+        alone = None if name is None else plant.attribute(name)
         if alone is not None and not isinstance(alone, mujoco.MjModel):
             raise ConfigurationError(
-                f"robot_model_attr names an attribute that holds an MjModel; {spec.robot_model_attr!r} is {alone!r}"
+                f"robot_model_attr names an attribute that holds an MjModel; {name!r} is {alone!r}"
             )
         self._coasting = Coasting(self.plant, spec.body, alone)
         self._still = np.zeros(self.plant.model.nu)
@@ -313,20 +310,20 @@ class _Group:
 
 def _checked_outline(given: Any, needed: bool) -> list[list[float]]:
     """The outline as plain data."""
+    if needed and not len(given):
+        raise ConfigurationError(
+            "untouched needs the machine's outline: [[x, y], ...] in its body's frame, m"
+        )
     try:
         points = np.array(given, dtype=np.float64).reshape(-1, 2)
     except (TypeError, ValueError):
         points = np.full((1, 2), np.nan)
     if not np.isfinite(points).all():
         raise ConfigurationError(f"outline is a list of points [x, y] in m, got {given!r}")
-    if len(points):
-        try:
+    try:
+        if len(points):
             convex_outline(points)
-        except ValueError as error:
-            raise ConfigurationError(f"outline: {error}") from None
-    elif needed:
-        raise ConfigurationError(
-            "untouched needs the machine's outline: [[x, y], ...] in its body's frame, m"
-        )
+    except ValueError as error:
+        raise ConfigurationError(f"outline: {error}") from None
     found: list[list[float]] = points.tolist()
     return found

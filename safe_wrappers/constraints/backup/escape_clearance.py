@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.checks import check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundBackupClearance
 from safe_wrappers.constraints.obstacles import Discs, TrackedDiscs, distances, obstacles_from
 from safe_wrappers.control.backup.evasive_maneuvers import EvasiveManeuvers, Maneuver
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Array, Constraint, Memory
+from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, Memory
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.planar_point import planar_point
@@ -61,20 +61,14 @@ class EscapeClearance(Constraint):
 
     def __post_init__(self) -> None:
         self.obstacles = obstacles_from(self.obstacles)
-        self.radius = non_negative("radius", self.radius, "m")
-        self.margin = non_negative("margin", self.margin, "m")
+        check_fields(self, non_negative, ("radius", "margin"), "m")
         self.horizon_s = positive("horizon_s", self.horizon_s, "s")
         if self.horizon_s <= max(_GOING_S):
-            raise ConfigurationError(
-                f"horizon_s must be longer than the manoeuvres, which go for {max(_GOING_S):g} s before they brake; "
-                f"got {self.horizon_s:g}"
-            )
+            longest = f"the manoeuvres, which go for {max(_GOING_S):g} s before they brake"
+            raise ConfigurationError(f"horizon_s must be longer than {longest}; got {self.horizon_s:g}")
         for obstacle in self.obstacles:
-            place = getattr(obstacle, "center", getattr(obstacle, "point", ()))
-            if len(place) > 2:
-                raise ConfigurationError(
-                    f"obstacles are seen from above: in {obstacle!r} give two coordinates, x and y"
-                )
+            if len(getattr(obstacle, "center", getattr(obstacle, "point", ()))) > 2:
+                raise ConfigurationError(f"obstacles are seen from above: give {obstacle!r} x and y alone")
 
     def bind(self, plant: Plant) -> "BoundEscapeClearance":
         return BoundEscapeClearance(self, plant)
@@ -90,9 +84,8 @@ class BoundEscapeClearance(BoundBackupClearance):
     """The manoeuvre that was open after the last control."""
 
     def __init__(self, spec: EscapeClearance, plant: Plant) -> None:
-        machine = require_mujoco(
-            plant, "EscapeClearance needs a MujocoPlant: it reads the point from the model"
-        )
+        hint = "EscapeClearance needs a MujocoPlant: it reads the point from the model"
+        machine = require_mujoco(plant, hint)
         self._moving: list[Any] = [o for o in spec.obstacles if _moves(o)]
         self._fixed = [o for o in spec.obstacles if not _moves(o)]
         for obstacle in self._moving:
@@ -107,10 +100,10 @@ class BoundEscapeClearance(BoundBackupClearance):
         holds = int(np.ceil(self.spec.horizon_s / self.plant.control_dt))
         longest = max(1, round(max(_GOING_S) / self.plant.control_dt))
         if holds <= longest:
-            raise ConfigurationError(
-                f"horizon_s = {self.spec.horizon_s:g} s is too short for steps of {self.plant.control_dt:g} s: "
-                f"a manoeuvre takes {longest} of them before it brakes"
+            steps = (
+                f"steps of {self.plant.control_dt:g} s: a manoeuvre takes {longest} of them before it brakes"
             )
+            raise ConfigurationError(f"horizon_s = {self.spec.horizon_s:g} s is too short for {steps}")
         bank = [Maneuver(0.0, 0.0, 0)]
         bank += [Maneuver(x, y, going) for x, y in _DIRECTIONS for going in range(1, longest + 1)]
         self._escapes = EvasiveManeuvers(point.axes, bank, np.arange(0, holds + 1, _EVERY))
@@ -122,8 +115,7 @@ class BoundEscapeClearance(BoundBackupClearance):
         """The manoeuvre that is open after the control: that of the nearest one that was asked about."""
         if not self._asked:
             return None
-        low, high, _, _, keep, add = self._hold
-        velocity = keep * self._velocity + add * np.minimum(np.maximum(self._driven(control), low), high)
+        velocity = self._held(self._driven(control))[1]
         led_to = np.concatenate([v for v, _ in self._asked])
         best = np.concatenate([b for _, b in self._asked])
         return int(best[((led_to - velocity) ** 2).sum(axis=1).argmin()])
@@ -140,7 +132,7 @@ class BoundEscapeClearance(BoundBackupClearance):
         self._velocity = self.plant.qvel[joints]
         # A way after a held control begins one hold from now.
         times = self.plant.control_dt * np.concatenate([[0.0], 1.0 + self._escapes.instants])
-        parts = [self._expected(o, self.plant, times) for o in self._moving]
+        parts = [self._expected(o, times) for o in self._moving]
         none = np.zeros((times.size, 0, 2))
         centers = np.concatenate([none, *(c for c, _ in parts)], axis=1)
         halves = np.concatenate([none, *(h for _, h in parts)], axis=1)
@@ -168,26 +160,29 @@ class BoundEscapeClearance(BoundBackupClearance):
             which += [i for i in (going_on, shorter) if i not in which]
         return np.array(which, dtype=np.intp)
 
-    def _expected(self, obstacle: Any, plant: MujocoPlant, times: Array) -> tuple[Array, Array]:
+    def _expected(self, obstacle: Any, times: Array) -> tuple[Array, Array]:
         """Centres and half-widths of the boxes that hold them, shapes (k, n, 2)."""
         # Under a delay the state is predicted: so are the obstacles, to the same moment.
-        late = times + (
-            self.plant.time - float(self.plant.attribute("data").time) if self.plant.delay_s else 0.0
-        )
+        if self.plant.delay_s:
+            times = times + (self.plant.time - float(self.plant.attribute("data").time))
         if isinstance(obstacle, TrackedDiscs):
-            centers, halves = obstacle.boxes(self.plant, late)
+            centers, halves = obstacle.boxes(self.plant, times)
             return centers[..., :2], halves[..., :2]
         centers = obstacle.centers(self.plant)[:, :2]
         velocity = np.asarray(self.plant.attribute(obstacle.velocity_attribute), dtype=np.float64)[:, :2]
-        moved = centers + late[:, None, None] * velocity
+        moved = centers + times[:, None, None] * velocity
         return moved, np.zeros_like(moved)
 
-    def _slacks(self, controls: Array) -> Array:
-        """What every way out after each of some held controls (c, 2) leaves, wanted >= 0, shape (c, manoeuvres)."""
+    def _held(self, controls: Array) -> tuple[Array, Array]:
+        """Positions and velocities after held controls, shapes (..., 2)."""
         low, high, drift, shift, keep, add = self._hold
         held = np.minimum(np.maximum(controls, low), high)
         position = self._position + drift * self._velocity + shift * held
-        velocity = keep * self._velocity + add * held
+        return position, keep * self._velocity + add * held
+
+    def _slacks(self, controls: Array) -> Array:
+        """What every way out after each of some held controls (c, 2) leaves, wanted >= 0, shape (c, manoeuvres)."""
+        position, velocity = self._held(controls)
         x, y = self._escapes.paths(position, velocity, self._open)
         left = (self._clearances(x, y) - self._wanted).min(axis=-1)
         self._asked.append((velocity, self._open[left.argmax(axis=1)]))
@@ -215,9 +210,7 @@ class BoundEscapeClearance(BoundBackupClearance):
     def _driven(self, control: Array) -> Array:
         return np.asarray(control)[list(self._point.actuators)]
 
-    def admits(self, control: Array) -> bool:
-        """Whether a held control leaves a way out."""
-        return self.slack(control) >= -self.tolerance
+    admits = BoundConstraint.admits  # by `slack`
 
     def slack(self, control: Array) -> float:
         """What the best way out after a held control leaves of what is asked for, m."""
@@ -237,11 +230,15 @@ class BoundEscapeClearance(BoundBackupClearance):
 
     def backup(self) -> Array:
         """Braking where it leaves a way out, else the first control of the one that keeps farthest away."""
-        control = np.zeros(self.plant.model.nu)
         firsts = self._firsts()
         left = self._slacks(firsts).max(axis=1)
-        control[list(self._point.actuators)] = firsts[0 if left[0] >= 0.0 else int(left.argmax())]
-        return control
+        return self._whole(np.zeros(self.plant.model.nu), firsts[0 if left[0] >= 0.0 else int(left.argmax())])
+
+    def _whole(self, control: Array, driven: Array) -> Array:
+        """A control with other values on the two slides, shape (m,)."""
+        whole = np.array(control)
+        whole[list(self._point.actuators)] = driven
+        return whole
 
     def _firsts(self) -> Array:
         """First controls of the manoeuvres: braking, and each direction; shape (5, 2)."""
@@ -261,12 +258,7 @@ class BoundEscapeClearance(BoundBackupClearance):
             closer = np.array(tried)
             closer = closer[self._slacks(closer).max(axis=1) >= 0.0]
             good = _nearest_first(np.concatenate([good, closer]), asked)
-        found = []
-        for pair in good:
-            whole = np.array(control)
-            whole[list(self._point.actuators)] = pair
-            found.append(whole)
-        return found
+        return [self._whole(control, pair) for pair in good]
 
 
 def _nearest_first(controls: Array, asked: Array) -> Array:

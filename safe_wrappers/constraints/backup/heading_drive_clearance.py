@@ -1,14 +1,14 @@
 """HeadingDriveClearance: keep the stopping path of a robot that is driven along its heading out of discs."""
 
-import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from safe_wrappers.checks import non_negative
+from safe_wrappers.checks import check_fields, non_negative
 from safe_wrappers.constraints.backup.base import BoundDetourClearance
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.backup.heading_drive import StoppingPath
@@ -65,8 +65,7 @@ class HeadingDriveClearance(Constraint):
 
     def __post_init__(self) -> None:
         self.obstacles = obstacles_from(self.obstacles, kinds=(Disc, Discs))
-        self.margin = non_negative("margin", self.margin, "m")
-        self.state_error = non_negative("state_error", self.state_error, "m")
+        check_fields(self, non_negative, ("margin", "state_error"), "m")
         self.uncertainty = non_negative("uncertainty", self.uncertainty, "a fraction")
         if self.uncertainty >= 1.0:
             raise ConfigurationError(f"uncertainty is a fraction in [0, 1), got {self.uncertainty}")
@@ -96,9 +95,8 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         self._swivel = 2.0 * abs(drive.com_offset)
         # The most that one hold's drive can add to the path; a turn and the way travelled depend on the speed.
         self._push = drive.fastest_change * (drive.control_dt + drive.coast_time)
-        turn = drive.control_dt * min(
-            drive.yaw_limit / max(drive.yaw_damping, 1e-12), math.pi / drive.control_dt
-        )
+        fastest_turn = min(drive.yaw_limit / max(drive.yaw_damping, 1e-12), math.pi / drive.control_dt)
+        turn = drive.control_dt * fastest_turn
         self._per_speed = drive.control_dt + turn * drive.coast_time
 
     def clearance(self) -> Array:
@@ -210,9 +208,7 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         """The clearances that count, as functions of the path, and what is needed of each."""
         if self._least < 0.0:
             return [(self._least_of, self._needed_outside(backup))]
-        return [
-            (functools.partial(self._to_disc, disc=disc), self._needed(disc, backup)) for disc in self._close
-        ]
+        return [(partial(self._to_disc, disc=disc), self._needed(disc, backup)) for disc in self._close]
 
     def _ends(self) -> tuple[float, float]:
         """The drive controls that brake and that push on, as far as the drive acts."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.checks import check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundBackupClearance
 from safe_wrappers.control.backup.point_among_walls import PointAmongWalls, PointMotion
 from safe_wrappers.control.numerics.rectangles import Rectangle, gaps, nearest
@@ -64,8 +64,7 @@ class WallClearance(Constraint):
 
     def __post_init__(self) -> None:
         self.margin = non_negative("margin", self.margin, "m")
-        if self.velocity_clip is not None:
-            self.velocity_clip = positive("velocity_clip", self.velocity_clip, "m/s")
+        check_fields(self, positive, ("velocity_clip",), "m/s")
 
     def bind(self, plant: Plant) -> "BoundWallClearance":
         return BoundWallClearance(self, plant)
@@ -78,11 +77,8 @@ class BoundWallClearance(BoundBackupClearance):
     plant: MujocoPlant
 
     def __init__(self, spec: WallClearance, plant: Plant) -> None:
-        needed = (
-            "WallClearance needs a MujocoPlant: it reads point and walls from the model. On an AnalyticPlant"
-        )
-        hint = "use Clearance(obstacles=[Box(...)], position=[0, 1], velocity=[2, 3], braking=...)"
-        super().__init__(spec, require_mujoco(plant, f"{needed} {hint}"))
+        hint = "on an AnalyticPlant use Clearance([Box(...)], position=[0, 1], velocity=[2, 3], braking=...)"
+        super().__init__(spec, require_mujoco(plant, f"WallClearance needs a MujocoPlant; {hint}"))
 
     def read_constants(self) -> None:
         clip = self.spec.velocity_clip if self.spec.velocity_clip is not None else math.inf
@@ -97,10 +93,9 @@ class BoundWallClearance(BoundBackupClearance):
         motion = PointMotion(float(q[i]) + x, float(q[j]) + y, float(v[i]), float(v[j]))
         self._motion = self._among.clipped(motion)
         self._needed: float | None = None
+        self._least = math.nan
         if math.isfinite(sum(motion)):
             self._least = self._among.distance(self._motion) - self._room
-        else:
-            self._least = math.nan
         self._inside = self._least >= -_HAIR_M
         return np.array([self._least + self.spec.margin] if self._among.walls else [])
 
@@ -162,10 +157,8 @@ class BoundWallClearance(BoundBackupClearance):
     def candidates(self, control: Array) -> list[Array]:
         """Admissible controls near a refused one, the nearest first: those that slide along the walls in its way."""
         (i, j), x_axis, y_axis = self._point.actuators, self._among.x_axis, self._among.y_axis
-        asked = (
-            max(x_axis.low, min(float(control[i]), x_axis.high)),
-            max(y_axis.low, min(float(control[j]), y_axis.high)),
-        )
+        x, y = float(control[i]), float(control[j])
+        asked = max(x_axis.low, min(x, x_axis.high)), max(y_axis.low, min(y, y_axis.high))
         found = [c for c in self._turned(asked, _TURNS) if self._admitted(c)] if self._inside else []
         if not found:  # where the path fits and no rectangle does
             found = [self._approached(self._backup(), asked, axes) for axes in ((0, 1), (1, 0))]
