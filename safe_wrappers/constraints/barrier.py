@@ -59,10 +59,11 @@ class Barrier(Constraint):
                 f"gradient must be a function of the state or None, got {self.gradient!r}"
             )
         if callable(self.alpha):
-            if self.alpha(0.0) != 0.0 or self.alpha(1.0) <= 0.0 or self.alpha(-1.0) >= 0.0:
+            below, zero, above = self.alpha(-1.0), self.alpha(0.0), self.alpha(1.0)
+            if zero != 0.0 or above <= 0.0 or below >= 0.0:
                 raise ConfigurationError(
                     "alpha as a function must be extended class K: alpha(0) = 0, increasing; got "
-                    f"alpha(-1), alpha(0), alpha(1) = {self.alpha(-1.0)}, {self.alpha(0.0)}, {self.alpha(1.0)}"
+                    f"alpha(-1), alpha(0), alpha(1) = {below}, {zero}, {above}"
                 )
         else:
             self.alpha = positive("alpha", self.alpha, "1/s")
@@ -160,18 +161,17 @@ class BoundBarrier(BoundConstraint):
             return
         x = self.plant.state
         self._degree_checked = True
-        if not np.isfinite(x).all() or not np.isfinite(self._height(x)):
-            raise ConfigurationError(
-                f"the first state must be finite and h of it too; got {x}, h = {self._height(x)}"
-            )
+        h = self._height(x)
+        if not np.isfinite([*x, h]).all():
+            raise ConfigurationError(f"the first state must be finite and h of it too; got {x}, h = {h}")
         if self.spec.gradient is not None:
             given, differences = self._gradient(x), numerical_gradient(self._height, x)
-            size = abs(self._height(x)) + np.abs(differences).max()
+            size = abs(h) + np.abs(differences).max()
             if np.abs(given - differences).max() > 1e-2 * size:
                 raise ConfigurationError(
                     f"gradient does not fit h: at the first state it gives {given}, differences give {differences}"
                 )
-        if acts(self._gradient(x), self.plant.g, self._height(x), _NO_EFFECT):
+        if acts(self._gradient(x), self.plant.g, h, _NO_EFFECT):
             return
         # The gradient may vanish at this very state (h = 1 - v^2 at rest): look around it before refusing.
         spread = np.random.default_rng(0).normal(size=(8, x.size)) * 0.1

@@ -6,7 +6,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from safe_wrappers.checks import name_list, non_negative, positive
+from safe_wrappers.checks import check_fields, name_list, non_negative, positive
 from safe_wrappers.constraints.obstacles import Nearest, obstacles_from
 from safe_wrappers.control.backup.stopping import sampled_acceleration_limit, sampled_inset
 from safe_wrappers.errors import ConfigurationError
@@ -71,8 +71,7 @@ class Clearance(Constraint):
     def __post_init__(self) -> None:
         self.obstacles = obstacles_from(self.obstacles)
         self.braking = positive("braking", self.braking, "m/s^2")
-        for name in ("radius", "margin", "state_error"):
-            setattr(self, name, non_negative(name, getattr(self, name), "m"))
+        check_fields(self, non_negative, ("radius", "margin", "state_error"), "m")
         for name in ("bodies", "sites", "geoms"):
             setattr(self, name, name_list(name, getattr(self, name), least=0))
         self.position, self.velocity = list(self.position), list(self.velocity)
@@ -118,12 +117,8 @@ class BoundClearance(BoundConstraint):
 
     def value(self) -> Array:
         """Room left after braking, margin and state error not taken off, m, one per point and surface."""
-        return np.concatenate(
-            [
-                sampled_inset(s.clearance, s.approach, self.spec.braking, self.plant.control_dt)
-                for s in self._seen()
-            ]
-        )
+        braking, hold = self.spec.braking, self.plant.control_dt
+        return np.concatenate([sampled_inset(s.clearance, s.approach, braking, hold) for s in self._seen()])
 
     def approach(self) -> tuple[Array, Array]:
         """Clearances (m) and approach speeds (m/s, towards the obstacle), as measured, one per point and surface."""

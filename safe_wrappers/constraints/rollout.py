@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 
-from safe_wrappers.checks import non_negative, positive, whole_number
+from safe_wrappers.checks import check_fields, non_negative, positive, whole_number
 from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.filter.linearize import linearize, tangent_rows
 from safe_wrappers.plants.mujoco.forecast import Forecast
@@ -44,8 +44,7 @@ class RolloutConstraint(Constraint):
         whole = isinstance(self.horizon, float | np.floating) and float(self.horizon).is_integer()
         horizon = int(self.horizon) if whole else self.horizon
         self.horizon = whole_number("horizon", horizon, 1, "control intervals to look ahead")
-        if self.max_decrease is not None:
-            self.max_decrease = positive("max_decrease", self.max_decrease, self.unit)
+        check_fields(self, positive, ("max_decrease",), self.unit)
 
 
 class BoundSlacks(BoundConstraint):
@@ -73,8 +72,7 @@ class RolloutMemory(NamedTuple):
 
     Attributes:
         least: What was left at the last states, the newest last, at most `horizon` of them.
-        response: How what is left at every instant changes with a control, and the observation until which that is
-            kept; None: not known.
+        response: How what is left changes with a control, and the observation until which that is kept; or None.
     """
 
     least: tuple[float, ...] = ()

@@ -79,8 +79,5 @@ class BoundTrackPermission(BoundConstraint):
         # All axes together are then no faster than the larger of the two.
         room = max(0.0, self.spec.creep**2 - (left * speed) ** 2) / max(v.size, 1)
         allowed = np.sqrt((left * v) ** 2 + room)
-        least, most = (
-            (-allowed - v) / self.plant.control_dt - drift,
-            (allowed - v) / self.plant.control_dt - drift,
-        )
+        least, most = ((end - v) / self.plant.control_dt - drift for end in (-allowed, allowed))
         return HalfSpaces(np.concatenate([effect, -effect]), np.concatenate([most, -least]))

@@ -259,10 +259,7 @@ class BoundTraction(BoundConstraint):
         least = self._torques(self._window[0], np.minimum(self._present, -carried)) - bias
         low, high = self.plant.acting_range
         low, high = np.maximum(low, -_UNBOUNDED), np.minimum(high, _UNBOUNDED)
-        ends = (
-            np.minimum(effect * low, effect * high).sum(axis=1),
-            np.maximum(effect * low, effect * high).sum(axis=1),
-        )
+        ends = [end(effect * low, effect * high).sum(axis=1) for end in (np.minimum, np.maximum)]
         # What is kept back for an error of the prediction is kept as far as the drive can: it is no limit by itself.
         gain = self._response.gain
         most = np.maximum(most - self._reserve[1] / gain, np.minimum(most, ends[0]))
@@ -273,9 +270,8 @@ class BoundTraction(BoundConstraint):
         least = np.where(outside, np.minimum(least, ends[1]), least)
         # Negated, so that a row that is not a number is kept, and fails, instead of being left out.
         up, down = ~(ends[1] <= most), ~(ends[0] >= least)
-        return HalfSpaces(
-            np.concatenate([effect[up], -effect[down]]), np.concatenate([most[up], -least[down]])
-        )
+        normals = np.concatenate([effect[up], -effect[down]])
+        return HalfSpaces(normals, np.concatenate([most[up], -least[down]]))
 
     def backup(self) -> Array:
         """The control that brakes the vehicle as the slip limit allows it; other actuators at zero."""
@@ -292,13 +288,12 @@ class BoundTraction(BoundConstraint):
 
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
         """The info keys `slip/...`: of the state before the step, and what its control did to the wheels."""
-        mean, std = self._estimate.mean, self._estimate.std
         changed = np.zeros(self.plant.lower.size, dtype=bool)
         if proposed is not None and executed is not None:
             changed = np.abs(executed - proposed) > _ROUNDING * np.abs(proposed) + _SOLVERS_NOISE
         return {
             keys.SLIP_RATIO: self._slip.copy(),
             keys.SLIP_LIMITED: self._wheels.driven_by(changed),
-            keys.SLIP_MU_ESTIMATE: mean,
-            keys.SLIP_MU_STD: std,
+            keys.SLIP_MU_ESTIMATE: self._estimate.mean,
+            keys.SLIP_MU_STD: self._estimate.std,
         }

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import name_list, non_negative, positive
+from safe_wrappers.checks import check_fields, name_list, non_negative, positive
 from safe_wrappers.constraints.rollout import BoundSlacks
 from safe_wrappers.control.contact.friction_cone import normal_and_tangential
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
@@ -46,16 +46,8 @@ class ContactFeasibility(Constraint):
     margin: float = 0.0
 
     def __post_init__(self) -> None:
-        self.friction_share = positive(
-            "friction_share", self.friction_share, "shares of the model's friction"
-        )
-        if self.friction_share > 1.0:
-            raise ConfigurationError(
-                f"friction_share is in (0, 1], got {self.friction_share}: no simulated ground holds more than "
-                "its own friction; a model with more is MujocoPlant(model=...)"
-            )
-        self.tolerance = non_negative("tolerance", self.tolerance, "shares of the weight")
-        self.margin = non_negative("margin", self.margin, "shares of the weight")
+        self.friction_share = checked_friction_share(self.friction_share)
+        check_fields(self, non_negative, ("tolerance", "margin"), "shares of the weight")
         if self.bodies is not None:
             self.bodies = name_list("bodies", self.bodies, also="None for every body")
 
@@ -71,16 +63,11 @@ class BoundContactFeasibility(BoundSlacks):
 
     def __init__(self, spec: ContactFeasibility, plant: Plant) -> None:
         super().__init__(spec, require_contacts(plant, "ContactFeasibility"))
-        m = self.plant.model
-        touching = can_touch_the_world(m)
-        if not touching.any():
-            raise UnsupportedEnvError(
-                "no body of this model can touch the fixed world with friction: there is no cone to stay in"
-            )
+        touching = touching_bodies(self.plant, "there is no cone to stay in")
         chosen = np.flatnonzero(touching)
         if self.spec.bodies is not None:
             chosen = np.array([self._resting(name, touching) for name in self.spec.bodies])
-        self._index = np.full(m.nbody, -1)
+        self._index = np.full(self.plant.model.nbody, -1)
         self._index[chosen] = np.arange(chosen.size)
         self._size = chosen.size
 
@@ -119,17 +106,31 @@ class BoundContactFeasibility(BoundSlacks):
         """The info keys `whole_body/cone_margin` and `whole_body/contacts`: forecast for the executed control."""
         contacts, margin = 0, 0.0
         if executed is not None:
-            found = self.plant.contact_forecast(executed)
-            contacts = int((found.step == 0).sum())
+            contacts = int((self.plant.contact_forecast(executed).step == 0).sum())
             margin = float(self.insides(executed).min())
-        return {
-            keys.WHOLE_BODY_CONTACTS: contacts,
-            keys.WHOLE_BODY_CONE_MARGIN: margin if np.isfinite(margin) else 0.0,
-        }
+        margin = margin if np.isfinite(margin) else 0.0
+        return {keys.WHOLE_BODY_CONTACTS: contacts, keys.WHOLE_BODY_CONE_MARGIN: margin}
 
 
 def require_contacts(plant: Plant, asker: str) -> MujocoPlant:
     """The plant, if it can forecast contact forces."""
-    return require_mujoco(
-        plant, f"{asker} forecasts contact forces with a MuJoCo model; an AnalyticPlant has none"
-    )
+    hint = "forecasts contact forces with a MuJoCo model; an AnalyticPlant has none"
+    return require_mujoco(plant, f"{asker} {hint}")
+
+
+def checked_friction_share(share: float) -> float:
+    """A share of the model's friction, in (0, 1]."""
+    share = positive("friction_share", share, "shares of the model's friction")
+    if share > 1.0:
+        raise ConfigurationError(
+            f"friction_share is in (0, 1], got {share}: no simulated ground holds more than its own friction"
+        )
+    return share
+
+
+def touching_bodies(plant: MujocoPlant, lacking: str) -> NDArray[np.bool_]:
+    """Which bodies can touch the fixed world, shape (nbody,); refuses a model that has none."""
+    touching = can_touch_the_world(plant.model)
+    if not touching.any():
+        raise UnsupportedEnvError(f"no body of this model can touch the fixed world with friction: {lacking}")
+    return touching

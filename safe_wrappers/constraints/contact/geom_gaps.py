@@ -41,16 +41,14 @@ class GeomGaps:
     def __init__(self, plant: MujocoPlant, machine: Sequence[str], world: Sequence[str]) -> None:
         m = plant.model
         own = [geom for name in machine for geom in _geoms(plant, name)]
-        trees = {int(m.body_treeid[m.geom_bodyid[geom]]) for geom in own}
-        if -1 in trees:
-            still = next(
-                n for n in machine if any(m.body_treeid[m.geom_bodyid[g]] < 0 for g in _geoms(plant, n))
-            )
-            raise ConfigurationError(f"no joint moves {still!r}: it cannot run into anything")
-        others = []
+        tree = m.body_treeid[m.geom_bodyid]
+        for name in machine:
+            if (tree[_geoms(plant, name)] < 0).any():
+                raise ConfigurationError(f"no joint moves {name!r}: it cannot run into anything")
+        others: list[int] = []
         for name in world:
             found = _geoms(plant, name)
-            if any(int(m.body_treeid[m.geom_bodyid[geom]]) in trees for geom in found):
+            if np.isin(tree[found], tree[own]).any():
                 raise ConfigurationError(
                     f"{name!r} is part of the machine itself, on the same joints as {', '.join(machine)}: it "
                     "cannot be an obstacle to it"
@@ -58,7 +56,7 @@ class GeomGaps:
             others += found
         self.pairs = [(a, b) for a in dict.fromkeys(own) for b in dict.fromkeys(others)]
         self.touch = np.array([max(m.geom_margin[a], m.geom_margin[b], 0.0) for a, b in self.pairs])
-        self.moves = np.array([m.body_treeid[m.geom_bodyid[b]] >= 0 for _, b in self.pairs])
+        self.moves = np.array([tree[b] >= 0 for _, b in self.pairs])
         self._segment = np.zeros(6)
 
     def distances(self, model: mujoco.MjModel, data: mujoco.MjData) -> Array:

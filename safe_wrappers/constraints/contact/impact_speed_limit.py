@@ -7,7 +7,7 @@ from typing import ClassVar
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import name_list, positive
+from safe_wrappers.checks import check_fields, name_list, positive
 from safe_wrappers.constraints.contact.geom_gaps import GeomGaps
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.control.contact.body_regions import body_region
@@ -74,11 +74,9 @@ class ImpactSpeedLimit(RolloutConstraint):
         self._check_shared()
         for name in ("bodies", "against"):
             setattr(self, name, name_list(name, getattr(self, name), "names of bodies or geoms"))
-        for name, unit in (("force_limit", "N"), ("stiffness", "N/m"), ("effective_mass", "kg")):
-            if getattr(self, name) is not None:
-                setattr(self, name, positive(name, getattr(self, name), unit))
-        if self.braking is not None:
-            self.braking = positive("braking", self.braking, "m/s^2")
+        units = {"force_limit": "N", "stiffness": "N/m", "effective_mass": "kg", "braking": "m/s^2"}
+        for name, unit in units.items():
+            check_fields(self, positive, (name,), unit)
         self._force, self._stiffness, self._other_mass = self._interface()
         if self.margin >= self._force:
             raise ConfigurationError(
@@ -91,9 +89,8 @@ class ImpactSpeedLimit(RolloutConstraint):
             if self.clamped:
                 raise ConfigurationError("clamped says how a region is hit: name the region too")
             if self.force_limit is None or self.stiffness is None:
-                raise ConfigurationError(
-                    "give a force_limit (N) and the interface's stiffness (N/m), or a region of the human body"
-                )
+                wanted = "a force_limit (N) and the interface's stiffness (N/m)"
+                raise ConfigurationError(f"give {wanted}, or a region of the human body")
             return self.force_limit, self.stiffness, np.inf
         region = body_region(self.region)
         limit = region.quasi_static_force if self.clamped else region.transient_force
@@ -122,13 +119,11 @@ class BoundImpactSpeedLimit(BoundRollout):
     def __init__(self, spec: ImpactSpeedLimit, plant: Plant) -> None:
         plant.require_acceleration("ImpactSpeedLimit")
         super().__init__(spec, plant)
-        self._gaps = GeomGaps(self.plant, self.spec.bodies, self.spec.against)
-        self._probe = mujoco.MjData(self.plant.model)
-        self._integration = np.zeros(
-            mujoco.mj_stateSize(self.plant.model, int(mujoco.mjtState.mjSTATE_INTEGRATION))
-        )
-        self._control: Array | None = None
         m = self.plant.model
+        self._gaps = GeomGaps(self.plant, self.spec.bodies, self.spec.against)
+        self._probe = mujoco.MjData(m)
+        self._integration = np.zeros(mujoco.mj_stateSize(m, int(mujoco.mjtState.mjSTATE_INTEGRATION)))
+        self._control: Array | None = None
         self._jacobians = [np.zeros((3, m.nv)) for _ in range(4)]
         self._mobile = np.zeros((1, m.nv))
 
@@ -178,13 +173,13 @@ class BoundImpactSpeedLimit(BoundRollout):
         if not self._gaps.moves[pair]:
             mass = 1.0 / (1.0 / mass + 1.0 / self.spec._other_mass)
         push = mass * max(moving, self._at_rest(given), 0.0)
-        return _Contact(
-            gap, max(speed, 0.0), mass * self.spec._stiffness, push, self.spec._stiffness * max(-gap, 0.0)
-        )
+        stiffness = self.spec._stiffness
+        return _Contact(gap, max(speed, 0.0), mass * stiffness, push, stiffness * max(-gap, 0.0))
 
     def _at_rest(self, given: Array) -> float:
         """Acceleration along the normal once the motion has stopped, when damping no longer holds it back, m/s^2."""
         if self._resting is None:
+            self._resting = self._moving
             if self._curving:
                 d = self._probe
                 velocity = d.qvel.copy()
@@ -193,8 +188,6 @@ class BoundImpactSpeedLimit(BoundRollout):
                 self._resting = self._forces()
                 d.qvel[:] = velocity
                 mujoco.mj_fwdVelocity(self.plant.model, d)
-            else:
-                self._resting = self._moving
         return float(given @ self._resting)
 
     def backup(self) -> Array:
@@ -210,14 +203,13 @@ class BoundImpactSpeedLimit(BoundRollout):
         self._at(self.plant.qpos, self.plant.qvel, None)
         contacts = [self._contact(pair) for pair in range(len(self._gaps.pairs))]
         touching = [c.gap <= touch for c, touch in zip(contacts, self._gaps.touch, strict=True)]
-        # Only a contact that is there is a fact; before it, how it will be is the forecast's to say.
-        self._lost = np.array(
-            [min(self._left(c), 0.0) if t else 0.0 for c, t in zip(contacts, touching, strict=True)]
-        )
-        value = []
+        # Only a contact that is there counts; before it, how it will be is the forecast's to say.
+        lost, value = [], []
         for c, there in zip(contacts, touching, strict=True):
-            left = self.spec._force - self._braked(c).peak if not there else self.spec._force - c.peak
+            left = self.spec._force - (c if there else self._braked(c)).peak
             value.append(left if there or self.spec.braking is not None else max(left, 0.0))
+            lost.append(min(self._left(c), 0.0) if there else 0.0)
+        self._lost = np.array(lost)
         return np.array(value)
 
     def _braked(self, contact: "_Contact") -> "_Contact":

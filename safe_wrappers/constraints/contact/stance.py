@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import non_negative, positive, whole_number
+from safe_wrappers.checks import check_fields, non_negative, positive, whole_number
+from safe_wrappers.constraints.contact.contact_feasibility import checked_friction_share, touching_bodies
 from safe_wrappers.constraints.limits.joints import refuse_uncovered_stops, stops
 from safe_wrappers.control.contact.friction_cone import cone_excess
 from safe_wrappers.control.legged.predicted_positions import predicted_position_rows
@@ -25,7 +26,6 @@ from safe_wrappers.control.legged.whole_body import (
 )
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, Memory
-from safe_wrappers.plants.mujoco.contact_forecast import can_touch_the_world
 from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
@@ -65,19 +65,14 @@ class Stance(Constraint):
     settle_s: float = 0.05
 
     def __post_init__(self) -> None:
-        self.friction_share = positive(
-            "friction_share", self.friction_share, "shares of the model's friction"
-        )
-        if self.friction_share > 1.0:
-            raise ConfigurationError(f"friction_share is in (0, 1], got {self.friction_share}")
+        self.friction_share = checked_friction_share(self.friction_share)
         if self.cone not in ("pyramid", "exact"):
             raise ConfigurationError(f'cone is "pyramid" or "exact", got {self.cone!r}')
         self.edges = whole_number("edges", self.edges, 3)
         if self.joint_tolerance is not None:
             self.joint_tolerance = non_negative("joint_tolerance", self.joint_tolerance, "rad or m")
-        if self.zmp_inset is not None:
-            self.zmp_inset = positive("zmp_inset", self.zmp_inset, "m: forces that push do the rest")
-        self.settle_s = positive("settle_s", self.settle_s, "s")
+        check_fields(self, positive, ("zmp_inset",), "m: forces that push do the rest")
+        check_fields(self, positive, ("settle_s",), "s")
 
     def bind(self, plant: Plant) -> "BoundStance":
         return BoundStance(self, plant)
@@ -96,27 +91,22 @@ class BoundStance(BoundConstraint):
         super().__init__(spec, require_mujoco(plant, hint))
         if not plant.has_acceleration:
             raise UnsupportedEnvError(hint)
-        if not can_touch_the_world(self.plant.model).any():
-            raise UnsupportedEnvError(
-                "no body of this model can touch the fixed world with friction: there is nothing to stand on"
-            )
+        touching_bodies(self.plant, "there is nothing to stand on")
         if self.spec.joint_tolerance is not None:
             refuse_uncovered_stops(self.plant.model)
-        self._joints, low, high = stops(self.plant.model)
+        joints, low, high = stops(self.plant.model)
         wider = self.spec.joint_tolerance or 0.0
         self._low, self._high = low - wider, high + wider
-        self._qpos = self.plant.model.jnt_qposadr[self._joints]
-        self._dofs = self.plant.model.jnt_dofadr[self._joints]
+        self._qpos, self._dofs = self.plant.model.jnt_qposadr[joints], self.plant.model.jnt_dofadr[joints]
 
     def observe(self, memory: Memory) -> None:
         self._known = False
         self._problem: WholeBodyProblem | None = None
         self._answer: WholeBodySolution | None = None
-        self._asked: Array | None = None
         self._contacts = 0
 
     def _write_down(self, control: Array) -> None:
-        """The program, once per observation; the first control asked for says which contacts open."""
+        """The program, once per observation; the first control says which contacts open."""
         if self._known:
             return
         self._known = True
@@ -191,10 +181,8 @@ class BoundStance(BoundConstraint):
         self._write_down(control)
         if self._problem is None:
             return False
-        answer = self._answer
-        if answer is None or self._asked is None:
-            answer = self._ask(self._problem, control)
-        if self._asked is not None and np.array_equal(control, self._asked):
+        answer = self._answer or self._ask(self._problem, control)
+        if np.array_equal(control, self._asked):
             return answer.status is WholeBodyStatus.INACTIVE
         if answer.status is WholeBodyStatus.INFEASIBLE:
             return False  # whatever the control
@@ -213,10 +201,8 @@ class BoundStance(BoundConstraint):
         self._write_down(proposed)
         if self._problem is None:
             return
-        if self._answer is None:  # another constraint was asked first, and has refused
-            self._ask(self._problem, proposed)
-        assert self._answer is not None
-        yield self._answer.control
+        # Another constraint may have refused before this one was asked.
+        yield (self._answer or self._ask(self._problem, proposed)).control
 
     def slack(self, control: Array) -> float:
         """What the forces that would hold the contacts leave of their cones, shares of the weight."""
@@ -225,10 +211,8 @@ class BoundStance(BoundConstraint):
         if self._problem is None:
             return -np.inf
         forces, _ = rigid_forces(self._problem, control)
-        if not len(forces):
-            return 0.0
         missed = cone_excess(forces, self._problem.normals, self._problem.friction)
-        return -float(missed.max()) / self.plant.weight_n
+        return -float(missed.max()) / self.plant.weight_n if len(forces) else 0.0
 
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
         """The info keys `whole_body/contacts` and `whole_body/cone_margin`: of the forces that would hold them."""

@@ -70,10 +70,9 @@ class BoundSupportMargin(BoundSlacks):
         """Distance to the edge minus inset and margin where it is least, shape (1,), m; 0 where there is none."""
         found = self.plant.contact_forecast(control)
         if not found.finite:
-            return np.full(1, np.nan)
-        return np.full(
-            1, min((d - self.spec.inset - self.spec.margin for d in self._distances(found)), default=0.0)
-        )
+            return np.array([np.nan])
+        left = (d - self.spec.inset - self.spec.margin for d in self._distances(found))
+        return np.array([min(left, default=0.0)])
 
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
         """The info keys `whole_body/zmp_margin` and `whole_body/supported`: forecast for the executed control."""
@@ -81,8 +80,7 @@ class BoundSupportMargin(BoundSlacks):
         if executed is not None:
             found = self.plant.contact_forecast(executed)
             distances = self._distances(found) if found.finite else []
-            least = min(distances, default=0.0)
-            share = len(distances) / found.steps
+            least, share = min(distances, default=0.0), len(distances) / found.steps
         return {keys.WHOLE_BODY_ZMP_MARGIN: least, keys.WHOLE_BODY_SUPPORTED: share}
 
 
