@@ -72,21 +72,19 @@ def project_batch(
     u = np.array(u_nom, dtype=np.float64)
     a, b = np.asarray(normals, dtype=np.float64), np.asarray(offsets, dtype=np.float64)
     if u.ndim != 2 or b.ndim != 2 or len(b) != len(u) or a.shape != (*b.shape, u.shape[1]):
-        raise ConfigurationError(
-            f"expected u_nom (B, m), normals (B, k, m) and offsets (B, k); got {u.shape}, {a.shape} and {b.shape}"
-        )
+        wanted = "u_nom (B, m), normals (B, k, m) and offsets (B, k)"
+        raise ConfigurationError(f"expected {wanted}; got {u.shape}, {a.shape} and {b.shape}")
     try:
         lo = np.broadcast_to(np.asarray(lower, dtype=np.float64), u.shape)
         hi = np.broadcast_to(np.asarray(upper, dtype=np.float64), u.shape)
     except ValueError:
+        given = f"{np.shape(lower)} and {np.shape(upper)}"
         raise ConfigurationError(
-            f"expected bounds of shape ({u.shape[1]},) or {u.shape}; got {np.shape(lower)} and {np.shape(upper)}"
+            f"expected bounds of shape ({u.shape[1]},) or {u.shape}; got {given}"
         ) from None
     if not np.isfinite(u).all():
-        where = np.flatnonzero(~np.isfinite(u).all(axis=1))
-        raise ConfigurationError(
-            f"u_nom must be finite, replace it before projecting; rows {where.tolist()} are not"
-        )
+        where = np.flatnonzero(~np.isfinite(u).all(axis=1)).tolist()
+        raise ConfigurationError(f"u_nom must be finite, replace it before projecting; rows {where} are not")
     if not (lo <= hi).all():  # also refuses NaN
         raise ConfigurationError(f"lower must not exceed upper, got {lo} and {hi}")
     with np.errstate(all="ignore"):  # numbers that overflow are left to `project`
@@ -115,15 +113,7 @@ def _without_solver(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> tuple
     left = np.flatnonzero(ordinary & ~solved)
     if left.size < _FEW:
         return answer, solved
-    u, a, b, lo, hi, length, excess = (
-        u[left],
-        a[left],
-        b[left],
-        lo[left],
-        hi[left],
-        length[left],
-        excess[left],
-    )
+    u, a, b, lo, hi, length, excess = (part[left] for part in (u, a, b, lo, hi, length, excess))
     slack = FEASIBILITY_TOLERANCE * batch_residual_scales(u, a, b, length, lo, hi)
     within = inside[left]
     near = within & (excess <= (1.0 - _CLEAR) * slack).all(axis=1)

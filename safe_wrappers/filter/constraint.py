@@ -12,9 +12,7 @@ from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
-
 Promise = Literal["proved", "best effort"]
-
 Memory = Any
 """What a bound constraint keeps from one control step to the next; None if nothing."""
 
@@ -66,8 +64,9 @@ class Constraint(ABC):
     def widened(self, margin: float) -> Self:
         """A copy whose margin is wider by this much, in the unit of its margin."""
         if not (is_dataclass(self) and any(f.name == "margin" for f in fields(self))):
+            name = type(self).__name__
             raise ConfigurationError(
-                f"{type(self).__name__} has no margin to widen; give it a field `margin`, or margin=0 here"
+                f"{name} has no margin to widen; give it a field `margin`, or margin=0 here"
             )
         own: Any = self
         wider: Self = replace(own, margin=own.margin + margin)

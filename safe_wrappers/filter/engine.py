@@ -112,6 +112,5 @@ def _refuse_same_keys(bound: Sequence[BoundConstraint]) -> None:
     for kind in kinds:
         if kinds.count(kind) > 1:
             raise ConfigurationError(
-                f"{kind} is in the list {kinds.count(kind)} times, and both would write the same info keys; use one "
-                "for everything it watches"
+                f"{kind} is in the list {kinds.count(kind)} times, and both would write the same info keys; use one"
             )

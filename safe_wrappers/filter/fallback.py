@@ -32,11 +32,9 @@ class Fallback:
 
     def __init__(self, choice: str | FallbackFunction, constraints: Sequence[BoundConstraint] = ()) -> None:
         if not callable(choice) and choice not in NAMES:
-            raise UnknownNameError(
-                f"no fallback {choice!r}; choose {', '.join(NAMES)}, or pass a function of the plant"
-            )
-        self._choice = choice
-        self._constraints = constraints
+            names = ", ".join(NAMES)
+            raise UnknownNameError(f"no fallback {choice!r}; choose {names}, or pass a function of the plant")
+        self._choice, self._constraints = choice, constraints
         self.brakes = choice == "brake"
 
     def __call__(
@@ -62,9 +60,8 @@ class Fallback:
             assert plant is not None
             control = np.asarray(self._choice(plant), dtype=np.float64)
             if control.shape != low.shape:
-                raise ConfigurationError(
-                    f"the fallback must return a control of shape {low.shape}, got {control.shape}"
-                )
+                wanted = f"the fallback must return a control of shape {low.shape}"
+                raise ConfigurationError(f"{wanted}, got {control.shape}")
         elif self._choice == "hold":
             control = last
         elif self._choice == "zero" or not readable:

@@ -78,9 +78,8 @@ def project(
     a = a.reshape(b.size, m) if a.ndim < 2 and a.size == b.size * m else a  # one row may come flat
     lo, hi = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     if u.ndim != 1 or a.shape != (b.size, m):
-        raise ConfigurationError(
-            f"expected u_nom (m,), normals (k, m) and offsets (k,); got {u.shape}, {a.shape} and {b.shape}"
-        )
+        wanted = "u_nom (m,), normals (k, m) and offsets (k,)"
+        raise ConfigurationError(f"expected {wanted}; got {u.shape}, {a.shape} and {b.shape}")
     try:
         if lo.shape != u.shape or hi.shape != u.shape:
             lo, hi = np.broadcast_to(lo, (m,)), np.broadcast_to(hi, (m,))
@@ -98,9 +97,8 @@ def box_least_squares(a: Array, b: Array, lower: Array, upper: Array) -> Array:
     hessian, linear = a.T @ a, -(a.T @ b)
     nearest = np.asarray(np.linalg.solve(hessian, -linear), dtype=np.float64)
     unit = control_unit(box_size(lower.tobytes(), upper.tobytes()), nearest, np.zeros(1), np.ones(1))
-    answer = solve_with_daqp(
-        hessian, linear / unit, np.zeros((0, linear.size)), np.zeros(0), lower / unit, upper / unit
-    )
+    no_rows = np.zeros((0, linear.size)), np.zeros(0)
+    answer = solve_with_daqp(hessian, linear / unit, *no_rows, lower / unit, upper / unit)
     # Without rows the problem cannot be infeasible; on a numerical failure the unbounded answer, clipped.
     return np.asarray(np.clip(nearest if answer is None else answer[0] * unit, lower, upper))
 
@@ -112,9 +110,8 @@ def check_solver(solver: str) -> None:
     import qpsolvers  # here: it imports every solver that is installed, JAX and torch among them
 
     if solver not in qpsolvers.available_solvers:
-        raise UnknownNameError(
-            f"solver {solver!r} is not installed; installed: {', '.join(sorted(qpsolvers.available_solvers))}"
-        )
+        there = ", ".join(sorted(qpsolvers.available_solvers))
+        raise UnknownNameError(f"solver {solver!r} is not installed; installed: {there}")
 
 
 def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array, solver: str) -> Projection:
