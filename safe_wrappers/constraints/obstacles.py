@@ -18,19 +18,12 @@ _SHARES = (1e-4, 0.1, 0.25, 0.5, 1.0)  # of the horizon, at which growth is look
 
 
 class Nearest(NamedTuple):
-    """For one point and k surfaces in d dimensions.
+    """For one point and k surfaces in d dimensions."""
 
-    Attributes:
-        distance: Signed, m, negative inside, shape (k,).
-        normal: Unit vectors from the surface towards the point, shape (k, d).
-        velocity: Of the surface, m/s, shape (k, d).
-        curvature: Of the surface of equal distance through the point, along each coordinate, 1/m, shape (k, d).
-    """
-
-    distance: Array
-    normal: Array
-    velocity: Array
-    curvature: Array
+    distance: Array  # signed, m, negative inside, shape (k,)
+    normal: Array  # unit vectors from the surface towards the point, shape (k, d)
+    velocity: Array  # of the surface, m/s, shape (k, d)
+    curvature: Array  # of the surface of equal distance through the point, along each coordinate, 1/m, (k, d)
 
 
 class Obstacle(Protocol):

@@ -68,15 +68,13 @@ class BoundSlacks(BoundConstraint):
 
 
 class RolloutMemory(NamedTuple):
-    """What a rollout constraint remembers of an episode.
+    """What a rollout constraint remembers of an episode."""
 
-    Attributes:
-        least: What was left at the last states, the newest last, at most `horizon` of them.
-        response: How what is left changes with a control, and the observation until which that is kept; or None.
-    """
-
-    least: tuple[float, ...] = ()
+    least: tuple[
+        float, ...
+    ] = ()  # what was left at the last states, the newest last, at most `horizon` of them
     response: tuple[Array, int] | None = None
+    """How what is left changes with a control, and the observation until which that is kept; None: not known."""
 
 
 class BoundRollout(BoundSlacks):

@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -86,38 +86,23 @@ class Traction(Constraint):
         return BoundTraction(self, plant)
 
 
-class TractionMemory(NamedTuple):
-    """What Traction remembers of an episode; arrays of shape (wheels,), before the last control.
-
-    Attributes:
-        estimate: Of the ground's friction.
-        rate: Turning rates, rad/s; None: nothing was measured.
-        time: s.
-        ground: Speeds of the ground below, m/s.
-        slip: Slip ratios along the heading.
-        across: And across it.
-        load: Forces on the ground, N.
-        most_load: The largest so far, N.
-        faster: Recent error of the predicted ground speed, upwards, m/s.
-        slower: Downwards, m/s.
-        ahead: By how much the ground speed is predicted to change, m/s.
-        traction: Force of the ground in the last control step, N.
-        present: Of the ground at its end, N.
-    """
+@dataclass
+class TractionMemory:
+    """What Traction remembers of an episode; arrays of shape (wheels,), before the last control."""
 
     estimate: FrictionEstimate
-    rate: Array | None
-    time: float
-    ground: Array
-    slip: Array
-    across: Array
-    load: Array
-    most_load: Array
-    faster: Array
-    slower: Array
-    ahead: Array
-    traction: Array
-    present: Array
+    rate: Array | None  # turning rates, rad/s; None: nothing was measured
+    time: float  # s
+    ground: Array  # speeds of the ground below, m/s
+    slip: Array  # slip ratios along the heading
+    across: Array  # and across it
+    load: Array  # forces on the ground, N
+    most_load: Array  # the largest so far, N
+    faster: Array  # recent error of the predicted ground speed, upwards, m/s
+    slower: Array  # downwards, m/s
+    ahead: Array  # by how much the ground speed is predicted to change, m/s
+    traction: Array  # force of the ground in the last control step, N
+    present: Array  # of the ground at its end, N
 
 
 class BoundTraction(BoundConstraint):
@@ -126,6 +111,7 @@ class BoundTraction(BoundConstraint):
     info_keys: tuple[str, ...] = (keys.SLIP_RATIO, keys.SLIP_LIMITED, keys.SLIP_MU_ESTIMATE, keys.SLIP_MU_STD)
     spec: Traction
     plant: MujocoPlant
+    seen: TractionMemory  # what is known at the observed state
 
     def __init__(self, spec: Traction, plant: Plant) -> None:
         hint = "Traction needs a MujocoPlant: it reads the wheels from the model"
@@ -154,18 +140,12 @@ class BoundTraction(BoundConstraint):
         return TractionMemory(FrictionEstimate(n), None, math.nan, *(np.zeros(n) for _ in range(10)))
 
     def executed(self, control: Array) -> Memory:
-        now = (self._rate, self._time, self._ground, self._slip, self._across, self._load, self._most_load)
-        return TractionMemory(
-            self._estimate, *now, self._faster, self._slower, self._ahead, self._traction, self._present
-        )
+        return self.seen
 
     def observe(self, memory: TractionMemory) -> None:
         """Take the state and measure what the last control step showed."""
         self._rows: HalfSpaces | None = None
-        self._estimate = memory.estimate.copy()
-        _, self._rate, self._time, self._ground, self._slip, self._across, *rest = memory
-        self._load, self._most_load, self._faster, self._slower, *measured = rest
-        self._ahead, self._traction, self._present = measured
+        seen = self.seen = replace(memory, estimate=memory.estimate.copy())
         if self.plant.model_version != self._model_version:
             self._read_constants()
         rate, ground, sideways = self._wheels.motion(self.plant)
@@ -173,41 +153,41 @@ class BoundTraction(BoundConstraint):
         assert published is not None  # there is no delay
         load = self._wheels.loads(self.plant.attribute("model"), published)
         if not np.isfinite(rate + ground + sideways + load).all():
-            self._rate = None
+            seen.rate = None
             return
         wheel = self._constants.radius * rate
         slip = slip_ratio(wheel, ground, self.spec.regularization)
         faster = np.maximum(np.maximum(np.abs(ground), np.abs(wheel)), self.spec.regularization)
         across = np.abs(sideways) / faster
-        elapsed, self._time = self.plant.time - self._time, self.plant.time
+        elapsed, seen.time = self.plant.time - seen.time, self.plant.time
         held = math.isclose(elapsed, self.plant.control_dt, rel_tol=1e-6)
-        again = elapsed == 0.0 and bool((rate == self._rate).all())  # keeps what was measured
-        if self._rate is None or not (held or again):
+        again = elapsed == 0.0 and bool((rate == seen.rate).all())  # keeps what was measured
+        if seen.rate is None or not (held or again):
             # Nothing before it, or a clock that was set: no held control led from that state to this one.
-            self._ahead, self._traction, self._present = (np.zeros_like(rate) for _ in range(3))
-            self._faster, self._slower = np.zeros_like(rate), np.zeros_like(rate)
+            seen.ahead, seen.traction, seen.present = (np.zeros_like(rate) for _ in range(3))
+            seen.faster, seen.slower = np.zeros_like(rate), np.zeros_like(rate)
         elif held:
-            error = ground - self._ground - self._ahead
-            self._faster = np.maximum(error, _SPEED_ERROR_FADE * self._faster)
-            self._slower = np.maximum(-error, _SPEED_ERROR_FADE * self._slower)
-            self._ahead = ground - self._ground
+            error = ground - seen.ground - seen.ahead
+            seen.faster = np.maximum(error, _SPEED_ERROR_FADE * seen.faster)
+            seen.slower = np.maximum(-error, _SPEED_ERROR_FADE * seen.slower)
+            seen.ahead = ground - seen.ground
             torque = self._wheels.torque(published)
-            self._traction = self._constants.traction(self._response, self._rate, rate, torque)
+            seen.traction = self._constants.traction(self._response, seen.rate, rate, torque)
             # Below the regularisation the number is no slip ratio, and says nothing about the curve.
             self._learn(ground, slip, across, load, rolls=faster > self.spec.regularization)
-        self._rate, self._ground, self._slip, self._across, self._load = rate, ground, slip, across, load
-        at, spread = self._estimate.peak_slip
+        seen.rate, seen.ground, seen.slip, seen.across, seen.load = rate, ground, slip, across, load
+        at, spread = seen.estimate.peak_slip
         limit = np.minimum(self.spec.max_slip, at - _CAUTION * spread) - self.spec.margin
         # Along and across share one curve: what slides sideways already is not left for driving and braking.
         limit = np.sqrt(np.maximum(limit**2 - across**2, 0.0))
         self._limit = np.maximum(limit, _LEAST_LIMIT * self.spec.max_slip)
-        speed, radius = ground + self._ahead, self._constants.radius
+        speed, radius = ground + seen.ahead, self._constants.radius
         low, high = slip_window(speed, self._limit, self.spec.regularization)
         self._window = low / radius, high / radius
         # A ground speed above the prediction is slip of a braked wheel, one below it of a driven wheel.
         self._reserve = (
-            self._kept_free(self._faster, speed - low) / radius,
-            self._kept_free(self._slower, high - speed) / radius,
+            self._kept_free(seen.faster, speed - low) / radius,
+            self._kept_free(seen.slower, high - speed) / radius,
         )
 
     @staticmethod
@@ -220,33 +200,34 @@ class BoundTraction(BoundConstraint):
         self, ground: Array, slip: Array, across: Array, load: Array, rolls: NDArray[np.bool_]
     ) -> None:
         """Give the estimate the slip and the friction of the last control step, where it showed any."""
-        mean_load, along = 0.5 * (load + self._load), 0.5 * (slip + self._slip)
-        total = np.hypot(along, 0.5 * (across + self._across))
-        self._most_load = np.maximum(self._most_load, mean_load)
-        self._estimate.travel(np.abs(ground) * self.plant.control_dt)
-        loaded = np.minimum(load, self._load) > _LEAST_LOAD * self._most_load
-        usable = loaded & rolls & (self._traction * along > 0.0) & (np.abs(along) > _LEAST_SHARE * total)
+        seen = self.seen
+        mean_load, along = 0.5 * (load + seen.load), 0.5 * (slip + seen.slip)
+        total = np.hypot(along, 0.5 * (across + seen.across))
+        seen.most_load = np.maximum(seen.most_load, mean_load)
+        seen.estimate.travel(np.abs(ground) * self.plant.control_dt)
+        loaded = np.minimum(load, seen.load) > _LEAST_LOAD * seen.most_load
+        usable = loaded & rolls & (seen.traction * along > 0.0) & (np.abs(along) > _LEAST_SHARE * total)
         # The force points against the sliding: its part along the heading is the part of the slip there.
         part = np.where(usable, np.abs(along) / np.where(usable, total, 1.0), 1.0)
-        friction = np.abs(self._traction) / (part * np.where(loaded, mean_load, 1.0))
+        friction = np.abs(seen.traction) / (part * np.where(loaded, mean_load, 1.0))
         usable &= friction <= _MOST_FRICTION
-        noise = (_NOISE + _NOISE_PER_SLIP * np.abs(slip - self._slip)) / part
-        self._estimate.update(total, friction, np.where(usable, noise, np.inf))
+        noise = (_NOISE + _NOISE_PER_SLIP * np.abs(slip - seen.slip)) / part
+        seen.estimate.update(total, friction, np.where(usable, noise, np.inf))
         # What was measured is the interval's mean; where the slip went on growing, so did the force. From nothing to
         # its end a slip is at most twice its mean; a slip that has changed its sign in between shows no more.
         now = np.where(slip * along > 0.0, np.minimum(np.abs(slip), 2.0 * np.abs(along)), 0.0)
-        risen = self._traction * self._estimate.rise(np.abs(along), now)
-        self._present = np.where(self._traction * along > 0.0, risen, self._traction)
+        risen = seen.traction * seen.estimate.rise(np.abs(along), now)
+        seen.present = np.where(seen.traction * along > 0.0, risen, seen.traction)
 
     def _torques(self, rates: Array, counted_on: Array) -> Array:
         """The torques that take the wheels to given rates by the end of the hold, if the ground gives a force."""
-        assert self._rate is not None
-        coasting = self._response.decay * self._rate
+        assert self.seen.rate is not None
+        coasting = self._response.decay * self.seen.rate
         return np.asarray((rates - coasting) / self._response.gain + self._constants.radius * counted_on)
 
     def rows(self) -> HalfSpaces:
         """Two per wheel, for driving and braking torque, where the drive could exceed them."""
-        if self._rate is None:  # says nothing, and a row that is not a number fails
+        if self.seen.rate is None:  # says nothing, and a row that is not a number fails
             return HalfSpaces(np.full((1, self.plant.lower.size), np.nan), np.full(1, np.nan))
         if self._rows is None:
             self._rows = self._bounds()
@@ -254,9 +235,9 @@ class BoundTraction(BoundConstraint):
 
     def _bounds(self) -> HalfSpaces:
         bias, effect = self._wheels.drive(self.plant)
-        carried = 0.0 if self.spec.friction is None else self.spec.friction * self._load
-        most = self._torques(self._window[1], np.maximum(self._present, carried)) - bias
-        least = self._torques(self._window[0], np.minimum(self._present, -carried)) - bias
+        carried = 0.0 if self.spec.friction is None else self.spec.friction * self.seen.load
+        most = self._torques(self._window[1], np.maximum(self.seen.present, carried)) - bias
+        least = self._torques(self._window[0], np.minimum(self.seen.present, -carried)) - bias
         low, high = self.plant.acting_range
         low, high = np.maximum(low, -_UNBOUNDED), np.minimum(high, _UNBOUNDED)
         ends = [end(effect * low, effect * high).sum(axis=1) for end in (np.minimum, np.maximum)]
@@ -265,7 +246,7 @@ class BoundTraction(BoundConstraint):
         most = np.maximum(most - self._reserve[1] / gain, np.minimum(most, ends[0]))
         least = np.minimum(least + self._reserve[0] / gain, np.maximum(least, ends[1]))
         # From outside the window, as fast back as the drive can: no more can be asked for.
-        outside = np.abs(self._slip) > self._limit
+        outside = np.abs(self.seen.slip) > self._limit
         most = np.where(outside, np.maximum(most, ends[0]), most)
         least = np.where(outside, np.minimum(least, ends[1]), least)
         # Negated, so that a row that is not a number is kept, and fails, instead of being left out.
@@ -275,15 +256,15 @@ class BoundTraction(BoundConstraint):
 
     def backup(self) -> Array:
         """The control that brakes the vehicle as the slip limit allows it; other actuators at zero."""
-        if self._rate is None:
+        if self.seen.rate is None:
             return np.zeros_like(self.plant.lower)
         bias, effect = self._wheels.drive(self.plant)
-        speed = self._ground + self._ahead
+        speed = self.seen.ground + self.seen.ahead
         low, high = self._window[0] + self._reserve[0], self._window[1] - self._reserve[1]
         wanted = np.where(speed > 0.0, low, high)
         # No farther than to a standstill: past it the wheel would drive the other way.
         wanted = np.where(speed > 0.0, np.maximum(wanted, 0.0), np.minimum(wanted, 0.0))
-        torque = self._torques(wanted, self._present) - bias
+        torque = self._torques(wanted, self.seen.present) - bias
         return np.asarray(np.linalg.lstsq(effect, torque, rcond=None)[0])
 
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
@@ -292,8 +273,8 @@ class BoundTraction(BoundConstraint):
         if proposed is not None and executed is not None:
             changed = np.abs(executed - proposed) > _ROUNDING * np.abs(proposed) + _SOLVERS_NOISE
         return {
-            keys.SLIP_RATIO: self._slip.copy(),
+            keys.SLIP_RATIO: self.seen.slip.copy(),
             keys.SLIP_LIMITED: self._wheels.driven_by(changed),
-            keys.SLIP_MU_ESTIMATE: self._estimate.mean,
-            keys.SLIP_MU_STD: self._estimate.std,
+            keys.SLIP_MU_ESTIMATE: self.seen.estimate.mean,
+            keys.SLIP_MU_STD: self.seen.estimate.std,
         }

@@ -55,19 +55,12 @@ class Projection(NamedTuple):
 
 
 class BoxSize(NamedTuple):
-    """How wide a box is.
+    """How wide a box is."""
 
-    Attributes:
-        half: Of its width, per component.
-        widest: The largest of them.
-        even: All are the same.
-        ordinary: Controls are of order one.
-    """
-
-    half: tuple[float, ...]
-    widest: float
-    even: bool
-    ordinary: bool
+    half: tuple[float, ...]  # half of its width, per component
+    widest: float  # the largest half
+    even: bool  # all are the same
+    ordinary: bool  # controls are of order one
 
 
 @functools.lru_cache(maxsize=256)

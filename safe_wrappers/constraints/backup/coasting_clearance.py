@@ -247,19 +247,12 @@ class BoundCoastingClearance(BoundDetourClearance):
 
 
 class _Outcome(NamedTuple):
-    """What a control leads to.
+    """What a control leads to."""
 
-    Attributes:
-        least: The least clearance until rest, m; minus infinity without rest.
-        end: The clearance at the end, m.
-        way: From here to there, shape (2,), m.
-        turn: How far it turns on the way, rad.
-    """
-
-    least: float
-    end: float
-    way: Array
-    turn: float
+    least: float  # the least clearance until rest, m; minus infinity without rest
+    end: float  # the clearance at the end, m
+    way: Array  # from here to there, shape (2,), m
+    turn: float  # how far it turns on the way, rad
 
 
 class _Group:

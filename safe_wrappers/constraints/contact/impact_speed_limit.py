@@ -263,21 +263,13 @@ class BoundImpactSpeedLimit(BoundRollout):
 
 @dataclass(frozen=True, slots=True)
 class _Contact:
-    """A contact, now or at the present speed.
+    """A contact, now or at the present speed."""
 
-    Attributes:
-        gap: m, negative inside.
-        speed: Of the approach, m/s, >= 0.
-        inertia: Mass times stiffness, N^2 s^2 / m^2.
-        push: What presses on besides the motion, N, >= 0.
-        pressed: Force by the present deflection, N.
-    """
-
-    gap: float
-    speed: float
-    inertia: float
-    push: float
-    pressed: float
+    gap: float  # m, negative inside
+    speed: float  # of the approach, m/s, >= 0
+    inertia: float  # mass times stiffness, N^2 s^2 / m^2
+    push: float  # what presses on besides the motion, N, >= 0
+    pressed: float  # force by the present deflection, N
 
     @property
     def peak(self) -> float:
