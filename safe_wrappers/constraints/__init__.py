@@ -11,8 +11,7 @@ from safe_wrappers.constraints.contact.contact_feasibility import ContactFeasibi
 from safe_wrappers.constraints.contact.impact_speed_limit import ImpactSpeedLimit
 from safe_wrappers.constraints.contact.stance import Stance
 from safe_wrappers.constraints.contact.support_margin import SupportMargin
-from safe_wrappers.constraints.limits.joint_position_limit import JointPositionLimit
-from safe_wrappers.constraints.limits.joint_speed_limit import JointSpeedLimit
+from safe_wrappers.constraints.limits.joints import JointPositionLimit, JointSpeedLimit
 from safe_wrappers.constraints.limits.singularity_margin import SingularityMargin
 from safe_wrappers.constraints.limits.speed_limit import SpeedLimit
 from safe_wrappers.constraints.limits.upright import Upright

@@ -52,18 +52,15 @@ class SerialChain:
             body = int(model.body_parentid[body])
         self.joints = np.array(sorted(j for j in carriers if model.jnt_type[j] in HINGE_OR_SLIDE), dtype=int)
         if not self.joints.size:
-            raise ConfigurationError(
-                f"no hinge or slide moves {self._what}: it has no manipulability; the model has the joints "
-                + ", ".join(plant.names("joint"))
-            )
+            wanted = f"no hinge or slide moves {self._what}: it has no manipulability"
+            raise ConfigurationError(f"{wanted}; the model has the joints {', '.join(plant.names('joint'))}")
         self.qpos, self.dofs = model.jnt_qposadr[self.joints], model.jnt_dofadr[self.joints]
         self.scalar = len(self.joints) == len(carriers)
         self._slides = (model.jnt_type[self.joints] == int(mujoco.mjtJoint.mjJNT_SLIDE))[:, None]
         self._data = mujoco.MjData(model)
         # Names, not views of the data: a copy of this object would hold on to the old one's.
-        places = {"site": "site_xpos", "body": "xpos", "geom": "geom_xpos"}
-        turns = {"site": "site_xmat", "body": "xmat", "geom": "geom_xmat"}
-        self._place, self._turn, self._index = places[kind], turns[kind], index
+        kinds = {"site": "site_", "body": "", "geom": "geom_"}
+        self._place, self._turn, self._index = f"{kinds[kind]}xpos", f"{kinds[kind]}xmat", index
 
     def columns(self, names: Sequence[str] | None) -> list[int]:
         """Places in `joints` of the named ones, or of those that an actuator drives directly.
@@ -78,10 +75,8 @@ class SerialChain:
             driven = driven_joints(model)
             found = [i for i, j in enumerate(self.joints) if int(j) in driven]
             if not found:
-                raise ConfigurationError(
-                    f"no actuator drives a joint that moves {self._what}: name the joints that move it; there are "
-                    + there
-                )
+                wanted = f"no actuator drives a joint that moves {self._what}: name the joints that move it"
+                raise ConfigurationError(f"{wanted}; there are {there}")
             remedy = "Name those that do the task: joints=[...]"
             refuse_uncovered(model, self.joints.tolist(), remedy, self._plant.has_acceleration)
             return found
@@ -89,15 +84,13 @@ class SerialChain:
         ids = scalar_joints(self._plant, names)
         for j, name in zip(ids, names, strict=True):
             if j not in places:
-                raise ConfigurationError(
-                    f"the joint {name!r} does not move {self._what}; those that do: {there}"
-                )
+                wanted = f"the joint {name!r} does not move {self._what}"
+                raise ConfigurationError(f"{wanted}; those that do: {there}")
         if len(set(ids)) < len(ids):
             raise ConfigurationError(f"a joint is named twice: {list(names)}")
         return sorted(places[j] for j in ids)
 
     def name(self, column: int) -> str:
-        """Of a joint."""
         return str(self._model.joint(self.joints[column]).name)
 
     def place(self, data: mujoco.MjData) -> None:
