@@ -107,6 +107,29 @@ class ImpactSpeedLimit(RolloutConstraint):
         return BoundImpactSpeedLimit(self, plant)
 
 
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """A contact, now or at the present speed."""
+
+    gap: float  # m, negative inside
+    speed: float  # of the approach, m/s, >= 0
+    inertia: float  # mass times stiffness, N^2 s^2 / m^2
+    push: float  # what presses on besides the motion, N, >= 0
+    pressed: float  # force by the present deflection, N
+
+    @property
+    def peak(self) -> float:
+        """From `m v^2 / 2 + k x^2 / 2 + F_p (x_max - x) = k x_max^2 / 2`, N."""
+        return self.push + float(np.hypot(self.pressed - self.push, np.sqrt(self.inertia) * self.speed))
+
+    def left(self, limit: float) -> float:
+        """What is left of a limit, N, to first order; in squares, nearly linear in the control."""
+        # Beyond the limit the push would change its sign with that of the first factor.
+        push = self.push if self.pressed <= limit else -self.push
+        square = (limit - self.pressed) * (limit + self.pressed - 2.0 * push)
+        return (square - self.inertia * self.speed**2) / (2.0 * limit)
+
+
 class BoundImpactSpeedLimit(BoundRollout):
     """ImpactSpeedLimit on a plant."""
 
@@ -124,10 +147,11 @@ class BoundImpactSpeedLimit(BoundRollout):
         self._probe = mujoco.MjData(m)
         self._integration = np.zeros(mujoco.mj_stateSize(m, int(mujoco.mjtState.mjSTATE_INTEGRATION)))
         self._control: Array | None = None
+        self._limit = self.spec._force - self.spec.margin
         self._jacobians = [np.zeros((3, m.nv)) for _ in range(4)]
         self._mobile = np.zeros((1, m.nv))
 
-    def _at(self, qpos: Array, qvel: Array, control: Array | None) -> None:
+    def place(self, qpos: Array, qvel: Array, control: Array | None) -> None:
         """Everything about a state but its constraint forces; without a control the actuators do not push."""
         m, d = self.plant.model, self._probe
         d.qpos[:], d.qvel[:] = qpos, qvel
@@ -148,8 +172,8 @@ class BoundImpactSpeedLimit(BoundRollout):
         mujoco.mj_fwdAcceleration(m, d)
         return np.asarray(d.qfrc_smooth - (0.0 if self._pushing else d.qfrc_actuator))
 
-    def _contact(self, pair: int) -> "_Contact":
-        """What a contact of the pair would be like, at the state of `_at`."""
+    def contact(self, pair: int) -> Contact:
+        """What a contact of the pair would be like, at the state of `place`."""
         m, d = self.plant.model, self._probe
         gap, normal, points = self._gaps.nearest(self.plant.model, d, pair)
         robot, other = self._gaps.pairs[pair]
@@ -163,7 +187,7 @@ class BoundImpactSpeedLimit(BoundRollout):
         mobility = float(row @ given)
         speed = float(row @ self._speeds)
         if mobility < _FIXED:
-            return _Contact(gap, 0.0, 0.0, 0.0, 0.0)
+            return Contact(gap, 0.0, 0.0, 0.0, 0.0)
         mass = 1.0 / mobility if self.spec.effective_mass is None else self.spec.effective_mass
         moving = float(given @ self._moving)
         if self._curving:
@@ -174,7 +198,7 @@ class BoundImpactSpeedLimit(BoundRollout):
             mass = 1.0 / (1.0 / mass + 1.0 / self.spec._other_mass)
         push = mass * max(moving, self._at_rest(given), 0.0)
         stiffness = self.spec._stiffness
-        return _Contact(gap, max(speed, 0.0), mass * stiffness, push, stiffness * max(-gap, 0.0))
+        return Contact(gap, max(speed, 0.0), mass * stiffness, push, stiffness * max(-gap, 0.0))
 
     def _at_rest(self, given: Array) -> float:
         """Acceleration along the normal once the motion has stopped, when damping no longer holds it back, m/s^2."""
@@ -200,32 +224,24 @@ class BoundImpactSpeedLimit(BoundRollout):
         data, what = self.plant.pose(), int(mujoco.mjtState.mjSTATE_INTEGRATION)
         mujoco.mj_getState(m, data, self._integration, what)
         mujoco.mj_setState(m, d, self._integration, what)
-        self._at(self.plant.qpos, self.plant.qvel, None)
-        contacts = [self._contact(pair) for pair in range(len(self._gaps.pairs))]
+        self.place(self.plant.qpos, self.plant.qvel, None)
+        contacts = [self.contact(pair) for pair in range(len(self._gaps.pairs))]
         touching = [c.gap <= touch for c, touch in zip(contacts, self._gaps.touch, strict=True)]
         # Only a contact that is there counts; before it, how it will be is the forecast's to say.
         lost, value = [], []
         for c, there in zip(contacts, touching, strict=True):
             left = self.spec._force - (c if there else self._braked(c)).peak
             value.append(left if there or self.spec.braking is not None else max(left, 0.0))
-            lost.append(min(self._left(c), 0.0) if there else 0.0)
+            lost.append(min(c.left(self._limit), 0.0) if there else 0.0)
         self._lost = np.array(lost)
         return np.array(value)
 
-    def _braked(self, contact: "_Contact") -> "_Contact":
+    def _braked(self, contact: Contact) -> Contact:
         """A contact to come, at the speed that the declared braking leaves of it."""
         if self.spec.braking is None:
             return contact
         square = max(contact.speed**2 - 2.0 * self.spec.braking * contact.gap, 0.0)
         return replace(contact, speed=square**0.5)
-
-    def _left(self, contact: "_Contact") -> float:
-        """What is left of the limit less the margin, N, to first order; in squares, nearly linear in the control."""
-        limit = self.spec._force - self.spec.margin
-        # Beyond the limit the push would change its sign with that of the first factor.
-        push = contact.push if contact.pressed <= limit else -contact.push
-        square = (limit - contact.pressed) * (limit + contact.pressed - 2.0 * push)
-        return (square - contact.inertia * contact.speed**2) / (2.0 * limit)
 
     def _violation(self, value: Array) -> Array:
         return self._lost
@@ -249,29 +265,13 @@ class BoundImpactSpeedLimit(BoundRollout):
         if self.spec.braking is not None:
             touched[soon] = list(range(pairs))
         # Without contact as much is left as in the gentlest one.
-        room = np.full((k, pairs), 0.5 * (self.spec._force - self.spec.margin))
+        room = np.full((k, pairs), 0.5 * self._limit)
         for instant, those in touched.items():
             # At the end of the held step another control takes over.
             control = self._control if instant < soon or instant == 0 else None
-            self._at(forecast.qpos[instant], forecast.qvel[instant], control)
+            self.place(forecast.qpos[instant], forecast.qvel[instant], control)
             for pair in those:
-                contact = self._contact(pair)
+                contact = self.contact(pair)
                 there = contact.gap <= self._gaps.touch[pair]
-                room[instant, pair] = self._left(contact if there else self._braked(contact))
+                room[instant, pair] = (contact if there else self._braked(contact)).left(self._limit)
         return room + self.spec.margin
-
-
-@dataclass(frozen=True, slots=True)
-class _Contact:
-    """A contact, now or at the present speed."""
-
-    gap: float  # m, negative inside
-    speed: float  # of the approach, m/s, >= 0
-    inertia: float  # mass times stiffness, N^2 s^2 / m^2
-    push: float  # what presses on besides the motion, N, >= 0
-    pressed: float  # force by the present deflection, N
-
-    @property
-    def peak(self) -> float:
-        """From `m v^2 / 2 + k x^2 / 2 + F_p (x_max - x) = k x_max^2 / 2`, N."""
-        return self.push + float(np.hypot(self.pressed - self.push, np.sqrt(self.inertia) * self.speed))

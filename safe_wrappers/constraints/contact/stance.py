@@ -103,20 +103,24 @@ class BoundStance(BoundConstraint):
         self._known = False
         self._problem: WholeBodyProblem | None = None
         self._answer: WholeBodySolution | None = None
-        self._contacts = 0
 
-    def _write_down(self, control: Array) -> None:
-        """The program, once per observation; the first control says which contacts open."""
-        if self._known:
-            return
-        self._known = True
+    def problem(self, control: Array) -> WholeBodyProblem | None:
+        """The program of the observed state, or None where it is not finite.
+
+        The first control, shape (m,), after `observe` says which contacts open.
+        """
+        if not self._known:
+            self._known, self._problem = True, self._write_down(control)
+        return self._problem
+
+    def _write_down(self, control: Array) -> WholeBodyProblem | None:
         data = self.plant.under(control)
         motion = equations_of_motion(self.plant.model, data, self.plant.actuators)
         found = motion.contacts
         # Beyond this MuJoCo resets the state in its step.
         within = bool((np.abs(self.plant.state) < mujoco.mjMAXVAL).all())
         if not (within and np.isfinite(motion.bias).all() and np.isfinite(found.forces).all()):
-            return  # nothing can be said
+            return None  # nothing can be said
         ground = fixed_bodies(self.plant.model)[found.pushed_by]
         # What the robot's bodies do to each other, and other things to it, stays as it is.
         bias = motion.bias - np.einsum("kiv,ki->v", found.jacobians[~ground], found.forces[~ground])
@@ -125,14 +129,15 @@ class BoundStance(BoundConstraint):
         acceleration = -(jacobians @ self.plant.qvel) / self.spec.settle_s
         limits: dict[str, Any] = {}
         if self.spec.joint_tolerance is not None:
-            limits["acceleration_rows"], limits["acceleration_limits"] = predicted_position_rows(
+            joints = (
                 self._dofs,
                 self.plant.qpos[self._qpos],
                 self.plant.qvel[self._dofs],
                 self._low,
                 self._high,
-                self.plant.control_dt,
-                self.plant.model.nv,
+            )
+            limits["acceleration_rows"], limits["acceleration_limits"] = predicted_position_rows(
+                *joints, self.plant.control_dt, self.plant.model.nv
             )
         if self.spec.zmp_inset is not None:
             rows = self._balance(found.points[ground], normals, pressing)
@@ -155,8 +160,7 @@ class BoundStance(BoundConstraint):
             **limits,
         )
         # Two points of one rigid foot cannot come to rest each as it likes.
-        self._problem = replace(problem, contact_acceleration=attainable_contact_acceleration(problem))
-        self._contacts = int(ground.sum())
+        return replace(problem, contact_acceleration=attainable_contact_acceleration(problem))
 
     def _balance(self, points: Array, normals: Array, pressing: NDArray[np.bool_]) -> Array | None:
         """The inset, as rows on all contact forces; None where there is no polygon."""
@@ -171,52 +175,51 @@ class BoundStance(BoundConstraint):
         rows[:, pressing] = some.reshape(len(some), -1, 3)
         return np.asarray(rows.reshape(len(some), -1))
 
-    def _solve(self, problem: WholeBodyProblem) -> WholeBodySolution:
+    def solve(self, problem: WholeBodyProblem) -> WholeBodySolution:
+        """By the specification's cone."""
         return solve_cone(problem) if self.spec.cone == "exact" else solve_pyramid(problem, self.spec.edges)
 
     def admits(self, control: Array) -> bool:
         """Whether the standing contacts could answer this control with forces inside their cones."""
         # An action space of another precision than the model's range may be a rounding wider.
         control = np.clip(control, self.plant.lower, self.plant.upper)
-        self._write_down(control)
-        if self._problem is None:
+        problem = self.problem(control)
+        if problem is None:
             return False
-        answer = self._answer or self._ask(self._problem, control)
+        answer = self._answer or self._ask(problem, control)
         if np.array_equal(control, self._asked):
             return answer.status is WholeBodyStatus.INACTIVE
         if answer.status is WholeBodyStatus.INFEASIBLE:
             return False  # whatever the control
         if float(np.abs(control - answer.control).max()) <= _SAME:
             return answer.status is not WholeBodyStatus.FAILED
-        return self._solve(replace(self._problem, nominal=control)).status is WholeBodyStatus.INACTIVE
+        return self.solve(replace(problem, nominal=control)).status is WholeBodyStatus.INACTIVE
 
     def _ask(self, problem: WholeBodyProblem, proposed: Array) -> WholeBodySolution:
         """Solve for a proposal, and keep the answer."""
-        self._asked, self._answer = proposed.copy(), self._solve(replace(problem, nominal=proposed))
+        self._asked, self._answer = proposed.copy(), self.solve(replace(problem, nominal=proposed))
         return self._answer
 
     def candidates(self, proposed: Array) -> Iterator[Array]:
         """The program's answer; where there is none, the control that misses least, which is refused."""
         proposed = np.clip(proposed, self.plant.lower, self.plant.upper)
-        self._write_down(proposed)
-        if self._problem is None:
-            return
-        # Another constraint may have refused before this one was asked.
-        yield (self._answer or self._ask(self._problem, proposed)).control
+        problem = self.problem(proposed)
+        if problem is not None:  # another constraint may have refused before this one was asked
+            yield (self._answer or self._ask(problem, proposed)).control
 
     def slack(self, control: Array) -> float:
         """What the forces that would hold the contacts leave of their cones, shares of the weight."""
         control = np.clip(control, self.plant.lower, self.plant.upper)
-        self._write_down(control)
-        if self._problem is None:
+        problem = self.problem(control)
+        if problem is None:
             return -np.inf
-        forces, _ = rigid_forces(self._problem, control)
-        missed = cone_excess(forces, self._problem.normals, self._problem.friction)
+        forces, _ = rigid_forces(problem, control)
+        missed = cone_excess(forces, problem.normals, problem.friction)
         return -float(missed.max()) / self.plant.weight_n if len(forces) else 0.0
 
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
         """The info keys `whole_body/contacts` and `whole_body/cone_margin`: of the forces that would hold them."""
         contacts, margin = 0, 0.0
         if executed is not None and self._problem is not None:
-            contacts, margin = self._contacts, 0.0 + self.slack(executed)
+            contacts, margin = len(self._problem.normals), 0.0 + self.slack(executed)
         return {keys.WHOLE_BODY_CONTACTS: contacts, keys.WHOLE_BODY_CONE_MARGIN: margin}
