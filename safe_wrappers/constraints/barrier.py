@@ -83,11 +83,10 @@ class BoundBarrier(BoundConstraint):
     def __init__(self, spec: Barrier, plant: Plant) -> None:
         plant.require_acceleration("Barrier")
         super().__init__(spec, plant)
-        if not callable(self.spec.alpha) and self.spec.alpha * self.plant.control_dt > 1.0:
-            raise ConfigurationError(
-                f"alpha = {self.spec.alpha}/s lets h cross zero within one hold of {self.plant.control_dt} s; "
-                f"alpha must be at most 1/hold = {1.0 / self.plant.control_dt:g}/s"
-            )
+        if not callable(spec.alpha) and spec.alpha * plant.control_dt > 1.0:
+            wanted = f"alpha must be at most 1/hold = {1.0 / plant.control_dt:g}/s"
+            crossing = f"alpha = {spec.alpha}/s lets h cross zero within one hold of {plant.control_dt} s"
+            raise ConfigurationError(f"{crossing}; {wanted}")
         self._degree_checked = False
 
     def observe(self, memory: Memory) -> None:
@@ -129,10 +128,9 @@ class BoundBarrier(BoundConstraint):
     def admits(self, control: Array) -> bool:
         """Whether the row holds and prediction keeps h through the hold (from outside: does not lose more)."""
         row = self.rows()
-        excess = float(row.normals[0] @ control - row.offsets[0])
-        if not excess <= 0.0 and not keeps_rows(
-            control, row.normals, row.offsets, self.plant.lower, self.plant.upper
-        ):
+        kept = float(row.normals[0] @ control - row.offsets[0]) <= 0.0
+        box = self.plant.lower, self.plant.upper
+        if not kept and not keeps_rows(control, row.normals, row.offsets, *box):
             return False
         floor = min(self._now, 0.0) - self._rounding
         return all(self._height(x) >= floor for x in self.plant.path(control))

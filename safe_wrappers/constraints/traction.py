@@ -117,21 +117,21 @@ class BoundTraction(BoundConstraint):
         hint = "Traction needs a MujocoPlant: it reads the wheels from the model"
         super().__init__(spec, require_mujoco(plant, hint))
         if self.plant.delay_s > 0.0:
-            raise ConfigurationError(
-                f"Traction measures the ground's force from how the wheels answer, which a plant with a delay "
-                f"({self.plant.delay_s} s) predicts instead; use delay_s=0"
+            answers = (
+                f"how the wheels answer, which a plant with a delay ({self.plant.delay_s} s) predicts instead"
             )
-        self._wheels = DrivenWheels(self.plant, self.spec.wheels)
+            raise ConfigurationError(f"Traction measures the ground's force from {answers}; use delay_s=0")
+        self.wheels = DrivenWheels(self.plant, self.spec.wheels)
         self._read_constants()
 
     def _read_constants(self) -> None:
         self._model_version = self.plant.model_version
-        self._constants = self._wheels.constants(self.plant)
+        self.constants = self.wheels.constants(self.plant)
         options = self.plant.model.opt
-        self._response = self._constants.response(
+        self._response = self.constants.response(
             float(options.timestep),
             self.plant.substeps,
-            self._wheels.feedback,
+            self.wheels.feedback,
             int(options.integrator) in _IMPLICIT,
         )
 
@@ -148,14 +148,14 @@ class BoundTraction(BoundConstraint):
         seen = self.seen = replace(memory, estimate=memory.estimate.copy())
         if self.plant.model_version != self._model_version:
             self._read_constants()
-        rate, ground, sideways = self._wheels.motion(self.plant)
+        rate, ground, sideways = self.wheels.motion(self.plant)
         published = self.plant.published()
         assert published is not None  # there is no delay
-        load = self._wheels.loads(self.plant.attribute("model"), published)
+        load = self.wheels.loads(self.plant.attribute("model"), published)
         if not np.isfinite(rate + ground + sideways + load).all():
             seen.rate = None
             return
-        wheel = self._constants.radius * rate
+        wheel = self.constants.radius * rate
         slip = slip_ratio(wheel, ground, self.spec.regularization)
         faster = np.maximum(np.maximum(np.abs(ground), np.abs(wheel)), self.spec.regularization)
         across = np.abs(sideways) / faster
@@ -171,8 +171,8 @@ class BoundTraction(BoundConstraint):
             seen.faster = np.maximum(error, _SPEED_ERROR_FADE * seen.faster)
             seen.slower = np.maximum(-error, _SPEED_ERROR_FADE * seen.slower)
             seen.ahead = ground - seen.ground
-            torque = self._wheels.torque(published)
-            seen.traction = self._constants.traction(self._response, seen.rate, rate, torque)
+            torque = self.wheels.torque(published)
+            seen.traction = self.constants.traction(self._response, seen.rate, rate, torque)
             # Below the regularisation the number is no slip ratio, and says nothing about the curve.
             self._learn(ground, slip, across, load, rolls=faster > self.spec.regularization)
         seen.rate, seen.ground, seen.slip, seen.across, seen.load = rate, ground, slip, across, load
@@ -181,7 +181,7 @@ class BoundTraction(BoundConstraint):
         # Along and across share one curve: what slides sideways already is not left for driving and braking.
         limit = np.sqrt(np.maximum(limit**2 - across**2, 0.0))
         self._limit = np.maximum(limit, _LEAST_LIMIT * self.spec.max_slip)
-        speed, radius = ground + seen.ahead, self._constants.radius
+        speed, radius = ground + seen.ahead, self.constants.radius
         low, high = slip_window(speed, self._limit, self.spec.regularization)
         self._window = low / radius, high / radius
         # A ground speed above the prediction is slip of a braked wheel, one below it of a driven wheel.
@@ -223,7 +223,7 @@ class BoundTraction(BoundConstraint):
         """The torques that take the wheels to given rates by the end of the hold, if the ground gives a force."""
         assert self.seen.rate is not None
         coasting = self._response.decay * self.seen.rate
-        return np.asarray((rates - coasting) / self._response.gain + self._constants.radius * counted_on)
+        return np.asarray((rates - coasting) / self._response.gain + self.constants.radius * counted_on)
 
     def rows(self) -> HalfSpaces:
         """Two per wheel, for driving and braking torque, where the drive could exceed them."""
@@ -234,7 +234,7 @@ class BoundTraction(BoundConstraint):
         return self._rows
 
     def _bounds(self) -> HalfSpaces:
-        bias, effect = self._wheels.drive(self.plant)
+        bias, effect = self.wheels.drive(self.plant)
         carried = 0.0 if self.spec.friction is None else self.spec.friction * self.seen.load
         most = self._torques(self._window[1], np.maximum(self.seen.present, carried)) - bias
         least = self._torques(self._window[0], np.minimum(self.seen.present, -carried)) - bias
@@ -258,7 +258,7 @@ class BoundTraction(BoundConstraint):
         """The control that brakes the vehicle as the slip limit allows it; other actuators at zero."""
         if self.seen.rate is None:
             return np.zeros_like(self.plant.lower)
-        bias, effect = self._wheels.drive(self.plant)
+        bias, effect = self.wheels.drive(self.plant)
         speed = self.seen.ground + self.seen.ahead
         low, high = self._window[0] + self._reserve[0], self._window[1] - self._reserve[1]
         wanted = np.where(speed > 0.0, low, high)
@@ -274,7 +274,7 @@ class BoundTraction(BoundConstraint):
             changed = np.abs(executed - proposed) > _ROUNDING * np.abs(proposed) + _SOLVERS_NOISE
         return {
             keys.SLIP_RATIO: self.seen.slip.copy(),
-            keys.SLIP_LIMITED: self._wheels.driven_by(changed),
+            keys.SLIP_LIMITED: self.wheels.driven_by(changed),
             keys.SLIP_MU_ESTIMATE: self.seen.estimate.mean,
             keys.SLIP_MU_STD: self.seen.estimate.std,
         }

@@ -76,9 +76,7 @@ class Fallback:
         backup = next((b for c in self._constraints if (b := c.backup()) is not None), None)
         if backup is not None:
             return np.asarray(backup, dtype=np.float64)
-        if plant is not None and plant.can_brake:
-            return brake(plant)
-        return least
+        return brake(plant) if plant is not None and plant.can_brake else least
 
 
 def brake(plant: Any) -> Array:

@@ -81,10 +81,10 @@ class BoundWallClearance(BoundBackupClearance):
         super().__init__(spec, require_mujoco(plant, f"WallClearance needs a MujocoPlant; {hint}"))
 
     def read_constants(self) -> None:
-        clip = self.spec.velocity_clip if self.spec.velocity_clip is not None else math.inf
-        self._point = point = planar_point(self.plant, clip)
+        clip = self.spec.velocity_clip
+        self._point = point = planar_point(self.plant, math.inf if clip is None else clip)
         around, reach = walls(self.plant.model, point.body)
-        self._among = PointAmongWalls(*point.axes, around, self.spec.velocity_clip is not None)
+        self._among = PointAmongWalls(*point.axes, around, clip is not None)
         self._room = reach + self.spec.margin
 
     def clearance(self) -> Array:

@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from safe_wrappers.checks import name_list, positive
+from safe_wrappers.checks import check_fields, name_list, positive
 from safe_wrappers.constraints.limits.serial_chain import FrameKind, SerialChain
 from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
 from safe_wrappers.control.filtering.manipulability import (
@@ -94,11 +94,9 @@ class SingularityMargin(RolloutConstraint):
                 "give a threshold on the manipulability, or a task_speed and a rate_limit to validate one for; got "
                 f"threshold={self.threshold!r}, task_speed={self.task_speed!r}, rate_limit={self.rate_limit!r}"
             )
-        if self.threshold is not None:
-            self.threshold = positive("threshold", self.threshold, "units of manipulability")
-        if speed is not None and limit is not None:
-            self.task_speed = positive("task_speed", speed, "task units per second")
-            self.rate_limit = positive("rate_limit", limit, "rad/s or m/s")
+        check_fields(self, positive, ("threshold",), "units of manipulability")
+        check_fields(self, positive, ("task_speed",), "task units per second")
+        check_fields(self, positive, ("rate_limit",), "rad/s or m/s")
         kinds: tuple[FrameKind, ...] = ("site", "body", "geom")
         named = [kind for kind in kinds if getattr(self, kind) is not None]
         if len(named) != 1 or not isinstance(getattr(self, named[0]), str):
