@@ -71,9 +71,8 @@ def box_size(lower: bytes, upper: bytes) -> BoxSize:
         for bottom, top in zip(np.frombuffer(lower).tolist(), np.frombuffer(upper).tolist(), strict=True)
     )
     widest = max(half, default=0.0)
-    return BoxSize(
-        half, widest, widest == min(half, default=0.0), 1.0 / ORDINARY_BOX <= widest <= ORDINARY_BOX
-    )
+    even, ordinary = widest == min(half, default=0.0), 1.0 / ORDINARY_BOX <= widest <= ORDINARY_BOX
+    return BoxSize(half, widest, even, ordinary)
 
 
 def residual_scale(box: float, length: float, values: float) -> float:
@@ -84,9 +83,7 @@ def residual_scale(box: float, length: float, values: float) -> float:
         length: Of the normal: what it changes by over one control unit.
         values: Size of the two numbers that the row compares.
     """
-    if box >= NO_BOUND * length:
-        return values
-    return min(box, max(values, length))
+    return values if box >= NO_BOUND * length else min(box, max(values, length))
 
 
 def residual_scales(u: Array, a: Array, b: Array, length: Array, box: BoxSize) -> Array:

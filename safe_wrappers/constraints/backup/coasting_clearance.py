@@ -86,9 +86,7 @@ class CoastingClearance(Constraint):
                 raise ConfigurationError(f"{name}: the way to rest is forecast past discs that stand still")
             setattr(self, name, found)
         if not (self.keep_out or self.untouched):
-            raise ConfigurationError(
-                "give obstacles in keep_out (of the origin) or untouched (by the outline)"
-            )
+            raise ConfigurationError("give obstacles in keep_out (for the origin) or untouched (the outline)")
         self.outline = _checked_outline(self.outline, needed=bool(self.untouched))
         if isinstance(self.horizon, bool) or self.horizon != int(self.horizon) or self.horizon < 2:
             wanted = "horizon is a whole number of control intervals >= 2"
@@ -115,9 +113,8 @@ class BoundCoastingClearance(BoundDetourClearance):
         name = spec.robot_model_attr
         alone = None if name is None else plant.attribute(name)
         if alone is not None and not isinstance(alone, mujoco.MjModel):
-            raise ConfigurationError(
-                f"robot_model_attr names an attribute that holds an MjModel; {name!r} is {alone!r}"
-            )
+            wanted = "robot_model_attr names an attribute that holds an MjModel"
+            raise ConfigurationError(f"{wanted}; {name!r} is {alone!r}")
         self._coasting = Coasting(self.plant, spec.body, alone)
         self._still = np.zeros(self.plant.model.nu)
         outline = np.reshape(spec.outline, (-1, 2))

@@ -98,8 +98,7 @@ class BoundContactFeasibility(BoundSlacks):
 
     def slacks(self, control: Array) -> Array:
         """What is left of the cone, tolerance added and margin taken off, per body, shares of the weight."""
-        # What is inside by more than asked for, or in the air, is all the same: differences between a touch and none
-        # would say nothing of the touch.
+        # Capped at the margin: differences between a touch and none would say nothing of the touch.
         return np.minimum(self.insides(control), self.spec.margin) + self.spec.tolerance - self.spec.margin
 
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:

@@ -59,10 +59,6 @@ class GeomGaps:
         self.moves = np.array([tree[b] >= 0 for _, b in self.pairs])
         self._segment = np.zeros(6)
 
-    def distances(self, model: mujoco.MjModel, data: mujoco.MjData) -> Array:
-        """Of all pairs where the geoms are, shape (pairs,), m; negative inside each other."""
-        return np.array([_distance(model, data, a, b, None) for a, b in self.pairs])
-
     def nearest(self, model: mujoco.MjModel, data: mujoco.MjData, pair: int) -> tuple[float, Array, Array]:
         """Distance (m), the unit normal from the machine to the world, and the nearest points of both, shape (6,)."""
         a, b = self.pairs[pair]

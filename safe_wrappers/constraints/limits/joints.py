@@ -88,10 +88,9 @@ def scalar_joints(plant: MujocoPlant, names: Sequence[str] | None) -> list[int]:
     if names is None:
         ids = driven_joints(model)
         if not ids:
-            raise ConfigurationError(
-                "no actuator drives a hinge or slide directly: name the joints; the model has: "
-                + ", ".join(plant.names("joint"))
-            )
+            there = ", ".join(plant.names("joint"))
+            wanted = "no actuator drives a hinge or slide directly: name the joints"
+            raise ConfigurationError(f"{wanted}; the model has: {there}")
         # What flies freely is no joint of a machine.
         own = [j for j in range(model.njnt) if model.jnt_type[j] != int(mujoco.mjtJoint.mjJNT_FREE)]
         refuse_uncovered(model, own, "Name those that you mean: joints=[...]", plant.has_acceleration)
