@@ -122,7 +122,8 @@ def checked_friction_share(share: float) -> float:
     share = positive("friction_share", share, "shares of the model's friction")
     if share > 1.0:
         raise ConfigurationError(
-            f"friction_share is in (0, 1], got {share}: no simulated ground holds more than its own friction"
+            f"friction_share is in (0, 1], got {share}: no simulated ground holds more than its own friction; a "
+            "model with more is MujocoPlant(model=...)"
         )
     return share
 
