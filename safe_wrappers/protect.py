@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium as gym
 import mujoco
 
-from safe_wrappers.constraints.limits.joint_speed_limit import JointSpeedLimit
+from safe_wrappers.constraints.limits.joints import JointSpeedLimit
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import check_actions
 from safe_wrappers.recipes import RECIPES

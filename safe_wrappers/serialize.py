@@ -9,7 +9,7 @@ import numpy as np
 from safe_wrappers import constraints
 from safe_wrappers.checks import settings_from
 from safe_wrappers.constraints.barrier import Barrier
-from safe_wrappers.constraints.obstacles import obstacle_kinds
+from safe_wrappers.constraints.obstacles import KINDS as OBSTACLES
 from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.duck_typed import duck_typed
@@ -39,7 +39,7 @@ def plain_data(value: Any) -> Any:
     if isinstance(value, list | tuple) and any(is_dataclass(one) for one in value):
         return [plain_data(one) for one in value]
     kind = type(value)
-    known = kind in KINDS.values() or kind in obstacle_kinds.KINDS.values()
+    known = kind in KINDS.values() or kind in OBSTACLES.values()
     ours = is_dataclass(kind) and kind.__module__.startswith("safe_wrappers.")
     if (not known and (not ours or isinstance(value, Constraint))) or kind is Barrier:
         return value

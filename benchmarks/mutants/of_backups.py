@@ -76,8 +76,8 @@ ESCAPE = Target(
         Mutant("if -self.spec.margin < self._best < 0.0 else 0.0", "if False else 0.0"),
         Mutant("firsts[0 if left[0] >= 0.0 else int(left.argmax())]", "firsts[0]"),
         Mutant(
-            "moved = centers + late[:, None, None] * velocity",
-            "moved = centers + 0.0 * late[:, None, None] * velocity",
+            "moved = centers + times[:, None, None] * velocity",
+            "moved = centers + 0.0 * times[:, None, None] * velocity",
         ),
         Mutant("_nearest_first(np.concatenate([good, closer]), asked)", "np.concatenate([good, closer])"),
         Mutant("            closer = closer[self._slacks(closer).max(axis=1) >= 0.0]\n", ""),

@@ -15,8 +15,7 @@ from safe_wrappers.errors import ConfigurationError, UnsafeStateWarning
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.engine import SafetyFilter
 from safe_wrappers.filter.fallback import FallbackFunction
-from safe_wrappers.filter.projection import check_solver
-from safe_wrappers.filter.rounding import cast_inside
+from safe_wrappers.filter.projection import cast_inside, check_solver
 from safe_wrappers.filter.search import Stage
 from safe_wrappers.plants.default import default_plant
 from safe_wrappers.plants.env_checks import check_actions, wrappers_of

@@ -9,8 +9,7 @@ from safe_wrappers.checks import non_negative
 from safe_wrappers.constraints.contact.contact_feasibility import ContactFeasibility
 from safe_wrappers.constraints.contact.stance import Stance
 from safe_wrappers.constraints.contact.support_margin import SupportMargin
-from safe_wrappers.constraints.limits.joint_position_limit import JointPositionLimit
-from safe_wrappers.constraints.limits.joints import refuse_uncovered_stops, stops
+from safe_wrappers.constraints.limits.joints import JointPositionLimit, refuse_uncovered_stops, stops
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint
