@@ -20,10 +20,9 @@ from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.filter.projection import check_solver
 from safe_wrappers.filter.rounding import cast_inside
 from safe_wrappers.filter.search import Stage
-from safe_wrappers.plants.default import default_plant
+from safe_wrappers.plants.default import PlantTemplate, default_plant, own_plant
 from safe_wrappers.plants.env_checks import check_actions, wrappers_of
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.template import PlantTemplate, own_plant
 from safe_wrappers.serialize import constraint_from, plain_data
 from safe_wrappers.stack import Layer, refuse_order
 

@@ -16,7 +16,7 @@ from safe_wrappers.control.estimation.observability import linear_observability
 from safe_wrappers.control.estimation.tracks import Tracks, largest_deviation
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError
 from safe_wrappers.plants.env_checks import read_attribute
-from safe_wrappers.plants.mujoco.timing import control_interval
+from safe_wrappers.plants.mujoco.binding import control_interval
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight
 from safe_wrappers.stack import Layer, refuse_order
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng

@@ -7,8 +7,8 @@ import gymnasium as gym
 
 from safe_wrappers.constraints.traction import Traction
 from safe_wrappers.filter.fallback import FallbackFunction
+from safe_wrappers.plants.default import PlantTemplate, own_plant
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.template import PlantTemplate, own_plant
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 
 

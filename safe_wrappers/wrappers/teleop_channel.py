@@ -15,9 +15,9 @@ from safe_wrappers.control.teleop.wave_line import Rule
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.fallback import FallbackFunction
+from safe_wrappers.plants.default import PlantTemplate, own_plant
 from safe_wrappers.plants.env_checks import check_actions, check_timing, refuse_changed_actions
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.template import PlantTemplate, own_plant
 from safe_wrappers.serialize import plain_data, recorded
 from safe_wrappers.stack import Layer, refuse_order
 from safe_wrappers.wrappers.cbf_action_filter import is_filtered

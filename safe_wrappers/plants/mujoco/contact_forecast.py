@@ -6,15 +6,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
 from safe_wrappers.plants.mujoco.forecast import RESETS
+from safe_wrappers.plants.mujoco.model import fixed_bodies
 from safe_wrappers.plants.mujoco.replay import evaluations
 
 Array = NDArray[np.float64]
 
 _FASTEST = float(mujoco.mjMAXVAL) ** 2
-"""Of squared lengths. MuJoCo answers numbers out of bounds with a reset, after which all may look well; and nothing
-checks the stages of a Runge-Kutta step that are made here."""
+"""Bound of squared lengths: MuJoCo does not check the stages of the Runge-Kutta steps that are made here."""
 
 
 class ContactForecast(NamedTuple):
@@ -29,8 +28,7 @@ class ContactForecast(NamedTuple):
         force: On the robot, shape (n, 3), N.
         friction: Coefficient of sliding that the model has for it, shape (n,); of two that differ with the direction
             the smaller one, and 0 for a contact without friction (condim 1).
-        finite: False where the simulation left the numbers that MuJoCo takes (it answers with a reset); then the
-            contacts say nothing.
+        finite: False where numbers left MuJoCo's bounds (it then resets the state); the contacts are meaningless.
     """
 
     steps: int
@@ -44,18 +42,15 @@ class ContactForecast(NamedTuple):
 
 
 class ContactReader:
-    """Reads the contacts of moving bodies with the fixed world.
+    """Reads the contacts of a model's moving bodies with the fixed world.
 
-    What MuJoCo has is copied as it is, and made sense of once for many readings: Python is slower than the physics.
-
-    Args:
-        model: Whose data will be read.
+    `read` only copies MuJoCo's arrays; `forecast` evaluates all of them at once, because Python is slow.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self._model = model
         fixed = fixed_bodies(model)
-        # Geom -1, of something flexible, is the last entry: it moves, and is no body of the robot.
+        # The last entry is for geom -1, of something flexible: it moves, but is not a body of the robot.
         bodies = np.where(fixed, 0, np.arange(model.nbody))
         self._body_of_geom: list[int] = [*bodies[model.geom_bodyid].tolist(), -1]
         self._wrench = np.zeros(6)
@@ -73,7 +68,7 @@ class ContactReader:
         self._dims: list[Array] = []
 
     def read(self, data: mujoco.MjData) -> None:
-        """Keep every contact that counts, as MuJoCo has computed them last."""
+        """Copy every contact of a moving body with the fixed world, as MuJoCo has computed them last."""
         step = self.count
         self.count += 1
         if not data.ncon:
@@ -97,14 +92,13 @@ class ContactReader:
         self._dims.append(contact.dim.copy())
 
     def forecast(self, finite: bool) -> ContactForecast:
-        """All that has been read."""
+        """All contacts that have been read since `clear`."""
         if not self._kept:
             none, nowhere = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
             return ContactForecast(self.count, none, none, nowhere, nowhere, nowhere, np.zeros(0), finite)
         step, which, body, side = np.array(self._kept, dtype=np.int64).T
         frames = np.concatenate(self._frames)[which].reshape(-1, 3, 3)
         sign = side[:, None].astype(np.float64)
-        # Where the two directions differ, the weaker one is counted on in all.
         friction = np.concatenate(self._friction)[which, :2].min(axis=1)
         return ContactForecast(
             steps=self.count,
@@ -117,31 +111,21 @@ class ContactReader:
             finite=finite,
         )
 
+    def follow(self, data: mujoco.MjData, substeps: int) -> ContactForecast:
+        """Step the data, with the control it has, and return the contacts of all these physics substeps."""
+        self.clear()
+        data.warning.number[RESETS] = 0
+        inside = True
 
-def forecast_contacts(
-    model: mujoco.MjModel, data: mujoco.MjData, substeps: int, reader: ContactReader
-) -> ContactForecast:
-    """Step the data through one control interval with the control it has, and write its contacts down.
+        def visit(at: mujoco.MjData, _: float) -> None:
+            nonlocal inside
+            self.read(at)
+            inside = inside and bool(at.qacc @ at.qacc < _FASTEST)
 
-    Args:
-        model: The plant's own.
-        data: At the present state, with the control; it is left at the end of the interval.
-        substeps: Physics substeps per control interval.
-        reader: For this model.
-    """
-    reader.clear()
-    data.warning.number[RESETS] = 0
-    inside = True
-
-    def visit(at: mujoco.MjData, _: float) -> None:
-        nonlocal inside
-        reader.read(at)
-        inside = inside and bool(at.qacc @ at.qacc < _FASTEST)
-
-    for _ in range(substeps):
-        evaluations(model, data, visit)
-    inside = inside and bool(data.qvel @ data.qvel < _FASTEST and data.qpos @ data.qpos < _FASTEST)
-    return reader.forecast(finite=inside and not data.warning.number[RESETS].any())
+        for _ in range(substeps):
+            evaluations(self._model, data, visit)
+        inside = inside and bool(data.qvel @ data.qvel < _FASTEST and data.qpos @ data.qpos < _FASTEST)
+        return self.forecast(finite=inside and not data.warning.number[RESETS].any())
 
 
 def can_touch_the_world(model: mujoco.MjModel) -> NDArray[np.bool_]:

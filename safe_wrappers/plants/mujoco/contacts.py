@@ -11,29 +11,21 @@ from safe_wrappers.errors import UnknownNameError
 
 
 class NormalContact(NamedTuple):
-    """One contact.
-
-    Attributes:
-        bodies: Ids of the two bodies, the smaller first; `nbody` stands for something flexible.
-        gap: Signed distance, m; negative where they penetrate.
-        force: Along the normal, N; positive pushes them apart.
-    """
+    """One contact."""
 
     bodies: tuple[int, int]
+    """Ids of the two bodies, the smaller first; `nbody` stands for something flexible."""
     gap: float
+    """Signed distance, m; negative where they penetrate."""
     force: float
+    """Along the normal, N; positive pushes them apart."""
 
 
 class Contacts:
-    """Reads the contacts between some bodies of a model and some others.
-
-    Args:
-        model: Whose data will be read.
-        bodies: Names; None is all of them.
-        against: Names of what they touch; None is all of them.
+    """Reads the contacts between the named bodies of a model and those they touch; None is all of them.
 
     Raises:
-        UnknownNameError: No body has that name; the message lists those there are.
+        UnknownNameError: No body has that name; the message lists all names.
     """
 
     def __init__(
@@ -44,14 +36,14 @@ class Contacts:
             _chosen(model, name, given) for name, given in (("bodies", bodies), ("against", against))
         )
         self._watched = (one[:, None] & other | other[:, None] & one).tolist()
-        # Geom -1, of something flexible, is the last entry.
+        # The last entry is for geom -1, of something flexible.
         self._body_of_geom: list[int] = [*model.geom_bodyid.tolist(), model.nbody]
         # A pyramidal cone's edges share the normal force; an elliptic cone's first row has it.
         pyramids = model.opt.cone == int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
         self._rows = {dim: 2 * (dim - 1) if pyramids and dim > 1 else 1 for dim in (1, 3, 4, 6)}
 
     def read(self, data: mujoco.MjData) -> list[NormalContact]:
-        """The watched contacts that are in the data, as MuJoCo has computed them last."""
+        """The watched contacts, as MuJoCo has computed them last."""
         if data.ncon == 0:
             return []
         contact, forces, found = data.contact, data.efc_force.tolist(), []
@@ -71,7 +63,7 @@ class Contacts:
 
 
 def _chosen(model: mujoco.MjModel, argument: str, names: Sequence[str] | None) -> np.ndarray:
-    """Which bodies are named, shape (nbody + 1,); the last stands for what is flexible, which has no name."""
+    """Which bodies are named, shape (nbody + 1,); the last entry stands for flexible parts, which have no name."""
     if names is None:
         return np.ones(model.nbody + 1, dtype=bool)
     names = name_list(argument, names, "names of bodies", "None for all")

@@ -1,13 +1,11 @@
-"""`qacc = drift + effect @ u` of a MuJoCo model, at the present set of active contacts and limits.
-
-Exact for pyramidal friction cones.
-"""
+"""`qacc = drift + effect @ u` of a MuJoCo model at the present set of active contacts and limits."""
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.plants.mujoco.actuators import AffineActuators
+from safe_wrappers.plants.mujoco.model import inertia
 
 Array = NDArray[np.float64]
 
@@ -18,7 +16,7 @@ _QUADRATIC = int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC)
 def drift_and_effect(
     model: mujoco.MjModel, data: mujoco.MjData, actuators: AffineActuators
 ) -> tuple[Array, Array]:
-    """Shapes (nv,) and (nv, nu), from data whose derived quantities are up to date."""
+    """Shapes (nv,) and (nv, nu), from data that are up to date; exact for pyramidal friction cones."""
     gain, _ = actuators.gain_and_bias(data.actuator_length, data.actuator_velocity)
     least, most = actuators.acting_range(data.actuator_length, data.actuator_velocity)
     moment = actuators.moment(data)
@@ -37,10 +35,7 @@ def _solve_inertia(m: mujoco.MjModel, d: mujoco.MjData, rows: Array) -> Array:
         mujoco.mj_solveM(m, d, out, np.ascontiguousarray(rows))
         return out
     jacobian = _constraint_jacobian(m, d)[active]
-    inertia = np.empty((m.nv, m.nv))
-    for i, unit in enumerate(np.eye(m.nv)):
-        mujoco.mj_mulM(m, d, inertia[i], unit)
-    stiff = inertia + jacobian.T @ (d.efc_D[active][:, None] * jacobian)
+    stiff = inertia(m, d) + jacobian.T @ (d.efc_D[active][:, None] * jacobian)
     return np.asarray(np.linalg.solve(stiff, rows.T).T)
 
 
@@ -71,12 +66,3 @@ def position_rate(model: mujoco.MjModel, qpos: Array, qvel: Array) -> Array:
         else:
             rate[q] = qvel[v]
     return rate
-
-
-def inertia_diagonal(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
-    """Diagonal of the joint-space inertia, shape (nv,), kg or kg m^2."""
-    diagonal, column = np.empty(model.nv), np.empty(model.nv)
-    for i, unit in enumerate(np.eye(model.nv)):
-        mujoco.mj_mulM(model, data, column, unit)
-        diagonal[i] = column[i]
-    return diagonal

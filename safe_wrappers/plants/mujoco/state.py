@@ -1,4 +1,4 @@
-"""The state that a `MujocoPlant` speaks of: the env's, or under a delay the one predicted from it."""
+"""The present state of a `MujocoPlant`: the env's, or under a delay the one predicted from it."""
 
 from abc import ABC
 from collections import deque
@@ -29,7 +29,7 @@ class MujocoState(Plant, ABC):
     _contact_forecasts: dict[bytes, ContactForecast]
 
     def _start(self) -> None:
-        """With the model and the control interval known, no state yet."""
+        """Called by `bind`, once the model and the control interval are known."""
         self._nq, self._nv = int(self.model.nq), int(self.model.nv)
         self._delay_steps = int(np.ceil(self.delay_s / self.model.opt.timestep - 1e-9))
         self._pending = deque(maxlen=max(1, -(-self._delay_steps // self.substeps)))
@@ -38,13 +38,13 @@ class MujocoState(Plant, ABC):
         self._loaded = self._forwarded = False
 
     def observe(self) -> None:
-        """Take the env's present state; nothing is computed until it is asked for."""
+        """Take the env's present state; everything else is computed on demand."""
         mujoco.mj_getState(self._raw.model, self._raw.data, self._snapshot, int(_STATE))
         self._loaded = self._forwarded = False
         self._forecasts.clear()
         self._contact_forecasts.clear()
         self.observation_id += 1
-        # MuJoCo resets a state that is not a number, which a prediction would hide.
+        # MuJoCo resets a state with a NaN: a prediction would hide it.
         if self._delay_steps and bool(np.isfinite(self._snapshot).all()):
             self._predict_over_delay()
 
@@ -57,7 +57,7 @@ class MujocoState(Plant, ABC):
 
     def _predict_over_delay(self) -> None:
         self._load()
-        # The oldest command has acted in part already; before the first one the env's own control acts.
+        # The oldest command has already acted in part; before the first one the env's own control acts.
         early = self._delay_steps - self.substeps * len(self._pending)
         if early > 0:
             mujoco.mj_step(self.model, self.data, early)
@@ -77,13 +77,13 @@ class MujocoState(Plant, ABC):
             self._loaded, self._forwarded = True, False
 
     def _load_to_step(self) -> None:
-        """The data at the present state, about to leave it."""
+        """The data at the present state; the caller may change it."""
         self._load()
         self._loaded = False
 
     @property
     def time(self) -> float:
-        """Of the present state, s; under a delay the predicted one."""
+        """Time of the present state, s; under a delay the predicted one."""
         return float(self._snapshot[0])
 
     @property

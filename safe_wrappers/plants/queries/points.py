@@ -1,4 +1,4 @@
-"""Named points of a MuJoCo machine, or one point of an analytic state: how they move."""
+"""The motion of named points of a MuJoCo machine, or of one point of an analytic state."""
 
 from collections.abc import Sequence
 
@@ -13,18 +13,13 @@ Array = NDArray[np.float64]
 
 
 class Points:
-    """Origins of bodies, sites and geoms (MujocoPlant), or state indices of one point (AnalyticPlant).
+    """Origins of named bodies, sites and geoms (MujocoPlant), or one point of the state (AnalyticPlant).
 
-    Args:
-        plant: Bound.
-        bodies: Names.
-        sites: Names.
-        geoms: Names.
-        position: Indices of the point's coordinates in the state.
-        velocity: Indices of its velocity, in the same order.
+    On an AnalyticPlant `position` and `velocity` are the indices of the point's coordinates and velocity in the
+    state.
 
     Raises:
-        ConfigurationError: Nothing is named that this plant can find; an unknown name with the list.
+        ConfigurationError: No point for this kind of plant, or an unknown name.
     """
 
     def __init__(
@@ -40,18 +35,16 @@ class Points:
         self._machine = plant if isinstance(plant, MujocoPlant) else None
         named = {"body": bodies, "site": sites, "geom": geoms}
         self._named = [(kind, name) for kind, names in named.items() for name in names]
-        if self._machine is None:
-            if not self._position:
-                raise ConfigurationError(
-                    "on an AnalyticPlant say where the point is in the state: position=[0, 1], velocity=[2, 3]"
-                )
-            return
-        if not self._named:
+        if self._machine is None and not self._position:
+            raise ConfigurationError(
+                "on an AnalyticPlant say where the point is in the state: position=[0, 1], velocity=[2, 3]"
+            )
+        if self._machine is not None and not self._named:
             raise ConfigurationError(
                 "name the bodies, sites or geoms to keep clear; the model has the bodies "
                 + ", ".join(self._machine.names("body"))
             )
-        for kind, name in self._named:
+        for kind, name in self._named if self._machine is not None else ():
             self._machine.named(kind, name)
 
     def motions(self) -> list[tuple[Array, Array]]:
@@ -62,7 +55,7 @@ class Points:
         return [(x[self._position], x[self._velocity])]
 
     def accelerations(self) -> list[tuple[Array, Array, Array, Array]]:
-        """Position, velocity, acceleration drift and control matrix of each point."""
+        """Position, velocity, drift and control matrix of the acceleration of each point, SI."""
         if self._machine is not None:
             return [self._machine.point(kind, name) for kind, name in self._named]
         x, p, v = self._plant.state, self._position, self._velocity
