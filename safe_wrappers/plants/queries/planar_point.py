@@ -1,8 +1,7 @@
-"""A point mass on two slides in a MuJoCo model: where it is, what moves it, how large it is, and its walls."""
+"""A point mass on two slides in a MuJoCo model: its joints, its actuators and the constants of its motion."""
 
 import copy
-from dataclasses import dataclass
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 import mujoco
 import numpy as np
@@ -16,51 +15,43 @@ Array = NDArray[np.float64]
 
 _ALIGNED = 1e-6
 _EXACT = 1e-9
-"""How closely the model's own step must follow the two axes' constants on the states that are tried, m, m/s."""
-_PROBES = 12
+"""Tolerance between the model's own step and the axes' constants at the states that are tried, m and m/s."""
+_TRIED = 12
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 
-@dataclass(frozen=True)
-class PlanarPoint:
-    """What `planar_point` finds in a model; x first, then y.
-
-    Attributes:
-        body: Index of the body.
-        axes: Constants of the motion.
-        joints: Indices of the two slides, in qpos and in qvel.
-        actuators: Indices of their actuators.
-        origin: Where the point is at qpos = 0, m.
-    """
+class PlanarPoint(NamedTuple):
+    """A point mass in a model; of pairs x is first, then y."""
 
     body: int
+    """Index of the body."""
     axes: tuple[DampedAxis, DampedAxis]
+    """Constants of the motion."""
     joints: tuple[int, int]
+    """Indices of the two slides, in qpos and in qvel."""
     actuators: tuple[int, int]
+    """Indices of their actuators."""
     origin: tuple[float, float]
+    """Where the point is at qpos = 0, m."""
 
 
 def planar_point(plant: MujocoPlant, clip: float, body: str | None = None) -> PlanarPoint:
-    """Find the point, or say what does not fit.
+    """Find the point, measure its constants by single physics steps of the model, and check them.
 
-    The constants are measured on the model itself, one physics step at a time, and then checked against it: what
-    is not a damped point mass with a force of its own on each axis (springs, gravity, friction, another
-    integrator, coupling) does not pass.
+    Springs, gravity, friction, coupling of the axes and other integrators are refused.
 
     Args:
-        plant: Bound; its model's constants are read.
-        clip: Speed per axis to which the env clips the motion at each control step's start, m/s.
-        body: Name of the body on the two slides, in a model in which more moves; none of that may act on them. None:
-            the slides are all that moves.
+        plant: Bound.
+        clip: Speed per axis to which the env clips the motion at the start of each control step, m/s.
+        body: Name of the body on the two slides; what else moves must not act on them. None: nothing else moves.
 
     Raises:
-        UnsupportedEnvError: The model is no such point.
+        UnsupportedEnvError: The model is no such point; the message says what does not fit.
     """
     m = plant.model
     slides = _only_slides(m) if body is None else _slides_of(m, plant.named("body", body), body)
     data = mujoco.MjData(m)
-    for joint in slides:
-        data.qpos[m.jnt_qposadr[joint]] = 0.0
+    data.qpos[m.jnt_qposadr[list(slides)]] = 0.0
     mujoco.mj_kinematics(m, data)
     joints = _order(slides, data.xaxis)
     if m.jnt_limited[list(slides)].any():
@@ -69,9 +60,8 @@ def planar_point(plant: MujocoPlant, clip: float, body: str | None = None) -> Pl
     order = int(m.jnt_qposadr[joints[0]]), int(m.jnt_qposadr[joints[1]])
     axes = _measured(plant, order, actuators, clip)
     index = int(m.jnt_bodyid[slides[0]])
-    return PlanarPoint(
-        index, axes, order, actuators, (float(data.xpos[index][0]), float(data.xpos[index][1]))
-    )
+    x, y, _ = data.xpos[index].tolist()
+    return PlanarPoint(index, axes, order, actuators, (x, y))
 
 
 def _only_slides(m: mujoco.MjModel) -> tuple[int, int]:
@@ -83,7 +73,7 @@ def _only_slides(m: mujoco.MjModel) -> tuple[int, int]:
 
 def _slides_of(m: mujoco.MjModel, body: int, name: str) -> tuple[int, int]:
     slides = [j for j in range(m.njnt) if m.jnt_bodyid[j] == body and m.jnt_type[j] == _SLIDE]
-    # Where nothing has more coordinates than rates before them, one index serves positions and speeds.
+    # With free and ball joints only after them, one index serves positions and speeds.
     if len(slides) != 2 or any(m.jnt_qposadr[j] != m.jnt_dofadr[j] for j in slides):
         _refuse(
             f"the body {name!r} must have two slides of its own, before any free or ball joint of the model; it has "
@@ -93,7 +83,7 @@ def _slides_of(m: mujoco.MjModel, body: int, name: str) -> tuple[int, int]:
 
 
 def _order(slides: tuple[int, int], axes: Array) -> tuple[int, int]:
-    """Which slide goes along world x and which along world y."""
+    """The slide along world x, then the one along world y."""
     for first, second in (slides, slides[::-1]):
         if np.allclose(axes[[first, second]], np.eye(3)[:2], atol=_ALIGNED):
             return first, second
@@ -125,21 +115,23 @@ def _measured(
     free.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     data = mujoco.MjData(free)
 
+    at, motors = list(order), list(actuators)
+
     def step(x: Array, v: Array, u: Array, around: np.random.Generator | None = None) -> tuple[Array, Array]:
         mujoco.mj_resetData(free, data)
-        if around is not None:  # what else moves must make no difference
+        if around is not None:  # everything else that moves must make no difference
             data.qvel[:] = around.uniform(-1.0, 1.0, m.nv)
             mujoco.mj_integratePos(free, data.qpos, data.qvel, 1.0)
             data.ctrl[:] = np.clip(around.uniform(-1.0, 1.0, m.nu), least, most)
-        data.qpos[list(order)], data.qvel[list(order)], data.ctrl[list(actuators)] = x, v, u
+        data.qpos[at], data.qvel[at], data.ctrl[motors] = x, v, u
         mujoco.mj_step(free, data)
-        return data.qpos[list(order)].copy(), data.qvel[list(order)].copy()
+        return data.qpos[at].copy(), data.qvel[at].copy()
 
     zero = np.zeros(2)
     decay = step(zero, np.ones(2), zero)[1]
     gain = step(zero, zero, high)[1] / high
     h, rng = float(m.opt.timestep), np.random.default_rng(0)
-    for _ in range(_PROBES):
+    for _ in range(_TRIED):
         x, v, u = rng.uniform(-3.0, 3.0, 2), rng.uniform(-5.0, 5.0, 2), rng.uniform(low, high)
         x_next, v_next = step(x, v, u, rng)
         expected = decay * v + gain * u

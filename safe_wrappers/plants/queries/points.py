@@ -35,16 +35,18 @@ class Points:
         self._machine = plant if isinstance(plant, MujocoPlant) else None
         named = {"body": bodies, "site": sites, "geom": geoms}
         self._named = [(kind, name) for kind, names in named.items() for name in names]
-        if self._machine is None and not self._position:
-            raise ConfigurationError(
-                "on an AnalyticPlant say where the point is in the state: position=[0, 1], velocity=[2, 3]"
-            )
-        if self._machine is not None and not self._named:
+        if self._machine is None:
+            if not self._position:
+                raise ConfigurationError(
+                    "on an AnalyticPlant say where the point is in the state: position=[0, 1], velocity=[2, 3]"
+                )
+            return
+        if not self._named:
             raise ConfigurationError(
                 "name the bodies, sites or geoms to keep clear; the model has the bodies "
                 + ", ".join(self._machine.names("body"))
             )
-        for kind, name in self._named if self._machine is not None else ():
+        for kind, name in self._named:
             self._machine.named(kind, name)
 
     def motions(self) -> list[tuple[Array, Array]]:

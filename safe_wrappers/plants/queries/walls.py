@@ -1,4 +1,4 @@
-"""The walls of a maze in a MuJoCo model: the fixed boxes that a body moving in the plane can run into."""
+"""The walls of a maze in a MuJoCo model: the fixed boxes that a body moving in the plane can touch."""
 
 import mujoco
 import numpy as np
@@ -11,22 +11,17 @@ _PLANE, _BOX = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_BOX)
 
 
 def walls(model: mujoco.MjModel, body: int) -> tuple[list[Rectangle], float]:
-    """Everything fixed that a body which slides in the horizontal plane can touch.
+    """Everything fixed that a body, given by its index, can touch as it slides along x and y without turning.
 
-    A level floor and whatever lies wholly above or below the body cannot be run into and are left out; so are
-    geoms that MuJoCo does not collide with it.
-
-    Args:
-        model: Its walls must not move and not change.
-        body: Index of the body; it slides along x and y and does not turn.
+    Level floors and geoms wholly above or below the body are left out.
 
     Returns:
-        The walls, touching ones joined, and the distance from the body's origin to a wall, m, from which on MuJoCo
-        reports a contact: the body's reach from its origin (a ball's radius) and both contact margins.
+        The walls, touching ones joined, m, and the distance of the body's origin from a wall at which MuJoCo reports
+        a contact, m: the body's radius and both contact margins.
 
     Raises:
-        UnsupportedEnvError: The body has nothing to collide with, or something in its way is not an upright box
-            along x and y.
+        UnsupportedEnvError: No geom of the body collides with anything, or something it can touch moves or is not an
+            upright box along x and y.
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -67,8 +62,8 @@ def walls(model: mujoco.MjModel, body: int) -> tuple[list[Rectangle], float]:
                 "obstacles that describe it (Box, Disc, Plane)."
             )
         widest = max(widest, gap)
-        x, y = float(centre[0]), float(centre[1])
-        found.append((x - float(half[0]), x + float(half[0]), y - float(half[1]), y + float(half[1])))
+        (x, y, _), (dx, dy, _) = centre.tolist(), half.tolist()
+        found.append((x - dx, x + dx, y - dy, y + dy))
     return merged(found), radius + margin + widest
 
 
