@@ -6,15 +6,13 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.env_checks import check_timing, read_attribute, refuse_second_env
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 @deprecated_parameters(renamed={"hold_s": "control_dt"})

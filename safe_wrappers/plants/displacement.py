@@ -5,9 +5,8 @@ from typing import Any, ClassVar, NoReturn
 import gymnasium as gym
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from safe_wrappers.checks import positive
+from safe_wrappers.checks import Array, positive
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.displacement_step import (
     DisplacementRecorder,
@@ -16,8 +15,6 @@ from safe_wrappers.plants.mujoco.displacement_step import (
 )
 from safe_wrappers.plants.mujoco.forecast import Forecast, Recorder
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
-
-Array = NDArray[np.float64]
 
 _WORKS = "Workspace, JointPositionLimit, JointSpeedLimit, SpeedLimit, SingularityMargin, Upright"
 

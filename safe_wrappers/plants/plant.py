@@ -4,13 +4,10 @@ from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
 import gymnasium as gym
-import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.deprecation import deprecated_attribute
 from safe_wrappers.errors import UnsupportedEnvError
-
-Array = NDArray[np.float64]
 
 
 class Plant(ABC):

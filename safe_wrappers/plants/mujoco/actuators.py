@@ -6,12 +6,10 @@ the clamp more control changes nothing, so it becomes a bound on the control.
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.model import control_range
-
-Array = NDArray[np.float64]
 
 _JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _AFFINE_GAIN, _AFFINE_BIAS = int(mujoco.mjtGain.mjGAIN_AFFINE), int(mujoco.mjtBias.mjBIAS_AFFINE)

@@ -6,13 +6,11 @@ from typing import Any
 import gymnasium as gym
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import name_of
 from safe_wrappers.plants.mujoco.displacement_step import moves_by_displacement
-
-Array = NDArray[np.float64]
 
 _LAST_INTEGRATOR = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
 

@@ -6,11 +6,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.plants.mujoco.forecast import RESETS
 from safe_wrappers.plants.mujoco.model import fixed_bodies
 from safe_wrappers.plants.mujoco.replay import evaluations
-
-Array = NDArray[np.float64]
 
 _FASTEST = float(mujoco.mjMAXVAL) ** 2
 """Bound of squared lengths: MuJoCo does not check the stages of the Runge-Kutta steps that are made here."""

@@ -5,11 +5,9 @@ from typing import Any
 import gymnasium as gym
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.plants.mujoco.forecast import Recorder
-
-Array = NDArray[np.float64]
 
 _TURN = np.array([1.0, 0.0, 1.0, 0.0])
 """What the envs add to the gripper's quaternion (w, x, y, z): MuJoCo makes a unit quaternion of the sum."""

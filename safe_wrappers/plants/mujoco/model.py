@@ -6,9 +6,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import UnknownNameError
-
-Array = NDArray[np.float64]
 
 
 def named(model: mujoco.MjModel, kind: str, name: str) -> int:

@@ -7,9 +7,8 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from safe_wrappers.checks import non_negative
+from safe_wrappers.checks import Array, non_negative
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants import env_checks
 from safe_wrappers.plants.mujoco import model as of_model
@@ -20,8 +19,6 @@ from safe_wrappers.plants.mujoco.forecast import Forecast, Poses, Recorder
 from safe_wrappers.plants.mujoco.linear_model import drift_and_effect, position_rate
 from safe_wrappers.plants.mujoco.state import MujocoState
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 class MujocoPlant(MujocoState):

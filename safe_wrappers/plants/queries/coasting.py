@@ -7,10 +7,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
-
-Array = NDArray[np.float64]
 
 _REST_SPEED = 0.01
 """m/s, of the body and of its farthest point as it turns: slower counts as at rest. Safety-Gymnasium's car then moves

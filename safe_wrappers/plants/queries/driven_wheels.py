@@ -8,12 +8,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.vehicle.wheel import Wheel
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.model import inertia
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
-
-Array = NDArray[np.float64]
 
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 _ROUND = [int(getattr(mujoco.mjtGeom, f"mjGEOM_{shape}")) for shape in ("SPHERE", "CYLINDER", "CAPSULE")]

@@ -14,11 +14,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.actuators import AffineActuators
 from safe_wrappers.plants.mujoco.model import control_range, fixed_bodies, inertia
-
-Array = NDArray[np.float64]
 
 _CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
 """Constraints of this type and above are contacts."""

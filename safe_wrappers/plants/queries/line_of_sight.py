@@ -8,10 +8,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.model import named
-
-Array = NDArray[np.float64]
 
 _TAKES_NORMALS = "normal" in (mujoco.mj_multiRay.__doc__ or "")
 """Later versions of MuJoCo take one more argument."""

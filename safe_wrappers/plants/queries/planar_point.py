@@ -5,13 +5,11 @@ from typing import NamedTuple, NoReturn
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.damped_axis import DampedAxis
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
-
-Array = NDArray[np.float64]
 
 _ALIGNED = 1e-6
 _EXACT = 1e-9
