@@ -1,5 +1,6 @@
 """The constraints that `protect` puts on each env it knows: limits, reserves, and why these numbers."""
 
+import copy
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -63,42 +64,30 @@ def _car_goal(env: gym.Env[Any, Any], detour: bool = True) -> list[Constraint]:
     ]
 
 
-def _rail(braking: float) -> Clearance:
-    ends = [Plane([-0.95], [1.0]), Plane([0.95], [-1.0])]
-    # The margin is for the pole: it pulls the cart while a control is held (up to 2 mm measured).
-    return Clearance(obstacles=ends, bodies=["cart"], braking=braking, margin=0.01)
+def _fixed(*constraints: Constraint) -> Callable[..., list[Constraint]]:
+    """The recipe of constraints that are the same for every env of an id."""
+
+    def recipe(env: gym.Env[Any, Any]) -> list[Constraint]:
+        return copy.deepcopy(list(constraints))
+
+    return recipe
 
 
-def _inverted_pendulum(env: gym.Env[Any, Any]) -> list[Constraint]:
-    # 300 N on 15.5 kg of cart and pole is 19 m/s^2; a tilted, falling pole takes less than half of it.
-    return [_rail(braking=8.0)]
-
-
-def _inverted_double_pendulum(env: gym.Env[Any, Any]) -> list[Constraint]:
-    # 500 N on 20 kg of cart and poles is 24 m/s^2, but swinging poles pull: a third of it, and a forecast besides.
-    return [_rail(braking=8.0), JointPositionLimit(-0.95, 0.95, joints=["slider"], margin=0.005, horizon=5)]
-
-
-def _reacher(env: gym.Env[Any, Any]) -> list[Constraint]:
-    # A torque of 200 N m on 1 kg m^2 for 0.02 s: one step can add 4 rad/s.
-    return [JointSpeedLimit(limit=5.0, margin=0.01, max_decrease=4.5)]
-
-
-def _flex_joint_reach(env: gym.Env[Any, Any]) -> list[Constraint]:
-    # The effect of a torque on the ringing joint shows within one and a half periods of the lowest resonance.
-    return [JointSpeedLimit(limit=8.0, margin=0.3, horizon=15)]
+_RAIL = Clearance(
+    obstacles=[Plane([-0.95], [1.0]), Plane([0.95], [-1.0])],
+    bodies=["cart"],
+    # 300 N on 15.5 kg of cart and pole is 19 m/s^2, 500 N on 20 kg of cart and two poles 24 m/s^2; poles that tilt
+    # and fall take up to two thirds of it.
+    braking=8.0,
+    # The pole pulls the cart while a control is held, by up to 2 mm (measured).
+    margin=0.01,
+)
 
 
 def _safe_rover(
     env: gym.Env[Any, Any], max_slip: float = 0.15, friction: float | None = None
 ) -> list[Constraint]:
     return [Traction(env.unwrapped.wheels, max_slip, friction)]  # type: ignore[attr-defined]
-
-
-def _teleop_contact(env: gym.Env[Any, Any]) -> list[Constraint]:
-    # A plane, not a box: the tool cannot go round the clamp.
-    face = Plane([0.0, CLAMP_Y], [0.0, -1.0])
-    return [Clearance([face], TELEOP_BRAKING, bodies=["tool"], radius=TOOL_RADIUS, margin=0.001)]
 
 
 def _of_what_is_known(
@@ -125,21 +114,6 @@ def _occluded_crossing(env: gym.Env[Any, Any], cars: str = "", sigmas: float = 3
     rails = [Plane([x, y], [-x, -y]) for x, y in ((-4.0, 0.0), (4.0, 0.0), (0.0, -3.5), (0.0, 3.5))]
     obstacles = [discs, Discs("pillar_positions", raw.pillar_radius), *rails]
     return [EscapeClearance("robot", obstacles, raw.robot_radius)]
-
-
-def _pusher(env: gym.Env[Any, Any]) -> list[Constraint]:
-    # The tip stays over the table, clear of its top by 2.5 cm, and in front of the shoulder.
-    table = Workspace([-0.2, -1.2, -0.3], [0.9, 0.15, 0.4], bodies=["tips_arm"], margin=0.005, horizon=8)
-    return [JointSpeedLimit(limit=6.0, margin=0.05), table]
-
-
-def _humanoid_standup(env: gym.Env[Any, Any]) -> list[Constraint]:
-    return [JointSpeedLimit(limit=20.0, margin=0.1)]
-
-
-def _point_maze(env: gym.Env[Any, Any]) -> list[Constraint]:
-    # gymnasium-robotics' point is clipped to 5 m/s along each axis before every step.
-    return [WallClearance(velocity_clip=5.0)]
 
 
 def _patrolled_maze(env: gym.Env[Any, Any], patrols: str = "", sigmas: float = 3.0) -> list[Constraint]:
@@ -210,26 +184,41 @@ def _fetch(
 def _velocity(robot: str, margin: float = 0.02, horizon: int = 3) -> Callable[..., list[Constraint]]:
     body = None if robot == "Humanoid" else "torso"
     direction = "xy" if robot in ("Ant", "Humanoid") else "+x"
-
-    def recipe(env: gym.Env[Any, Any]) -> list[Constraint]:
-        return [SpeedLimit(SPEED_LIMITS[robot], body, direction, margin=margin, horizon=horizon)]
-
-    return recipe
+    return _fixed(SpeedLimit(SPEED_LIMITS[robot], body, direction, margin=margin, horizon=horizon))
 
 
 RECIPES: dict[str, Callable[..., list[Constraint]]] = {
     **{f"SafePointGoal{level}": _point_goal for level in range(3)},
     **{f"SafeCarGoal{level}": _car_goal for level in range(3)},
-    "InvertedPendulum": _inverted_pendulum,
-    "InvertedDoublePendulum": _inverted_double_pendulum,
-    "FlexJointReach": _flex_joint_reach,
-    "Reacher": _reacher,
+    "InvertedPendulum": _fixed(_RAIL),
+    # The forecast is for swinging poles, which pull; alone it would brake late.
+    "InvertedDoublePendulum": _fixed(
+        _RAIL, JointPositionLimit(-0.95, 0.95, joints=["slider"], margin=0.005, horizon=5)
+    ),
+    # The effect of a torque on the ringing joint shows within one and a half periods of the lowest resonance.
+    "FlexJointReach": _fixed(JointSpeedLimit(limit=8.0, margin=0.3, horizon=15)),
+    # A torque of 200 N m on 1 kg m^2 for 0.02 s: one step can add 4 rad/s.
+    "Reacher": _fixed(JointSpeedLimit(limit=5.0, margin=0.01, max_decrease=4.5)),
     "SafeRover": _safe_rover,
-    "TeleopContact": _teleop_contact,
+    # A plane, not a box: the tool cannot go round the clamp.
+    "TeleopContact": _fixed(
+        Clearance(
+            [Plane([0.0, CLAMP_Y], [0.0, -1.0])],
+            TELEOP_BRAKING,
+            bodies=["tool"],
+            radius=TOOL_RADIUS,
+            margin=0.001,
+        )
+    ),
     "OccludedCrossing": _occluded_crossing,
-    "Pusher": _pusher,
-    "HumanoidStandup": _humanoid_standup,
-    "PointMaze": _point_maze,
+    # The tip stays over the table, clear of its top by 2.5 cm, and in front of the shoulder.
+    "Pusher": _fixed(
+        JointSpeedLimit(limit=6.0, margin=0.05),
+        Workspace([-0.2, -1.2, -0.3], [0.9, 0.15, 0.4], bodies=["tips_arm"], margin=0.005, horizon=8),
+    ),
+    "HumanoidStandup": _fixed(JointSpeedLimit(limit=20.0, margin=0.1)),
+    # gymnasium-robotics' point is clipped to 5 m/s along each axis before every step.
+    "PointMaze": _fixed(WallClearance(velocity_clip=5.0)),
     "PatrolledPointMaze": _patrolled_maze,
     "AntMaze": _ant_maze,
     **{f"Fetch{task}": _fetch for task in ("Reach", "Push", "Slide", "PickAndPlace")},

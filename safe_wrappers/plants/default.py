@@ -33,12 +33,3 @@ def own_plant(plant: Any) -> Plant | None:
 def default_plant(env: gym.Env[Any, Any]) -> MujocoPlant:
     """A `DisplacementPlant` for envs of the Fetch kind, else a `MujocoPlant`; not bound yet."""
     return DisplacementPlant() if moves_by_displacement(env.unwrapped) else MujocoPlant()
-
-
-def plant_of_the_present(plant: Plant, env: gym.Env[Any, Any]) -> Plant:
-    """For a MujocoPlant one on the env's own model and without delay, bound; any other plant unchanged."""
-    if not isinstance(plant, MujocoPlant):
-        return plant
-    present = default_plant(env)
-    present.bind(env)
-    return present

@@ -121,23 +121,9 @@ class DisplacementPlant(MujocoPlant):
         return self._lower, self._upper
 
     @property
-    def f(self) -> Array:
-        """Raises: see the class."""
-        self.require_acceleration("f")
-
-    @property
-    def g(self) -> Array:
-        """Raises: see the class."""
-        self.require_acceleration("g")
-
-    @property
     def acceleration(self) -> tuple[Array, Array]:
-        """Raises: see the class."""
-        self.require_acceleration("acceleration")
-
-    def point(self, kind: str, name: str) -> tuple[Array, Array, Array, Array]:
-        """Raises: see the class; `motion` has position and velocity."""
-        self.require_acceleration("point")
+        """Raises, as `f`, `g` and `point` do; `motion` has position and velocity."""
+        self.require_acceleration("`f`, `g`, `acceleration` or `point`")
 
     def require_acceleration(self, asker: str) -> NoReturn:
         """Raise an error that says what can be used instead."""

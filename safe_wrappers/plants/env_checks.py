@@ -85,13 +85,14 @@ def check_timing(env: gym.Env[Any, Any], control_dt: float | None) -> float:
 def check_actions(env: gym.Env[Any, Any]) -> gym.spaces.Box:
     """The env's action space, refused unless it is a one-dimensional, floating Box."""
     space = env.action_space
-    discrete = [part for part in _parts(space) if not _is_floating(part)]
+    box = gym.spaces.Box
+    discrete = [s for s in _parts(space) if not (isinstance(s, box) and np.issubdtype(s.dtype, np.floating))]
     if discrete:
         raise ConfigurationError(
             f"expected a continuous Box action space, got {space}: for the discrete actions of {discrete[0]} there "
             "is no closest safe action to project to"
         )
-    if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
+    if not isinstance(space, box) or len(space.shape) != 1:
         raise ConfigurationError(
             f"expected actions of shape (m,), got {space}. Give the env one flat Box of its own, from this space: "
             "`action_space = gymnasium.spaces.flatten_space(space)`, and in its step "
@@ -107,7 +108,3 @@ def _parts(space: gym.Space[Any]) -> Iterator[gym.Space[Any]]:
         return
     for part in space.values() if isinstance(space, gym.spaces.Dict) else space:
         yield from _parts(part)
-
-
-def _is_floating(space: gym.Space[Any]) -> bool:
-    return isinstance(space, gym.spaces.Box) and np.issubdtype(space.dtype, np.floating)

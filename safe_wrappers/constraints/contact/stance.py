@@ -25,7 +25,7 @@ from safe_wrappers.control.legged.whole_body import (
 )
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, Memory, Promise
-from safe_wrappers.plants.mujoco.contact_forecast import can_touch_the_world
+from safe_wrappers.plants.mujoco.contacts import can_touch_the_world
 from safe_wrappers.plants.mujoco.model import fixed_bodies
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant

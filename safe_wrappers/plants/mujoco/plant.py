@@ -14,7 +14,7 @@ from safe_wrappers.plants import env_checks
 from safe_wrappers.plants.mujoco import model as of_model
 from safe_wrappers.plants.mujoco.actuators import AffineActuators
 from safe_wrappers.plants.mujoco.binding import check_action_space, control_interval, own_model, physics_steps
-from safe_wrappers.plants.mujoco.contact_forecast import ContactForecast, ContactReader
+from safe_wrappers.plants.mujoco.contacts import ContactForecast, ContactReader
 from safe_wrappers.plants.mujoco.forecast import Forecast, Poses, Recorder
 from safe_wrappers.plants.mujoco.linear_model import drift_and_effect, position_rate
 from safe_wrappers.plants.mujoco.state import MujocoState
@@ -108,14 +108,14 @@ class MujocoPlant(MujocoState):
     @property
     def f(self) -> Array:
         """Drift of (qpos, qvel), shape (nq + nv,): at zero control, with bias forces and active constraints."""
-        self.forward()
-        return np.concatenate([position_rate(self.model, self.qpos, self.qvel), self._drift])
+        drift, _ = self.acceleration
+        return np.concatenate([position_rate(self.model, self.qpos, self.qvel), drift])
 
     @property
     def g(self) -> Array:
         """Control matrix, shape (nq + nv, nu); positions do not respond at once."""
-        self.forward()
-        return np.vstack([np.zeros((self.model.nq, self.model.nu)), self._effect])
+        _, effect = self.acceleration
+        return np.vstack([np.zeros((self.model.nq, self.model.nu)), effect])
 
     @property
     def acceleration(self) -> tuple[Array, Array]:
@@ -244,12 +244,11 @@ class MujocoPlant(MujocoState):
         Returns:
             p (3,) in m, v (3,) in m/s, a0 (3,) in m/s^2 and A (3, nu): `acceleration = a0 + A @ u`.
         """
-        m, d = self.model, self.forward()
+        m, d, (drift, effect) = self.model, self.data, self.acceleration
         body, p = of_model.frame(m, d, kind, name)
         jac, jac_dot = np.zeros((3, m.nv)), np.zeros((3, m.nv))
         mujoco.mj_jac(m, d, jac, None, p, body)
         mujoco.mj_jacDot(m, d, jac_dot, None, p, body)
-        drift, effect = self._drift, self._effect
         return p.copy(), jac @ self.qvel, jac @ drift + jac_dot @ self.qvel, jac @ effect
 
     def named(self, kind: str, name: str) -> int:

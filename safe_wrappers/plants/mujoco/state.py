@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from safe_wrappers.checks import Array
-from safe_wrappers.plants.mujoco.contact_forecast import ContactForecast
+from safe_wrappers.plants.mujoco.contacts import ContactForecast
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 
