@@ -96,7 +96,7 @@ class AnalyticPlant(Plant):
         self.observation_id += 1
         x = np.array(self._state_of(self._env.unwrapped), dtype=np.float64).reshape(-1)
         if self.delay_s > 0.0:
-            x = self._advance(x)
+            x = self._after_delay(x)
         self._x, self._drift, self._effect = x, None, None
 
     def executed(self, control: Array | None) -> None:
@@ -106,7 +106,7 @@ class AnalyticPlant(Plant):
         elif self.delay_s > 0.0:
             self._pending.append(np.array(control))
 
-    def _advance(self, x: Array) -> Array:
+    def _after_delay(self, x: Array) -> Array:
         """Integrate over the commands in flight, the oldest first: it has acted in part already."""
         early = self.delay_s - self.control_dt * len(self._pending)
         if early > 0.0:  # before the first command of an episode no control acts

@@ -48,6 +48,15 @@ def control_range(model: mujoco.MjModel) -> tuple[Array, Array]:
     return low, np.where(limited, model.actuator_ctrlrange[:, 1], np.inf)
 
 
+def kinematics(model: mujoco.MjModel, data: mujoco.MjData, own: mujoco.MjData) -> None:
+    """Compute poses and velocities at the state of the data in `own`; after a step those of the data may lag."""
+    own.qpos[:], own.qvel[:] = data.qpos, data.qvel
+    own.mocap_pos[:], own.mocap_quat[:] = data.mocap_pos, data.mocap_quat
+    mujoco.mj_kinematics(model, own)
+    mujoco.mj_comPos(model, own)
+    mujoco.mj_comVel(model, own)
+
+
 def inertia(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
     """Joint-space inertia with armature, shape (nv, nv), kg or kg m^2."""
     matrix = np.empty((model.nv, model.nv))

@@ -37,9 +37,8 @@ class WheelMotion(NamedTuple):
 class DrivenWheels:
     """The wheels of a vehicle on level ground, on the named hinges of a bound plant.
 
-    One or more actuators drive each hinge directly. The radius is that of a sphere, cylinder or capsule of the
-    wheel's
-    body: the one named like the joint, else the first that can touch something. A positive joint rate rolls ahead.
+    One or more actuators drive each hinge directly. The radius is that of a sphere, cylinder or capsule of its body:
+    the one named like the joint, else the first that can touch something. A positive joint rate rolls ahead.
 
     Attributes:
         feedback: Of the speed servos on each wheel, shape (n,), N m s/rad.
@@ -61,23 +60,30 @@ class DrivenWheels:
         self._joints = np.array([plant.named("joint", name) for name in names])
         for joint, name in zip(self._joints, names, strict=True):
             if m.jnt_type[joint] != _HINGE:
-                hinges = ", ".join(
-                    m.joint(j).name for j in np.flatnonzero(m.jnt_type == _HINGE) if m.joint(j).name
-                )
+                hinges = [m.joint(j).name for j in np.flatnonzero(m.jnt_type == _HINGE)]
                 raise ConfigurationError(
-                    f"joint {name!r} is no hinge, so it is no wheel's axle; hinges are {hinges}"
+                    f"joint {name!r} is no hinge, so it is no wheel's axle; hinges are "
+                    + ", ".join(filter(None, hinges))
                 )
+        self.dofs = m.jnt_dofadr[self._joints]
         direct = np.isin(m.actuator_trntype, _DRIVES)
         self._drives = direct & (m.actuator_trnid[:, 0] == self._joints[:, None])
-        for drives, name in zip(self._drives, names, strict=True):
+        data = mujoco.MjData(m)
+        mujoco.mj_forward(m, data)
+        turns = plant.actuators.moment(data)[:, self.dofs].T != 0.0
+        for drives, others, name in zip(self._drives, turns & ~self._drives, names, strict=True):
             if not drives.any():
                 driven = sorted({m.joint(int(j)).name for j in m.actuator_trnid[direct, 0]})
                 raise ConfigurationError(
                     f"no actuator drives joint {name!r} directly, so its slip cannot be limited; driven are "
                     + (", ".join(driven) or "none")
                 )
-        self.dofs = m.jnt_dofadr[self._joints]
-        self._refuse_other_drives(plant)
+            if others.any():  # `drive` does not model them
+                found = [m.actuator(int(i)).name or f"actuator #{i}" for i in np.flatnonzero(others)]
+                raise ConfigurationError(
+                    f"joint {name!r} is also driven by {', '.join(found)} through a tendon or a site, which its slip "
+                    "limit would not hold back; drive wheels by actuators on their own joints"
+                )
         self._bodies = m.jnt_bodyid[self._joints]
         self._roots = m.body_rootid[self._bodies]
         self._geoms = np.array([_round_geom(plant, int(j)) for j in self._joints])
@@ -90,21 +96,6 @@ class DrivenWheels:
         self._fixed_drive: tuple[Array, Array] | None = None
         self.constants(plant)
 
-    def _refuse_other_drives(self, plant: MujocoPlant) -> None:
-        """Refuse a drive through a tendon or a site, which `drive` does not model."""
-        data = mujoco.MjData(plant.model)
-        mujoco.mj_forward(plant.model, data)
-        turns = plant.actuators.moment(data)[:, self.dofs].T != 0.0
-        for others, name in zip(turns & ~self._drives, self.names, strict=True):
-            if others.any():
-                found = [
-                    plant.model.actuator(int(i)).name or f"actuator #{i}" for i in np.flatnonzero(others)
-                ]
-                raise ConfigurationError(
-                    f"joint {name!r} is also driven by {', '.join(found)} through a tendon or a site, which its slip "
-                    "limit would not hold back; drive wheels by actuators on their own joints"
-                )
-
     def constants(self, plant: MujocoPlant) -> Wheel:
         """Radius, inertia about the axle and damping in the plant's present model; also sets `feedback`."""
         m, data = plant.model, mujoco.MjData(plant.model)
@@ -112,13 +103,10 @@ class DrivenWheels:
         mujoco.mj_forward(m, data)
         # The torque of a servo that a forcerange may clamp counts as constant, not as feedback.
         servos = (m.actuator_biastype == _AFFINE_BIAS) & ~m.actuator_forcelimited.astype(bool)
-        self._opposing = self._drives * np.where(
-            servos, -m.actuator_gear[:, 0] * m.actuator_biasprm[:, 2], 0.0
-        )
-        self.feedback = np.asarray((self._opposing * m.actuator_gear[:, 0]).sum(axis=1))
-        return Wheel(
-            m.geom_size[self._geoms, 0], np.diag(inertia(m, data))[self.dofs], m.dof_damping[self.dofs]
-        )
+        gear, about_axle = m.actuator_gear[:, 0], np.diag(inertia(m, data))[self.dofs]
+        self._opposing = self._drives * np.where(servos, -gear * m.actuator_biasprm[:, 2], 0.0)
+        self.feedback = np.asarray((self._opposing * gear).sum(axis=1))
+        return Wheel(m.geom_size[self._geoms, 0], about_axle, m.dof_damping[self.dofs])
 
     def motion(self, plant: MujocoPlant) -> WheelMotion:
         """Rates and speeds over ground at the plant's present state."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.mujoco.model import named
+from safe_wrappers.plants.mujoco.model import kinematics, named
 
 _TAKES_NORMALS = "normal" in (mujoco.mj_multiRay.__doc__ or "")
 """Later versions of MuJoCo take one more argument."""
@@ -62,18 +62,15 @@ class LineOfSight:
         if groups is not None:
             self._groups = np.zeros(mujoco.mjNGROUP, dtype=np.uint8)
             self._groups[list(groups)] = 1
-        self._root = _ancestors(model)
+        self._inside = np.eye(model.nbody, dtype=bool)
+        """Whether body i is body j or a descendant of it, shape (nbody, nbody)."""
+        for body in range(1, model.nbody):
+            self._inside[body] |= self._inside[model.body_parentid[body]]
 
     def read(self, data: mujoco.MjData) -> None:
-        """Take the state of the data and compute its kinematics, which lag a substep behind in an env's data."""
-        mine = self.data
-        mine.qpos[:], mine.qvel[:] = data.qpos, data.qvel
-        if self.model.nmocap:
-            mine.mocap_pos[:], mine.mocap_quat[:] = data.mocap_pos, data.mocap_quat
-        mujoco.mj_kinematics(self.model, mine)
-        mujoco.mj_comPos(self.model, mine)
-        mujoco.mj_camlight(self.model, mine)
-        mujoco.mj_comVel(self.model, mine)
+        """Take the state of an env's data, whose own poses may lag a substep behind."""
+        kinematics(self.model, data, self.data)
+        mujoco.mj_camlight(self.model, self.data)
 
     @property
     def position(self) -> Array:
@@ -128,7 +125,7 @@ class LineOfSight:
         hitting = hit >= 0
         blocker = self.model.geom_bodyid[np.where(hitting, hit, 0)]
         own = bodies[which]
-        itself = (own >= 0) & self._root[blocker, np.maximum(own, 0)]
+        itself = (own >= 0) & self._inside[blocker, np.maximum(own, 0)]
         seen[which] = ~hitting | itself | (at >= lengths[which] - _SKIN_M)
         return np.asarray(seen)
 
@@ -142,11 +139,3 @@ def _angle_of_view(model: mujoco.MjModel, camera: int) -> float:
             "view_deg"
         )
     return float(model.cam_fovy[camera])
-
-
-def _ancestors(model: mujoco.MjModel) -> NDArray[np.bool_]:
-    """Whether body i is body j or moves with it as its descendant, shape (nbody, nbody)."""
-    inside = np.eye(model.nbody, dtype=bool)
-    for body in range(1, model.nbody):
-        inside[body] |= inside[model.body_parentid[body]]
-    return inside

@@ -5,13 +5,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.control.legged.centroidal import CentroidalMomentum, centroidal_momentum
+from safe_wrappers.plants.mujoco.model import kinematics
 
 
 class MomentumReader:
-    """Computes the momentum of some bodies with mass, ids of shape (n,), with kinematics of its own.
-
-    After a step MuJoCo's own positions may lag behind the state. Armature belongs to no body and is left out.
-    """
+    """Computes the momentum of some bodies with mass, ids of shape (n,). Armature, of no body, is left out."""
 
     def __init__(self, model: mujoco.MjModel, bodies: NDArray[np.intp]) -> None:
         self._model, self._bodies = model, bodies
@@ -20,11 +18,7 @@ class MomentumReader:
     def read(self, data: mujoco.MjData) -> CentroidalMomentum | None:
         """The momentum at the state of the data, which are only read; None where numbers are not finite."""
         model, own, bodies = self._model, self._data, self._bodies
-        own.qpos[:], own.qvel[:] = data.qpos, data.qvel
-        own.mocap_pos[:], own.mocap_quat[:] = data.mocap_pos, data.mocap_quat
-        mujoco.mj_kinematics(model, own)
-        mujoco.mj_comPos(model, own)
-        mujoco.mj_comVel(model, own)
+        kinematics(model, data, own)
         positions, motion = own.xipos[bodies], own.cvel[bodies]
         if not (np.isfinite(positions).all() and np.isfinite(motion).all()):
             return None

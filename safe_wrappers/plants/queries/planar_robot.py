@@ -86,9 +86,8 @@ def heading_drive(plant: MujocoPlant, body: str, uncertainty: float = 0.0) -> He
     problems = {
         "the slides need equal damping above zero": damping[0] != damping[1] or damping[0] <= 0.0,
         "the centre of mass must lie on the heading": abs(float(com[1])) > 1e-9,
-        "the joints must have no armature or stiffness": bool(
-            m.dof_armature[dofs].any() or m.jnt_stiffness[frame.joints].any()
-        ),
+        "the joints must have no armature or stiffness": m.dof_armature[dofs].any()
+        or m.jnt_stiffness[frame.joints].any(),
         "the drive must be a plain motor": m.actuator_gaintype[a] != fixed
         or m.actuator_biastype[a] != int(mujoco.mjtBias.mjBIAS_NONE),
         "the turning actuator must be a speed servo": m.actuator_gaintype[t] != fixed
@@ -102,6 +101,7 @@ def heading_drive(plant: MujocoPlant, body: str, uncertainty: float = 0.0) -> He
             raise UnsupportedEnvError(f"body {body!r} is no heading drive: {expectation}. Use Clearance.")
     gear, turn_gear = float(m.actuator_gear[a, 0]), float(m.actuator_gear[t, 0])
     gain, turn_gain = float(m.actuator_gainprm[a, 0]), float(m.actuator_gainprm[t, 0])
+    yaw_clamp = float(m.actuator_forcerange[t, 1]) if m.actuator_forcelimited[t] else math.inf
     return HeadingDrive(
         mass=mass,
         damping=float(damping[0]),
@@ -112,8 +112,7 @@ def heading_drive(plant: MujocoPlant, body: str, uncertainty: float = 0.0) -> He
         drive_limit=gear * _force_limit(m, a, gain),
         yaw_gain=turn_gear * turn_gain,
         yaw_feedback=turn_gear**2 * float(m.actuator_biasprm[t, 2]),
-        yaw_limit=turn_gear
-        * (float(m.actuator_forcerange[t, 1]) if m.actuator_forcelimited[t] else math.inf),
+        yaw_limit=turn_gear * yaw_clamp,
         timestep=float(m.opt.timestep),
         substeps=plant.substeps,
         uncertainty=uncertainty,
