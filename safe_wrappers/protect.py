@@ -74,13 +74,14 @@ def _by_hand(env: gym.Env[Any, Any]) -> str:
             return _limiting_joints(env, model)
     except ConfigurationError as error:
         return f"A filter by hand is refused, too: {error}"
-    named = env.has_wrapper_attr("dt")
+    say, argument = "", ""
+    if not env.has_wrapper_attr("dt"):
+        say, argument = ", and say with control_dt how long a step lasts, in s", ", control_dt=control_dt"
     return (
         "It has no MuJoCo model. Describe it by x' = f(x) + g(x) u with x = state(env), and what must stay positive "
-        f"by h(x){'' if named else ', and say with control_dt how long a step lasts, in s'}; then it is three "
-        "lines:\n"
+        f"by h(x){say}; then it is three lines:\n"
         "    import safe_wrappers as sw\n"
-        f"    plant = sw.AnalyticPlant(f, g, state{'' if named else ', control_dt=control_dt'})\n"
+        f"    plant = sw.AnalyticPlant(f, g, state{argument})\n"
         "    env = sw.CBFActionFilter(env, [sw.constraints.Barrier(h)], plant=plant)"
     )
 

@@ -64,6 +64,7 @@ class DisplacementPlant(MujocoPlant):
         self._pose = np.zeros(7)
         self._body = gripper_of(raw.model)
         super().bind(env)
+        self._clamped = False  # all of the action space acts
         self.gripper = self.model.body(self._body).name
         delayed = self._delay_steps / self.substeps
         if delayed != int(delayed):
@@ -107,18 +108,8 @@ class DisplacementPlant(MujocoPlant):
             control = np.append(control[:3], 0.0)
         return super().forecast(control, horizon)
 
-    def forward(self) -> mujoco.MjData:
-        """The plant's data with every derived quantity up to date at the present state."""
-        self._load()
-        if not self._forwarded:
-            mujoco.mj_forward(self.model, self.data)
-            self._forwarded = True
-        return self.data
-
-    @property
-    def acting_range(self) -> tuple[Array, Array]:
-        """All of the action space, shapes (4,)."""
-        return self._lower, self._upper
+    def _linearise(self) -> None:
+        mujoco.mj_forward(self.model, self.data)
 
     @property
     def acceleration(self) -> tuple[Array, Array]:

@@ -52,10 +52,9 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         buffer_size: Env steps to keep, over all envs; a changed step counts once.
         observation_space: Not a Dict; for those there is `ExecutedActionDictReplayBuffer`.
         action_space: A bounded Box.
-        device, n_envs, handle_timeout_termination: As in SB3.
+        device, n_envs, handle_timeout_termination, more: As in SB3.
         optimize_memory_usage: As in SB3, mode "safe_action" only.
         mode: "safe_action" or "both".
-        more: Further arguments of the SB3 buffer, as in `ExecutedActionHerReplayBuffer`.
 
     Attributes:
         actions, rewards: In mode "both" the policy's actions and penalised rewards.

@@ -87,9 +87,7 @@ class MujocoPlant(MujocoState):
         self.model.dof_damping *= damping
         mujoco.mj_setConst(self.model, self.data)
         self._recorder = self._new_recorder()  # its braking depends on the masses
-        self._loaded = self._forwarded = False
-        self._forecasts.clear()
-        self._contact_forecasts.clear()
+        self._forget()
 
     def forward(self) -> mujoco.MjData:
         """The plant's data with every derived quantity up to date at the present state.
@@ -98,12 +96,15 @@ class MujocoPlant(MujocoState):
         """
         self._load()
         if not self._forwarded:
-            # Contact forces are linearised about the control nearest to zero.
-            self.data.ctrl[:] = np.clip(0.0, self._lower, self._upper)
-            mujoco.mj_forward(self.model, self.data)
-            self._drift, self._effect = drift_and_effect(self.model, self.data, self.actuators)
+            self._linearise()
             self._forwarded = True
         return self.data
+
+    def _linearise(self) -> None:
+        """`forward` at the control nearest to zero, about which contact forces are linearised."""
+        self.data.ctrl[:] = np.clip(0.0, self._lower, self._upper)
+        mujoco.mj_forward(self.model, self.data)
+        self._drift, self._effect = drift_and_effect(self.model, self.data, self.actuators)
 
     @property
     def f(self) -> Array:

@@ -31,16 +31,18 @@ class MujocoState(Plant, ABC):
         self._nq, self._nv = int(self.model.nq), int(self.model.nv)
         self._delay_steps = int(np.ceil(self.delay_s / self.model.opt.timestep - 1e-9))
         self._pending = deque(maxlen=max(1, -(-self._delay_steps // self.substeps)))
-        self._forecasts, self._contact_forecasts = {}, {}
         self._snapshot = np.zeros(mujoco.mj_stateSize(self.model, int(_STATE)))
+        self._forget()
+
+    def _forget(self) -> None:
+        """Called when the state or the model has changed."""
         self._loaded = self._forwarded = False
+        self._forecasts, self._contact_forecasts = {}, {}
 
     def observe(self) -> None:
         """Take the env's present state; everything else is computed on demand."""
         mujoco.mj_getState(self._raw.model, self._raw.data, self._snapshot, int(_STATE))
-        self._loaded = self._forwarded = False
-        self._forecasts.clear()
-        self._contact_forecasts.clear()
+        self._forget()
         self.observation_id += 1
         # MuJoCo resets a state with a NaN: a prediction would hide it.
         if self._delay_steps and bool(np.isfinite(self._snapshot).all()):

@@ -49,11 +49,11 @@ def planar_point(plant: MujocoPlant, clip: float, body: str | None = None) -> Pl
         UnsupportedEnvError: The model is no such point; the message says what does not fit.
     """
     m = plant.model
-    slides = _only_slides(m) if body is None else _slides_of(m, plant.named("body", body), body)
+    slides = _slides(m, None if body is None else plant.named("body", body))
     data = mujoco.MjData(m)
     data.qpos[m.jnt_qposadr[list(slides)]] = 0.0
     mujoco.mj_kinematics(m, data)
-    joints = _order(slides, data.xaxis)
+    joints = _along_x_and_y(slides, data.xaxis)
     if m.jnt_limited[list(slides)].any():
         _refuse("its slides must have no limits (walls stop it, not joints)")
     actuators = _actuators(m, joints, alone=body is None)
@@ -64,25 +64,22 @@ def planar_point(plant: MujocoPlant, clip: float, body: str | None = None) -> Pl
     return PlanarPoint(index, axes, order, actuators, (x, y))
 
 
-def _only_slides(m: mujoco.MjModel) -> tuple[int, int]:
-    if m.nv != 2 or m.njnt != 2 or list(m.jnt_type) != [_SLIDE, _SLIDE] or m.jnt_bodyid[0] != m.jnt_bodyid[1]:
+def _slides(m: mujoco.MjModel, body: int | None) -> tuple[int, int]:
+    """Two slides of one body: of the only one that moves, or of the one with this index."""
+    slides = [j for j in range(m.njnt) if m.jnt_type[j] == _SLIDE and body in (None, m.jnt_bodyid[j])]
+    if body is None and (len(slides), m.njnt, len(set(m.jnt_bodyid.tolist()))) != (2, 2, 1):
         kinds = [mujoco.mjtJoint(k).name[6:].lower() for k in m.jnt_type]
         _refuse(f"it needs one body on two slides and nothing else that moves; the model has {kinds}")
-    return 0, 1
-
-
-def _slides_of(m: mujoco.MjModel, body: int, name: str) -> tuple[int, int]:
-    slides = [j for j in range(m.njnt) if m.jnt_bodyid[j] == body and m.jnt_type[j] == _SLIDE]
     # With free and ball joints only after them, one index serves positions and speeds.
     if len(slides) != 2 or any(m.jnt_qposadr[j] != m.jnt_dofadr[j] for j in slides):
         _refuse(
-            f"the body {name!r} must have two slides of its own, before any free or ball joint of the model; it has "
-            f"{len(slides)}"
+            f"the body {m.body(body).name!r} must have two slides of its own, before any free or ball joint of the "
+            f"model; it has {len(slides)}"
         )
     return slides[0], slides[1]
 
 
-def _order(slides: tuple[int, int], axes: Array) -> tuple[int, int]:
+def _along_x_and_y(slides: tuple[int, int], axes: Array) -> tuple[int, int]:
     """The slide along world x, then the one along world y."""
     for first, second in (slides, slides[::-1]):
         if np.allclose(axes[[first, second]], np.eye(3)[:2], atol=_ALIGNED):
