@@ -17,7 +17,8 @@ from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 
 def protect_options() -> frozenset[str]:
     """Every option that `protect` takes for some env."""
-    return frozenset(name for takes in (*RECIPES.values(), CBFActionFilter) for name in _options(takes))
+    of_recipes = [name for recipe in RECIPES.values() for name in _options(recipe)]
+    return frozenset(of_recipes + _options(CBFActionFilter))
 
 
 def _options(takes: Callable[..., Any]) -> list[str]:

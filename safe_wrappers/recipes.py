@@ -1,4 +1,4 @@
-"""The constraints that `protect` puts on each env it knows: limits, reserves, and why these numbers."""
+"""The constraints that `protect` puts on each known env, and the reasons for their numbers."""
 
 import copy
 from collections.abc import Callable, Sequence

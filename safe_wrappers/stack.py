@@ -26,7 +26,7 @@ class Layer(Enum):
 
 _PER_CHUNK: Final = {Layer.HANDOVER: "its step is a whole chunk, not a control step"}
 _LAST_WORD: Final = "it changes actions that the filter has checked, and the filter has the last word"
-_AGE: Final = "it hands commands over, and the lease must hear how old each one is"
+_AGE: Final = "it hands commands over, and the lease must know how old each one is"
 _NETWORK: Final = "it hands commands over, which the channel must do at every control step"
 
 _WRONG_WAY_ROUND: Final = {

@@ -1,4 +1,4 @@
-"""Hindsight experience replay (HER) that knows what the filter executed."""
+"""Hindsight experience replay (HER) with the action that the filter executed."""
 
 import copy
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""A replay buffer that knows what the filter executed: the "safe action" and "both" learners."""
+"""Replay buffers with the action that the filter executed: the "safe action" and "both" learners."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Final

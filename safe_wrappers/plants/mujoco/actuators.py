@@ -9,10 +9,11 @@ import numpy as np
 
 from safe_wrappers.checks import Array
 from safe_wrappers.errors import UnsupportedEnvError
-from safe_wrappers.plants.mujoco.model import control_range
+from safe_wrappers.plants.mujoco.model import control_range, inertia
 
 _JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _AFFINE_GAIN, _AFFINE_BIAS = int(mujoco.mjtGain.mjGAIN_AFFINE), int(mujoco.mjtBias.mjBIAS_AFFINE)
+_QUADRATIC = int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC)
 _HANDLED = (
     ("transmission", "actuator_trntype", mujoco.mjtTrn, ("joint", "jointinparent", "site", "tendon")),
     ("activation dynamics", "actuator_dyntype", mujoco.mjtDyn, ("none",)),
@@ -127,3 +128,40 @@ class AffineActuators:
             return None
         gear, q, v = self._on_joints
         return gear * qpos[q], gear * qvel[v]
+
+
+def drift_and_effect(
+    model: mujoco.MjModel, data: mujoco.MjData, actuators: AffineActuators
+) -> tuple[Array, Array]:
+    """`qacc = drift + effect @ u`, shapes (nv,) and (nv, nu), at the present set of active contacts and limits.
+
+    The data must be up to date. Exact for pyramidal friction cones.
+    """
+    gain, _ = actuators.gain_and_bias(data.actuator_length, data.actuator_velocity)
+    least, most = actuators.acting_range(data.actuator_length, data.actuator_velocity)
+    moment = actuators.moment(data)
+    force_per_control = moment * gain[:, None]
+    saturated = most <= least
+    effect = _solve_inertia(model, data, force_per_control).T
+    effect = np.where(saturated, 0.0, effect)
+    return data.qacc - effect @ np.where(saturated, 0.0, np.clip(data.ctrl, least, most)), effect
+
+
+def _solve_inertia(m: mujoco.MjModel, d: mujoco.MjData, rows: Array) -> Array:
+    """`rows @ inv(M + J_a' D_a J_a)`: accelerations per generalised force with the active constraints."""
+    out = np.zeros_like(rows)
+    active = d.efc_state == _QUADRATIC if d.nefc else np.zeros(0, bool)
+    if not active.any():
+        mujoco.mj_solveM(m, d, out, np.ascontiguousarray(rows))
+        return out
+    jacobian = _constraint_jacobian(m, d)[active]
+    stiff = inertia(m, d) + jacobian.T @ (d.efc_D[active][:, None] * jacobian)
+    return np.asarray(np.linalg.solve(stiff, rows.T).T)
+
+
+def _constraint_jacobian(m: mujoco.MjModel, d: mujoco.MjData) -> Array:
+    if not mujoco.mj_isSparse(m):
+        return np.array(d.efc_J.reshape(d.nefc, m.nv))
+    dense = np.zeros((d.nefc, m.nv))
+    mujoco.mju_sparse2dense(dense, d.efc_J, d.efc_J_rownnz, d.efc_J_rowadr, d.efc_J_colind)
+    return dense

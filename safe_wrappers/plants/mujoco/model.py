@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from safe_wrappers.checks import Array
 from safe_wrappers.errors import UnknownNameError
 
+_FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
+
 
 def named(model: mujoco.MjModel, kind: str, name: str) -> int:
     """The id of a body, site, geom, joint, actuator or camera; for an unknown name an error that lists all."""
@@ -63,3 +65,24 @@ def inertia(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
     for row, unit in zip(matrix, np.eye(model.nv), strict=True):
         mujoco.mj_mulM(model, data, row, unit)
     return matrix
+
+
+def position_rate(model: mujoco.MjModel, qpos: Array, qvel: Array) -> Array:
+    """Time derivative of the positions, shape (nq,)."""
+    if model.nq == model.nv:
+        return qvel.copy()
+    rate = np.zeros(model.nq)
+    for j in range(model.njnt):
+        q, v = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
+        kind = model.jnt_type[j]
+        if kind == _FREE:
+            rate[q : q + 3] = qvel[v : v + 3]
+            q, v = q + 3, v + 3
+        if kind in (_FREE, _BALL):
+            # Angular velocities of these joints are in the body's frame; mju_derivQuat wants the world's.
+            turn = np.zeros(4)
+            mujoco.mju_mulQuatAxis(turn, qpos[q : q + 4].copy(), qvel[v : v + 3].copy())
+            rate[q : q + 4] = 0.5 * turn
+        else:
+            rate[q] = qvel[v]
+    return rate

@@ -12,16 +12,16 @@ from safe_wrappers.checks import Array, non_negative
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants import env_checks
 from safe_wrappers.plants.mujoco import model as of_model
-from safe_wrappers.plants.mujoco.actuators import AffineActuators
+from safe_wrappers.plants.mujoco.actuators import AffineActuators, drift_and_effect
 from safe_wrappers.plants.mujoco.binding import check_action_space, control_interval, own_model, physics_steps
 from safe_wrappers.plants.mujoco.contacts import ContactForecast, ContactReader
 from safe_wrappers.plants.mujoco.forecast import Forecast, Poses, Recorder
-from safe_wrappers.plants.mujoco.linear_model import drift_and_effect, position_rate
-from safe_wrappers.plants.mujoco.state import MujocoState
 from safe_wrappers.plants.plant import Plant
 
+_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
-class MujocoPlant(MujocoState):
+
+class MujocoPlant(Plant):
     """`x = (qpos, qvel)`, `x' = f + g u`, through the actuators and the active constraints.
 
     f and g hold for the present set of active contacts and limits; a contact that opens or closes within the control
@@ -43,9 +43,9 @@ class MujocoPlant(MujocoState):
     def __init__(self, model: mujoco.MjModel | None = None, delay_s: float = 0.0) -> None:
         self._given = model
         self.delay_s = non_negative("delay_s", delay_s, "s")
-        self._pending = deque()
+        self._pending: deque[Array] = deque()
         self._factors = (1.0, 1.0)
-        self._raw = None
+        self._raw: Any = None
         self.observation_id = self.model_version = 0
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
@@ -62,7 +62,11 @@ class MujocoPlant(MujocoState):
         self._check_action_space(env)
         self.substeps = physics_steps(raw)
         self.control_dt = env_checks.check_timing(env, control_interval(raw))
-        self._start()
+        self._nq, self._nv = int(self.model.nq), int(self.model.nv)
+        self._delay_steps = int(np.ceil(self.delay_s / self.model.opt.timestep - 1e-9))
+        self._pending = deque(maxlen=max(1, -(-self._delay_steps // self.substeps)))
+        self._snapshot = np.zeros(mujoco.mj_stateSize(self.model, _STATE))
+        self._forget()
         self._recorder = self._new_recorder()
         self._contact_reader = ContactReader(self.model)
         if self._factors != (1.0, 1.0):
@@ -89,6 +93,74 @@ class MujocoPlant(MujocoState):
         self._recorder = self._new_recorder()  # its braking depends on the masses
         self._forget()
 
+    def _forget(self) -> None:
+        """Called when the state or the model has changed."""
+        self._loaded = self._forwarded = False
+        self._forecasts: dict[bytes, Forecast] = {}
+        self._contact_forecasts: dict[bytes, ContactForecast] = {}
+
+    def observe(self) -> None:
+        """Take the env's present state; everything else is computed on demand."""
+        mujoco.mj_getState(self._raw.model, self._raw.data, self._snapshot, _STATE)
+        self._forget()
+        self.observation_id += 1
+        # MuJoCo resets a state with a NaN: a prediction would hide it.
+        if self._delay_steps and bool(np.isfinite(self._snapshot).all()):
+            self._predict_over_delay()
+
+    def executed(self, control: Array | None) -> None:
+        """Remember a sent command for the delay."""
+        if control is None:
+            self._pending.clear()
+        elif self._delay_steps:
+            self._pending.append(np.array(control))
+
+    def _predict_over_delay(self) -> None:
+        self._load()
+        # The oldest command has already acted in part; before the first one the env's own control acts.
+        early = self._delay_steps - self.substeps * len(self._pending)
+        if early > 0:
+            mujoco.mj_step(self.model, self.data, early)
+        for i, control in enumerate(self._pending):
+            self.data.ctrl[:] = control
+            mujoco.mj_step(self.model, self.data, self.substeps + (min(early, 0) if i == 0 else 0))
+        self._keep()
+
+    def _keep(self) -> None:
+        """Take the data's state as the present one."""
+        mujoco.mj_getState(self.model, self.data, self._snapshot, _STATE)
+        self._loaded = False
+
+    def _load(self) -> None:
+        if not self._loaded:
+            mujoco.mj_setState(self.model, self.data, self._snapshot, _STATE)
+            self._loaded, self._forwarded = True, False
+
+    def _load_to_step(self) -> None:
+        """The data at the present state; the caller may change it."""
+        self._load()
+        self._loaded = False
+
+    @property
+    def time(self) -> float:
+        """Time of the present state, s; under a delay the predicted one."""
+        return float(self._snapshot[0])
+
+    @property
+    def qpos(self) -> Array:
+        """Positions, shape (nq,): m, rad, or quaternions."""
+        return self._snapshot[1 : 1 + self._nq]
+
+    @property
+    def qvel(self) -> Array:
+        """Velocities, shape (nv,): m/s or rad/s."""
+        return self._snapshot[1 + self._nq : 1 + self._nq + self._nv]
+
+    @property
+    def state(self) -> Array:
+        """(qpos, qvel), shape (nq + nv,)."""
+        return self._snapshot[1 : 1 + self._nq + self._nv]
+
     def forward(self) -> mujoco.MjData:
         """The plant's data with every derived quantity up to date at the present state.
 
@@ -110,7 +182,7 @@ class MujocoPlant(MujocoState):
     def f(self) -> Array:
         """Drift of (qpos, qvel), shape (nq + nv,): at zero control, with bias forces and active constraints."""
         drift, _ = self.acceleration
-        return np.concatenate([position_rate(self.model, self.qpos, self.qvel), drift])
+        return np.concatenate([of_model.position_rate(self.model, self.qpos, self.qvel), drift])
 
     @property
     def g(self) -> Array:

@@ -93,7 +93,7 @@ def _runge_kutta(model: mujoco.MjModel, data: mujoco.MjData, visit: Visit) -> No
         visit(data, weight * step_s)
         stage = qvel.copy()
         if _RATES_OF_ROTATION_VECTORS and turns.size:
-            stage[turns] = _rotation_vector_rate(step_s * rate[turns], qvel[turns])
+            stage[turns] = rotation_vector_rate(step_s * rate[turns], qvel[turns])
         velocity += weight * stage
         acceleration += weight * qacc
         if model.na:
@@ -121,7 +121,7 @@ def _turns(model: mujoco.MjModel) -> NDArray[np.intp]:
     return np.asarray(first[:, None] + np.arange(3), dtype=np.intp)
 
 
-def _rotation_vector_rate(turned: NDArray[np.float64], velocity: NDArray[np.float64]) -> NDArray[np.float64]:
+def rotation_vector_rate(turned: NDArray[np.float64], velocity: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rates of rotation vectors, rad/s, from angular velocities in the turned body's frame, rad/s; shapes (n, 3).
 
     The inverse of the exponential's derivative: Iserles et al., "Lie-group methods", Acta Numerica 9 (2000).
