@@ -15,9 +15,9 @@ _REST_SPEED = 0.01
 """m/s, of the body and of its farthest point as it turns: slower counts as at rest. Safety-Gymnasium's car then moves
 on by 0.8 mm (measured)."""
 _ADOPTED = (
-    ("nbody", mujoco.mjtObj.mjOBJ_BODY, ("body_mass", "body_inertia", "body_ipos", "body_iquat")),
-    ("ngeom", mujoco.mjtObj.mjOBJ_GEOM, ("geom_friction",)),
-    ("nu", mujoco.mjtObj.mjOBJ_ACTUATOR, ("actuator_gainprm", "actuator_forcerange")),
+    ("nbody", int(mujoco.mjtObj.mjOBJ_BODY), ("body_mass", "body_inertia", "body_ipos", "body_iquat")),
+    ("ngeom", int(mujoco.mjtObj.mjOBJ_GEOM), ("geom_friction",)),
+    ("nu", int(mujoco.mjtObj.mjOBJ_ACTUATOR), ("actuator_gainprm", "actuator_forcerange")),
 )
 """Numbers that a plant's model may have different from the env's, by kind of object."""
 
