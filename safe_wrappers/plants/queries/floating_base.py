@@ -80,11 +80,10 @@ def equations_of_motion(
     acts = AffineActuators(model) if actuators is None else actuators
     gain, _ = acts.gain_and_bias(data.actuator_length, data.actuator_velocity)
     actuation = np.array(acts.moment(data).T * gain)
-    bias = (
-        actuation @ np.clip(data.ctrl, *control_range(model))
-        - data.qfrc_smooth
-        - _other_constraints(model, data)
-    )
+    others = np.zeros(model.nv)  # generalised force of all constraints but the contacts
+    if data.nefc:
+        mujoco.mj_mulJacTVec(model, data, others, np.where(data.efc_type < _CONTACT, data.efc_force, 0.0))
+    bias = actuation @ np.clip(data.ctrl, *control_range(model)) - data.qfrc_smooth - others
     return FloatingBaseTerms(inertia(model, data), bias, actuation, contact_points(model, data))
 
 
@@ -135,12 +134,3 @@ def contact_points(model: mujoco.MjModel, data: mujoco.MjData) -> ContactPoints:
         moments=moments,
         gaps=np.array(data.contact.dist[touching]).reshape(k),
     )
-
-
-def _other_constraints(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
-    """Generalised force of all constraints but the contacts, shape (nv,)."""
-    total = np.zeros(model.nv)
-    if data.nefc:
-        others = np.where(data.efc_type < _CONTACT, data.efc_force, 0.0)
-        mujoco.mj_mulJacTVec(model, data, total, others)
-    return total

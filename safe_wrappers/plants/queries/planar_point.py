@@ -46,7 +46,7 @@ def planar_point(plant: MujocoPlant, clip: float, body: str | None = None) -> Pl
         body: Name of the body on the two slides; what else moves must not act on them. None: nothing else moves.
 
     Raises:
-        UnsupportedEnvError: The model is no such point; the message says what does not fit.
+        UnsupportedEnvError: The model is not such a point; the message says why.
     """
     m = plant.model
     slides = _slides(m, None if body is None else plant.named("body", body))

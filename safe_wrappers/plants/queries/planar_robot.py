@@ -70,7 +70,7 @@ def heading_drive(plant: MujocoPlant, body: str, uncertainty: float = 0.0) -> He
     """The constants of a planar robot from a plant's model.
 
     Raises:
-        UnsupportedEnvError: The model is no heading drive; the message says what does not fit.
+        UnsupportedEnvError: The model is not such a robot; the message says why.
     """
     m = plant.model
     frame = PlanarFrame(plant, body)
