@@ -12,8 +12,8 @@ from safe_wrappers.checks import name_list, non_negative, positive
 from safe_wrappers.control.contact.friction_cone import normal_and_tangential
 from safe_wrappers.control.legged.support_distances import support_distances
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
-from safe_wrappers.plants.mujoco.contact_forecast import ContactForecast, ContactReader, can_touch_the_world
-from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
+from safe_wrappers.plants.mujoco.contacts import ContactForecast, ContactReader, can_touch_the_world
+from safe_wrappers.plants.mujoco.model import fixed_bodies
 from safe_wrappers.plants.queries.momentum import MomentumReader
 from safe_wrappers.wrappers.common.layer import Env, Reset
 from safe_wrappers.wrappers.common.step_monitor import StepMonitor

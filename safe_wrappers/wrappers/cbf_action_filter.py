@@ -17,10 +17,9 @@ from safe_wrappers.filter.engine import SafetyFilter
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.filter.projection import cast_inside, check_solver
 from safe_wrappers.filter.search import Stage
-from safe_wrappers.plants.default import default_plant
+from safe_wrappers.plants.default import default_plant, own_plant
 from safe_wrappers.plants.env_checks import check_actions, wrappers_of
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.template import own_plant
 from safe_wrappers.serialize import constraint_from, plain_data
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step

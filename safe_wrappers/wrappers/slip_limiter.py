@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 from safe_wrappers.constraints.traction import Traction
 from safe_wrappers.filter.fallback import FallbackFunction
+from safe_wrappers.plants.default import own_plant
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.template import own_plant
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.common.layer import Env
 

@@ -14,8 +14,8 @@ from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.fallback import FallbackFunction
+from safe_wrappers.plants.default import own_plant
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.template import own_plant
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.common.layer import Env
 

@@ -329,11 +329,11 @@ def test_other_envs_and_other_plants_are_refused():
 
 @pytest.mark.parametrize("options, message", [
     ({"delay_s": 0.05}, r"delay_s = 0.05 s is not a whole number of control intervals of 0.04 s"),
-    ({"delay_s": -0.04}, "delay_s is a time in seconds, >= 0"),
-    ({"delay_s": "soon"}, "delay_s is a time in seconds, got 'soon'"),
-    ({"metres_per_unit": 0.0}, "metres_per_unit is a displacement in m per unit of action, > 0; got 0.0"),
-    ({"metres_per_unit": np.nan}, "metres_per_unit is a displacement .* got nan"),
-    ({"metres_per_unit": "far"}, "metres_per_unit is a displacement .* got 'far'"),
+    ({"delay_s": -0.04}, "delay_s must be a finite number >= 0 in s"),
+    ({"delay_s": "soon"}, "delay_s must be a number in s, got 'soon'"),
+    ({"metres_per_unit": 0.0}, "metres_per_unit must be a finite number > 0 in m per unit of action, got 0.0"),
+    ({"metres_per_unit": np.nan}, "metres_per_unit must be a finite number > 0 .* got nan"),
+    ({"metres_per_unit": "far"}, "metres_per_unit must be a number .* got 'far'"),
 ])  # fmt: skip
 def test_nonsense_is_refused(options, message):
     with pytest.raises(ConfigurationError, match=message):

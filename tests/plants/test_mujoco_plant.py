@@ -534,7 +534,7 @@ def test_forgetting_clears_the_commands_in_flight():
 
 @pytest.mark.parametrize("delay", [-0.1, np.nan, np.inf])
 def test_a_senseless_delay_is_refused(delay):
-    with pytest.raises(ConfigurationError, match="delay_s is a time in seconds, >= 0"):
+    with pytest.raises(ConfigurationError, match="delay_s must be a finite number >= 0 in s"):
         bound(gym.make("Reacher-v5"), delay_s=delay)
 
 

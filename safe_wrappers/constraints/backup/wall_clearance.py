@@ -12,8 +12,7 @@ from safe_wrappers.control.numerics.rectangles import Rectangle, gaps, nearest
 from safe_wrappers.filter.constraint import Array, Constraint, HalfSpaces
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.queries.planar_point import planar_point
-from safe_wrappers.plants.queries.walls import walls
+from safe_wrappers.plants.queries.planar_point import planar_point, walls
 
 _Control = tuple[float, float]
 """Along x and along y, in the actuators' units."""

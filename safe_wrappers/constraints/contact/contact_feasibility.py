@@ -13,8 +13,8 @@ from safe_wrappers.constraints.rollout import BoundSlacks
 from safe_wrappers.control.contact.friction_cone import normal_and_tangential
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Array, Constraint
-from safe_wrappers.plants.mujoco.contact_forecast import can_touch_the_world
-from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
+from safe_wrappers.plants.mujoco.contacts import can_touch_the_world
+from safe_wrappers.plants.mujoco.model import fixed_bodies
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 

@@ -11,7 +11,7 @@ from safe_wrappers.constraints.contact.contact_feasibility import require_contac
 from safe_wrappers.constraints.rollout import BoundSlacks
 from safe_wrappers.control.legged.support_distances import support_distances
 from safe_wrappers.filter.constraint import Array, Constraint, Memory
-from safe_wrappers.plants.mujoco.contact_forecast import ContactForecast
+from safe_wrappers.plants.mujoco.contacts import ContactForecast
 from safe_wrappers.plants.plant import Plant
 
 

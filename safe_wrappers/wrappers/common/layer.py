@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.plants.template import PlantTemplate
+from safe_wrappers.plants.default import PlantTemplate
 from safe_wrappers.serialize import recorded
 from safe_wrappers.stack import Layer, refuse_order
 
