@@ -33,7 +33,11 @@ HEADING_DRIVE = Target(
 
 COASTING = Target(
     "constraints/backup/[bc]*.py",
-    ("tests/constraints/test_coasting_clearance.py", "tests/wrappers/test_closed_loop_car_goal.py"),
+    (
+        "tests/constraints/test_coasting_rest.py",
+        "tests/constraints/test_coasting_clearance.py",
+        "tests/wrappers/test_closed_loop_car_goal.py",
+    ),
     (
         Mutant(_FORGOTTEN, "Detour()"),
         Mutant(_FORGOTTEN, "self._memory"),
