@@ -68,7 +68,11 @@ COASTING = Target(
 
 ESCAPE = Target(
     "constraints/backup/escape_clearance.py",
-    ("tests/constraints/test_escape_clearance.py", "tests/wrappers/test_closed_loop_occlusion.py"),
+    (
+        "tests/constraints/test_escape_boxes.py",
+        "tests/constraints/test_escape_clearance.py",
+        "tests/wrappers/test_closed_loop_occlusion.py",
+    ),
     (
         Mutant("shorter = going_on - 1 if", "shorter = going_on if"),
         Mutant("        if going_on is not None:", "        if False:"),
@@ -113,7 +117,7 @@ ESCAPE = Target(
 
 WALL = Target(
     "constraints/backup/wall_clearance.py",
-    ("tests/constraints/test_wall_clearance.py",),
+    ("tests/constraints/test_wall_corners.py", "tests/constraints/test_wall_clearance.py"),
     (
         Mutant("return self._left_after(control) >= self._recovery() - _NOISE_M", "return True"),
         Mutant("min(0.0, self._least) - _NOISE_M", "0.0"),
