@@ -6,6 +6,7 @@ LEASE = Target(
     "wrappers/lease*/**/*.py",
     (
         "tests/wrappers/test_admission.py",
+        "tests/wrappers/test_budget_commands.py",
         "tests/wrappers/test_stopping_budget.py",
         "tests/wrappers/test_teleop_revocation.py",
     ),
