@@ -66,7 +66,11 @@ LEASE = Target(
 
 LEASE_EXPIRY = Target(
     "wrappers/lease_expiry.py",
-    ("tests/wrappers/test_lease_expiry.py", "tests/wrappers/test_authority_stack.py"),
+    (
+        "tests/wrappers/test_lease_over_filter.py",
+        "tests/wrappers/test_lease_expiry.py",
+        "tests/wrappers/test_authority_stack.py",
+    ),
     (
         Mutant("refused |= not self._grant(now)", "self._grant(now)"),
         Mutant(
@@ -132,6 +136,7 @@ HANDOVER = Target(
     "wrappers/*handover*/**/*.py",
     (
         "tests/wrappers/test_chunk_queue.py",
+        "tests/wrappers/test_chunks_arriving.py",
         "tests/wrappers/test_macro_info.py",
         "tests/wrappers/test_upsampling.py",
         "tests/wrappers/test_chunk_handover.py",
@@ -180,7 +185,7 @@ HANDOVER = Target(
 
 CHUNK_HANDOVER = Target(
     "wrappers/chunk_handover.py",
-    ("tests/wrappers/test_chunk_handover.py",),
+    ("tests/wrappers/test_chunks_arriving.py", "tests/wrappers/test_chunk_handover.py"),
     (
         Mutant("latency = now - command.observed", "latency = now"),
         Mutant("            total += float(reward)", "            total = float(reward)"),
