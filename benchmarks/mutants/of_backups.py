@@ -6,7 +6,11 @@ _FORGOTTEN = "Detour(self._memory.side, self._memory.steps - 1)"
 
 HEADING_DRIVE = Target(
     "constraints/backup/[bh]*.py",
-    ("tests/constraints/test_heading_drive_clearance.py", "tests/wrappers/test_closed_loop_point_goal.py"),
+    (
+        "tests/constraints/test_heading_drive_reach.py",
+        "tests/constraints/test_heading_drive_clearance.py",
+        "tests/wrappers/test_closed_loop_point_goal.py",
+    ),
     (
         Mutant(_FORGOTTEN, "Detour()"),
         Mutant(_FORGOTTEN, "self._memory"),
