@@ -64,7 +64,6 @@ COASTING = Target(
         Mutant(
             "np.minimum(np.maximum(control, self._low), self._high) + 0.0",
             "np.minimum(np.maximum(control, self._low), self._high)",
-            equal="minus zero is forecast once more, with the same outcome; only the cache is larger",
         ),
         Mutant("return after.end if self._least < 0.0 else after.least", "return after.end"),
     ),
