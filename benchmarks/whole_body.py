@@ -35,7 +35,7 @@ import numpy as np
 import safe_wrappers as sw
 from safe_wrappers.appendix.legged.balance import support_margin, zmp_of_forces
 from safe_wrappers.control.legged.support import common_plane, support_polygon
-from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
+from safe_wrappers.plants.mujoco.model import fixed_bodies
 from safe_wrappers.plants.mujoco.replay import Replay
 
 RESULTS = Path(__file__).parent / "results"

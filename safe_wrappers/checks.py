@@ -1,4 +1,4 @@
-"""Checks of arguments: each returns what it was given in one type, or raises an error that names the parameter."""
+"""Checks of arguments: each returns the value in one type, or raises an error that names the parameter."""
 
 import inspect
 import math
@@ -17,30 +17,27 @@ T = TypeVar("T")
 
 
 def positive(name: str, value: float, unit: str) -> float:
-    """A finite number above zero, or an error that names the parameter and its unit."""
-    number = _number(name, value, unit)
-    if not (math.isfinite(number) and number > 0.0):
-        raise ConfigurationError(f"{name} must be a finite number > 0 in {unit}, got {value!r}")
-    return number
+    """A finite number above zero."""
+    return _number(name, value, unit, "> 0", math.ulp(0.0))
 
 
 def non_negative(name: str, value: float, unit: str) -> float:
-    """A finite number of at least zero, or an error that names the parameter and its unit."""
-    number = _number(name, value, unit)
-    if not (math.isfinite(number) and number >= 0.0):
-        raise ConfigurationError(f"{name} must be a finite number >= 0 in {unit}, got {value!r}")
+    """A finite number of at least zero."""
+    return _number(name, value, unit, ">= 0", 0.0)
+
+
+def _number(name: str, value: float, unit: str, bound: str, least: float) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise ConfigurationError(f"{name} must be a number in {unit}, got {value!r}") from None
+    if not (math.isfinite(number) and number >= least):
+        raise ConfigurationError(f"{name} must be a finite number {bound} in {unit}, got {value!r}")
     return number
 
 
-def _number(name: str, value: Any, unit: str) -> float:
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        raise ConfigurationError(f"{name} must be a number in {unit}, got {value!r}") from None
-
-
 def whole_number(name: str, value: Any, least: int, of: str = "") -> int:
-    """A whole number, no float, or an error that names the parameter and what it counts."""
+    """A whole number, not a float; `of` says in messages what it counts."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         counted = f" of {of}" if of else ""
         raise ConfigurationError(f"{name} is a whole number{counted}, at least {least}; got {value!r}")
@@ -48,7 +45,7 @@ def whole_number(name: str, value: Any, least: int, of: str = "") -> int:
 
 
 def name_list(name: str, given: Any, of: str = "names", also: str = "", least: int = 1) -> list[str]:
-    """A list of at least so many names, or an error that names the parameter and what else (`also`) it may be."""
+    """A list of at least `least` names; `of` and `also` say in messages what they are and what else is allowed."""
     listed = isinstance(given, Sequence | np.ndarray) and not isinstance(given, str) and len(given) >= least
     if not (listed and all(isinstance(one, str) for one in given)):
         raise ConfigurationError(f"{name} is a list of {of}{', or ' + also if also else ''}; got {given!r}")
@@ -56,17 +53,11 @@ def name_list(name: str, given: Any, of: str = "names", also: str = "", least: i
 
 
 def settings_from(kind: type[T], given: Any, name: str, also: str = "") -> T:
-    """An instance of a dataclass itself, or made from the dict of its fields.
-
-    Args:
-        kind: The dataclass.
-        given: The instance or the dict.
-        name: Of the parameter, for messages.
-        also: What else the parameter takes, for messages.
+    """An instance of the dataclass `kind`: the given one, or one made from the dict of its fields.
 
     Raises:
-        ConfigurationError: Neither, or a field without a default is missing.
-        UnknownNameError: A key that is no field.
+        ConfigurationError: Neither, or a field without a default is missing; `also` says what else is allowed.
+        UnknownNameError: A key that is not a field.
     """
     if isinstance(given, kind):
         return given
@@ -86,7 +77,7 @@ def settings_from(kind: type[T], given: Any, name: str, also: str = "") -> T:
 def check_fields(
     settings: Any, check: Callable[[str, float, str], float], names: Sequence[str], unit: str
 ) -> None:
-    """Put fields of a frozen dataclass through `positive` or `non_negative`; None stays where it is the default."""
+    """Check fields of a frozen dataclass by `positive` or `non_negative`; None stays where it is the default."""
     defaults = {field.name: field.default for field in fields(settings)}
     for name in names:
         value = getattr(settings, name)
@@ -95,11 +86,7 @@ def check_fields(
 
 
 def finite_array(name: str, value: ArrayLike) -> Array:
-    """One value as float64, any shape.
-
-    Raises:
-        ConfigurationError: What is no number, or not finite; it names the argument.
-    """
+    """The value as finite float64, any shape."""
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -110,11 +97,7 @@ def finite_array(name: str, value: ArrayLike) -> Array:
 
 
 def finite_arrays(**values: ArrayLike) -> list[Array]:
-    """The values as float64, broadcast together, in the order given.
-
-    Raises:
-        ConfigurationError: What is no number, or not finite, or shapes that do not broadcast.
-    """
+    """The values as finite float64, broadcast together, in the given order."""
     arrays = [finite_array(name, value) for name, value in values.items()]
     try:
         return list(np.broadcast_arrays(*arrays))

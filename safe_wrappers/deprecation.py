@@ -17,16 +17,13 @@ def deprecated_parameters(
     moved: Mapping[str, type[Any]] | None = None,
     positional: Sequence[str] = (),
 ) -> Callable[[type[T]], type[T]]:
-    """Class decorator: the constructor goes on taking parameters that were renamed, or moved into a dataclass.
+    """Class decorator: the constructor still takes parameters that were renamed, or moved into a dataclass.
 
     Args:
-        renamed: Old name to new name.
-        moved: Parameter to the dataclass that it takes now. The fields of the dataclass are accepted as keywords of
-            the constructor; an argument at the place of the parameter is then the dataclass's first field.
-        positional: Old names of positional arguments that follow those of today.
-
-    Raises:
-        ConfigurationError: On a call that gives the old and the new name of a parameter.
+        renamed: Old name to new name; a call that gives both raises a ConfigurationError.
+        moved: Parameter to the dataclass that it takes now. The dataclass's fields are accepted as keywords of the
+            constructor; an argument at the place of the parameter is then the dataclass's first field.
+        positional: Old names of positional arguments after the present ones.
     """
     renames, moves = dict(renamed or {}), dict(moved or {})
     homes = {field.name: parameter for parameter, kind in moves.items() for field in fields(kind)}
@@ -57,16 +54,13 @@ def deprecated_parameters(
                     new[renames[name]] = value
             written = []
             for parameter, value in new.items():
+                words = "..."
                 if parameter in moves:
                     first = fields(moves[parameter])[0].name
-                    if parameter in bound.arguments:
-                        value = {first: bound.arguments[parameter], **value}
-                    value.setdefault(first, None)
-                    words = ", ".join(f"{name}=..." for name in value)
-                    written.append(f"{parameter}={moves[parameter].__name__}({words})")
+                    value = {first: bound.arguments.get(parameter)} | value
+                    words = f"{moves[parameter].__name__}({', '.join(f'{name}=...' for name in value)})"
                     value = moves[parameter](**value)
-                else:
-                    written.append(f"{parameter}=...")
+                written.append(f"{parameter}={words}")
                 bound.arguments[parameter] = value
             warnings.warn(
                 f"{kind.__name__}: {', '.join(old)} {'is' if len(old) == 1 else 'are'} deprecated; write "

@@ -1,7 +1,7 @@
 """The registry of info keys: type, unit and meaning of each, and how it is merged, summed up and logged.
 
-Every wrapper writes its keys at every step with the dtype given here, so that `Monitor`, TensorBoard and
-Gymnasium's vector envs need no glue. No key holds a wall-clock value: `check_env` compares two runs exactly.
+Every wrapper writes its keys at every step with the dtype given here. No key holds a wall-clock value: `check_env`
+compares two runs exactly.
 """
 
 from dataclasses import dataclass
@@ -12,17 +12,15 @@ import numpy as np
 
 @dataclass(frozen=True)
 class InfoKey:
-    """What is known of one info key; the docstring of its constant says what it means.
+    """One info key; the docstring of its constant says what it means.
 
     Attributes:
-        name: The key.
-        dtype: Of NumPy; "dict" is no number.
         shape: Of an array, such as "(3,)" or "(wheels,)"; "" is a number.
         unit: SI, "action" or "reward"; "" without a unit.
-        chunk: What becomes of it in a step of many control steps (`ChunkHandover`).
-        where: A key: control steps at which that one is 0 or missing do not count for `chunk`. "" counts all.
+        chunk: How `ChunkHandover` merges the values of the control steps in its step.
+        where: A key; `chunk` leaves out control steps at which it is 0 or missing. "" counts all.
         log: `InterventionCallback` logs ``interventions/step_<log>``, the mean over steps and envs; "" is not logged.
-        entries: What `number` takes of an array, the largest size or the mean.
+        entries: What `number` takes of an array: the largest size or the mean.
     """
 
     name: str
@@ -46,10 +44,9 @@ class EpisodeFigure:
     """One figure of an episode: in ``info["interventions"]`` and a column of `RecordInterventions`' CSV file.
 
     Attributes:
-        name: Of the figure.
-        how: Made from the steps: "count" is the number of steps at which a key is above zero, or the sum of a key of
-            whole numbers; "onsets" counts the entries of an array that become True; "any" is whether it ever was.
-        of: The info keys that it is made from: all that are there for "count", else the first one that is.
+        how: "count" is the number of steps at which a key is above zero, or the sum of a key of whole numbers;
+            "onsets" counts the entries of an array that become True; "any" is whether it ever was.
+        of: The info keys that it is made from: for "count" all that exist, else the first that exists.
         running: The key with the figure of the episode so far; "" for none.
     """
 
@@ -78,23 +75,21 @@ CBF_FALLBACK: Final = _key("cbf/fallback", "bool", chunk="any", log="fallback")
 CBF_NONFINITE: Final = _key("cbf/nonfinite", "bool", chunk="any")
 """The proposed action held a NaN or an infinity; it never reaches the env."""
 CBF_CORRECTION: Final = _key("cbf/correction", "float64", unit="action", chunk="max", log="correction")
-"""L2 norm of executed minus proposed (boxing counts; 0 for a non-finite proposal's missing entries: those are
-compared as 0)."""
+"""L2 norm of executed minus proposed, boxing included; entries of the proposal that are not finite are taken as 0."""
 CBF_CLIPPED: Final = _key("cbf/clipped", "float64", unit="action", chunk="max")
 """L2 norm of boxed minus proposed: what the action space alone took away."""
 CBF_MARGIN: Final = _key("cbf/margin", "float64", chunk="min")
-"""The smallest barrier value h over all constraints before the step, each in its own unit (m, rad/s, ...), to the
-limit itself: a constraint's margin is not taken off. 0 when no constraint has a barrier, or nothing that it watches
-is there."""
+"""The smallest barrier value h over all constraints before the step, each in its own unit, without its margin. 0
+when there is no barrier value."""
 CBF_UNSAFE: Final = _key("cbf/unsafe", "bool", chunk="any")
 """Some h was negative (by more than rounding, 1e-6) or not a number before the step."""
 CBF_REFUSED: Final = _key("cbf/refused", "bool", shape="(constraints,)", chunk="any")
-"""One per constraint in the order of the filter's `constraint_names`: it did not admit the boxed proposal. More than
-one may; all False when nothing was changed, or when the state or the proposal was not finite."""
+"""Which constraints, in the order of `constraint_names`, did not admit the boxed proposal; all False when nothing was
+changed, or when the state or the proposal was not finite."""
 CBF_STAGE: Final = _key("cbf/stage", "int64")
-"""Which stage of the search found the executed action, a `safe_wrappers.filter.search.Stage`: 0 the proposal itself,
-1 projection on rows, 2 a constraint's candidate, 3 projection on rows linearised anew, 4 an overshoot, 5 a blend, 6
-a backup control, 7 the fallback, 8 the least violation."""
+"""The `safe_wrappers.filter.search.Stage` that found the executed action: 0 the proposal, 1 projection on rows, 2 a
+constraint's candidate, 3 projection on new rows, 4 an overshoot, 5 a blend, 6 a backup control, 7 the fallback, 8 the
+least violation."""
 EXECUTED_ACTION: Final = _key("executed_action", "float64", shape="(m,)", unit="action")
 """What the env was really given."""
 PROPOSED_ACTION: Final = _key("proposed_action", "float64", shape="(m,)", unit="action")
@@ -106,30 +101,28 @@ CBF_FLOATS: Final = tuple(key.name for key in _NUMBERS if key.dtype == "float64"
 
 # Traction in a filter, SlipLimiter: every step --------------------------------------------------------------------
 SLIP_RATIO: Final = _key("slip/ratio", "float64", shape="(wheels,)", log="slip")
-"""One per wheel in the order of `wheels`: normalised slip before the step."""
+"""Normalised slip of each wheel, in the order of `wheels`, before the step."""
 SLIP_LIMITED: Final = _key("slip/limited", "bool", shape="(wheels,)", chunk="any", log="slip_limited")
 """The filter changed a control that drives this wheel."""
 SLIP_MU_ESTIMATE: Final = _key("slip/mu_estimate", "float64", shape="(wheels,)")
 """Estimated peak friction coefficient of each wheel's ground, before the step."""
 SLIP_MU_STD: Final = _key("slip/mu_std", "float64", shape="(wheels,)")
-"""The estimate's standard deviation (of its model; no error bound)."""
+"""Standard deviation of the estimate, by its model."""
 
 # ContactFeasibility and SupportMargin in a filter, WholeBodyFilter: every step -------------------------------------
 WHOLE_BODY_CONTACTS: Final = _key("whole_body/contacts", "int64")
 """Contacts of the robot with the fixed world at the state before the step."""
 WHOLE_BODY_CONE_MARGIN: Final = _key("whole_body/cone_margin", "float64")
-"""By how much the contact forces stay inside the narrowed friction cones at worst, forecast for the executed action
-over its control step, as a share of the robot's weight; negative outside, 0 where nothing touches."""
+"""How far the contact forces stay inside the narrowed friction cones at worst, forecast for the executed action, as a
+share of the robot's weight; negative outside, 0 without contacts."""
 WHOLE_BODY_ZMP_MARGIN: Final = _key("whole_body/zmp_margin", "float64", unit="m")
-"""Least distance of the zero moment point from the edge of the support polygon, forecast for the executed action,
-while there is a polygon; 0 where there is none."""
+"""Least distance of the zero moment point from the edge of the support polygon in that forecast; 0 without one."""
 WHOLE_BODY_SUPPORTED: Final = _key("whole_body/supported", "float64")
-"""Share of the forecast's instants at which there is a polygon: three contact points of one plane."""
+"""Share of the forecast's instants with a support polygon: three contact points of one plane."""
 
 # Tasks, every step: the env's own truth, never the filter's plant ------------------------------------------
 COST: Final = _key("cost", "float64", chunk="sum", log="cost")
-"""Cost of this control step, judged at its end, as Safety-Gymnasium publishes it; `CostFunction` writes it for a
-task that reports none."""
+"""Cost of this control step, judged at its end, by the task or a `CostFunction`."""
 COST_SUBSTEP: Final = _key("cost_substep", "float64", chunk="sum", log="cost_substep")
 """1 if the constraint was violated at any physics substep of this control step, else 0."""
 SPIN_OUT: Final = _key("spin_out", "float64", chunk="max", log="spin_out")
@@ -151,33 +144,31 @@ ADAPTION_TASK_REWARD: Final = _key("adaption/task_reward", "float64", unit="rewa
 
 # ChunkHandover, every step: of its chunk of control steps --------------------------------------------------------
 HANDOVER_SEAM_JUMP: Final = _key("handover/seam_jump", "float64", shape="(3,)", unit="action")
-"""The largest first, second and third difference of the executed commands over this step's seams: a difference
-counts if its newest command is one of the blend's or of the three after it."""
+"""The largest first, second and third difference of the executed commands whose newest command is in a blend or one
+of the three after it."""
 HANDOVER_PEAK_JERK: Final = _key("handover/peak_jerk", "float64", unit="action/s", log="peak_jerk")
-"""The largest difference of neighbouring executed commands over the control interval, of any component, seam or
-not."""
+"""The largest rate of change between neighbouring executed commands, of any component."""
 HANDOVER_BLEND_TIME: Final = _key("handover/blend_time", "float64", unit="s", log="blend_time")
-"""How long the longest blend takes that began in this step; 0 where none did."""
+"""Duration of the longest blend that began in this step; 0 where none did."""
 HANDOVER_STARVED: Final = _key("handover/starved", "int64", log="starved")
-"""Control steps of this step at which the queue was dry and the fallback gave the command."""
+"""Control steps of this step at which the queue was empty and the fallback gave the command."""
 HANDOVER_LIMITED: Final = _key("handover/limited", "int64", log="limited")
-"""Control steps of this step at which a command was held back, beyond the blend, to keep `rate_limit`."""
+"""Control steps of this step at which `rate_limit` changed a command, beyond the blend."""
 HANDOVER_REFUSED: Final = _key("handover/refused", "bool")
 """A chunk was refused: not finite, not newer than the one in force, too late, or out of reach."""
 HANDOVER_LATENCY: Final = _key("handover/latency", "int64")
-"""Control steps that went by between the observation and the takeover of the last chunk that took over in this step,
-as consumed; -1 where none did."""
+"""Control steps from the observation to the takeover of the last chunk that took over in this step; -1 without."""
 HANDOVER_STEPS: Final = _key("handover/steps", "int64")
 """Control steps executed in this step (fewer than the execution horizon where the episode ended)."""
 
 # LeaseExpiry, every control step ---------------------------------------------------------------------------------
 LEASE_REMAINING_S: Final = _key("lease/remaining_s", "float64", unit="s")
-"""What the lease in force has left after this control step; 0 where there is none."""
+"""Remaining time of the lease in force after this control step; 0 without a lease."""
 LEASE_EXPIRED: Final = _key("lease/expired", "bool", chunk="any", log="lease_expired")
 """A lease ran out at this control step (once per lease)."""
 LEASE_REFUSED: Final = _key("lease/refused", "bool", chunk="any", log="lease_refused")
-"""A command was refused: a fresh one was not granted a lease, or it was not finite, older than the one in force or
-from the future, or a chunk's end was out of reach."""
+"""A command was refused: no lease was granted, or it was not finite, older than the one in force or from the future,
+or a chunk's end was out of reach."""
 LEASE_BRAKING: Final = _key("lease/braking", "bool", chunk="any", log="lease_braking")
 """The fallback acted at this control step."""
 
@@ -185,8 +176,7 @@ LEASE_BRAKING: Final = _key("lease/braking", "bool", chunk="any", log="lease_bra
 TELEOP_ROUND_TRIP_S: Final = _key("teleop/round_trip_s", "float64", unit="s")
 """Age of the image that the command in force was made from; before the first one, since the reset."""
 TELEOP_CEILING_S: Final = _key("teleop/ceiling_s", "float64", unit="s")
-"""The longest admissible round trip when this step was decided on, within its `longest_s` of 0; inf without a
-ceiling."""
+"""The longest admissible round trip when this step was decided, from 0 to `longest_s`; inf without a ceiling."""
 TELEOP_CLEARANCE_M: Final = _key("teleop/clearance_m", "float64", unit="m", chunk="min")
 """The smaller clearance, before or after the step; inf without a ceiling, or with nothing near."""
 TELEOP_REVOKED: Final = _key("teleop/revoked", "bool", chunk="any")
@@ -198,10 +188,9 @@ TELEOP_ENERGY_OUT_J: Final = _key("teleop/energy_out_j", "float64", unit="J")
 TELEOP_IN_FLIGHT_J: Final = _key("teleop/in_flight_j", "float64", unit="J")
 """Energy of the waves on their way; 0 with plain coding."""
 TELEOP_CREATED_J: Final = _key("teleop/created_j", "float64", unit="J")
-"""The most that came out, or was in flight, beyond what went in, at any time so far; 0: passive."""
+"""The largest excess of energy out and in flight over energy in, so far; 0 is passive."""
 TELEOP_LOST: Final = _key("teleop/lost", "int64", chunk="sum")
-"""Packets of this step, in both directions, that got lost; an action that is not finite, which is not sent, is
-one."""
+"""Packets of this step, in both directions, that got lost; actions that are not finite count as lost."""
 TELEOP_LATE: Final = _key("teleop/late", "int64", chunk="sum")
 """Commands that arrived in this step behind or together with a newer one."""
 
@@ -211,11 +200,11 @@ CONTACT_PEAK_FORCE: Final = _key("contact/peak_force", "float64", unit="N", chun
 CONTACT_IMPULSE: Final = _key("contact/impulse", "float64", unit="N s", chunk="sum")
 """The normal forces of all contacts, summed and integrated over the control step."""
 CONTACT_PENETRATION: Final = _key("contact/penetration", "float64", unit="m", chunk="max")
-"""The deepest."""
+"""The largest penetration depth."""
 CONTACT_RESIDUAL: Final = _key("contact/residual", "float64", unit="N m", chunk="max")
-"""The largest ``|gap * force|`` of a contact: what misses complementarity."""
+"""The largest ``|gap * force|`` of a contact: the violation of complementarity."""
 CONTACT_PARTIAL: Final = _key("contact/partial", "bool", chunk="any")
-"""Not every substep was seen; the others are of the contacts that the step left behind, for one substep."""
+"""Not every substep was seen; the other keys describe only the last substep."""
 
 # BalanceMonitor, every step: of the robot and its contacts with the fixed world ------------------------------------
 BALANCE_LINEAR_MOMENTUM: Final = _key("balance/linear_momentum", "float64", shape="(3,)", unit="kg m/s")
@@ -223,20 +212,17 @@ BALANCE_LINEAR_MOMENTUM: Final = _key("balance/linear_momentum", "float64", shap
 BALANCE_ANGULAR_MOMENTUM: Final = _key("balance/angular_momentum", "float64", shape="(3,)", unit="kg m^2/s")
 """About the centre of mass, after the step."""
 BALANCE_FRICTION_USED: Final = _key("balance/friction_used", "float64", chunk="max")
-"""The largest ``|f_t| / (share mu f_n)`` of a contact that carries 1 % of the weight or more, over all evaluations
-of the physics."""
+"""The largest ``|f_t| / (share mu f_n)`` of a contact with at least 1 % of the weight, over all evaluations."""
 BALANCE_ZMP_MARGIN: Final = _key(
     "balance/zmp_margin", "float64", unit="m", chunk="min", where="balance/supported"
 )
-"""Least distance of the zero moment point from the edge of the support polygon minus the inset, over the evaluations
-with a polygon; 0 where there is none."""
+"""Least distance of the zero moment point from the edge of the support polygon, less the inset; 0 without one."""
 BALANCE_SUPPORTED: Final = _key("balance/supported", "float64", chunk="mean")
-"""Share of the evaluations with a polygon: three contact points of one plane, not on a line."""
+"""Share of the evaluations with a support polygon: three contact points of one plane, not on a line."""
 BALANCE_AIRBORNE: Final = _key("balance/airborne", "float64", chunk="mean")
 """Share of the evaluations without a contact point."""
 BALANCE_PARTIAL: Final = _key("balance/partial", "bool", chunk="any")
-"""Not every evaluation was seen, and the others are of the contacts that the step left behind; or numbers were not
-finite, and are reported as 0."""
+"""Not every evaluation was seen (then only the last one counts), or numbers were not finite (reported as 0)."""
 
 # OcclusionPenalty, every step: one entry per track, after the step ------------------------------------------------
 OCCLUSION_VISIBLE: Final = _key("occlusion/visible", "bool", shape="(tracks,)", log="seen", entries="mean")
@@ -246,8 +232,8 @@ OCCLUSION_SIGMA: Final = _key("occlusion/sigma", "float64", shape="(tracks,)", u
 OCCLUSION_EXPIRED: Final = _key(
     "occlusion/expired", "bool", shape="(tracks,)", chunk="any", log="expired", entries="mean"
 )
-"""`sigmas` standard deviations would cross the tolerance before the next step ends, if nothing is seen until then:
-no permission to rely on this track."""
+"""Without a measurement, `sigmas` standard deviations would cross the tolerance before the next step ends: no
+permission to rely on this track."""
 OCCLUSION_PENALTY: Final = _key(
     "occlusion/penalty", "float64", unit="reward", chunk="sum", log="occlusion_penalty"
 )
@@ -257,7 +243,7 @@ OCCLUSION_TASK_REWARD: Final = _key("occlusion/task_reward", "float64", unit="re
 
 # The faults of safe_wrappers.wrappers.faults, every step --------------------------------------------------------
 FAULT_ACTIVE: Final = _key("fault/active", "bool", chunk="any", log="fault")
-"""What the policy gave at this step did not arrive as it was: it was lost, late, or replaced."""
+"""The policy's action of this step was lost, late or replaced."""
 
 # RecordInterventions ---------------------------------------------------------------------------------------
 RUNNING_PREFIX: Final = "interventions/"
@@ -285,8 +271,7 @@ EPISODE: Final = (
 )
 """An episode's figures beside its length and return, in the order of the CSV file."""
 EPISODE_SUMMARY: Final = _key("interventions", "dict")
-"""At an episode's last step only, as RecordEpisodeStatistics adds `episode`: length, return, and the figures of
-`EPISODE` that the stack and the task report."""
+"""At an episode's last step only: length, return, and the figures of `EPISODE` that the stack and the task report."""
 RUNNING: Final = tuple(_key(figure.running, "float64") for figure in EPISODE if figure.running)
-"""Every step: the episode so far, NaN where the task or the stack does not report what it is made from.
-Monitor reads them at the terminal step (`info_keywords`)."""
+"""Every step: the episode so far; NaN where the task or the stack does not report the keys. Monitor's
+`info_keywords`."""

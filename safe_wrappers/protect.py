@@ -1,12 +1,13 @@
 """protect: the recommended stack for a known env, in one call."""
 
 import inspect
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
 import mujoco
 
-from safe_wrappers.constraints.limits.joint_speed_limit import JointSpeedLimit
+from safe_wrappers.constraints.limits.joints import JointSpeedLimit
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import check_actions
 from safe_wrappers.recipes import RECIPES
@@ -15,26 +16,28 @@ from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 
 
 def protect_options() -> frozenset[str]:
-    """Every option that `protect` knows, for whichever env."""
-    of_recipes = {n for recipe in RECIPES.values() for n in inspect.signature(recipe).parameters}
-    return frozenset(
-        (of_recipes | inspect.signature(CBFActionFilter).parameters.keys()) - {"env", "constraints"}
-    )
+    """Every option that `protect` takes for some env."""
+    of_recipes = [name for recipe in RECIPES.values() for name in _options(recipe)]
+    return frozenset(of_recipes + _options(CBFActionFilter))
+
+
+def _options(takes: Callable[..., Any]) -> list[str]:
+    return [name for name in inspect.signature(takes).parameters if name not in ("env", "constraints")]
 
 
 def protect(env: gym.Env[Any, Any], **options: Any) -> CBFActionFilter:
     """Wrap a known env with the constraints that we recommend and test for it.
 
     Args:
-        env: Made by `gymnasium.make`; its id says which recipe applies, whatever the version.
-        options: Passed to `CBFActionFilter`: `margin` (added to the recipe's own), `fallback`, `solver`,
-            `plant`. SafePointGoal also takes `detour` (go around a hazard instead of stopping before it,
-            default True), `brake` (count on the drive to stop, default True) and `uncertainty` (of mass and
-            damping, a fraction, default 0); SafeCarGoal takes `detour`; Fetch takes `low` and `high` (corners of the
-            gripper's box, m), `keep_out` (obstacles for its fingers) and `table` (keep them off it, default True).
+        env: Made by `gymnasium.make`; its id without the version selects the recipe.
+        options: Those of `CBFActionFilter`, with `margin` added to the recipe's own. SafePointGoal also takes
+            `detour` (go around a hazard instead of stopping before it, default True), `brake` (count on the drive to
+            stop, default True) and `uncertainty` (of mass and damping, a fraction, default 0); SafeCarGoal takes
+            `detour`; Fetch takes `low` and `high` (corners of the gripper's box, m), `keep_out` (obstacles for its
+            fingers) and `table` (keep the fingers off it, default True).
 
     Raises:
-        UnsupportedEnvError: Not one env, or no recipe for it; the message has the lines that protect it by hand.
+        UnsupportedEnvError: Not a single env, or no recipe for it; the message has the lines that protect it by hand.
         ConfigurationError: A layer inside that belongs outside, such as `RecordInterventions`.
 
     Example:
@@ -53,8 +56,7 @@ def protect(env: gym.Env[Any, Any], **options: Any) -> CBFActionFilter:
             f"no recipe for {env_id or env.unwrapped!r}; there are recipes for {', '.join(sorted(RECIPES))}. "
             f"{_by_hand(env)}"
         )
-    of_recipe = [name for name in inspect.signature(recipe).parameters if name != "env"]
-    of_filter = [n for n in inspect.signature(CBFActionFilter).parameters if n not in ("env", "constraints")]
+    of_recipe, of_filter = _options(recipe), _options(CBFActionFilter)
     for name in options:
         if name not in of_recipe + of_filter:
             raise UnknownNameError(
@@ -73,19 +75,20 @@ def _by_hand(env: gym.Env[Any, Any]) -> str:
             return _limiting_joints(env, model)
     except ConfigurationError as error:
         return f"A filter by hand is refused, too: {error}"
-    named = env.has_wrapper_attr("dt")
+    say, argument = "", ""
+    if not env.has_wrapper_attr("dt"):
+        say, argument = ", and say with control_dt how long a step lasts, in s", ", control_dt=control_dt"
     return (
         "It has no MuJoCo model. Describe it by x' = f(x) + g(x) u with x = state(env), and what must stay positive "
-        f"by h(x){'' if named else ', and say with control_dt how long a step lasts, in s'}; then it is three "
-        "lines:\n"
+        f"by h(x){say}; then it is three lines:\n"
         "    import safe_wrappers as sw\n"
-        f"    plant = sw.AnalyticPlant(f, g, state{'' if named else ', control_dt=control_dt'})\n"
+        f"    plant = sw.AnalyticPlant(f, g, state{argument})\n"
         "    env = sw.CBFActionFilter(env, [sw.constraints.Barrier(h)], plant=plant)"
     )
 
 
 def _limiting_joints(env: gym.Env[Any, Any], model: mujoco.MjModel) -> str:
-    """A limit on the joints that are driven, or else on all that have a name."""
+    """Lines that limit the driven joints, or else all joints that have a name."""
     joints = ""
     try:
         CBFActionFilter(env, [JointSpeedLimit(limit=4.0)])
@@ -105,7 +108,7 @@ def _limiting_joints(env: gym.Env[Any, Any], model: mujoco.MjModel) -> str:
 
 
 def _of_no_env(given: Any) -> str:
-    """What to write in place of what is no env."""
+    """What to write instead, where the argument is not an env."""
     if isinstance(given, str):
         return f"write protect(gym.make({given!r}))"
     if isinstance(given, gym.vector.VectorEnv):

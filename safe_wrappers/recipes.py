@@ -1,5 +1,6 @@
-"""The constraints that `protect` puts on each env it knows: limits, reserves, and why these numbers."""
+"""The constraints that `protect` puts on each known env, and the reasons for their numbers."""
 
+import copy
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
@@ -54,8 +55,8 @@ def _car_goal(env: gym.Env[Any, Any], detour: bool = True) -> list[Constraint]:
             untouched=[Discs("vase_positions", radius=VASE_HULL_RADIUS_M)] if vases else [],
             outline=[[side * x, y] for x, y in CAR.corners for side in (1.0, -1.0)],
             robot_model_attr="robot_model",
-            # Full torque for one control step and rest: 0.03 m from rest and 0.09 m from full speed (measured), half
-            # as much again.
+            # Measured for full torque for one control step and then rest, 0.03 m from rest and 0.09 m from full
+            # speed, and half as much again.
             max_decrease=0.05,
             max_decrease_per_speed=0.13,
             detour=detour,
@@ -63,31 +64,24 @@ def _car_goal(env: gym.Env[Any, Any], detour: bool = True) -> list[Constraint]:
     ]
 
 
-def _rail(braking: float) -> Clearance:
-    ends = [Plane([-0.95], [1.0]), Plane([0.95], [-1.0])]
-    # The margin is for the pole: it pulls the cart while a control is held (up to 2 mm measured).
-    return Clearance(obstacles=ends, bodies=["cart"], braking=braking, margin=0.01)
+def _fixed(*constraints: Constraint) -> Callable[..., list[Constraint]]:
+    """The recipe of constraints that are the same for every env of an id."""
+
+    def recipe(env: gym.Env[Any, Any]) -> list[Constraint]:
+        return copy.deepcopy(list(constraints))
+
+    return recipe
 
 
-def _inverted_pendulum(env: gym.Env[Any, Any]) -> list[Constraint]:
-    # 300 N on 15.5 kg of cart and pole is 19 m/s^2; a tilted, falling pole takes less than half of it.
-    return [_rail(braking=8.0)]
-
-
-def _inverted_double_pendulum(env: gym.Env[Any, Any]) -> list[Constraint]:
-    # 500 N on 20 kg of cart and poles is 24 m/s^2, but swinging poles pull: the inset for a third of it, and a
-    # forecast, which alone would brake late.
-    return [_rail(braking=8.0), JointPositionLimit(-0.95, 0.95, joints=["slider"], margin=0.005, horizon=5)]
-
-
-def _reacher(env: gym.Env[Any, Any]) -> list[Constraint]:
-    # A torque of 200 N m on 1 kg m^2 for 0.02 s: one step can add 4 rad/s.
-    return [JointSpeedLimit(limit=5.0, margin=0.01, max_decrease=4.5)]
-
-
-def _flex_joint_reach(env: gym.Env[Any, Any]) -> list[Constraint]:
-    # What a torque does to a joint that rings shows within one and a half periods of the lowest resonance.
-    return [JointSpeedLimit(limit=8.0, margin=0.3, horizon=15)]
+_RAIL = Clearance(
+    obstacles=[Plane([-0.95], [1.0]), Plane([0.95], [-1.0])],
+    bodies=["cart"],
+    # 300 N on 15.5 kg of cart and pole is 19 m/s^2, 500 N on 20 kg of cart and two poles 24 m/s^2; poles that tilt
+    # and fall take up to two thirds of it.
+    braking=8.0,
+    # The pole pulls the cart while a control is held, by up to 2 mm (measured).
+    margin=0.01,
+)
 
 
 def _safe_rover(
@@ -96,16 +90,10 @@ def _safe_rover(
     return [Traction(env.unwrapped.wheels, max_slip, friction)]  # type: ignore[attr-defined]
 
 
-def _teleop_contact(env: gym.Env[Any, Any]) -> list[Constraint]:
-    # Half-way round the clamp is no way: its face is a line across everything that the tool reaches.
-    face = Plane([0.0, CLAMP_Y], [0.0, -1.0])
-    return [Clearance([face], TELEOP_BRAKING, bodies=["tool"], radius=TOOL_RADIUS, margin=0.001)]
-
-
 def _of_what_is_known(
     env: gym.Env[Any, Any], option: str, chosen: str, radius: float, true: str, sigmas: float
 ) -> Any:
-    """Discs where things truly are, were seen last, or may be after all that an OcclusionPenalty inside has seen."""
+    """Discs at the true positions, at those seen last, or at the estimates of an OcclusionPenalty inside."""
     known: dict[str, Any] = {
         "true": TrackedDiscs(radius, sigmas, attribute=true),
         "last_seen": Discs("last_seen_positions", radius),
@@ -122,32 +110,17 @@ def _of_what_is_known(
 def _occluded_crossing(env: gym.Env[Any, Any], cars: str = "", sigmas: float = 3.0) -> list[Constraint]:
     raw: Any = env.unwrapped
     discs = _of_what_is_known(env, "cars", cars, raw.car_radius, "car_tracks", sigmas)
-    # No way out leads through pillars, or over the rails at 4 m and 3.5 m.
+    # An escape must not lead through pillars, or over the rails at 4 m and 3.5 m.
     rails = [Plane([x, y], [-x, -y]) for x, y in ((-4.0, 0.0), (4.0, 0.0), (0.0, -3.5), (0.0, 3.5))]
     obstacles = [discs, Discs("pillar_positions", raw.pillar_radius), *rails]
     return [EscapeClearance("robot", obstacles, raw.robot_radius)]
 
 
-def _pusher(env: gym.Env[Any, Any]) -> list[Constraint]:
-    # The tip stays over the table, clear of its top by 2.5 cm, and in front of the shoulder.
-    table = Workspace([-0.2, -1.2, -0.3], [0.9, 0.15, 0.4], bodies=["tips_arm"], margin=0.005, horizon=8)
-    return [JointSpeedLimit(limit=6.0, margin=0.05), table]
-
-
-def _humanoid_standup(env: gym.Env[Any, Any]) -> list[Constraint]:
-    return [JointSpeedLimit(limit=20.0, margin=0.1)]
-
-
-def _point_maze(env: gym.Env[Any, Any]) -> list[Constraint]:
-    # gymnasium-robotics' point is clipped to 5 m/s along each axis before every step.
-    return [WallClearance(velocity_clip=5.0)]
-
-
 def _patrolled_maze(env: gym.Env[Any, Any], patrols: str = "", sigmas: float = 3.0) -> list[Constraint]:
     raw: Any = env.unwrapped
     discs = _of_what_is_known(env, "patrols", patrols, raw.patrol_radius, "patrol_tracks", sigmas)
-    # The ways out do not know the walls: with them as obstacles a corridor has none but to stand still, and stepping
-    # aside at the last moment, which the walls' own constraint leaves, avoids more. The ball rests within 0.5 s.
+    # The escapes ignore walls: with walls as obstacles the only escape in a corridor is to stop, while evasion at the
+    # last moment, within WallClearance, avoids more collisions. The ball comes to rest within 0.5 s.
     aside = EscapeClearance("particle", [discs], raw.ball_radius, margin=0.03, horizon_s=1.0)
     return [WallClearance(velocity_clip=5.0), aside]
 
@@ -156,19 +129,17 @@ def _ant_maze(env: gym.Env[Any, Any]) -> list[Constraint]:
     # The torso's ball has 0.25 m; the legs reach farther and may touch.
     model: mujoco.MjModel = env.unwrapped.model  # type: ignore[attr-defined]
     fixed = (model.geom_bodyid == 0) & (model.geom_type == int(mujoco.mjtGeom.mjGEOM_BOX))
-    places, sizes = model.geom_pos[fixed], model.geom_size[fixed]
-    blocks = [
-        (p[0] - s[0], p[0] + s[0], p[1] - s[1], p[1] + s[1]) for p, s in zip(places, sizes, strict=True)
-    ]
+    boxes = zip(model.geom_pos[fixed], model.geom_size[fixed], strict=True)
+    blocks = [(x - dx, x + dx, y - dy, y + dy) for (x, y, _), (dx, dy, _) in boxes]
     walls = [
         Box([(a + b) / 2.0, (c + d) / 2.0], [(b - a) / 2.0, (d - c) / 2.0]) for a, b, c, d in merged(blocks)
     ]
-    # An ant at 4 m/s moves 1 m in five steps.
+    # At 4 m/s an ant moves 1 m in five steps.
     return [Workspace(keep_out=walls, bodies=["torso"], radius=0.4, margin=0.01, horizon=5, max_decrease=1.0)]
 
 
 FINGER_RADIUS_M = 0.0414
-"""Around the centre of a Fetch finger, a box of 77 x 14 x 27 mm: to its corners, rounded up."""
+"""From the centre of a Fetch finger, a box of 77 x 14 x 27 mm, to its corners, rounded up."""
 
 
 def _fetch(
@@ -184,13 +155,13 @@ def _fetch(
     middle = raw.model.geom_pos[geom] + raw.model.body("table0").pos
     half = raw.model.geom_size[geom]
     top = float(middle[2] + half[2])
-    # Goals and objects lie within 0.15 m of where the gripper starts (FetchSlide's goals are out of its reach on
-    # purpose), and whoever pushes an object comes from 0.06 m beyond it; a block is lifted to 0.48 m above the table.
-    # In the whole box the gripper comes within 15 mm of where it is sent, and tilts by less than 30 degrees.
+    # Goals and objects lie within 0.15 m of the gripper's start (those of FetchSlide farther away), objects are
+    # pushed from 0.06 m beyond, and a block is lifted to 0.48 m above the table. The arm reaches all of the box to 15
+    # mm.
     least = [float(start[0]) - 0.25, float(start[1]) - 0.25, top + 0.02]
     most = [float(start[0]) + 0.25, float(start[1]) + 0.25, top + 0.5]
-    # Two control steps: a displacement of zero stops the gripper within one. In two it covers 83 mm per axis at most,
-    # and a finger that opens or closes as well 0.16 m in all (measured); farther from a limit nothing is forecast.
+    # A displacement of zero stops the gripper within one of the two control steps. In both it moves by 83 mm per axis
+    # at most, and a finger that also opens or closes by 0.16 m in all (measured).
     grip = Workspace(
         least if low is None else low,
         most if high is None else high,
@@ -215,52 +186,54 @@ LOOK_AHEAD_BELOW: Final = {"HalfCheetah": 0.8, "Hopper": 0.7, "Walker2d": 0.7, "
 (`benchmarks/look_ahead.py`); Swimmer's were, whatever they left."""
 
 
-def _velocity(robot: str, margin: float, horizon: int = 3) -> Callable[..., list[Constraint]]:
-    plane, share = robot in ("Ant", "Humanoid"), LOOK_AHEAD_BELOW.get(robot)
-
-    def recipe(env: gym.Env[Any, Any]) -> list[Constraint]:
-        limit = SpeedLimit(
-            SPEED_LIMITS[robot],
-            body=None if robot == "Humanoid" else "torso",
-            direction="xy" if plane else "+x",
-            margin=margin,
-            horizon=horizon,
-            look_ahead_below=None if share is None else share * SPEED_LIMITS[robot],
-        )
-        return [limit]
-
-    return recipe
+def _velocity(robot: str, margin: float = 0.02, horizon: int = 3) -> Callable[..., list[Constraint]]:
+    body = None if robot == "Humanoid" else "torso"
+    direction = "xy" if robot in ("Ant", "Humanoid") else "+x"
+    limit, share = SPEED_LIMITS[robot], LOOK_AHEAD_BELOW.get(robot)
+    skipped = None if share is None else share * limit
+    return _fixed(
+        SpeedLimit(limit, body, direction, margin=margin, horizon=horizon, look_ahead_below=skipped)
+    )
 
 
 RECIPES: dict[str, Callable[..., list[Constraint]]] = {
-    "SafePointGoal0": _point_goal,
-    "SafePointGoal1": _point_goal,
-    "SafePointGoal2": _point_goal,
-    "SafeCarGoal0": _car_goal,
-    "SafeCarGoal1": _car_goal,
-    "SafeCarGoal2": _car_goal,
-    "InvertedPendulum": _inverted_pendulum,
-    "InvertedDoublePendulum": _inverted_double_pendulum,
-    "FlexJointReach": _flex_joint_reach,
-    "Reacher": _reacher,
+    **{f"SafePointGoal{level}": _point_goal for level in range(3)},
+    **{f"SafeCarGoal{level}": _car_goal for level in range(3)},
+    "InvertedPendulum": _fixed(_RAIL),
+    # The forecast is for swinging poles, which pull; alone it would brake late.
+    "InvertedDoublePendulum": _fixed(
+        _RAIL, JointPositionLimit(-0.95, 0.95, joints=["slider"], margin=0.005, horizon=5)
+    ),
+    # The effect of a torque on the ringing joint shows within one and a half periods of the lowest resonance.
+    "FlexJointReach": _fixed(JointSpeedLimit(limit=8.0, margin=0.3, horizon=15)),
+    # A torque of 200 N m on 1 kg m^2 for 0.02 s: one step can add 4 rad/s.
+    "Reacher": _fixed(JointSpeedLimit(limit=5.0, margin=0.01, max_decrease=4.5)),
     "SafeRover": _safe_rover,
-    "TeleopContact": _teleop_contact,
+    # A plane, not a box: the tool cannot go round the clamp.
+    "TeleopContact": _fixed(
+        Clearance(
+            [Plane([0.0, CLAMP_Y], [0.0, -1.0])],
+            TELEOP_BRAKING,
+            bodies=["tool"],
+            radius=TOOL_RADIUS,
+            margin=0.001,
+        )
+    ),
     "OccludedCrossing": _occluded_crossing,
-    "Pusher": _pusher,
-    "HumanoidStandup": _humanoid_standup,
-    "PointMaze": _point_maze,
+    # The tip stays over the table, clear of its top by 2.5 cm, and in front of the shoulder.
+    "Pusher": _fixed(
+        JointSpeedLimit(limit=6.0, margin=0.05),
+        Workspace([-0.2, -1.2, -0.3], [0.9, 0.15, 0.4], bodies=["tips_arm"], margin=0.005, horizon=8),
+    ),
+    "HumanoidStandup": _fixed(JointSpeedLimit(limit=20.0, margin=0.1)),
+    # gymnasium-robotics' point is clipped to 5 m/s along each axis before every step.
+    "PointMaze": _fixed(WallClearance(velocity_clip=5.0)),
     "PatrolledPointMaze": _patrolled_maze,
     "AntMaze": _ant_maze,
-    "FetchReach": _fetch,
-    "FetchPush": _fetch,
-    "FetchSlide": _fetch,
-    "FetchPickAndPlace": _fetch,
-    # A policy trained through three steps ahead found states with no way out (1 violation in 1000 steps).
-    "HalfCheetah": _velocity("HalfCheetah", margin=0.02, horizon=5),
-    "Hopper": _velocity("Hopper", margin=0.02),
-    "Walker2d": _velocity("Walker2d", margin=0.02),
+    **{f"Fetch{task}": _fetch for task in ("Reach", "Push", "Slide", "PickAndPlace")},
+    # With a horizon of three a trained policy found states with no way out (1 violation in 1000 steps).
+    "HalfCheetah": _velocity("HalfCheetah", horizon=5),
     "Swimmer": _velocity("Swimmer", margin=0.005),
-    "Ant": _velocity("Ant", margin=0.02),
-    "Humanoid": _velocity("Humanoid", margin=0.02),
+    **{robot: _velocity(robot) for robot in ("Hopper", "Walker2d", "Ant", "Humanoid")},
 }
-"""By the env's id without its version; an id with a further word ("PointMaze_UMaze") has the recipe of the first."""
+"""By the env's id without its version, or the part of it before "_" (PointMaze_UMaze)."""

@@ -9,7 +9,7 @@ import numpy as np
 from safe_wrappers import constraints
 from safe_wrappers.checks import settings_from
 from safe_wrappers.constraints.barrier import Barrier
-from safe_wrappers.constraints.obstacles import obstacle_kinds
+from safe_wrappers.constraints.obstacles import KINDS as OBSTACLES
 from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.duck_typed import duck_typed
@@ -31,15 +31,14 @@ def constraint_from(data: Any) -> Constraint:
 
 
 def plain_data(value: Any) -> Any:
-    """The dict of a dataclass of ours, or a list of such dicts; anything else as it is.
+    """The dict of a dataclass of this library, or a list of such dicts; any other value unchanged.
 
-    Constraints and obstacles have their class under `kind`. A `Barrier`, which holds functions, and what others have
-    written stay as they are.
+    Constraints and obstacles have their class under `kind`. A `Barrier`, which holds functions, is left unchanged.
     """
     if isinstance(value, list | tuple) and any(is_dataclass(one) for one in value):
         return [plain_data(one) for one in value]
     kind = type(value)
-    known = kind in KINDS.values() or kind in obstacle_kinds.KINDS.values()
+    known = kind in KINDS.values() or kind in OBSTACLES.values()
     ours = is_dataclass(kind) and kind.__module__.startswith("safe_wrappers.")
     if (not known and (not ours or isinstance(value, Constraint))) or kind is Barrier:
         return value
@@ -50,7 +49,7 @@ def plain_data(value: Any) -> Any:
 
 
 def plain_numbers(given: Any) -> Any:
-    """Floats and lists of floats for arrays, tuples and NumPy's scalars; what is no number is left for the checks."""
+    """Floats and lists of floats for arrays, tuples and NumPy's scalars; other values unchanged."""
     if given is None or isinstance(given, str):
         return given
     try:
@@ -60,10 +59,8 @@ def plain_numbers(given: Any) -> Any:
 
 
 def recorded(arguments: Mapping[str, Any], **plain: Any) -> dict[str, Any]:
-    """A constructor's arguments for Gymnasium's `RecordConstructorArgs`.
+    """A constructor's arguments, from `locals()` at its first line, for Gymnasium's `RecordConstructorArgs`.
 
-    Args:
-        arguments: A copy of `locals()` from the constructor's first line.
-        plain: Those of them that are recorded as plain data.
+    `plain` are those that are recorded as plain data.
     """
     return {name: value for name, value in {**arguments, **plain}.items() if name not in ("self", "env")}

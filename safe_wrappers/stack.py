@@ -10,7 +10,7 @@ from safe_wrappers.plants.env_checks import wrappers_of
 
 
 class Layer(Enum):
-    """What a wrapper of this library does in a stack; each names its own in the class attribute `layer`."""
+    """What a wrapper of this library does in a stack; its class attribute `layer`."""
 
     COST = auto()
     OCCLUSION = auto()
@@ -26,7 +26,7 @@ class Layer(Enum):
 
 _PER_CHUNK: Final = {Layer.HANDOVER: "its step is a whole chunk, not a control step"}
 _LAST_WORD: Final = "it changes actions that the filter has checked, and the filter has the last word"
-_AGE: Final = "it hands commands over, and the lease must hear how old each one is"
+_AGE: Final = "it hands commands over, and the lease must know how old each one is"
 _NETWORK: Final = "it hands commands over, which the channel must do at every control step"
 
 _WRONG_WAY_ROUND: Final = {
@@ -51,45 +51,38 @@ _WRONG_WAY_ROUND: Final = {
     },
     **dict.fromkeys((Layer.MONITOR, Layer.ADAPTION, Layer.RECORDER), _PER_CHUNK),
 }
-"""By the outer layer, then the inner one: why not. The other way round is right."""
+"""By the outer layer, then the inner one: why this order is wrong. The reverse is right."""
 
 _BOTH_END_AUTHORITY: Final = "both decide when a command's authority ends; use one of them"
 _NOT_TOGETHER: Final = {
-    (Layer.COST, Layer.COST): "this env has a CostFunction already; add up the costs in one function",
-    (
-        Layer.OCCLUSION,
-        Layer.OCCLUSION,
-    ): "this env has an OcclusionPenalty already; give that one all the tracks",
-    (Layer.FILTER, Layer.FILTER): (
-        "this env is filtered already; constraints compose in one projection, so pass all of them to one filter: "
-        "CBFActionFilter(env, [*inner.constraints, more])"
-    ),
-    (Layer.LEASE, Layer.LEASE): _BOTH_END_AUTHORITY,
-    (Layer.LEASE, Layer.CHANNEL): _BOTH_END_AUTHORITY,
-    (Layer.CHANNEL, Layer.LEASE): _BOTH_END_AUTHORITY,
-    (
-        Layer.CHANNEL,
-        Layer.CHANNEL,
-    ): "one network is between operator and machine; give one channel all the delay",
-    (
-        Layer.ADAPTION,
-        Layer.ADAPTION,
-    ): "this env has an AdaptionPenalty already, and its penalty would be taken twice",
-    (Layer.HANDOVER, Layer.HANDOVER): "this env takes chunks already, and a chunk of chunks has no meaning",
+    Layer.COST: {Layer.COST: "this env has a CostFunction already; add up the costs in one function"},
+    Layer.OCCLUSION: {
+        Layer.OCCLUSION: "this env has an OcclusionPenalty already; give that one all the tracks",
+    },
+    Layer.FILTER: {
+        Layer.FILTER: "this env is filtered already; constraints compose in one projection, so pass all of them to "
+        "one filter: CBFActionFilter(env, [*inner.constraints, more])",
+    },
+    Layer.LEASE: dict.fromkeys((Layer.LEASE, Layer.CHANNEL), _BOTH_END_AUTHORITY),
+    Layer.CHANNEL: {
+        Layer.CHANNEL: "one network is between operator and machine; give one channel all the delay",
+        Layer.LEASE: _BOTH_END_AUTHORITY,
+    },
+    Layer.ADAPTION: {
+        Layer.ADAPTION: "this env has an AdaptionPenalty already, and its penalty would be taken twice",
+    },
+    Layer.HANDOVER: {
+        Layer.HANDOVER: "this env takes chunks already, and a chunk of chunks has no meaning",
+    },
 }
-"""By the outer layer and the inner one: why not both."""
+"""By the outer layer, then the inner one: why not both."""
 
 
 def refuse_order(env: gym.Env[Any, Any], layer: Layer, name: str) -> None:
-    """Refuse a layer around an env whose wrappers it must be inside of, or cannot go together with.
-
-    Args:
-        env: What it is to be put around.
-        layer: The layer.
-        name: What the user calls it.
+    """Refuse to put a layer, called `name` in messages, around an env with wrappers that must be outside of it.
 
     Raises:
-        ConfigurationError: Why not, and the order that works where there is one.
+        ConfigurationError: Says why, and the right order if there is one.
     """
     for inner in wrappers_of(env):
         other = getattr(inner, "layer", None)
@@ -101,7 +94,7 @@ def refuse_order(env: gym.Env[Any, Any], layer: Layer, name: str) -> None:
             raise ConfigurationError(
                 f"{inside} inside {name}: {why}; put it outside: {inside}({name}(env, ...), ...)"
             )
-        why = _NOT_TOGETHER.get((layer, other))
+        why = _NOT_TOGETHER.get(layer, {}).get(other)
         if why is not None:
             raise ConfigurationError(f"{inside} inside {name}: {why}")
         if layer is Layer.MONITOR and inside == name:

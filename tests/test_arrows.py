@@ -130,7 +130,12 @@ def test_the_parser_sees_what_it_should(tmp_path):
     found = imports(path, "safe_wrappers.control")
     assert found == {"torch.nn", "safe_wrappers.wrappers.x", "safe_wrappers.plants.plant.Plant"}
     assert layers_used("control", LAYERS["control"] / "watchdog" / "leases.py") == {"errors"}
-    assert layers_used("plants", LAYERS["plants"] / "analytic.py") == {"deprecation", "errors", "plants"}
+    assert layers_used("plants", LAYERS["plants"] / "analytic.py") == {
+        "checks",
+        "deprecation",
+        "errors",
+        "plants",
+    }
 
 
 def test_control_runs_without_gymnasium_and_mujoco():

@@ -6,7 +6,11 @@ _FORGOTTEN = "Detour(self._memory.side, self._memory.steps - 1)"
 
 HEADING_DRIVE = Target(
     "constraints/backup/[bh]*.py",
-    ("tests/constraints/test_heading_drive_clearance.py", "tests/wrappers/test_closed_loop_point_goal.py"),
+    (
+        "tests/constraints/test_heading_drive_reach.py",
+        "tests/constraints/test_heading_drive_clearance.py",
+        "tests/wrappers/test_closed_loop_point_goal.py",
+    ),
     (
         Mutant(_FORGOTTEN, "Detour()"),
         Mutant(_FORGOTTEN, "self._memory"),
@@ -33,7 +37,11 @@ HEADING_DRIVE = Target(
 
 COASTING = Target(
     "constraints/backup/[bc]*.py",
-    ("tests/constraints/test_coasting_clearance.py", "tests/wrappers/test_closed_loop_car_goal.py"),
+    (
+        "tests/constraints/test_coasting_rest.py",
+        "tests/constraints/test_coasting_clearance.py",
+        "tests/wrappers/test_closed_loop_car_goal.py",
+    ),
     (
         Mutant(_FORGOTTEN, "Detour()"),
         Mutant(_FORGOTTEN, "self._memory"),
@@ -56,7 +64,6 @@ COASTING = Target(
         Mutant(
             "np.minimum(np.maximum(control, self._low), self._high) + 0.0",
             "np.minimum(np.maximum(control, self._low), self._high)",
-            equal="minus zero is forecast once more, with the same outcome; only the cache is larger",
         ),
         Mutant("return after.end if self._least < 0.0 else after.least", "return after.end"),
     ),
@@ -64,7 +71,11 @@ COASTING = Target(
 
 ESCAPE = Target(
     "constraints/backup/escape_clearance.py",
-    ("tests/constraints/test_escape_clearance.py", "tests/wrappers/test_closed_loop_occlusion.py"),
+    (
+        "tests/constraints/test_escape_boxes.py",
+        "tests/constraints/test_escape_clearance.py",
+        "tests/wrappers/test_closed_loop_occlusion.py",
+    ),
     (
         Mutant("shorter = going_on - 1 if", "shorter = going_on if"),
         Mutant("        if going_on is not None:", "        if False:"),
@@ -76,8 +87,8 @@ ESCAPE = Target(
         Mutant("if -self.spec.margin < self._best < 0.0 else 0.0", "if False else 0.0"),
         Mutant("firsts[0 if left[0] >= 0.0 else int(left.argmax())]", "firsts[0]"),
         Mutant(
-            "moved = centers + late[:, None, None] * velocity",
-            "moved = centers + 0.0 * late[:, None, None] * velocity",
+            "moved = centers + times[:, None, None] * velocity",
+            "moved = centers + 0.0 * times[:, None, None] * velocity",
         ),
         Mutant("_nearest_first(np.concatenate([good, closer]), asked)", "np.concatenate([good, closer])"),
         Mutant("            closer = closer[self._slacks(closer).max(axis=1) >= 0.0]\n", ""),
@@ -109,7 +120,7 @@ ESCAPE = Target(
 
 WALL = Target(
     "constraints/backup/wall_clearance.py",
-    ("tests/constraints/test_wall_clearance.py",),
+    ("tests/constraints/test_wall_corners.py", "tests/constraints/test_wall_clearance.py"),
     (
         Mutant("return self._left_after(control) >= self._recovery() - _NOISE_M", "return True"),
         Mutant("min(0.0, self._least) - _NOISE_M", "0.0"),

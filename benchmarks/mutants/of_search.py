@@ -110,12 +110,12 @@ ROLLOUT = Target(
         Mutant("_RESOLUTION = 1e-6", "_RESOLUTION = 0.0"),
         Mutant("RECOVERY_S = 0.1", "RECOVERY_S = 0.2"),
         Mutant(
-            "self._least - self._max_decrease >= margin + self.tolerance",
-            "self._least >= margin + self.tolerance",
+            "self._least - most >= self.spec.margin + self.tolerance",
+            "self._least >= self.spec.margin + self.tolerance",
         ),
-        Mutant("if fallen > max_decrease + self.tolerance:", "if fallen > 2.0 * max_decrease:"),
+        Mutant("fallen > most + self.tolerance:", "fallen > 2.0 * most:"),
         Mutant(
-            "                stacklevel=2,\n            )\n            self._max_decrease = None",
+            "                stacklevel=2,\n            )\n            self._max_decrease = most = None",
             "                stacklevel=2,\n            )",
         ),
         Mutant("(*self._recent, self._least)[-self.spec.horizon :]", "(*self._recent, self._least)[-1:]"),

@@ -6,6 +6,7 @@ LEASE = Target(
     "wrappers/lease*/**/*.py",
     (
         "tests/wrappers/test_admission.py",
+        "tests/wrappers/test_budget_commands.py",
         "tests/wrappers/test_stopping_budget.py",
         "tests/wrappers/test_teleop_revocation.py",
     ),
@@ -65,7 +66,11 @@ LEASE = Target(
 
 LEASE_EXPIRY = Target(
     "wrappers/lease_expiry.py",
-    ("tests/wrappers/test_lease_expiry.py", "tests/wrappers/test_authority_stack.py"),
+    (
+        "tests/wrappers/test_lease_over_filter.py",
+        "tests/wrappers/test_lease_expiry.py",
+        "tests/wrappers/test_authority_stack.py",
+    ),
     (
         Mutant("refused |= not self._grant(now)", "self._grant(now)"),
         Mutant(
@@ -122,16 +127,21 @@ LEASE_EXPIRY = Target(
             "sent = self._command if self._blend is None",
         ),
         Mutant("self._chunk_refused |= not admitted", "pass"),
-        Mutant("executed = np.array(info[keys.EXECUTED_ACTION], dtype=np.float64)", "pass"),
         Mutant("(start, steps, done + 1) if done + 1 < steps else None", "None"),
     ),
+)
+
+COMMAND_GATE = Target(
+    "wrappers/common/command_gate.py",
+    ("tests/wrappers/test_lease_expiry.py", "tests/wrappers/test_authority_stack.py"),
+    (Mutant("executed = np.array(info[keys.EXECUTED_ACTION], dtype=np.float64)", "pass"),),
 )
 
 HANDOVER = Target(
     "wrappers/*handover*/**/*.py",
     (
         "tests/wrappers/test_chunk_queue.py",
-        "tests/wrappers/test_macro_info.py",
+        "tests/wrappers/test_chunks_arriving.py",
         "tests/wrappers/test_upsampling.py",
         "tests/wrappers/test_chunk_handover.py",
     ),
@@ -144,10 +154,15 @@ HANDOVER = Target(
             equal="every command is clipped once more when it is sent",
         ),
         Mutant(
-            "for c in reversed(self._coming) if c.due <= self.now]",
-            "for c in self._coming if c.due <= self.now]",
+            "for chunk in reversed([c for c in self._coming if c.due <= self.now]):",
+            "for chunk in [c for c in self._coming if c.due <= self.now]:",
         ),
-        Mutant("return chunk.commands[self.now - chunk.observed :]", "return chunk.commands"),
+        Mutant("left = chunk.commands[self.now - chunk.observed :]", "left = chunk.commands"),
+        Mutant("fresh = newest.commands[self.now - newest.observed :]", "fresh = newest.commands"),
+        Mutant("            if self._blend != ENSEMBLE:\n                break\n", ""),
+        Mutant("if not (len(left) and admits(left[-1], len(left))):", "if not len(left):"),
+        Mutant("admits(left[-1], len(left))", "admits(left[0], len(left))"),
+        Mutant("if not (len(left) and admits(", "if not (admits("),
         Mutant("self._coming = [c for c in self._coming if c.observed > newest.observed]", "pass"),
         Mutant("np.exp(-self._decay * np.arange", "np.exp(self._decay * np.arange"),
         Mutant("(done + 1.0) / (steps + 1.0)", "done / (steps + 1.0)"),
@@ -157,18 +172,11 @@ HANDOVER = Target(
             "        self._fade = None\n        return len(self._sent) > 0, joined.steps",
             "        return len(self._sent) > 0, joined.steps",
         ),
-        Mutant("shortest / self._control_dt - _WHOLE) - 1)", "shortest / self._control_dt - _WHOLE))"),
+        Mutant("whole_steps(shortest, self._control_dt) - 1)", "whole_steps(shortest, self._control_dt))"),
         Mutant("starved, limited or held, took_over", "starved, limited, took_over"),
         Mutant("if acting != self._acting and len(self._sent):", "if False:"),
         Mutant("weights @ votes / weights.sum()", "weights @ votes / len(votes)"),
         Mutant("np.where(step / control_dt > rate_limit, np.nextafter(step, 0.0), step)", "step"),
-        Mutant(
-            "if name in i and (not key.where or i.get(key.where))]",
-            "if name in i]",
-        ),
-        Mutant('"min": np.min', '"min": np.max'),
-        Mutant('"max": np.max', '"max": np.min'),
-        Mutant('"sum": np.sum', '"sum": np.max'),
         Mutant("return self.chunk - self.horizon - self.delay[1]", "return self.chunk - self.horizon"),
         Mutant("if not delay[1] <= horizon <= size - delay[1]:", "if not horizon <= size - delay[1]:"),
         Mutant("if fewest >= available and sizes.chunk > 1:", "if fewest > available and sizes.chunk > 1:"),
@@ -179,26 +187,32 @@ HANDOVER = Target(
 
 CHUNK_HANDOVER = Target(
     "wrappers/chunk_handover.py",
-    ("tests/wrappers/test_chunk_handover.py",),
     (
+        "tests/wrappers/test_macro_info.py",
+        "tests/wrappers/test_chunks_arriving.py",
+        "tests/wrappers/test_chunk_handover.py",
+    ),
+    (
+        Mutant(
+            "if name in i and (not key.where or i.get(key.where))]",
+            "if name in i]",
+        ),
+        Mutant('"min": np.min', '"min": np.max'),
+        Mutant('"max": np.max', '"max": np.min'),
+        Mutant('"sum": np.sum', '"sum": np.max'),
         Mutant("latency = now - command.observed", "latency = now"),
         Mutant("            total += float(reward)", "            total = float(reward)"),
         Mutant("infos.append(dict(info))", "infos.append(info)"),
-        Mutant("            if self.blend != ENSEMBLE:\n                break\n", ""),
-        Mutant("admits = inside.admits(left[-1], len(left))", "pass"),
-        Mutant("admits = inside.admits(left[-1], len(left))", "admits = inside.admits(left[0], len(left))"),
-        Mutant("admits = len(left) > 0", "admits = True"),
         Mutant(
             "        if not np.isfinite(chunk).all():\n            return False\n",
             "",
-            equal="the queue refuses it as well; the spline between its entries is not finite either",
         ),
         Mutant(
             "self.now_s < observed_s <= self.now_s + self._clock_error_s +",
             "self.now_s < observed_s <= self.now_s +",
         ),
         Mutant(
-            "math.floor(observed_s / self.control_dt + _SAME_STEP)",
+            "math.floor(observed_s / self.control_dt + SAME_STEP)",
             "math.floor(observed_s / self.control_dt)",
         ),
         Mutant("self._delay[1] + 1))", "self._delay[1] + 2))"),

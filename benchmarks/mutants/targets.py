@@ -3,7 +3,7 @@
 from benchmarks.mutants.of_backups import COASTING, ESCAPE, HEADING_DRIVE, WALL
 from benchmarks.mutants.of_projection import PROJECTION
 from benchmarks.mutants.of_search import ROLLOUT, SEARCH
-from benchmarks.mutants.of_wrappers import CHUNK_HANDOVER, HANDOVER, LEASE, LEASE_EXPIRY
+from benchmarks.mutants.of_wrappers import CHUNK_HANDOVER, COMMAND_GATE, HANDOVER, LEASE, LEASE_EXPIRY
 from benchmarks.mutants.target import Target
 
 TARGETS: dict[str, Target] = {
@@ -16,6 +16,7 @@ TARGETS: dict[str, Target] = {
     "wall": WALL,
     "lease": LEASE,
     "lease expiry": LEASE_EXPIRY,
+    "command gate": COMMAND_GATE,
     "handover": HANDOVER,
     "chunk handover": CHUNK_HANDOVER,
 }

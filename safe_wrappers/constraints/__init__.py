@@ -11,14 +11,12 @@ from safe_wrappers.constraints.contact.contact_feasibility import ContactFeasibi
 from safe_wrappers.constraints.contact.impact_speed_limit import ImpactSpeedLimit
 from safe_wrappers.constraints.contact.stance import Stance
 from safe_wrappers.constraints.contact.support_margin import SupportMargin
-from safe_wrappers.constraints.limits.joint_position_limit import JointPositionLimit
-from safe_wrappers.constraints.limits.joint_speed_limit import JointSpeedLimit
+from safe_wrappers.constraints.limits.joints import JointPositionLimit, JointSpeedLimit
 from safe_wrappers.constraints.limits.singularity_margin import SingularityMargin
 from safe_wrappers.constraints.limits.speed_limit import SpeedLimit
 from safe_wrappers.constraints.limits.upright import Upright
 from safe_wrappers.constraints.limits.workspace import Workspace
-from safe_wrappers.constraints.obstacles.obstacles import Box, Disc, Discs, Plane, Sphere
-from safe_wrappers.constraints.obstacles.tracked_discs import TrackedDiscs
+from safe_wrappers.constraints.obstacles import Box, Disc, Discs, Plane, Sphere, TrackedDiscs
 from safe_wrappers.constraints.track_permission import TrackPermission
 from safe_wrappers.constraints.traction import Traction
 

@@ -1,10 +1,10 @@
 """Barrier: the user's own h on the plant's state."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.control.filtering.cbf import (
@@ -16,40 +16,30 @@ from safe_wrappers.control.filtering.cbf import (
     relative_degree,
 )
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory, Promise
+from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.filter.linearize import linearize
 from safe_wrappers.filter.projection import keeps_rows
 from safe_wrappers.plants.plant import Plant
 
-Array = NDArray[np.float64]
-
-_ROUNDING = 1e-9
-"""Round-off, as a share of h's size: of its value and its gradient together."""
-_NO_EFFECT = 1e-7
-"""Error of differences, as a share of h's size and of the control's effect on the state: a smaller effect on h' may
-be none."""
+_ROUNDING = 1e-9  # round-off, as a share of h's size: of its value and its gradient together
+_NO_EFFECT = 1e-7  # error of differences, as a share of h's size and of the control's effect on the state
 
 
 @dataclass
 class Barrier(Constraint):
     """Keep `h(x) >= 0` by `Lf h + Lg h u >= -alpha (h - margin) + curvature * hold / 2`.
 
-    What it promises: in continuous time the set `h >= margin` is invariant while the row is feasible. A held
-    control is predicted as well: h must not be negative at the half and at the end of the hold (AnalyticPlant; the
-    end by Runge-Kutta and by one Euler step), or at every physics substep (MujocoPlant); else the constraint is
-    linearised about the refused control. So a control that is not flagged keeps h at those instants, for a plant
-    and an integration that are right; `margin` covers errors of both and of the state. `curvature` adds a reserve to
-    the row. Feasibility depends on h and the actuators: infeasible steps are counted and the fallback runs. Hence
-    best effort.
+    Best effort: in continuous time the set `h >= margin` is invariant while the row is feasible. The held control is
+    predicted as well: one that is not flagged keeps h at the half and at the end of the hold (AnalyticPlant) or at
+    every physics substep (MujocoPlant), for a plant and an integration that are right.
 
     Args:
-        h: Takes the plant's state (n,), returns a number, positive inside the safe set. Its relative degree
-            must be one: the control must act on h', so a position under a force needs its braking distance in
-            h (see `Clearance`). This is checked at the first reset.
+        h: Takes the plant's state (n,), returns a number, positive inside the safe set. The control must act on h'
+            (relative degree one); this is checked at the first reset.
         gradient: Takes the state, returns dh/dx (n,). None differentiates by central differences.
-        alpha: Decay gain in 1/s (`alpha * h`), at most `1 / hold`; or an increasing function of h, with
-            alpha(0) = 0, in h units per second (extended class K).
-        margin: Reserve for state error and model error, in units of h.
+        alpha: Decay gain in 1/s (`alpha * h`), at most `1 / hold`; or an increasing function of h, with alpha(0) = 0,
+            in h units per second (extended class K).
+        margin: Reserve for errors of state, model and integration, in units of h.
         curvature: Bound on -h'' while a control is held, in units of h per s^2.
 
     Source: appendix "Lie derivatives and forward invariance" and footnote 1.
@@ -61,8 +51,6 @@ class Barrier(Constraint):
     margin: float = 0.0
     curvature: float = 0.0
 
-    promise: Promise = field(default="best effort", init=False)
-
     def __post_init__(self) -> None:
         if not callable(self.h):
             raise ConfigurationError(f"h must be a function of the state, got {self.h!r}")
@@ -71,10 +59,11 @@ class Barrier(Constraint):
                 f"gradient must be a function of the state or None, got {self.gradient!r}"
             )
         if callable(self.alpha):
-            if self.alpha(0.0) != 0.0 or self.alpha(1.0) <= 0.0 or self.alpha(-1.0) >= 0.0:
+            below, zero, above = self.alpha(-1.0), self.alpha(0.0), self.alpha(1.0)
+            if zero != 0.0 or above <= 0.0 or below >= 0.0:
                 raise ConfigurationError(
                     "alpha as a function must be extended class K: alpha(0) = 0, increasing; got "
-                    f"alpha(-1), alpha(0), alpha(1) = {self.alpha(-1.0)}, {self.alpha(0.0)}, {self.alpha(1.0)}"
+                    f"alpha(-1), alpha(0), alpha(1) = {below}, {zero}, {above}"
                 )
         else:
             self.alpha = positive("alpha", self.alpha, "1/s")
@@ -82,7 +71,6 @@ class Barrier(Constraint):
         self.curvature = non_negative("curvature", self.curvature, "units of h per s^2")
 
     def bind(self, plant: Plant) -> "BoundBarrier":
-        """On a plant."""
         return BoundBarrier(self, plant)
 
 
@@ -95,15 +83,13 @@ class BoundBarrier(BoundConstraint):
     def __init__(self, spec: Barrier, plant: Plant) -> None:
         plant.require_acceleration("Barrier")
         super().__init__(spec, plant)
-        if not callable(self.spec.alpha) and self.spec.alpha * self.plant.control_dt > 1.0:
-            raise ConfigurationError(
-                f"alpha = {self.spec.alpha}/s lets h cross zero within one hold of {self.plant.control_dt} s; "
-                f"alpha must be at most 1/hold = {1.0 / self.plant.control_dt:g}/s"
-            )
+        if not callable(spec.alpha) and spec.alpha * plant.control_dt > 1.0:
+            wanted = f"alpha must be at most 1/hold = {1.0 / plant.control_dt:g}/s"
+            crossing = f"alpha = {spec.alpha}/s lets h cross zero within one hold of {plant.control_dt} s"
+            raise ConfigurationError(f"{crossing}; {wanted}")
         self._degree_checked = False
 
     def observe(self, memory: Memory) -> None:
-        """Nothing is known of this state yet."""
         self._row: HalfSpaces | None = None
 
     def value(self) -> Array:
@@ -120,7 +106,6 @@ class BoundBarrier(BoundConstraint):
         return float(h.reshape(()))
 
     def rows(self) -> HalfSpaces:
-        """The barrier condition as one half-space."""
         if self._row is None:
             self._row = self._condition()
         return self._row
@@ -143,16 +128,14 @@ class BoundBarrier(BoundConstraint):
     def admits(self, control: Array) -> bool:
         """Whether the row holds and prediction keeps h through the hold (from outside: does not lose more)."""
         row = self.rows()
-        excess = float(row.normals[0] @ control - row.offsets[0])
-        if not excess <= 0.0 and not keeps_rows(
-            control, row.normals, row.offsets, self.plant.lower, self.plant.upper
-        ):
+        kept = float(row.normals[0] @ control - row.offsets[0]) <= 0.0
+        box = self.plant.lower, self.plant.upper
+        if not kept and not keeps_rows(control, row.normals, row.offsets, *box):
             return False
         floor = min(self._now, 0.0) - self._rounding
         return all(self._height(x) >= floor for x in self.plant.path(control))
 
     def linearize(self, control: Array) -> HalfSpaces:
-        """The predicted h, linearised about a refused control."""
         self.rows()
         floor = min(self._now, 0.0)
 
@@ -176,18 +159,17 @@ class BoundBarrier(BoundConstraint):
             return
         x = self.plant.state
         self._degree_checked = True
-        if not np.isfinite(x).all() or not np.isfinite(self._height(x)):
-            raise ConfigurationError(
-                f"the first state must be finite and h of it too; got {x}, h = {self._height(x)}"
-            )
+        h = self._height(x)
+        if not np.isfinite([*x, h]).all():
+            raise ConfigurationError(f"the first state must be finite and h of it too; got {x}, h = {h}")
         if self.spec.gradient is not None:
             given, differences = self._gradient(x), numerical_gradient(self._height, x)
-            size = abs(self._height(x)) + np.abs(differences).max()
+            size = abs(h) + np.abs(differences).max()
             if np.abs(given - differences).max() > 1e-2 * size:
                 raise ConfigurationError(
                     f"gradient does not fit h: at the first state it gives {given}, differences give {differences}"
                 )
-        if acts(self._gradient(x), self.plant.g, self._height(x), _NO_EFFECT):
+        if acts(self._gradient(x), self.plant.g, h, _NO_EFFECT):
             return
         # The gradient may vanish at this very state (h = 1 - v^2 at rest): look around it before refusing.
         spread = np.random.default_rng(0).normal(size=(8, x.size)) * 0.1

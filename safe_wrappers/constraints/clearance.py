@@ -1,22 +1,18 @@
 """Clearance: keep points of the machine away from obstacles, with room to brake."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from safe_wrappers.checks import name_list, non_negative, positive
-from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
-from safe_wrappers.constraints.obstacles.obstacles import Nearest
+from safe_wrappers.checks import check_fields, name_list, non_negative, positive
+from safe_wrappers.constraints.obstacles import Nearest, obstacles_from
 from safe_wrappers.control.backup.stopping import sampled_acceleration_limit, sampled_inset
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory, Promise
+from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.points import Points
-
-Array = NDArray[np.float64]
 
 
 class _Seen(NamedTuple):
@@ -34,19 +30,19 @@ class _Seen(NamedTuple):
 class Clearance(Constraint):
     """Keep `distance - (stopping distance) >= 0` from every point to every obstacle, also between samples.
 
-    The row bounds the acceleration towards the obstacle that may be held for a control interval, so that full
-    braking afterwards still stops in front of it (`control/backup/stopping.py`). Delay is the plant's: the state is
-    predicted over it.
+    The row bounds the acceleration towards the obstacle that may be held for a control interval, so that full braking
+    afterwards still stops in front of it (`control/backup/stopping.py`). The state is predicted over the plant's
+    delay.
 
-    What it promises: in one dimension, and head on, the bound is exact for the declared `braking`. Elsewhere
-    `margin` must cover that the direction to the obstacle and the drift change within a hold; and several obstacles,
-    or joint limits, can ask for more than the actuators have. Hence best effort: infeasible steps are counted and
-    the fallback runs. A machine that cannot brake in every direction needs `HeadingDriveClearance`.
+    Best effort: head on, and in one dimension, the bound is exact for the declared `braking`. Elsewhere `margin` must
+    cover that the direction to the obstacle and the drift change within a hold; and several obstacles, or joint
+    limits, can ask for more than the actuators have. A machine that cannot brake in every direction needs
+    `HeadingDriveClearance`.
 
     Args:
         obstacles: `Disc`, `Sphere`, `Box`, `Plane`, `Discs`.
-        braking: Validated lower bound on the deceleration that the actuators can give in any direction
-            and every state of the envelope, m/s^2.
+        braking: Validated lower bound on the deceleration that the actuators can give in any direction and every
+            state of the envelope, m/s^2.
         bodies: Names of bodies whose frame origins are kept clear (MujocoPlant).
         sites: Names of sites, likewise.
         geoms: Names of geoms: their centres, likewise.
@@ -70,14 +66,12 @@ class Clearance(Constraint):
     margin: float = 0.0
     state_error: float = 0.0
 
-    promise: Promise = field(default="best effort", init=False)
     measures_approach: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         self.obstacles = obstacles_from(self.obstacles)
         self.braking = positive("braking", self.braking, "m/s^2")
-        for name in ("radius", "margin", "state_error"):
-            setattr(self, name, non_negative(name, getattr(self, name), "m"))
+        check_fields(self, non_negative, ("radius", "margin", "state_error"), "m")
         for name in ("bodies", "sites", "geoms"):
             setattr(self, name, name_list(name, getattr(self, name), least=0))
         self.position, self.velocity = list(self.position), list(self.velocity)
@@ -88,7 +82,6 @@ class Clearance(Constraint):
             )
 
     def bind(self, plant: Plant) -> "BoundClearance":
-        """On a plant."""
         return BoundClearance(self, plant)
 
 
@@ -103,7 +96,6 @@ class BoundClearance(BoundConstraint):
         self._points = Points(plant, spec.bodies, spec.sites, spec.geoms, spec.position, spec.velocity)
 
     def observe(self, memory: Memory) -> None:
-        """Nothing is seen of this state yet."""
         self._observed: list[_Seen] | None = None
 
     def _gaps(self, p: Array, v: Array) -> tuple[Nearest, Array, Array, Array]:
@@ -125,18 +117,11 @@ class BoundClearance(BoundConstraint):
 
     def value(self) -> Array:
         """Room left after braking, margin and state error not taken off, m, one per point and surface."""
-        return np.concatenate(
-            [
-                sampled_inset(s.clearance, s.approach, self.spec.braking, self.plant.control_dt)
-                for s in self._seen()
-            ]
-        )
+        braking, hold = self.spec.braking, self.plant.control_dt
+        return np.concatenate([sampled_inset(s.clearance, s.approach, braking, hold) for s in self._seen()])
 
     def approach(self) -> tuple[Array, Array]:
-        """Clearances (m) and approach speeds (m/s, towards the obstacle), one per point and surface.
-
-        As measured: neither margin, nor state error, nor the way of braking is taken off.
-        """
+        """Clearances (m) and approach speeds (m/s, towards the obstacle), as measured, one per point and surface."""
         # Not through `_seen`: the accelerations, which only the rows need, are most of its work.
         gaps = [self._gaps(p, v) for p, v in self._points.motions()]
         return np.concatenate([g[1] for g in gaps]), np.concatenate([g[2] for g in gaps])

@@ -5,37 +5,22 @@ from abc import abstractmethod
 from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from safe_wrappers.checks import non_negative, positive, whole_number
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory
+from safe_wrappers.checks import check_fields, non_negative, positive, whole_number
+from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.filter.linearize import linearize, tangent_rows
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 
-Array = NDArray[np.float64]
-
-_STEP = 1e-4
-"""Width of the differences about braking, as a share of the control's range."""
+_STEP = 1e-4  # width of the differences about braking, as a share of the control's range
 _INSTANTS = (1, 2, 3, 5, 8, 13, 21, 34, 55)
 """Instants of a control interval that get rows, beside its last; forecasts are judged at all instants."""
-_KEPT = 10
-"""Control steps for which a response is kept: it is a guess that forecasts check, and costs a forecast a control."""
-_SAME_RESPONSE = 1
-"""Linearisations of one step that use the kept response."""
-_RESOLUTION = 1e-6
-"""Rounding of controls, as a share of half their range, for which rows are tightened."""
+_KEPT = 10  # control steps for which a response is kept: a guess that forecasts check
+_SAME_RESPONSE = 1  # linearisations of one step that use the kept response
+_RESOLUTION = 1e-6  # rounding of controls, as a share of half their range, for which rows are tightened
 RECOVERY_S = 0.1
 """Time constant of recovery from a violation, s."""
-
-
-def mujoco_rollouts(plant: Plant, asker: str) -> MujocoPlant:
-    """The plant, if it has a MuJoCo model to forecast with."""
-    return require_mujoco(
-        plant,
-        f"{asker} forecasts with a MuJoCo model; on an AnalyticPlant use Barrier(h) or Clearance(...)",
-    )
 
 
 RENAMED: Final = {"holds": "horizon", "reach": "max_decrease"}
@@ -43,10 +28,10 @@ RENAMED: Final = {"holds": "horizon", "reach": "max_decrease"}
 
 
 class RolloutConstraint(Constraint):
-    """A requirement along a rollout: the held control first, braking after it.
+    """A requirement along a forecast of the held control, and then of the actuated joints braking.
 
-    Attributes of a subclass (dataclass fields): `margin` (units of the value), `horizon` (control intervals to
-    look ahead), `max_decrease` (units of the value, or None: always forecast).
+    A subclass is a dataclass with the fields `margin` (in `unit`), `horizon` (control intervals to look ahead) and
+    `max_decrease` (in `unit`, or None: every control is forecast).
     """
 
     margin: float
@@ -60,10 +45,7 @@ class RolloutConstraint(Constraint):
         whole = isinstance(self.horizon, float | np.floating) and float(self.horizon).is_integer()
         horizon = int(self.horizon) if whole else self.horizon
         self.horizon = whole_number("horizon", horizon, 1, "control intervals to look ahead")
-        if self.max_decrease is not None:
-            self.max_decrease = positive("max_decrease", self.max_decrease, self.unit)
-        if self.look_ahead_below is not None:
-            self.look_ahead_below = positive("look_ahead_below", self.look_ahead_below, self.unit)
+        check_fields(self, positive, ("max_decrease",), self.unit)
 
 
 class BoundSlacks(BoundConstraint):
@@ -83,38 +65,27 @@ class BoundSlacks(BoundConstraint):
         return least if least == least else -np.inf
 
     def linearize(self, control: Array) -> HalfSpaces:
-        """The slacks, linearised about a refused control."""
         return linearize(self.slacks, control, self.plant.lower, self.plant.upper)
-
-    def rows(self) -> HalfSpaces:
-        """None: what counts is the prediction, linearised where a control has been refused."""
-        return HalfSpaces.none(self.plant.lower.size)
 
 
 class RolloutMemory(NamedTuple):
-    """What a rollout constraint remembers of an episode.
+    """What a rollout constraint remembers of an episode."""
 
-    Attributes:
-        least: What was left at the last states, the newest last, at most `horizon` of them.
-        response: How what is left at every instant changes with a control, and the observation until which it is
-            kept; None: not known.
-    """
-
-    least: tuple[float, ...] = ()
+    least: tuple[
+        float, ...
+    ] = ()  # what was left at the last states, the newest last, at most `horizon` of them
     response: tuple[Array, int] | None = None
+    """How what is left changes with a control, and the observation until which that is kept; None: not known."""
 
 
 class BoundRollout(BoundSlacks):
-    """A requirement `room >= margin` along a forecast: the held control first, braking after it.
+    """A requirement `room >= margin` along a forecast of the held control, and then of braking.
 
-    A subclass says what is left of its limit at the present state (`_now`) and along a forecast (`_room`).
-    This class decides from it (`admits`), linearises about a refused control (`linearize`) and says what a control
-    leaves (`slack`).
+    A subclass says what is left of its limit at the present state (`now`) and along a forecast (`room`).
 
-    A forecast costs at least as much as a step of the env. So `max_decrease` may declare how far `value` can fall at
-    most
-    within the forecast, for any control: a state with more than that left needs none. The declaration is checked at
-    every step, and dropped with a warning when broken.
+    A forecast costs at least as much as a step of the env. A state with more than `max_decrease` left, the most that
+    `value` can fall within it, needs none. The declaration is checked at every step, and dropped with a warning when
+    broken.
     """
 
     spec: Any
@@ -122,54 +93,44 @@ class BoundRollout(BoundSlacks):
     _response: tuple[Array, int] | None
 
     def __init__(self, spec: RolloutConstraint, plant: Plant) -> None:
-        super().__init__(spec, mujoco_rollouts(plant, type(spec).__name__))
+        hint = "forecasts with a MuJoCo model; on an AnalyticPlant use Barrier(h) or Clearance(...)"
+        super().__init__(spec, require_mujoco(plant, f"{type(spec).__name__} {hint}"))
         self._max_decrease = spec.max_decrease
 
     @abstractmethod
-    def _room(self, forecast: Forecast) -> Array:
+    def room(self, forecast: Forecast) -> Array:
         """What is left of the limit along a forecast, in time: shape (instants, n)."""
 
     @abstractmethod
-    def _now(self) -> Array:
+    def now(self) -> Array:
         """What is left of the limit at the present state, shape (n,)."""
 
     def start(self) -> Memory:
-        """Nothing is known yet."""
         return RolloutMemory()
 
     def observe(self, memory: RolloutMemory) -> None:
-        """Take what is left at the present state, and whether a forecast is needed."""
-        self._value = self._now()
+        self._value = self.now()
         self._linear: HalfSpaces | None = None
         self._linearized = 0
         self._least = float(self._value.min(initial=np.inf))
         self._recent, self._response = memory
-        if self._max_decrease is not None:
-            self._check_max_decrease(self._max_decrease)
         self._outside = self._violation(self._value)
-        margin = self.spec.margin
-        self._far = (
-            self._max_decrease is not None and self._least - self._max_decrease >= margin + self.tolerance
-        )
-
-    def _check_max_decrease(self, max_decrease: float) -> None:
-        fallen = max(self._recent, default=-np.inf) - self._least
-        if fallen > max_decrease + self.tolerance:
+        most, fallen = self._max_decrease, max(self._recent, default=-np.inf) - self._least
+        if most is not None and fallen > most + self.tolerance:
             warnings.warn(
                 f"{type(self.spec).__name__}: what is left of the limit fell by {fallen:.3g} {self.spec.unit} within "
-                f"{len(self._recent)} control steps, farther than the declared max_decrease of {max_decrease:g}; "
-                "from now on every control is forecast",
+                f"{len(self._recent)} control steps, farther than the declared max_decrease of {most:g}; from now on "
+                "every control is forecast",
                 stacklevel=2,
             )
-            self._max_decrease = None
+            self._max_decrease = most = None
+        self._far = most is not None and self._least - most >= self.spec.margin + self.tolerance
 
     def executed(self, control: Array) -> Memory:
-        """What was left in the last `horizon` states, and the response if it is known."""
         recent = (*self._recent, self._least)[-self.spec.horizon :] if self._max_decrease is not None else ()
         return RolloutMemory(recent, self._response)
 
     def value(self) -> Array:
-        """What is left of the limit at the present state, margin not taken off."""
         return self._value
 
     def _violation(self, value: Array) -> Array:
@@ -180,10 +141,10 @@ class BoundRollout(BoundSlacks):
         """What is left of what is asked for along the forecast of a control, shape (k,); wanted >= 0."""
         inside = not self._outside.any()
         if inside and self.spec.look_ahead_below is not None:
-            held = self._room(self.plant.forecast(control, 1)) - self.spec.margin
+            held = self.room(self.plant.forecast(control, 1)) - self.spec.margin
             if (held >= self.spec.look_ahead_below).all():
                 return np.asarray(held.min(axis=0))
-        left = self._room(self.plant.forecast(control, self.spec.horizon)) - self.spec.margin
+        left = self.room(self.plant.forecast(control, self.spec.horizon)) - self.spec.margin
         if inside:
             return np.asarray(left.min(axis=0))
         # From outside, bound by bound: no farther out on the way, and closer at the end.
@@ -195,10 +156,9 @@ class BoundRollout(BoundSlacks):
 
     def admits(self, control: Array) -> bool:
         """Whether the forecast keeps the margin (from outside: whether it comes back towards it)."""
-        return self._far or self.slack(control) >= -self.tolerance
+        return self._far or super().admits(control)
 
     def linearize(self, control: Array) -> HalfSpaces:
-        """The forecast, linearised about a refused control."""
         if self.plant.has_acceleration:
             return super().linearize(control)
         self._linearized += 1
@@ -207,10 +167,9 @@ class BoundRollout(BoundSlacks):
         return self._instants(control)
 
     def rows(self) -> HalfSpaces:
-        """None: the forecast is linearised about a refused control.
+        """Where controls are displacements: the forecast linearised about braking, instant by instant; else none.
 
-        Where controls are displacements: the forecast linearised about braking, instant by instant. A refused
-        displacement may press the machine against something, and then says little about others.
+        A refused displacement may press the machine against something, and then says little about others.
         """
         if self.plant.has_acceleration or self._far:
             return super().rows()
@@ -224,9 +183,9 @@ class BoundRollout(BoundSlacks):
     def _respond(self, control: Array) -> None:
         """How what is left at every instant changes with a control, by differences, shape (instants, n, nu)."""
         plant, horizon = self.plant, self.spec.horizon
-        room = self._room(plant.forecast(control, horizon))
+        room = self.room(plant.forecast(control, horizon))
         step = np.where(control < 0.0, _STEP, -_STEP) * (plant.upper - plant.lower)
-        changed = [self._room(plant.forecast(control + part, horizon)) for part in np.diag(step)]
+        changed = [self.room(plant.forecast(control + part, horizon)) for part in np.diag(step)]
         parts = [(other - room) / width for other, width in zip(changed, step, strict=True)]
         self._response = np.stack(parts, axis=-1), plant.observation_id + _KEPT
 
@@ -234,7 +193,7 @@ class BoundRollout(BoundSlacks):
         """A row for every bound that some control could break, at a few instants of a control's forecast."""
         assert self._response is not None  # `rows` is asked first
         plant, horizon = self.plant, self.spec.horizon
-        left = self._room(plant.forecast(control, horizon)) - self.spec.margin - self._outside
+        left = self.room(plant.forecast(control, horizon)) - self.spec.margin - self._outside
         left[-1] += self._outside - self._closer()
         each = len(left) // horizon
         chosen = [i for i in range(len(left)) if i % each + 1 in (*_INSTANTS, each)]

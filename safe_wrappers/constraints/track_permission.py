@@ -1,32 +1,27 @@
 """TrackPermission: stop while the permission of a track has expired."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import name_list, non_negative, positive
 from safe_wrappers.errors import UnknownNameError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Promise
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 @dataclass
 class TrackPermission(Constraint):
     """While the permission of a track has expired, slow down to `creep` (rest), at least as hard as `braking`.
 
-    An `OcclusionPenalty` inside the filter says which tracks may be relied on. The rows bound the speed along an axis
-    at the end of the control step: it falls by `braking` times the control interval, shared as the velocity is, down
-    to `creep`. With all permissions in force there are no rows.
+    An `OcclusionPenalty` inside the filter says which tracks may be relied on. With all permissions in force there
+    are no rows.
 
-    What it promises: executed controls brake as declared, or the step is flagged infeasible. Where standing still is
-    not safe, add `Clearance` with `TrackedDiscs`. Best effort: the drift changes within a held step, and another
-    constraint may ask for the opposite.
+    Best effort: executed controls brake as declared, or the step is flagged infeasible; the drift changes within a
+    held step. Where standing still is not safe, add `EscapeClearance` with `TrackedDiscs`.
 
     Args:
         body: Name of the body whose frame origin is stopped.
@@ -34,8 +29,7 @@ class TrackPermission(Constraint):
         creep: Speed that stays allowed, m/s.
         tracks: Names of the tracks that count (`track_names` of the OcclusionPenalty); None: all.
 
-    Source: appendix "Continuous Lyapunov and Riccati covariance dynamics": expire tracking permission before the
-    declared error bound crosses the physical tolerance.
+    Source: appendix "Continuous Lyapunov and Riccati covariance dynamics".
     """
 
     body: str
@@ -43,7 +37,6 @@ class TrackPermission(Constraint):
     creep: float = 0.0
     tracks: Sequence[str] | None = None
 
-    promise: Promise = field(default="best effort", init=False)
     needs_acceleration: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -53,7 +46,6 @@ class TrackPermission(Constraint):
             self.tracks = name_list("tracks", self.tracks, also="None for all")
 
     def bind(self, plant: Plant) -> "BoundTrackPermission":
-        """On a plant."""
         return BoundTrackPermission(self, plant)
 
 
@@ -87,8 +79,5 @@ class BoundTrackPermission(BoundConstraint):
         # All axes together are then no faster than the larger of the two.
         room = max(0.0, self.spec.creep**2 - (left * speed) ** 2) / max(v.size, 1)
         allowed = np.sqrt((left * v) ** 2 + room)
-        least, most = (
-            (-allowed - v) / self.plant.control_dt - drift,
-            (allowed - v) / self.plant.control_dt - drift,
-        )
+        least, most = ((end - v) / self.plant.control_dt - drift for end in (-allowed, allowed))
         return HalfSpaces(np.concatenate([effect, -effect]), np.concatenate([most, -least]))

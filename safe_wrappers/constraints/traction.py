@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
@@ -11,41 +11,26 @@ from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import name_list, non_negative, positive
-from safe_wrappers.constraints.traction_memory import TractionMemory
 from safe_wrappers.control.vehicle.friction_estimate import FrictionEstimate
 from safe_wrappers.control.vehicle.slip import slip_ratio, slip_window
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory, Promise
+from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.driven_wheels import DrivenWheels
 
-Array = NDArray[np.float64]
-
-_CAUTION = 0.5
-"""Standard deviations of the estimated peak's slip by which the limit stays on the rising side of it."""
-_NOISE = 0.02
-"""Standard deviation of a measured friction coefficient while the slip stands still."""
-_NOISE_PER_SLIP = 1.5
-"""And what a slip that changed within the interval adds to it: at which slip the force acted is not known."""
-_LEAST_LIMIT = 0.1
-"""Share of `max_slip` that is always allowed: without any slip there is no force."""
-_SPEED_ERROR_FACTOR = 2.0
-"""Times the ground speed's recent error of prediction: what is kept free for the next one."""
-_SPEED_ERROR_IGNORED = 0.05
-"""Share of the room below the limit that such an error may take without being counted."""
-_SPEED_ERROR_FADE = 0.9
-"""Share of such an error that still counts one control step later."""
-_LEAST_SHARE = 0.3
-"""Of the slip that must be along the heading: the force across is not measured."""
-_UNBOUNDED = 1e9
-"""Stands for the control of an actuator without limits."""
-_LEAST_LOAD = 0.05
-"""Share of the largest load seen below which a wheel counts as in the air: it measures nothing."""
-_MOST_FRICTION = 3.0
-"""Force over load beyond which something else than the ground held the wheel: it says nothing about the curve."""
-_ROUNDING = 1e-6
-"""Share of a control below which its change is the action space's own rounding (float32)."""
+_CAUTION = 0.5  # standard deviations of the believed peak's slip by which the limit stays below it
+_NOISE = 0.02  # standard deviation of a measured friction coefficient while the slip stands still
+_NOISE_PER_SLIP = 1.5  # what a slip that changed within the interval adds to it
+_LEAST_LIMIT = 0.1  # share of `max_slip` that is always allowed: without any slip there is no force
+_SPEED_ERROR_FACTOR = 2.0  # times the recent error of the predicted ground speed: kept free for the next
+_SPEED_ERROR_IGNORED = 0.05  # share of the room below the limit that such an error may take uncounted
+_SPEED_ERROR_FADE = 0.9  # share of such an error that still counts one control step later
+_LEAST_SHARE = 0.3  # of the slip that must be along the heading: the force across is not measured
+_UNBOUNDED = 1e9  # stands for the control of an actuator without limits
+_LEAST_LOAD = 0.05  # share of the largest load seen below which a wheel counts as in the air
+_MOST_FRICTION = 3.0  # force over load beyond which something else than the ground held the wheel
+_ROUNDING = 1e-6  # share of a control below which its change is the action space's own rounding (float32)
 _SOLVERS_NOISE = 1e-9
 
 
@@ -58,43 +43,22 @@ class Traction(Constraint):
     """Keep the slip ratio of every driven wheel within `max_slip`, and below where its ground's curve seems to peak.
 
     The wheel's own equation says which torque takes the slip to its limit by the end of the held control step. The
-    force of the ground in it is not modelled but measured, from how the wheel answered the last torque; so no
-    friction has to be known. From slip and force over load the peak of the traction curve is estimated for each
-    wheel, with its uncertainty (`control/vehicle/friction_estimate.py`); where it is believed to lie below
-    `max_slip`, the limit is half a standard deviation below it. Accelerating and braking, forward and in reverse are
-    the same rows.
+    force of the ground in it is measured, from how the wheel answered the last torque, so no friction has to be
+    known. From slip and force over load the peak of the traction curve is estimated for each wheel, with its
+    uncertainty (`control/vehicle/friction_estimate.py`); the limit is half a standard deviation below it, or
+    `max_slip`. A wheel in the air is held within the limit of its ground speed.
 
-    What it promises: a wheel whose ground stays the same for a control step ends it within the limit, up to what
-    its force and its speed over ground change otherwise than predicted. At the edge of another ground, and where a
-    wheel is unloaded or hits something, the measured force is one control step old: the slip overshoots for one or
-    two steps, and comes back as fast as the drives can bring it. The speed over ground is predicted to change as in
-    the step before, which it does not where the other wheels' commands have changed: that overshoots on any ground.
-    So twice the largest recent error of this prediction (faded by a tenth at every step, less a twentieth of the
-    window) is kept free on the side on which it was wrong, up to nine tenths of the window. A first change of the
-    other wheels' commands after a calm drive is not foreseen, and overshoots for up to three steps.
-
-    A wheel that slides sideways has less left to slip along its heading (a friction circle), so that driving and
-    braking leave the grip to the turn; but a turn that is too fast for the ground still slides, and a vehicle that
-    spins about its own axis turns its wheels faster than any drive follows. Hence best effort. An overshoot is no
-    unsafe state, so there is no `value`, and `slip/ratio` alone shows it. From outside the limit the rows ask for no
-    more than the drives can give: the way back is not called infeasible.
-
-    The estimate believes in curves of one shape, the Magic Formula's. On others it may take the peak for a later one:
-    on Burckhardt's snow (peak at 0.06, nearly flat behind it) a wheel is held at 0.11, for 2 % less force.
-    What else holds an axle (dry friction, a spring) is measured as force of the ground: the limit keeps, the friction
-    estimate is too high. A state that is set from outside within an episode looks like a force, too, for one step,
-    and like a ground speed that cannot be predicted, for some twenty.
-
-    A wheel in the air has no force: its circumferential speed is held within the limit of its ground speed, so
-    that it touches down rolling, and its estimate stays as it is. At a standstill slip is counted against
-    `regularization`.
+    Best effort: a wheel whose ground stays the same for a control step ends it within the limit, up to what its force
+    and its speed over ground change otherwise than predicted. At the edge of another ground, where a wheel is
+    unloaded or hits something, and after a change of the other wheels' commands, the slip overshoots for one to three
+    steps, and comes back as fast as the drives can bring it. An overshoot is no unsafe state, so there is no `value`:
+    `slip/ratio` shows it.
 
     Args:
         wheels: Names of the wheels' hinges; each must be driven by actuators on that joint and nothing else.
         max_slip: Largest slip ratio, normalised, in (0, 1).
         friction: Declared lower bound on the peak friction coefficient under every wheel, > 0: the ground is then
-            counted on for that much force at once, instead of only for what it gave in the last control step. A bound
-            that is too high lets wheels spin. None counts on nothing.
+            counted on for that much force at once. A bound that is too high lets wheels spin. None counts on nothing.
         regularization: Speed below which slip is counted against it, m/s.
         margin: Slip kept free below the limit.
 
@@ -106,8 +70,6 @@ class Traction(Constraint):
     friction: float | None = None
     regularization: float = 0.5
     margin: float = 0.0
-
-    promise: Promise = field(default="best effort", init=False)
 
     def __post_init__(self) -> None:
         self.wheels = name_list("wheels", self.wheels, "joint names", least=0)
@@ -121,105 +83,111 @@ class Traction(Constraint):
             raise ConfigurationError(f"margin must be below max_slip = {self.max_slip}, got {self.margin}")
 
     def bind(self, plant: Plant) -> "BoundTraction":
-        """On a plant."""
         return BoundTraction(self, plant)
+
+
+@dataclass
+class TractionMemory:
+    """What Traction remembers of an episode; arrays of shape (wheels,), before the last control."""
+
+    estimate: FrictionEstimate
+    rate: Array | None  # turning rates, rad/s; None: nothing was measured
+    time: float  # s
+    ground: Array  # speeds of the ground below, m/s
+    slip: Array  # slip ratios along the heading
+    across: Array  # and across it
+    load: Array  # forces on the ground, N
+    most_load: Array  # the largest so far, N
+    faster: Array  # recent error of the predicted ground speed, upwards, m/s
+    slower: Array  # downwards, m/s
+    ahead: Array  # by how much the ground speed is predicted to change, m/s
+    traction: Array  # force of the ground in the last control step, N
+    present: Array  # of the ground at its end, N
 
 
 class BoundTraction(BoundConstraint):
     """Traction on a plant."""
 
-    info_keys: tuple[str, ...] = (
-        keys.SLIP_RATIO,
-        keys.SLIP_LIMITED,
-        keys.SLIP_MU_ESTIMATE,
-        keys.SLIP_MU_STD,
-    )
+    info_keys: tuple[str, ...] = (keys.SLIP_RATIO, keys.SLIP_LIMITED, keys.SLIP_MU_ESTIMATE, keys.SLIP_MU_STD)
     spec: Traction
     plant: MujocoPlant
+    seen: TractionMemory  # what is known at the observed state
 
     def __init__(self, spec: Traction, plant: Plant) -> None:
         hint = "Traction needs a MujocoPlant: it reads the wheels from the model"
         super().__init__(spec, require_mujoco(plant, hint))
         if self.plant.delay_s > 0.0:
-            raise ConfigurationError(
-                f"Traction measures the ground's force from how the wheels answer, which a plant with a delay "
-                f"({self.plant.delay_s} s) predicts instead; use delay_s=0"
+            answers = (
+                f"how the wheels answer, which a plant with a delay ({self.plant.delay_s} s) predicts instead"
             )
-        self._wheels = DrivenWheels(self.plant, self.spec.wheels)
+            raise ConfigurationError(f"Traction measures the ground's force from {answers}; use delay_s=0")
+        self.wheels = DrivenWheels(self.plant, self.spec.wheels)
         self._read_constants()
 
     def _read_constants(self) -> None:
         self._model_version = self.plant.model_version
-        self._constants = self._wheels.constants(self.plant)
+        self.constants = self.wheels.constants(self.plant)
         options = self.plant.model.opt
-        self._response = self._constants.response(
+        self._response = self.constants.response(
             float(options.timestep),
             self.plant.substeps,
-            self._wheels.feedback,
+            self.wheels.feedback,
             int(options.integrator) in _IMPLICIT,
         )
 
     def start(self) -> Memory:
-        """Nothing is known of the ground, and nothing was measured."""
         n = len(self.spec.wheels)
         return TractionMemory(FrictionEstimate(n), None, math.nan, *(np.zeros(n) for _ in range(10)))
 
     def executed(self, control: Array) -> Memory:
-        """What was measured, and the estimate from it."""
-        now = (self._rate, self._time, self._ground, self._slip, self._across, self._load, self._most_load)
-        return TractionMemory(
-            self._estimate, *now, self._faster, self._slower, self._ahead, self._traction, self._present
-        )
+        return self.seen
 
     def observe(self, memory: TractionMemory) -> None:
         """Take the state and measure what the last control step showed."""
         self._rows: HalfSpaces | None = None
-        self._estimate = memory.estimate.copy()
-        _, self._rate, self._time, self._ground, self._slip, self._across, *rest = memory
-        self._load, self._most_load, self._faster, self._slower, *measured = rest
-        self._ahead, self._traction, self._present = measured
+        seen = self.seen = replace(memory, estimate=memory.estimate.copy())
         if self.plant.model_version != self._model_version:
             self._read_constants()
-        rate, ground, sideways = self._wheels.motion(self.plant)
+        rate, ground, sideways = self.wheels.motion(self.plant)
         published = self.plant.published()
         assert published is not None  # there is no delay
-        load = self._wheels.loads(self.plant.attribute("model"), published)
+        load = self.wheels.loads(self.plant.attribute("model"), published)
         if not np.isfinite(rate + ground + sideways + load).all():
-            self._rate = None
+            seen.rate = None
             return
-        wheel = self._constants.radius * rate
+        wheel = self.constants.radius * rate
         slip = slip_ratio(wheel, ground, self.spec.regularization)
         faster = np.maximum(np.maximum(np.abs(ground), np.abs(wheel)), self.spec.regularization)
         across = np.abs(sideways) / faster
-        elapsed, self._time = self.plant.time - self._time, self.plant.time
+        elapsed, seen.time = self.plant.time - seen.time, self.plant.time
         held = math.isclose(elapsed, self.plant.control_dt, rel_tol=1e-6)
-        again = elapsed == 0.0 and bool((rate == self._rate).all())  # keeps what was measured
-        if self._rate is None or not (held or again):
+        again = elapsed == 0.0 and bool((rate == seen.rate).all())  # keeps what was measured
+        if seen.rate is None or not (held or again):
             # Nothing before it, or a clock that was set: no held control led from that state to this one.
-            self._ahead, self._traction, self._present = (np.zeros_like(rate) for _ in range(3))
-            self._faster, self._slower = np.zeros_like(rate), np.zeros_like(rate)
+            seen.ahead, seen.traction, seen.present = (np.zeros_like(rate) for _ in range(3))
+            seen.faster, seen.slower = np.zeros_like(rate), np.zeros_like(rate)
         elif held:
-            error = ground - self._ground - self._ahead
-            self._faster = np.maximum(error, _SPEED_ERROR_FADE * self._faster)
-            self._slower = np.maximum(-error, _SPEED_ERROR_FADE * self._slower)
-            self._ahead = ground - self._ground
-            torque = self._wheels.torque(published)
-            self._traction = self._constants.traction(self._response, self._rate, rate, torque)
+            error = ground - seen.ground - seen.ahead
+            seen.faster = np.maximum(error, _SPEED_ERROR_FADE * seen.faster)
+            seen.slower = np.maximum(-error, _SPEED_ERROR_FADE * seen.slower)
+            seen.ahead = ground - seen.ground
+            torque = self.wheels.torque(published)
+            seen.traction = self.constants.traction(self._response, seen.rate, rate, torque)
             # Below the regularisation the number is no slip ratio, and says nothing about the curve.
             self._learn(ground, slip, across, load, rolls=faster > self.spec.regularization)
-        self._rate, self._ground, self._slip, self._across, self._load = rate, ground, slip, across, load
-        at, spread = self._estimate.peak_slip
+        seen.rate, seen.ground, seen.slip, seen.across, seen.load = rate, ground, slip, across, load
+        at, spread = seen.estimate.peak_slip
         limit = np.minimum(self.spec.max_slip, at - _CAUTION * spread) - self.spec.margin
         # Along and across share one curve: what slides sideways already is not left for driving and braking.
         limit = np.sqrt(np.maximum(limit**2 - across**2, 0.0))
         self._limit = np.maximum(limit, _LEAST_LIMIT * self.spec.max_slip)
-        speed, radius = ground + self._ahead, self._constants.radius
+        speed, radius = ground + seen.ahead, self.constants.radius
         low, high = slip_window(speed, self._limit, self.spec.regularization)
         self._window = low / radius, high / radius
         # A ground speed above the prediction is slip of a braked wheel, one below it of a driven wheel.
         self._reserve = (
-            self._kept_free(self._faster, speed - low) / radius,
-            self._kept_free(self._slower, high - speed) / radius,
+            self._kept_free(seen.faster, speed - low) / radius,
+            self._kept_free(seen.slower, high - speed) / radius,
         )
 
     @staticmethod
@@ -229,93 +197,84 @@ class BoundTraction(BoundConstraint):
         return np.minimum(counted, (1.0 - _LEAST_LIMIT) * room)
 
     def _learn(
-        self,
-        ground: Array,
-        slip: Array,
-        across: Array,
-        load: Array,
-        rolls: NDArray[np.bool_],
+        self, ground: Array, slip: Array, across: Array, load: Array, rolls: NDArray[np.bool_]
     ) -> None:
         """Give the estimate the slip and the friction of the last control step, where it showed any."""
-        mean_load, along = 0.5 * (load + self._load), 0.5 * (slip + self._slip)
-        total = np.hypot(along, 0.5 * (across + self._across))
-        self._most_load = np.maximum(self._most_load, mean_load)
-        self._estimate.travel(np.abs(ground) * self.plant.control_dt)
-        loaded = np.minimum(load, self._load) > _LEAST_LOAD * self._most_load
-        usable = loaded & rolls & (self._traction * along > 0.0) & (np.abs(along) > _LEAST_SHARE * total)
+        seen = self.seen
+        mean_load, along = 0.5 * (load + seen.load), 0.5 * (slip + seen.slip)
+        total = np.hypot(along, 0.5 * (across + seen.across))
+        seen.most_load = np.maximum(seen.most_load, mean_load)
+        seen.estimate.travel(np.abs(ground) * self.plant.control_dt)
+        loaded = np.minimum(load, seen.load) > _LEAST_LOAD * seen.most_load
+        usable = loaded & rolls & (seen.traction * along > 0.0) & (np.abs(along) > _LEAST_SHARE * total)
         # The force points against the sliding: its part along the heading is the part of the slip there.
         part = np.where(usable, np.abs(along) / np.where(usable, total, 1.0), 1.0)
-        friction = np.abs(self._traction) / (part * np.where(loaded, mean_load, 1.0))
+        friction = np.abs(seen.traction) / (part * np.where(loaded, mean_load, 1.0))
         usable &= friction <= _MOST_FRICTION
-        noise = (_NOISE + _NOISE_PER_SLIP * np.abs(slip - self._slip)) / part
-        self._estimate.update(total, friction, np.where(usable, noise, np.inf))
+        noise = (_NOISE + _NOISE_PER_SLIP * np.abs(slip - seen.slip)) / part
+        seen.estimate.update(total, friction, np.where(usable, noise, np.inf))
         # What was measured is the interval's mean; where the slip went on growing, so did the force. From nothing to
         # its end a slip is at most twice its mean; a slip that has changed its sign in between shows no more.
         now = np.where(slip * along > 0.0, np.minimum(np.abs(slip), 2.0 * np.abs(along)), 0.0)
-        risen = self._traction * self._estimate.rise(np.abs(along), now)
-        self._present = np.where(self._traction * along > 0.0, risen, self._traction)
+        risen = seen.traction * seen.estimate.rise(np.abs(along), now)
+        seen.present = np.where(seen.traction * along > 0.0, risen, seen.traction)
 
     def _torques(self, rates: Array, counted_on: Array) -> Array:
         """The torques that take the wheels to given rates by the end of the hold, if the ground gives a force."""
-        assert self._rate is not None
-        coasting = self._response.decay * self._rate
-        return np.asarray((rates - coasting) / self._response.gain + self._constants.radius * counted_on)
+        assert self.seen.rate is not None
+        coasting = self._response.decay * self.seen.rate
+        return np.asarray((rates - coasting) / self._response.gain + self.constants.radius * counted_on)
 
     def rows(self) -> HalfSpaces:
         """Two per wheel, for driving and braking torque, where the drive could exceed them."""
-        if self._rate is None:  # says nothing, and a row that is not a number fails
+        if self.seen.rate is None:  # says nothing, and a row that is not a number fails
             return HalfSpaces(np.full((1, self.plant.lower.size), np.nan), np.full(1, np.nan))
         if self._rows is None:
             self._rows = self._bounds()
         return self._rows
 
     def _bounds(self) -> HalfSpaces:
-        bias, effect = self._wheels.drive(self.plant)
-        carried = 0.0 if self.spec.friction is None else self.spec.friction * self._load
-        most = self._torques(self._window[1], np.maximum(self._present, carried)) - bias
-        least = self._torques(self._window[0], np.minimum(self._present, -carried)) - bias
+        bias, effect = self.wheels.drive(self.plant)
+        carried = 0.0 if self.spec.friction is None else self.spec.friction * self.seen.load
+        most = self._torques(self._window[1], np.maximum(self.seen.present, carried)) - bias
+        least = self._torques(self._window[0], np.minimum(self.seen.present, -carried)) - bias
         low, high = self.plant.acting_range
         low, high = np.maximum(low, -_UNBOUNDED), np.minimum(high, _UNBOUNDED)
-        ends = (
-            np.minimum(effect * low, effect * high).sum(axis=1),
-            np.maximum(effect * low, effect * high).sum(axis=1),
-        )
+        ends = [end(effect * low, effect * high).sum(axis=1) for end in (np.minimum, np.maximum)]
         # What is kept back for an error of the prediction is kept as far as the drive can: it is no limit by itself.
         gain = self._response.gain
         most = np.maximum(most - self._reserve[1] / gain, np.minimum(most, ends[0]))
         least = np.minimum(least + self._reserve[0] / gain, np.maximum(least, ends[1]))
         # From outside the window, as fast back as the drive can: no more can be asked for.
-        outside = np.abs(self._slip) > self._limit
+        outside = np.abs(self.seen.slip) > self._limit
         most = np.where(outside, np.maximum(most, ends[0]), most)
         least = np.where(outside, np.minimum(least, ends[1]), least)
         # Negated, so that a row that is not a number is kept, and fails, instead of being left out.
         up, down = ~(ends[1] <= most), ~(ends[0] >= least)
-        return HalfSpaces(
-            np.concatenate([effect[up], -effect[down]]), np.concatenate([most[up], -least[down]])
-        )
+        normals = np.concatenate([effect[up], -effect[down]])
+        return HalfSpaces(normals, np.concatenate([most[up], -least[down]]))
 
     def backup(self) -> Array:
         """The control that brakes the vehicle as the slip limit allows it; other actuators at zero."""
-        if self._rate is None:
+        if self.seen.rate is None:
             return np.zeros_like(self.plant.lower)
-        bias, effect = self._wheels.drive(self.plant)
-        speed = self._ground + self._ahead
+        bias, effect = self.wheels.drive(self.plant)
+        speed = self.seen.ground + self.seen.ahead
         low, high = self._window[0] + self._reserve[0], self._window[1] - self._reserve[1]
         wanted = np.where(speed > 0.0, low, high)
         # No farther than to a standstill: past it the wheel would drive the other way.
         wanted = np.where(speed > 0.0, np.maximum(wanted, 0.0), np.minimum(wanted, 0.0))
-        torque = self._torques(wanted, self._present) - bias
+        torque = self._torques(wanted, self.seen.present) - bias
         return np.asarray(np.linalg.lstsq(effect, torque, rcond=None)[0])
 
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
         """The info keys `slip/...`: of the state before the step, and what its control did to the wheels."""
-        mean, std = self._estimate.mean, self._estimate.std
         changed = np.zeros(self.plant.lower.size, dtype=bool)
         if proposed is not None and executed is not None:
             changed = np.abs(executed - proposed) > _ROUNDING * np.abs(proposed) + _SOLVERS_NOISE
         return {
-            keys.SLIP_RATIO: self._slip.copy(),
-            keys.SLIP_LIMITED: self._wheels.driven_by(changed),
-            keys.SLIP_MU_ESTIMATE: mean,
-            keys.SLIP_MU_STD: std,
+            keys.SLIP_RATIO: self.seen.slip.copy(),
+            keys.SLIP_LIMITED: self.wheels.driven_by(changed),
+            keys.SLIP_MU_ESTIMATE: self.seen.estimate.mean,
+            keys.SLIP_MU_STD: self.seen.estimate.std,
         }

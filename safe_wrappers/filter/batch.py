@@ -21,14 +21,10 @@ from safe_wrappers.filter.projection import check_solver, project_unchecked
 
 Mask = NDArray[np.bool_]
 
-_CLEAR = 1e-6
-"""Share of a tolerance by which a residual must differ from it to be judged here: `project` judges the others."""
-_FEW = 16
-"""Fewer problems that a nominal does not solve are faster one by one."""
-_SPARE = 1e3
-"""Tolerances by which every other row must be kept where the projection on one of them is taken for that on all."""
-_LARGEST = 1e150
-"""Larger numbers may overflow when squared: left to `project`."""
+_CLEAR = 1e-6  # share of a tolerance by which a residual must differ from it to be judged here
+_FEW = 16  # fewer problems that a nominal does not solve are faster one by one
+_SPARE = 1e3  # tolerances by which all other rows must be kept where the projection on one row is the answer
+_LARGEST = 1e150  # larger numbers may overflow when squared: left to `project`
 
 
 class BatchProjection(NamedTuple):
@@ -55,7 +51,9 @@ def project_batch(
     upper: ArrayLike,
     solver: str = "daqp",
 ) -> BatchProjection:
-    """Project B nominal controls, each onto its own half-spaces and box; the answers are those of `project`.
+    """Project B nominal controls, each onto its own half-spaces and box; statuses and answers are those of `project`.
+
+    Inactive controls are the nominal ones bit for bit, the others equal within the accuracy of the solver.
 
     Args:
         u_nom: Nominal controls, shape (B, m), finite.
@@ -66,10 +64,6 @@ def project_batch(
         upper: Box, shape (m,) or (B, m); +inf is no bound.
         solver: As in `project`.
 
-    Returns:
-        A `BatchProjection`. The statuses are those that `project` gives, problem by problem; inactive controls are
-        the nominal ones bit for bit, the others equal within the accuracy of the solver.
-
     Raises:
         ConfigurationError: Shapes do not match, bounds cross, or an argument that must be finite is not.
         UnknownNameError: No such solver is installed.
@@ -78,21 +72,19 @@ def project_batch(
     u = np.array(u_nom, dtype=np.float64)
     a, b = np.asarray(normals, dtype=np.float64), np.asarray(offsets, dtype=np.float64)
     if u.ndim != 2 or b.ndim != 2 or len(b) != len(u) or a.shape != (*b.shape, u.shape[1]):
-        raise ConfigurationError(
-            f"expected u_nom (B, m), normals (B, k, m) and offsets (B, k); got {u.shape}, {a.shape} and {b.shape}"
-        )
+        wanted = "u_nom (B, m), normals (B, k, m) and offsets (B, k)"
+        raise ConfigurationError(f"expected {wanted}; got {u.shape}, {a.shape} and {b.shape}")
     try:
         lo = np.broadcast_to(np.asarray(lower, dtype=np.float64), u.shape)
         hi = np.broadcast_to(np.asarray(upper, dtype=np.float64), u.shape)
     except ValueError:
+        given = f"{np.shape(lower)} and {np.shape(upper)}"
         raise ConfigurationError(
-            f"expected bounds of shape ({u.shape[1]},) or {u.shape}; got {np.shape(lower)} and {np.shape(upper)}"
+            f"expected bounds of shape ({u.shape[1]},) or {u.shape}; got {given}"
         ) from None
     if not np.isfinite(u).all():
-        where = np.flatnonzero(~np.isfinite(u).all(axis=1))
-        raise ConfigurationError(
-            f"u_nom must be finite, replace it before projecting; rows {where.tolist()} are not"
-        )
+        where = np.flatnonzero(~np.isfinite(u).all(axis=1)).tolist()
+        raise ConfigurationError(f"u_nom must be finite, replace it before projecting; rows {where} are not")
     if not (lo <= hi).all():  # also refuses NaN
         raise ConfigurationError(f"lower must not exceed upper, got {lo} and {hi}")
     with np.errstate(all="ignore"):  # numbers that overflow are left to `project`
@@ -121,15 +113,7 @@ def _without_solver(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> tuple
     left = np.flatnonzero(ordinary & ~solved)
     if left.size < _FEW:
         return answer, solved
-    u, a, b, lo, hi, length, excess = (
-        u[left],
-        a[left],
-        b[left],
-        lo[left],
-        hi[left],
-        length[left],
-        excess[left],
-    )
+    u, a, b, lo, hi, length, excess = (part[left] for part in (u, a, b, lo, hi, length, excess))
     slack = FEASIBILITY_TOLERANCE * batch_residual_scales(u, a, b, length, lo, hi)
     within = inside[left]
     near = within & (excess <= (1.0 - _CLEAR) * slack).all(axis=1)

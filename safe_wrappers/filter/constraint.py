@@ -12,9 +12,7 @@ from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
-
 Promise = Literal["proved", "best effort"]
-
 Memory = Any
 """What a bound constraint keeps from one control step to the next; None if nothing."""
 
@@ -59,15 +57,16 @@ class Constraint(ABC):
         """The constraint on a plant that is bound to its env.
 
         Raises:
-            UnsupportedEnvError: The plant cannot answer what the constraint asks of it.
+            UnsupportedEnvError: The plant does not have what the constraint needs.
             ConfigurationError: Names or numbers that do not fit the plant.
         """
 
     def widened(self, margin: float) -> Self:
         """A copy whose margin is wider by this much, in the unit of its margin."""
         if not (is_dataclass(self) and any(f.name == "margin" for f in fields(self))):
+            name = type(self).__name__
             raise ConfigurationError(
-                f"{type(self).__name__} has no margin to widen; give it a field `margin`, or margin=0 here"
+                f"{name} has no margin to widen; give it a field `margin`, or margin=0 here"
             )
         own: Any = self
         wider: Self = replace(own, margin=own.margin + margin)
@@ -77,13 +76,13 @@ class Constraint(ABC):
 class BoundConstraint:
     """A constraint on one plant. Every method has a default; a subclass overrides what it can answer.
 
-    In every control step the filter calls `observe` once, after the plant has taken the env's state, then asks
-    questions, and closes the step with `executed`. What lasts from step to step is a value: `start` gives that of a
-    new episode, `observe` takes it, `executed` returns the next one. A constraint may keep what it has computed until
-    the next `observe`, and must not change anything else.
+    In every control step the filter calls `observe` once, after the plant has taken the env's state, then the other
+    methods, and closes the step with `executed`. What lasts from step to step is a value: `start` gives that of a new
+    episode, `observe` takes it, `executed` returns the next one. A constraint may keep what it has computed until the
+    next `observe`, and must not change anything else.
 
     A constraint that says its requirement as rows overrides `rows` alone. One that predicts a held control sets
-    `predicts` and overrides `slack`, or `admits`: the filter asks it about controls, and takes its rows for a guess.
+    `predicts` and overrides `slack`, or `admits`; its rows are then a guess.
 
     Args:
         spec: The specification.

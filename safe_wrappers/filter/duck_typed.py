@@ -1,18 +1,15 @@
 """Constraints as they were written before `Constraint` was a base class: objects with `rows(plant)`."""
 
 import copy
+import functools
 import warnings
-from collections.abc import Iterable
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces, Memory
+from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, Memory
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 def duck_typed(given: Any) -> Constraint:
@@ -33,11 +30,7 @@ def duck_typed(given: Any) -> Constraint:
 
 
 class DuckTyped(Constraint):
-    """An object with `rows(plant)` and, if it has them, the methods of its time.
-
-    Args:
-        given: The object; its methods take the plant first.
-    """
+    """An object with `rows(plant)` and, if it has them, the other methods of its time; they take the plant first."""
 
     def __init__(self, given: Any) -> None:
         self.given = given
@@ -46,11 +39,9 @@ class DuckTyped(Constraint):
         self.margin, self.state_error = (getattr(given, name, 0.0) for name in ("margin", "state_error"))
 
     def bind(self, plant: Plant) -> "BoundDuckTyped":
-        """A copy of the object, bound if it wants to be."""
         return BoundDuckTyped(self, plant)
 
     def widened(self, margin: float) -> Self:
-        """With a wider margin of the object's own."""
         if not hasattr(self.given, "margin"):
             return super().widened(margin)
         wider = copy.deepcopy(self)
@@ -58,52 +49,39 @@ class DuckTyped(Constraint):
         return wider
 
 
+_SAME = {name: name for name in ("check", "approach", "rows", "backup")}
+_SAME |= {"cut": "linearize", "suggestions": "candidates"}
+"""Methods of then that are those of today but for the plant, by their names then and now."""
+
+
 class BoundDuckTyped(BoundConstraint):
-    """Its methods on a plant."""
+    """A copy of such an object on a plant."""
 
     def __init__(self, spec: DuckTyped, plant: Plant) -> None:
         super().__init__(spec, plant)
-        self._given = copy.deepcopy(spec.given)
-        self.predicts = hasattr(self._given, "admits")
-        self.has_value, self.has_backup = (hasattr(self._given, name) for name in ("value", "backup"))
-        if hasattr(self._given, "report"):
+        given = self._given = copy.deepcopy(spec.given)
+        self.predicts = hasattr(given, "admits")
+        self.has_value, self.has_backup = hasattr(given, "value"), hasattr(given, "backup")
+        if hasattr(given, "report"):
             self.info_keys = ("*",)
-        if hasattr(self._given, "bind"):
-            self._given.bind(plant)
-
-    def _ask(self, method: str, default: Any, *arguments: Any) -> Any:
-        known = getattr(self._given, method, None)
-        return default if known is None else known(*arguments)
+        if hasattr(given, "bind"):
+            given.bind(plant)
+        for then, now in _SAME.items():
+            if hasattr(given, then):
+                setattr(self, now, functools.partial(getattr(given, then), plant))
 
     @property
     def scale(self) -> float:
-        """Its own, or 1."""
         return float(getattr(self._given, "scale", 1.0))
 
     def start(self) -> Memory:
-        """What lasts is the object's own affair."""
-        self._ask("reset", None)
-
-    def check(self) -> None:
-        """Its own check."""
-        self._ask("check", None, self.plant)
+        if hasattr(self._given, "reset"):  # what lasts is the object's own
+            self._given.reset()
 
     def value(self) -> Array:
-        """Its barriers."""
-        return np.asarray(self._ask("value", np.zeros(0), self.plant))
-
-    def approach(self) -> tuple[Array, Array] | None:
-        """Its clearances and speeds."""
-        found: tuple[Array, Array] | None = self._ask("approach", None, self.plant)
-        return found
-
-    def rows(self) -> HalfSpaces:
-        """Its rows."""
-        rows: HalfSpaces = self._given.rows(self.plant)
-        return rows
+        return np.asarray(self._given.value(self.plant)) if self.has_value else super().value()
 
     def slack(self, control: Array) -> float:
-        """Its shortfall, or whether it admits the control, or its rows."""
         if not self.predicts:
             return super().slack(control)
         if hasattr(self._given, "shortfall"):
@@ -111,27 +89,14 @@ class BoundDuckTyped(BoundConstraint):
         return 0.0 if self.admits(control) else -np.inf
 
     def admits(self, control: Array) -> bool:
-        """Its own answer, or that of its rows."""
         return bool(self._given.admits(self.plant, control)) if self.predicts else super().admits(control)
-
-    def linearize(self, control: Array) -> HalfSpaces:
-        """Its cut."""
-        rows: HalfSpaces = self._ask("cut", super().linearize(control), self.plant, control)
-        return rows
-
-    def candidates(self, control: Array) -> Iterable[Array]:
-        """Its suggestions."""
-        every: Iterable[Array] = self._ask("suggestions", (), self.plant, control)
-        return every
-
-    def backup(self) -> Array | None:
-        """Its backup."""
-        control: Array | None = self._ask("backup", None, self.plant)
-        return control
 
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
         """Its report; after a reset of two zero actions."""
+        if not hasattr(self._given, "report"):
+            return {}
         zero = np.zeros(self.plant.lower.size)
-        both = [zero if action is None else action for action in (proposed, executed)]
-        found: dict[str, Any] = self._ask("report", {}, *both)
+        found: dict[str, Any] = self._given.report(
+            *(zero if action is None else action for action in (proposed, executed))
+        )
         return found

@@ -5,15 +5,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import BoundConstraint, Constraint
+from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint
 from safe_wrappers.filter.fallback import Fallback, FallbackFunction
 from safe_wrappers.filter.search import Decision, SafeActionSearch
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 class SafetyFilter:
@@ -50,8 +47,12 @@ class SafetyFilter:
     ) -> None:
         self.plant = plant
         self.bound: list[BoundConstraint] = [constraint.bind(plant) for constraint in constraints]
-        _refuse_same_keys(self.bound)
         self.reporting = [c for c in self.bound if c.info_keys]
+        kinds = [type(c.spec).__name__ for c in self.reporting]
+        for kind in kinds:
+            if kinds.count(kind) > 1:
+                twice = f"{kind} is in the list {kinds.count(kind)} times"
+                raise ConfigurationError(f"{twice}, and both would write the same info keys; use one")
         self._search = SafeActionSearch(plant, self.bound, Fallback(fallback, self.bound), solver, low, high)
         self._low, self._high = low, high
 
@@ -107,14 +108,3 @@ class SafetyFilter:
         for c in self.reporting:
             found |= c.info(proposed, executed)
         return found
-
-
-def _refuse_same_keys(bound: Sequence[BoundConstraint]) -> None:
-    """Two constraints of a kind would write the same info keys."""
-    kinds = [type(c.spec).__name__ for c in bound if c.info_keys]
-    for kind in kinds:
-        if kinds.count(kind) > 1:
-            raise ConfigurationError(
-                f"{kind} is in the list {kinds.count(kind)} times, and both would write the same info keys; use one "
-                "for everything it watches"
-            )

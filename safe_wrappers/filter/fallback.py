@@ -4,14 +4,12 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.filter.constraint import BoundConstraint
+from safe_wrappers.filter.constraint import Array, BoundConstraint
 from safe_wrappers.filter.projection import box_least_squares
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 FallbackFunction = Callable[[Plant], ArrayLike]
 """The user's own: takes the plant at its present state, returns a control of shape (m,)."""
@@ -23,12 +21,10 @@ class Fallback:
     """Chooses a finite control inside the box, whatever happens.
 
     Args:
-        choice: "brake" takes the motion away as fast as the actuators can: by a constraint's own proved
-            stopping control where one has it, else by `brake` on a MujocoPlant; an AnalyticPlant does not say
-            which states are velocities, so there it is the control that violates the rows least. Where all
-            constraints forecast and none admits it, the filter takes, of all that it has tried, the control that
-            fails least. "hold" repeats the last executed action; "zero" is no control; or a function of the plant.
-        constraints: "brake" uses the first one's `backup` that there is.
+        choice: "brake" takes the motion away as fast as the actuators can: by the first `backup` of a constraint,
+            else by `brake` on a MujocoPlant, else by the control that violates the rows least. "hold" repeats the
+            last executed action; "zero" is no control; or a function of the plant.
+        constraints: Whose backups "brake" uses.
 
     Raises:
         UnknownNameError: No fallback of that name.
@@ -36,11 +32,9 @@ class Fallback:
 
     def __init__(self, choice: str | FallbackFunction, constraints: Sequence[BoundConstraint] = ()) -> None:
         if not callable(choice) and choice not in NAMES:
-            raise UnknownNameError(
-                f"no fallback {choice!r}; choose {', '.join(NAMES)}, or pass a function of the plant"
-            )
-        self._choice = choice
-        self._constraints = constraints
+            names = ", ".join(NAMES)
+            raise UnknownNameError(f"no fallback {choice!r}; choose {names}, or pass a function of the plant")
+        self._choice, self._constraints = choice, constraints
         self.brakes = choice == "brake"
 
     def __call__(
@@ -60,15 +54,14 @@ class Fallback:
             low: Action box, shape (m,).
             high: Likewise.
             least: The control that violates the rows least, if one is known.
-            readable: False if the state is not a number: braking is then no control, for want of a motion to brake.
+            readable: False if the state is not a number: then there is no motion to brake.
         """
         if callable(self._choice):
             assert plant is not None
             control = np.asarray(self._choice(plant), dtype=np.float64)
             if control.shape != low.shape:
-                raise ConfigurationError(
-                    f"the fallback must return a control of shape {low.shape}, got {control.shape}"
-                )
+                wanted = f"the fallback must return a control of shape {low.shape}"
+                raise ConfigurationError(f"{wanted}, got {control.shape}")
         elif self._choice == "hold":
             control = last
         elif self._choice == "zero" or not readable:
@@ -83,17 +76,15 @@ class Fallback:
         backup = next((b for c in self._constraints if (b := c.backup()) is not None), None)
         if backup is not None:
             return np.asarray(backup, dtype=np.float64)
-        if plant is not None and plant.can_brake:
-            return brake(plant)
-        return least
+        return brake(plant) if plant is not None and plant.can_brake else least
 
 
 def brake(plant: Any) -> Array:
-    """The control that leaves the least kinetic energy at the end of the hold, in the linear model.
+    """The control that leaves the least kinetic energy at the end of the hold, in the linear model, shape (m,).
 
-    Energies are counted joint by joint (the diagonal of the inertia). A small weight on the control settles
-    actuators that do not matter. Best effort: it opposes motion, it does not balance. A plant whose controls are no
-    forces brakes as its forecasts do.
+    Energies are counted joint by joint (the diagonal of the inertia). A small weight on the control settles actuators
+    that do not matter. Best effort: it does not balance. A plant whose controls are no forces brakes as its forecasts
+    do.
     """
     if not plant.has_acceleration:
         return np.asarray(plant.braking())

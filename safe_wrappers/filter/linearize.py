@@ -3,16 +3,11 @@
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from safe_wrappers.filter.constraint import HalfSpaces
+from safe_wrappers.filter.constraint import Array, HalfSpaces
 
-Array = NDArray[np.float64]
-
-_STEP = 1e-4
-"""Width of the differences, as a share of the control's range."""
-_INWARD = 0.01
-"""Aim this share of the violation beyond the boundary, so that repeated linearisations end inside it."""
+_STEP = 1e-4  # width of the differences, as a share of the control's range
+_INWARD = 0.01  # aim this share of the violation beyond the boundary, to end inside it
 
 
 def linearize(slacks: Callable[[Array], Array], control: Array, low: Array, high: Array) -> HalfSpaces:

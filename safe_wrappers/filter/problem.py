@@ -1,7 +1,4 @@
-"""A projection's answer, and the sizes that say what is small in a problem.
-
-What is small is a share of the problem's own size, so that a control in N and one in MN get the same answer.
-"""
+"""A projection's answer, and the sizes that say what is small: shares of the problem's own size, N or MN alike."""
 
 import functools
 import math
@@ -17,8 +14,7 @@ FEASIBILITY_TOLERANCE = 1e-9
 """Largest residual that the nominal may have, as a share of `residual_scales`; answers may have ten times as much."""
 EXACT_SHARE = 1e-3
 """Share of what the nominal is allowed that round-off leaves. More may be far from every admissible control."""
-_NARROWEST = 1e-6
-"""A box narrower than this share of its distance from zero counts as this wide: rounding grows with the latter."""
+_NARROWEST = 1e-6  # a box narrower than this share of its distance from zero counts as this wide: rounding
 ORDINARY_BOX = 16.0
 """Boxes within this factor of one are not rescaled: a solver's tolerances fit them as they are."""
 NO_BOUND = 1e15
@@ -47,8 +43,7 @@ class Projection(NamedTuple):
         control: Shape (m,), always finite and inside the box.
         status: See `Status`; compares equal to its string.
         violation: Largest `normals @ control - offsets` over all rows, at least 0, in row units.
-        multipliers: One per row, shape (k,), at least 0; zeros unless `projected`. With the box's own
-            multipliers they make the KKT conditions hold.
+        multipliers: One per row, shape (k,), at least 0; zeros unless `projected`. The box's own are not among them.
         iterations: Of the backend; 0 where no solver was called.
     """
 
@@ -60,19 +55,12 @@ class Projection(NamedTuple):
 
 
 class BoxSize(NamedTuple):
-    """How wide a box is.
+    """How wide a box is."""
 
-    Attributes:
-        half: Of its width, per component.
-        widest: The largest of them.
-        even: All are the same.
-        ordinary: Controls are of order one.
-    """
-
-    half: tuple[float, ...]
-    widest: float
-    even: bool
-    ordinary: bool
+    half: tuple[float, ...]  # half of its width, per component
+    widest: float  # the largest half
+    even: bool  # all are the same
+    ordinary: bool  # controls are of order one
 
 
 @functools.lru_cache(maxsize=256)
@@ -83,9 +71,8 @@ def box_size(lower: bytes, upper: bytes) -> BoxSize:
         for bottom, top in zip(np.frombuffer(lower).tolist(), np.frombuffer(upper).tolist(), strict=True)
     )
     widest = max(half, default=0.0)
-    return BoxSize(
-        half, widest, widest == min(half, default=0.0), 1.0 / ORDINARY_BOX <= widest <= ORDINARY_BOX
-    )
+    even, ordinary = widest == min(half, default=0.0), 1.0 / ORDINARY_BOX <= widest <= ORDINARY_BOX
+    return BoxSize(half, widest, even, ordinary)
 
 
 def residual_scale(box: float, length: float, values: float) -> float:
@@ -96,9 +83,7 @@ def residual_scale(box: float, length: float, values: float) -> float:
         length: Of the normal: what it changes by over one control unit.
         values: Size of the two numbers that the row compares.
     """
-    if box >= NO_BOUND * length:
-        return values
-    return min(box, max(values, length))
+    return values if box >= NO_BOUND * length else min(box, max(values, length))
 
 
 def residual_scales(u: Array, a: Array, b: Array, length: Array, box: BoxSize) -> Array:

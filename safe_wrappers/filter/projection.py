@@ -1,17 +1,14 @@
 """The minimal intervention: the control closest to the nominal one inside every half-space and the box.
 
-Source: appendix "Minimal-intervention quadratic program" and Systems Perspective 1.1: feasibility comes before
-invariance, and clamping a projection afterwards is not the projection with a box.
+Source: appendix "Minimal-intervention quadratic program" and Systems Perspective 1.1.
 
 The ways through, cheapest first: the nominal is feasible (returned bit for bit, no solver); one row and a box
-(exact, by the breakpoints of a piecewise linear function); else a QP backend. Every answer is checked with
-our own residual, whatever the solver says of it. Calls share no state, so a failed solve cannot spoil the next.
-
-Solvers know only absolute tolerances; they get the problem divided by a power of two, which rounds nothing.
+(exact); else a QP backend. Every answer is checked with our own residual. Calls share no state. Solvers know only
+absolute tolerances; they get the problem divided by a power of two, which rounds nothing.
 """
 
 import math
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,16 +31,15 @@ __all__ = [
     "Projection",
     "Status",
     "box_least_squares",
+    "cast_inside",
     "check_solver",
     "keeps_rows",
     "project",
     "project_unchecked",
 ]
 
-_SHORTEST = 1e-6
-"""Rows shorter than this, or longer than its inverse, are looked at one by one before a solver sees them."""
-_OVERFLOWING = 1e300
-"""Where a sum is not finite, numbers from here on are taken as infinite."""
+_SHORTEST = 1e-6  # rows shorter than this, or longer than its inverse, are looked at one by one
+_OVERFLOWING = 1e300  # where a sum is not finite, numbers from here on are taken as infinite
 
 
 def project(
@@ -56,22 +52,19 @@ def project(
 ) -> Projection:
     """Project a nominal control onto `{u : normals @ u <= offsets, lower <= u <= upper}`.
 
+    A nominal that misses a row by up to 1e-9 of what half of the box changes of it counts as admissible; an answer
+    may miss it by ten times as much. Where the box is wide (more than 16 control units) or open, the numbers that the
+    row compares take its place. An infeasible problem gives the least violation: the smallest sum of squared,
+    normalised violations, and among those the control closest to `u_nom`.
+
     Args:
         u_nom: Nominal control, shape (m,), finite.
-        normals: Row normals, shape (k, m); k may be 0. Rows may be degenerate: a zero normal with a
-            non-negative offset is dropped, with a negative one it makes the problem infeasible.
+        normals: Row normals, shape (k, m); k may be 0. A zero normal with a non-negative offset is dropped, with a
+            negative one it makes the problem infeasible.
         offsets: Shape (k,).
         lower: Box, shape (m,); -inf is no bound.
         upper: Box, shape (m,); +inf is no bound.
         solver: "daqp" (called directly) or any installed qpsolvers backend by name.
-
-    A nominal that misses a row by up to 1e-9 of what half of the box changes of it counts as admissible; an answer
-    may miss it by ten times as much. Where the box is wide (more than 16 control units) or open, the numbers that the
-    row compares take its place.
-
-    Returns:
-        A `Projection`. Infeasible problems give the least-violation control: the smallest sum of squared,
-        normalised violations, and among those the control closest to `u_nom`.
 
     Raises:
         ConfigurationError: Shapes do not match, bounds cross, or an argument that must be finite is not.
@@ -85,9 +78,8 @@ def project(
     a = a.reshape(b.size, m) if a.ndim < 2 and a.size == b.size * m else a  # one row may come flat
     lo, hi = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     if u.ndim != 1 or a.shape != (b.size, m):
-        raise ConfigurationError(
-            f"expected u_nom (m,), normals (k, m) and offsets (k,); got {u.shape}, {a.shape} and {b.shape}"
-        )
+        wanted = "u_nom (m,), normals (k, m) and offsets (k,)"
+        raise ConfigurationError(f"expected {wanted}; got {u.shape}, {a.shape} and {b.shape}")
     try:
         if lo.shape != u.shape or hi.shape != u.shape:
             lo, hi = np.broadcast_to(lo, (m,)), np.broadcast_to(hi, (m,))
@@ -105,9 +97,8 @@ def box_least_squares(a: Array, b: Array, lower: Array, upper: Array) -> Array:
     hessian, linear = a.T @ a, -(a.T @ b)
     nearest = np.asarray(np.linalg.solve(hessian, -linear), dtype=np.float64)
     unit = control_unit(box_size(lower.tobytes(), upper.tobytes()), nearest, np.zeros(1), np.ones(1))
-    answer = solve_with_daqp(
-        hessian, linear / unit, np.zeros((0, linear.size)), np.zeros(0), lower / unit, upper / unit
-    )
+    no_rows = np.zeros((0, linear.size)), np.zeros(0)
+    answer = solve_with_daqp(hessian, linear / unit, *no_rows, lower / unit, upper / unit)
     # Without rows the problem cannot be infeasible; on a numerical failure the unbounded answer, clipped.
     return np.asarray(np.clip(nearest if answer is None else answer[0] * unit, lower, upper))
 
@@ -119,9 +110,8 @@ def check_solver(solver: str) -> None:
     import qpsolvers  # here: it imports every solver that is installed, JAX and torch among them
 
     if solver not in qpsolvers.available_solvers:
-        raise UnknownNameError(
-            f"solver {solver!r} is not installed; installed: {', '.join(sorted(qpsolvers.available_solvers))}"
-        )
+        there = ", ".join(sorted(qpsolvers.available_solvers))
+        raise UnknownNameError(f"solver {solver!r} is not installed; installed: {there}")
 
 
 def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array, solver: str) -> Projection:
@@ -179,16 +169,24 @@ def keeps_rows(control: Array, normals: Array, offsets: Array, lower: Array, upp
     return bool((kept & np.isfinite(length)).all())  # what overflows would be allowed anything
 
 
+def cast_inside(control: Array, dtype: Any, normals: Array, offsets: Array, low: Array, high: Array) -> Any:
+    """A control inside its rows and a box that is exact in `dtype`, cast to it.
+
+    Where rounding broke a row, each component moves by one unit in the last place towards feasibility.
+    """
+    sent = np.clip(control, low, high).astype(dtype)
+    if not offsets.size or dtype == np.float64:
+        return sent
+    excess = normals @ sent.astype(np.float64) - np.maximum(offsets, normals @ control)
+    worst = int(excess.argmax())
+    if excess[worst] <= 0.0:
+        return sent
+    towards = np.where(normals[worst] > 0.0, -np.inf, np.where(normals[worst] < 0.0, np.inf, sent))
+    return np.clip(np.nextafter(sent, towards.astype(dtype)), low.astype(dtype), high.astype(dtype))
+
+
 def _careful(
-    u: Array,
-    a: Array,
-    b: Array,
-    lo: Array,
-    hi: Array,
-    length: Array,
-    slack: Array,
-    unit: float,
-    solver: str,
+    u: Array, a: Array, b: Array, lo: Array, hi: Array, length: Array, slack: Array, unit: float, solver: str
 ) -> Projection:
     """Row by row: which matter, which are degenerate, which cannot be met; then a backend on unit rows."""
     # What the box alone can reach decides which rows matter; a zero normal is the extreme case.

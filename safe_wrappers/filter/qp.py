@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 
 from safe_wrappers.filter.problem import EXACT_SHARE, UNBOUNDED, Array
 
-_OPTIMALITY_TOLERANCE = 1e-4
-"""Largest distance between a backend's answer and the one its multipliers stand for, in units of `control_unit`."""
-_SOLVERS_TOLERANCE = 1e-11
-"""Of daqp, in units of `control_unit`: rows at a small angle multiply a residual by the inverse of the angle."""
-_SOFT = 1e-8
-"""Weight of the distance from the nominal beside squared violations."""
-Backend = Callable[[Array, Array, Array, Array, Array, Array], tuple[Array, Array, int] | None]
-"""(P, q, G, h, lower, upper) -> (x, row multipliers, iterations), or None when it gave up."""
+_OPTIMALITY_TOLERANCE = 1e-4  # between a backend's answer and the one of its multipliers, in `control_unit`s
+_SOLVERS_TOLERANCE = 1e-11  # of daqp, in `control_unit`s: rows at a small angle multiply a residual
+_SOFT = 1e-8  # weight of the distance from the nominal beside squared violations
+Answer = tuple[Array, Array, int]
+"""x, row multipliers, iterations."""
+Backend = Callable[[Array, Array, Array, Array, Array, Array], Answer | None]
+"""(P, q, G, h, lower, upper) -> an answer, or None when it gave up."""
 
 
 @functools.cache
@@ -41,9 +40,7 @@ def _sense(n: int) -> NDArray[np.int32]:
     return np.zeros(n, np.int32)
 
 
-def solve_with_daqp(
-    p: Array, q: Array, g: Array, h: Array, lo: Array, hi: Array
-) -> tuple[Array, Array, int] | None:
+def solve_with_daqp(p: Array, q: Array, g: Array, h: Array, lo: Array, hi: Array) -> Answer | None:
     """The `Backend` that is called directly."""
     n, k = q.size, h.size
     upper = np.minimum(np.concatenate((hi, h)), UNBOUNDED)
@@ -60,9 +57,7 @@ def solve_with_daqp(
 def _named(name: str) -> Backend:
     import qpsolvers
 
-    def solve(
-        p: Array, q: Array, g: Array, h: Array, lo: Array, hi: Array
-    ) -> tuple[Array, Array, int] | None:
+    def solve(p: Array, q: Array, g: Array, h: Array, lo: Array, hi: Array) -> Answer | None:
         problem = qpsolvers.Problem(p, q, g, h, lb=lo, ub=hi)
         try:
             with warnings.catch_warnings():  # of matrix conversions and of statuses, which we check ourselves
@@ -104,14 +99,12 @@ def solve_unit_rows(
     # Closest to the nominal among those that violate (about) as little.
     relaxed = np.maximum(h, g @ least) + 0.1 * allowed
     answer = _nearest(solve_with_daqp, u, g, relaxed, lo, hi, allowed)
-    if answer is None:
-        return least, np.zeros(h.size), 0, True
-    return *answer, True
+    return *(answer or (least, np.zeros(h.size), 0)), True
 
 
 def _nearest(
     backend: Backend, u: Array, g: Array, h: Array, lo: Array, hi: Array, allowed: Array
-) -> tuple[Array, Array, int] | None:
+) -> Answer | None:
     answer = backend(identity(u.size), -u, g, h, lo, hi)
     if answer is None:
         return None
@@ -128,14 +121,12 @@ def _nearest(
     return x, multipliers, iterations
 
 
-def _by_distance(
-    u: Array, g: Array, h: Array, lo: Array, hi: Array, allowed: Array
-) -> tuple[Array, Array, int] | None:
+def _by_distance(u: Array, g: Array, h: Array, lo: Array, hi: Array, allowed: Array) -> Answer | None:
     """The projection by non-negative least squares (Lawson and Hanson, Solving Least Squares Problems, ch. 23).
 
-    Where rows oppose each other at a small angle, a small residual can be far from every admissible control, and a
-    solver that works with residuals takes the rows for contradictory. Here the residual of the least squares is
-    `1 / sqrt(1 + distance^2)`, so whether a control exists is decided by how far away it is.
+    Where rows oppose each other at a small angle, a small residual can be far from every admissible control. The
+    residual of these least squares is `1 / sqrt(1 + distance^2)`: whether a control exists is decided by how far away
+    it is.
     """
     from scipy.optimize import nnls  # here: few need it, and it takes a while to import
 
@@ -176,25 +167,17 @@ def _polish(
     polished = fixed.copy()
     polished[free] = u[free] + step
     inside = bool((polished >= lo).all() and (polished <= hi).all())
-    if not inside or bool((g @ polished - h > allowed).any()):
-        return None
-    return polished
+    return polished if inside and not bool((g @ polished - h > allowed).any()) else None
 
 
 def _least_violation(backend: Backend, u: Array, g: Array, h: Array, lo: Array, hi: Array) -> Array | None:
     """Minimise the squared violations of unit rows over the box; the box itself is never softened."""
     m, k = u.size, h.size
-    weight = np.concatenate([np.full(m, _SOFT), np.ones(k)])
+    weight = np.diag(np.concatenate([np.full(m, _SOFT), np.ones(k)]))
     linear = np.concatenate([-_SOFT * u, np.zeros(k)])
     rows = np.hstack([g, -np.eye(k)])
-    answer = backend(
-        np.diag(weight),
-        linear,
-        rows,
-        h,
-        np.concatenate([lo, np.zeros(k)]),
-        np.concatenate([hi, np.full(k, np.inf)]),
-    )
+    low, high = np.concatenate([lo, np.zeros(k)]), np.concatenate([hi, np.full(k, np.inf)])
+    answer = backend(weight, linear, rows, h, low, high)
     if answer is None or not np.isfinite(answer[0]).all():
         return None
     return cast(Array, np.clip(answer[0][:m], lo, hi))

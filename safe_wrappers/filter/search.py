@@ -1,7 +1,6 @@
 """From a boxed proposal to an admissible action: a ladder of stages, the cheapest first.
 
-Each stage is a method of `SafeActionSearch` that returns the control it has found, or None; `Decision.stage` names
-the one that answered.
+Each stage is a method that returns the control it has found, or None; `Decision.stage` names the one that answered.
 """
 
 from collections.abc import Sequence
@@ -11,22 +10,18 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.filter.constraint import BoundConstraint, HalfSpaces
+from safe_wrappers.filter.constraint import Array, BoundConstraint, HalfSpaces
 from safe_wrappers.filter.fallback import Fallback
 from safe_wrappers.filter.projection import Projection, Status, keeps_rows, project_unchecked
 from safe_wrappers.plants.plant import Plant
 
-Array = NDArray[np.float64]
 Rows = tuple[Array, Array]
 """`normals @ u <= offsets`: shapes (k, m) and (k,)."""
 _NO_ROWS: Rows = (np.zeros((0, 0)), np.zeros(0))
 
-_LINEARIZATIONS = 6
-"""How often a refused control is answered by linearising anew about it."""
-_OVERSHOOTS = (0.02, 0.1)
-"""Shares by which a refused correction is made larger where no constraint can linearise anew."""
-_BLENDS = (0.1, 0.25, 0.5, 0.75)
-"""How far a refused control is moved towards the backup control, step by step."""
+_LINEARIZATIONS = 6  # how often a refused control is answered by linearising anew about it
+_OVERSHOOTS = (0.02, 0.1)  # shares by which a refused correction is made larger
+_BLENDS = (0.1, 0.25, 0.5, 0.75)  # shares of the way from a refused control to the backup control
 
 
 class Stage(IntEnum):
@@ -137,7 +132,7 @@ class SafeActionSearch:
             if result.status is Status.INACTIVE and control is proposal:
                 return Decision(proposal, Stage.PROPOSAL, changed=False)
             if result.status in (Status.INFEASIBLE, Status.FAILED):
-                return self._fall_back(control, last, infeasible=result.status is Status.INFEASIBLE)
+                return self._unprojected(result.status, control, last)
             if not self._predicting or self._admitted(control):
                 return self._projected(proposal, control, Stage.ROWS, strict)
         else:
@@ -161,7 +156,7 @@ class SafeActionSearch:
             rows = strict
             result, control = self._project(proposal, *rows)
         if result.status in (Status.INFEASIBLE, Status.FAILED):
-            return self._fall_back(control, last, infeasible=result.status is Status.INFEASIBLE)
+            return self._unprojected(result.status, control, last)
         if self._admitted(control):
             return self._projected(proposal, control, Stage.ROWS, rows)
         admitted, control, rows = self.relinearize(proposal, control, rows, strict)
@@ -172,11 +167,7 @@ class SafeActionSearch:
     def relinearize(
         self, proposal: Array, control: Array, rows: Rows, strict: Rows
     ) -> tuple[bool, Array, Rows]:
-        """Project again with rows linearised about each refused answer.
-
-        Returns:
-            Whether an answer is admitted; the last answer; the rows that it was projected on.
-        """
+        """Project again with rows linearised about each refused answer: whether one is admitted, it, its rows."""
         for left in reversed(range(_LINEARIZATIONS)):
             tangents = self._tangents(control)
             if not tangents[1].size:
@@ -265,8 +256,8 @@ class SafeActionSearch:
     def _projected(self, proposal: Array, control: Array, stage: Stage, rows: Rows) -> Decision:
         return Decision(control, stage, changed=bool((control != proposal).any()), rows=rows)
 
-    def _fall_back(self, least: Array, last: Array, infeasible: bool) -> Decision:
-        control = self._fallback_control(least, last)
+    def _unprojected(self, status: Status, least: Array, last: Array) -> Decision:
+        control, infeasible = self._fallback_control(least, last), status is Status.INFEASIBLE
         return Decision(control, Stage.FALLBACK, fallback=True, infeasible=infeasible)
 
     def _fallback_control(self, least: Array | None, last: Array) -> Array:
@@ -312,9 +303,8 @@ class SafeActionSearch:
         force = np.clip(nominal, least, most)
         reach, box = most - least, high - low
         unit = np.where((reach > 0.0) & np.isfinite(box), reach / np.where(box > 0.0, box, 1.0), 1.0)
-        result = project_unchecked(
-            force / unit, normals * unit, offsets, least / unit, most / unit, self._solver
-        )
+        scaled = force / unit, normals * unit, offsets, least / unit, most / unit
+        result = project_unchecked(*scaled, self._solver)
         if result.status is Status.INACTIVE:
             return result, nominal
         # A component that saturates as the policy's did stays the policy's: the force is the same.

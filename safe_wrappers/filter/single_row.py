@@ -19,9 +19,9 @@ from safe_wrappers.filter.problem import (
 def project_single_row(u: Array, a: Array, b: Array, lo: Array, hi: Array) -> Projection:
     """Exact projection on one half-space and the box, in scalars: at this size they beat arrays.
 
-    The solution is `clip(u - lam * a, lo, hi)` for the smallest lam >= 0 at which `a @ clip(...)` has come
-    down to the limit; that function of lam is non-increasing and piecewise linear, so its breakpoints are
-    walked in order. Where it never comes down, the corner with the smallest `a @ u` violates least.
+    The solution is `clip(u - lam * a, lo, hi)` for the smallest lam >= 0 at which `a @ clip(...)`, non-increasing and
+    piecewise linear in lam, has come down to the limit. Where it never does, the corner with the smallest `a @ u`
+    violates least.
     """
     nominal, slope, low, high = u.tolist(), a[0].tolist(), lo.tolist(), hi.tolist()
     limit = float(b[0])

@@ -1,4 +1,4 @@
-"""What the filter knows of a machine: its dynamics, read from an env at every step."""
+"""Models of machines for the filter, read from an env at every step."""
 
 from safe_wrappers.plants.analytic import AnalyticPlant
 from safe_wrappers.plants.displacement import DisplacementPlant

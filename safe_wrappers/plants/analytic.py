@@ -6,20 +6,13 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from safe_wrappers.checks import Array, non_negative, positive
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.env_checks import (
-    check_delay,
-    check_timing,
-    read_attribute,
-    refuse_second_env,
-    seconds,
-)
+from safe_wrappers.plants.env_checks import check_timing, read_attribute, refuse_second_env
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 @deprecated_parameters(renamed={"hold_s": "control_dt"})
@@ -29,14 +22,13 @@ class AnalyticPlant(Plant):
     Args:
         f: x of shape (n,) to the drift, shape (n,), in state units per second.
         g: x to the control matrix, shape (n, m).
-        state: Takes the (unwrapped) env, returns x.
-        lower: Smallest control, shape (m,) or scalar; None takes the action space's.
-        upper: Largest control, likewise.
-        control_dt: Control interval in s; None takes the env's `dt`. An env that names none needs it.
+        state: The unwrapped env to x.
+        lower, upper: Smallest and largest control, shape (m,) or scalar; None takes the action space's.
+        control_dt: Control interval in s; None takes the env's `dt`, and an env without `dt` needs it.
         delay_s: Delay from measurement to effect in s; predicted over with the commands in flight.
 
     Raises:
-        ConfigurationError: Shapes that do not fit, values that are not finite, or a hold interval that is wrong or
+        ConfigurationError: Shapes that do not fit, values that are not finite, or a control interval that is wrong or
             missing.
 
     Example:
@@ -50,7 +42,7 @@ class AnalyticPlant(Plant):
     """
 
     control_dt: float
-    """Control interval, s; without a `control_dt` of the user's known once the plant is bound to an env."""
+    """Control interval, s; where the env's `dt` is taken, it is known once the plant is bound."""
 
     def __init__(
         self,
@@ -66,22 +58,21 @@ class AnalyticPlant(Plant):
             if not callable(function):
                 raise ConfigurationError(f"{name} must be a function, got {function!r}")
         self._f, self._g, self._state_of = f, g, state
-        self._given_control_dt = None if control_dt is None else seconds("control_dt", control_dt)
+        self._given_control_dt = None if control_dt is None else positive("control_dt", control_dt, "s")
         if self._given_control_dt is not None:
             self.control_dt = self._given_control_dt
-        self.delay_s = seconds("delay_s", delay_s)
+        self.delay_s = non_negative("delay_s", delay_s, "s")
         self._box = (lower, upper)
-        self._env: gym.Env[Any, Any] | None = None
+        self._env: Any = None
         self._x = np.zeros(0)
         self._drift: Array | None = None
         self._effect: Array | None = None
         self._pending: deque[Array] = deque()
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
-        """Attach to an env: checks the time step and the bounds."""
+        """Attach to an env; checks the control interval and the bounds."""
         refuse_second_env(self._env, env)
         self.control_dt = check_timing(env, self._given_control_dt)
-        check_delay(self.delay_s)
         self._pending = deque(maxlen=max(1, int(np.ceil(self.delay_s / self.control_dt - 1e-9))))
         space = env.action_space
         assert isinstance(space, gym.spaces.Box)  # the filter has refused every other space
@@ -101,12 +92,11 @@ class AnalyticPlant(Plant):
         self._env = env
 
     def observe(self) -> None:
-        """Read the state, predict it over the delay."""
+        """Read the state and predict it over the delay."""
         self.observation_id += 1
-        assert self._env is not None  # bound by the filter
         x = np.array(self._state_of(self._env.unwrapped), dtype=np.float64).reshape(-1)
         if self.delay_s > 0.0:
-            x = self._advance(x)
+            x = self._after_delay(x)
         self._x, self._drift, self._effect = x, None, None
 
     def executed(self, control: Array | None) -> None:
@@ -116,20 +106,17 @@ class AnalyticPlant(Plant):
         elif self.delay_s > 0.0:
             self._pending.append(np.array(control))
 
-    def _advance(self, x: Array) -> Array:
-        """RK4 through the commands in flight, the oldest first: it has acted in part already.
-
-        Before the first command of an episode no control acts.
-        """
+    def _after_delay(self, x: Array) -> Array:
+        """Integrate over the commands in flight, the oldest first: it has acted in part already."""
         early = self.delay_s - self.control_dt * len(self._pending)
-        if early > 0.0:
+        if early > 0.0:  # before the first command of an episode no control acts
             x = self.integrate(x, np.zeros(self._lower.size), early)
         for i, control in enumerate(self._pending):
             x = self.integrate(x, control, self.control_dt + (min(early, 0.0) if i == 0 else 0.0))
         return x
 
     def integrate(self, x: Array, control: Array, span_s: float, substeps: int = 4) -> Array:
-        """The state after holding a control for `span_s`, by classical Runge-Kutta."""
+        """The state after a control held for `span_s`, by classical Runge-Kutta."""
         step = span_s / substeps
         for _ in range(substeps):
             k1 = self._rate(x, control)
@@ -140,9 +127,9 @@ class AnalyticPlant(Plant):
         return x
 
     def path(self, control: Array) -> list[Array]:
-        """The states half-way through and at the end of a held control, by one Runge-Kutta step.
+        """States half-way and at the end of a held control, by one Runge-Kutta step.
 
-        And the end by one Euler step: many envs integrate that way, and their truth counts.
+        And the end by one Euler step, by which many envs integrate.
         """
         x, hold = self._x, self.control_dt
         k1 = self.f + self.g @ control
@@ -153,7 +140,7 @@ class AnalyticPlant(Plant):
         return [x + 0.5 * hold * k3, end, x + hold * k1]
 
     def _rate(self, x: Array, control: Array) -> Array:
-        return np.asarray(self._f(x), dtype=np.float64) + np.asarray(self._g(x), dtype=np.float64) @ control
+        return self.drift(x) + self.effect(x) @ control
 
     @property
     def state(self) -> Array:
@@ -164,7 +151,7 @@ class AnalyticPlant(Plant):
     def f(self) -> Array:
         """Drift at the state, shape (n,)."""
         if self._drift is None:
-            self._drift = np.asarray(self._f(self._x), dtype=np.float64)
+            self._drift = self.drift(self._x)
             if self._drift.shape != self._x.shape:
                 raise ConfigurationError(
                     f"f must return the shape of the state {self._x.shape}, got {self._drift.shape}"
@@ -175,11 +162,10 @@ class AnalyticPlant(Plant):
     def g(self) -> Array:
         """Control matrix at the state, shape (n, m)."""
         if self._effect is None:
-            self._effect = np.asarray(self._g(self._x), dtype=np.float64)
-            if self._effect.shape != (self._x.size, self._lower.size):
+            self._effect, expected = self.effect(self._x), (self._x.size, self._lower.size)
+            if self._effect.shape != expected:
                 raise ConfigurationError(
-                    f"g must return shape (states, controls) = {(self._x.size, self._lower.size)}, "
-                    f"got {self._effect.shape}"
+                    f"g must return shape (states, controls) = {expected}, got {self._effect.shape}"
                 )
         return self._effect
 
@@ -203,5 +189,4 @@ class AnalyticPlant(Plant):
 
     def attribute(self, name: str) -> Any:
         """Read a published fact of the env."""
-        assert self._env is not None
         return read_attribute(self._env, name)

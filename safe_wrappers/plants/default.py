@@ -1,22 +1,33 @@
-"""Which plant describes an env, where the user names none."""
+"""Which plant describes an env: the user's, one that a spec recorded, or the default."""
 
+import copy
 from typing import Any
 
 import gymnasium as gym
 
+from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.displacement import DisplacementPlant
 from safe_wrappers.plants.mujoco.displacement_step import moves_by_displacement
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 
 
-def plant_of_the_present(plant: Plant, env: gym.Env[Any, Any]) -> Plant:
-    """One on the env's own model and without delay in place of a MujocoPlant, bound; any other plant as it is."""
-    if not isinstance(plant, MujocoPlant):
-        return plant
-    present = default_plant(env)
-    present.bind(env)
-    return present
+class PlantTemplate:
+    """A plant as an env's spec keeps it: every env that is made from the spec gets a copy."""
+
+    def __init__(self, plant: Plant) -> None:
+        self.plant = plant
+
+
+def own_plant(plant: Any) -> Plant | None:
+    """The given plant, a copy of it if it comes from a spec, or an error if it is not a plant."""
+    if isinstance(plant, PlantTemplate):
+        return copy.deepcopy(plant.plant)
+    if plant is not None and not isinstance(plant, Plant):
+        raise ConfigurationError(
+            f"plant is a MujocoPlant, an AnalyticPlant or another subclass of sw.Plant, got {plant!r}"
+        )
+    return plant
 
 
 def default_plant(env: gym.Env[Any, Any]) -> MujocoPlant:

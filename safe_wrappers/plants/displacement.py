@@ -5,8 +5,8 @@ from typing import Any, ClassVar, NoReturn
 import gymnasium as gym
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array, positive
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.displacement_step import (
     DisplacementRecorder,
@@ -16,62 +16,39 @@ from safe_wrappers.plants.mujoco.displacement_step import (
 from safe_wrappers.plants.mujoco.forecast import Forecast, Recorder
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
-Array = NDArray[np.float64]
-
 _WORKS = "Workspace, JointPositionLimit, JointSpeedLimit, SpeedLimit, SingularityMargin, Upright"
 
 
 class DisplacementPlant(MujocoPlant):
     """Actions `(dx, dy, dz, fingers)` in [-1, 1] that move a mocap body, which pulls the gripper after it.
 
-    At the start of a step the env puts the mocap body where MuJoCo last evaluated the gripper (`data.xpos`: after a
-    step it lags one physics substep behind the positions, unless the env has called `mj_forward` since), moves it by
-    `metres_per_unit` times the action, and leaves a soft weld to pull the arm after it. This plant does the same to
-    its own copy of the model. So forecasts are the env's own step, bit for bit, for actions in the action space's
-    dtype; an action in another precision is rounded to it first (a displacement of some nm).
-
-    What it is not: a machine `x' = f(x) + g(x) u`. A displacement is no force, and no acceleration follows from it
-    that would hold over the step: `f`, `g`, `acceleration` and `point` are refused, and with them the constraints
-    that need rows. Those that forecast work: Workspace and its obstacles, joint positions and speeds, SpeedLimit.
-
-    Braking is a displacement of zero: the mocap body stays where the gripper is. After steps at full displacement
-    (31 to 33 mm each) the gripper moves on by 4 to 6 mm, and in the control interval after that it is slower than
-    0.03 m/s. Then it sinks under its weight, by 4 mm/s, and where the arm is nearly stretched and the gripper tilted,
-    it is pulled upright and back, by up to 6 mm per step. A displacement against the motion, of 0.02 s times the
-    speed, stops it 2 to 3 mm earlier, and it swings back five times as fast.
+    The plant repeats the env's own step on a copy of the model, so that its forecasts are exact, bit for bit, for
+    actions in the action space's dtype; others are rounded to it first (some nm). `f`, `g`, `acceleration` and
+    `point` raise, because no acceleration follows from a displacement: constraints that need rows cannot be used,
+    those that forecast can. Braking is a displacement of zero; from full speed the gripper moves on by 4 to 6 mm.
 
     Args:
-        model: The filter's model; None copies the env's. Pass another (other masses) to test mismatch.
+        model: As in `MujocoPlant`.
         delay_s: As in `MujocoPlant`, in whole control intervals; before the first command zero displacements act.
         metres_per_unit: Displacement of an action of 1, m.
 
     Attributes:
         gripper: Name of the body that the mocap body pulls.
-        blocked: Whether the env keeps the fingers closed, so that the last entry of an action does nothing.
+        blocked: Whether the env keeps the fingers closed; then the last entry of an action has no effect.
 
     Raises:
-        UnsupportedEnvError: Not an env of the Fetch kind: one mocap body welded to one body, four actions in
-            [-1, 1], `n_substeps` and `block_gripper`.
+        UnsupportedEnvError: Not an env of the Fetch kind: one mocap body welded to one body, four actions,
+            `n_substeps` and `block_gripper`.
         ConfigurationError: A delay that is not a whole number of control intervals.
     """
 
     has_acceleration: ClassVar[bool] = False
 
     def __init__(
-        self,
-        model: mujoco.MjModel | None = None,
-        delay_s: float = 0.0,
-        metres_per_unit: float = 0.05,
+        self, model: mujoco.MjModel | None = None, delay_s: float = 0.0, metres_per_unit: float = 0.05
     ) -> None:
         super().__init__(model, delay_s)
-        try:
-            self.metres_per_unit = float(metres_per_unit)
-        except (TypeError, ValueError):
-            self.metres_per_unit = np.nan
-        if not 0.0 < self.metres_per_unit < np.inf:
-            raise ConfigurationError(
-                f"metres_per_unit is a displacement in m per unit of action, > 0; got {metres_per_unit!r}"
-            )
+        self.metres_per_unit = positive("metres_per_unit", metres_per_unit, "m per unit of action")
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
         """Attach to an env and copy its model."""
@@ -87,6 +64,7 @@ class DisplacementPlant(MujocoPlant):
         self._pose = np.zeros(7)
         self._body = gripper_of(raw.model)
         super().bind(env)
+        self._clamped = False  # all of the action space acts
         self.gripper = self.model.body(self._body).name
         delayed = self._delay_steps / self.substeps
         if delayed != int(delayed):
@@ -105,7 +83,7 @@ class DisplacementPlant(MujocoPlant):
         )
 
     def observe(self) -> None:
-        """Take the env's present state, and where MuJoCo last evaluated the gripper."""
+        """Take the env's present state, and the gripper's pose as MuJoCo last evaluated it."""
         data: mujoco.MjData = self._raw.data
         self._pose[:3], self._pose[3:] = data.xpos[self._body], data.xquat[self._body]
         super().observe()
@@ -125,45 +103,21 @@ class DisplacementPlant(MujocoPlant):
         self._pose[:3], self._pose[3:] = self.data.xpos[self._body], self.data.xquat[self._body]
 
     def forecast(self, control: Array, horizon: int = 1) -> Forecast:
-        """What a displacement leads to: held for one control interval, then none."""
-        if self.blocked:  # one forecast for all that differ in what does nothing
+        """A displacement, shape (4,), for one control interval, then none."""
+        if self.blocked:  # the last entry has no effect: share the forecast
             control = np.append(control[:3], 0.0)
         return super().forecast(control, horizon)
 
-    def forward(self) -> mujoco.MjData:
-        """The plant's data, every derived quantity up to date at the present state, mocap body and servos as set."""
-        self._load()
-        if not self._forwarded:
-            mujoco.mj_forward(self.model, self.data)
-            self._forwarded = True
-        return self.data
-
-    @property
-    def acting_range(self) -> tuple[Array, Array]:
-        """All of the action space acts."""
-        return self._lower, self._upper
-
-    @property
-    def f(self) -> Array:
-        """Refused: see the class."""
-        self.require_acceleration("f")
-
-    @property
-    def g(self) -> Array:
-        """Refused: see the class."""
-        self.require_acceleration("g")
+    def _linearise(self) -> None:
+        mujoco.mj_forward(self.model, self.data)
 
     @property
     def acceleration(self) -> tuple[Array, Array]:
-        """Refused: see the class."""
-        self.require_acceleration("acceleration")
-
-    def point(self, kind: str, name: str) -> tuple[Array, Array, Array, Array]:
-        """Refused: see the class; `motion` has position and velocity."""
-        self.require_acceleration("point")
+        """Raises, as `f`, `g` and `point` do; `motion` has position and velocity."""
+        self.require_acceleration("`f`, `g`, `acceleration` or `point`")
 
     def require_acceleration(self, asker: str) -> NoReturn:
-        """Say to who asks for accelerations that there are none, and what to use instead."""
+        """Raise an error that says what can be used instead."""
         raise UnsupportedEnvError(
             f"{asker} needs the acceleration that an action causes; on a {type(self).__name__} an action is a "
             f"displacement of the gripper, from which none follows. Constraints that forecast work: {_WORKS}"

@@ -1,4 +1,4 @@
-"""What a plant or a wrapper asks of its env: time steps, action spaces, published facts, other wrappers."""
+"""What a plant or a wrapper requires of its env: time steps, action spaces, published facts, other wrappers."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -6,7 +6,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from safe_wrappers.checks import positive
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
+
+_REPEATS = ("StickyAction", "MaxAndSkipObservation", "RepeatAction")
 
 
 def read_attribute(env: gym.Env[Any, Any], name: str) -> Any:
@@ -21,7 +24,7 @@ def read_attribute(env: gym.Env[Any, Any], name: str) -> Any:
 
 
 def refuse_second_env(bound: gym.Env[Any, Any] | None, env: gym.Env[Any, Any]) -> None:
-    """A plant reads one env: shared between two filters, one of them would read the wrong machine."""
+    """Refuse a plant that is bound already: shared by two filters, one of them would read the wrong machine."""
     if bound is not None and bound.unwrapped is not env.unwrapped:
         raise ConfigurationError(
             "this plant is bound to another env already; give every filter a plant of its own (in a vector env, "
@@ -38,12 +41,9 @@ def wrappers_of(env: gym.Env[Any, Any]) -> Iterator[Any]:
 
 
 def name_of(env: gym.Env[Any, Any]) -> str:
-    """What to call an env in a message: its id, or what it says of itself."""
+    """What to call an env in a message: its id, else its repr."""
     spec = env.unwrapped.spec
     return spec.id if spec is not None else repr(env.unwrapped)
-
-
-_REPEATS = ("StickyAction", "MaxAndSkipObservation", "RepeatAction")
 
 
 def refuse_changed_actions(env: gym.Env[Any, Any]) -> None:
@@ -56,38 +56,24 @@ def refuse_changed_actions(env: gym.Env[Any, Any]) -> None:
             )
 
 
-def seconds(name: str, value: Any) -> float:
-    """A number of seconds, or an error that names the parameter."""
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        raise ConfigurationError(f"{name} is a time in seconds, got {value!r}") from None
-
-
-def check_delay(delay_s: float) -> None:
-    """Refuse a delay that is negative or not finite."""
-    if not (np.isfinite(delay_s) and delay_s >= 0.0):
-        raise ConfigurationError(f"delay_s is a time in seconds, >= 0; got {delay_s}")
-
-
 def check_timing(env: gym.Env[Any, Any], control_dt: float | None) -> float:
     """How long one action is held, s: the env's `dt`, or `control_dt` where the env has none.
 
     Raises:
-        ConfigurationError: Neither is there, or they disagree, or it is no time above 0.
+        ConfigurationError: Neither is given, they disagree, or it is not a finite time above 0.
     """
     try:
         dt = float(env.get_wrapper_attr("dt"))
     except (AttributeError, TypeError, ValueError):
         dt = None
-    if control_dt is None and dt is None:
+    if control_dt is not None:
+        hold = positive("control_dt", control_dt, "s")
+    elif dt is not None:
+        hold = positive("the env's dt", dt, "s")
+    else:
         raise ConfigurationError(
             f"{name_of(env)} does not say how long a step lasts (it has no attribute dt): pass control_dt, in seconds"
         )
-    hold = seconds("control_dt", dt if control_dt is None else control_dt)
-    if not (np.isfinite(hold) and hold > 0.0):
-        whose = "the env's dt" if control_dt is None else "control_dt"
-        raise ConfigurationError(f"{whose} is the control interval in seconds, > 0; got {hold}")
     if dt is not None and not np.isclose(dt, hold, rtol=1e-6):
         raise ConfigurationError(
             f"control_dt = {hold} s, but one step of this env lasts dt = {dt} s; a filter that looks ahead by "
@@ -99,13 +85,14 @@ def check_timing(env: gym.Env[Any, Any], control_dt: float | None) -> float:
 def check_actions(env: gym.Env[Any, Any]) -> gym.spaces.Box:
     """The env's action space, refused unless it is a one-dimensional, floating Box."""
     space = env.action_space
-    discrete = [part for part in _parts(space) if not _is_floating(part)]
+    box = gym.spaces.Box
+    discrete = [s for s in _parts(space) if not (isinstance(s, box) and np.issubdtype(s.dtype, np.floating))]
     if discrete:
         raise ConfigurationError(
             f"expected a continuous Box action space, got {space}: for the discrete actions of {discrete[0]} there "
             "is no closest safe action to project to"
         )
-    if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
+    if not isinstance(space, box) or len(space.shape) != 1:
         raise ConfigurationError(
             f"expected actions of shape (m,), got {space}. Give the env one flat Box of its own, from this space: "
             "`action_space = gymnasium.spaces.flatten_space(space)`, and in its step "
@@ -115,13 +102,9 @@ def check_actions(env: gym.Env[Any, Any]) -> gym.spaces.Box:
 
 
 def _parts(space: gym.Space[Any]) -> Iterator[gym.Space[Any]]:
-    """What a Dict or Tuple is made of; any other space is its own part."""
+    """The parts of a Dict or Tuple, recursively; any other space is its only part."""
     if not isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
         yield space
         return
     for part in space.values() if isinstance(space, gym.spaces.Dict) else space:
         yield from _parts(part)
-
-
-def _is_floating(space: gym.Space[Any]) -> bool:
-    return isinstance(space, gym.spaces.Box) and np.issubdtype(space.dtype, np.floating)

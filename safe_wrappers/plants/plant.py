@@ -1,20 +1,13 @@
-"""Plant: the filter's model of the machine.
-
-A Plant may be wrong on purpose (other masses, other damping): that is how mismatch is tested. What judges a
-violation is always the env, never the Plant.
-"""
+"""Plant: the filter's model of the machine. It may be wrong; violations are always judged on the env."""
 
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
 import gymnasium as gym
-import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.deprecation import deprecated_attribute
 from safe_wrappers.errors import UnsupportedEnvError
-
-Array = NDArray[np.float64]
 
 
 class Plant(ABC):
@@ -24,8 +17,8 @@ class Plant(ABC):
         control_dt: Control interval in s: how long one action is held.
         delay_s: Evidence age plus detection plus actuation delay in s; the state that the constraints see is
             predicted over it with the commands in flight.
-        observation_id: Counts observations.
-        model_version: Counts changes of the model, so that a constraint can read its constants anew.
+        observation_id: Number of observations so far.
+        model_version: Number of changes of the model, after which a constraint reads its constants again.
     """
 
     control_dt: float
@@ -40,7 +33,7 @@ class Plant(ABC):
     bounds_are_action_space: ClassVar[bool] = False
     """Whether `lower` and `upper` are the action space's at every state."""
     can_brake: ClassVar[bool] = False
-    """Whether it knows which states are velocities, so that a fallback can brake."""
+    """Whether it knows which states are velocities, as a braking fallback needs."""
 
     @property
     @abstractmethod
@@ -81,7 +74,7 @@ class Plant(ABC):
 
     @abstractmethod
     def executed(self, control: Array | None) -> None:
-        """Remember what was sent, for the delay; None forgets everything (a new episode)."""
+        """Remember a sent control, for the delay; None forgets all (a new episode)."""
 
     @abstractmethod
     def attribute(self, name: str) -> Any:
@@ -97,14 +90,14 @@ class Plant(ABC):
         return []
 
     def drift(self, x: Array) -> Array:
-        """The drift at any state, shape (n,); without a model of other states that of the present one."""
+        """The drift at any state, shape (n,); by default that of the present one."""
         return self.f
 
     def effect(self, x: Array) -> Array:
-        """The control matrix at any state, shape (n, m), likewise."""
+        """The control matrix at any state, shape (n, m); by default that of the present one."""
         return self.g
 
     def require_acceleration(self, asker: str) -> None:
-        """Refuse a constraint whose rows say what a control does to accelerations where none is known."""
+        """Refuse a constraint, named by `asker`, whose rows need f and g where there are none."""
         if not self.has_acceleration:
             raise UnsupportedEnvError(f"{asker} needs the acceleration that a control causes")

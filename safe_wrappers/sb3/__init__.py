@@ -12,8 +12,7 @@ from safe_wrappers.sb3.executed_action_replay_buffer import (
     ExecutedActionDictReplayBuffer,
     ExecutedActionReplayBuffer,
 )
-from safe_wrappers.sb3.intervention_callback import InterventionCallback
-from safe_wrappers.sb3.intervention_eval_callback import InterventionEvalCallback
+from safe_wrappers.sb3.intervention_callback import InterventionCallback, InterventionEvalCallback
 
 __all__ = [
     "ExecutedActionDictReplayBuffer",

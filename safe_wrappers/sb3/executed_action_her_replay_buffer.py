@@ -1,6 +1,4 @@
-"""Hindsight experience replay (HER) that knows what the filter executed."""
-
-from __future__ import annotations
+"""Hindsight experience replay (HER) with the action that the filter executed."""
 
 import copy
 from collections.abc import Sequence
@@ -8,32 +6,28 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.sb3.executed_action_replay_buffer import ExecutedActionReplayBuffer
+from safe_wrappers.sb3.executed_action_replay_buffer import ExecutedActionReplayBuffer, Flags, picked
 
 
 class ExecutedActionHerReplayBuffer(ExecutedActionReplayBuffer, HerReplayBuffer):
     """SB3's `HerReplayBuffer`, with the action that the filter executed and with the penalty in relabelled rewards.
 
-    HER (Andrychowicz et al., NeurIPS 2017) replays most transitions with another goal g', one that the episode did
-    reach, and the task's reward for it, r' = `compute_reward(achieved, g', info)`. Whether and how far the filter
-    changed an action does not depend on the goal, so that of a changed step
+    HER (Andrychowicz et al., NeurIPS 2017) replays most transitions with a goal g' that the episode did reach, and
+    the task's reward for it, r' = `compute_reward(achieved, g', info)`. Of a step that the filter changed
 
     - mode "safe_action" replays (s, g', a_safe, s', r');
-    - mode "both" replays that one and (s, g', a, s', r' - penalty), where the penalty is what this step cost, as
-      `AdaptionPenalty` said at the time;
-    - mode "adaption_penalty" replays the latter alone. With SB3's own `HerReplayBuffer` behind an `AdaptionPenalty`
-      relabelled rewards would have no penalty: `compute_reward` is the task's and does not know of it.
+    - mode "adaption_penalty" replays (s, g', a, s', r' - penalty), with the penalty that `AdaptionPenalty` took at
+      the time; SB3's own `HerReplayBuffer` would leave it out;
+    - mode "both" replays both.
 
-    The naive learner uses SB3's `HerReplayBuffer`. What is not changed is drawn as SB3 draws it, bit for bit with the
-    same seed. As in SB3 only whole episodes are drawn from, and a loaded buffer needs `set_env`, which
-    `load_replay_buffer` calls. The reward has to be a function of the goals alone: a wrapper that scales rewards, or
-    an `OcclusionPenalty`, is not in `compute_reward`.
+    Unchanged steps are drawn as SB3 draws them, bit for bit with the same seed. The reward has to be a function of
+    the goals alone: wrappers that change rewards, such as `OcclusionPenalty`, are not in `compute_reward`. A loaded
+    buffer needs `set_env`, which `load_replay_buffer` calls.
 
     Example:
         >>> import gymnasium as gym, gymnasium_robotics, safe_wrappers as sw
@@ -49,10 +43,10 @@ class ExecutedActionHerReplayBuffer(ExecutedActionReplayBuffer, HerReplayBuffer)
         ... )
 
     Args:
-        buffer_size, observation_space, action_space, device, n_envs, handle_timeout_termination: As in
-            `ExecutedActionReplayBuffer`; observations are a Dict with `observation`, `achieved_goal`, `desired_goal`.
         mode: "safe_action", "both" or "adaption_penalty".
-        env, n_sampled_goal, goal_selection_strategy, copy_info_dict: As in `HerReplayBuffer`. `env` comes from SB3.
+        env, n_sampled_goal, goal_selection_strategy, copy_info_dict: As in `HerReplayBuffer`; SB3 passes `env`.
+        args, more: The others as in `ExecutedActionReplayBuffer`; observations are a Dict with `observation`,
+            `achieved_goal` and `desired_goal`.
 
     Attributes:
         penalties: Modes "both" and "adaption_penalty": of each step, (buffer_size, n_envs), reward.
@@ -71,21 +65,11 @@ class ExecutedActionHerReplayBuffer(ExecutedActionReplayBuffer, HerReplayBuffer)
             # In double precision, so that a penalty comes off a relabelled reward as it came off the task's own.
             self.penalties = np.zeros(self.rewards.shape)
 
-    def add(
-        self,
-        obs: Any,
-        next_obs: Any,
-        action: NDArray[Any],
-        reward: NDArray[Any],
-        done: NDArray[Any],
-        infos: list[dict[str, Any]],
+    def _keep(
+        self, infos: Any, executed: NDArray[Any], task: NDArray[Any], changed: Flags, finite: Flags
     ) -> None:
-        """Stores one step of every env; `action` is the policy's, scaled, and `infos` hold the executed one."""
-        at = self.pos
-        super().add(obs, next_obs, action, reward, done, infos)
-        if self.mode != "safe_action":
-            finite = np.isfinite(action.reshape((self.n_envs, self.action_dim))).all(axis=1)
-            self.penalties[at] = np.where(finite, [info[keys.ADAPTION_PENALTY] for info in infos], 0.0)
+        super()._keep(infos, executed, task, changed, finite)
+        self.penalties[self.pos] = np.where(finite, [info[keys.ADAPTION_PENALTY] for info in infos], 0.0)
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
         """Draws a batch, uniformly from all transitions of whole episodes; most of them get a new goal.
@@ -95,37 +79,24 @@ class ExecutedActionHerReplayBuffer(ExecutedActionReplayBuffer, HerReplayBuffer)
         """
         if self.mode == "safe_action" or not self.ep_length.any():
             return HerReplayBuffer.sample(self, batch_size, env)
-        slots, envs, second = self._draw(batch_size)
+        slots, envs, _ = drawn = self._draw(batch_size)
         replayed = int(self.her_ratio * batch_size)
         goals = self._sample_goals(slots[:replayed], envs[:replayed])
-        # SB3 puts what is not relabelled first.
-        slots, envs, second = (np.roll(drawn, -replayed) for drawn in (slots, envs, second))
+        # SB3 puts the transitions with their own goals first.
+        slots, envs, second = drawn = np.roll(drawn, -replayed, axis=1)
         real = batch_size - replayed
-        before = {key: stored[slots, envs] for key, stored in self.observations.items()}
-        after = {key: stored[slots, envs] for key, stored in self.next_observations.items()}
+        before, after = (picked(part, slots, envs) for part in (self.observations, self.next_observations))
         before["desired_goal"][real:] = after["desired_goal"][real:] = goals
-        actions, rewards = self.actions[slots, envs], self.rewards[slots, envs]
+        rewards = self.rewards[slots, envs]
         if self.mode == "both":
-            actions = np.where(second[:, None], self.executed_actions[slots, envs], actions)
             rewards = np.where(second, self.task_rewards[slots, envs], rewards)
         penalties = np.where(second, 0.0, self.penalties[slots, envs])
         relabelled = self._task_rewards(after["achieved_goal"][real:], goals, slots[real:], envs[real:])
         rewards[real:] = relabelled - penalties[real:]
-        dones = self.dones[slots, envs] * (1 - self.timeouts[slots, envs])
-        observed, next_observed = (self._normalize_obs(part, env) for part in (before, after))
-        return DictReplayBufferSamples(
-            observations={key: self.to_torch(part) for key, part in dict(observed).items()},
-            actions=self.to_torch(actions),
-            next_observations={key: self.to_torch(part) for key, part in dict(next_observed).items()},
-            dones=self.to_torch(dones.reshape(-1, 1)),
-            rewards=self.to_torch(self._normalize_reward(rewards.reshape(-1, 1), env)),
-        )
+        return self._batch(drawn, before, after, rewards, env)
 
     def _draw(self, count: int) -> NDArray[np.int64]:
-        """Slots, envs and which of the two transitions, uniform over those of whole episodes.
-
-        With no second transition the numbers are drawn as SB3 draws them.
-        """
+        """Slots, envs and which of the two transitions, uniformly from whole episodes, by SB3's own random calls."""
         whole = self.ep_length > 0
         first = np.flatnonzero(whole)
         second = np.flatnonzero(whole & self.changed) if self.mode == "both" else first[:0]

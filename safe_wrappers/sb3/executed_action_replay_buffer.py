@@ -1,6 +1,4 @@
-"""A replay buffer that knows what the filter executed: the "safe action" and "both" learners."""
-
-from __future__ import annotations
+"""Replay buffers with the action that the filter executed: the "safe action" and "both" learners."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Final
@@ -16,33 +14,25 @@ from stable_baselines3.common.vec_env import VecNormalize
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ActionError, ConfigurationError
 
-MODES: Final = ("safe_action", "both")
+Flags = NDArray[np.bool_]
+
 _SAME: Final = 1e-3
-"""Two scaled actions that differ by less differ by rounding: a wrong unit differs by a share of the range."""
+"""Two scaled actions that differ by less differ by rounding only, not by their unit."""
 
 
 class ExecutedActionReplayBuffer(ReplayBuffer):
     """SB3's replay buffer for SAC, TD3 and DDPG, with the action that the filter executed.
 
-    SB3 stores the policy's action a, whatever the filter made of it ("naive" in Krasowski et al., Provably Safe
-    Reinforcement Learning, TMLR 2023). Where the filter changed the action to a_safe, this buffer stores
+    SB3 stores the policy's action a ("naive" in Krasowski et al., Provably Safe Reinforcement Learning, TMLR 2023).
+    Where the filter changed it to a_safe, this buffer stores
 
     - mode "safe_action": (s, a_safe, s', r) instead;
-    - mode "both": (s, a_safe, s', r) beside (s, a, s', r - penalty). The penalty is `AdaptionPenalty`'s, which this
-      mode needs in the env; r is the task's own reward.
+    - mode "both": (s, a_safe, s', r) beside (s, a, s', r - penalty), with the task's reward r and the penalty of the
+      `AdaptionPenalty` in the env. Batches are drawn uniformly from all transitions.
 
-    An unchanged step is stored once, as SB3 stores it, bit for bit. Actions are stored as SB3 stores them, scaled to
-    [-1, 1] as `policy.scale_action` does.
-
-    `buffer_size` counts env steps, as in SB3, so that every mode remembers equally far back. In mode "both" a changed
-    step keeps two actions and rewards and one pair of observations; batches are drawn uniformly from all transitions,
-    so that a changed step is drawn twice as often. A policy's action that is not finite is never stored: that step
-    has the executed action only.
-
-    On-policy algorithms (PPO, A2C) have no replay buffer and cannot learn from the executed action: they weigh an
-    action by the probability with which the policy drew it, and the policy did not draw this one. `AdaptionPenalty`
-    works with them. SB3 makes n-step returns with a buffer of its own; with this one returns are one-step whatever
-    `n_steps` says (SB3 warns).
+    Unchanged steps are stored as SB3 stores them, bit for bit. A policy's action that is not finite is never stored;
+    such a step has the executed action only. Returns are one-step whatever SB3's `n_steps` says. On-policy algorithms
+    have no replay buffer.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
@@ -59,30 +49,27 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         ... )
 
     Args:
-        buffer_size: Env steps to keep, over all envs.
+        buffer_size: Env steps to keep, over all envs; a changed step counts once.
         observation_space: Not a Dict; for those there is `ExecutedActionDictReplayBuffer`.
         action_space: A bounded Box.
-        device: Where batches go.
-        n_envs: Number of envs.
+        device, n_envs, handle_timeout_termination, more: As in SB3.
         optimize_memory_usage: As in SB3, mode "safe_action" only.
-        handle_timeout_termination: As in SB3.
         mode: "safe_action" or "both".
-        more: What the SB3 buffer beneath takes besides; none here, HER's in `ExecutedActionHerReplayBuffer`.
 
     Attributes:
-        actions, rewards: What SB3 expects there: in mode "both" the policy's actions and penalised rewards.
+        actions, rewards: In mode "both" the policy's actions and penalised rewards.
         executed_actions, task_rewards: Mode "both": the second transition, scaled actions (buffer_size, n_envs, nu)
             and rewards (buffer_size, n_envs).
         changed: Mode "both": where there is a second transition, (buffer_size, n_envs).
 
     Raises:
-        ConfigurationError: An unknown mode, or spaces it cannot work with; at the first step, an env without a
-            filter, without the penalty that "both" needs or with the one that "safe_action" does not take, or with a
-            wrapper outside the filter that changes actions.
+        ConfigurationError: An unknown mode or unsuitable spaces; at the first step, an env without a filter, without
+            the penalty that "both" needs, with one in "safe_action", or with a wrapper outside the filter that
+            changes actions.
         ActionError: An executed action that is not finite.
     """
 
-    modes: ClassVar[Sequence[str]] = MODES
+    modes: ClassVar[Sequence[str]] = ("safe_action", "both")
     others: ClassVar[str] = (
         "the naive learner and the one with the adaption penalty alone use SB3's own ReplayBuffer"
     )
@@ -114,16 +101,11 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
             raise ConfigurationError(
                 "mode 'both' does not work with optimize_memory_usage=True; leave it out"
             )
-        super().__init__(
-            buffer_size,
-            observation_space,
-            action_space,
-            device=device,
-            n_envs=n_envs,
-            optimize_memory_usage=optimize_memory_usage,
-            handle_timeout_termination=handle_timeout_termination,
-            **more,
-        )
+        more |= {
+            "optimize_memory_usage": optimize_memory_usage,
+            "handle_timeout_termination": handle_timeout_termination,
+        }
+        super().__init__(buffer_size, observation_space, action_space, device=device, n_envs=n_envs, **more)
         self.mode = mode
         self._low, self._high = action_space.low, action_space.high
         if mode == "both":
@@ -147,62 +129,73 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         if not np.isfinite(executed).all():
             raise ActionError(f"an executed action is not finite: {[i[keys.EXECUTED_ACTION] for i in infos]}")
         finite = np.isfinite(policy).all(axis=1)
-        self._check_units(policy[finite], self._scaled(infos, keys.PROPOSED_ACTION)[finite])
+        chosen, given = policy[finite], self._scaled(infos, keys.PROPOSED_ACTION)[finite]
+        if not (np.abs(chosen - given) < _SAME).all():
+            raise self._foreign(
+                f"scaled to [-1, 1], the policy chose {chosen} and the filter was given {given}"
+            )
         changed = np.array([bool(info[keys.CBF_INTERVENED]) for info in infos]) | ~finite
-        # Unscaling and scaling again is not the identity in floating point: what was not changed stays the policy's.
+        # Unscaling and scaling again is not the identity in floating point: unchanged actions stay the policy's.
         executed = np.where(changed[:, None], executed, policy)
         if self.mode == "safe_action":
             super().add(obs, next_obs, executed, reward, done, infos)
             return
         task = np.array([info[keys.ADAPTION_TASK_REWARD] for info in infos], dtype=np.float64)
+        self._keep(infos, executed, task, changed, finite)
+        policy = np.where(finite[:, None], policy, executed)
+        super().add(obs, next_obs, policy, np.where(finite, reward, task), done, infos)
+
+    def _keep(
+        self, infos: Any, executed: NDArray[Any], task: NDArray[Any], changed: Flags, finite: Flags
+    ) -> None:
+        """Store what SB3's buffer has no place for, at the present slot."""
         if self.mode == "both":
             self.executed_actions[self.pos], self.task_rewards[self.pos] = executed, task
             self.changed[self.pos] = changed & finite
-        super().add(
-            obs,
-            next_obs,
-            np.where(finite[:, None], policy, executed),
-            np.where(finite, reward, task),
-            done,
-            infos,
-        )
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
         """Draws a batch, uniformly from all stored transitions, with replacement."""
         if self.mode == "safe_action":
             return super().sample(batch_size, env)
-        slots, envs, second = self._draw(batch_size)
-        actions = np.where(second[:, None], self.executed_actions[slots, envs], self.actions[slots, envs])
+        slots, envs, second = drawn = self._draw(batch_size)
         rewards = np.where(second, self.task_rewards[slots, envs], self.rewards[slots, envs])
+        before, after = (picked(part, slots, envs) for part in (self.observations, self.next_observations))
+        return self._batch(drawn, before, after, rewards, env)
+
+    def _batch(
+        self, drawn: NDArray[np.int64], before: Any, after: Any, rewards: Any, env: VecNormalize | None
+    ) -> Any:
+        """The drawn transitions with these observations and rewards, as SB3 takes them."""
+        slots, envs, second = drawn
+        actions = self.actions[slots, envs]
+        if self.mode == "both":
+            actions = np.where(second[:, None], self.executed_actions[slots, envs], actions)
         dones = self.dones[slots, envs] * (1 - self.timeouts[slots, envs])
         kind: Any = DictReplayBufferSamples if isinstance(self, DictReplayBuffer) else ReplayBufferSamples
         return kind(
-            observations=self._observations(self.observations, slots, envs, env),
+            observations=self._observed(before, env),
             actions=self.to_torch(actions),
-            next_observations=self._observations(self.next_observations, slots, envs, env),
+            next_observations=self._observed(after, env),
             dones=self.to_torch(dones.reshape(-1, 1)),
             rewards=self.to_torch(self._normalize_reward(rewards.reshape(-1, 1), env)),
         )
 
+    def _observed(self, observations: Any, env: VecNormalize | None) -> Any:
+        seen: Any = self._normalize_obs(observations, env)
+        if isinstance(seen, Mapping):
+            return {key: self.to_torch(value) for key, value in seen.items()}
+        return self.to_torch(seen)
+
     def _draw(self, count: int) -> NDArray[np.int64]:
-        """Slots, envs and which of the two transitions (1 is the executed one), uniform over those that exist."""
+        """Slots, envs and which of the two transitions (1 is the executed one), shape (3, count), uniformly."""
         drawn = np.empty((3, 0), dtype=np.int64)
         while drawn.shape[1] < count:
-            # At least half of all candidates exist, and what is kept is uniform; counting the changed steps of a
-            # full buffer for every batch would cost more. NumPy's global generator, which SB3 seeds and uses.
+            # Rejection sampling: at least half of the candidates exist. Counting the changed steps of a full buffer
+            # for every batch would cost more. NumPy's global generator is the one that SB3 seeds and uses.
             tries = np.stack([np.random.randint(0, n, 2 * count) for n in (self.size(), self.n_envs, 2)])
             slots, envs, second = tries
             drawn = np.hstack([drawn, tries[:, (second == 0) | self.changed[slots, envs]]])
         return drawn[:, :count]
-
-    def _observations(
-        self, stored: Any, slots: NDArray[np.int64], envs: NDArray[np.int64], env: VecNormalize | None
-    ) -> Any:
-        if isinstance(stored, Mapping):
-            picked: Any = self._normalize_obs({k: v[slots, envs] for k, v in stored.items()}, env)
-            return {key: self.to_torch(value) for key, value in picked.items()}
-        array: Any = self._normalize_obs(stored[slots, envs], env)
-        return self.to_torch(array)
 
     def _scaled(self, infos: Sequence[Mapping[str, Any]], key: str) -> NDArray[Any]:
         """Actions from the infos as `policy.scale_action` makes them, (n_envs, nu), in its precision."""
@@ -233,18 +226,19 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
                     " which is the safe one; use mode 'both', or take the wrapper away"
                 )
 
-    def _check_units(self, policy: NDArray[Any], proposed: NDArray[Any]) -> None:
-        if not (np.abs(policy - proposed) < _SAME).all():
-            raise self._foreign(
-                f"scaled to [-1, 1], the policy chose {policy} and the filter was given {proposed}"
-            )
-
     def _foreign(self, what: str) -> ConfigurationError:
         return ConfigurationError(
             f"the filter's actions are not the policy's ({what}): a wrapper outside the filter changes actions, so"
             " the executed action is not in the policy's units; take that wrapper away (SB3 scales actions to [-1, 1]"
             " itself), or learn from the policy's action (SB3's own ReplayBuffer)"
         )
+
+
+def picked(stored: Any, slots: NDArray[np.int64], envs: NDArray[np.int64]) -> Any:
+    """A copy of the observations of some slots and envs."""
+    if isinstance(stored, Mapping):
+        return {key: part[slots, envs] for key, part in stored.items()}
+    return stored[slots, envs]
 
 
 class ExecutedActionDictReplayBuffer(ExecutedActionReplayBuffer, DictReplayBuffer):

@@ -1,11 +1,9 @@
-"""Logs what the filter did during SB3's rollouts."""
-
-from __future__ import annotations
+"""Callbacks that log what the filter did during SB3's rollouts and evaluations."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import Logger
 
 from safe_wrappers import info as keys
@@ -14,19 +12,14 @@ from safe_wrappers import info as keys
 class InterventionCallback(BaseCallback):
     """Logs interventions, corrections and costs of the training rollouts under `interventions/`.
 
-    Two kinds of values reach the logger (stdout, TensorBoard, CSV), both as means since its last dump:
+    The logger gets means since its last dump, of what the task and the layers of the stack report:
 
-    - `interventions/step_<name>`: over all steps of all envs, from the keys that the wrappers and the task write at
-      every step; `InfoKey.log` in `safe_wrappers.info` is the name of each, such as `step_rate`, `step_cost`,
-      `step_lease_braking` or `step_sigma`;
-    - `interventions/rate`, `correction_mean`, `infeasible`, `violations` and the other figures of
-      `safe_wrappers.info.EPISODE`: over the episodes that ended, from `RecordInterventions`.
+    - `interventions/step_<name>`: over all steps of all envs; `InfoKey.log` in `safe_wrappers.info` is the name of
+      each, such as `step_rate` or `step_cost`;
+    - `interventions/rate`, `correction_mean` and the other figures of `safe_wrappers.info.EPISODE`: over the episodes
+      that ended, from `RecordInterventions`.
 
-    What neither the task nor a layer of the stack reports is not logged: no filter, no `rate`; no cost, no
-    `violations`.
-
-    It reads infos only, so it works the same with `DummyVecEnv` and `SubprocVecEnv`. For evaluation use
-    `InterventionEvalCallback`.
+    It reads infos only, in any VecEnv. For evaluation use `InterventionEvalCallback`.
 
     Example:
         >>> import gymnasium as gym
@@ -43,6 +36,19 @@ class InterventionCallback(BaseCallback):
         for info in self.locals["infos"]:
             log_episode(self.logger, info, keys.RUNNING_PREFIX)
         return True
+
+
+class InterventionEvalCallback(EvalCallback):
+    """Logs `RecordInterventions`' episode values under `eval/interventions/`, beside `eval/mean_reward`.
+
+    Same arguments as SB3's `EvalCallback`, which dumps the log before any child callback runs.
+    """
+
+    def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
+        # SB3's hook into `evaluate_policy`, called at every step of every evaluation env, before the dump.
+        super()._log_success_callback(locals_, globals_)
+        if locals_["done"]:
+            log_episode(self.logger, locals_["info"], "eval/interventions/")
 
 
 def log_steps(logger: Logger, infos: Iterable[Mapping[str, Any]]) -> None:

@@ -1,37 +1,23 @@
 """AdaptionPenalty: the learner's reward is reduced where the filter changed its action."""
 
-from typing import Any, ClassVar, SupportsFloat
-
-import gymnasium as gym
+from typing import Any, ClassVar
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.stack import Layer, refuse_order
+from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.cbf_action_filter import is_filtered
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
 
 
-class AdaptionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
+class AdaptionPenalty(LayerWrapper):
     """Takes a penalty off the reward at every step at which the filter changed the action.
 
-    The "adaption penalty" of Krasowski et al. (Provably Safe Reinforcement Learning, TMLR 2023): the learner keeps
-    its own action a, and learns from r(s, a_safe) - penalty instead of r(s, a_safe), where
-
-        penalty = penalty + per_correction * |a_safe - a|    if `cbf/intervened`
-                  0                                          otherwise.
-
-    The constant alone is what their benchmark used; the part that grows with the distance is the one that they
-    give for action projection. Any algorithm can learn from it, PPO too: the action is still the policy's own.
-    What a penalty is worth depends on the task's reward; look at both before choosing it.
-
-    `compute_reward` of a task with goals stays the task's own and knows of no penalty. With hindsight replay (HER)
-    use `safe_wrappers.sb3.ExecutedActionHerReplayBuffer`, which takes the penalty off relabelled rewards too.
-
-    **Order.** filter -> `RecordInterventions` -> SB3's `Monitor` -> `AdaptionPenalty`. What lies inside sees the
-    task's own reward, so that the episodes' returns, in `info["interventions"]`, in Monitor's files and in
-    `rollout/ep_rew_mean`, can be compared with a run that has no penalty; only the learner sees the penalised one.
-    A Monitor put outside records the penalised reward. Wrappers that scale or clip rewards belong inside. For
-    evaluation leave this wrapper out.
+    The learner keeps its own action a, and its reward is r(s, a_safe) less `penalty + per_correction * |a_safe - a|`
+    (Krasowski et al., Provably Safe Reinforcement Learning, TMLR 2023). `compute_reward` of a task with goals stays
+    the task's own; with hindsight replay use `safe_wrappers.sb3.ExecutedActionHerReplayBuffer`, which takes the
+    penalty off relabelled rewards too. Put it outside `RecordInterventions` and SB3's `Monitor`, so that these record
+    the task's own reward; wrappers that scale or clip rewards belong inside. For evaluation leave it out.
 
     Args:
         env: With a `CBFActionFilter` inside.
@@ -41,8 +27,7 @@ class AdaptionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
     Info, at every step: ``adaption/penalty`` and ``adaption/task_reward`` (float), whose difference is the reward.
 
     Raises:
-        ConfigurationError: No filter inside, a second AdaptionPenalty, a penalty that is negative or not finite,
-            or none at all.
+        ConfigurationError: No filter inside, a second AdaptionPenalty, or no penalty, or one that is negative.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
@@ -52,15 +37,12 @@ class AdaptionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         >>> _, reward, _, _, info = env.step(env.action_space.sample())
         >>> float(reward) == info["adaption/task_reward"] - info["adaption/penalty"]
         True
-
-    Change log:
-        * v0.1.0: added.
     """
 
     layer: ClassVar = Layer.ADAPTION
 
-    def __init__(self, env: gym.Env[Any, Any], penalty: float = 0.0, per_correction: float = 0.0) -> None:
-        refuse_order(env, self.layer, type(self).__name__)
+    def __init__(self, env: Env, penalty: float = 0.0, per_correction: float = 0.0) -> None:
+        LayerWrapper.__init__(self, env)
         if not is_filtered(env):
             raise ConfigurationError(
                 "AdaptionPenalty needs a CBFActionFilter inside, which says when an action was changed:"
@@ -73,20 +55,17 @@ class AdaptionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
                 "AdaptionPenalty: give penalty (per changed step), per_correction (per unit of cbf/correction), or"
                 " both; with neither the learner is the naive one, which needs no wrapper"
             )
-        gym.utils.RecordConstructorArgs.__init__(self, penalty=penalty, per_correction=per_correction)
-        gym.Wrapper.__init__(self, env)
+        self._record({"penalty": penalty, "per_correction": per_correction})
         self.penalty = penalty
         self.per_correction = per_correction
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Resets the env; its info holds the keys of a step, as 0."""
         observation, info = self.env.reset(seed=seed, options=options)
         info[keys.ADAPTION_PENALTY] = info[keys.ADAPTION_TASK_REWARD] = 0.0
         return observation, info
 
-    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> Step:
         """Steps the env; an unchanged step's reward passes through untouched."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         penalty = 0.0

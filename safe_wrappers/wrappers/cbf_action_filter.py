@@ -5,51 +5,45 @@ import math
 import time
 import warnings
 from collections.abc import Sequence
-from typing import Any, ClassVar, SupportsFloat
+from typing import Any, ClassVar
 
-import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative
-from safe_wrappers.errors import ActionError, ConfigurationError, UnsafeStateWarning
+from safe_wrappers.errors import ConfigurationError, UnsafeStateWarning
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.engine import SafetyFilter
 from safe_wrappers.filter.fallback import FallbackFunction
-from safe_wrappers.filter.projection import check_solver
-from safe_wrappers.filter.rounding import cast_inside
+from safe_wrappers.filter.projection import cast_inside, check_solver
 from safe_wrappers.filter.search import Stage
-from safe_wrappers.plants.default import default_plant
+from safe_wrappers.plants.default import default_plant, own_plant
 from safe_wrappers.plants.env_checks import check_actions, wrappers_of
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.template import PlantTemplate, own_plant
 from safe_wrappers.serialize import constraint_from, plain_data
-from safe_wrappers.stack import Layer, refuse_order
-
-Array = NDArray[np.float64]
+from safe_wrappers.stack import Layer
+from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.common.receiver import action_array
 
 _SAFE_TOLERANCE = 1e-6
 """h below zero by less is rounding (of float32 actions, too), in the constraints' own units."""
 
 
-class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
+class CBFActionFilter(LayerWrapper):
     """Filters actions through constraints, all of them in one projection.
 
-    At every step: read the plant; if every constraint admits the policy's action, execute it bit for bit; else
-    project it onto the rows of all constraints and the actuator box at once, check the answer against the rows
-    and, where a constraint can, by prediction; if nothing admissible is found, run the fallback and say so.
+    At every step: if every constraint admits the policy's action, execute it bit for bit; else project it onto the
+    rows of all constraints and the actuator box at once, and check the answer against the rows and, where a
+    constraint can, by prediction; if nothing admissible is found, run the fallback and say so.
 
     **What it guarantees.** No non-finite action, and none outside the action space, reaches the env. The executed
     action satisfies every constraint's rows (to 1e-8 of half the box) or, where a constraint predicts the held
     step, its prediction; else `cbf/infeasible` or `cbf/fallback` is True. If every constraint's `promise` is
     "proved" and the plant is right within the constraints' margins, episodes that start safe stay safe at every
-    physics substep, whatever the fallback: a proved stopping control is tried before it.
+    physics substep, whatever the fallback.
 
     **What it does not.** A "best effort" constraint, a plant outside its margins, or a start that is already
-    unsafe (warned of once per episode, counted in `cbf/unsafe`) void that. It does not clip rewards or end
-    episodes. A learner that stores the policy's action learns from "naive" replays (Krasowski et al., 2023);
-    `AdaptionPenalty` and `safe_wrappers.sb3.ExecutedActionReplayBuffer` are the other choices.
+    unsafe (warned of once per episode, counted in `cbf/unsafe`) void that. It does not clip rewards or end episodes.
 
     Args:
         env: With a one-dimensional Box action space.
@@ -84,14 +78,15 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
 
     def __init__(
         self,
-        env: gym.Env[Any, Any],
+        env: Env,
         constraints: Sequence[Constraint | dict[str, Any]],
         plant: Plant | None = None,
         fallback: str | FallbackFunction = "brake",
         solver: str = "daqp",
         margin: float = 0.0,
     ) -> None:
-        refuse_order(env, self.layer, type(self).__name__)
+        arguments = dict(locals())
+        LayerWrapper.__init__(self, env)
         space = check_actions(env)
         plant = own_plant(plant)
         if isinstance(constraints, str | dict) or not isinstance(constraints, Sequence) or not constraints:
@@ -99,15 +94,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         own = [copy.deepcopy(c) for c in [*map(constraint_from, constraints)]]
         margin = non_negative("margin", margin, "the constraints' own units")
         check_solver(solver)
-        gym.utils.RecordConstructorArgs.__init__(
-            self,
-            constraints=[plain_data(c) for c in own],
-            plant=None if plant is None else PlantTemplate(plant),
-            fallback=fallback,
-            solver=solver,
-            margin=margin,
-        )
-        gym.Wrapper.__init__(self, env)
+        self._record(arguments, constraints=[plain_data(c) for c in own], plant=plant, margin=margin)
         self.constraints: list[Constraint] = [c.widened(margin) for c in own] if margin else own
         self.constraint_names = _unique([type(c).__name__ for c in self.constraints])
         self.plant: Plant = plant if plant is not None else default_plant(env)
@@ -120,9 +107,7 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         self.filter_seconds = 0.0
         self.filter_calls = 0
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env and forget the episode: commands in flight, the last action, the warning."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._warned.discard("unsafe")
@@ -132,17 +117,16 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         info[keys.CBF_MARGIN] = margin
         info[keys.CBF_UNSAFE] = unsafe
         info[keys.CBF_REFUSED] = np.zeros(len(self.constraints), dtype=bool)
-        # Nothing was proposed or executed yet. But when all sub-envs of a vector env reset at once, its infos hold
-        # these keys only if a reset reports them, and a loop reads them at every step.
+        # When all sub-envs of a vector env reset at once, its infos hold only the keys that a reset reports.
         info[keys.PROPOSED_ACTION] = np.zeros(self._shape)
         info[keys.EXECUTED_ACTION] = np.zeros(self._shape)
         info[keys.CBF_STAGE] = int(Stage.PROPOSAL)
         return observation, info | self.filter.info(None, None)
 
-    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> Step:
         """Filter the action and step the env with what may be executed."""
         started = time.perf_counter()
-        proposed = self._checked(action)
+        proposed: Array = action_array(action, self._shape, np.float64)
         self.filter.observe()
         margin, unsafe = self._margin()
         readable = self.filter.margin == self.filter.margin
@@ -150,23 +134,18 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         inside = bool(((proposed >= self._low) & (proposed <= self._high)).all())
         finite = inside or bool(np.isfinite(proposed).all())
         clipped = 0.0
-        if not readable:
-            proposed = np.where(np.isfinite(proposed), proposed, 0.0)
-            decision = self.filter.filter(None)
-        elif inside:
-            decision = self.filter.filter(proposed)
-        elif finite:
-            boxed = np.clip(proposed, self._low, self._high)
-            clipped = float(np.linalg.norm(boxed - proposed))
-            self._warn_once(
-                "clipped",
-                f"the policy's action left the action space by {clipped:.3g}; it is boxed (cbf/clipped)",
-            )
-            decision = self.filter.filter(boxed)
-        else:
-            self._warn_once("nonfinite", f"the policy's action is not finite ({proposed}); the fallback acts")
-            proposed = np.where(np.isfinite(proposed), proposed, 0.0)
-            decision = self.filter.filter(None)
+        usable: Array | None = proposed
+        if not (readable and finite):
+            if readable:
+                message = f"the policy's action is not finite ({proposed}); the fallback acts"
+                self._warn_once("nonfinite", message)
+            usable, proposed = None, np.where(np.isfinite(proposed), proposed, 0.0)
+        elif not inside:
+            usable = np.clip(proposed, self._low, self._high)
+            clipped = float(np.linalg.norm(usable - proposed))
+            message = f"the policy's action left the action space by {clipped:.3g}; it is boxed (cbf/clipped)"
+            self._warn_once("clipped", message)
+        decision = self.filter.filter(usable)
         intervened = decision.changed
         if inside and not decision.changed:
             # Bit for bit the policy's own action wherever the filter has nothing to say.
@@ -187,10 +166,8 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
         info[keys.CBF_FALLBACK] = decision.fallback
         info[keys.CBF_NONFINITE] = not finite
         info[keys.CBF_UNSAFE] = unsafe
-        refused = decision.refused
-        info[keys.CBF_REFUSED] = (
-            refused if refused is not None else np.zeros(len(self.constraints), dtype=bool)
-        )
+        none = np.zeros(len(self.constraints), dtype=bool)
+        info[keys.CBF_REFUSED] = none if decision.refused is None else decision.refused
         info[keys.CBF_CORRECTION] = correction
         info[keys.CBF_CLIPPED] = clipped
         info[keys.CBF_MARGIN] = margin
@@ -201,32 +178,20 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
             info |= self.filter.info(proposed, executed)
         return observation, reward, terminated, truncated, info
 
-    def _checked(self, action: Any) -> Array:
-        try:
-            proposed = np.array(action, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise ActionError(f"expected an action of shape {self._shape}, got {action!r}") from None
-        if proposed.shape != self._shape:
-            raise ActionError(f"expected an action of shape {self._shape}, got shape {proposed.shape}")
-        return proposed
-
     def _margin(self) -> tuple[float, bool]:
         """`cbf/margin` and `cbf/unsafe`: 0 where no h is finite, unsafe where the state or an h is not a number."""
         lowest = self.filter.margin
         unsafe = not lowest >= -_SAFE_TOLERANCE
         margin = lowest if math.isfinite(lowest) else 0.0
         if unsafe:
-            self._warn_unsafe(margin)
+            self._warn_once(
+                "unsafe",
+                f"the state is outside the safe set (cbf/margin = {margin:.3g}); the filter drives it "
+                "back where it can, and promises nothing until it is inside",
+                UnsafeStateWarning,
+                stacklevel=4,
+            )
         return margin, unsafe
-
-    def _warn_unsafe(self, margin: float) -> None:
-        self._warn_once(
-            "unsafe",
-            f"the state is outside the safe set (cbf/margin = {margin:.3g}); the filter drives it "
-            "back where it can, and promises nothing until it is inside",
-            UnsafeStateWarning,
-            stacklevel=5,
-        )
 
     def _warn_once(
         self, what: str, message: str, category: type[Warning] = UserWarning, stacklevel: int = 3
@@ -239,12 +204,10 @@ class CBFActionFilter(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruct
 
 def _unique(kinds: list[str]) -> list[str]:
     """A number behind every kind that occurs more than once."""
-    return [
-        kind if kinds.count(kind) == 1 else f"{kind} {kinds[: i + 1].count(kind)}"
-        for i, kind in enumerate(kinds)
-    ]
+    places = [kinds[: i + 1].count(kind) for i, kind in enumerate(kinds)]
+    return [k if kinds.count(k) == 1 else f"{k} {place}" for k, place in zip(kinds, places, strict=True)]
 
 
-def is_filtered(env: gym.Env[Any, Any]) -> bool:
+def is_filtered(env: Env) -> bool:
     """Whether there is a filter among an env's wrappers."""
     return any(isinstance(inner, CBFActionFilter) for inner in wrappers_of(env))

@@ -2,12 +2,11 @@
 
 import math
 import warnings
-from collections.abc import Sequence
-from typing import Any, ClassVar, Final, SupportsFloat
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative
@@ -15,96 +14,66 @@ from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ActionError, UnknownNameError
 from safe_wrappers.filter.fallback import FallbackFunction
+from safe_wrappers.plants.default import own_plant
 from safe_wrappers.plants.env_checks import check_actions, check_timing
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.template import PlantTemplate, own_plant
-from safe_wrappers.serialize import plain_numbers, recorded
-from safe_wrappers.stack import Layer, refuse_order
+from safe_wrappers.serialize import plain_numbers
+from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.receiver import CommandReceiver, receiver_inside
+from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.common.receiver import SAME_STEP, CommandReceiver, receiver_inside
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
-from safe_wrappers.wrappers.handover.macro_info import macro_info
-from safe_wrappers.wrappers.handover.queue import BASELINES, ENSEMBLE, Chunk, ChunkQueue, Command
-from safe_wrappers.wrappers.handover.sizes import ChunkSizes, blend_bounds
-from safe_wrappers.wrappers.handover.upsampling import Upsampling
-
-Array = NDArray[np.float64]
-
-_SAME_STEP: Final = 1e-6
-"""Control steps: an observation time that falls short of a step by less counts as that step's."""
-_REST: Final = {
-    keys.HANDOVER_PEAK_JERK: 0.0,
-    keys.HANDOVER_BLEND_TIME: 0.0,
-    keys.HANDOVER_STARVED: 0,
-    keys.HANDOVER_LIMITED: 0,
-    keys.HANDOVER_STEPS: 0,
-    keys.HANDOVER_REFUSED: False,
-    keys.HANDOVER_LATENCY: -1,
-}
-"""What a reset reports beside `handover/seam_jump`."""
+from safe_wrappers.wrappers.handover.queue import BASELINES, ChunkQueue, Command
+from safe_wrappers.wrappers.handover.sizes import ChunkSizes, Upsampling, blend_bounds
 
 
 @deprecated_parameters(renamed={"jerk_limit": "rate_limit", "hold_s": "control_dt"})
-class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, CommandReceiver):
+class ChunkHandover(LayerWrapper, CommandReceiver):
     """Executes action chunks that come late, over seams that keep a rate limit.
 
     The action space becomes the chunk, shape (H, m). One `step(chunk)` is `execution_horizon` control steps (fewer
-    where the episode ends); rewards are summed up. A chunk's entry j is meant for the j-th control step after the
-    observation that it was made from; with an `inference_delay` of d control steps the left-over of the chunk before
-    goes on for d steps, then the new chunk takes over at its entry d. At the start of an episode, with no left-over
-    yet, and whenever the queue runs dry, the fallback acts.
+    where the episode ends); rewards are summed up. A chunk's entry j is meant for the j-th control step after its
+    observation. With an `inference_delay` of d the left-over of the chunk before goes on for d control steps, then
+    the new chunk takes over at its entry d, over a blend (`control/handover/seams.py`). Without a left-over the
+    fallback acts.
 
-    **Seams.** The new chunk is blended in over the shortest time that keeps `rate_limit`, and at least over
-    `blend_time`; with neither given, over the left-over. See `control/handover/seams.py`. A chunk whose step at the
-    seam keeps the limit anyhow is executed bit for bit (without a `blend_time`).
+    **What it guarantees.** With `rate_limit`, the commands that this wrapper sends in neighbouring control steps of
+    an episode differ by at most `rate_limit` times the control interval in every component, whatever the chunks:
+    where no blend can keep the limit the commands are held back, which is counted (`handover/limited`). A chunk with
+    an entry that is not finite is refused as a whole. Entries outside the action box are clipped to it.
 
-    **What it guarantees.** With `rate_limit`, the commands u[k] and u[k+1] that this wrapper sends in neighbouring
-    control steps of an episode differ by at most `rate_limit` times the control interval in every component, whatever
-    the chunks: where no blend can keep the limit the commands are held back, which is counted (`handover/limited`),
-    and are late. A chunk with an entry that is not finite is refused as a whole: the left-over goes on, then the
-    fallback. Entries outside the env's action box are clipped to it.
+    **What it does not.** A filter inside may have to break the limit; `handover/peak_jerk` is measured on executed
+    commands. It does not check that a chunk is safe: `LeaseExpiry` and `CBFActionFilter` belong inside.
 
-    **What it does not.** The limit is on the difference of neighbouring commands over the control interval: each
-    command is held for its interval, so the signal itself jumps, and the first command of an episode has no
-    neighbour. A filter inside may have to break the limit; `handover/peak_jerk` is measured on executed commands. It
-    does not check that a chunk is safe: `LeaseExpiry` and `CBFActionFilter` belong inside.
-
-    **Chunks of one** (`chunk_size=1, execution_horizon=1`) are for ordinary policies, whose actions of shape (m,) are
-    taken, too: commands pass as they are, held back by `rate_limit` alone, and only a change of their source is
-    blended: call `switch("human")`, give the human's actions, `switch("policy")`. The fallback is such a change, too.
-    A single action is for one control step, so one that comes late is refused.
-
-    **Baselines** without any bound: blend="replace" takes the new chunk at once, blend="ensemble" averages all
-    chunks at hand with weights exp(-decay i), i = 0 the oldest (temporal ensembling, Zhao et al., RSS 2023).
+    With `chunk_size=1, execution_horizon=1` it takes the actions (m,) of ordinary policies, too: they are held back
+    by `rate_limit` alone, and only a change of their source (`switch`, or the fallback) is blended.
 
     Args:
         env: With a one-dimensional Box action space.
         chunk_size: H, entries of a chunk.
         execution_horizon: s, control steps from one chunk's observation to the next; `d <= s <= H - d`.
         inference_delay: d, control steps; or [least, most], drawn anew for every chunk.
-        blend: "smoothstep", "quintic", "hermite", or a baseline.
-        blend_time: s, the least duration of a blend.
-        rate_limit: Bound on |du/dt| = |u[k+1] - u[k]| / control interval, of neighbouring commands, for every action
-            component, or a list with one for each, action units per second (the mean jerk over a control interval,
-            where the command is an acceleration or a torque).
+        blend: "smoothstep", "quintic", "hermite"; or a baseline without any bound: "replace" takes the new chunk at
+            once, "ensemble" averages all chunks at hand (temporal ensembling, Zhao et al., RSS 2023).
+        blend_time: s, the least duration of a blend; without it and `rate_limit` blends are as long as the left-over.
+        rate_limit: Bound on |u[k+1] - u[k]| / control interval, for every action component, or a list with one for
+            each, action units per second.
         fallback: "brake", "hold", "zero", or a function of the plant; "brake" needs MuJoCo or a plant.
         plant: For the fallback; None reads the env's MuJoCo model.
         control_dt: Control interval, s; None reads the env's `dt`.
-        decay: Of the ensemble's weights.
-        steps_per_entry: Control steps from one entry of a chunk to the next, for policies that are slower than the
-            control loop: the commands between are a cubic Hermite spline's (`wrappers/handover/upsampling.py`). H
+        decay: The ensemble's weights are exp(-decay i), i = 0 the oldest.
+        steps_per_entry: Control steps from one entry of a chunk to the next, with a cubic Hermite spline between; H
             then is `(chunk_size - 1) * steps_per_entry + 1` control steps.
-        clock_error_s: Bound on how far ahead observation times may be, s: one that is ahead of `now_s` by no more
-            counts as now; a chunk that is farther ahead is refused.
+        clock_error_s: Observation times that are ahead of `now_s` by no more count as now, s; a chunk that is farther
+            ahead is refused.
 
     Info, at every step (see `safe_wrappers.info`): ``handover/seam_jump``, ``handover/peak_jerk``,
-    ``handover/blend_time``, ``handover/starved``, ``handover/limited``, ``handover/refused``,
-    ``handover/latency``, ``handover/steps``. The inner layers' costs are summed over the control steps, their flags
-    are True if they were at any of them (`wrappers/handover/macro_info.py`).
+    ``handover/blend_time``, ``handover/starved``, ``handover/limited``, ``handover/refused``, ``handover/latency``,
+    ``handover/steps``. The inner layers' info is merged over the control steps.
 
     Raises:
-        ConfigurationError: Sizes that do not fit together, times or limits that are not positive, nothing to blend
-            over, or not a Box action space.
+        ConfigurationError: Sizes that do not fit together, a time or limit that is not positive, nothing to blend
+            over.
         ActionError: A chunk of the wrong shape; the env was not stepped.
 
     Example:
@@ -114,9 +83,6 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         >>> info = env.step(env.action_space.sample())[4]
         >>> info["handover/peak_jerk"] <= 20.0
         True
-
-    Change log:
-        * v0.1.0: added.
     """
 
     layer: ClassVar = Layer.HANDOVER
@@ -125,7 +91,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
 
     def __init__(
         self,
-        env: gym.Env[Any, Any],
+        env: Env,
         chunk_size: int,
         execution_horizon: int,
         inference_delay: int | Sequence[int] = 0,
@@ -140,8 +106,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         clock_error_s: float = 0.0,
     ) -> None:
         arguments = dict(locals())
-        # First: with a handover inside the actions are no vector either.
-        refuse_order(env, self.layer, type(self).__name__)
+        LayerWrapper.__init__(self, env)  # first: with a handover inside the actions are no vector either
         space = check_actions(env)
         plant = own_plant(plant)
         sizes = ChunkSizes.checked(chunk_size, execution_horizon, inference_delay, steps_per_entry)
@@ -149,22 +114,18 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             raise UnknownNameError(f"no blend {blend!r}; choose {', '.join((*BLENDS, *BASELINES))}")
         decay = non_negative("decay", decay, "a number")
         blend_time, rate_limit, control_dt = map(plain_numbers, (blend_time, rate_limit, control_dt))
-        gym.utils.RecordConstructorArgs.__init__(
-            self,
-            **recorded(
-                arguments,
-                chunk_size=sizes.entries,
-                execution_horizon=sizes.horizon,
-                inference_delay=sizes.delay[0] if sizes.delay[0] == sizes.delay[1] else list(sizes.delay),
-                blend_time=blend_time,
-                rate_limit=rate_limit,
-                plant=None if plant is None else PlantTemplate(plant),
-                control_dt=control_dt,
-                decay=decay,
-                steps_per_entry=sizes.steps_per_entry,
-            ),
+        self._record(
+            arguments,
+            chunk_size=sizes.entries,
+            execution_horizon=sizes.horizon,
+            inference_delay=sizes.delay[0] if sizes.delay[0] == sizes.delay[1] else list(sizes.delay),
+            blend_time=blend_time,
+            rate_limit=rate_limit,
+            plant=plant,
+            control_dt=control_dt,
+            decay=decay,
+            steps_per_entry=sizes.steps_per_entry,
         )
-        gym.Wrapper.__init__(self, env)
         self.chunk_size, self.execution_horizon, self.blend = sizes.entries, sizes.horizon, blend
         self.control_dt = check_timing(env, control_dt)
         self._delay = sizes.delay
@@ -179,44 +140,32 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         self._fallback = FallbackController(env, fallback, plant)
         fewest, rate_limits = blend_bounds(sizes, space, self.control_dt, blend, blend_time, rate_limit)
         self._queue = ChunkQueue(
-            self._controls,
-            self.control_dt,
-            blend=blend,
-            fewest=fewest,
-            rate_limit=rate_limits,
-            low=np.asarray(space.low, np.float64),
-            high=np.asarray(space.high, np.float64),
-            dtype=space.dtype,
-            decay=decay,
+            space, self.control_dt, blend=blend, fewest=fewest, rate_limit=rate_limits, decay=decay
         )
         self._inside = receiver_inside(env)
         self._random = WrapperRng(type(self).__name__)
         self._warned = False
         self._start()
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env and forget all chunks; the delays' random numbers start anew with a seed."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._random.reset(self.env, seed)
         self._fallback.reset()
         self._queue.reset()
         self._start()
-        info.update(_REST)
-        info[keys.HANDOVER_SEAM_JUMP] = np.zeros(DIFFERENCES)
+        info.update(self._measured([], False, -1))
         return observation, info
 
-    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> Step:
         """Execute the next `execution_horizon` control steps, with this chunk from when it is there."""
         refused = not self._submit(self._checked(action))
         total, infos, commands, latency = 0.0, [], [], -1
         terminated = truncated = False
         for _ in range(self.execution_horizon):
             now = self._queue.now
-            admitted, one_refused = self._admitted()
-            refused |= one_refused
-            command = self._queue.next(admitted, self._fallback.command)
+            command = self._queue.next(self._admits, self._fallback.command)
+            refused |= command.refused
             if command.took_over:
                 latency = now - command.observed
             if self._inside is not None:
@@ -234,9 +183,7 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
                 break
         self._observed_s = self.now_s
         info = macro_info(infos)
-        info.update(self._measured(commands))
-        info[keys.HANDOVER_REFUSED] = refused
-        info[keys.HANDOVER_LATENCY] = latency
+        info.update(self._measured(commands, refused, latency))
         return observation, total, terminated, truncated, info
 
     @property
@@ -245,44 +192,23 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         return self._queue.now * self.control_dt
 
     def switch(self, source: str) -> None:
-        """Name the source of the chunks from now on; the change is blended, from the last command.
-
-        Args:
-            source: Any name, such as "human" or "policy".
-        """
+        """Name the source of the chunks from now on; the change is blended, from the last command."""
         self._queue.switch(source)
 
     def _checked(self, action: Any) -> Array:
+        expected = f"expected a chunk of shape {self.action_space.shape}"
         try:
             chunk = np.array(action, dtype=np.float64)
         except (TypeError, ValueError):
-            raise ActionError(
-                f"expected a chunk of shape {self.action_space.shape}, got {action!r}"
-            ) from None
+            raise ActionError(f"{expected}, got {action!r}") from None
         if self.chunk_size == 1 and chunk.shape == (self._controls,):
             return chunk[None]  # an ordinary policy's action
         if chunk.shape != self.action_space.shape:
-            raise ActionError(
-                f"expected a chunk of shape {self.action_space.shape} (chunk_size, controls), got {chunk.shape}"
-            )
+            raise ActionError(f"{expected} (chunk_size, controls), got {chunk.shape}")
         return chunk
 
-    def _admitted(self) -> tuple[list[Chunk], bool]:
-        """The chunks that may take over now, the newest first; and whether one was refused."""
-        admitted: list[Chunk] = []
-        refused = False
-        for chunk in self._queue.arrived():
-            left, inside = self._queue.left(chunk), self._inside
-            admits = len(left) > 0  # it came in time
-            if admits and inside is not None:
-                admits = inside.admits(left[-1], len(left))
-            if not admits:
-                refused = True
-                continue
-            admitted.append(chunk)
-            if self.blend != ENSEMBLE:
-                break
-        return admitted, refused
+    def _admits(self, end: Array, steps: int) -> bool:
+        return self._inside is None or self._inside.admits(end, steps)
 
     def _submit(self, chunk: Array) -> bool:
         """Send the chunk on its way; False if one came and was refused."""
@@ -292,9 +218,9 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         if not np.isfinite(chunk).all():
             return False
         observed_s = self._observed_s
-        if self.now_s < observed_s <= self.now_s + self._clock_error_s + _SAME_STEP * self.control_dt:
+        if self.now_s < observed_s <= self.now_s + self._clock_error_s + SAME_STEP * self.control_dt:
             observed_s = self.now_s
-        observed = math.floor(observed_s / self.control_dt + _SAME_STEP)
+        observed = math.floor(observed_s / self.control_dt + SAME_STEP)
         return self._queue.submit(self._upsampling.commands(chunk), observed, self._queue.now + delay)
 
     def _start(self) -> None:
@@ -309,10 +235,9 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             self._seam_until = now + command.blend_steps + DIFFERENCES - 1  # it ends a blend under way
         return now <= self._seam_until
 
-    def _measured(self, commands: list[Command]) -> dict[str, Any]:
-        counted = np.array(self._in_seam)
-        jump = np.zeros(DIFFERENCES)
-        peak = 0.0
+    def _measured(self, commands: list[Command], refused: bool, latency: int) -> dict[str, Any]:
+        counted = np.array(self._in_seam, dtype=bool)
+        jump, peak = np.zeros(DIFFERENCES), 0.0
         for order in range(1, DIFFERENCES + 1):
             steps = np.abs(np.diff(self._executed, n=order, axis=0))[-len(counted) :].max(axis=1, initial=0.0)
             at_seam = steps[counted[len(counted) - len(steps) :]]
@@ -337,4 +262,31 @@ class ChunkHandover(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             keys.HANDOVER_STARVED: sum(c.starved for c in commands),
             keys.HANDOVER_LIMITED: limited,
             keys.HANDOVER_STEPS: len(commands),
+            keys.HANDOVER_REFUSED: refused,
+            keys.HANDOVER_LATENCY: latency,
         }
+
+
+_MERGES: dict[str, Callable[..., Any]] = {
+    "sum": np.sum,
+    "any": np.any,
+    "max": np.max,
+    "min": np.min,
+    "mean": np.mean,
+}
+
+
+def macro_info(infos: list[dict[str, Any]]) -> dict[str, Any]:
+    """The last control step's info, with each registered key merged over the steps as `InfoKey.chunk` says."""
+    last = infos[-1]
+    if len(infos) == 1:
+        return last
+    merged: dict[str, Any] = {}
+    for name, key in keys.KEYS.items():
+        values = [i[name] for i in infos if name in i and (not key.where or i.get(key.where))]
+        if values and key.chunk in _MERGES:
+            value = _MERGES[key.chunk](values, axis=0)
+            array = isinstance(values[-1], np.ndarray)
+            merged[name] = np.asarray(value, values[-1].dtype) if array else type(values[-1])(value)
+    last.update(merged)
+    return last

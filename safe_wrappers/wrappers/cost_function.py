@@ -2,27 +2,25 @@
 
 import pkgutil
 from collections.abc import Callable
-from typing import Any, ClassVar, SupportsFloat
+from typing import Any, ClassVar
 
-import gymnasium as gym
 import numpy as np
 
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.stack import Layer, refuse_order
+from safe_wrappers.stack import Layer
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
 
 Judge = Callable[[Any], float]
 """Takes the unwrapped env, returns the cost of the step that it has just made."""
 
 
-class CostFunction(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
+class CostFunction(LayerWrapper):
     """Writes ``info["cost"]`` for a task that does not judge itself; changes nothing else.
 
-    After every step, and after a reset, `fn` is asked about the state in which the env now is: any number above 0
-    is a violation. It judges control steps at their ends: what happens between two of them it does not see, so
-    `cost_substep` is not judged. It gets the env, not a filter's plant, so a filter with a wrong model is caught.
-
-    Put it next to the task, so that everything outside sees the cost. A filter does not read it.
+    After every step, and after a reset, `fn` judges the state in which the env (not a filter's plant) now is: any
+    number above 0 is a violation. It does not see what happens within a control step. Put it next to the task, so
+    that everything outside sees the cost.
 
     Args:
         env: Whose task reports no cost.
@@ -34,7 +32,7 @@ class CostFunction(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
 
     Raises:
         ConfigurationError: `fn` is no function, cannot be imported, or returned something else than a finite
-            number; the env has a cost of its own; or a wrapper is inside that must be outside (`stack.py`).
+            number; the env has a cost of its own; or a wrong order.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
@@ -45,33 +43,25 @@ class CostFunction(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
         >>> costs = [env.step(env.action_space.high)[4]["cost"] for _ in range(20)]
         >>> sorted(set(costs))
         [0.0, 1.0]
-
-    Change log:
-        * v0.1.0: added.
     """
 
     layer: ClassVar = Layer.COST
 
-    def __init__(self, env: gym.Env[Any, Any], fn: Judge | str) -> None:
-        refuse_order(env, self.layer, type(self).__name__)
+    def __init__(self, env: Env, fn: Judge | str) -> None:
+        LayerWrapper.__init__(self, env)
         function = _imported(fn) if isinstance(fn, str) else fn
         if not callable(function):
-            raise ConfigurationError(
-                f"fn is a function of the env, or its name 'module:function'; got {fn!r}"
-            )
-        gym.utils.RecordConstructorArgs.__init__(self, fn=_reference(function))
-        gym.Wrapper.__init__(self, env)
+            raise ConfigurationError(f"fn is a function of the env or its name 'module:function'; got {fn!r}")
+        self._record({"fn": _reference(function)})
         self.fn: Judge = function
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Resets the env; info has the cost of the state in which the episode starts."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._judge(info)
         return observation, info
 
-    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> Step:
         """Steps the env and judges where it is now."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._judge(info)

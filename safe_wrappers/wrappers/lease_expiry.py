@@ -1,12 +1,9 @@
 """LeaseExpiry: a command is in force only while the machine could still stop behind it."""
 
 import math
-import warnings
 from collections.abc import Mapping
-from typing import Any, ClassVar, Final, SupportsFloat
+from typing import Any, ClassVar
 
-import gymnasium as gym
-import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
@@ -17,14 +14,15 @@ from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.fallback import FallbackFunction
-from safe_wrappers.plants.env_checks import check_actions, check_timing, refuse_changed_actions
+from safe_wrappers.plants.default import own_plant
+from safe_wrappers.plants.env_checks import refuse_changed_actions
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.template import PlantTemplate, own_plant
-from safe_wrappers.serialize import plain_data, recorded
-from safe_wrappers.stack import Layer, refuse_order
-from safe_wrappers.wrappers.cbf_action_filter import is_filtered
+from safe_wrappers.serialize import plain_data
+from safe_wrappers.stack import Layer
+from safe_wrappers.wrappers.common.command_gate import CommandGate
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.receiver import CommandReceiver, action_array
+from safe_wrappers.wrappers.common.layer import Array, Env, Reset, Step
+from safe_wrappers.wrappers.common.receiver import action_array, whole_steps
 from safe_wrappers.wrappers.lease.admission import Admission, Measured
 from safe_wrappers.wrappers.lease.stopping_budget import (
     BoundBudget,
@@ -32,11 +30,6 @@ from safe_wrappers.wrappers.lease.stopping_budget import (
     StoppingBudget,
     budget_from,
 )
-
-Array = NDArray[np.float64]
-
-_SAME_TIME: Final = 1e-6
-"""Control steps: times that are closer count as the same."""
 
 
 @deprecated_parameters(
@@ -49,37 +42,20 @@ _SAME_TIME: Final = 1e-6
     moved={"budget": StoppingBudget},
     positional=("braking", "acceleration", "closing_speed", "top_speed"),
 )
-class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, CommandReceiver):
+class LeaseExpiry(CommandGate):
     """Grants every fresh command a lease, and brakes when nothing fresh has come before it runs out.
 
-    A lease is as long as the machine, driven on by the command at its worst and told nothing more, could still stop
-    inside the clearance of the moment:
-
-        way(lease + detect + confirm + age + act) + v^2 / (2 braking) + localisation + margin <= clearance
-
-    (`control/watchdog/leases.py`; the way at the approach speed v, growing by `acceleration`). It is granted when a
-    fresh command comes, and counted down on the clock of control steps: the clearance is not read in between. While
-    nothing fresh comes, the command in force goes on: repeated if it is a single one, step by step if it is a chunk's
-    (`ChunkHandover` outside). A control step is executed only if the lease covers all of it. Otherwise, and where a
-    fresh command would get no lease for a whole step, the fallback brakes at once. Only a fresh command ends the
-    braking, over a blend of `blend_time`; a lease that ends during this blend brakes at once, too.
-
-    **Fresh** is a command whose observation is newer than that of the command in force. Without a call of
-    `set_observation_time` every action is made from the newest observation; `ChunkHandover` and the faults of
-    `safe_wrappers.wrappers.faults` call it. A command that is not newer (a frozen policy, a repeated chunk) is
-    executed under the old lease; an older one or one from the future is refused. The age of a command counts in its
-    lease. A command that is not finite is refused.
+    A lease is as long as the machine, driven on by the command at its worst, could still stop inside the clearance of
+    the moment (`StoppingBudget`). A command is fresh if its observation is newer than that of the command in force
+    (`set_observation_time`; by default it is the newest one). One that is not newer is executed under the old lease;
+    one that is older, from the future or not finite is refused.
 
     **What it guarantees.** If braking, acceleration, delays and bounds are what they are declared to be and the
     clearance does not shrink by itself, the machine stops inside it whenever commands stop coming, whatever the
     commands did. No command that is not finite passes. While leases last the commands pass bit for bit.
 
-    **What it does not.** It does not look at what a fresh command does: a policy may drive into the obstacle until
-    the clearance is too small for a lease of one control step; then it brakes. Obstacles that come closer by
-    themselves must be in the approach speed. `CBFActionFilter` belongs inside. Close to an obstacle no command gets a
-    lease, one that leads away neither; with a `CBFActionFilter` inside, `min_lease_s` of one control step lets every
-    fresh command through to it. Behind a `ChunkHandover` a fresh command comes once per `execution_horizon`: give
-    `min_lease_s` that time, or brake and chunks take turns.
+    **What it does not.** It does not check what a fresh command does; `CBFActionFilter` belongs inside. Close to an
+    obstacle no command gets a lease, not even one that leads away, unless `min_lease_s` allows it.
 
     Args:
         env: With a one-dimensional Box action space.
@@ -89,14 +65,13 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         age_s: t_age, s, of the clearance when it is read.
         max_lease_s: No lease is longer, s.
         min_lease_s: Every fresh command gets a lease of at least so long, s; above 0 only with a CBFActionFilter
-            inside.
+            inside. Behind a `ChunkHandover` give the time of one `execution_horizon`.
         blend_time: s, of the way back from the fallback to a fresh command.
         brake_blend_time: s, of the way to the fallback; it counts in the budget. 0: at once.
         clock_error_s: Bound on how wrong the times of observations may be, s; it counts in the budget.
-        motion_limits: Limits on the motion, {"max_acceleration": ..., "max_speed": ..., "max_jerk": ..., "arrival":
-            "moving"
-            or "rest"}, for actions that are position setpoints: `ChunkHandover` then has a chunk refused whose end is
-            out of reach in its time (`wrappers/lease/admission.py`).
+        motion_limits: For actions that are position setpoints: {"max_acceleration": ..., "max_speed": ...,
+            "max_jerk": ..., "arrival": "moving" or "rest"}. Chunks whose end is out of reach in its time are then
+            refused.
         measured: For `motion_limits`: a function of the env that returns positions, velocities and, for an arrival at
             rest with limited jerk, accelerations; None reads the lengths of the MuJoCo actuators.
         fallback: "brake", "hold", "zero", or a function of the plant.
@@ -119,23 +94,17 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         >>> info = env.step(env.action_space.sample())[4]
         >>> info["lease/braking"], info["lease/remaining_s"] > 0.0
         (False, True)
-
-    Change log:
-        * v0.1.0: added.
     """
 
     layer: ClassVar = Layer.LEASE
 
-    _until_s: float
-    _newest_s: float
+    _fallback: FallbackController
     _executed: Array | None
-    _braking: bool
-    _chunk_refused: bool
     _blend: tuple[Array, int, int] | None
 
     def __init__(
         self,
-        env: gym.Env[Any, Any],
+        env: Env,
         budget: StoppingBudget | dict[str, Any] | Constraint | ClearanceFunction,
         *,
         detect_s: float = 0.0,
@@ -153,31 +122,28 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         control_dt: float | None = None,
     ) -> None:
         arguments = dict(locals())
-        refuse_order(env, self.layer, type(self).__name__)
-        space = check_actions(env)
+        CommandGate.__init__(self, env, control_dt)
         refuse_changed_actions(env)
         plant, budget = own_plant(plant), budget_from(budget)
-        gym.utils.RecordConstructorArgs.__init__(
-            self,
-            **recorded(
-                arguments,
-                budget=plain_data(budget),
-                motion_limits=dict(motion_limits) if isinstance(motion_limits, Mapping) else motion_limits,
-                plant=None if plant is None else PlantTemplate(plant),
-            ),
-        )
-        gym.Wrapper.__init__(self, env)
-        self.control_dt = check_timing(env, control_dt)
-        self._same_s = _SAME_TIME * self.control_dt
+        limits = dict(motion_limits) if isinstance(motion_limits, Mapping) else motion_limits
+        self._record(arguments, budget=plain_data(budget), motion_limits=limits, plant=plant)
         self._max_lease_s = positive("max_lease_s", max_lease_s, "s")
         if self._max_lease_s < self.control_dt - self._same_s:
             raise ConfigurationError(
                 f"max_lease_s = {max_lease_s} s is less than one control step, {self.control_dt} s: no command would "
                 "ever be executed"
             )
-        self._min_lease_s = _min_lease(env, min_lease_s, self._max_lease_s)
-        self._blend_steps = self._steps("blend_time", blend_time)
-        self._brake_steps = self._steps("brake_blend_time", brake_blend_time)
+        self._min_lease_s = non_negative("min_lease_s", min_lease_s, "s")
+        if self._min_lease_s > self._max_lease_s:
+            raise ConfigurationError(f"min_lease_s = {min_lease_s} s is above max_lease_s = {max_lease_s} s")
+        if self._min_lease_s > 0.0 and not self._filtered:
+            raise ConfigurationError(
+                f"min_lease_s = {min_lease_s} s without a CBFActionFilter inside would let a command drive into the "
+                "obstacle: leave it 0, or put the filter inside, LeaseExpiry(sw.protect(env), ...)"
+            )
+        self._blend_steps = whole_steps(non_negative("blend_time", blend_time, "s"), self.control_dt)
+        brake_blend_time = non_negative("brake_blend_time", brake_blend_time, "s")
+        self._brake_steps = whole_steps(brake_blend_time, self.control_dt)
         self._clock_error_s = non_negative("clock_error_s", clock_error_s, "s")
         delays = {"detect_s": detect_s, "confirm_s": confirm_s, "age_s": age_s}
         of_formula = LeaseDelays(*(non_negative(name, value, "s") for name, value in delays.items()))
@@ -190,31 +156,29 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         if motion_limits is None and measured is not None:
             raise ConfigurationError("measured is for motion_limits, which is missing: give both, or neither")
         self._admission = (
-            None if motion_limits is None else Admission(env, motion_limits, measured, space.shape[0])
+            None if motion_limits is None else Admission(env, motion_limits, measured, self._low.size)
         )
-        self._shape, self._dtype = space.shape, space.dtype
-        self._box = tuple(
-            np.nan_to_num(np.asarray(end)).astype(np.float64) for end in (space.low, space.high)
-        )
-        self._filtered = is_filtered(env)  # a filter inside says what was executed
-        self._warned = False
-        self._start()
+        self._start({})
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env; no command is in force."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._fallback.reset()
         self._budget.reset()
-        self._start()
+        self._start(info)
         info[keys.LEASE_REMAINING_S] = 0.0
-        if not self._filtered:
-            info[keys.EXECUTED_ACTION] = np.zeros(self._shape)
         info.update(dict.fromkeys((keys.LEASE_EXPIRED, keys.LEASE_REFUSED, keys.LEASE_BRAKING), False))
         return observation, info
 
-    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+    def _start(self, info: dict[str, Any]) -> None:
+        super()._start(info)
+        self._until_s = self._newest_s = -math.inf
+        self._command = self._rest()
+        self._executed = None
+        self._braking = self._chunk_refused = False
+        self._blend = None
+
+    def step(self, action: Any) -> Step:
         """Execute the action under its lease, the command in force under its own, or the fallback."""
         given = action_array(action, self._shape)
         now = self.now_s
@@ -235,31 +199,17 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
             if not self._braking:
                 self._braking, self._blend = True, self._start_blend(self._brake_steps)
             sent = self._blended(self._fallback.command())
-        executed = sent.astype(np.float64)
-        observation, reward, terminated, truncated, info = self.env.step(sent)
-        if self._filtered:
-            executed = np.array(info[keys.EXECUTED_ACTION], dtype=np.float64)
-        else:
-            info[keys.EXECUTED_ACTION] = executed.copy()
-        self._executed = executed
-        self._fallback.executed(executed)
-        self._steps_done += 1
+        self._executed, answer = self._execute(sent)
         self._observed_s = self.now_s
+        info = answer[4]
         info[keys.LEASE_REMAINING_S] = max(self._until_s - self.now_s, 0.0)
         info[keys.LEASE_EXPIRED] = expired
         info[keys.LEASE_REFUSED] = refused
         info[keys.LEASE_BRAKING] = not covered
-        return observation, reward, terminated, truncated, info
+        return answer
 
     def admits(self, end: Array, steps: int) -> bool:
-        """Whether the end of a chunk of setpoints is within `motion_limits`; a refusal is in the next step's info.
-
-        Necessary only: what is admitted still needs its path and its stopping checked. True without `motion_limits`.
-
-        Args:
-            end: The chunk's last command, shape (m,).
-            steps: Control steps from now to the end of that command.
-        """
+        """Whether the end of a chunk of setpoints is within `motion_limits`; a refusal is in the next step's info."""
         admitted = self._admission is None or self._admission.admits(end, steps * self.control_dt)
         self._chunk_refused |= not admitted
         return admitted
@@ -271,14 +221,7 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         if observed_s is None:
             return False, False, refused
         from_future = observed_s > now + self._clock_error_s + self._same_s
-        finite = bool(np.isfinite(command.astype(np.float64)).all())
-        if not finite and not self._warned:
-            self._warned = True
-            warnings.warn(
-                f"the policy's action is not finite ({command}); the command in force goes on under its lease",
-                UserWarning,
-                stacklevel=3,
-            )
+        finite = self._is_finite(command, "policy's", "the command in force goes on under its lease")
         if from_future or observed_s < newest_s - self._same_s or not finite:
             return False, False, True
         fresh = observed_s > newest_s + self._same_s
@@ -300,39 +243,14 @@ class LeaseExpiry(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorAr
         """From what was executed last, over so many steps; None where nothing was executed yet."""
         if self._executed is None or steps == 0:
             return None
-        return np.clip(self._executed, *self._box), steps, 0
+        return self._boxed(self._executed), steps, 0
 
     def _blended(self, target: Any) -> Any:
         """In the box, so that rounding to its dtype makes no infinity of anything."""
-        control = np.clip(np.asarray(target, dtype=np.float64), *self._box)
+        control = self._boxed(target)
         if self._blend is not None:
             start, steps, done = self._blend
             weight = float(smoothstep((done + 1.0) / (steps + 1.0)))
             control = start * (1.0 - weight) + weight * control
             self._blend = (start, steps, done + 1) if done + 1 < steps else None
         return control.astype(self._dtype)
-
-    def _steps(self, name: str, value: float) -> int:
-        """Whole control steps, rounded up."""
-        return math.ceil(non_negative(name, value, "s") / self.control_dt - _SAME_TIME)
-
-    def _start(self) -> None:
-        self._steps_done = 0
-        self._until_s = self._newest_s = -math.inf
-        self._observed_s = 0.0
-        self._command = np.clip(np.zeros(self._shape), *self._box).astype(self._dtype)
-        self._executed = None
-        self._braking = self._chunk_refused = False
-        self._blend = None
-
-
-def _min_lease(env: gym.Env[Any, Any], min_lease_s: float, max_lease_s: float) -> float:
-    min_lease_s = non_negative("min_lease_s", min_lease_s, "s")
-    if min_lease_s > max_lease_s:
-        raise ConfigurationError(f"min_lease_s = {min_lease_s} s is more than max_lease_s = {max_lease_s} s")
-    if min_lease_s > 0.0 and not is_filtered(env):
-        raise ConfigurationError(
-            f"min_lease_s = {min_lease_s} s without a CBFActionFilter inside would let a command drive into the "
-            "obstacle: leave it 0, or put the filter inside, LeaseExpiry(sw.protect(env), ...)"
-        )
-    return min_lease_s

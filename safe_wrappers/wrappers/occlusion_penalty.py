@@ -2,88 +2,68 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar, SupportsFloat
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.control.estimation.covariance import blind_time
 from safe_wrappers.control.estimation.observability import unobservable_directions
 from safe_wrappers.control.estimation.tracks import Tracks, largest_deviation
-from safe_wrappers.errors import ConfigurationError, SafeWrappersError
+from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import read_attribute
-from safe_wrappers.plants.mujoco.timing import control_interval
+from safe_wrappers.plants.mujoco.binding import control_interval
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight
-from safe_wrappers.stack import Layer, refuse_order
+from safe_wrappers.stack import Layer
+from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
-from safe_wrappers.wrappers.occlusion.measured import measured
 from safe_wrappers.wrappers.occlusion.sensor import Sensor, sensor_from
-from safe_wrappers.wrappers.occlusion.things import check_env, tracked_things, with_tracks
-from safe_wrappers.wrappers.occlusion.track import Track, track_from
-
-Array = NDArray[np.float64]
+from safe_wrappers.wrappers.occlusion.track import Track, track_from, tracked_things
 
 _AXES = ("x", "y", "z")
 
 
-class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
+class OcclusionPenalty(LayerWrapper):
     """Estimates what a sensor on the robot sees, and sees no more, and takes a penalty off the reward for not seeing.
 
-    After every step it casts a ray to each tracked point, all in one call. What is in sight is measured, with noise,
-    and updates the track's Kalman estimate; what is not grows less certain, as the Lyapunov equation says, exactly.
-    Four things come of it, each of which can be used without the others:
+    After every step it casts a ray to each tracked point. What is in sight is measured, with noise, and updates the
+    track's Kalman estimate; what is not grows less certain, as the Lyapunov equation says, exactly. A track's
+    permission to be relied on expires before ``sigmas * sigma`` crosses `tolerance`, one control step ahead. The
+    filter belongs outside: its `TrackPermission` and `TrackedDiscs` read the estimates.
 
-    - **Reward**: `weight` times the mean, over the tracks within the sensor's range, of
-      ``min(1, sigmas * sigma / tolerance) ** 2``, is taken off. `weight=0` leaves the reward alone.
-    - **Observation** (`observe`): for each track the estimated position relative to the sensor's body (m, world
-      axes), the estimated velocity (m/s) and the standard deviation along each axis (m), appended to a flat Box, or
-      under the key "tracks" of a Dict. The tracks' true states are not in it.
-    - **Permission**: a track's permission to be relied on expires *before* ``sigmas * sigma`` crosses `tolerance`,
-      one control step ahead, and comes back when it is seen. `TrackPermission` stops the machine then; `permissions`
-      says for how long they would last.
-    - **The filter around it**: `TrackedDiscs` are obstacles that are as much larger as the estimates are uncertain,
-      so `Clearance` and the like keep k sigma more distance and the robot that sees less moves more carefully.
-
-    **What it promises.** If the tracked things move as declared, the sensor's noise is as declared, and nothing else
-    is measured than what is in sight, then the errors have the covariances that are given: see the tails in
-    `appendix.estimation.sigma_coverage` for what k sigma means. It is no hard bound, and not about things that are
-    not tracked. An estimate that is one step old is never used: the estimate is of the state that the action acts on.
-
-    **Order.** Inside the filter, which reads the estimates: ``CBFActionFilter(OcclusionPenalty(env, ...), ...)``.
-    Returns that are recorded outside hold the penalty; `RecordInterventions` adds it back.
+    **What it guarantees.** If the tracked things move as declared, the sensor's noise is as declared, and nothing
+    else is measured than what is in sight, then the errors have the covariances that are given. **What it does not.**
+    A covariance is no hard bound, and says nothing of things that are not tracked.
 
     Args:
         env: Its unwrapped env has MuJoCo's `.model` and `.data`.
         tracks: Each a `Track`, or the dict of a recorded one.
         sensor: A `Sensor`, or the name of a camera in the model.
         tolerance: Position error that the task can bear, m.
-        weight: Of the penalty, in units of the task's reward per step.
+        weight: Of the penalty, in units of the task's reward per step: times the mean, over the tracks within the
+            sensor's range, of ``min(1, sigmas * sigma / tolerance) ** 2``.
         sigmas: k of the bound that is compared with the tolerance.
         axes: "xy" tracks in the plane, "xyz" in space.
-        observe: Whether the observation gains the estimates.
+        observe: Whether the observation gains, for each track, the estimated position relative to the sensor's body
+            (m, world axes), the estimated velocity (m/s) and the standard deviation along each axis (m): appended to
+            a flat Box, or under the key "tracks" of a Dict.
 
     Info, at every step and at reset: ``occlusion/visible``, ``occlusion/expired`` (bool arrays, one per track),
     ``occlusion/sigma`` (m, array), ``occlusion/penalty``, ``occlusion/task_reward`` (float).
 
     Attributes:
-        tracking: The `control.estimation.tracks.Tracks`: positions, velocities, covariances, and those ahead. What
-            `TrackedDiscs` read.
+        tracking: The `control.estimation.tracks.Tracks`: positions, velocities, covariances, and those ahead.
         track_names: One per track: the body's name, or the attribute's with an index.
         last_seen_positions: Where each was measured to be last, shape (n, d), m; before that, the initial fix.
         permitted: Tracks that may be relied on, bool (n,).
-        unobservable: Track name -> directions of its state that this sensor cannot resolve even in sight, in the
-            names of the state ("x", "vy"); empty for a sensor that measures positions.
+        unobservable: Track name -> directions of its state ("x", "vy") that the sensor cannot resolve even in sight.
 
     Raises:
         UnsupportedEnvError: No MuJoCo model, or with `observe` neither a flat Box nor a Dict observation.
-        UnknownNameError: No such camera, site, body or attribute; the message lists those there are.
-        ConfigurationError: A number outside its range, a covariance that is none, no track, a second
-            OcclusionPenalty, or a filter or `ChunkHandover` inside.
-        SafeWrappersError: At a step: the simulation's time ran backwards.
+        ConfigurationError: A number outside its range, a name that the model does not have, or a wrong order.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
@@ -96,16 +76,13 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         (6,)
 
     Source: appendix "Continuous Covariance Propagation and Observability".
-
-    Change log:
-        * v0.1.0: added.
     """
 
     layer: ClassVar = Layer.OCCLUSION
 
     def __init__(
         self,
-        env: gym.Env[Any, Any],
+        env: Env,
         tracks: Sequence[Track | dict[str, Any]],
         sensor: Sensor | str | dict[str, Any],
         tolerance: float,
@@ -114,9 +91,13 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         axes: str = "xy",
         observe: bool = True,
     ) -> None:
+        arguments = dict(locals())
         raw: Any = env.unwrapped
-        check_env(env)
-        refuse_order(env, self.layer, type(self).__name__)
+        if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
+            raise UnsupportedEnvError(
+                f"OcclusionPenalty casts rays in MuJoCo: it needs an env with .model and .data; {raw} has none"
+            )
+        LayerWrapper.__init__(self, env)
         if isinstance(tracks, str | dict) or not isinstance(tracks, Sequence) or not tracks:
             raise ConfigurationError(f"tracks is a list with at least one Track, got {tracks!r}")
         self.tracks = [track_from(t) for t in tracks]
@@ -132,58 +113,43 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
             raise ConfigurationError(f"axes is 'xy' or 'xyz', got {axes!r}")
         if not isinstance(observe, bool | np.bool_):
             raise ConfigurationError(f"observe is True or False, got {observe!r}")
-        gym.utils.RecordConstructorArgs.__init__(
-            self,
+        self._record(
+            arguments,
             tracks=[t.data() for t in self.tracks],
             sensor=self.sensor.data(),
             tolerance=self.tolerance,
             weight=self.weight,
             sigmas=self.sigmas,
-            axes=axes,
             observe=bool(observe),
         )
-        gym.Wrapper.__init__(self, env)
         self._raw, self._d, self._random = raw, len(axes), WrapperRng("OcclusionPenalty")
         self._control_dt = control_interval(raw)
         self._matrix, self._noise = self.sensor.matrices(self._d)
         self._noise_root = np.linalg.cholesky(self._noise)
         self._look_at(raw.model)
-        self.tracking = Tracks([m for t, count in self._counted for m in [t.motion(self._d)] * count])
-        self._start_std = [
-            np.concatenate([np.tile(t.start(self._d)[k], (count, 1)) for t, count in self._counted])
-            for k in (0, 1)
-        ]
-        self.unobservable = self._unobservable(axes)
+        owners = [thing.track for thing in self._things]
+        self.track_names = [thing.name for thing in self._things]
+        self.tracking = Tracks([track.motion(self._d) for track in owners])
+        self._start_std = [np.stack(stds) for stds in zip(*(t.start(self._d) for t in owners), strict=True)]
+        names = [*axes, *(f"v{axis}" for axis in axes)]
+        self.unobservable = {
+            name: list(unobservable_directions(motion.matrices()[0], self._matrix, names))
+            for name, motion in zip(self.track_names, self.tracking.motions, strict=True)
+        }
         self.last_seen_positions = np.zeros((len(self.track_names), self._d))
         self.permitted = np.zeros(len(self.track_names), dtype=bool)
         self.observe = bool(observe)
         if observe:
-            self.observation_space = with_tracks(env.observation_space, 3 * self._d * len(self.track_names))
-
-    # What is tracked, and from where --------------------------------------------------------------------------
+            self.observation_space = _with_tracks(env.observation_space, 3 * self._d * len(self.track_names))
 
     def _look_at(self, model: mujoco.MjModel) -> None:
         """Resolve names on a model."""
         s = self.sensor
         range_m = math.inf if s.range_m is None else s.range_m
         self._sight = LineOfSight(model, s.camera, s.site, s.view_deg, range_m, s.occluder_groups)
-        bodies, self.track_names, counts = tracked_things(model, self.tracks, self._published)
-        self._counted = list(zip(self.tracks, counts, strict=True))
-        if len(set(self.track_names)) < len(self.track_names):
-            twice = sorted({n for n in self.track_names if self.track_names.count(n) > 1})
-            raise ConfigurationError(f"each thing is tracked once; these are named twice: {', '.join(twice)}")
-        self._bodies = np.array(bodies, dtype=np.intp)
+        self._things = tracked_things(model, self.tracks, self._published)
+        self._bodies = np.array([thing.body for thing in self._things], dtype=np.intp)
         self._in_model = self._bodies >= 0
-
-    def _look_at_another(self, model: mujoco.MjModel) -> None:
-        """The env has another model now; the tracks must be the same."""
-        before = self.track_names
-        self._look_at(model)
-        if self.track_names != before:
-            raise ConfigurationError(
-                f"the env has another model than when the wrapper was made, with other things to track: "
-                f"{', '.join(self.track_names)} and not {', '.join(before)}"
-            )
 
     def _published(self, track: Track) -> Array:
         points = np.asarray(read_attribute(self.env, track.published or ""), dtype=np.float64)
@@ -193,14 +159,6 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
                 f"{points.shape}; how many there are is read when the wrapper is made"
             )
         return points
-
-    def _unobservable(self, axes: str) -> dict[str, list[str]]:
-        names = [*axes, *(f"v{axis}" for axis in axes)]
-        directions: list[list[str]] = []
-        for track, count in self._counted:
-            a, _, _ = track.motion(self._d).matrices()
-            directions += [list(unobservable_directions(a, self._matrix, names))] * count
-        return dict(zip(self.track_names, directions, strict=True))
 
     def _truth(self) -> tuple[Array, Array | None]:
         """True positions, shape (n, 3), m, and velocities, (n, d), m/s, if the sensor measures them."""
@@ -213,59 +171,53 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
             velocities = np.empty((len(positions), self._d))
             for i in np.flatnonzero(self._in_model):
                 velocities[i] = sight.velocity(int(self._bodies[i]))[0][: self._d]
-        at = 0
-        for track, count in self._counted:
+        for track in self.tracks:
             if track.published is not None:
                 points = self._published(track)
-                if len(points) != count:
+                which = [i for i, thing in enumerate(self._things) if thing.track is track]
+                if len(points) != len(which):
                     raise ConfigurationError(
-                        f"the env's {track.published} had {count} points when the wrapper was made, and has "
+                        f"the env's {track.published} had {len(which)} points when the wrapper was made, and has "
                         f"{len(points)} now; things that come and go cannot be tracked"
                     )
-                there = positions[at : at + count]
-                there[:, 2] = sight.position[2]  # a point of the plane is looked at level
-                there[:, : points.shape[1]] = points
-            at += count
+                positions[which, 2] = sight.position[2]  # a point of the plane is looked at level
+                positions[which, : points.shape[1]] = points
         return positions, velocities
 
-    # Gymnasium --------------------------------------------------------------------------------------------------
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env, start every track from its initial fix, and look once."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._random.reset(self.env, seed)
         if self._sight.model is not self._raw.model:
-            self._look_at_another(self._raw.model)
+            self._look_at(self._raw.model)
+            names = [thing.name for thing in self._things]
+            if names != self.track_names:
+                raise ConfigurationError(
+                    f"the env has another model than when the wrapper was made, with other things to track: "
+                    f"{', '.join(names)} and not {', '.join(self.track_names)}"
+                )
         self._time = float(self._raw.data.time)
         self._sight.read(self._raw.data)
         self._start()
-        self._look()
+        info.update(self._look())
         info[keys.OCCLUSION_PENALTY] = info[keys.OCCLUSION_TASK_REWARD] = 0.0
-        self._tell(info)
         return self._observed(observation), info
 
-    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> Step:
         """Step the env with the action as it is, and look."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self.tracking.advance(self._elapsed())
         self._sight.read(self._raw.data)
-        self._look()
+        info.update(self._look())
         penalty = self.weight * self._uncertainty() if self.weight else 0.0
         info[keys.OCCLUSION_TASK_REWARD] = float(reward)
         info[keys.OCCLUSION_PENALTY] = penalty
-        self._tell(info)
         if penalty:
             reward = float(reward) - penalty
         return self._observed(observation), reward, terminated, truncated, info
 
     def permissions(self, horizon_s: float = 60.0) -> Array:
-        """How long each track may still be relied on if nothing is seen from now on, s, shape (n,).
-
-        Until the bound is at the tolerance: `permitted` ends a control step before. 0 where it is there already; inf
-        where it is not reached within the horizon.
-        """
+        """How long each track may be relied on if nothing is seen from now on, s, (n,); inf beyond the horizon."""
         direction = np.eye(self._d, 2 * self._d)
         times = []
         for i, motion in enumerate(self.tracking.motions):
@@ -273,8 +225,6 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
             covariance = self.tracking.covariance[i]
             times.append(blind_time(covariance, a, q, direction, self.tolerance, self.sigmas, horizon_s))
         return np.array(times)
-
-    # Estimating ---------------------------------------------------------------------------------------------------
 
     def _elapsed(self) -> float:
         now = float(self._raw.data.time)
@@ -302,8 +252,8 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         self.tracking.start(mean, covariance)
         self.last_seen_positions = mean[:, :d].copy()
 
-    def _look(self) -> None:
-        """Measure what is in sight, and say what may be relied on."""
+    def _look(self) -> dict[str, Any]:
+        """Measure what is in sight, and report what may be relied on."""
         d, n = self._d, len(self.track_names)
         truth, velocities = self._truth()
         seen = self._sight.sees(truth, self._bodies)
@@ -314,15 +264,19 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         which = np.flatnonzero(seen)
         if which.size:
             among = None if velocities is None else velocities[which]
-            measurements = measured(self.sensor, self._sight, d, truth[which], among)
+            measurements = self.sensor.measured(self._sight, d, truth[which], among)
             measurements += noise[which]
             self.tracking.see(which, measurements, self._matrix, self._noise)
             if self.sensor.position_std is not None:
                 self.last_seen_positions[which] = measurements[:, :d]
-        self._visible = seen
         self._sigma = largest_deviation(self.tracking.position_covariances)
         soon = largest_deviation(self.tracking.ahead([self._control_dt])[1][0])
         self.permitted = self.sigmas * np.maximum(self._sigma, soon) <= self.tolerance
+        return {
+            keys.OCCLUSION_VISIBLE: seen,
+            keys.OCCLUSION_SIGMA: self._sigma.copy(),
+            keys.OCCLUSION_EXPIRED: ~self.permitted,
+        }
 
     def _uncertainty(self) -> float:
         """Mean share of the tolerated variance that is used up, over the tracks within range."""
@@ -332,11 +286,6 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         away = self.tracking.positions - self._sight.position[: self._d]
         near = (away * away).sum(axis=1) <= self.sensor.range_m**2
         return float(share[near].mean()) if near.any() else 0.0
-
-    def _tell(self, info: dict[str, Any]) -> None:
-        info[keys.OCCLUSION_VISIBLE] = self._visible.copy()
-        info[keys.OCCLUSION_SIGMA] = self._sigma.copy()
-        info[keys.OCCLUSION_EXPIRED] = ~self.permitted
 
     def _observed(self, observation: Any) -> Any:
         if not self.observe:
@@ -348,3 +297,27 @@ class OcclusionPenalty(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstruc
         if isinstance(observation, dict):
             return observation | {"tracks": flat}
         return np.concatenate([observation, flat.astype(observation.dtype)])
+
+
+def _with_tracks(space: gym.Space[Any], size: int) -> gym.Space[Any]:
+    """The observation space with so many numbers more."""
+    if isinstance(space, gym.spaces.Dict):
+        if "tracks" in space.spaces:
+            raise UnsupportedEnvError(
+                "the observation has an entry 'tracks' already, which the estimates would replace; rename it inside, "
+                "or pass observe=False"
+            )
+        more = gym.spaces.Box(-np.inf, np.inf, (size,), dtype=np.float64)
+        return gym.spaces.Dict({**space.spaces, "tracks": more})
+    if (
+        isinstance(space, gym.spaces.Box)
+        and len(space.shape) == 1
+        and np.issubdtype(space.dtype, np.floating)
+    ):
+        bound = np.full(size, np.inf)
+        low, high = np.concatenate([space.low, -bound]), np.concatenate([space.high, bound])
+        return gym.spaces.Box(low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype.type)
+    raise UnsupportedEnvError(
+        f"with observe=True the observation must be a flat Box of floats or a Dict, got {space}; flatten it inside, "
+        "or pass observe=False"
+    )

@@ -1,24 +1,41 @@
 """What the filter did and what the task cost, per step so far and per episode, in info and in a CSV file."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math
 import os
 from pathlib import Path
-from typing import Any, ClassVar, Final, SupportsFloat
+from typing import Any, ClassVar, Final
 
-import gymnasium as gym
 import numpy as np
 
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.stack import Layer, refuse_order
-from safe_wrappers.wrappers.common.not_judged import NOT_JUDGED
+from safe_wrappers.stack import Layer
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
 
 COLUMNS: Final = ("length", "return", *(figure.name for figure in keys.EPISODE))
 """The CSV file's columns. Cells stay empty where the task or the stack does not report what they hold."""
+
+
+class _NotJudged(np.float64):
+    """A NaN that equals every NaN: Gymnasium's `check_env` compares the infos of two equal runs by `==`."""
+
+    def __eq__(self, other: Any) -> bool:
+        return isinstance(other, float) and math.isnan(other)
+
+    def __ne__(self, other: Any) -> bool:
+        return not self == other
+
+    def __hash__(self) -> int:
+        return hash(type(self))
+
+    def __reduce__(self) -> str:
+        return "NOT_JUDGED"  # the one below, in a copy and in another process too
+
+
+NOT_JUDGED: Final = _NotJudged("nan")
+"""float64 NaN, written in info for a number that nobody reported; test for it with `math.isnan`."""
 
 
 class _Tally:
@@ -76,25 +93,17 @@ class _Tally:
         return self._total / steps if how == "mean" else self._total
 
 
-class RecordInterventions(
-    gym.Wrapper[Any, Any, Any, Any],
-    gym.utils.RecordConstructorArgs,
-):
+class RecordInterventions(LayerWrapper):
     """Counts interventions, corrections and costs; changes neither actions, rewards nor observations.
 
     Put it outside the filter, `LeaseExpiry`, `TeleopChannel` and `OcclusionPenalty`, and inside `ChunkHandover` and
-    SB3's `Monitor`; other orders of our own wrappers are refused (`stack.py`).
+    SB3's `Monitor`. At every step `info` gains the keys of `safe_wrappers.info.RUNNING` (float64, the episode so
+    far), and at an episode's last step `info["interventions"]`, a dict: `length`, `return` (of the task: penalties
+    that a wrapper inside has taken off are added back), and the figures of `safe_wrappers.info.EPISODE`. A mean is
+    over all steps of the episode, `margin_min` the smallest finite `cbf/margin`.
 
-    **What nobody reported is not zero.** Without a filter inside (the unfiltered arm of a comparison) there are no
-    `cbf/*` keys, and many tasks report no `cost`. What would be made of them is NaN in the running keys, missing
-    in the episode's summary, and an empty cell in the file. The same holds for a 0 that was not reported at every
-    step; a count above 0 is given, as a lower bound. `CostFunction` gives a cost to a task that has none.
-
-    At every step `info` gains the keys of `safe_wrappers.info.RUNNING` (float64, the episode so far), and at an
-    episode's last step `info["interventions"]`, a dict: `length`, `return` (of the task: what an `OcclusionPenalty`
-    or `AdaptionPenalty` inside has taken off is added back), and the figures of `safe_wrappers.info.EPISODE`: rates,
-    corrections, costs, numbers of steps. A mean is over all steps of the episode, `margin_min` the smallest finite
-    `cbf/margin`.
+    What nobody reported is not zero: it is NaN in the running keys, missing in the summary, and an empty cell in the
+    file. The same holds for a 0 that was not reported at every step; a count above 0 is a lower bound.
 
     Args:
         env: The env to record.
@@ -113,41 +122,29 @@ class RecordInterventions(
         ...     _, _, _, _, info = env.step(env.action_space.low)
         >>> print(list(info["interventions"]), info["interventions/cost"])  # no filter, and a task without a cost
         ['length', 'return'] nan
-
-    Change log:
-        * v0.1.0: added.
     """
 
     layer: ClassVar = Layer.RECORDER
 
-    def __init__(self, env: gym.Env[Any, Any], path: str | os.PathLike[str] | None = None) -> None:
-        refuse_order(env, self.layer, type(self).__name__)
+    def __init__(self, env: Env, path: str | os.PathLike[str] | None = None) -> None:
+        LayerWrapper.__init__(self, env)
         text = None if path is None else os.fspath(path)
         if text is not None:
             _continue_file(Path(text))
-        gym.utils.RecordConstructorArgs.__init__(self, path=text)
-        gym.Wrapper.__init__(self, env)
+        self._record({"path": text})
         self.path = text
         self._clear()
 
     @property
     def filter_time_us(self) -> float | None:
-        """Mean time of one filter call in microseconds; None with no filter inside or before its first call.
-
-        An attribute, because wall-clock values in `info` would make two identical runs differ.
-        """
+        """Mean time of one filter call, microseconds; None with no filter inside or before its first call."""
         if not self.env.has_wrapper_attr("filter_seconds"):
             return None
         calls = int(self.env.get_wrapper_attr("filter_calls"))
         return 1e6 * float(self.env.get_wrapper_attr("filter_seconds")) / calls if calls else None
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        """Starts a new episode's counts: 0 in info of what this reset's info has, NaN of what it lacks.
-
-        Seed and options pass through untouched.
-        """
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
+        """Start a new episode's counts: 0 in info of what this reset's info has, NaN of what it lacks."""
         self._clear()
         observation, info = self.env.reset(seed=seed, options=options)
         for tally in self._tallies:
@@ -156,8 +153,8 @@ class RecordInterventions(
                 info[tally.figure.running] = 0.0 if tally.figure.of[0] in info else NOT_JUDGED
         return observation, info
 
-    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Steps the env and adds the running counts, and the summary at the episode's end, to its info."""
+    def step(self, action: Any) -> Step:
+        """Step the env; its info gains the running counts, and the summary at the episode's end."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._steps += 1
         penalties = info.get(keys.OCCLUSION_PENALTY, 0.0) + info.get(keys.ADAPTION_PENALTY, 0.0)
@@ -183,14 +180,7 @@ class RecordInterventions(
 
 
 def read_episodes(path: str | os.PathLike[str]) -> list[dict[str, float]]:
-    """Reads back a CSV file of `RecordInterventions`; a half-written last line is left out.
-
-    Args:
-        path: The file.
-
-    Returns:
-        One dict per episode; empty cells (what was not reported) are left out of it.
-    """
+    """Read a CSV file of `RecordInterventions`: one dict per whole line, without the cells that are empty."""
     rows = csv.DictReader(io.StringIO(_whole_lines(Path(path).read_bytes()).decode()))
     return [{key: float(value) for key, value in row.items() if value != ""} for row in rows]
 
@@ -202,9 +192,7 @@ def _whole_lines(data: bytes) -> bytes:
 
 def _continue_file(path: Path) -> None:
     if path.is_dir():
-        raise ConfigurationError(
-            f"RecordInterventions: path {str(path)!r} is a folder; give a file name in it."
-        )
+        raise ConfigurationError(f"RecordInterventions: {str(path)!r} is a folder; give a file name in it.")
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         return

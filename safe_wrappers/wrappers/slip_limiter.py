@@ -1,28 +1,22 @@
 """SlipLimiter: the filter with Traction alone."""
 
 from collections.abc import Sequence
-from typing import Any
-
-import gymnasium as gym
 
 from safe_wrappers.constraints.traction import Traction
 from safe_wrappers.filter.fallback import FallbackFunction
+from safe_wrappers.plants.default import own_plant
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.template import PlantTemplate, own_plant
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
+from safe_wrappers.wrappers.common.layer import Env
 
 
 class SlipLimiter(CBFActionFilter):
     """Keeps every driven wheel on what seems the stable side of its traction curve, with friction unknown.
 
     It is `CBFActionFilter` with one `Traction`; put `Traction` into a filter's list to hold it together with other
-    constraints, in one projection.
-
-    **What it guarantees.** What `CBFActionFilter` does. **What it does not.** See `Traction`: a wheel that comes to
-    another ground overshoots for one or two control steps; wheels that are driven against each other overshoot on any
-    ground (dry, limit 0.15, commands drawn for each wheel: a slip above 0.17 in 0.05 % of the steps if drawn anew at
-    every step, in 1.5 % if full ones are held for up to 19 steps, three of them in a row at most); sideways slip is
-    not limited, and obstacles are none of its business. No flag marks an overshoot; ``slip/ratio`` shows it.
+    constraints. **What it guarantees.** What `CBFActionFilter` does. **What it does not.** See `Traction`: a wheel
+    that comes to another ground, and wheels that are driven against each other, overshoot for a few control steps;
+    sideways slip is not limited. No flag marks an overshoot; ``slip/ratio`` shows it.
 
     Args:
         env: Of MuJoCo, with a Box action space that is its model's control range.
@@ -55,7 +49,7 @@ class SlipLimiter(CBFActionFilter):
 
     def __init__(
         self,
-        env: gym.Env[Any, Any],
+        env: Env,
         wheels: Sequence[str],
         max_slip: float = 0.15,
         friction: float | None = None,
@@ -65,17 +59,8 @@ class SlipLimiter(CBFActionFilter):
         solver: str = "daqp",
         margin: float = 0.0,
     ) -> None:
+        arguments = dict(locals())
         traction = Traction(wheels, max_slip, friction, regularization, margin)
         plant = own_plant(plant)
-        gym.utils.RecordConstructorArgs.__init__(
-            self,
-            wheels=list(wheels),
-            max_slip=max_slip,
-            friction=friction,
-            regularization=regularization,
-            plant=None if plant is None else PlantTemplate(plant),
-            fallback=fallback,
-            solver=solver,
-            margin=margin,
-        )
-        super().__init__(env, [traction], plant=plant, fallback=fallback, solver=solver)
+        self._record(arguments, wheels=list(wheels), plant=plant)
+        CBFActionFilter.__init__(self, env, [traction], plant=plant, fallback=fallback, solver=solver)

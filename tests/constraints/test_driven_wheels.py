@@ -13,7 +13,7 @@ FLOOR = '<geom name="floor" type="plane" size="50 50 0.1" friction="0.01 0.005 0
 
 def wheels_of(env):
     limiter = sw.SlipLimiter(env, wheels=["left", "right"])
-    return limiter.filter.bound[0]._wheels, limiter.plant
+    return limiter.filter.bound[0].wheels, limiter.plant
 
 
 def test_motion_is_that_of_the_wheels_centres_in_any_attitude():

@@ -20,7 +20,7 @@ from safe_wrappers.appendix.contact.impact import (
     peak_force,
     time_to_peak,
 )
-from safe_wrappers.constraints.contact.impact_speed_limit import _Contact
+from safe_wrappers.constraints.contact.impact_speed_limit import Contact
 from safe_wrappers.control.contact.body_regions import BODY_REGIONS
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 
@@ -101,7 +101,7 @@ def full(raw, k):
     deflection=st.floats(0.0, 0.02),
 )
 def test_the_peak_is_that_of_the_differential_equation(speed, mass, stiffness, push, deflection):
-    contact = _Contact(-deflection, speed, mass * stiffness, push, stiffness * deflection)
+    contact = Contact(-deflection, speed, mass * stiffness, push, stiffness * deflection)
     period = 2.0 * np.pi * np.sqrt(mass / stiffness)
     done = solve_ivp(
         lambda _, s: [s[1], (push - stiffness * s[0]) / mass],
@@ -114,10 +114,6 @@ def test_the_peak_is_that_of_the_differential_equation(speed, mass, stiffness, p
     assert contact.peak == pytest.approx(stiffness * done.y[0].max(), rel=1e-3, abs=1e-3)
 
 
-PLANT = sw.MujocoPlant()
-PLANT.bind(slide())
-
-
 @settings(max_examples=200, deadline=None)
 @given(
     speed=st.floats(0.0, 2.0),
@@ -127,22 +123,21 @@ PLANT.bind(slide())
     margin=st.floats(0.0, 50.0),
 )
 def test_what_is_left_is_negative_exactly_where_the_peak_is_too_high(speed, inertia, push, pressed, margin):
-    contact = _Contact(0.0, speed, inertia, push, pressed)
-    constraint = limit(margin=margin).bind(PLANT)
-    left, over = constraint._left(contact), contact.peak - (LIMIT - margin)
+    contact = Contact(0.0, speed, inertia, push, pressed)
+    left, over = contact.left(LIMIT - margin), contact.peak - (LIMIT - margin)
     if abs(over) > 1e-6 * LIMIT:
         assert (left < 0.0) == (over > 0.0)
     assert left <= 0.5 * LIMIT + 1e-9
-    harder = constraint._left(replace(contact, push=push + 10.0))
+    harder = replace(contact, push=push + 10.0).left(LIMIT - margin)
     assert harder < left or pressed == LIMIT - margin  # also where all is lost
 
 
 def test_to_first_order_what_is_left_is_the_force_that_is_missing():
-    at_limit = _Contact(0.0, SLOW, MASS * K, 0.0, 0.0)
+    at_limit = Contact(0.0, SLOW, MASS * K, 0.0, 0.0)
     assert at_limit.peak == pytest.approx(LIMIT)
     for more in (-1e-4, 1e-4):
         contact = replace(at_limit, speed=SLOW * (1.0 + more))
-        assert limit().bind(PLANT)._left(contact) == pytest.approx(LIMIT - contact.peak, rel=1e-3)
+        assert contact.left(LIMIT) == pytest.approx(LIMIT - contact.peak, rel=1e-3)
 
 
 ARM = """<mujoco><option timestep="0.001"/><worldbody>
@@ -177,8 +172,8 @@ def test_speed_mass_and_push_are_those_of_the_moving_arm(seed):
     m, data, control = env.model, mujoco.MjData(env.model), rng.uniform(-1.0, 1.0, 3)
     constraint.value()
     qpos, qvel = env.data.qpos.copy(), env.data.qvel.copy()
-    constraint._at(qpos, qvel, control)
-    contact = constraint._contact(0)
+    constraint.place(qpos, qvel, control)
+    contact = constraint.contact(0)
 
     # The distance and the point by hand: the wall's normal, the fist's lowest point above it.
     data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, control
@@ -210,11 +205,11 @@ def test_speed_mass_and_push_are_those_of_the_moving_arm(seed):
     mujoco.mj_forward(m, data)
     resting = float(row @ data.qacc_smooth)
     assert contact.push == pytest.approx(mass * max(growing, resting, 0.0), rel=1e-4, abs=1e-4)
-    constraint._at(qpos, qvel, None)
+    constraint.place(qpos, qvel, None)
     data.ctrl[:] = 0.0
     mujoco.mj_forward(m, data)
     resting = float(row @ data.qacc_smooth)  # without the motors
-    assert constraint._contact(0).push >= mass * max(resting, 0.0) - 1e-9
+    assert constraint.contact(0).push >= mass * max(resting, 0.0) - 1e-9
 
 
 def test_some_of_those_pushes_come_from_the_motion_and_some_from_rest():
@@ -227,11 +222,11 @@ def test_some_of_those_pushes_come_from_the_motion_and_some_from_rest():
     for _ in range(30):
         qpos = env.model.qpos0.copy()
         qpos[:3], qvel = rng.uniform(-0.8, 0.8, 3), np.zeros(env.model.nv)
-        constraint._at(qpos, qvel, np.ones(3))
-        resting = constraint._contact(0).push
+        constraint.place(qpos, qvel, np.ones(3))
+        resting = constraint.contact(0).push
         qvel[:3] = rng.uniform(-3.0, 3.0, 3)
-        constraint._at(qpos, qvel, np.ones(3))
-        more[constraint._contact(0).push > resting + 1e-9] += 1
+        constraint.place(qpos, qvel, np.ones(3))
+        more[constraint.contact(0).push > resting + 1e-9] += 1
     assert min(more.values()) >= 3
 
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.obstacles.obstacles import distances
+from safe_wrappers.constraints.obstacles import distances
 from safe_wrappers.errors import ConfigurationError
 
 COORDINATE = st.floats(-2, 2).map(lambda v: round(v, 4))

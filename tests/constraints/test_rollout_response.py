@@ -21,11 +21,11 @@ class Approaching(BoundRollout):
             None,
         )
 
-    def _room(self, forecast):
+    def room(self, forecast):
         share = np.linspace(1.0 / INSTANTS, 1.0, INSTANTS)[:, None]
         return self.plant.left - forecast[0] * self.plant.gain * share
 
-    def _now(self):
+    def now(self):
         return np.array([self.plant.left])
 
 

@@ -95,7 +95,7 @@ def test_w_is_that_of_mujoco_s_jacobian_now_and_ahead(task):
         plant.observe()
         assert limit.value() == pytest.approx(expected(env.data.qpos), rel=1e-9, abs=1e-9)
         forecast = plant.forecast(rng.uniform(-3.0, 3.0, 4), 2)
-        room = limit._room(forecast)
+        room = limit.room(forecast)
         assert room.shape == (10, 1)
         for k in range(10):
             # Beyond a singular pose a square task counts as negative; the difference has a test of its own.
@@ -175,7 +175,7 @@ def test_a_square_task_is_not_passed_through_its_singular_pose():
         forecast = limit.plant.forecast(np.zeros(2), 2)
         crossing = forecast.qpos[:, 1]
         assert (crossing * side).min() < -0.2  # it does pass through, to where w is large again
-        np.testing.assert_allclose(limit._room(forecast)[:, 0], side * 0.011 * np.sin(crossing) / 0.003 - 1.0)
+        np.testing.assert_allclose(limit.room(forecast)[:, 0], side * 0.011 * np.sin(crossing) / 0.003 - 1.0)
         assert not limit.admits(np.zeros(2))
 
 

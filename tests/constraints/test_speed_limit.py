@@ -51,7 +51,7 @@ def test_the_forecast_speed_is_the_one_that_the_task_judges(robot, version):
         if speeds and not plane:  # the step behind it is judged by the same measure
             assert 50.0 - present == pytest.approx(speeds[-1], abs=1e-12)
         forecast = plant.forecast(action)
-        ahead = 50.0 - limit._room(forecast)
+        ahead = 50.0 - limit.room(forecast)
         assert ahead.shape == (1, 2)
         assert limit.slack(action) == pytest.approx(50.0 - ahead.max(), abs=1e-12)
         limit.executed(action)
@@ -238,7 +238,7 @@ def test_under_a_delay_only_the_predicted_states_count():
     for k in range(60):
         position = float(env.data.qpos[0])
         filtered.filter.observe()
-        assert filtered.filter.bound[0]._room(plant.forecast(np.zeros(1))).shape == (1, 1)
+        assert filtered.filter.bound[0].room(plant.forecast(np.zeros(1))).shape == (1, 1)
         decision = filtered.filter.filter(np.array([20.0 * (-1.0) ** (k // 20)]))
         filtered.filter.executed(decision.control)
         queue.append(float(decision.control[0]))

@@ -174,7 +174,7 @@ def test_contacts_that_the_torques_lift_open():
     env.data.qvel[2] = 0.4  # the whole robot on its way up
     stance.plant.observe()
     assert stance.admits(np.full(4, 0.3))
-    problem = stance._problem
+    problem = stance.problem(np.full(4, 0.3))
     assert problem.breaking.all() or not len(problem.normals)
     assert stance.slack(np.full(4, 0.3)) >= 0.0
 
@@ -206,7 +206,7 @@ def test_an_inset_of_the_zero_moment_point_is_kept_by_the_forces():
     for inset in (0.3 - 0.34 * np.tan(tilt) - 0.1, 0.3 - 0.2 * np.tan(tilt)):
         stance = settled(env, sw.constraints.Stance(1.0, zmp_inset=inset, **STANCE), steps=60)
         verdicts.append(stance.admits(STILL))
-        assert stance._problem.force_rows is not None
+        assert stance.problem(STILL).force_rows is not None
     assert verdicts == [True, False]
 
 
@@ -232,7 +232,7 @@ def test_other_contacts_count_as_the_forces_that_they_are():
     for env in (light, heavy):
         stance = settled(env, sw.constraints.Stance(0.5, "exact", **STANCE), STILL, 200)
         assert stance.admits(STILL)
-        pressures.append(stance._solve(stance._problem).forces[:, 2].sum())
+        pressures.append(stance.solve(stance.problem(STILL)).forces[:, 2].sum())
         assert pressures[-1] == pytest.approx(stance.plant.weight_n, rel=0.02)
         assert stance.info(STILL, STILL)["whole_body/contacts"] == 4
     assert pressures[1] > 1.6 * pressures[0]
@@ -294,9 +294,9 @@ def test_robots_unflagged_steps_have_forces_at_the_first_instant(env_id, cone):
         counts["changed"] += info["cbf/intervened"]
         if not flagged(info):
             # The same program with the executed action as the nominal one: nothing is left to change.
-            problem = stance._problem
+            problem = stance.problem(info["executed_action"])
             asked = np.clip(info["executed_action"], problem.lower, problem.upper)
-            answer = stance._solve(type(problem)(**{**fields_of(problem), "nominal": asked}))
+            answer = stance.solve(type(problem)(**{**fields_of(problem), "nominal": asked}))
             assert answer.residuals.cone < 1e-4 and answer.residuals.contact < 1e-3
             # Rounded to float32 it may have to move again, and then the price of forces moves it too.
             assert np.abs(answer.control - asked).max() < 2e-3

@@ -233,7 +233,7 @@ def test_reports_do_not_change_afterwards():
 
 
 def trolley_slip(env):
-    wheels = env.filter.bound[0]._wheels
+    wheels = env.filter.bound[0].wheels
     env.plant.observe()
     rate, ground, _ = wheels.motion(env.plant)
     return slip_ratio(0.1 * rate, ground, 0.5)
@@ -358,7 +358,7 @@ def test_made_again_from_its_spec():
 
 def test_the_constants_read_from_the_model():
     env = sw.SlipLimiter(Trolley(damping=0.3), wheels=["left", "right"])
-    constants = env.filter.bound[0]._constants
+    constants = env.filter.bound[0].constants
     np.testing.assert_allclose(constants.radius, 0.1)
     np.testing.assert_allclose(constants.damping, 0.3)
     np.testing.assert_allclose(constants.inertia, 0.01 + 0.5 * 0.5 * 0.1**2)
@@ -369,7 +369,7 @@ def test_loads_carry_the_weight():
     env.reset(seed=0)
     for _ in range(100):
         env.step(np.zeros(2, dtype=np.float32))
-    wheels = env.filter.bound[0]._wheels
+    wheels = env.filter.bound[0].wheels
     loads = wheels.loads(env.unwrapped.model, env.unwrapped.data)
     weight = 9.81 * env.unwrapped.model.body_mass.sum()
     # About the caster's contact: the wheels' share is the centre of mass's distance from it.

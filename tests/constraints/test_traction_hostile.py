@@ -203,7 +203,7 @@ def test_a_quarter_car_by_its_equations(ground, speed, action):
         v, w, impulse = equations(ground, MOST * info["executed_action"][0], before, raw.dt)
         np.testing.assert_allclose(raw.data.qvel[[0, 2]], (v, w), rtol=5e-3, atol=5e-3)
         env.filter.observe()
-        errors.append(abs(traction._traction[0] - impulse / raw.dt) / (MASS * 9.81))
+        errors.append(abs(traction.seen.traction[0] - impulse / raw.dt) / (MASS * 9.81))
         slips.append(abs(slip_of(v, w)))
     assert max(errors) < 0.02  # of the load
     assert max(slips) < 0.16
@@ -271,7 +271,7 @@ def test_loads_are_the_envs_whatever_the_plants_model_looks_like(change):
     filtered.plant.observe()
     filtered.filter.bound[0].rows()
     assert (expected > 5.0).all()
-    np.testing.assert_allclose(filtered.filter.bound[0]._load, expected, rtol=1e-6)
+    np.testing.assert_allclose(filtered.filter.bound[0].seen.load, expected, rtol=1e-6)
 
 
 SERVOS = "".join(f'<velocity joint="{side}" kv="{{kv}}" ctrlrange="-40 40"/>' for side in ("left", "right"))
@@ -294,7 +294,7 @@ def test_wheels_that_touch_nothing_feel_no_force(actuators, integrator, substeps
         raw.step(np.array([0.5, -0.3]) * env.action_space.high)
         env.filter.observe()
     assert np.abs(raw.data.qvel[6:]).min() > 0.3
-    np.testing.assert_allclose(env.filter.bound[0]._traction, 0.0, atol=1e-4)
+    np.testing.assert_allclose(env.filter.bound[0].seen.traction, 0.0, atol=1e-4)
 
 
 @pytest.mark.parametrize(("kv", "substeps"), [(0.5, 25), (5.0, 5), (5.0, 25)])
@@ -349,9 +349,9 @@ def test_a_clock_that_is_set_back_measures_nothing():
     raw = env.unwrapped
     mujoco.mj_resetData(raw.model, raw.data)
     raw.set_state(raw.init_qpos.copy(), np.zeros(raw.model.nv))
-    known = env.filter.bound[0]._estimate.mean
+    known = env.filter.bound[0].seen.estimate.mean
     info = env.step(FULL)[4]
-    np.testing.assert_array_equal(env.filter.bound[0]._traction, 0.0)
+    np.testing.assert_array_equal(env.filter.bound[0].seen.traction, 0.0)
     np.testing.assert_array_equal(info["slip/mu_estimate"], known)
     fresh = start(rover(), ground="wet").step(FULL)[4]
     # As from a fresh start but for the limit, which the estimate has moved.
@@ -381,7 +381,7 @@ def test_a_state_that_is_no_number_is_forgotten():
     raw = env.unwrapped
     good = raw.data.qvel.copy()
     traction, full = env.filter.bound[0], np.ones(2)
-    assert (traction._present > 0.0).all()
+    assert (traction.seen.present > 0.0).all()
     raw.data.qvel[6] = np.nan
     env.plant.observe()
     traction.observe(traction.executed(full))
@@ -391,7 +391,7 @@ def test_a_state_that_is_no_number_is_forgotten():
     env.plant.observe()
     traction.observe(traction.executed(full))
     assert np.isfinite(traction.rows().offsets).all()
-    np.testing.assert_array_equal(traction._present, 0.0)
+    np.testing.assert_array_equal(traction.seen.present, 0.0)
 
 
 class AlwaysHere(gym.Wrapper):

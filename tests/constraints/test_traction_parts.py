@@ -86,7 +86,7 @@ def test_a_wheel_that_is_hardly_loaded_teaches_nothing():
     start(env, ground="wet", speed=2.0)
     for _ in range(40):
         info = env.step(FULL)[4]
-    wheels, before = env.filter.bound[0]._wheels, info["slip/mu_estimate"]
+    wheels, before = env.filter.bound[0].wheels, info["slip/mu_estimate"]
     measured = wheels.loads
     wheels.loads = lambda model, data: 0.01 * measured(model, data)  # for one step: it hops
     env.step(FULL)
@@ -210,7 +210,7 @@ def test_a_measurement_that_is_no_number_is_reported_and_forgotten():
     start(env, ground="wet", speed=2.0)
     for _ in range(20):
         env.step(FULL)
-    wheels = env.filter.bound[0]._wheels
+    wheels = env.filter.bound[0].wheels
     measured = wheels.loads
     wheels.loads = lambda model, data: np.nan * measured(model, data)
     with warnings.catch_warnings():

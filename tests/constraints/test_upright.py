@@ -66,7 +66,7 @@ def test_the_forecast_is_followed_substep_by_substep():
     env.data.qvel[3] = 2.0  # turning about x at 2 rad/s, and falling
     mujoco.mj_forward(env.model, env.data)
     limit = bound(env, sw.constraints.Upright("box", lowest=1.0, tilt=1.0, horizon=4))
-    room = limit._room(limit.plant.forecast(np.zeros(1), 4))
+    room = limit.room(limit.plant.forecast(np.zeros(1), 4))
     assert room.shape == (20, 2)
     data = mujoco.MjData(env.model)
     mujoco.mj_copyData(data, env.model, env.data)

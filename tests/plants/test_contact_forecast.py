@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from safe_wrappers.plants.mujoco.contact_forecast import can_touch_the_world
+from safe_wrappers.plants.mujoco.contacts import can_touch_the_world
 from safe_wrappers.plants.mujoco.replay import Replay
 
 ROBOTS = ("Ant-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Humanoid-v5")

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 
 import safe_wrappers as sw
-from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
+from safe_wrappers.plants.mujoco.model import fixed_bodies
 
 XML = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="1 1 1"/>
 <body name="shelf"><geom size=".1"/></body>

@@ -231,7 +231,7 @@ def test_a_pose_after_a_forecast_is_still_that_of_the_state():
     plant.forecast(np.ones(8), 3)
     np.testing.assert_array_equal(plant.pose().xpos, fresh(env.unwrapped).xpos)
     plant.forward()
-    list(plant.rollout(np.ones(8)))
+    plant.path(np.ones(8))
     np.testing.assert_array_equal(plant.pose().xpos, fresh(env.unwrapped).xpos)
 
 

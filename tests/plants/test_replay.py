@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from safe_wrappers.appendix.contact.impact import peak_force
 from safe_wrappers.plants.mujoco.contacts import Contacts
-from safe_wrappers.plants.mujoco.replay import Replay, _rotation_vector_rate
+from safe_wrappers.plants.mujoco.replay import Replay, rotation_vector_rate
 
 INTEGRATORS = ("Euler", "implicit", "implicitfast", "RK4")
 RAW = ("HalfCheetah-v5", "Pusher-v5", "Hopper-v5", "Ant-v5", "Humanoid-v5", "SafePointGoal2-v0")
@@ -82,7 +82,7 @@ def test_the_rate_of_a_rotation_vector_turns_by_the_angular_velocity():
     for length in (0.0, 1e-9, 1e-3, 0.5, 3.0):
         turned, velocity = rng.normal(size=(2, 5, 3))
         turned *= length / np.linalg.norm(turned, axis=1, keepdims=True)
-        rate = _rotation_vector_rate(turned, velocity)
+        rate = rotation_vector_rate(turned, velocity)
         after = Rotation.from_rotvec(turned + short * rate)
         difference = (Rotation.from_rotvec(turned) * Rotation.from_rotvec(short * velocity)).inv() * after
         assert difference.magnitude().max() < 20.0 * short**2

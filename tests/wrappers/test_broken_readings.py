@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from safe_wrappers.constraints.obstacles.obstacles import Discs
+from safe_wrappers.constraints.obstacles import Discs
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 

@@ -18,6 +18,7 @@ from slow_handover import BLENDS, Slow, measured
 import safe_wrappers as sw
 from safe_wrappers.errors import ActionError, ConfigurationError, UnknownNameError
 from safe_wrappers.wrappers.common.receiver import CommandReceiver
+from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 from safe_wrappers.wrappers.faults import ClockSkew, DroppedRefreshes, FrozenPolicy, RepeatedCommands
 
 HOLD = 0.1
@@ -170,11 +171,12 @@ def play(scenario):
     """One episode of both: per step the env's info and reward, and the oracle's ticks."""
     env, oracle = scenario.env(), scenario.oracle()
     env.reset(seed=scenario.seed)
-    rng = np.random.default_rng(scenario.seed)
+    rng, delays = np.random.default_rng(scenario.seed), WrapperRng("ChunkHandover")
+    delays.reset(env, scenario.seed)
     names = itertools.cycle(["human", "fallback", "policy"])
     line, steps = env.unwrapped, []
     for event in scenario.events:
-        delay = int(copy.deepcopy(env._random.draw).integers(scenario.delay[0], scenario.delay[1] + 1))
+        delay = int(delays.draw.integers(scenario.delay[0], scenario.delay[1] + 1))
         chunk, observed = act(event, env, oracle, scenario.chunk(rng), rng, names)
         refused = observed is not None and not oracle.submit(chunk, observed, oracle.now + delay)
         start = oracle.now
@@ -701,16 +703,13 @@ def test_temporal_ensembling_by_its_formula(delay, decay):
 def test_two_chunks_that_are_there_at_once_both_count_in_the_ensemble():
     """The first takes the whole horizon, the second none: both are there at control step 2."""
 
-    class Delays:
-        def __init__(self, values):
-            self.values = list(values)
-
-        def integers(self, low, high):
-            return self.values.pop(0)
-
     env = sw.ChunkHandover(Line(), 6, 2, [0, 2], blend="ensemble", decay=0.0, fallback="zero")
-    env.reset(seed=0)
-    env._random._generator = Delays([2, 0])
+    delays = WrapperRng("ChunkHandover")
+    for seed in range(100):
+        delays.reset(env, seed)
+        if [int(delays.draw.integers(0, 3)) for _ in range(2)] == [2, 0]:
+            break
+    env.reset(seed=seed)
     env.step(np.full((6, 1), 0.2, np.float32))
     env.step(np.full((6, 1), 0.4, np.float32))
     np.testing.assert_allclose([c[0] for c in env.unwrapped.given], [0.0, 0.0, 0.3, 0.3], atol=1e-6)
@@ -937,9 +936,8 @@ def test_limits_may_be_numpys_and_are_recorded_as_plain_numbers(limit):
         control_dt=np.float64(0.02),
     )
     again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
-    assert (
-        np.ravel(again._queue._rate_limit).tolist() == np.broadcast_to(np.asarray(limit, float), 2).tolist()
-    )
+    recorded = again.spec.additional_wrappers[-1].kwargs["rate_limit"]
+    assert np.broadcast_to(recorded, 2).tolist() == np.broadcast_to(np.asarray(limit, float), 2).tolist()
 
 
 def test_each_component_keeps_its_own_limit():

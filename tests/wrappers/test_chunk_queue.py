@@ -2,8 +2,8 @@
 
 import itertools
 import math
-from types import SimpleNamespace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,17 +17,9 @@ HOLD = 0.1
 def queue(
     blend="replace", fewest=0, limit=math.inf, controls=1, decay=0.0, low=-1e3, high=1e3, dtype=np.float64
 ):
-    ends = [np.full(controls, end) for end in (low, high)]
+    space = gym.spaces.Box(low, high, (controls,), dtype)
     return ChunkQueue(
-        controls,
-        HOLD,
-        blend=blend,
-        fewest=fewest,
-        rate_limit=np.full(controls, limit),
-        low=ends[0],
-        high=ends[1],
-        dtype=dtype,
-        decay=decay,
+        space, HOLD, blend=blend, fewest=fewest, rate_limit=np.full(controls, limit), decay=decay
     )
 
 
@@ -45,17 +37,8 @@ def never():
 
 
 def tick(queue, stand_in=fallback, admit=lambda end, steps: True):
-    """One command, of the newest chunk that is admitted, and whether one was refused, as `ChunkHandover` does it."""
-    admitted, refused = [], False
-    for chunk in queue.arrived():
-        left = queue.left(chunk)
-        if len(left) and admit(left[-1], len(left)):
-            admitted.append(chunk)
-            if queue._blend != "ensemble":
-                break
-        else:
-            refused = True
-    return SimpleNamespace(**queue.next(admitted, stand_in)._asdict(), refused=refused)
+    """One command."""
+    return queue.next(admit, stand_in)
 
 
 def run(queue, ticks, *how, **admit):
@@ -300,8 +283,7 @@ def test_a_fade_is_as_long_as_the_way_inside_the_box():
 def test_coming_back_in_the_middle_of_a_fade_starts_from_where_it_is():
     q = queue("smoothstep", fewest=4)
     q.submit(np.array([[1.0]]), 0, 0)
-    run(q, 3, lambda: np.array([0.0]))
-    at = float(q._sent[-1][0])
+    at = float(run(q, 3, lambda: np.array([0.0]))[-1].control[0])
     assert 0.0 < at < 1.0
     q.submit(np.array([[1.0]]), 3, 3)
     back = run(q, 1, never)[0]
@@ -314,8 +296,7 @@ def test_a_long_chunk_ends_a_fade():
     """A chunk that takes over while the queue fades into the fallback: one blend, its own."""
     q = queue("smoothstep", fewest=4)
     q.submit(np.full((1, 1), 1.0), 0, 0)
-    run(q, 2, lambda: np.array([0.0]))
-    at = float(q._sent[-1][0])
+    at = float(run(q, 2, lambda: np.array([0.0]))[-1].control[0])
     q.submit(np.full((9, 1), 1.0), 2, 2)
     commands = run(q, 9, never)
     alpha = [10 * s**3 - 15 * s**4 + 6 * s**5 for s in (0.2, 0.4, 0.6, 0.8)] + [1.0] * 5

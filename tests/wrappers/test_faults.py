@@ -441,9 +441,10 @@ def test_repeats_are_caught_though_commands_keep_coming(kind):
 def test_chunks_are_carried_lost_and_repeated_as_a_whole(kind):
     cart = BrakedCart()
     chunks = sw.ChunkHandover(cart, 6, 2, blend="replace", fallback="zero")
-    heard = []
-    true = chunks.step
-    chunks.step = lambda action: (heard.append((chunks._observed_s, np.array(action))), true(action))[1]
+    heard, stamps = [], []
+    step, stamp = chunks.step, chunks.set_observation_time
+    chunks.set_observation_time = lambda observed_s: (stamps.append(observed_s), stamp(observed_s))[1]
+    chunks.step = lambda action: (heard.append((stamps[-1], np.array(action))), step(action))[1]
     env = faulty(kind, chunks)
     env.reset(seed=2)
     sent = [np.full((6, 2), 0.01 * t) + np.arange(6)[:, None] * 0.001 for t in range(40)]

@@ -7,8 +7,8 @@ from chunk_worlds import Line
 
 import safe_wrappers as sw
 from safe_wrappers import info as keys
+from safe_wrappers.wrappers.chunk_handover import macro_info
 from safe_wrappers.wrappers.faults import DroppedRefreshes
-from safe_wrappers.wrappers.handover.macro_info import macro_info
 
 REFUSED = ([True, False], [False, False], [False, False])
 INFOS = [

@@ -10,8 +10,12 @@ from gymnasium.utils.env_checker import check_env
 import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.common.not_judged import NOT_JUDGED
-from safe_wrappers.wrappers.record_interventions import COLUMNS, RecordInterventions, read_episodes
+from safe_wrappers.wrappers.record_interventions import (
+    COLUMNS,
+    NOT_JUDGED,
+    RecordInterventions,
+    read_episodes,
+)
 
 
 class Scripted(gym.Wrapper):

@@ -90,7 +90,7 @@ def test_wrappers_inside_that_change_or_repeat_the_action(wrap):
         (
             lambda e: sw.AnalyticPlant(f=len, g=len, state=len, control_dt="a"),
             ConfigurationError,
-            "control_dt is a time in seconds, got 'a'",
+            "control_dt must be a number in s, got 'a'",
         ),
     ],
 )

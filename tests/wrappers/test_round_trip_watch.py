@@ -65,15 +65,15 @@ def test_far_away_any_command_may_be_executed_and_close_by_only_one_that_can_be_
     looking = watch(env, ceiling())
     place(env)
     looking.look()
-    assert looking.can_stop_after(np.array([0.0, 1.0]))
+    assert looking.budget.can_stop_after(np.array([0.0, 1.0]), HOLD)
     place(env, (0.0, ROOM - 0.001 - 0.00002))  # 20 micrometres before its margin
     looking.look()
-    assert not looking.can_stop_after(np.array([0.0, 1.0]))
+    assert not looking.budget.can_stop_after(np.array([0.0, 1.0]), HOLD)
     for away in (0.0, -0.2, -1.0):
-        assert looking.can_stop_after(np.array([0.5, away]))
+        assert looking.budget.can_stop_after(np.array([0.5, away]), HOLD)
     place(env, (0.0, ROOM - 0.02), (0.0, 1.0))  # it needs 0.0208 + 0.001 m to stop
     looking.look()
-    assert not looking.can_stop_after(np.array([0.0, 0.0]))
+    assert not looking.budget.can_stop_after(np.array([0.0, 0.0]), HOLD)
 
 
 def test_the_delay_of_the_brake_is_counted(env):
@@ -81,7 +81,7 @@ def test_the_delay_of_the_brake_is_counted(env):
     for act_s, possible in ((0.0, True), (0.02, False)):
         looking = watch(env, ceiling(act_s=act_s))
         looking.look()
-        assert looking.can_stop_after(np.array([0.0, 0.0])) == possible
+        assert looking.budget.can_stop_after(np.array([0.0, 0.0]), HOLD) == possible
 
 
 def approach(env):
@@ -98,10 +98,10 @@ def test_a_function_of_the_env_measures_as_well(env):
         looking.look()
     assert by_function.ceiling_s == pytest.approx(by_constraint.ceiling_s)
     assert by_function.clearance_m == pytest.approx(by_constraint.clearance_m)
-    assert by_function.can_stop_after(np.array([0.0, 1.0]))
+    assert by_function.budget.can_stop_after(np.array([0.0, 1.0]), HOLD)
     place(env, (0.0, ROOM - 0.00102))
     by_function.look()  # it knows no command from another: none is admitted
-    assert not by_function.can_stop_after(np.array([0.0, -1.0]))
+    assert not by_function.budget.can_stop_after(np.array([0.0, -1.0]), HOLD)
 
 
 @pytest.mark.parametrize("answer", [(np.nan, 0.1), (0.1, np.inf), (-np.inf, 0.0)])
@@ -112,7 +112,7 @@ def test_what_cannot_be_read_has_no_ceiling(env, answer):
     env.reset(seed=0)
     looking.look()
     assert not looking.readable and looking.ceiling_s == -1.0 and looking.clearance_m == 0.0
-    assert not looking.can_stop_after(np.zeros(2))
+    assert not looking.budget.can_stop_after(np.zeros(2), HOLD)
 
 
 def test_a_ceiling_is_plain_data():

@@ -5,10 +5,11 @@ import pytest
 from teleop_worlds import Energies, ceiling, channel, clamp, place
 
 import safe_wrappers as sw
+from safe_wrappers.control.teleop.wave_line import WaveLine
 from safe_wrappers.envs.teleop_operator import TeleopOperator
-from safe_wrappers.wrappers.teleop.coding import Up
+from safe_wrappers.wrappers.teleop import coding as codings
+from safe_wrappers.wrappers.teleop.coding import Up, WaveCoding
 from safe_wrappers.wrappers.teleop.link import Packet
-from safe_wrappers.wrappers.teleop.wave_coding import WaveCoding
 
 B = 40.0
 NETWORKS = {
@@ -112,13 +113,20 @@ def test_pressing_with_a_still_hand_both_forces_agree():
     assert info["contact_force"] == pytest.approx(8.0, abs=0.05)
 
 
-def test_a_wave_that_is_held_by_the_plant_would_create_energy():
+def test_a_wave_that_is_held_by_the_plant_would_create_energy(monkeypatch):
     # The test of the test: hold the last wave at the machine instead of paying for it, and count.
     env = channel(0.0, 0.0, coding="wave", impedance=B)
     energies = Energies(env)
+    lines, held = [], []
+
+    class Held(WaveLine):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            lines.append(self)
+
+    monkeypatch.setattr(codings, "WaveLine", Held)
     place(env, (0.1, 0.0))
-    line = env._coding._up
-    held = []
+    line = lines[-2]  # an episode makes the line up, then the line down
 
     def never_empty(packets):
         held.extend(wave for _, wave in packets)
@@ -228,17 +236,17 @@ def test_waves_in_a_queue_are_as_old_as_they_are():
 
 def test_what_a_machine_took_unpaid_is_paid_by_the_next_waves():
     machine, tick = Machine(), 0.001
-    coding = WaveCoding(machine, tick, 2.0, "queue")
-    coding.reset(np.zeros(1))
+    waves = WaveCoding(machine, tick, 2.0, "queue")
+    waves.reset(np.zeros(1))
     flows, out = [], 0.0
     for sequence in range(14):
-        wave = coding.near(np.array([0.5]))  # sqrt(2 b) v = 1 sqrt(W): half a watt
-        coding.sent_up(sequence, wave, False)
-        order = coding.far([Packet(sequence, Up(None, 0.0, wave))], Up(None, 0.0, wave), None)
+        wave = waves.near(np.array([0.5]))  # sqrt(2 b) v = 1 sqrt(W): half a watt
+        waves.sent(True, sequence, wave, False)
+        order = waves.far([Packet(sequence, Up(None, 0.0, wave))], Up(None, 0.0, wave), None)
         # At first it resists with 5 N although it said 0; then as it says.
         machine.true = np.array([5.0 if sequence == 0 else 0.0])
-        back, taken = coding.settle(order.flow, None, True)
-        coding.sent_down(sequence, back, False)
+        back, taken = waves.settle(order.flow, None, True)
+        waves.sent(False, sequence, back, False)
         out += float(taken.effort @ taken.flow + 0.5 * back @ back) * tick
         flows.append(float(order.flow[0]))
         if sequence == 0:

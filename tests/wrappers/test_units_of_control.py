@@ -134,10 +134,10 @@ class Forecasting(BoundRollout):
     def __init__(self, unit):
         self.unit_of_control = unit
 
-    def _now(self):
+    def now(self):
         return np.array([1.0])
 
-    def _room(self, forecast):
+    def room(self, forecast):
         return np.array([[0.3 - forecast @ np.array([1.0, 0.5]) / self.unit_of_control]])
 
 

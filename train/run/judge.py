@@ -10,7 +10,8 @@ import numpy as np
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.engine import SafetyFilter
-from safe_wrappers.plants.default import plant_of_the_present
+from safe_wrappers.plants import MujocoPlant
+from safe_wrappers.plants.default import default_plant
 from safe_wrappers.wrappers.cost_function import refuse_own_cost
 
 _TOLERANCE: Final = 1e-6
@@ -47,9 +48,11 @@ class ConstraintJudge(gym.Wrapper[Any, Any, Any, Any]):
                     f"env.judge: {type(constraint.spec).__name__} has no h (`value`) and cannot judge; use env.cost: "
                     "module:function"
                 )
-        self._plant = plant_of_the_present(its_filter.plant, task)
+        self._plant = its_filter.plant
         self._constraints = its_filter.bound
-        if self._plant is not its_filter.plant:
+        if isinstance(self._plant, MujocoPlant):
+            self._plant = default_plant(task)
+            self._plant.bind(task)
             self._constraints = [constraint.spec.bind(self._plant) for constraint in its_filter.bound]
         elif self._plant.delay_s:
             raise ConfigurationError(

@@ -4,30 +4,20 @@ import math
 from abc import abstractmethod
 from typing import Any, ClassVar, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from safe_wrappers.filter.constraint import BoundConstraint, Memory
+from safe_wrappers.filter.constraint import Array, BoundConstraint, Memory
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 class BoundBackupClearance(BoundConstraint):
     """A clearance along a backup manoeuvre, on a plant.
 
-    A backup manoeuvre leads to a state that may last, for example full braking until rest. A state is safe if the
-    manoeuvre from there keeps the clearance. A control is admitted if the held control, and the manoeuvre after it,
-    keep the clearance. So from a safe state the first control of the manoeuvre is always admitted, for any number of
-    obstacles at once.
+    The manoeuvre leads to a state that may last, for example full braking until rest. A control is admitted if the
+    held control, and the manoeuvre after it, keep the clearance. So from a safe state the first control of the
+    manoeuvre is always admitted, for any number of obstacles at once.
 
     A subclass overrides `clearance`, `clearance_after` and `backup`. It may override `read_constants`, `candidates`
     and `rows`; `admits` instead of `clearance_after` where that costs less; `slack` where it can measure it. The
     specification has a `margin`, m.
-
-    Args:
-        spec: The specification.
-        plant: Bound to its env.
     """
 
     predicts: bool = True
@@ -59,7 +49,6 @@ class BoundBackupClearance(BoundConstraint):
         raise NotImplementedError(f"{type(self).__name__} overrides neither clearance_after nor admits")
 
     def observe(self, memory: Memory) -> None:
-        """Take the state and the memory."""
         self._memory = memory
         if self.plant.model_version != self._model_version:
             self._model_version = self.plant.model_version
@@ -83,12 +72,7 @@ class BoundBackupClearance(BoundConstraint):
 
 
 class Detour(NamedTuple):
-    """On which side an obstacle is being passed: the memory of a clearance with detours.
-
-    Attributes:
-        side: 1.0 is the left one, -1.0 the right one.
-        steps: Control steps for which the side is kept.
-    """
+    """The side on which an obstacle is passed (1.0 left, -1.0 right), and the control steps for which it is kept."""
 
     side: float = 0.0
     steps: int = 0
@@ -102,11 +86,9 @@ class BoundDetourClearance(BoundBackupClearance):
     _memory: Detour
 
     def start(self) -> Memory:
-        """No detour is being made."""
         return Detour()
 
     def executed(self, control: Array) -> Memory:
-        """The detour that is being made."""
         return Detour(self._memory.side, self._memory.steps - 1)
 
     def _kept_side(self) -> float:

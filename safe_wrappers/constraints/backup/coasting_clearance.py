@@ -3,35 +3,27 @@
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.checks import check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundDetourClearance, Detour
-from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
-from safe_wrappers.constraints.obstacles.obstacles import Disc, Discs
+from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.numerics.outlines import convex_outline, distances_to_outline
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Constraint, Promise
+from safe_wrappers.filter.constraint import Array, Constraint
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.coasting import Coasting, Course
 
-Array = NDArray[np.float64]
-
-_SAME_M = 1e-6
-"""Rounding of a rollout: a smaller loss of clearance is none."""
-_STILL = 1e-9
-"""States (m, rad, m/s, rad/s) and places of discs that differ by less are the same."""
-_WAY_OUT_M = 1e-3
-"""Clearance that a control has to gain at its end where zero control leaves less than the margin."""
-_RECOVERED = 0.5
-"""Share of the best gain of clearance that a control has to reach from inside an obstacle."""
+_SAME_M = 1e-6  # rounding of a rollout: a smaller loss of clearance is none
+_STILL = 1e-9  # states (m, rad, m/s, rad/s) and places of discs that differ by less are the same
+_WAY_OUT_M = 1e-3  # gain of clearance that is asked for where zero control leaves less than the margin
+_RECOVERED = 0.5  # share of the best gain of clearance that a control has to reach from inside an obstacle
 _AROUND = ((1.0, 0.5), (1.0, 0.0), (1.0, -1.0), (-0.5, -1.0))
 """Shares of the drive for the outer and the inner actuator of a detour, as they are tried."""
 
@@ -48,32 +40,27 @@ _AROUND = ((1.0, 0.5), (1.0, 0.0), (1.0, -1.0), (-0.5, -1.0))
 class CoastingClearance(Constraint):
     """Keep a free-moving machine out of discs, counting its whole way until it rests without control.
 
-    For machines that friction and damping stop within a few steps, for example on wheels. The backup manoeuvre is
-    zero control. A control is rolled out on the machine's model, substep by substep: held for one control interval,
-    then zero, until rest. It is admitted if the machine rests within `horizon` control intervals, and if on the whole
-    way the body's origin stays out of `keep_out` and the outline out of `untouched`, each by `margin`.
+    For machines that friction and damping stop within a few steps, for example on wheels. A control is forecast on
+    the machine's model: held for one control interval, then zero. It is admitted if the machine rests within
+    `horizon` control intervals, and if on the whole way the body's origin stays out of `keep_out` and the outline out
+    of `untouched`. From inside an obstacle controls are admitted that gain at least half of what full drive gains at
+    best.
 
-    What it promises: proved, for obstacles that stand still, and as far as `margin` covers the rollout's error. From
-    a state whose way to rest is clear there is always an admissible control, and every physics substep is clear. With
-    Safety-Gymnasium's car the next step is predicted to 0.2 mm, rest to 0.8 mm, and a tilted outline reaches out by
-    1.5 mm (measured): a margin of 5 mm is twice their sum.
-
-    From inside an obstacle (an unsafe start) controls are admitted that gain at least half of the clearance that full
-    drive gains at best.
+    Proved, for obstacles that stand still, and as far as `margin` covers the forecast's error: from a state whose way
+    to rest is clear there is always an admissible control, and every physics substep is clear.
 
     Args:
         keep_out: `Disc` and `Discs` for the body's origin.
         untouched: `Disc` and `Discs` for the outline.
         outline: Points [x, y] in the body's frame, m; the outline is their convex hull.
         body: Name of the machine's body, on a free joint.
-        robot_model_attr: Name of an attribute of the env that holds a model of the machine alone, for the rollouts;
+        robot_model_attr: Name of an attribute of the env that holds a model of the machine alone, for the forecasts;
             None takes the plant's model.
-        margin: Kept free, m: covers the rollout's error and the tilt of the outline.
+        margin: Kept free, m: covers the forecast's error and the tilt of the outline.
         horizon: Control intervals within which the machine has to rest.
         max_decrease: Bound on the way of the origin or a corner of the outline until rest, m, for any control held
-            for one
-            interval from rest; states with more clearance need no rollout. Checked at every rollout, and dropped
-            with a warning when broken. None: always roll out.
+            for one interval from rest; states with more clearance need no forecast. Checked at every forecast, and
+            dropped with a warning when broken.
         max_decrease_per_speed: What the speed of the origin or a corner adds to that, m per m/s.
         detour: When a driving action of a machine with two actuators is refused, first try to turn while driving, or
             to reverse while turning, around the obstacle. No safety measure.
@@ -90,7 +77,7 @@ class CoastingClearance(Constraint):
     max_decrease_per_speed: float = 0.0
     detour: bool = False
 
-    promise: Promise = field(default="proved", init=False)
+    promise = "proved"
 
     def __post_init__(self) -> None:
         for name in ("keep_out", "untouched"):
@@ -99,24 +86,17 @@ class CoastingClearance(Constraint):
                 raise ConfigurationError(f"{name}: the way to rest is forecast past discs that stand still")
             setattr(self, name, found)
         if not (self.keep_out or self.untouched):
-            raise ConfigurationError(
-                "give obstacles in keep_out (for the origin) or untouched (for the outline)"
-            )
+            raise ConfigurationError("give obstacles in keep_out (for the origin) or untouched (the outline)")
         self.outline = _checked_outline(self.outline, needed=bool(self.untouched))
-        self.margin = non_negative("margin", self.margin, "m")
         if isinstance(self.horizon, bool) or self.horizon != int(self.horizon) or self.horizon < 2:
-            raise ConfigurationError(
-                f"horizon is a whole number of control intervals >= 2, got {self.horizon!r}"
-            )
+            wanted = "horizon is a whole number of control intervals >= 2"
+            raise ConfigurationError(f"{wanted}, got {self.horizon!r}")
         self.horizon = int(self.horizon)
-        if self.max_decrease is not None:
-            self.max_decrease = positive("max_decrease", self.max_decrease, "m")
-        self.max_decrease_per_speed = non_negative(
-            "max_decrease_per_speed", self.max_decrease_per_speed, "m per m/s"
-        )
+        check_fields(self, non_negative, ("margin",), "m")
+        check_fields(self, positive, ("max_decrease",), "m")
+        check_fields(self, non_negative, ("max_decrease_per_speed",), "m per m/s")
 
     def bind(self, plant: Plant) -> "BoundCoastingClearance":
-        """On a plant."""
         return BoundCoastingClearance(self, plant)
 
 
@@ -130,11 +110,11 @@ class BoundCoastingClearance(BoundDetourClearance):
     def __init__(self, spec: CoastingClearance, plant: Plant) -> None:
         hint = "CoastingClearance needs a MujocoPlant: it forecasts with the machine's model"
         super().__init__(spec, require_mujoco(plant, hint))
-        alone = None if spec.robot_model_attr is None else plant.attribute(spec.robot_model_attr)
+        name = spec.robot_model_attr
+        alone = None if name is None else plant.attribute(name)
         if alone is not None and not isinstance(alone, mujoco.MjModel):
-            raise ConfigurationError(
-                f"robot_model_attr names an attribute that holds an MjModel; {spec.robot_model_attr!r} is {alone!r}"
-            )
+            wanted = "robot_model_attr names an attribute that holds an MjModel"
+            raise ConfigurationError(f"{wanted}; {name!r} is {alone!r}")
         self._coasting = Coasting(self.plant, spec.body, alone)
         self._still = np.zeros(self.plant.model.nu)
         outline = np.reshape(spec.outline, (-1, 2))
@@ -146,7 +126,6 @@ class BoundCoastingClearance(BoundDetourClearance):
         self._known: dict[bytes, _Outcome] = {}
 
     def start(self) -> Detour:
-        """No detour is being made, and no forecast is known."""
         self._seen = np.zeros(0)
         return Detour()
 
@@ -266,28 +245,16 @@ class BoundCoastingClearance(BoundDetourClearance):
 
 
 class _Outcome(NamedTuple):
-    """What a control leads to.
+    """What a control leads to."""
 
-    Attributes:
-        least: The least clearance until rest, m; minus infinity without rest.
-        end: The clearance at the end, m.
-        way: From here to there, shape (2,), m.
-        turn: How far it turns on the way, rad.
-    """
-
-    least: float
-    end: float
-    way: Array
-    turn: float
+    least: float  # the least clearance until rest, m; minus infinity without rest
+    end: float  # the clearance at the end, m
+    way: Array  # from here to there, shape (2,), m
+    turn: float  # how far it turns on the way, rad
 
 
 class _Group:
-    """Discs that one part of the machine keeps clear of.
-
-    Args:
-        obstacles: `Disc` and `Discs`.
-        plant: To read where they are.
-        outline: Corners in the body's frame, shape (c, 2); None means its origin.
+    """Discs that the outline, corners (c, 2) in the body's frame, or the body's origin keeps clear of.
 
     Attributes:
         centers: Of all discs, shape (n, 2), m.
@@ -334,20 +301,20 @@ class _Group:
 
 def _checked_outline(given: Any, needed: bool) -> list[list[float]]:
     """The outline as plain data."""
+    if needed and not len(given):
+        raise ConfigurationError(
+            "untouched needs the machine's outline: [[x, y], ...] in its body's frame, m"
+        )
     try:
         points = np.array(given, dtype=np.float64).reshape(-1, 2)
     except (TypeError, ValueError):
         points = np.full((1, 2), np.nan)
     if not np.isfinite(points).all():
         raise ConfigurationError(f"outline is a list of points [x, y] in m, got {given!r}")
-    if len(points):
-        try:
+    try:
+        if len(points):
             convex_outline(points)
-        except ValueError as error:
-            raise ConfigurationError(f"outline: {error}") from None
-    elif needed:
-        raise ConfigurationError(
-            "untouched needs the machine's outline: [[x, y], ...] in its body's frame, m"
-        )
+    except ValueError as error:
+        raise ConfigurationError(f"outline: {error}") from None
     found: list[list[float]] = points.tolist()
     return found

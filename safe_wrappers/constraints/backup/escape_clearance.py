@@ -1,62 +1,45 @@
-"""EscapeClearance: keep an escape manoeuvre clear of moving obstacles, for a point mass on two axes.
-
-Standing still is not safe in front of something that approaches. So a control is admitted if, held for one control
-step, it leaves at least one manoeuvre (go in some direction, brake, stay) whose whole way keeps clear of where the
-obstacles may be by then.
-"""
+"""EscapeClearance: keep an escape manoeuvre clear of moving obstacles, for a point mass on two axes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.checks import check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundBackupClearance
-from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
-from safe_wrappers.constraints.obstacles.obstacles import Discs, distances
-from safe_wrappers.constraints.obstacles.tracked_discs import TrackedDiscs
+from safe_wrappers.constraints.obstacles import Discs, TrackedDiscs, distances, obstacles_from
 from safe_wrappers.control.backup.evasive_maneuvers import EvasiveManeuvers, Maneuver
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Constraint, Memory, Promise
+from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, Memory
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.planar_point import planar_point
 
-Array = NDArray[np.float64]
-
-_EVERY = 2
-"""Holds between the instants at which ways are checked."""
-_GOING_S = (0.3, 0.8)
-"""For how long the manoeuvres go before they brake, s."""
+_EVERY = 2  # holds between the instants at which ways are checked
+_GOING_S = (0.3, 0.8)  # for how long the manoeuvres go before they brake, s
 _DIRECTIONS = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
-_RECOVERY_S = 0.4
-"""Time constant, s, with which the way out of a violation must come clear."""
-_BLENDS = (0.2, 0.4, 0.6, 0.8)
-"""Shares of the way from a refused control to one that leaves a way out."""
-_APPROACHED = 2
-"""How many of those are approached."""
+_RECOVERY_S = 0.4  # time constant, s, with which the way out of a violation must come clear
+_BLENDS = (0.2, 0.4, 0.6, 0.8)  # shares of the way from a refused control to one that leaves a way out
+_APPROACHED = 2  # how many of those are approached
 
 
 @dataclass
 class EscapeClearance(Constraint):
     """Keep a point mass on two axes out of obstacles, moving ones above all, by keeping an escape open.
 
-    The manoeuvres: brake at once; or go along +x, -x, +y or -y with full force for 0.3 s or 0.8 s, and brake. Each is
-    followed for `horizon_s`, exactly as the plant moves. Moving obstacles are where they are expected to be by then
-    (`Discs` at constant velocity), `TrackedDiscs` anywhere inside the bound of their estimate as it grows if nothing
-    more is seen, boxed in along x and y. So the less is known, the earlier the machine keeps off.
+    The manoeuvres: brake at once; or go along +x, -x, +y or -y with full force for 0.3 s or 0.8 s, and brake. A
+    control is admitted if, held for one control step, it leaves one whose whole way keeps clear of where the
+    obstacles may be by then: `Discs` at constant velocity, `TrackedDiscs` anywhere inside the bound of their estimate
+    as it grows.
 
-    What it promises: from a state with a clear manoeuvre, the executed control leaves one, or the step is flagged.
-    While every obstacle stays inside its declared bound, that manoeuvre keeps clear for the rest of the horizon. Best
-    effort: nine manoeuvres are tried, and the one that was clear before; estimates move (up to `margin` of that is
-    not flagged); ways are checked at every second control step (for a relative speed v and steps of h, they miss
-    `(v h)^2 / 2` over the distance); obstacles count up to the horizon.
+    Best effort: from a state with a clear manoeuvre, the executed control leaves one, or the step is flagged; while
+    every obstacle stays inside its declared bound, that manoeuvre keeps clear until the horizon. Ways are checked at
+    every second control step, and estimates move (up to `margin` of that is not flagged).
 
     Args:
-        body: Name of the body on its two slides along x and y, each with a force actuator of its own. What else the
-            body or the model can do must not act on these.
+        body: Name of the body on its two slides along x and y, each with a force actuator of its own.
         obstacles: `TrackedDiscs`, `Discs`, and what stands still: `Disc`, `Box`, `Plane`.
         radius: Of the machine around the body's origin, m.
         margin: Fixed protective distance, m.
@@ -76,27 +59,18 @@ class EscapeClearance(Constraint):
     margin: float = 0.05
     horizon_s: float = 2.5
 
-    promise: Promise = field(default="best effort", init=False)
-
     def __post_init__(self) -> None:
         self.obstacles = obstacles_from(self.obstacles)
-        self.radius = non_negative("radius", self.radius, "m")
-        self.margin = non_negative("margin", self.margin, "m")
+        check_fields(self, non_negative, ("radius", "margin"), "m")
         self.horizon_s = positive("horizon_s", self.horizon_s, "s")
         if self.horizon_s <= max(_GOING_S):
-            raise ConfigurationError(
-                f"horizon_s must be longer than the manoeuvres, which go for {max(_GOING_S):g} s before they brake; "
-                f"got {self.horizon_s:g}"
-            )
+            longest = f"the manoeuvres, which go for {max(_GOING_S):g} s before they brake"
+            raise ConfigurationError(f"horizon_s must be longer than {longest}; got {self.horizon_s:g}")
         for obstacle in self.obstacles:
-            place = getattr(obstacle, "center", getattr(obstacle, "point", ()))
-            if len(place) > 2:
-                raise ConfigurationError(
-                    f"obstacles are seen from above: in {obstacle!r} give two coordinates, x and y"
-                )
+            if len(getattr(obstacle, "center", getattr(obstacle, "point", ()))) > 2:
+                raise ConfigurationError(f"obstacles are seen from above: give {obstacle!r} x and y alone")
 
     def bind(self, plant: Plant) -> "BoundEscapeClearance":
-        """On a plant."""
         return BoundEscapeClearance(self, plant)
 
 
@@ -110,9 +84,8 @@ class BoundEscapeClearance(BoundBackupClearance):
     """The manoeuvre that was open after the last control."""
 
     def __init__(self, spec: EscapeClearance, plant: Plant) -> None:
-        machine = require_mujoco(
-            plant, "EscapeClearance needs a MujocoPlant: it reads the point from the model"
-        )
+        hint = "EscapeClearance needs a MujocoPlant: it reads the point from the model"
+        machine = require_mujoco(plant, hint)
         self._moving: list[Any] = [o for o in spec.obstacles if _moves(o)]
         self._fixed = [o for o in spec.obstacles if not _moves(o)]
         for obstacle in self._moving:
@@ -121,17 +94,16 @@ class BoundEscapeClearance(BoundBackupClearance):
         super().__init__(spec, machine)
 
     def read_constants(self) -> None:
-        """The point's motion, and the manoeuvres that it can make."""
         self._point = point = planar_point(self.plant, np.inf, self.spec.body)
         # What one hold makes of a state; x and y.
         self._hold = np.array([(a.low, a.high, a.drift, a.shift, a.keep, a.add) for a in point.axes]).T
         holds = int(np.ceil(self.spec.horizon_s / self.plant.control_dt))
         longest = max(1, round(max(_GOING_S) / self.plant.control_dt))
         if holds <= longest:
-            raise ConfigurationError(
-                f"horizon_s = {self.spec.horizon_s:g} s is too short for steps of {self.plant.control_dt:g} s: "
-                f"a manoeuvre takes {longest} of them before it brakes"
+            steps = (
+                f"steps of {self.plant.control_dt:g} s: a manoeuvre takes {longest} of them before it brakes"
             )
+            raise ConfigurationError(f"horizon_s = {self.spec.horizon_s:g} s is too short for {steps}")
         bank = [Maneuver(0.0, 0.0, 0)]
         bank += [Maneuver(x, y, going) for x, y in _DIRECTIONS for going in range(1, longest + 1)]
         self._escapes = EvasiveManeuvers(point.axes, bank, np.arange(0, holds + 1, _EVERY))
@@ -143,8 +115,7 @@ class BoundEscapeClearance(BoundBackupClearance):
         """The manoeuvre that is open after the control: that of the nearest one that was asked about."""
         if not self._asked:
             return None
-        low, high, _, _, keep, add = self._hold
-        velocity = keep * self._velocity + add * np.minimum(np.maximum(self._driven(control), low), high)
+        velocity = self._held(self._driven(control))[1]
         led_to = np.concatenate([v for v, _ in self._asked])
         best = np.concatenate([b for _, b in self._asked])
         return int(best[((led_to - velocity) ** 2).sum(axis=1).argmin()])
@@ -161,7 +132,7 @@ class BoundEscapeClearance(BoundBackupClearance):
         self._velocity = self.plant.qvel[joints]
         # A way after a held control begins one hold from now.
         times = self.plant.control_dt * np.concatenate([[0.0], 1.0 + self._escapes.instants])
-        parts = [self._expected(o, self.plant, times) for o in self._moving]
+        parts = [self._expected(o, times) for o in self._moving]
         none = np.zeros((times.size, 0, 2))
         centers = np.concatenate([none, *(c for c, _ in parts)], axis=1)
         halves = np.concatenate([none, *(h for _, h in parts)], axis=1)
@@ -189,26 +160,29 @@ class BoundEscapeClearance(BoundBackupClearance):
             which += [i for i in (going_on, shorter) if i not in which]
         return np.array(which, dtype=np.intp)
 
-    def _expected(self, obstacle: Any, plant: MujocoPlant, times: Array) -> tuple[Array, Array]:
+    def _expected(self, obstacle: Any, times: Array) -> tuple[Array, Array]:
         """Centres and half-widths of the boxes that hold them, shapes (k, n, 2)."""
         # Under a delay the state is predicted: so are the obstacles, to the same moment.
-        late = times + (
-            self.plant.time - float(self.plant.attribute("data").time) if self.plant.delay_s else 0.0
-        )
+        if self.plant.delay_s:
+            times = times + (self.plant.time - float(self.plant.attribute("data").time))
         if isinstance(obstacle, TrackedDiscs):
-            centers, halves = obstacle.boxes(self.plant, late)
+            centers, halves = obstacle.boxes(self.plant, times)
             return centers[..., :2], halves[..., :2]
         centers = obstacle.centers(self.plant)[:, :2]
         velocity = np.asarray(self.plant.attribute(obstacle.velocity_attribute), dtype=np.float64)[:, :2]
-        moved = centers + late[:, None, None] * velocity
+        moved = centers + times[:, None, None] * velocity
         return moved, np.zeros_like(moved)
 
-    def _slacks(self, controls: Array) -> Array:
-        """What every way out after each of some held controls (c, 2) leaves, wanted >= 0, shape (c, manoeuvres)."""
+    def _held(self, controls: Array) -> tuple[Array, Array]:
+        """Positions and velocities after held controls, shapes (..., 2)."""
         low, high, drift, shift, keep, add = self._hold
         held = np.minimum(np.maximum(controls, low), high)
         position = self._position + drift * self._velocity + shift * held
-        velocity = keep * self._velocity + add * held
+        return position, keep * self._velocity + add * held
+
+    def _slacks(self, controls: Array) -> Array:
+        """What every way out after each of some held controls (c, 2) leaves, wanted >= 0, shape (c, manoeuvres)."""
+        position, velocity = self._held(controls)
         x, y = self._escapes.paths(position, velocity, self._open)
         left = (self._clearances(x, y) - self._wanted).min(axis=-1)
         self._asked.append((velocity, self._open[left.argmax(axis=1)]))
@@ -236,9 +210,7 @@ class BoundEscapeClearance(BoundBackupClearance):
     def _driven(self, control: Array) -> Array:
         return np.asarray(control)[list(self._point.actuators)]
 
-    def admits(self, control: Array) -> bool:
-        """Whether a held control leaves a way out."""
-        return self.slack(control) >= -self.tolerance
+    admits = BoundConstraint.admits  # by `slack`
 
     def slack(self, control: Array) -> float:
         """What the best way out after a held control leaves of what is asked for, m."""
@@ -258,11 +230,15 @@ class BoundEscapeClearance(BoundBackupClearance):
 
     def backup(self) -> Array:
         """Braking where it leaves a way out, else the first control of the one that keeps farthest away."""
-        control = np.zeros(self.plant.model.nu)
         firsts = self._firsts()
         left = self._slacks(firsts).max(axis=1)
-        control[list(self._point.actuators)] = firsts[0 if left[0] >= 0.0 else int(left.argmax())]
-        return control
+        return self._whole(np.zeros(self.plant.model.nu), firsts[0 if left[0] >= 0.0 else int(left.argmax())])
+
+    def _whole(self, control: Array, driven: Array) -> Array:
+        """A control with other values on the two slides, shape (m,)."""
+        whole = np.array(control)
+        whole[list(self._point.actuators)] = driven
+        return whole
 
     def _firsts(self) -> Array:
         """First controls of the manoeuvres: braking, and each direction; shape (5, 2)."""
@@ -282,12 +258,7 @@ class BoundEscapeClearance(BoundBackupClearance):
             closer = np.array(tried)
             closer = closer[self._slacks(closer).max(axis=1) >= 0.0]
             good = _nearest_first(np.concatenate([good, closer]), asked)
-        found = []
-        for pair in good:
-            whole = np.array(control)
-            whole[list(self._point.actuators)] = pair
-            found.append(whole)
-        return found
+        return [self._whole(control, pair) for pair in good]
 
 
 def _nearest_first(controls: Array, asked: Array) -> Array:

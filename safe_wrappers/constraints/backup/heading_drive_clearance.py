@@ -1,41 +1,35 @@
 """HeadingDriveClearance: keep the stopping path of a robot that is driven along its heading out of discs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from safe_wrappers.checks import non_negative
+from safe_wrappers.checks import check_fields, non_negative
 from safe_wrappers.constraints.backup.base import BoundDetourClearance
-from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
-from safe_wrappers.constraints.obstacles.obstacles import Disc, Discs
+from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.backup import drive_among_discs as among
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Promise
+from safe_wrappers.filter.constraint import Array, Constraint, HalfSpaces
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.planar_robot import PlanarFrame, heading_drive
-
-Array = NDArray[np.float64]
 
 
 @dataclass
 class HeadingDriveClearance(Constraint):
     """Keep the stopping path of a planar robot out of every disc.
 
-    The robot slides on two joints with equal damping, turns on a hinge, and its drive pushes along the heading
-    only: nothing brakes it sideways. The backup manoeuvre brakes along the heading and holds it; clearance is counted
-    from the area that it sweeps until rest (`control/backup/heading_drive.py`), and never shrinks under it. A control
-    is admitted if one control step of it uses up at most half of the clearance.
+    The robot slides on two joints with equal damping, turns on a hinge, and its drive pushes along the heading only.
+    The backup manoeuvre brakes along the heading and holds it; clearance is counted from the area that it sweeps
+    until rest (`control/backup/heading_drive.py`), and never shrinks under it. A control is admitted if one control
+    step of it uses up at most half of the clearance.
 
-    What it promises: proved, up to what `margin` covers. From a safe state the backup is admissible, for any
-    number of discs, and the discs stay clear at every physics substep, while mass and damping are right to
-    within `uncertainty`, the measured position is right to within `state_error`, discs stand still and nothing
-    hits the robot. `margin` covers what the closed form leaves out: the curvature of the path within a step and the
-    turning servo's chatter, under 2 mm for the Point robot (measured, `tests/control`); a pushed vase adds 0.1 mm
-    a step.
+    Proved: from a safe state the backup is admissible, for any number of discs, and the discs stay clear at every
+    physics substep, while mass and damping are right to within `uncertainty`, the measured position to within
+    `state_error`, discs stand still and nothing hits the robot. `margin` covers what the closed form leaves out,
+    under 2 mm for the Point robot.
 
     Args:
         obstacles: `Disc` and `Discs`; they stand still.
@@ -44,9 +38,8 @@ class HeadingDriveClearance(Constraint):
         state_error: Bound on the error of the measured position, m.
         uncertainty: Relative uncertainty of mass and of damping, in [0, 1).
         brake: False: the backup coasts along the heading, too; it needs no drive, and more room.
-        detour: When a driving action is refused, first try the same drive while turning towards the nearer
-            tangent of the disc in the way, then turning alone; both only if admitted. No safety measure: a driver
-            that does not see the discs gets around them.
+        detour: When a driving action is refused, first try the same drive while turning towards the nearer tangent of
+            the disc in the way, then turning alone; both only if admitted. No safety measure.
     """
 
     obstacles: Sequence[Any]
@@ -57,18 +50,16 @@ class HeadingDriveClearance(Constraint):
     brake: bool = True
     detour: bool = False
 
-    promise: Promise = field(default="proved", init=False)
+    promise = "proved"
 
     def __post_init__(self) -> None:
         self.obstacles = obstacles_from(self.obstacles, kinds=(Disc, Discs))
-        self.margin = non_negative("margin", self.margin, "m")
-        self.state_error = non_negative("state_error", self.state_error, "m")
+        check_fields(self, non_negative, ("margin", "state_error"), "m")
         self.uncertainty = non_negative("uncertainty", self.uncertainty, "a fraction")
         if self.uncertainty >= 1.0:
             raise ConfigurationError(f"uncertainty is a fraction in [0, 1), got {self.uncertainty}")
 
     def bind(self, plant: Plant) -> "BoundHeadingDriveClearance":
-        """On a plant."""
         return BoundHeadingDriveClearance(self, plant)
 
 

@@ -1,69 +1,53 @@
-"""WallClearance: keep a point mass on two axes out of walls, counting its whole braking path.
-
-The backup manoeuvre brakes each axis by itself, fully, and in its last hold just to rest
-(`control/backup/point_among_walls.py`). From a safe state braking is admitted: after one hold of it the manoeuvre is
-the rest of the one that was clear before. At rest the braking control is zero. By induction the point never touches
-a wall, for any number of walls at once.
-
-Source: appendix "Relative degree and kinetic stopping insets", in two dimensions with box walls.
-"""
+"""WallClearance: keep a point mass on two axes out of walls, counting its whole braking path."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.checks import check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundBackupClearance
 from safe_wrappers.control.backup.point_among_walls import PointAmongWalls, PointMotion
 from safe_wrappers.control.numerics.rectangles import Rectangle, gaps, nearest
-from safe_wrappers.filter.constraint import Constraint, HalfSpaces, Promise
+from safe_wrappers.filter.constraint import Array, Constraint, HalfSpaces
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.queries.planar_point import planar_point
-from safe_wrappers.plants.queries.walls import walls
-
-Array = NDArray[np.float64]
+from safe_wrappers.plants.queries.planar_point import planar_point, walls
 
 _Control = tuple[float, float]
 """Along x and along y, in the actuators' units."""
 
-_HAIR_M = 1e-7
-"""Extra distance of corrections, for rounding to float32; a state that has lost no more of it is inside."""
-_NOISE_M = 1e-12
-"""Rounding of float64 between a path and the rest of it."""
-_RECOVERY_S = 0.1
-"""Time constant, s, with which a violation must shrink from outside; less where the backup cannot."""
-_TURNS = 4
-"""How many walls, one after another, a correction may have to turn away from."""
-_HALVINGS = 5
-"""How finely a correction is moved back towards the proposal where the path fits and its rectangle does not."""
+_HAIR_M = 1e-7  # extra distance of corrections, for rounding to float32
+_NOISE_M = 1e-12  # rounding of float64 between a path and the rest of it
+_RECOVERY_S = 0.1  # time constant, s, with which a violation must shrink from outside
+_TURNS = 4  # how many walls, one after another, a correction may have to turn away from
+_HALVINGS = 5  # steps that move a correction back towards the proposal where the path fits, not its rectangle
 
 
 @dataclass
 class WallClearance(Constraint):
     """Keep a point mass that is pushed along two axes out of every wall of a maze (PointMaze).
 
-    Walls and point are found in the MuJoCo model: the body on its two slides, and every fixed box, along x and y,
-    that it can collide with. A control is admitted if, held for one control step and followed by braking, it
-    keeps the point clear of them. A refused one is replaced by a control that slides along the wall.
+    Walls and point are found in the MuJoCo model. A control is admitted if, held for one control step and followed by
+    full braking of each axis, it keeps the point clear of every fixed box. A refused one is replaced by a control
+    that slides along the wall.
 
-    What it promises: proved. From a safe state the point never touches a wall, at any substep or in between. The
-    plant's mass, damping and gears must be the machine's (they are measured on its model; one that moves otherwise is
-    refused), walls stand still, and `velocity_clip` is the env's. `margin` covers rounding (under a micrometre) and
-    the expected position error. Under a plant's `delay_s` the state is predicted without the clip: proved up to that
-    speed.
+    Proved: from a safe state the point never touches a wall, at any substep or in between. The plant's mass, damping
+    and gears must be the machine's, walls stand still, and `velocity_clip` is the env's. Under a plant's `delay_s`
+    the state is predicted without the clip: proved up to that speed.
 
     Args:
-        margin: Fixed protective distance, beyond that at which MuJoCo reports a contact, m.
-        velocity_clip: Speed along each axis to which the env clips the motion at the start of every control step,
-            m/s (PointMaze: 5). None: not known; every clip is covered, by a more cautious count at corners.
+        margin: Fixed protective distance, beyond that at which MuJoCo reports a contact, m; covers rounding (under a
+            micrometre) and the position error.
+        velocity_clip: Speed along each axis to which the env clips the motion at the start of every control step, m/s
+            (PointMaze: 5). None: not known; every clip is covered, by a more cautious count at corners.
 
     Raises:
-        ConfigurationError: A number that is not one, or is negative.
-        UnsupportedEnvError: At binding: not a `MujocoPlant`, not a point on two slides with a force of its own
-            on each, or walls that are not boxes along x and y.
+        ConfigurationError: A number that is negative or not finite.
+        UnsupportedEnvError: At binding: not a `MujocoPlant`, not a point on two slides with a force of its own on
+            each, or walls that are not boxes along x and y.
+
+    Source: appendix "Relative degree and kinetic stopping insets", in two dimensions with box walls.
 
     Example:
         >>> import safe_wrappers as sw
@@ -75,15 +59,13 @@ class WallClearance(Constraint):
     margin: float = 0.001
     velocity_clip: float | None = None
 
-    promise: Promise = field(default="proved", init=False)
+    promise = "proved"
 
     def __post_init__(self) -> None:
         self.margin = non_negative("margin", self.margin, "m")
-        if self.velocity_clip is not None:
-            self.velocity_clip = positive("velocity_clip", self.velocity_clip, "m/s")
+        check_fields(self, positive, ("velocity_clip",), "m/s")
 
     def bind(self, plant: Plant) -> "BoundWallClearance":
-        """On a plant."""
         return BoundWallClearance(self, plant)
 
 
@@ -94,33 +76,25 @@ class BoundWallClearance(BoundBackupClearance):
     plant: MujocoPlant
 
     def __init__(self, spec: WallClearance, plant: Plant) -> None:
-        needed = (
-            "WallClearance needs a MujocoPlant: it reads point and walls from the model. On an AnalyticPlant"
-        )
-        hint = "use Clearance(obstacles=[Box(...)], position=[0, 1], velocity=[2, 3], braking=...)"
-        super().__init__(spec, require_mujoco(plant, f"{needed} {hint}"))
+        hint = "on an AnalyticPlant use Clearance([Box(...)], position=[0, 1], velocity=[2, 3], braking=...)"
+        super().__init__(spec, require_mujoco(plant, f"WallClearance needs a MujocoPlant; {hint}"))
 
     def read_constants(self) -> None:
-        """The point's motion, and the walls."""
-        clip = self.spec.velocity_clip if self.spec.velocity_clip is not None else math.inf
-        self._point = point = planar_point(self.plant, clip)
+        clip = self.spec.velocity_clip
+        self._point = point = planar_point(self.plant, math.inf if clip is None else clip)
         around, reach = walls(self.plant.model, point.body)
-        self._among = PointAmongWalls(*point.axes, around, self.spec.velocity_clip is not None)
+        self._among = PointAmongWalls(*point.axes, around, clip is not None)
         self._room = reach + self.spec.margin
 
     def clearance(self) -> Array:
-        """Distance of the braking path from touching the nearest wall, margin not taken off, m, shape (1,).
-
-        No walls, no value: shape (0,).
-        """
+        """Distance of the braking path from touching a wall, margin not taken off, m, shape (1,); no walls: (0,)."""
         (i, j), (x, y), q, v = self._point.joints, self._point.origin, self.plant.qpos, self.plant.qvel
         motion = PointMotion(float(q[i]) + x, float(q[j]) + y, float(v[i]), float(v[j]))
         self._motion = self._among.clipped(motion)
         self._needed: float | None = None
+        self._least = math.nan
         if math.isfinite(sum(motion)):
             self._least = self._among.distance(self._motion) - self._room
-        else:
-            self._least = math.nan
         self._inside = self._least >= -_HAIR_M
         return np.array([self._least + self.spec.margin] if self._among.walls else [])
 
@@ -182,10 +156,8 @@ class BoundWallClearance(BoundBackupClearance):
     def candidates(self, control: Array) -> list[Array]:
         """Admissible controls near a refused one, the nearest first: those that slide along the walls in its way."""
         (i, j), x_axis, y_axis = self._point.actuators, self._among.x_axis, self._among.y_axis
-        asked = (
-            max(x_axis.low, min(float(control[i]), x_axis.high)),
-            max(y_axis.low, min(float(control[j]), y_axis.high)),
-        )
+        x, y = float(control[i]), float(control[j])
+        asked = max(x_axis.low, min(x, x_axis.high)), max(y_axis.low, min(y, y_axis.high))
         found = [c for c in self._turned(asked, _TURNS) if self._admitted(c)] if self._inside else []
         if not found:  # where the path fits and no rectangle does
             found = [self._approached(self._backup(), asked, axes) for axes in ((0, 1), (1, 0))]

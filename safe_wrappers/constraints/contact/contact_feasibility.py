@@ -1,24 +1,22 @@
 """ContactFeasibility: the ground's forces on the robot stay inside their friction cones."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import name_list, non_negative, positive
+from safe_wrappers.checks import check_fields, name_list, non_negative, positive
 from safe_wrappers.constraints.rollout import BoundSlacks
 from safe_wrappers.control.contact.friction_cone import normal_and_tangential
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.filter.constraint import Constraint, Promise
-from safe_wrappers.plants.mujoco.contact_forecast import can_touch_the_world
-from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
+from safe_wrappers.filter.constraint import Array, Constraint
+from safe_wrappers.plants.mujoco.contacts import can_touch_the_world
+from safe_wrappers.plants.mujoco.model import fixed_bodies
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 @dataclass
@@ -28,16 +26,13 @@ class ContactFeasibility(Constraint):
     In a simulator forces are inside the model's cone by construction, and a foot whose force is on the cone slides.
     So the required cone is narrower by `friction_share`. Forces that pull are outside.
 
-    MuJoCo's default cones are pyramids inside the round one: in some directions a foot slides at 0.71 of the
-    friction. A share of 0.7 is below that in every direction; with a larger one a foot may slide within its share.
-
-    What it promises: for a plant that is right, an executed control that is not flagged keeps every contact force
-    of its control step, at every evaluation of the physics, within the cone and the tolerance. Such a control need
-    not exist, now (a foot that lands sideways slides) or in the next step. It is no balance: a robot may fall over on
-    feet that do not slide. Hence best effort.
+    Best effort: an executed control that is not flagged keeps every contact force of its control step, at every
+    evaluation of the physics, within cone and tolerance, for a plant that is right. Such a control need not exist: a
+    foot that lands sideways slides. It is no balance: a robot may fall over on feet that do not slide.
 
     Args:
-        friction_share: Of the model's friction coefficient, in (0, 1].
+        friction_share: Of the model's friction coefficient, in (0, 1]. MuJoCo's default cones are pyramids: above
+            0.71 a foot may slide within its share.
         tolerance: By how much a force may miss its cone, as a share of the robot's weight: light touches scrape.
         bodies: Names of the bodies whose contacts count; None is every moving body.
         margin: Kept free inside the cone, as a share of the weight. More than the tolerance refuses light touches.
@@ -50,24 +45,13 @@ class ContactFeasibility(Constraint):
     bodies: Sequence[str] | None = None
     margin: float = 0.0
 
-    promise: Promise = field(default="best effort", init=False)
-
     def __post_init__(self) -> None:
-        self.friction_share = positive(
-            "friction_share", self.friction_share, "shares of the model's friction"
-        )
-        if self.friction_share > 1.0:
-            raise ConfigurationError(
-                f"friction_share is in (0, 1], got {self.friction_share}: no simulated ground holds more than "
-                "its own friction; a model with more is MujocoPlant(model=...)"
-            )
-        self.tolerance = non_negative("tolerance", self.tolerance, "shares of the weight")
-        self.margin = non_negative("margin", self.margin, "shares of the weight")
+        self.friction_share = checked_friction_share(self.friction_share)
+        check_fields(self, non_negative, ("tolerance", "margin"), "shares of the weight")
         if self.bodies is not None:
             self.bodies = name_list("bodies", self.bodies, also="None for every body")
 
     def bind(self, plant: Plant) -> "BoundContactFeasibility":
-        """On a plant."""
         return BoundContactFeasibility(self, plant)
 
 
@@ -79,16 +63,11 @@ class BoundContactFeasibility(BoundSlacks):
 
     def __init__(self, spec: ContactFeasibility, plant: Plant) -> None:
         super().__init__(spec, require_contacts(plant, "ContactFeasibility"))
-        m = self.plant.model
-        touching = can_touch_the_world(m)
-        if not touching.any():
-            raise UnsupportedEnvError(
-                "no body of this model can touch the fixed world with friction: there is no cone to stay in"
-            )
+        touching = touching_bodies(self.plant, "there is no cone to stay in")
         chosen = np.flatnonzero(touching)
         if self.spec.bodies is not None:
             chosen = np.array([self._resting(name, touching) for name in self.spec.bodies])
-        self._index = np.full(m.nbody, -1)
+        self._index = np.full(self.plant.model.nbody, -1)
         self._index[chosen] = np.arange(chosen.size)
         self._size = chosen.size
 
@@ -103,7 +82,7 @@ class BoundContactFeasibility(BoundSlacks):
     def insides(self, control: Array) -> Array:
         """By how much each body's contact forces stay inside the cone, at worst, shape (k,), shares of the weight.
 
-        Infinite for a body that touches nothing; not a number where the simulation is none.
+        Infinite for a body that touches nothing; NaN where the simulation has diverged.
         """
         found = self.plant.contact_forecast(control)
         if not found.finite:
@@ -119,25 +98,39 @@ class BoundContactFeasibility(BoundSlacks):
 
     def slacks(self, control: Array) -> Array:
         """What is left of the cone, tolerance added and margin taken off, per body, shares of the weight."""
-        # What is inside by more than asked for, or in the air, is all the same: differences between a touch and none
-        # would say nothing of the touch.
+        # Capped at the margin: differences between a touch and none would say nothing of the touch.
         return np.minimum(self.insides(control), self.spec.margin) + self.spec.tolerance - self.spec.margin
 
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
         """The info keys `whole_body/cone_margin` and `whole_body/contacts`: forecast for the executed control."""
         contacts, margin = 0, 0.0
         if executed is not None:
-            found = self.plant.contact_forecast(executed)
-            contacts = int((found.step == 0).sum())
+            contacts = int((self.plant.contact_forecast(executed).step == 0).sum())
             margin = float(self.insides(executed).min())
-        return {
-            keys.WHOLE_BODY_CONTACTS: contacts,
-            keys.WHOLE_BODY_CONE_MARGIN: margin if np.isfinite(margin) else 0.0,
-        }
+        margin = margin if np.isfinite(margin) else 0.0
+        return {keys.WHOLE_BODY_CONTACTS: contacts, keys.WHOLE_BODY_CONE_MARGIN: margin}
 
 
 def require_contacts(plant: Plant, asker: str) -> MujocoPlant:
     """The plant, if it can forecast contact forces."""
-    return require_mujoco(
-        plant, f"{asker} forecasts contact forces with a MuJoCo model; an AnalyticPlant has none"
-    )
+    hint = "forecasts contact forces with a MuJoCo model; an AnalyticPlant has none"
+    return require_mujoco(plant, f"{asker} {hint}")
+
+
+def checked_friction_share(share: float) -> float:
+    """A share of the model's friction, in (0, 1]."""
+    share = positive("friction_share", share, "shares of the model's friction")
+    if share > 1.0:
+        raise ConfigurationError(
+            f"friction_share is in (0, 1], got {share}: no simulated ground holds more than its own friction; a "
+            "model with more is MujocoPlant(model=...)"
+        )
+    return share
+
+
+def touching_bodies(plant: MujocoPlant, lacking: str) -> NDArray[np.bool_]:
+    """Which bodies can touch the fixed world, shape (nbody,); refuses a model that has none."""
+    touching = can_touch_the_world(plant.model)
+    if not touching.any():
+        raise UnsupportedEnvError(f"no body of this model can touch the fixed world with friction: {lacking}")
+    return touching

@@ -4,26 +4,20 @@ from collections.abc import Iterator, Sequence
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
-Array = NDArray[np.float64]
-
-_FAR = 1e6
-"""Largest distance that is measured, m."""
+_FAR = 1e6  # largest distance that is measured, m
 _BESIDE = 1e-7 * np.array(
     [[0.0, 0.0, 0.0], [1.0, 0.3, 0.2], [-0.3, 1.0, -0.5], [0.4, -0.6, 1.0], [-1.0, -0.7, -0.4]]
 )
 """Offsets at which a distance is measured again, m."""
-_ROUND = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
-"""Up to it: planes, height fields, spheres, capsules."""
-_NUDGE = 1e-6
-"""Width of the differences that give a normal, m."""
-_NORMAL = 1e-9
-"""Distance below which the nearest points give no normal, m."""
+_ROUND = int(mujoco.mjtGeom.mjGEOM_CAPSULE)  # up to it: planes, height fields, spheres, capsules
+_NUDGE = 1e-6  # width of the differences that give a normal, m
+_NORMAL = 1e-9  # distance below which the nearest points give no normal, m
 
 
 class GeomGaps:
@@ -47,16 +41,14 @@ class GeomGaps:
     def __init__(self, plant: MujocoPlant, machine: Sequence[str], world: Sequence[str]) -> None:
         m = plant.model
         own = [geom for name in machine for geom in _geoms(plant, name)]
-        trees = {int(m.body_treeid[m.geom_bodyid[geom]]) for geom in own}
-        if -1 in trees:
-            still = next(
-                n for n in machine if any(m.body_treeid[m.geom_bodyid[g]] < 0 for g in _geoms(plant, n))
-            )
-            raise ConfigurationError(f"no joint moves {still!r}: it cannot run into anything")
-        others = []
+        tree = m.body_treeid[m.geom_bodyid]
+        for name in machine:
+            if (tree[_geoms(plant, name)] < 0).any():
+                raise ConfigurationError(f"no joint moves {name!r}: it cannot run into anything")
+        others: list[int] = []
         for name in world:
             found = _geoms(plant, name)
-            if any(int(m.body_treeid[m.geom_bodyid[geom]]) in trees for geom in found):
+            if np.isin(tree[found], tree[own]).any():
                 raise ConfigurationError(
                     f"{name!r} is part of the machine itself, on the same joints as {', '.join(machine)}: it "
                     "cannot be an obstacle to it"
@@ -64,12 +56,8 @@ class GeomGaps:
             others += found
         self.pairs = [(a, b) for a in dict.fromkeys(own) for b in dict.fromkeys(others)]
         self.touch = np.array([max(m.geom_margin[a], m.geom_margin[b], 0.0) for a, b in self.pairs])
-        self.moves = np.array([m.body_treeid[m.geom_bodyid[b]] >= 0 for _, b in self.pairs])
+        self.moves = np.array([tree[b] >= 0 for _, b in self.pairs])
         self._segment = np.zeros(6)
-
-    def distances(self, model: mujoco.MjModel, data: mujoco.MjData) -> Array:
-        """Of all pairs where the geoms are, shape (pairs,), m; negative inside each other."""
-        return np.array([_distance(model, data, a, b, None) for a, b in self.pairs])
 
     def nearest(self, model: mujoco.MjModel, data: mujoco.MjData, pair: int) -> tuple[float, Array, Array]:
         """Distance (m), the unit normal from the machine to the world, and the nearest points of both, shape (6,)."""
@@ -97,17 +85,11 @@ class GeomGaps:
     def touched(
         self, plant: MujocoPlant, forecast: Forecast, data: mujoco.MjData, pair: int
     ) -> Iterator[int]:
-        """The instants of a forecast at which a contact has to be judged, in time.
+        """The instants of a forecast at which a contact of a pair has to be judged, in time.
 
         These are the first instant of every contact, the last of every control step, and the first of every approach
-        after a rebound in contact; in between the control is held, and the approach was judged when it began.
-        Instants are skipped only while the geoms cannot have covered their distance.
-
-        Args:
-            plant: Whose forecast it is.
-            forecast: k instants.
-            data: Where to place the geoms; only their poses are written.
-            pair: Index.
+        after a rebound in contact; in between the control is held, and the approach was judged when it began. Only
+        the geoms' poses are written into `data`.
         """
         m, (a, b) = plant.model, self.pairs[pair]
         (centres, axes), (other, others) = _path(m, forecast, a), _path(m, forecast, b)
@@ -133,9 +115,9 @@ class GeomGaps:
 def _distance(model: mujoco.MjModel, data: mujoco.MjData, a: int, b: int, segment: Array | None) -> float:
     """MuJoCo's distance of two geoms, m, and the nearest points into `segment`.
 
-    For about one in thirty pairs of boxes that are apart MuJoCo 3.11 returns exactly 0, or the wrong sign.
-    Another rounding mostly gives the right one. So a pair that seems to touch is measured again at small
-    offsets, and the median of the results other than 0 counts. Planes, spheres and capsules do not need it.
+    For about one in thirty pairs of boxes that are apart MuJoCo 3.11 returns exactly 0, or the wrong sign. So a pair
+    that seems to touch is measured again at small offsets, and the median of the results other than 0 counts. Planes,
+    spheres and capsules do not need it.
     """
     gap = mujoco.mj_geomDistance(model, data, a, b, _FAR, segment)
     if gap > 0.0 or model.geom_type[a] <= _ROUND or model.geom_type[b] <= _ROUND:

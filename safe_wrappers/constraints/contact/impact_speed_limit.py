@@ -6,23 +6,19 @@ from typing import ClassVar
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from safe_wrappers.checks import name_list, positive
+from safe_wrappers.checks import check_fields, name_list, positive
 from safe_wrappers.constraints.contact.geom_gaps import GeomGaps
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.control.contact.body_regions import body_region
 from safe_wrappers.control.contact.contact import series_stiffness
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Promise
+from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 
-Array = NDArray[np.float64]
-
-_FIXED = 1e-12
-"""Mobility along the normal, 1/kg, below which a geom cannot move into contact."""
+_FIXED = 1e-12  # mobility along the normal, 1/kg, below which a geom cannot move into contact
 
 
 @deprecated_parameters(renamed={"holds": "horizon"})
@@ -30,30 +26,23 @@ _FIXED = 1e-12
 class ImpactSpeedLimit(RolloutConstraint):
     """Keep the approach speed at every contact so low that its peak force stays below a limit.
 
-    A mass m that meets a spring k at the speed v, under a push F_p, presses with at most
-    `F_p + sqrt(F_p^2 + k m v^2)`. So the speed allowed at the first touch is `sqrt(F (F - 2 F_p) / (k m))`. F_p is
-    the push towards the obstacle (motors, gravity, centrifugal forces); a pull does not count: braking after contact
-    comes too late (`appendix.contact.impact.attenuation_after_delay`). m is the machine's effective mass at the
-    contact point and along its normal, by the model's Jacobian and inertia.
+    A mass m that meets a spring k at the speed v, under a push F_p, presses with at most `F_p + sqrt(F_p^2 + k m
+    v^2)`. m is the machine's effective mass at the contact point and along its normal; F_p is the push of motors,
+    gravity and centrifugal forces towards the obstacle; a pull does not count. A forecast of the held control, and
+    then of the actuated joints braking, is judged at every physics substep. In contact, the deflection counts as
+    stored energy.
 
-    The plant's model is stepped through the held action, and then with the actuated joints braking, for `horizon`
-    control steps in all; every contact on the way has to be slow enough. In contact already, the deflection that the
-    model shows counts as stored energy. Distances are MuJoCo's, between the declared geoms, at every physics substep.
+    Best effort: along the held step of an executed control that is not flagged every first touch keeps the limit, for
+    a plant that is right, a contact that is a linear spring of the declared stiffness, and one pair of geoms at a
+    time; friction, and forces through other contacts and joint stops, are not counted. Obstacles are taken where they
+    are. The physics step should be at most a tenth of `appendix.contact.impact.time_to_peak`.
 
-    What it promises: along the held step of an executed control that is not flagged every first touch keeps the
-    limit, for a plant that is right, a contact that is a linear spring of the declared stiffness, and one pair of
-    geoms at a time; friction, and forces through other contacts and joint stops, are not counted. Braking can keep it
-    afterwards if it takes no more than `horizon` control steps, or if `braking` is true. Obstacles are taken where
-    they are. The physics step should be at most a tenth of `appendix.contact.impact.time_to_peak`. Hence best effort.
-
-    `value`, N: the limit less the peak that a contact at the present speed would have. Before contact, without
-    `braking`, it is not below zero, since the machine may still slow down; with it, the speed counts that this
-    deceleration leaves at the contact.
+    `value`, N: the limit less the peak that a contact at the present speed would have; before contact not below zero,
+    unless `braking` is declared.
 
     Args:
         bodies: Names of the machine's bodies (all their geoms that can collide, or all if none can) or geoms.
-        against: Names of bodies or geoms of the world. Moving ones (mocap, free) are taken at their present place;
-            the speed of free ones counts.
+        against: Names of bodies or geoms of the world; the speed of free ones counts.
         force_limit: Largest peak force, N, of each pair of geoms. None takes the region's.
         region: Of a human body (`control.contact.body_regions`, ISO/TS 15066:2016, to be checked against its text):
             its spring, its effective mass, and its transient force limit.
@@ -62,9 +51,9 @@ class ImpactSpeedLimit(RolloutConstraint):
             region's; None is a rigid robot then.
         effective_mass: Of the machine, kg; None has it computed at every contact.
         braking: Deceleration, m/s^2, that the machine can give every declared point towards every obstacle from
-            everywhere: makes up for a look-ahead that ends before the machine stands. None relies on the forecast.
+            everywhere: makes up for a forecast that ends before the machine stands. None relies on the forecast.
         margin: Kept free below the limit, N.
-        horizon: Control steps to look ahead; cover the time that braking takes, and that of a contact.
+        horizon: Control steps to forecast; cover the time that braking takes, and that of a contact.
     """
 
     bodies: Sequence[str]
@@ -79,18 +68,15 @@ class ImpactSpeedLimit(RolloutConstraint):
     horizon: int = 5
 
     max_decrease: float | None = field(default=None, init=False, repr=False)
-    promise: Promise = field(default="best effort", init=False)
     unit: ClassVar[str] = "N"
 
     def __post_init__(self) -> None:
         self._check_shared()
         for name in ("bodies", "against"):
             setattr(self, name, name_list(name, getattr(self, name), "names of bodies or geoms"))
-        for name, unit in (("force_limit", "N"), ("stiffness", "N/m"), ("effective_mass", "kg")):
-            if getattr(self, name) is not None:
-                setattr(self, name, positive(name, getattr(self, name), unit))
-        if self.braking is not None:
-            self.braking = positive("braking", self.braking, "m/s^2")
+        units = {"force_limit": "N", "stiffness": "N/m", "effective_mass": "kg", "braking": "m/s^2"}
+        for name, unit in units.items():
+            check_fields(self, positive, (name,), unit)
         self._force, self._stiffness, self._other_mass = self._interface()
         if self.margin >= self._force:
             raise ConfigurationError(
@@ -103,9 +89,8 @@ class ImpactSpeedLimit(RolloutConstraint):
             if self.clamped:
                 raise ConfigurationError("clamped says how a region is hit: name the region too")
             if self.force_limit is None or self.stiffness is None:
-                raise ConfigurationError(
-                    "give a force_limit (N) and the interface's stiffness (N/m), or a region of the human body"
-                )
+                wanted = "a force_limit (N) and the interface's stiffness (N/m)"
+                raise ConfigurationError(f"give {wanted}, or a region of the human body")
             return self.force_limit, self.stiffness, np.inf
         region = body_region(self.region)
         limit = region.quasi_static_force if self.clamped else region.transient_force
@@ -119,8 +104,30 @@ class ImpactSpeedLimit(RolloutConstraint):
         return force, float(series_stiffness(pad, region.stiffness)), np.inf if self.clamped else region.mass
 
     def bind(self, plant: Plant) -> "BoundImpactSpeedLimit":
-        """On a plant."""
         return BoundImpactSpeedLimit(self, plant)
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """A contact, now or at the present speed."""
+
+    gap: float  # m, negative inside
+    speed: float  # of the approach, m/s, >= 0
+    inertia: float  # mass times stiffness, N^2 s^2 / m^2
+    push: float  # what presses on besides the motion, N, >= 0
+    pressed: float  # force by the present deflection, N
+
+    @property
+    def peak(self) -> float:
+        """From `m v^2 / 2 + k x^2 / 2 + F_p (x_max - x) = k x_max^2 / 2`, N."""
+        return self.push + float(np.hypot(self.pressed - self.push, np.sqrt(self.inertia) * self.speed))
+
+    def left(self, limit: float) -> float:
+        """What is left of a limit, N, to first order; in squares, nearly linear in the control."""
+        # Beyond the limit the push would change its sign with that of the first factor.
+        push = self.push if self.pressed <= limit else -self.push
+        square = (limit - self.pressed) * (limit + self.pressed - 2.0 * push)
+        return (square - self.inertia * self.speed**2) / (2.0 * limit)
 
 
 class BoundImpactSpeedLimit(BoundRollout):
@@ -130,23 +137,21 @@ class BoundImpactSpeedLimit(BoundRollout):
 
     @property
     def scale(self) -> float:
-        """The limit."""
         return self.spec._force
 
     def __init__(self, spec: ImpactSpeedLimit, plant: Plant) -> None:
         plant.require_acceleration("ImpactSpeedLimit")
         super().__init__(spec, plant)
-        self._gaps = GeomGaps(self.plant, self.spec.bodies, self.spec.against)
-        self._probe = mujoco.MjData(self.plant.model)
-        self._integration = np.zeros(
-            mujoco.mj_stateSize(self.plant.model, int(mujoco.mjtState.mjSTATE_INTEGRATION))
-        )
-        self._control: Array | None = None
         m = self.plant.model
+        self._gaps = GeomGaps(self.plant, self.spec.bodies, self.spec.against)
+        self._probe = mujoco.MjData(m)
+        self._integration = np.zeros(mujoco.mj_stateSize(m, int(mujoco.mjtState.mjSTATE_INTEGRATION)))
+        self._control: Array | None = None
+        self._limit = self.spec._force - self.spec.margin
         self._jacobians = [np.zeros((3, m.nv)) for _ in range(4)]
         self._mobile = np.zeros((1, m.nv))
 
-    def _at(self, qpos: Array, qvel: Array, control: Array | None) -> None:
+    def place(self, qpos: Array, qvel: Array, control: Array | None) -> None:
         """Everything about a state but its constraint forces; without a control the actuators do not push."""
         m, d = self.plant.model, self._probe
         d.qpos[:], d.qvel[:] = qpos, qvel
@@ -167,8 +172,8 @@ class BoundImpactSpeedLimit(BoundRollout):
         mujoco.mj_fwdAcceleration(m, d)
         return np.asarray(d.qfrc_smooth - (0.0 if self._pushing else d.qfrc_actuator))
 
-    def _contact(self, pair: int) -> "_Contact":
-        """What a contact of the pair would be like, at the state of `_at`."""
+    def contact(self, pair: int) -> Contact:
+        """What a contact of the pair would be like, at the state of `place`."""
         m, d = self.plant.model, self._probe
         gap, normal, points = self._gaps.nearest(self.plant.model, d, pair)
         robot, other = self._gaps.pairs[pair]
@@ -182,7 +187,7 @@ class BoundImpactSpeedLimit(BoundRollout):
         mobility = float(row @ given)
         speed = float(row @ self._speeds)
         if mobility < _FIXED:
-            return _Contact(gap, 0.0, 0.0, 0.0, 0.0)
+            return Contact(gap, 0.0, 0.0, 0.0, 0.0)
         mass = 1.0 / mobility if self.spec.effective_mass is None else self.spec.effective_mass
         moving = float(given @ self._moving)
         if self._curving:
@@ -192,13 +197,13 @@ class BoundImpactSpeedLimit(BoundRollout):
         if not self._gaps.moves[pair]:
             mass = 1.0 / (1.0 / mass + 1.0 / self.spec._other_mass)
         push = mass * max(moving, self._at_rest(given), 0.0)
-        return _Contact(
-            gap, max(speed, 0.0), mass * self.spec._stiffness, push, self.spec._stiffness * max(-gap, 0.0)
-        )
+        stiffness = self.spec._stiffness
+        return Contact(gap, max(speed, 0.0), mass * stiffness, push, stiffness * max(-gap, 0.0))
 
     def _at_rest(self, given: Array) -> float:
         """Acceleration along the normal once the motion has stopped, when damping no longer holds it back, m/s^2."""
         if self._resting is None:
+            self._resting = self._moving
             if self._curving:
                 d = self._probe
                 velocity = d.qvel.copy()
@@ -207,60 +212,48 @@ class BoundImpactSpeedLimit(BoundRollout):
                 self._resting = self._forces()
                 d.qvel[:] = velocity
                 mujoco.mj_fwdVelocity(self.plant.model, d)
-            else:
-                self._resting = self._moving
         return float(given @ self._resting)
 
     def backup(self) -> Array:
         """The braking with which every forecast goes on: what was admitted for its sake stays admissible."""
         return self.plant.braking()
 
-    def _now(self) -> Array:
+    def now(self) -> Array:
         m, d = self.plant.model, self._probe
         self._known: dict[tuple[int, bytes], Array] = {}
         data, what = self.plant.pose(), int(mujoco.mjtState.mjSTATE_INTEGRATION)
         mujoco.mj_getState(m, data, self._integration, what)
         mujoco.mj_setState(m, d, self._integration, what)
-        self._at(self.plant.qpos, self.plant.qvel, None)
-        contacts = [self._contact(pair) for pair in range(len(self._gaps.pairs))]
+        self.place(self.plant.qpos, self.plant.qvel, None)
+        contacts = [self.contact(pair) for pair in range(len(self._gaps.pairs))]
         touching = [c.gap <= touch for c, touch in zip(contacts, self._gaps.touch, strict=True)]
-        # Only a contact that is there is a fact; before it, how it will be is the forecast's to say.
-        self._lost = np.array(
-            [min(self._left(c), 0.0) if t else 0.0 for c, t in zip(contacts, touching, strict=True)]
-        )
-        value = []
+        # Only a contact that is there counts; before it, how it will be is the forecast's to say.
+        lost, value = [], []
         for c, there in zip(contacts, touching, strict=True):
-            left = self.spec._force - self._braked(c).peak if not there else self.spec._force - c.peak
+            left = self.spec._force - (c if there else self._braked(c)).peak
             value.append(left if there or self.spec.braking is not None else max(left, 0.0))
+            lost.append(min(c.left(self._limit), 0.0) if there else 0.0)
+        self._lost = np.array(lost)
         return np.array(value)
 
-    def _braked(self, contact: "_Contact") -> "_Contact":
+    def _braked(self, contact: Contact) -> Contact:
         """A contact to come, at the speed that the declared braking leaves of it."""
         if self.spec.braking is None:
             return contact
         square = max(contact.speed**2 - 2.0 * self.spec.braking * contact.gap, 0.0)
         return replace(contact, speed=square**0.5)
 
-    def _left(self, contact: "_Contact") -> float:
-        """What is left of the limit less the margin, N, to first order; in squares, nearly linear in the control."""
-        limit = self.spec._force - self.spec.margin
-        # Beyond the limit the push would change its sign with that of the first factor.
-        push = contact.push if contact.pressed <= limit else -contact.push
-        square = (limit - contact.pressed) * (limit + contact.pressed - 2.0 * push)
-        return (square - contact.inertia * contact.speed**2) / (2.0 * limit)
-
     def _violation(self, value: Array) -> Array:
         return self._lost
 
     def slacks(self, control: Array) -> Array:
-        """What is left along the forecast of a control; see `BoundRollout`."""
         key = self.plant.model_version, control.tobytes()
         if key not in self._known:
             self._control = control
             self._known[key] = super().slacks(control)
         return self._known[key]
 
-    def _room(self, forecast: Forecast) -> Array:
+    def room(self, forecast: Forecast) -> Array:
         k, pairs = len(forecast.qpos), len(self._gaps.pairs)
         if not np.isfinite(forecast.qpos[-1]).all():
             return np.full((k, pairs), np.nan)  # MuJoCo's simulation has diverged
@@ -272,37 +265,13 @@ class BoundImpactSpeedLimit(BoundRollout):
         if self.spec.braking is not None:
             touched[soon] = list(range(pairs))
         # Without contact as much is left as in the gentlest one.
-        room = np.full((k, pairs), 0.5 * (self.spec._force - self.spec.margin))
+        room = np.full((k, pairs), 0.5 * self._limit)
         for instant, those in touched.items():
             # At the end of the held step another control takes over.
             control = self._control if instant < soon or instant == 0 else None
-            self._at(forecast.qpos[instant], forecast.qvel[instant], control)
+            self.place(forecast.qpos[instant], forecast.qvel[instant], control)
             for pair in those:
-                contact = self._contact(pair)
+                contact = self.contact(pair)
                 there = contact.gap <= self._gaps.touch[pair]
-                room[instant, pair] = self._left(contact if there else self._braked(contact))
+                room[instant, pair] = (contact if there else self._braked(contact)).left(self._limit)
         return room + self.spec.margin
-
-
-@dataclass(frozen=True, slots=True)
-class _Contact:
-    """A contact, now or at the present speed.
-
-    Attributes:
-        gap: m, negative inside.
-        speed: Of the approach, m/s, >= 0.
-        inertia: Mass times stiffness, N^2 s^2 / m^2.
-        push: What presses on besides the motion, N, >= 0.
-        pressed: Force by the present deflection, N.
-    """
-
-    gap: float
-    speed: float
-    inertia: float
-    push: float
-    pressed: float
-
-    @property
-    def peak(self) -> float:
-        """From `m v^2 / 2 + k x^2 / 2 + F_p (x_max - x) = k x_max^2 / 2`, N."""
-        return self.push + float(np.hypot(self.pressed - self.push, np.sqrt(self.inertia) * self.speed))

@@ -1,39 +1,34 @@
 """SupportMargin: the zero moment point stays inside the support polygon, by an inset."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.constraints.contact.contact_feasibility import require_contacts
 from safe_wrappers.constraints.rollout import BoundSlacks
 from safe_wrappers.control.legged.support_distances import support_distances
-from safe_wrappers.filter.constraint import Constraint, Memory, Promise
-from safe_wrappers.plants.mujoco.contact_forecast import ContactForecast
+from safe_wrappers.filter.constraint import Array, Constraint, Memory
+from safe_wrappers.plants.mujoco.contacts import ContactForecast
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 @dataclass
 class SupportMargin(Constraint):
     """Keep the zero moment point of the contact forces inside the hull of the contact points, by an inset.
 
-    It applies while there are at least three contact points in one plane that are not on a line; the robot starts to
-    tip about an edge where the point reaches it. On two point feet, in the air, or on contacts at several heights
-    there is no polygon and no requirement.
+    It applies while there are at least three contact points in one plane that are not on a line. On two point feet,
+    in the air, or on contacts at several heights there is no polygon and no requirement.
 
-    What it promises: for a plant that is right, an executed control that is not flagged keeps the inset at every
-    evaluation of the physics of its control step at which there is a polygon. Such a control need not exist, now or
-    in the next step; and crossing an edge predicts no particular fall. Hence best effort.
+    Best effort: an executed control that is not flagged keeps the inset at every evaluation of the physics of its
+    control step at which there is a polygon, for a plant that is right. Such a control need not exist; and crossing
+    an edge predicts no particular fall.
 
     Args:
-        inset: m, positive: pushing forces alone keep the point inside the hull, and on its edge while the robot tips.
-            An inset of millimetres can be crossed between two evaluations; and beyond the edge the distance does not
-            grow, so the answer may be the fallback where a closer one exists.
+        inset: m, positive: pushing forces alone keep the point inside the hull. An inset of millimetres can be
+            crossed between two evaluations.
         margin: Kept free inside the inset, m.
 
     Source: appendix "Physical contact feasibility constraints", third condition and footnote 8.
@@ -42,14 +37,11 @@ class SupportMargin(Constraint):
     inset: float
     margin: float = 0.0
 
-    promise: Promise = field(default="best effort", init=False)
-
     def __post_init__(self) -> None:
         self.inset = positive("inset", self.inset, "m: forces that push keep the point inside by themselves")
         self.margin = non_negative("margin", self.margin, "m")
 
     def bind(self, plant: Plant) -> "BoundSupportMargin":
-        """On a plant."""
         return BoundSupportMargin(self, plant)
 
 
@@ -63,7 +55,6 @@ class BoundSupportMargin(BoundSlacks):
         super().__init__(spec, require_contacts(plant, "SupportMargin"))
 
     def observe(self, memory: Memory) -> None:
-        """Nothing is known of this state yet."""
         self._known: list[tuple[ContactForecast, list[float]]] = []
 
     def _distances(self, found: ContactForecast) -> list[float]:
@@ -79,10 +70,9 @@ class BoundSupportMargin(BoundSlacks):
         """Distance to the edge minus inset and margin where it is least, shape (1,), m; 0 where there is none."""
         found = self.plant.contact_forecast(control)
         if not found.finite:
-            return np.full(1, np.nan)
-        return np.full(
-            1, min((d - self.spec.inset - self.spec.margin for d in self._distances(found)), default=0.0)
-        )
+            return np.array([np.nan])
+        left = (d - self.spec.inset - self.spec.margin for d in self._distances(found))
+        return np.array([min(left, default=0.0)])
 
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
         """The info keys `whole_body/zmp_margin` and `whole_body/supported`: forecast for the executed control."""
@@ -90,8 +80,7 @@ class BoundSupportMargin(BoundSlacks):
         if executed is not None:
             found = self.plant.contact_forecast(executed)
             distances = self._distances(found) if found.finite else []
-            least = min(distances, default=0.0)
-            share = len(distances) / found.steps
+            least, share = min(distances, default=0.0), len(distances) / found.steps
         return {keys.WHOLE_BODY_ZMP_MARGIN: least, keys.WHOLE_BODY_SUPPORTED: share}
 
 

@@ -1,21 +1,36 @@
-"""Which hinges and slides a constraint on joints means."""
+"""Limits on the positions and the speeds of hinges and slides, and which joints a constraint means."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import name_list, positive
+from safe_wrappers.constraints.rollout import RECOVERY_S, RENAMED, BoundRollout, RolloutConstraint
+from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
+from safe_wrappers.filter.constraint import Array, HalfSpaces
+from safe_wrappers.plants.mujoco.forecast import Forecast
+from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
+from safe_wrappers.plants.plant import Plant
 
-_HINGE_OR_SLIDE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+HINGE_OR_SLIDE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 _DRIVES = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
 def driven_joints(model: mujoco.MjModel) -> list[int]:
     """The hinges and slides that an actuator drives directly."""
-    return [j for j in _direct(model) if model.jnt_type[j] in _HINGE_OR_SLIDE]
+    return [j for j in _direct(model) if model.jnt_type[j] in HINGE_OR_SLIDE]
+
+
+def per_joint(name: str, given: float | Sequence[float], count: int) -> Array:
+    """One value for all joints, or one for each, as an array of shape (count,)."""
+    try:
+        return np.broadcast_to(np.asarray(given, dtype=np.float64), (count,))
+    except ValueError:
+        raise ConfigurationError(f"expected one {name} or {count}, got {given}") from None
 
 
 def _direct(model: mujoco.MjModel) -> list[int]:
@@ -26,14 +41,14 @@ def _direct(model: mujoco.MjModel) -> list[int]:
 def refuse_uncovered(model: mujoco.MjModel, joints: Iterable[int], remedy: str, forces: bool = True) -> None:
     """Refuse to take the driven joints for all where an action moves others of these joints as well.
 
-    It does where it is no force, where an actuator pulls at a tendon or a site, and where
-    one drives a ball joint. A joint that nothing drives in any other machine is passive, and no action's.
+    It does where it is no force, pulls at a tendon or a site, or drives a ball joint. In other machines a joint that
+    nothing drives is passive.
 
     Args:
         model: The machine's.
         joints: Ids of the joints in question.
-        remedy: What to do instead.
-        forces: Whether actions are forces, and not displacements (a `DisplacementPlant`'s).
+        remedy: What to do instead, for the error's message.
+        forces: Whether actions are forces; False: displacements.
 
     Raises:
         ConfigurationError: With the joints that would be covered, and those that would not.
@@ -49,7 +64,7 @@ def refuse_uncovered(model: mujoco.MjModel, joints: Iterable[int], remedy: str, 
         )
 
 
-def stops(model: mujoco.MjModel) -> tuple[list[int], NDArray[np.float64], NDArray[np.float64]]:
+def stops(model: mujoco.MjModel) -> tuple[list[int], Array, Array]:
     """The driven hinges and slides that have a range, and its ends, rad or m."""
     limited = [j for j in driven_joints(model) if model.jnt_limited[j]]
     low, high = model.jnt_range[limited].T
@@ -66,24 +81,209 @@ def scalar_joints(plant: MujocoPlant, names: Sequence[str] | None) -> list[int]:
     """Ids of the named joints, or of every hinge and slide that an actuator drives directly.
 
     Raises:
-        ConfigurationError: A named joint is neither hinge nor slide; or no actuator drives one directly, or an
-            action moves others, too.
+        ConfigurationError: No hinge or slide is driven, an action moves others as well, or a named joint is neither.
         UnknownNameError: No joint of that name.
     """
     model = plant.model
     if names is None:
         ids = driven_joints(model)
         if not ids:
-            raise ConfigurationError(
-                "no actuator drives a hinge or slide directly: name the joints; the model has: "
-                + ", ".join(plant.names("joint"))
-            )
+            there = ", ".join(plant.names("joint"))
+            wanted = "no actuator drives a hinge or slide directly: name the joints"
+            raise ConfigurationError(f"{wanted}; the model has: {there}")
         # What flies freely is no joint of a machine.
         own = [j for j in range(model.njnt) if model.jnt_type[j] != int(mujoco.mjtJoint.mjJNT_FREE)]
         refuse_uncovered(model, own, "Name those that you mean: joints=[...]", plant.has_acceleration)
         return ids
     ids = [plant.named("joint", name) for name in names]
     for j, name in zip(ids, names, strict=True):
-        if model.jnt_type[j] not in _HINGE_OR_SLIDE:
+        if model.jnt_type[j] not in HINGE_OR_SLIDE:
             raise ConfigurationError(f"joint {name!r} is neither a hinge nor a slide")
     return ids
+
+
+@deprecated_parameters(renamed=RENAMED)
+@dataclass
+class JointPositionLimit(RolloutConstraint):
+    """Keep joint positions in a range that may be narrower than the model's own.
+
+    A forecast of the held control, and then of every actuated joint braking, has to keep the range at every substep.
+
+    Best effort: an executed control that is not flagged keeps the range at every physics substep of its step, for a
+    plant that is right. Gravity, coupling, contacts and passive joints can be stronger than the actuators.
+
+    Args:
+        lower: Smallest position, rad for hinges, m for slides; one, or one per joint. None: the model's own range.
+        upper: Largest, likewise.
+        joints: Names. None: every hinge and slide that an actuator drives directly; refused where an action moves
+            others as well.
+        margin: Kept free inside the range, rad or m.
+        horizon: Control steps to forecast; cover the braking time.
+        max_decrease: The farthest that a joint can move within `horizon` control steps, rad or m; states with more
+            than that left need no forecast.
+    """
+
+    lower: float | Sequence[float] | None = None
+    upper: float | Sequence[float] | None = None
+    joints: Sequence[str] | None = None
+    margin: float = 0.0
+    horizon: int = 5
+    max_decrease: float | None = None
+
+    unit: ClassVar[str] = "rad or m"
+
+    def __post_init__(self) -> None:
+        self._check_shared()
+        for name in ("lower", "upper"):
+            setattr(self, name, _positions(name, getattr(self, name)))
+        if self.joints is not None:
+            self.joints = name_list("joints", self.joints, also="None for every driven joint")
+
+    def bind(self, plant: Plant) -> "BoundJointPositionLimit":
+        return BoundJointPositionLimit(self, plant)
+
+
+class BoundJointPositionLimit(BoundRollout):
+    """JointPositionLimit on a plant."""
+
+    spec: JointPositionLimit
+
+    def __init__(self, spec: JointPositionLimit, plant: Plant) -> None:
+        super().__init__(spec, plant)
+        ids = scalar_joints(self.plant, self.spec.joints)
+        model: mujoco.MjModel = self.plant.model
+        self._qpos = model.jnt_qposadr[ids]
+        limited = model.jnt_limited[ids].astype(bool)
+        own = np.where(limited[:, None], model.jnt_range[ids], [-np.inf, np.inf])
+        lower, upper = self.spec.lower, self.spec.upper
+        self._low = own[:, 0] if lower is None else per_joint("lower", lower, len(ids))
+        self._high = own[:, 1] if upper is None else per_joint("upper", upper, len(ids))
+        narrow = ~(self._high - self._low > 2.0 * self.spec.margin)
+        if narrow.any():
+            j = int(np.flatnonzero(narrow)[0])
+            raise ConfigurationError(
+                f"nothing is left of the range of joint {model.joint(ids[j]).name!r}: {self._low[j]:g} to "
+                f"{self._high[j]:g} with a margin of {self.spec.margin:g} at both ends"
+            )
+        self._below, self._above = np.isfinite(self._low), np.isfinite(self._high)
+        if not (self._below.any() or self._above.any()):
+            raise ConfigurationError("none of these joints has a range in the model: pass lower and upper")
+
+    def now(self) -> Array:
+        return self._left(self.plant.qpos)
+
+    def _left(self, qpos: Array) -> Array:
+        """Room to every bound that there is, the lower ones first, shape (..., n)."""
+        q = qpos[..., self._qpos]
+        sides = (q - self._low)[..., self._below], (self._high - q)[..., self._above]
+        return np.concatenate(sides, axis=-1)
+
+    def room(self, forecast: Forecast) -> Array:
+        return self._left(forecast.qpos)
+
+
+def _positions(name: str, given: float | Sequence[float] | None) -> float | list[float] | None:
+    if given is None:
+        return None
+    try:
+        found = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        found = np.array(np.nan)
+    if found.ndim > 1 or not found.size or np.isnan(found).any():
+        raise ConfigurationError(f"{name} is a position in rad or m, or one per joint; got {given!r}")
+    listed: float | list[float] = found.tolist()
+    return listed
+
+
+@deprecated_parameters(renamed=RENAMED)
+@dataclass
+class JointSpeedLimit(RolloutConstraint):
+    """Keep `|joint speed| <= limit`.
+
+    Rows bound the speed at the end of the held control step; a forecast of that step checks every physics substep.
+
+    Best effort: an executed control that is not flagged keeps the limit at every physics substep of its step, for a
+    plant that is right. Gravity, coupling, contacts and joint stops can be stronger than the actuators.
+
+    Args:
+        limit: In rad/s for hinges, m/s for slides; one number, or one per named joint.
+        joints: Names. None: every hinge and slide that an actuator drives directly; refused where an action moves
+            others as well.
+        margin: Kept free below the limit, rad/s or m/s.
+        horizon: Control steps to forecast; the actuated joints brake after the first.
+        max_decrease: The most that a joint's speed can rise within `horizon` control steps, rad/s or m/s; states with
+            more than that left need no forecast.
+    """
+
+    limit: float | Sequence[float]
+    joints: Sequence[str] | None = None
+    margin: float = 0.0
+    horizon: int = 1
+    max_decrease: float | None = None
+
+    unit: ClassVar[str] = "rad/s or m/s"
+
+    def __post_init__(self) -> None:
+        self._check_shared()
+        limits = self.limit if isinstance(self.limit, Sequence | np.ndarray) else [self.limit]
+        checked = [positive("limit", one, "rad/s or m/s") for one in limits]
+        if self.joints is not None:
+            self.joints = name_list("joints", self.joints, also="None for every driven joint")
+        if not checked:
+            raise ConfigurationError("limit is one number, or a list with one per joint; got []")
+        self.limit = checked if limits is self.limit else checked[0]
+        if min(checked) <= self.margin:
+            raise ConfigurationError(f"the margin {self.margin} leaves nothing of the limit {self.limit}")
+
+    def bind(self, plant: Plant) -> "BoundJointSpeedLimit":
+        return BoundJointSpeedLimit(self, plant)
+
+
+class BoundJointSpeedLimit(BoundRollout):
+    """JointSpeedLimit on a plant."""
+
+    spec: JointSpeedLimit
+
+    @property
+    def scale(self) -> float:
+        return float(np.min(self.spec.limit))
+
+    def __init__(self, spec: JointSpeedLimit, plant: Plant) -> None:
+        hint = "on an AnalyticPlant write Barrier(lambda x: limit**2 - x[i]**2)"
+        require_mujoco(plant, f"JointSpeedLimit needs a MujocoPlant (named joints); {hint}")
+        super().__init__(spec, plant)
+        ids = scalar_joints(self.plant, self.spec.joints)
+        self._dofs = self.plant.model.jnt_dofadr[ids]
+        self._limits = per_joint("limit", self.spec.limit, len(ids))
+        self._bound = self._limits - self.spec.margin
+
+    def now(self) -> Array:
+        """Speed left below the limit, per joint, rad/s or m/s."""
+        self._speeds = np.abs(self.plant.qvel[self._dofs])
+        return np.asarray(self._limits - self._speeds)
+
+    def room(self, forecast: Forecast) -> Array:
+        return np.asarray(self._limits - np.abs(forecast.qvel[:, self._dofs]))
+
+    def slacks(self, control: Array) -> Array:
+        """What is left below the bound along the forecast and at its end, per joint, shape (2 k,)."""
+        left = self.room(self.plant.forecast(control, self.spec.horizon)) - self.spec.margin
+        over = np.maximum(self._speeds - self._bound, 0.0)
+        # From above the bound, joint by joint: never faster on the way, and closer at the end.
+        decay = np.exp(-self.spec.horizon * self.plant.control_dt / RECOVERY_S)
+        return np.concatenate([left.min(axis=0) + over, left[-1] + over * decay])
+
+    def rows(self) -> HalfSpaces:
+        """Two rows per joint that could reach its limit within the hold; none where controls are no forces."""
+        if not self.plant.has_acceleration:
+            return super().rows()
+        v, (a0, a) = self.plant.qvel[self._dofs], (part[self._dofs] for part in self.plant.acceleration)
+        strongest = np.maximum(np.abs(self.plant.lower), np.abs(self.plant.upper))
+        # No push, not NaN, where an actuator without effect is infinitely strong.
+        pushes = np.abs(a) * np.where(a == 0.0, 0.0, strongest)
+        highest = np.abs(v) + self.plant.control_dt * (np.abs(a0) + pushes.sum(axis=1))
+        near = highest > self._bound
+        normals = np.vstack([a[near], -a[near]])
+        room = self._bound[near] / self.plant.control_dt
+        rate, bias = v[near] / self.plant.control_dt, a0[near]
+        return HalfSpaces(normals, np.concatenate([room - rate - bias, room + rate + bias]))

@@ -5,23 +5,24 @@ from typing import Literal
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from safe_wrappers.constraints.limits.joints import driven_joints, refuse_uncovered, scalar_joints
+from safe_wrappers.constraints.limits.joints import (
+    HINGE_OR_SLIDE,
+    driven_joints,
+    refuse_uncovered,
+    scalar_joints,
+)
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
-Array = NDArray[np.float64]
 FrameKind = Literal["site", "body", "geom"]
-
-_HINGE_OR_SLIDE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 class SerialChain:
     """Hinges and slides that carry a frame, and what their speeds do to it.
 
-    Jacobians come from the joints' axes and anchors after forward kinematics alone, on data of its own, so that a
-    forecast of many states costs little.
+    Jacobians come from the joints' axes and anchors, by forward kinematics on data of its own.
 
     Args:
         plant: Bound.
@@ -32,7 +33,7 @@ class SerialChain:
         joints: Ids of the n hinges and slides between the world and the frame, from the base on, shape (n,).
         qpos: Their addresses in qpos, shape (n,).
         dofs: Their addresses in qvel, shape (n,).
-        scalar: Nothing else carries the frame: no ball, no free joint.
+        scalar: No ball and no free joint carries the frame.
 
     Raises:
         UnknownNameError: No frame of that name.
@@ -49,27 +50,24 @@ class SerialChain:
             first = int(model.body_jntadr[body])
             carriers += range(first, first + int(model.body_jntnum[body])) if first >= 0 else []
             body = int(model.body_parentid[body])
-        self.joints = np.array(sorted(j for j in carriers if model.jnt_type[j] in _HINGE_OR_SLIDE), dtype=int)
+        self.joints = np.array(sorted(j for j in carriers if model.jnt_type[j] in HINGE_OR_SLIDE), dtype=int)
         if not self.joints.size:
-            raise ConfigurationError(
-                f"no hinge or slide moves {self._what}: it has no manipulability; the model has the joints "
-                + ", ".join(plant.names("joint"))
-            )
+            wanted = f"no hinge or slide moves {self._what}: it has no manipulability"
+            raise ConfigurationError(f"{wanted}; the model has the joints {', '.join(plant.names('joint'))}")
         self.qpos, self.dofs = model.jnt_qposadr[self.joints], model.jnt_dofadr[self.joints]
         self.scalar = len(self.joints) == len(carriers)
         self._slides = (model.jnt_type[self.joints] == int(mujoco.mjtJoint.mjJNT_SLIDE))[:, None]
         self._data = mujoco.MjData(model)
         # Names, not views of the data: a copy of this object would hold on to the old one's.
-        places = {"site": "site_xpos", "body": "xpos", "geom": "geom_xpos"}
-        turns = {"site": "site_xmat", "body": "xmat", "geom": "geom_xmat"}
-        self._place, self._turn, self._index = places[kind], turns[kind], index
+        kinds = {"site": "site_", "body": "", "geom": "geom_"}
+        self._place, self._turn, self._index = f"{kinds[kind]}xpos", f"{kinds[kind]}xmat", index
 
     def columns(self, names: Sequence[str] | None) -> list[int]:
         """Places in `joints` of the named ones, or of those that an actuator drives directly.
 
         Raises:
             UnknownNameError: No joint of that name.
-            ConfigurationError: One that does not carry the frame, or is named twice; or none that is driven.
+            ConfigurationError: A joint that does not carry the frame, or is named twice; or none is driven.
         """
         model = self._model
         there = ", ".join(str(model.joint(j).name) for j in self.joints)
@@ -77,10 +75,8 @@ class SerialChain:
             driven = driven_joints(model)
             found = [i for i, j in enumerate(self.joints) if int(j) in driven]
             if not found:
-                raise ConfigurationError(
-                    f"no actuator drives a joint that moves {self._what}: name the joints that move it; there are "
-                    + there
-                )
+                wanted = f"no actuator drives a joint that moves {self._what}: name the joints that move it"
+                raise ConfigurationError(f"{wanted}; there are {there}")
             remedy = "Name those that do the task: joints=[...]"
             refuse_uncovered(model, self.joints.tolist(), remedy, self._plant.has_acceleration)
             return found
@@ -88,19 +84,17 @@ class SerialChain:
         ids = scalar_joints(self._plant, names)
         for j, name in zip(ids, names, strict=True):
             if j not in places:
-                raise ConfigurationError(
-                    f"the joint {name!r} does not move {self._what}; those that do: {there}"
-                )
+                wanted = f"the joint {name!r} does not move {self._what}"
+                raise ConfigurationError(f"{wanted}; those that do: {there}")
         if len(set(ids)) < len(ids):
             raise ConfigurationError(f"a joint is named twice: {list(names)}")
         return sorted(places[j] for j in ids)
 
     def name(self, column: int) -> str:
-        """Of a joint."""
         return str(self._model.joint(self.joints[column]).name)
 
     def place(self, data: mujoco.MjData) -> None:
-        """Put the bodies that the env moves by hand (mocap) where they are, for Jacobians from now on."""
+        """Take over the poses of the bodies that the env moves by hand (mocap), for Jacobians from now on."""
         if self._model.nmocap:
             self._data.mocap_pos[:], self._data.mocap_quat[:] = data.mocap_pos, data.mocap_quat
 
@@ -108,8 +102,8 @@ class SerialChain:
         """At finite positions of shape (k, nq).
 
         Returns:
-            Jacobians, shape (k, 6, n): velocity of the frame's origin and angular velocity, in the world's axes, per
-            joint; and the frame's axes as columns, shape (k, 3, 3).
+            Jacobians, shape (k, 6, n), velocity of the frame's origin over angular velocity, in the world's axes; and
+            the frame's axes as columns, shape (k, 3, 3).
         """
         model, data, joints, k = self._model, self._data, self.joints, len(qpos)
         arms, axes = np.empty((k, len(joints), 3)), np.empty((k, len(joints), 3))
@@ -130,10 +124,6 @@ class SerialChain:
         """Configurations with these joints uniform in their ranges, shape (count, nq).
 
         A hinge without a range turns once; a slide without one, and every other joint, stays at the model's zero.
-
-        Args:
-            rng: Draws them.
-            count: How many.
         """
         model = self._model
         zero = model.qpos0[self.qpos][:, None]

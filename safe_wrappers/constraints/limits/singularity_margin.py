@@ -5,9 +5,8 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from safe_wrappers.checks import name_list, positive
+from safe_wrappers.checks import check_fields, name_list, positive
 from safe_wrappers.constraints.limits.serial_chain import FrameKind, SerialChain
 from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
 from safe_wrappers.control.filtering.manipulability import (
@@ -20,20 +19,15 @@ from safe_wrappers.control.filtering.manipulability import (
 )
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import HalfSpaces, Promise
+from safe_wrappers.filter.constraint import Array, HalfSpaces
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 
-Array = NDArray[np.float64]
-
-_SAMPLES = 2000
-"""Configurations that say which manipulability can be reached."""
-_STILL = 1e-9
-"""Columns with a smaller norm are zero, m or rad per rad."""
+_SAMPLES = 2000  # configurations that say which manipulability can be reached
+_STILL = 1e-9  # columns with a smaller norm are zero, m or rad per rad
 _DECAY_HOLDS = 2.0
-"""Time constant of the rows, control intervals: longer brakes early, shorter is refused by the forecast."""
-_ALONG_S = 1e-5
-"""Width of the difference for the curvature of w along the motion, s."""
+"""Time constant of the rows, control intervals: longer brakes early, shorter is refused by forecasts."""
+_ALONG_S = 1e-5  # width of the difference for the curvature of w along the motion, s
 
 
 @deprecated_parameters(renamed=RENAMED)
@@ -41,26 +35,14 @@ _ALONG_S = 1e-5
 class SingularityMargin(RolloutConstraint):
     """Keep the manipulability `w = sqrt(det(J J'))` of a frame, for declared task directions, above a threshold.
 
-    Near a singular pose a Cartesian command needs unbounded joint rates. w by itself bounds no joint rate, so a
-    threshold has to be *validated* for the machine. Given `task_speed` and `rate_limit` instead of a threshold, it is
-    the smallest w above which none of 2,000 sampled configurations needs more than the limit at that speed in any
-    direction; `control.filtering.manipulability.validated_threshold` says what that proves, and does it for other
-    samples.
+    w bounds no joint rate, so a threshold has to be validated for the machine. With `task_speed` and `rate_limit` it
+    is the smallest w above which none of 2,000 sampled configurations needs more than the limit at that speed. With
+    as many joints as directions the sign of the determinant counts as well. `value` is w over the threshold, less 1.
 
-    A torque changes w through two integrations. So the forecast goes on after the held control, braking every
-    actuated joint, for `horizon` control steps in all; w has to stay at every physics substep of it. Where controls
-    are
-    forces, rows `w'' + 2 a w' + a^2 (w - threshold) >= 0` are the first guess. With as many joints as directions the
-    determinant's sign counts, too: an arm does not pass through the singular pose between two substeps.
-
-    What it promises: an executed control that is not flagged keeps the threshold at every substep of its step, for a
-    plant that is right, and as long as braking takes no more than `horizon` steps leaves one that stops in time.
-    Gravity, contacts and coupling can be stronger than the actuators. Hence best effort. It limits neither joint
-    rates (`JointSpeedLimit`) nor torques.
-
-    `value`, and so `cbf/margin`, is w over the threshold, less 1: -1 is singular. w itself has no fixed scale (at
-    most 0.01 m^2 for Reacher, 0.003 m^6 for Fetch's hand). A start below the threshold (Reacher's and Pusher's arms
-    begin stretched) counts as `cbf/unsafe`; the filter brings w up again.
+    Best effort: a forecast of the held control, and then of every actuated joint braking, keeps w. An executed
+    control that is not flagged keeps the threshold at every physics substep of its step, for a plant that is right.
+    Gravity, contacts and coupling can be stronger than the actuators. Joint rates (`JointSpeedLimit`) and torques are
+    not limited.
 
     Args:
         threshold: Smallest w, in m^k for k translations and hinges (times `length` to the number of rotations). None
@@ -72,14 +54,14 @@ class SingularityMargin(RolloutConstraint):
         rotations: About these axes, some of "xyz".
         length: Length that weighs a rotation against a translation, m; needed if there are both.
         frame: Axes of directions and rotations: the "world"'s or the frame's "own".
-        joints: Names of the joints that do the task. None takes those that an actuator drives directly, if they move
-            the frame. Where none does (Fetch's arm is pulled by its hand) name them.
+        joints: Names of the joints that do the task. None: those that an actuator drives directly and that move the
+            frame.
         task_speed: Speed that has to be possible in every direction, m/s (rad/s for rotations alone).
         rate_limit: Largest rate of each joint at that speed, rad/s for hinges, m/s for slides.
         margin: Kept free above the threshold, as a share of it.
-        horizon: Control steps to look ahead; cover the time that braking takes.
-        max_decrease: The most that w can fall within `horizon` control steps in the declared envelope, in shares of
-            the threshold; states with more than that left need no forecast. None forecasts always.
+        horizon: Control steps to forecast; cover the braking time.
+        max_decrease: The most that w can fall within `horizon` control steps, in shares of the threshold; states with
+            more than that left need no forecast.
 
     Attributes:
         validated: What the sample said of the threshold; None if it was given, or before the constraint is bound.
@@ -100,7 +82,6 @@ class SingularityMargin(RolloutConstraint):
     horizon: int = 5
     max_decrease: float | None = None
 
-    promise: Promise = field(default="best effort", init=False)
     validated: ValidatedThreshold | None = field(default=None, init=False, repr=False, compare=False)
     unit: ClassVar[str] = "shares of the threshold"
 
@@ -113,11 +94,9 @@ class SingularityMargin(RolloutConstraint):
                 "give a threshold on the manipulability, or a task_speed and a rate_limit to validate one for; got "
                 f"threshold={self.threshold!r}, task_speed={self.task_speed!r}, rate_limit={self.rate_limit!r}"
             )
-        if self.threshold is not None:
-            self.threshold = positive("threshold", self.threshold, "units of manipulability")
-        if speed is not None and limit is not None:
-            self.task_speed = positive("task_speed", speed, "task units per second")
-            self.rate_limit = positive("rate_limit", limit, "rad/s or m/s")
+        check_fields(self, positive, ("threshold",), "units of manipulability")
+        check_fields(self, positive, ("task_speed",), "task units per second")
+        check_fields(self, positive, ("rate_limit",), "rad/s or m/s")
         kinds: tuple[FrameKind, ...] = ("site", "body", "geom")
         named = [kind for kind in kinds if getattr(self, kind) is not None]
         if len(named) != 1 or not isinstance(getattr(self, named[0]), str):
@@ -133,7 +112,6 @@ class SingularityMargin(RolloutConstraint):
         self._rows, self._weights = task_rows(self.directions, self.rotations, self.length)
 
     def bind(self, plant: Plant) -> "BoundSingularityMargin":
-        """On a plant."""
         return BoundSingularityMargin(self, plant)
 
 
@@ -145,6 +123,7 @@ class BoundSingularityMargin(BoundRollout):
     def __init__(self, spec: SingularityMargin, plant: Plant) -> None:
         super().__init__(spec, plant)
         name = getattr(spec, spec._kind)
+        what = f"the {spec._kind} {name!r}"
         self._chain = SerialChain(self.plant, self.spec._kind, name)
         self._columns = self._chain.columns(self.spec.joints)
         sampled = self._chain.sample(np.random.default_rng(0), _SAMPLES)
@@ -152,35 +131,31 @@ class BoundSingularityMargin(BoundRollout):
         if self.spec.joints is not None and idle.any():
             still = self._chain.name(self._columns[int(np.argmax(idle))])
             raise ConfigurationError(
-                f"the joint {still!r} moves the {self.spec._kind} {name!r} in none of the task's directions: "
-                "leave it out"
+                f"the joint {still!r} moves {what} in none of the task's directions: leave it out"
             )
         self._columns = [c for c, does_nothing in zip(self._columns, idle, strict=True) if not does_nothing]
         task = f"directions={self.spec.directions!r}, rotations={self.spec.rotations!r}"
-        count = len(self._columns)
-        if count < len(self.spec._rows):
+        count, wanted = len(self._columns), len(self.spec._rows)
+        if count < wanted:
+            there = ", ".join(map(self._chain.name, self._columns)) or "none"
             raise ConfigurationError(
-                f"{count} joints cannot move the {self.spec._kind} {name!r} in {len(self.spec._rows)} directions at "
-                f"once ({task}); the joints are "
-                + (", ".join(map(self._chain.name, self._columns)) or "none")
+                f"{count} joints cannot move {what} in {wanted} directions at once ({task}); the joints are {there}"
             )
         # With as many joints as directions w is the determinant but for its sign, which turns at a singular pose.
-        self._signed, self._side = count == len(self.spec._rows), 1.0
+        self._signed, self._side = count == wanted, 1.0
         found = np.abs(self._measure(sampled))
         most = float(found.max())
         if most < _STILL:
             raise ConfigurationError(
-                f"the {self.spec._kind} {name!r} cannot be moved in all of these directions at once in any "
-                f"configuration: {task}, frame={self.spec.frame!r}"
+                f"{what} cannot be moved in all of these directions at once in any configuration: {task}, "
+                f"frame={self.spec.frame!r}"
             )
-        if self.spec.threshold is None:
-            assert self.spec.task_speed is not None and self.spec.rate_limit is not None
-            self.spec.validated = validated_threshold(
-                self._task(sampled), self.spec.task_speed, self.spec.rate_limit
-            )
-            self._threshold = self.spec.validated.threshold
+        if spec.threshold is not None:
+            self._threshold = spec.threshold
         else:
-            self._threshold = self.spec.threshold
+            assert spec.task_speed is not None and spec.rate_limit is not None
+            spec.validated = validated_threshold(self._task(sampled), spec.task_speed, spec.rate_limit)
+            self._threshold = spec.validated.threshold
         if self._threshold * (1.0 + self.spec.margin) >= most:
             raise ConfigurationError(
                 f"no configuration has a manipulability above {self._threshold:g} with a margin of "
@@ -191,9 +166,12 @@ class BoundSingularityMargin(BoundRollout):
     def _task(self, qpos: Array) -> Array:
         """Shape (k, m, n)."""
         jacobians, axes = self._chain.jacobians(qpos)
-        return (
-            self._in_frame(jacobians, axes)[:, self.spec._rows][:, :, self._columns]
-            * self.spec._weights[:, None]
+        return self._chosen(self._in_frame(jacobians, axes))
+
+    def _chosen(self, jacobians: Array) -> Array:
+        """The task's directions, weighed, and the joints that do it, shape (..., m, n)."""
+        return np.asarray(
+            jacobians[..., self.spec._rows, :][..., self._columns] * self.spec._weights[:, None]
         )
 
     def _in_frame(self, jacobians: Array, axes: Array) -> Array:
@@ -205,14 +183,14 @@ class BoundSingularityMargin(BoundRollout):
         return np.concatenate([back @ jacobians[..., :3, :], back @ jacobians[..., 3:, :]], axis=-2)
 
     def _measure(self, qpos: Array) -> Array:
-        """w, shape (k,), below zero beyond the singular pose; NaN where a position is no number."""
+        """w, shape (k,), below zero beyond the singular pose; NaN where a position is not finite."""
         w = np.full(len(qpos), np.nan)
         finite = np.isfinite(qpos).all(axis=1)
         task = self._task(qpos[finite])
         w[finite] = self._side * np.linalg.det(task) if self._signed else manipulability(task)
         return w
 
-    def _now(self) -> Array:
+    def now(self) -> Array:
         self._chain.place(self.plant.pose())
         self._side = 1.0
         w = self._measure(self.plant.qpos[None])
@@ -220,7 +198,7 @@ class BoundSingularityMargin(BoundRollout):
             self._side, w = -1.0, -w
         return np.asarray(w / self._threshold - 1.0)
 
-    def _room(self, forecast: Forecast) -> Array:
+    def room(self, forecast: Forecast) -> Array:
         return np.asarray(self._measure(forecast.qpos) / self._threshold - 1.0)[:, None]
 
     def _slope(self, qpos: Array) -> Array:
@@ -233,16 +211,13 @@ class BoundSingularityMargin(BoundRollout):
             blocks = np.swapaxes(jacobians.reshape(len(qpos), 2, 3, -1), 2, 3)[:, None]
             carried = np.swapaxes(np.cross(turning, blocks), 3, 4)
             change = change - carried.reshape(change.shape)
-        task = self._in_frame(jacobians, axes)[:, self.spec._rows][:, :, self._columns]
-        moved = self._in_frame(change, axes)[:, :, self.spec._rows][..., self._columns]
-        return manipulability_gradient(
-            task * self.spec._weights[:, None], moved * self.spec._weights[:, None]
-        )
+        moved = self._in_frame(change, axes)
+        return manipulability_gradient(self._chosen(self._in_frame(jacobians, axes)), self._chosen(moved))
 
     def rows(self) -> HalfSpaces:
-        """One row, a first guess for the forecast.
+        """One row `w'' + 2 a w' + a^2 (w - threshold) >= 0`, a first guess for the forecast, which decides.
 
-        Where a ball or free joint carries the frame as well, or controls are no forces, it is that of every forecast.
+        Where a ball or free joint carries the frame as well, or controls are no forces: those of `BoundRollout`.
         """
         if not (self._chain.scalar and self.plant.has_acceleration):
             return super().rows()

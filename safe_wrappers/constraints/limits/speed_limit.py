@@ -1,20 +1,17 @@
 """SpeedLimit: how fast a body, or the machine's centre of mass, may move."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from safe_wrappers.checks import positive
+from safe_wrappers.checks import check_fields, positive
 from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint, RolloutMemory
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.filter.constraint import Memory, Promise
+from safe_wrappers.filter.constraint import Array, Memory
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 DIRECTIONS = ("+x", "-x", "x", "+y", "-y", "y", "+z", "-z", "z", "xy", "xyz")
 
@@ -24,29 +21,24 @@ DIRECTIONS = ("+x", "-x", "x", "+y", "-y", "y", "+z", "-z", "z", "xy", "xyz")
 class SpeedLimit(RolloutConstraint):
     """Keep the speed of a body, or of the centre of mass, below a limit.
 
-    Speed is displacement over time, as Gymnasium's `x_velocity` is: over one control step, or over one physics
-    substep. The action is held through the forecast's first control step, contacts included, and the actuated
-    joints are braked in the others (`horizon`), so that the next step can keep the limit, too.
+    Speed is displacement over time, as Gymnasium's `x_velocity` is. Over a control step two displacements count: from
+    state to state, and that of MuJoCo's `data.xpos`, from which Gymnasium reads Ant's and Humanoid's speed.
 
-    What it promises: the first control step of an executed control that is not flagged keeps the limit, exactly,
-    for a plant that is right. Such a control need not exist: in flight no actuator changes the momentum, and contact
-    forces have one sign. Then the step is infeasible, and the control that exceeds the limit least is executed. Hence
-    best effort.
-
-    Over one control step two displacements count: from state to state, and that of MuJoCo's `data.xpos`, which
-    belongs to the last point that the integrator evaluated (Gymnasium reads Ant's and Humanoid's speed from it).
+    Best effort: the control step of an executed control that is not flagged keeps the limit, for a plant that is
+    right. Such a control need not exist: in flight no actuator changes the momentum, and contact forces have one
+    sign.
 
     Args:
         limit: m/s.
         body: Name of the body whose frame origin counts; None: the whole machine's centre of mass.
         direction: "+x" and so on limit one sign, "x" both, "xy" and "xyz" the length of the vector.
-        average: "step" over a control step, "substep" over a physics substep (instantaneous).
+        average: "step" over a control step, "substep" over a physics substep.
         margin: Kept free below the limit, m/s.
-        horizon: Control steps to look ahead.
-        max_decrease: The most that the speed can rise within `horizon` control steps in the declared envelope, m/s;
-            states with more than that left need no forecast. None forecasts always.
-        look_ahead_below: m/s; a control after whose control step at least this much is left is admitted without a
-            look at the further steps. None: always look.
+        horizon: Control steps to forecast; the actuated joints brake after the first.
+        max_decrease: The most that the speed can rise within `horizon` control steps, m/s; states with more than that
+            left need no forecast.
+        look_ahead_below: m/s; a control that leaves at least this much after its own control step is admitted without
+            a look at the others. None: always look.
     """
 
     limit: float
@@ -58,12 +50,11 @@ class SpeedLimit(RolloutConstraint):
     max_decrease: float | None = None
     look_ahead_below: float | None = None
 
-    promise: Promise = field(default="best effort", init=False)
     unit: ClassVar[str] = "m/s"
 
     def __post_init__(self) -> None:
         self._check_shared()
-        self.limit = positive("limit", self.limit, "m/s")
+        check_fields(self, positive, ("limit", "look_ahead_below"), "m/s")
         if self.margin >= self.limit:
             raise ConfigurationError(f"the margin {self.margin} leaves nothing of the limit {self.limit}")
         if self.direction not in DIRECTIONS:
@@ -72,17 +63,11 @@ class SpeedLimit(RolloutConstraint):
             raise UnknownNameError(f"no average {self.average!r}; choose step or substep")
 
     def bind(self, plant: Plant) -> "BoundSpeedLimit":
-        """On a plant."""
         return BoundSpeedLimit(self, plant)
 
 
 class SpeedMemory(NamedTuple):
-    """What SpeedLimit remembers of an episode.
-
-    Attributes:
-        rollout: As every constraint on rollouts.
-        here: The point at the last control step, m; None: there was none.
-    """
+    """The memory of every rollout, and the point at the last control step, m (None: there was none)."""
 
     rollout: RolloutMemory
     here: Array | None = None
@@ -95,33 +80,23 @@ class BoundSpeedLimit(BoundRollout):
 
     @property
     def scale(self) -> float:
-        """The limit."""
         return self.spec.limit
 
     def __init__(self, spec: SpeedLimit, plant: Plant) -> None:
         super().__init__(spec, plant)
-        self._body = None if self.spec.body is None else self.plant.named("body", self.spec.body)
+        self._body = None if spec.body is None else self.plant.named("body", spec.body)
         self._axes = ["xyz".index(letter) for letter in spec.direction.strip("+-")]
         self._sign = {"+": 1.0, "-": -1.0}.get(spec.direction[0])
-        self._model_version = self.plant.model_version
-        self._weigh()
         self._window = self.plant.substeps if self.spec.average == "step" else 1
 
-    def _weigh(self) -> None:
-        mass = self.plant.model.body_mass
-        self._shares = mass / mass.sum()
-
     def start(self) -> Memory:
-        """No position before the present one."""
         return SpeedMemory(super().start())
 
     def observe(self, memory: Memory) -> None:
-        """Measure the speed from the position before this one."""
         self._before = memory.here
         super().observe(memory.rollout)
 
     def executed(self, control: Array) -> Memory:
-        """And the present position."""
         return SpeedMemory(super().executed(control), self._here)
 
     def _point(self, frames: Array, centres: Array) -> Array:
@@ -129,10 +104,9 @@ class BoundSpeedLimit(BoundRollout):
             return np.asarray((self._shares @ centres)[..., self._axes])
         return np.asarray(frames[..., self._body, :][..., self._axes])
 
-    def _now(self) -> Array:
-        if self._model_version != self.plant.model_version:
-            self._model_version = self.plant.model_version
-            self._weigh()
+    def now(self) -> Array:
+        mass = self.plant.model.body_mass
+        self._shares = mass / mass.sum()
         pose = self.plant.pose()
         data = self.plant.published()
         self._shown = None if data is None else self._point(data.xpos, data.xipos)
@@ -153,7 +127,7 @@ class BoundSpeedLimit(BoundRollout):
     def _violation(self, value: Array) -> Array:
         return np.zeros(1)  # the next step's displacement starts afresh: there is no way back to allow for
 
-    def _room(self, forecast: Forecast) -> Array:
+    def room(self, forecast: Forecast) -> Array:
         poses = forecast.poses(self._window)
         left = self._along(self._point(poses.frames, poses.centres), self._here)
         if self.spec.average == "substep" or self._shown is None:

@@ -1,21 +1,18 @@
 """Upright: a body stays above a height and within a tilt."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import positive
 from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Promise
+from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 @deprecated_parameters(renamed=RENAMED)
@@ -23,10 +20,10 @@ Array = NDArray[np.float64]
 class Upright(RolloutConstraint):
     """Keep a body's height in a range and its own z axis within an angle of the vertical.
 
-    What it promises: an executed control that is not flagged keeps both at every physics substep of its step,
-    for a plant that is right. It looks `horizon` control steps ahead, with the actuated joints braked after the
-    first: that refuses controls shortly before a fall, and does not balance. A robot on legs can be unrecoverable
-    long before it falls. Hence best effort.
+    A forecast of the held control, and then of the actuated joints braking, has to keep both at every substep.
+
+    Best effort: an executed control that is not flagged keeps both at every physics substep of its step, for a plant
+    that is right. It does not balance: a robot on legs can be unrecoverable long before it falls.
 
     Args:
         body: Its name.
@@ -34,9 +31,9 @@ class Upright(RolloutConstraint):
         highest: Likewise.
         tilt: Largest angle between the body's z axis and the world's, rad; None: no bound.
         margin: Kept free, m for the heights and rad for the tilt.
-        horizon: Control steps to look ahead.
-        max_decrease: The most that height (m) and tilt (rad) can change within `horizon` control steps in the
-            declared envelope; states with more than that left need no forecast. None forecasts always.
+        horizon: Control steps to forecast.
+        max_decrease: The most that height (m) and tilt (rad) can change within `horizon` control steps; states with
+            more than that left need no forecast.
     """
 
     body: str = "torso"
@@ -47,15 +44,13 @@ class Upright(RolloutConstraint):
     horizon: int = 5
     max_decrease: float | None = None
 
-    promise: Promise = field(default="best effort", init=False)
     unit: ClassVar[str] = "m or rad"
 
     def __post_init__(self) -> None:
         self._check_shared()
         if self.lowest is None and self.highest is None and self.tilt is None:
             raise ConfigurationError("give at least one of lowest (m), highest (m) and tilt (rad)")
-        for name in ("lowest", "highest"):
-            height = getattr(self, name)
+        for name, height in (("lowest", self.lowest), ("highest", self.highest)):
             if height is not None and not (isinstance(height, int | float) and math.isfinite(height)):
                 raise ConfigurationError(f"{name} is a height in m or None, got {height!r}")
         if self.tilt is not None:
@@ -64,19 +59,14 @@ class Upright(RolloutConstraint):
                 raise ConfigurationError(
                     f"tilt is an angle above the margin ({self.margin}) and at most pi, got {self.tilt}"
                 )
-        low, high = self._heights()
-        if not high - low > 2.0 * self.margin:
+        low, high = self.lowest, self.highest
+        if low is not None and high is not None and not high - low > 2.0 * self.margin:
             raise ConfigurationError(
                 f"nothing is left between lowest = {self.lowest} m and highest = {self.highest} m with a margin "
                 f"of {self.margin} m at both ends"
             )
 
-    def _heights(self) -> tuple[float, float]:
-        low = -math.inf if self.lowest is None else self.lowest
-        return low, math.inf if self.highest is None else self.highest
-
     def bind(self, plant: Plant) -> "BoundUpright":
-        """On a plant."""
         return BoundUpright(self, plant)
 
 
@@ -89,22 +79,21 @@ class BoundUpright(BoundRollout):
         super().__init__(spec, plant)
         self._body = self.plant.named("body", self.spec.body)
 
-    def _now(self) -> Array:
+    def now(self) -> Array:
         pose = self.plant.pose()
         return self._left(pose.xpos[self._body, 2], pose.xmat[self._body, 8])
 
     def _left(self, height: Array, cosine: Array) -> Array:
-        low, high = self.spec._heights()
         left = []
         if self.spec.lowest is not None:
-            left.append(height - low)
+            left.append(height - self.spec.lowest)
         if self.spec.highest is not None:
-            left.append(high - height)
+            left.append(self.spec.highest - height)
         if self.spec.tilt is not None:
             left.append(self.spec.tilt - np.arccos(np.clip(cosine, -1.0, 1.0)))
         return np.array(left)
 
-    def _room(self, forecast: Forecast) -> Array:
+    def room(self, forecast: Forecast) -> Array:
         poses = forecast.poses()
         left = self._left(poses.frames[:, self._body, 2], poses.axes[:, self._body, 2, 2])
         return np.asarray(left.T)

@@ -1,23 +1,19 @@
 """Workspace: named points stay inside a box, and out of what stands in it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import name_list, non_negative
-from safe_wrappers.constraints.obstacles.obstacle_kinds import obstacles_from
-from safe_wrappers.constraints.obstacles.obstacles import distances
+from safe_wrappers.constraints.obstacles import distances, obstacles_from
 from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Promise
+from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
 
 
 @deprecated_parameters(renamed=RENAMED)
@@ -25,13 +21,11 @@ Array = NDArray[np.float64]
 class Workspace(RolloutConstraint):
     """Keep points of the machine inside an axis-aligned box and outside obstacles, in world coordinates.
 
-    Position under a force has relative degree two: a point that is inside may be too fast to stay. So the
-    forecast goes on after the held control, braking every actuated joint, for `horizon` control steps in all; the
-    workspace has to hold at every physics substep of it. Moving obstacles are taken where they are.
+    A forecast of the held control, and then of every actuated joint braking, has to keep them at every substep.
+    Moving obstacles are taken where they are.
 
-    What it promises: an executed control that is not flagged keeps the workspace at every substep of its step,
-    for a plant that is right, and as long as braking takes no more than `horizon` steps leaves one that stops in
-    time. Near a singular pose, or under loads stronger than the actuators, a point can move on. Hence best effort.
+    Best effort: an executed control that is not flagged keeps the workspace at every physics substep of its step, for
+    a plant that is right. Near a singular pose, or under loads stronger than the actuators, a point can move on.
 
     Args:
         low: Smallest x, y, z, m; None is no bound, for all or for one: `[None, -0.5, None]`.
@@ -42,9 +36,9 @@ class Workspace(RolloutConstraint):
         geoms: Names of geoms: their centres.
         radius: Of the machine around each point, m.
         margin: Kept free, m.
-        horizon: Control steps to look ahead; cover the time that braking takes.
-        max_decrease: The farthest that a point can move within `horizon` control steps in the declared envelope, m;
-            states with more than that left need no forecast. None forecasts always.
+        horizon: Control steps to forecast; cover the braking time.
+        max_decrease: The farthest that a point can move within `horizon` control steps, m; states with more than that
+            left need no forecast.
     """
 
     low: Sequence[float | None] | None = None
@@ -58,7 +52,6 @@ class Workspace(RolloutConstraint):
     horizon: int = 5
     max_decrease: float | None = None
 
-    promise: Promise = field(default="best effort", init=False)
     unit: ClassVar[str] = "m"
 
     def __post_init__(self) -> None:
@@ -70,8 +63,7 @@ class Workspace(RolloutConstraint):
             setattr(self, name, name_list(name, getattr(self, name), least=0))
         self._low = np.array([-np.inf if v is None else v for v in self.low or [None] * 3])
         self._high = np.array([np.inf if v is None else v for v in self.high or [None] * 3])
-        bounded = bool(np.isfinite(self._low).any() or np.isfinite(self._high).any())
-        if not (bounded or self.keep_out):
+        if not (np.isfinite([self._low, self._high]).any() or self.keep_out):
             raise ConfigurationError("give a bound in low or high (m), or something to keep_out of")
         if (self._high - self._low <= 2.0 * (self.margin + self.radius)).any():
             raise ConfigurationError(
@@ -80,7 +72,6 @@ class Workspace(RolloutConstraint):
             )
 
     def bind(self, plant: Plant) -> "BoundWorkspace":
-        """On a plant."""
         return BoundWorkspace(self, plant)
 
 
@@ -92,18 +83,16 @@ class BoundWorkspace(BoundRollout):
     def __init__(self, spec: Workspace, plant: Plant) -> None:
         super().__init__(spec, plant)
         if not (self.spec.bodies or self.spec.sites or self.spec.geoms):
+            there = ", ".join(self.plant.names("body"))
             raise ConfigurationError(
-                "name the bodies, sites or geoms to keep inside; the model has the bodies "
-                + ", ".join(self.plant.names("body"))
+                f"name the bodies, sites or geoms to keep inside; the bodies are {there}"
             )
         m = self.plant.model
-        found = [(self.plant.named("body", name), np.zeros(3)) for name in self.spec.bodies]
-        for kind, names in (("site", self.spec.sites), ("geom", self.spec.geoms)):
-            for name in names:
-                i = self.plant.named(kind, name)
-                found.append((int(getattr(m, f"{kind}_bodyid")[i]), np.array(getattr(m, f"{kind}_pos")[i])))
-        self._bodies = np.array([body for body, _ in found])
-        self._offsets = np.array([offset for _, offset in found])
+        bodies = [self.plant.named("body", name) for name in self.spec.bodies]
+        sites = [self.plant.named("site", name) for name in self.spec.sites]
+        geoms = [self.plant.named("geom", name) for name in self.spec.geoms]
+        self._bodies = np.array([*bodies, *m.site_bodyid[sites], *m.geom_bodyid[geoms]], dtype=int)
+        self._offsets = np.vstack([np.zeros((len(bodies), 3)), m.site_pos[sites], m.geom_pos[geoms]])
 
     def _points(self, frames: Array, axes: Array) -> Array:
         """World positions, shape (k, points, 3)."""
@@ -124,12 +113,12 @@ class BoundWorkspace(BoundRollout):
             left.append(surfaces.reshape(k, points.shape[1] * surfaces.shape[1]))
         return np.concatenate(left, axis=1) - self.spec.radius
 
-    def _now(self) -> Array:
+    def now(self) -> Array:
         pose = self.plant.pose()
         points = self._points(pose.xpos[None], pose.xmat.reshape(1, -1, 3, 3))
         return np.asarray(self._left(points)[0])
 
-    def _room(self, forecast: Forecast) -> Array:
+    def room(self, forecast: Forecast) -> Array:
         poses = forecast.poses()
         return self._left(self._points(poses.frames, poses.axes))
 

@@ -20,7 +20,7 @@ def _compiler() -> Callable[..., Any] | None:
         import numba
     except ImportError:  # a Python or machine that it does not support yet
         return None
-    return numba.njit  # type: ignore[no-any-return]
+    return numba.njit
 
 
 _COMPILE = _compiler()

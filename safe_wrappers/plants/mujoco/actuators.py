@@ -1,56 +1,45 @@
-"""MuJoCo actuators as an affine map from control to force, refusing by name what is not one.
+"""MuJoCo actuators as an affine map from control to force; those that are none are refused by name.
 
-`force = gain * ctrl + bias`, `gain = g0 + g1 length + g2 velocity`, likewise `bias`; then `forcerange` clamps
-it. Inside the clamp the map is affine with constants of the present state; outside it more control changes
-nothing, so the clamp becomes a bound on the control that still acts.
+`force = gain * ctrl + bias`, `gain = g0 + g1 length + g2 velocity`, likewise `bias`, clamped to `forcerange`. Beyond
+the clamp more control changes nothing, so it becomes a bound on the control.
 """
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import UnsupportedEnvError
-
-Array = NDArray[np.float64]
+from safe_wrappers.plants.mujoco.model import control_range, inertia
 
 _JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-_TRANSMISSIONS = (*_JOINT_TRANSMISSIONS, int(mujoco.mjtTrn.mjTRN_SITE), int(mujoco.mjtTrn.mjTRN_TENDON))
-_NO_DYNAMICS = int(mujoco.mjtDyn.mjDYN_NONE)
-_FIXED_GAIN, _AFFINE_GAIN = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)
-_NO_BIAS, _AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
+_AFFINE_GAIN, _AFFINE_BIAS = int(mujoco.mjtGain.mjGAIN_AFFINE), int(mujoco.mjtBias.mjBIAS_AFFINE)
+_QUADRATIC = int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC)
+_HANDLED = (
+    ("transmission", "actuator_trntype", mujoco.mjtTrn, ("joint", "jointinparent", "site", "tendon")),
+    ("activation dynamics", "actuator_dyntype", mujoco.mjtDyn, ("none",)),
+    ("gain type", "actuator_gaintype", mujoco.mjtGain, ("fixed", "affine")),
+    ("bias type", "actuator_biastype", mujoco.mjtBias, ("none", "affine")),
+)
 
 
-def refuse_unsupported(model: mujoco.MjModel) -> None:
+def _refuse_unsupported(model: mujoco.MjModel) -> None:
     """Raise for any actuator whose force is not affine in its control at a given state."""
-    for i in range(
-        len(model.actuator_trntype)
-    ):  # not nu: from 3.12 on an actuator may have no control at all
+    # Not nu: from MuJoCo 3.12 on an actuator may have no control at all.
+    for i in range(len(model.actuator_trntype)):
         name = model.actuator(i).name or f"#{i}"
-        transmission, dynamics = int(model.actuator_trntype[i]), int(model.actuator_dyntype[i])
-        gain, bias = int(model.actuator_gaintype[i]), int(model.actuator_biastype[i])
-        if transmission not in _TRANSMISSIONS:
-            kind = mujoco.mjtTrn(transmission).name[6:].lower()
-            _refuse(name, f"transmission {kind}", "joint, jointinparent, site, tendon")
-        if dynamics != _NO_DYNAMICS:
-            _refuse(name, f"activation dynamics {mujoco.mjtDyn(dynamics).name[6:].lower()}", "none")
-        if gain not in (_FIXED_GAIN, _AFFINE_GAIN):
-            _refuse(name, f"gain type {mujoco.mjtGain(gain).name[7:].lower()}", "fixed, affine")
-        if bias not in (_NO_BIAS, _AFFINE_BIAS):
-            _refuse(name, f"bias type {mujoco.mjtBias(bias).name[7:].lower()}", "none, affine")
+        for what, field, kinds, handled in _HANDLED:
+            kind = kinds(int(getattr(model, field)[i])).name.partition("_")[2].lower()
+            if kind not in handled:
+                _refuse(name, f"{what} {kind}", ", ".join(handled))
         if hasattr(model, "actuator_delay") and model.actuator_delay[i] > 0.0:
             _refuse(name, f"a delay of {model.actuator_delay[i]} s", "none (say delay_s instead)")
-    if model.jnt_actfrclimited.any():
-        joint = model.joint(int(np.flatnonzero(model.jnt_actfrclimited)[0])).name
-        raise UnsupportedEnvError(
-            f"joint {joint!r} clamps the sum of its actuators' forces (actuatorfrcrange), which MujocoPlant does "
-            "not model; give the actuators a forcerange instead, or use AnalyticPlant"
-        )
-    if model.tendon_actfrclimited.any():
-        tendon = model.tendon(int(np.flatnonzero(model.tendon_actfrclimited)[0])).name
-        raise UnsupportedEnvError(
-            f"tendon {tendon!r} clamps the sum of its actuators' forces (actuatorfrcrange), which MujocoPlant "
-            "does not model; give the actuators a forcerange instead, or use AnalyticPlant"
-        )
+    for kind, limited in (("joint", model.jnt_actfrclimited), ("tendon", model.tendon_actfrclimited)):
+        if limited.any():
+            name = getattr(model, kind)(int(np.flatnonzero(limited)[0])).name
+            raise UnsupportedEnvError(
+                f"{kind} {name!r} clamps the sum of its actuators' forces (actuatorfrcrange), which MujocoPlant "
+                "does not model; give the actuators a forcerange instead, or use AnalyticPlant"
+            )
 
 
 def _refuse(actuator: str, what: str, handled: str) -> None:
@@ -68,7 +57,7 @@ class AffineActuators:
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        refuse_unsupported(model)
+        _refuse_unsupported(model)
         self._model = model
         self._moment = np.zeros((model.nu, model.nv))
         self._on_joints: tuple[Array, Array, Array] | None = None
@@ -101,18 +90,12 @@ class AffineActuators:
     def acting_range(self, length: Array, velocity: Array, control_dt: float = 0.0) -> tuple[Array, Array]:
         """The controls between which the force still changes, inside ctrlrange; shapes (nu,) and (nu,).
 
-        An actuator that is saturated over its whole ctrlrange gets a range of zero width.
-
-        Args:
-            length: Of the actuators' transmissions, m or rad, shape (nu,).
-            velocity: Of the same, shape (nu,).
-            control_dt: Widen by what a speed servo's own force can shift its clamp within this time, s; MuJoCo's
-                `actuator_acc0` (acceleration per force in the reference pose) bounds how fast.
+        Zero width where an actuator is saturated over its whole ctrlrange. Length and velocity are those of the
+        transmissions (m or rad, per second). The range is widened by what a speed servo's own force can shift its
+        clamp within `control_dt`, s; `actuator_acc0`, acceleration per force in the reference pose, bounds how fast.
         """
         m = self._model
-        limited = m.actuator_ctrllimited.astype(bool)
-        low = np.where(limited, m.actuator_ctrlrange[:, 0], -np.inf)
-        high = np.where(limited, m.actuator_ctrlrange[:, 1], np.inf)
+        low, high = control_range(m)
         clamped = m.actuator_forcelimited.astype(bool)
         if not clamped.any():
             return low, high
@@ -129,7 +112,7 @@ class AffineActuators:
         return np.clip(least, low, high), np.clip(most, low, high)
 
     def motion_without_kinematics(self, qpos: Array, qvel: Array) -> tuple[Array, Array] | None:
-        """Length and velocity where joints alone tell all that a clamp depends on, else None."""
+        """Length and velocity of the transmissions where the joints alone determine every clamp, else None."""
         m = self._model
         if self._on_joints is None:
             depends = m.actuator_forcelimited.astype(bool) & (
@@ -145,3 +128,40 @@ class AffineActuators:
             return None
         gear, q, v = self._on_joints
         return gear * qpos[q], gear * qvel[v]
+
+
+def drift_and_effect(
+    model: mujoco.MjModel, data: mujoco.MjData, actuators: AffineActuators
+) -> tuple[Array, Array]:
+    """`qacc = drift + effect @ u`, shapes (nv,) and (nv, nu), at the present set of active contacts and limits.
+
+    The data must be up to date. Exact for pyramidal friction cones.
+    """
+    gain, _ = actuators.gain_and_bias(data.actuator_length, data.actuator_velocity)
+    least, most = actuators.acting_range(data.actuator_length, data.actuator_velocity)
+    moment = actuators.moment(data)
+    force_per_control = moment * gain[:, None]
+    saturated = most <= least
+    effect = _solve_inertia(model, data, force_per_control).T
+    effect = np.where(saturated, 0.0, effect)
+    return data.qacc - effect @ np.where(saturated, 0.0, np.clip(data.ctrl, least, most)), effect
+
+
+def _solve_inertia(m: mujoco.MjModel, d: mujoco.MjData, rows: Array) -> Array:
+    """`rows @ inv(M + J_a' D_a J_a)`: accelerations per generalised force with the active constraints."""
+    out = np.zeros_like(rows)
+    active = d.efc_state == _QUADRATIC if d.nefc else np.zeros(0, bool)
+    if not active.any():
+        mujoco.mj_solveM(m, d, out, np.ascontiguousarray(rows))
+        return out
+    jacobian = _constraint_jacobian(m, d)[active]
+    stiff = inertia(m, d) + jacobian.T @ (d.efc_D[active][:, None] * jacobian)
+    return np.asarray(np.linalg.solve(stiff, rows.T).T)
+
+
+def _constraint_jacobian(m: mujoco.MjModel, d: mujoco.MjData) -> Array:
+    if not mujoco.mj_isSparse(m):
+        return np.array(d.efc_J.reshape(d.nefc, m.nv))
+    dense = np.zeros((d.nefc, m.nv))
+    mujoco.mju_sparse2dense(dense, d.efc_J, d.efc_J_rownnz, d.efc_J_rowadr, d.efc_J_colind)
+    return dense

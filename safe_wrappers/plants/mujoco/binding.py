@@ -1,4 +1,4 @@
-"""What a `MujocoPlant` asks of an env: a model that it can copy, and actions that are the model's controls."""
+"""What a `MujocoPlant` needs of an env: a model to copy, the length of a step, actions that are controls."""
 
 import copy
 from typing import Any
@@ -6,24 +6,17 @@ from typing import Any
 import gymnasium as gym
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import name_of
 from safe_wrappers.plants.mujoco.displacement_step import moves_by_displacement
-
-Array = NDArray[np.float64]
 
 _LAST_INTEGRATOR = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
 
 
 def own_model(raw: Any, given: mujoco.MjModel | None) -> mujoco.MjModel:
-    """A copy of the given model, or of an unwrapped env's.
-
-    Raises:
-        UnsupportedEnvError: The env has no MuJoCo model, or one with the 'discrete' integrator.
-        ConfigurationError: The given model is not of the env's joints, actuators and timestep.
-    """
+    """A copy of the given model, or of an unwrapped env's, or an error that says why a plant cannot use it."""
     if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
         raise UnsupportedEnvError(
             f"{raw} has no MuJoCo .model and .data; describe it with "
@@ -50,24 +43,38 @@ def own_model(raw: Any, given: mujoco.MjModel | None) -> mujoco.MjModel:
     return model
 
 
-def control_range(model: mujoco.MjModel) -> tuple[Array, Array]:
-    """Smallest and largest control, shapes (nu,): ctrlrange, or -inf and inf."""
-    limited = model.actuator_ctrllimited.astype(bool)
-    low = np.where(limited, model.actuator_ctrlrange[:, 0], -np.inf)
-    return low, np.where(limited, model.actuator_ctrlrange[:, 1], np.inf)
+def control_interval(raw: Any) -> float:
+    """How long an unwrapped MuJoCo env holds one action, s."""
+    return physics_steps(raw) * float(raw.model.opt.timestep)
+
+
+def physics_steps(raw: Any) -> int:
+    """How many physics substeps an unwrapped MuJoCo env takes with one action."""
+    env = raw
+    if not hasattr(raw, "frame_skip"):
+        # The physics may be stepped by an env that this one holds: a maze holds its robot's.
+        held = (e for e in vars(raw).values() if isinstance(e, gym.Env))
+        env = next((e for e in held if getattr(e, "data", None) is raw.data), raw)
+    given = getattr(env, "frame_skip", getattr(env, "n_substeps", None))
+    if given is not None:
+        return int(given)
+    if not hasattr(env, "dt"):
+        raise UnsupportedEnvError(
+            f"{raw} does not say how long a step lasts: give it an attribute dt (s) or frame_skip (physics steps)"
+        )
+    return round(float(env.dt) / float(raw.model.opt.timestep))
 
 
 def check_action_space(env: gym.Env[Any, Any], lower: Array, upper: Array) -> None:
-    """Refuse an env whose action space is not the model's control range."""
+    """Refuse an env whose action space is not the model's control range, shapes (nu,)."""
     space = env.action_space
     assert isinstance(space, gym.spaces.Box)  # the filter has refused every other space
     limited = np.isfinite(lower)
     rounding = 0.5e-6 * (upper - lower)[limited]
-    fits = space.shape == lower.shape and (
+    if space.shape == lower.shape and (
         np.allclose(space.low[limited], lower[limited], atol=rounding)
         and np.allclose(space.high[limited], upper[limited], atol=rounding)
-    )
-    if fits:
+    ):
         return
     ranges = f"the action space is {space}, the model's control range {lower} to {upper}"
     if space != env.unwrapped.action_space:

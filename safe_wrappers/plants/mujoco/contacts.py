@@ -1,39 +1,38 @@
-"""The contacts of a MuJoCo model: which bodies, how far apart, how much force along the normal."""
+"""The contacts of a MuJoCo model, as they are and as forecast: which bodies, how far apart, how much force."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
-from safe_wrappers.checks import name_list
+from safe_wrappers.checks import Array, name_list
 from safe_wrappers.errors import UnknownNameError
+from safe_wrappers.plants.mujoco.forecast import RESETS
+from safe_wrappers.plants.mujoco.model import fixed_bodies
+from safe_wrappers.plants.mujoco.replay import evaluations
+
+_FASTEST = float(mujoco.mjMAXVAL) ** 2
+"""Bound of squared lengths: MuJoCo does not check the stages of the Runge-Kutta steps that are made here."""
 
 
 class NormalContact(NamedTuple):
-    """One contact.
-
-    Attributes:
-        bodies: Ids of the two bodies, the smaller first; `nbody` stands for something flexible.
-        gap: Signed distance, m; negative where they penetrate.
-        force: Along the normal, N; positive pushes them apart.
-    """
+    """One contact."""
 
     bodies: tuple[int, int]
+    """Ids of the two bodies, the smaller first; `nbody` stands for something flexible."""
     gap: float
+    """Signed distance, m; negative where they penetrate."""
     force: float
+    """Along the normal, N; positive pushes them apart."""
 
 
 class Contacts:
-    """Reads the contacts between some bodies of a model and some others.
-
-    Args:
-        model: Whose data will be read.
-        bodies: Names; None is all of them.
-        against: Names of what they touch; None is all of them.
+    """Reads the contacts between the named bodies of a model and those they touch; None is all of them.
 
     Raises:
-        UnknownNameError: No body has that name; the message lists those there are.
+        UnknownNameError: No body has that name; the message lists all names.
     """
 
     def __init__(
@@ -44,14 +43,14 @@ class Contacts:
             _chosen(model, name, given) for name, given in (("bodies", bodies), ("against", against))
         )
         self._watched = (one[:, None] & other | other[:, None] & one).tolist()
-        # Geom -1, of something flexible, is the last entry.
+        # The last entry is for geom -1, of something flexible.
         self._body_of_geom: list[int] = [*model.geom_bodyid.tolist(), model.nbody]
         # A pyramidal cone's edges share the normal force; an elliptic cone's first row has it.
         pyramids = model.opt.cone == int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
         self._rows = {dim: 2 * (dim - 1) if pyramids and dim > 1 else 1 for dim in (1, 3, 4, 6)}
 
     def read(self, data: mujoco.MjData) -> list[NormalContact]:
-        """The watched contacts that are in the data, as MuJoCo has computed them last."""
+        """The watched contacts, as MuJoCo has computed them last."""
         if data.ncon == 0:
             return []
         contact, forces, found = data.contact, data.efc_force.tolist(), []
@@ -70,8 +69,130 @@ class Contacts:
         return found
 
 
+class ContactForecast(NamedTuple):
+    """Every contact of the robot with what does not move, at every evaluation of the physics of one held control.
+
+    Attributes:
+        steps: How many evaluations there are: one per physics substep, four with Runge-Kutta.
+        step: Which of them each contact belongs to, shape (n,).
+        body: Id of the body of the robot, shape (n,).
+        point: Shape (n, 3), m.
+        normal: Pointing at the robot, shape (n, 3).
+        force: On the robot, shape (n, 3), N.
+        friction: Coefficient of sliding that the model has for it, shape (n,); of two that differ with the direction
+            the smaller one, and 0 for a contact without friction (condim 1).
+        finite: False where numbers left MuJoCo's bounds (it then resets the state); the contacts are meaningless.
+    """
+
+    steps: int
+    step: NDArray[np.int64]
+    body: NDArray[np.int64]
+    point: Array
+    normal: Array
+    force: Array
+    friction: Array
+    finite: bool
+
+
+class ContactReader:
+    """Reads the contacts of a model's moving bodies with the fixed world.
+
+    `read` only copies MuJoCo's arrays; `forecast` evaluates all of them at once, because Python is slow.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self._model = model
+        fixed = fixed_bodies(model)
+        # The last entry is for geom -1, of something flexible: it moves, but is not a body of the robot.
+        bodies = np.where(fixed, 0, np.arange(model.nbody))
+        self._body_of_geom: list[int] = [*bodies[model.geom_bodyid].tolist(), -1]
+        self._wrench = np.zeros(6)
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget what has been read."""
+        self.count = 0
+        self._kept: list[tuple[int, int, int, int]] = []
+        self._forces: list[Array] = []
+        self._copied = 0
+        self._copies: list[tuple[Array, ...]] = []
+
+    def read(self, data: mujoco.MjData) -> None:
+        """Copy every contact of a moving body with the fixed world, as MuJoCo has computed them last."""
+        step = self.count
+        self.count += 1
+        if not data.ncon:
+            return
+        contact, body, before = data.contact, self._body_of_geom, len(self._kept)
+        geoms, addresses = contact.geom.tolist(), contact.efc_address.tolist()
+        for i, ((one, other), address) in enumerate(zip(geoms, addresses, strict=True)):
+            first, second = body[one], body[other]
+            if address < 0 or first == second or min(first, second) != 0:
+                continue
+            mujoco.mj_contactForce(self._model, data, i, self._wrench)
+            self._forces.append(self._wrench.copy())
+            # MuJoCo's normal points from the first geom to the second, and the force is on the second.
+            self._kept.append((step, self._copied + i, first or second, 1 if first == 0 else -1))
+        if len(self._kept) == before:
+            return
+        self._copied += len(geoms)
+        fields = contact.pos, contact.frame, contact.friction, contact.dim
+        self._copies.append(tuple(field.copy() for field in fields))
+
+    def forecast(self, finite: bool) -> ContactForecast:
+        """All contacts that have been read since `clear`."""
+        if not self._kept:
+            none, nowhere = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+            return ContactForecast(self.count, none, none, nowhere, nowhere, nowhere, np.zeros(0), finite)
+        step, which, body, side = np.array(self._kept, dtype=np.int64).T
+        points, frames, friction, dims = (
+            np.concatenate(field)[which] for field in zip(*self._copies, strict=True)
+        )
+        frames, sign = frames.reshape(-1, 3, 3), side[:, None].astype(np.float64)
+        return ContactForecast(
+            steps=self.count,
+            step=step,
+            body=body,
+            point=points,
+            normal=sign * frames[:, 0],
+            force=sign * np.einsum("ki,kij->kj", np.array(self._forces)[:, :3], frames),
+            friction=np.where(dims > 1, friction[:, :2].min(axis=1), 0.0),
+            finite=finite,
+        )
+
+    def follow(self, data: mujoco.MjData, substeps: int) -> ContactForecast:
+        """Step the data, with the control it has, and return the contacts of all these physics substeps."""
+        self.clear()
+        data.warning.number[RESETS] = 0
+        inside = True
+
+        def visit(at: mujoco.MjData, _: float) -> None:
+            nonlocal inside
+            self.read(at)
+            inside = inside and bool(at.qacc @ at.qacc < _FASTEST)
+
+        for _ in range(substeps):
+            evaluations(self._model, data, visit)
+        inside = inside and bool(data.qvel @ data.qvel < _FASTEST and data.qpos @ data.qpos < _FASTEST)
+        return self.forecast(finite=inside and not data.warning.number[RESETS].any())
+
+
+def can_touch_the_world(model: mujoco.MjModel) -> NDArray[np.bool_]:
+    """Which moving bodies have a geom that may meet one of the fixed world's with friction, shape (nbody,)."""
+    fixed = fixed_bodies(model)[model.geom_bodyid]
+    kind, other, size = model.geom_contype, model.geom_conaffinity, model.geom_condim
+    found = np.zeros(model.nbody, dtype=bool)
+    for ground in np.flatnonzero(fixed):
+        meets = (kind & other[ground]) | (kind[ground] & other)
+        found[model.geom_bodyid[~fixed & (meets != 0) & (np.maximum(size, size[ground]) > 1)]] = True
+    for one, two, dim in zip(model.pair_geom1, model.pair_geom2, model.pair_dim, strict=True):
+        if dim > 1 and fixed[one] != fixed[two]:
+            found[model.geom_bodyid[two if fixed[one] else one]] = True
+    return found
+
+
 def _chosen(model: mujoco.MjModel, argument: str, names: Sequence[str] | None) -> np.ndarray:
-    """Which bodies are named, shape (nbody + 1,); the last stands for what is flexible, which has no name."""
+    """Which bodies are named, shape (nbody + 1,); the last entry stands for flexible parts, which have no name."""
     if names is None:
         return np.ones(model.nbody + 1, dtype=bool)
     names = name_list(argument, names, "names of bodies", "None for all")

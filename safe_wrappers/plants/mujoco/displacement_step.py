@@ -1,15 +1,13 @@
 """What gymnasium-robotics' Fetch envs do to their data with an action, and which envs are of that kind."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.plants.mujoco.forecast import Recorder
-
-Array = NDArray[np.float64]
 
 _TURN = np.array([1.0, 0.0, 1.0, 0.0])
 """What the envs add to the gripper's quaternion (w, x, y, z): MuJoCo makes a unit quaternion of the sum."""
@@ -47,17 +45,14 @@ def _welds(model: mujoco.MjModel) -> list[tuple[int, int]]:
 
 
 class DisplacementRecorder(Recorder):
-    """Forecasts under displacements of the gripper; braking is none.
+    """Forecasts under displacements of the gripper; braking is a displacement of zero.
 
     Args:
-        model: The plant's own.
-        substeps: Physics substeps per control interval.
+        model, substeps: As in `Recorder`.
         metres_per_unit: Displacement of an action of 1, m.
-        dtype: Of the env's actions, in whose precision it scales them.
+        dtype: Of the env's actions; the env scales them in this precision.
         blocked: Whether the env keeps the fingers closed.
     """
-
-    settles: ClassVar[bool] = True
 
     def __init__(
         self, model: mujoco.MjModel, substeps: int, metres_per_unit: float, dtype: Any, blocked: bool
@@ -71,14 +66,14 @@ class DisplacementRecorder(Recorder):
         self._servo_acts = 0.0 if blocked else 1.0
 
     def act(self, data: mujoco.MjData, control: Array) -> None:
-        """Move the mocap body off where MuJoCo last evaluated the gripper, and give the fingers' servos a target."""
+        """Move the mocap body from where MuJoCo last evaluated the gripper; set the finger servos' targets."""
         step = control.astype(self._dtype)
         data.mocap_pos[self._mocap] = data.xpos[self._gripper] + self._scale * step[:3]
         data.mocap_quat[self._mocap] = data.xquat[self._gripper] + _TURN
         data.ctrl[:] = data.qpos[self._servoed] + self._servo_acts * step[3]
 
     def settle(self, data: mujoco.MjData) -> None:
-        """A blocked gripper's fingers are put back to zero, and poses are those of the new positions."""
+        """Put a blocked gripper's fingers back to zero, and update the poses."""
         if self._closed.size:
             data.qpos[self._closed] = 0.0
             mujoco.mj_kinematics(self._model, data)

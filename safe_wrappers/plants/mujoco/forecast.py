@@ -1,12 +1,12 @@
 """A forecast: what a MuJoCo model does under a held control, and under braking after it."""
 
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from safe_wrappers.checks import Array
+from safe_wrappers.plants.mujoco.model import control_range
 
 _BRAKING = 0.5
 """Share of an actuated joint's own motion that braking takes away per control interval; more would chatter."""
@@ -15,42 +15,30 @@ RESETS = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWA
 
 
 class Poses(NamedTuple):
-    """Where the bodies are at k instants.
-
-    Attributes:
-        frames: Origins of the bodies' frames, shape (k, nbody, 3), m.
-        axes: Their rotation matrices, shape (k, nbody, 3, 3).
-        centres: Centres of mass of the bodies, shape (k, nbody, 3), m.
-    """
+    """Where the bodies are at k instants."""
 
     frames: Array
+    """Origins of the bodies' frames, shape (k, nbody, 3), m."""
     axes: Array
+    """Rotation matrices of the frames, shape (k, nbody, 3, 3)."""
     centres: Array
+    """Centres of mass, shape (k, nbody, 3), m."""
 
 
 class Forecast:
     """The machine after every physics substep of a forecast.
 
     Attributes:
-        qpos: Positions, shape (k, nq); NaN from the control interval on in which MuJoCo had to reset the state.
-        qvel: Velocities, shape (k, nv), likewise.
-        published_frames: `data.xpos` as MuJoCo leaves it at the end of every control interval, shape (holds,
-            nbody, 3), m. It is not the state's: after Euler steps it lags one substep behind, after
-            Runge-Kutta steps it is that of the last point that was evaluated.
-        published_centres: Likewise `data.xipos`.
+        qpos, qvel: Positions, shape (k, nq), and velocities, shape (k, nv); NaN from the control interval on in which
+            MuJoCo had to reset the state.
+        published_frames, published_centres: `data.xpos` and `data.xipos` as MuJoCo leaves them at the end of every
+            control interval, shapes (holds, nbody, 3), m. They lag behind the state: by one substep after Euler
+            steps, to the last stage after Runge-Kutta steps.
     """
 
-    def __init__(
-        self,
-        recorder: "Recorder",
-        qpos: Array,
-        qvel: Array,
-        published_frames: Array,
-        published_centres: Array,
-    ) -> None:
-        self._recorder = recorder
-        self.qpos, self.qvel = qpos, qvel
-        self.published_frames, self.published_centres = published_frames, published_centres
+    def __init__(self, recorder: "Recorder", qpos: Array, qvel: Array, frames: Array, centres: Array) -> None:
+        self._recorder, self.qpos, self.qvel = recorder, qpos, qvel
+        self.published_frames, self.published_centres = frames, centres
         self._poses: dict[int, Poses] = {}
 
     def poses(self, every: int = 1) -> Poses:
@@ -69,34 +57,25 @@ class Forecast:
 
 
 class Recorder:
-    """Steps a model and writes down what a forecast holds.
-
-    Args:
-        model: The plant's own.
-        substeps: Physics substeps per control interval.
+    """Steps the plant's own model and keeps what a forecast holds; `substeps` are those of a control interval.
 
     Attributes:
         held: Data at the end of the latest forecast's first control interval.
-        held_control: Bytes of the control of that interval; empty: none from the present state.
+        held_control: Bytes of the control of that interval; empty: there is none from the present state.
     """
-
-    settles: ClassVar[bool] = False
-    """Whether `settle` changes anything."""
 
     def __init__(self, model: mujoco.MjModel, substeps: int) -> None:
         self._model, self._substeps = model, substeps
         self.held, self.held_control = mujoco.MjData(model), b""
         self._still = mujoco.MjData(model)
-        limited = model.actuator_ctrllimited.astype(bool)
-        self._low = np.where(limited, model.actuator_ctrlrange[:, 0], -np.inf)
-        self._high = np.where(limited, model.actuator_ctrlrange[:, 1], np.inf)
+        self._low, self._high = control_range(model)
         # A unit force accelerates its joints by acc0 (in the reference pose), a transmission by gear times that.
         control_dt = substeps * model.opt.timestep
         gain, gear = model.actuator_gainprm[:, 0], np.abs(model.actuator_gear).max(axis=1)
         response = model.actuator_acc0 * gear * gain * control_dt
         acts = response != 0.0
         self._damping = np.where(acts, _BRAKING / np.where(acts, response, 1.0), 0.0)
-        # At rest a servo must push neither way: one for position is told where it is, one for speed zero.
+        # At rest a servo must push neither way: a position servo's target is where it is, a speed servo's is zero.
         biased = model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)
         bias = np.where(biased[:, None], model.actuator_biasprm[:, :3], 0.0)
         self._rest = -bias[:, :2] / np.where(acts, gain, 1.0)[:, None]
@@ -105,13 +84,10 @@ class Recorder:
     def record(
         self, data: mujoco.MjData, control: Array, horizon: int, first: Forecast | None = None
     ) -> Forecast:
-        """Hold a control for one control interval; in the others each actuator brakes its own joints.
+        """Hold a control, shape (nu,), for one control interval; in the others each actuator brakes its own joints.
 
-        Args:
-            data: At the present state; with `first`, anything. It is left at the end of the forecast.
-            control: Shape (nu,).
-            horizon: Control intervals in all, >= 1.
-            first: The control's forecast over one control interval, to go on from: `held_control` is the control.
+        `data` starts at the present state and is left at the end, after `horizon` >= 1 control intervals. With
+        `first`, the forecast of `held_control` over one interval, it goes on from there.
         """
         m, n = self._model, self._substeps
         qpos, qvel = np.empty((horizon * n, m.nq)), np.empty((horizon * n, m.nv))
@@ -127,16 +103,15 @@ class Recorder:
             self.act(data, self.braking(data) if hold else control)
             for i in range(hold * n, hold * n + n):
                 mujoco.mj_step(m, data)
-                qpos[i], qvel[i] = data.qpos, data.qvel
-            if self.settles:
-                self.settle(data)
+                if i == hold * n + n - 1:
+                    self.settle(data)
                 qpos[i], qvel[i] = data.qpos, data.qvel
             frames[hold], centres[hold] = data.xpos, data.xipos
             if hold == 0:
                 mujoco.mj_copyData(self.held, m, data)
                 self.held_control = control.tobytes()
             if data.warning.number[RESETS].any():
-                # MuJoCo answers numbers out of bounds with a reset, after which all may look well.
+                # After a reset, MuJoCo's response to numbers out of bounds, all numbers may look plausible.
                 qpos[hold * n :] = qvel[hold * n :] = frames[hold:] = centres[hold:] = np.nan
                 break
         return Forecast(self, qpos, qvel, frames, centres)
@@ -155,7 +130,7 @@ class Recorder:
         return np.asarray(np.minimum(np.maximum(control, self._low), self._high))
 
     def place(self, data: mujoco.MjData) -> None:
-        """Put the bodies that the env moves by hand (mocap) where they are, for the poses asked for from now on."""
+        """Take the places of mocap bodies, which positions do not determine, for later calls of `poses`."""
         if self._model.nmocap:
             self._still.mocap_pos[:], self._still.mocap_quat[:] = data.mocap_pos, data.mocap_quat
 

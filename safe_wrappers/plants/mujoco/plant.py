@@ -1,59 +1,43 @@
-"""MujocoPlant: f and g of any env whose unwrapped env has `.model` and `.data`.
-
-The plant owns a copy of the model and its own data. It never writes to the env's, and its model may be changed
-to be wrong on purpose (`plant.perturb(mass=1.2)`).
-"""
+"""MujocoPlant: f and g of any env whose unwrapped env has `.model` and `.data`, from a copy of the model."""
 
 from collections import deque
-from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import gymnasium as gym
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array, non_negative
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.plants.env_checks import (
-    check_delay,
-    check_timing,
-    read_attribute,
-    refuse_changed_actions,
-    refuse_second_env,
-    seconds,
-)
-from safe_wrappers.plants.mujoco.actuators import AffineActuators
-from safe_wrappers.plants.mujoco.binding import check_action_space, control_range, own_model
-from safe_wrappers.plants.mujoco.contact_forecast import ContactForecast, ContactReader, forecast_contacts
-from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
+from safe_wrappers.plants import env_checks
+from safe_wrappers.plants.mujoco import model as of_model
+from safe_wrappers.plants.mujoco.actuators import AffineActuators, drift_and_effect
+from safe_wrappers.plants.mujoco.binding import check_action_space, control_interval, own_model, physics_steps
+from safe_wrappers.plants.mujoco.contacts import ContactForecast, ContactReader
 from safe_wrappers.plants.mujoco.forecast import Forecast, Poses, Recorder
-from safe_wrappers.plants.mujoco.linear_model import drift_and_effect, inertia_diagonal, position_rate
-from safe_wrappers.plants.mujoco.named import frame, named, names
-from safe_wrappers.plants.mujoco.shared_step import SharedStep, can_share
-from safe_wrappers.plants.mujoco.state import MujocoState
-from safe_wrappers.plants.mujoco.timing import control_interval, physics_steps
+from safe_wrappers.plants.mujoco.shared_step import shared_step
 from safe_wrappers.plants.plant import Plant
 
-Array = NDArray[np.float64]
+_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
-class MujocoPlant(MujocoState):
+class MujocoPlant(Plant):
     """`x = (qpos, qvel)`, `x' = f + g u`, through the actuators and the active constraints.
 
-    The drift and the control matrix hold at the present set of active contacts and limits; a contact that
-    opens or closes within the hold changes them. They are exact for pyramidal friction cones.
+    f and g hold for the present set of active contacts and limits; a contact that opens or closes within the control
+    interval changes them. They are exact for pyramidal friction cones. The env's own model and data are only read.
 
     Args:
         model: The filter's model; None copies the env's. Pass another (other masses) to test mismatch.
-        delay_s: Evidence age plus detection plus actuation delay in s; the state is predicted over it with
-            the commands in flight, on this plant's model.
+        delay_s: Evidence age plus detection plus actuation delay in s; the state is predicted over it, on this
+            plant's model, with the commands in flight.
         share_step: Let the rollout of the executed control be the env's step, which saves simulating it twice. None:
-            with envs where that was measured equal bit for bit (Gymnasium's MuJoCo envs and ours on velocity);
+            with envs where that was measured equal bit for bit (Gymnasium's MuJoCo envs, and ours on velocity);
             True: with any env that does not override `MujocoEnv`'s simulation step and leaves its model alone.
 
     Raises:
-        UnsupportedEnvError: The env has no MuJoCo model, an actuator that is not affine, or an action space
-            that is not its model's control range.
+        UnsupportedEnvError: No MuJoCo model, an actuator that is not affine, or an action space that is not the
+            model's control range.
     """
 
     bounds_are_action_space: ClassVar[bool] = True
@@ -63,45 +47,36 @@ class MujocoPlant(MujocoState):
         self, model: mujoco.MjModel | None = None, delay_s: float = 0.0, share_step: bool | None = None
     ) -> None:
         self._given, self._share_step = model, share_step
-        self.delay_s = seconds("delay_s", delay_s)
-        self._pending = deque()
+        self.delay_s = non_negative("delay_s", delay_s, "s")
+        self._pending: deque[Array] = deque()
         self._factors = (1.0, 1.0)
-        self._raw = None
-        self.observation_id = self.model_version = 0
+        self._raw: Any = None
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
         """Attach to an env and copy its model."""
         raw: Any = env.unwrapped
-        refuse_second_env(self._raw, env)
+        env_checks.refuse_second_env(self._raw, env)
         self.model = own_model(raw, self._given)
         self._raw, self._env = raw, env
         self.data = mujoco.MjData(self.model)
-        self._shared: SharedStep | None = None
         self.actuators = AffineActuators(self.model)
         self._clamped = bool(self.model.actuator_forcelimited.any())
-        self._lower, self._upper = control_range(self.model)
-        refuse_changed_actions(env)
+        self._lower, self._upper = of_model.control_range(self.model)
+        env_checks.refuse_changed_actions(env)
         self._check_action_space(env)
         self.substeps = physics_steps(raw)
-        self.control_dt = check_timing(env, control_interval(raw))
-        check_delay(self.delay_s)
-        self._start()
+        self.control_dt = env_checks.check_timing(env, control_interval(raw))
+        self._nq, self._nv = int(self.model.nq), int(self.model.nv)
+        self._delay_steps = int(np.ceil(self.delay_s / self.model.opt.timestep - 1e-9))
+        self._pending = deque(maxlen=max(1, -(-self._delay_steps // self.substeps)))
+        self._snapshot = np.zeros(mujoco.mj_stateSize(self.model, _STATE))
         self._recorder = self._new_recorder()
-        if self._may_share(env):
-            self._shared = SharedStep(raw, self.substeps)
+        self._forget()
+        exact = self._given is None and not self.delay_s
+        self._shared = shared_step(env, self.substeps, exact, self._share_step)
         self._contact_reader = ContactReader(self.model)
         if self._factors != (1.0, 1.0):
             self.perturb(*self._factors)
-
-    def _may_share(self, env: gym.Env[Any, Any]) -> bool:
-        """Whether rollouts are the env's own steps: its model, its state now, and a step that is known."""
-        exact = self._given is None and not self.delay_s
-        if self._share_step and not (exact and can_share(env, known_only=False)):
-            raise ConfigurationError(
-                "share_step=True needs the env's own model, no delay, and an env that steps as Gymnasium's MujocoEnv "
-                f"does; {env.unwrapped} with model={self._given!r} and delay_s={self.delay_s} is none: leave it out"
-            )
-        return self._share_step is not False and exact and can_share(env, known_only=not self._share_step)
 
     @property
     def shared_steps(self) -> int:
@@ -134,39 +109,105 @@ class MujocoPlant(MujocoState):
         self.model.dof_damping *= damping
         mujoco.mj_setConst(self.model, self.data)
         self._recorder = self._new_recorder()  # its braking depends on the masses
+        self._forget()
+
+    def _forget(self) -> None:
+        """Called when the state or the model has changed."""
         self._loaded = self._forwarded = False
-        self._forecasts.clear()
-        self._contact_forecasts.clear()
+        self._recorder.held_control = b""
+        self._forecasts: dict[bytes, Forecast] = {}
+        self._contact_forecasts: dict[bytes, ContactForecast] = {}
+
+    def observe(self) -> None:
+        """Take the env's present state; everything else is computed on demand."""
+        mujoco.mj_getState(self._raw.model, self._raw.data, self._snapshot, _STATE)
+        self._forget()
+        self.observation_id += 1
+        # MuJoCo resets a state with a NaN: a prediction would hide it.
+        if self._delay_steps and bool(np.isfinite(self._snapshot).all()):
+            self._predict_over_delay()
+
+    def executed(self, control: Array | None) -> None:
+        """Remember a sent command for the delay."""
+        if control is None:
+            self._pending.clear()
+        elif self._delay_steps:
+            self._pending.append(np.array(control))
+
+    def _predict_over_delay(self) -> None:
+        self._load()
+        # The oldest command has already acted in part; before the first one the env's own control acts.
+        early = self._delay_steps - self.substeps * len(self._pending)
+        if early > 0:
+            mujoco.mj_step(self.model, self.data, early)
+        for i, control in enumerate(self._pending):
+            self.data.ctrl[:] = control
+            mujoco.mj_step(self.model, self.data, self.substeps + (min(early, 0) if i == 0 else 0))
+        self._keep()
+
+    def _keep(self) -> None:
+        """Take the data's state as the present one."""
+        mujoco.mj_getState(self.model, self.data, self._snapshot, _STATE)
+        self._loaded = False
+
+    def _load(self) -> None:
+        if not self._loaded:
+            mujoco.mj_setState(self.model, self.data, self._snapshot, _STATE)
+            self._loaded, self._forwarded = True, False
+
+    def _load_to_step(self) -> None:
+        """The data at the present state; the caller may change it."""
+        self._load()
+        self._loaded = False
+
+    @property
+    def time(self) -> float:
+        """Time of the present state, s; under a delay the predicted one."""
+        return float(self._snapshot[0])
+
+    @property
+    def qpos(self) -> Array:
+        """Positions, shape (nq,): m, rad, or quaternions."""
+        return self._snapshot[1 : 1 + self._nq]
+
+    @property
+    def qvel(self) -> Array:
+        """Velocities, shape (nv,): m/s or rad/s."""
+        return self._snapshot[1 + self._nq : 1 + self._nq + self._nv]
+
+    @property
+    def state(self) -> Array:
+        """(qpos, qvel), shape (nq + nv,)."""
+        return self._snapshot[1 : 1 + self._nq + self._nv]
 
     def forward(self) -> mujoco.MjData:
         """The plant's data with every derived quantity up to date at the present state.
 
-        MuJoCo's own `data.xpos` and `data.xvel` lag one substep behind `qpos` after a step; these do not.
+        The env's own lag one substep behind `qpos` after a step.
         """
         self._load()
         if not self._forwarded:
-            if self.model.nu:
-                self.data.ctrl[:] = self._reference()
-            mujoco.mj_forward(self.model, self.data)
-            self._drift, self._effect = drift_and_effect(self.model, self.data, self.actuators)
+            self._linearise()
             self._forwarded = True
         return self.data
 
-    def _reference(self) -> Array:
-        """The control about which contact forces are linearised: zero, or the nearest the actuator has."""
-        return np.asarray(np.clip(0.0, self._lower, self._upper))
+    def _linearise(self) -> None:
+        """`forward` at the control nearest to zero, about which contact forces are linearised."""
+        self.data.ctrl[:] = np.clip(0.0, self._lower, self._upper)
+        mujoco.mj_forward(self.model, self.data)
+        self._drift, self._effect = drift_and_effect(self.model, self.data, self.actuators)
 
     @property
     def f(self) -> Array:
         """Drift of (qpos, qvel), shape (nq + nv,): at zero control, with bias forces and active constraints."""
-        self.forward()
-        return np.concatenate([position_rate(self.model, self.qpos, self.qvel), self._drift])
+        drift, _ = self.acceleration
+        return np.concatenate([of_model.position_rate(self.model, self.qpos, self.qvel), drift])
 
     @property
     def g(self) -> Array:
         """Control matrix, shape (nq + nv, nu); positions do not respond at once."""
-        self.forward()
-        return np.vstack([np.zeros((self.model.nq, self.model.nu)), self._effect])
+        _, effect = self.acceleration
+        return np.vstack([np.zeros((self.model.nq, self.model.nu)), effect])
 
     @property
     def acceleration(self) -> tuple[Array, Array]:
@@ -186,9 +227,9 @@ class MujocoPlant(MujocoState):
 
     @property
     def acting_range(self) -> tuple[Array, Array]:
-        """The controls between which the force still changes at some time of the hold, shapes (nu,).
+        """The controls between which the force still changes at some time of the control interval, shapes (nu,).
 
-        Narrower than the bounds where a forcerange clamps; beyond it f + g u is not the machine.
+        Narrower than the bounds where a forcerange clamps; f + g u is not valid beyond it.
         """
         if not self._clamped:
             return self._lower, self._upper
@@ -200,54 +241,29 @@ class MujocoPlant(MujocoState):
 
     def inertia_diagonal(self) -> Array:
         """Diagonal of the joint-space inertia, shape (nv,), kg or kg m^2."""
-        return inertia_diagonal(self.model, self.forward())
-
-    def rollout(self, control: Array) -> Iterator[mujoco.MjData]:
-        """Hold a control for one control interval on the plant's own model, substep by substep.
-
-        Yields the plant's data after each physics substep (positions and velocities are new, derived
-        quantities lag as MuJoCo leaves them). The present state is restored for the next question.
-        """
-        self._load_to_step()
-        self._recorder.act(self.data, control)
-        for left in range(self.substeps - 1, -1, -1):
-            mujoco.mj_step(self.model, self.data)
-            if left == 0:
-                self._recorder.settle(self.data)
-            yield self.data
+        return np.diag(of_model.inertia(self.model, self.forward()))
 
     def forecast(self, control: Array, horizon: int = 1) -> Forecast:
-        """What a control leads to: held for one control interval, then the actuated joints are braked.
+        """A control, shape (nu,), held for one control interval, then every actuator brakes its own motion.
 
-        Kept until the next observation, so that constraints that ask about one control share one forecast.
-
-        Args:
-            control: Shape (nu,).
-            horizon: Control intervals to look ahead, >= 1. In those after the first every actuator opposes its
-                own motion (`Recorder`), which is one way to go on, not the best one.
+        `horizon` >= 1 counts all control intervals. Braking is one way to continue, not the best one. A forecast is
+        kept until the next observation, so that constraints share it.
         """
         key = control.tobytes()
         known = self._forecasts.get(key)
         if known is None or len(known.published_frames) < horizon:
             first = known.first(1) if known is not None and self._recorder.held_control == key else None
-            if first is None:
-                self._load_to_step()
-            self._loaded = False
+            self._load_to_step()
             known = self._forecasts[key] = self._recorder.record(self.data, control, horizon, first)
         return known.first(horizon)
 
     def contact_forecast(self, control: Array) -> ContactForecast:
-        """The contacts with the fixed world while a control is held for one control interval, shape (nu,).
-
-        Kept until the next observation.
-        """
+        """Contacts with the fixed world while a control, shape (nu,), is held for one interval; kept as forecasts."""
         key = control.tobytes()
         if key not in self._contact_forecasts:
             self._load_to_step()
             self._recorder.act(self.data, control)
-            self._contact_forecasts[key] = forecast_contacts(
-                self.model, self.data, self.substeps, self._contact_reader
-            )
+            self._contact_forecasts[key] = self._contact_reader.follow(self.data, self.substeps)
         return self._contact_forecasts[key]
 
     def under(self, control: Array) -> mujoco.MjData:
@@ -259,18 +275,16 @@ class MujocoPlant(MujocoState):
 
     @property
     def weight_n(self) -> float:
-        """Of everything that moves, N; without gravity its mass in kg."""
-        moving = ~fixed_bodies(self.model)
-        gravity = float(np.linalg.norm(self.model.opt.gravity))
-        return float(self.model.body_mass[moving].sum()) * (gravity or 1.0)
+        """Weight of everything that moves, N; without gravity its mass in kg."""
+        return of_model.weight_n(self.model)
 
     def braking(self) -> Array:
-        """The control with which a forecast goes on after its held control, shape (nu,), from the present state."""
+        """The control by which a forecast brakes, at the present state, shape (nu,)."""
         return self._recorder.braking(self.forward())
 
     def pose(self) -> mujoco.MjData:
         """The plant's data with positions of bodies up to date at the present state; cheaper than `forward`."""
-        self._load()  # a forecast leaves the data at its end
+        self._load()
         if not self._forwarded:
             mujoco.mj_kinematics(self.model, self.data)
         return self.data
@@ -284,65 +298,49 @@ class MujocoPlant(MujocoState):
         return self._recorder.poses(before[None])
 
     def published(self) -> mujoco.MjData | None:
-        """The env's own data, to read what it publishes; None under a delay, when the present is predicted.
-
-        After a step `data.xpos` and what depends on it belong to the last point that the integrator evaluated.
-        """
-        data: mujoco.MjData = self._raw.data
-        return None if self._delay_steps else data
+        """The env's own data, whose derived quantities lag; None under a delay, when the state is predicted."""
+        return None if self._delay_steps else self._raw.data
 
     def path(self, control: Array) -> list[Array]:
         """The states (qpos, qvel) after each physics substep of a held control."""
-        return [np.concatenate([data.qpos, data.qvel]) for data in self.rollout(control)]
+        forecast = self.forecast(control)
+        return list(np.hstack([forecast.qpos, forecast.qvel]))
 
     def motion(self, kind: str, name: str) -> tuple[Array, Array]:
-        """Position and velocity of a named frame's origin, as `point` has them; without accelerations much cheaper.
-
-        Args:
-            kind: "body", "site" or "geom".
-            name: Its name in the model.
-
-        Returns:
-            p (3,) in m, v (3,) in m/s.
-        """
+        """Position (3,), m, and velocity (3,), m/s, of a named frame's origin; much cheaper than `point`."""
         m, d = self.model, self.pose()
         if not self._forwarded:
-            mujoco.mj_comPos(m, d)  # the Jacobian's points of reference
-        body, p = frame(m, d, kind, name)
+            mujoco.mj_comPos(m, d)  # for the Jacobian
+        body, p = of_model.frame(m, d, kind, name)
         jac = np.zeros((3, m.nv))
         mujoco.mj_jac(m, d, jac, None, p, body)
         return p.copy(), jac @ self.qvel
 
     def point(self, kind: str, name: str) -> tuple[Array, Array, Array, Array]:
-        """Motion of a named frame's origin: position, velocity, drift and control matrix of its acceleration.
-
-        Args:
-            kind: "body", "site" or "geom".
-            name: Its name in the model.
+        """Motion of the origin of a named "body", "site" or "geom".
 
         Returns:
             p (3,) in m, v (3,) in m/s, a0 (3,) in m/s^2 and A (3, nu): `acceleration = a0 + A @ u`.
         """
-        m, d = self.model, self.forward()
-        body, p = frame(m, d, kind, name)
+        m, d, (drift, effect) = self.model, self.data, self.acceleration
+        body, p = of_model.frame(m, d, kind, name)
         jac, jac_dot = np.zeros((3, m.nv)), np.zeros((3, m.nv))
         mujoco.mj_jac(m, d, jac, None, p, body)
         mujoco.mj_jacDot(m, d, jac_dot, None, p, body)
-        drift, effect = self._drift, self._effect
         return p.copy(), jac @ self.qvel, jac @ drift + jac_dot @ self.qvel, jac @ effect
 
     def named(self, kind: str, name: str) -> int:
-        """The id of a body, site, geom, joint or actuator; an unknown name is refused with the list."""
-        return named(self.model, kind, name)
+        """The id of a body, site, geom, joint or actuator; for an unknown name an error that lists all."""
+        return of_model.named(self.model, kind, name)
 
     def names(self, kind: str, pattern: str = "*") -> list[str]:
         """All names of a kind that match a shell pattern."""
-        return names(self.model, kind, pattern)
+        return of_model.names(self.model, kind, pattern)
 
     def attribute(self, name: str) -> Any:
         """Read a published fact of the env."""
         found = getattr(self._raw, name, None)
-        return found if found is not None else read_attribute(self._env, name)
+        return found if found is not None else env_checks.read_attribute(self._env, name)
 
 
 def require_mujoco(plant: Plant, message: str) -> MujocoPlant:

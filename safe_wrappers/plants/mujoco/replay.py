@@ -1,4 +1,4 @@
-"""Replay: an env's control step once more, on data of its own, with every evaluation of the physics in sight."""
+"""Replay: repeat an env's control step on separate data, and visit every evaluation of the physics."""
 
 from collections.abc import Callable
 from typing import Any, Final
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Visit = Callable[[mujoco.MjData, float], None]
-"""Given data whose contacts and forces are those of one evaluation, and the share of time that it acts for, s."""
+"""Takes data with the contacts and forces of one evaluation, and the time for which it counts, s."""
 
 _INPUTS: Final = mujoco.mjtState.mjSTATE_USER
 _PHYSICS: Final = mujoco.mjtState.mjSTATE_PHYSICS
@@ -17,25 +17,21 @@ _FROM_POSITIONS: Final = int(mujoco.mjtStage.mjSTAGE_NONE)
 _STAGES: Final = ((0.5, 1.0 / 6.0), (0.5, 1.0 / 3.0), (1.0, 1.0 / 3.0), (0.0, 1.0 / 6.0))
 """Where the next evaluation is, in time steps, and the weight of this one."""
 _RATES_OF_ROTATION_VECTORS: Final = mujoco.mj_version() >= 4_000_000
-"""Runge-Kutta up to MuJoCo 3.17 weighs the stages' angular velocities as they are; from 4.0 on it weighs the rates of
-the rotation vector since the step's start, which makes orientations accurate to fourth order, too."""
+"""From MuJoCo 4.0 on Runge-Kutta averages rates of the rotation vector since the step's start; before, the stages'
+angular velocities."""
 _BALL: Final = int(mujoco.mjtJoint.mjJNT_BALL)
 _ROUNDING: Final = 1e-10
-"""What our Runge-Kutta steps may differ from MuJoCo's by: a compiler may fuse a product and a sum."""
+"""Tolerance of our Runge-Kutta steps against MuJoCo's: a compiler may fuse a product and a sum."""
 
 
 class Replay:
-    """Steps from the state before an env's step to the one after it, with the inputs that the env has left.
+    """Repeats the step of an unwrapped env with MuJoCo `.model` and `.data`, which are only read.
 
-    Inputs are controls, applied forces, mocap poses and the like, as they are after the env's step: most envs set
-    them once, at its start. One that changes them between substeps, or writes to the state, ends elsewhere than
-    the replay, which says so.
+    The inputs (controls, applied forces, mocap poses) are taken as they are after the env's step. An env that changes
+    them between substeps, or writes to the state, ends elsewhere than the replay; then `after` returns False.
 
-    Runge-Kutta steps are made here stage by stage, since MuJoCo leaves only the last one's forces behind; on Ant-v5
+    Runge-Kutta steps are made here stage by stage, since MuJoCo keeps only the forces of the last stage; on Ant-v5
     these alone are wrong by half of the impulse in the median step.
-
-    Args:
-        raw: Env with MuJoCo `.model` and `.data`; neither is written to.
     """
 
     def __init__(self, raw: Any) -> None:
@@ -43,8 +39,8 @@ class Replay:
         self._model: Any = None
 
     def before(self) -> None:
-        """Keep all data that the env's step starts from: which bodies sleep is not in MuJoCo's state."""
-        if self._model is not self._raw.model:  # the first time, or the env has made itself another one
+        """Copy all data before the env's step: MuJoCo's state alone does not say which bodies sleep."""
+        if self._model is not self._raw.model:  # the first time, or the env has a new model
             self._model = self._raw.model
             self._data = mujoco.MjData(self._model)
             self._inputs, self._end, self._there = (
@@ -54,14 +50,11 @@ class Replay:
         mujoco.mj_copyData(self._data, self._model, self._raw.data)
 
     def after(self, visit: Visit) -> bool:
-        """Replay the step that the env has made since; once per step.
-
-        Args:
-            visit: Called at each evaluation in turn.
+        """Replay the step that the env has made since, and call `visit` at each evaluation; once per step.
 
         Returns:
             Whether it ends in the env's own state, bit for bit (Runge-Kutta: up to rounding). If not, what was
-            visited is not what happened.
+            visited is not what happened in the env.
         """
         model: mujoco.MjModel = self._raw.model
         data, there = self._data, self._raw.data
@@ -70,29 +63,27 @@ class Replay:
         mujoco.mj_getState(model, there, self._inputs, int(_INPUTS))
         mujoco.mj_setState(model, data, self._inputs, int(_INPUTS))
         step_s = float(model.opt.timestep)
-        by_stages = model.opt.integrator == _RK4
         for _ in range(round((there.time - data.time) / step_s)):
             evaluations(model, data, visit)
         mujoco.mj_getState(model, data, self._end, int(_PHYSICS))
         mujoco.mj_getState(model, there, self._there, int(_PHYSICS))
-        if by_stages:
+        if model.opt.integrator == _RK4:
             return bool(np.allclose(self._end, self._there, rtol=_ROUNDING, atol=_ROUNDING))
         return np.array_equal(self._end, self._there)
 
 
 def evaluations(model: mujoco.MjModel, data: mujoco.MjData, visit: Visit) -> None:
-    """One physics substep, with every evaluation of the physics in sight; of Runge-Kutta there are four."""
+    """Make one physics substep and visit its evaluations of the physics; Runge-Kutta has four."""
     if model.opt.integrator == _RK4:
         _runge_kutta(model, data, visit)
         return
-    mujoco.mj_step(model, data)  # it leaves the forces that it has integrated
+    mujoco.mj_step(model, data)  # it leaves the forces that it has integrated in the data
     visit(data, float(model.opt.timestep))
 
 
 def _runge_kutta(model: mujoco.MjModel, data: mujoco.MjData, visit: Visit) -> None:
-    """`mj_step` by the classical four stages, in the order of MuJoCo's own sums; the last one is at its end."""
+    """`mj_step` by the classical four stages, in the order of MuJoCo's own sums."""
     step_s, time = float(model.opt.timestep), data.time
-    # Positions change by their rates as quaternions do; the others are added to. Views of the data, and copies.
     qpos, qvel, act, qacc, act_dot = data.qpos, data.qvel, data.act, data.qacc, data.act_dot
     qpos0, qvel0, act0 = qpos.copy(), qvel.copy(), act.copy()
     velocity, acceleration, activation = np.zeros(model.nv), np.zeros(model.nv), np.zeros(model.na)
@@ -102,7 +93,7 @@ def _runge_kutta(model: mujoco.MjModel, data: mujoco.MjData, visit: Visit) -> No
         visit(data, weight * step_s)
         stage = qvel.copy()
         if _RATES_OF_ROTATION_VECTORS and turns.size:
-            stage[turns] = _rotation_vector_rate(step_s * rate[turns], qvel[turns])
+            stage[turns] = rotation_vector_rate(step_s * rate[turns], qvel[turns])
         velocity += weight * stage
         acceleration += weight * qacc
         if model.na:
@@ -130,13 +121,12 @@ def _turns(model: mujoco.MjModel) -> NDArray[np.intp]:
     return np.asarray(first[:, None] + np.arange(3), dtype=np.intp)
 
 
-def _rotation_vector_rate(turned: NDArray[np.float64], velocity: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rates of rotation vectors, rad/s, at angular velocities in the turned body's frame, rad/s; shapes (n, 3).
+def rotation_vector_rate(turned: NDArray[np.float64], velocity: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rates of rotation vectors, rad/s, from angular velocities in the turned body's frame, rad/s; shapes (n, 3).
 
-    The inverse of the exponential's derivative: Iserles, Munthe-Kaas, Nørsett and Zanna, "Lie-group methods", Acta
-    Numerica 9 (2000).
+    The inverse of the exponential's derivative: Iserles et al., "Lie-group methods", Acta Numerica 9 (2000).
     """
-    with np.errstate(over="ignore", invalid="ignore"):  # whoever visits the stages judges such numbers
+    with np.errstate(over="ignore", invalid="ignore"):  # `visit` judges such numbers
         half = 0.5 * np.linalg.norm(turned, axis=1, keepdims=True)
         small = half < 1e-6
         angle = np.where(small, 1.0, half)

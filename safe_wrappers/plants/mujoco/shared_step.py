@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
 from numpy.typing import NDArray
 
+from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.forecast import Recorder
 
 Array = NDArray[np.float64]
@@ -17,16 +18,29 @@ _KNOWN: Final = ("gymnasium.envs.mujoco.", "safe_wrappers.envs.velocity")
 """Envs whose shared step was measured equal bit for bit (`tests/plants/test_shared_step.py`)."""
 
 
-def can_share(env: gym.Env[Any, Any], known_only: bool) -> bool:
-    """Whether an env steps its data as Gymnasium's `MujocoEnv` does, so that a rollout can stand for its step.
+def shared_step(
+    env: gym.Env[Any, Any], substeps: int, exact: bool, wanted: bool | None
+) -> "SharedStep | None":
+    """What hands rollouts to an env, or None where they are not its own steps.
 
     Args:
         env: Any env.
-        known_only: Only the envs that were measured; else every one that does not override the step.
+        substeps: Physics steps per control step.
+        exact: Whether rollouts start from the env's present state, on a copy of its model.
+        wanted: None: only with the envs that were measured; True: with any that does not override the step.
+
+    Raises:
+        ConfigurationError: It is wanted where it cannot be.
     """
-    kind = type(env.unwrapped)
-    inherits = getattr(kind, "_step_mujoco_simulation", None) is MujocoEnv._step_mujoco_simulation
-    return inherits and (not known_only or kind.__module__.startswith(_KNOWN))
+    raw = env.unwrapped
+    inherits = getattr(type(raw), "_step_mujoco_simulation", None) is MujocoEnv._step_mujoco_simulation
+    if wanted and not (exact and inherits):
+        raise ConfigurationError(
+            "share_step=True needs the env's own model, no delay, and an env that steps as Gymnasium's MujocoEnv "
+            f"does; {raw} and its plant do not have all of these: leave it out"
+        )
+    known = wanted or (wanted is None and type(raw).__module__.startswith(_KNOWN))
+    return SharedStep(raw, substeps) if exact and inherits and known else None
 
 
 class SharedStep:

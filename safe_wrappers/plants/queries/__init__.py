@@ -1,1 +1,1 @@
-"""What constraints and wrappers ask of a model beyond its linear form."""
+"""What constraints and wrappers need of a model beyond its linear form."""

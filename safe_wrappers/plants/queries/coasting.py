@@ -1,4 +1,4 @@
-"""What a machine on a free joint does under a held control and then, without any, until it rests."""
+"""Simulates a machine on a free joint: a held control, then none until it rests."""
 
 import math
 from typing import Any, NamedTuple
@@ -7,53 +7,44 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
-Array = NDArray[np.float64]
-
 _REST_SPEED = 0.01
-"""m/s, of the body and of its farthest point as it turns: slower counts as at rest. What is left of the way is
-under a millimetre for Safety-Gymnasium's car (measured: 0.8 mm)."""
-_OBJECTS = {
-    "body": mujoco.mjtObj.mjOBJ_BODY,
-    "geom": mujoco.mjtObj.mjOBJ_GEOM,
-    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
-}
-_ADOPTED = {
-    "body": ("body_mass", "body_inertia", "body_ipos", "body_iquat"),
-    "geom": ("geom_friction",),
-    "actuator": ("actuator_gainprm", "actuator_forcerange"),
-}
-"""What a plant's model may have other than the env's, by kind of object."""
+"""m/s, of the body and of its farthest point as it turns: slower counts as at rest. Safety-Gymnasium's car then moves
+on by 0.8 mm (measured)."""
+_ADOPTED = (
+    ("nbody", int(mujoco.mjtObj.mjOBJ_BODY), ("body_mass", "body_inertia", "body_ipos", "body_iquat")),
+    ("ngeom", int(mujoco.mjtObj.mjOBJ_GEOM), ("geom_friction",)),
+    ("nu", int(mujoco.mjtObj.mjOBJ_ACTUATOR), ("actuator_gainprm", "actuator_forcerange")),
+)
+"""Numbers that a plant's model may have different from the env's, by kind of object."""
 
 
 class Course(NamedTuple):
-    """Where the machine's body is at k instants, one per physics substep.
-
-    Attributes:
-        places: Its origin from above, shape (k, 2), m.
-        ahead: Its x axis from above, unit vectors, shape (k, 2).
-        rests: Whether it has come to rest by the last instant.
-    """
+    """Where the machine's body is at k instants, one per physics substep."""
 
     places: Array
+    """Its origin from above, shape (k, 2), m."""
     ahead: Array
+    """Its x axis from above, unit vectors, shape (k, 2)."""
     rests: bool
+    """Whether it has come to rest by the last instant."""
 
 
 class Coasting:
     """Runs the machine's model: a held control first, no control after it.
 
     Args:
-        plant: Bound; its state is where a run starts, its model gives the masses, damping, friction and motors.
+        plant: Bound; a run starts at its state and uses its masses, damping, friction and motors.
         body: Name of the machine's body; it has a free joint.
-        alone: A model of the machine without what it must not touch anyway: faster to step. Joints and actuators
-            are found by their names. None runs the plant's own model.
+        alone: A model of the machine without obstacles, which is faster to step, with joints and actuators of the
+            same names. None runs the plant's own model.
 
     Raises:
         UnsupportedEnvError: The body is not on a free joint.
-        ConfigurationError: The model alone has a joint or an actuator that the plant's has not, or another timestep.
+        ConfigurationError: The model alone has a joint that the plant's has not, other actuators or another timestep.
     """
 
     def __init__(self, plant: MujocoPlant, body: str, alone: mujoco.MjModel | None = None) -> None:
@@ -83,56 +74,52 @@ class Coasting:
         self._model_version = -1
 
     def _adopt(self) -> None:
-        """Take the numbers that the plant's model may have wrong on purpose."""
+        """Copy the plant's masses, damping, friction and motors into the model that is stepped."""
         self._model_version = self._plant.model_version
         if not self._own:
             return
         m, whole = self._model, self._plant.model
-        for kind, fields in _ADOPTED.items():
-            for i in range(getattr(m, f"n{kind}")):
-                name = mujoco.mj_id2name(m, _OBJECTS[kind], i)
-                j = mujoco.mj_name2id(whole, _OBJECTS[kind], name) if name else -1
+        for count, kind, fields in _ADOPTED:
+            for i in range(getattr(m, count)):
+                name = mujoco.mj_id2name(m, kind, i)
+                j = mujoco.mj_name2id(whole, kind, name) if name else -1
                 for field in fields if j >= 0 else ():
                     getattr(m, field)[i] = getattr(whole, field)[j]
         m.dof_damping[:] = whole.dof_damping[self._qvel]
         mujoco.mj_setConst(m, self._data)
 
     def start(self) -> Course:
-        """Where the machine is now, as a course of one instant."""
+        """The present pose, as a course of one instant."""
         return _course(self._plant.qpos[self._pose][None], False)
 
     def state(self) -> Array:
-        """The machine's positions and velocities now: m, rad, quaternions, m/s, rad/s."""
+        """The machine's present positions and velocities: m, rad, quaternions, m/s, rad/s."""
         return np.concatenate([self._plant.qpos[self._qpos], self._plant.qvel[self._qvel]])
 
     def speed(self, turning_radius: float) -> float:
-        """The largest speed of its origin and of a point at that distance, as it moves now, m/s."""
+        """Present speed of its origin, plus that of a point at this distance as it turns, m/s."""
         vx, vy, _, wx, wy, wz = self._plant.qvel[self._motion].tolist()
         return math.hypot(vx, vy) + math.sqrt(wx * wx + wy * wy + wz * wz) * turning_radius
 
     def run(self, control: Array, horizon: int, turning_radius: float) -> Course:
-        """Hold a control for one control interval, then none until the machine rests.
+        """Hold a control, shape (nu,), for one control interval, then none until the machine rests.
 
-        Args:
-            control: Shape (nu,).
-            horizon: Control intervals at most, >= 1.
-            turning_radius: The farthest point of the machine from its origin, m: turning moves it too.
+        It ends after `horizon` >= 1 control intervals at most. `turning_radius`, m, is the distance of the machine's
+        farthest point from its origin.
         """
-        plant, m, data = self._plant, self._model, self._data
+        plant, m, data, n, at = self._plant, self._model, self._data, self._plant.substeps, self._at
         if plant.model_version != self._model_version:
             self._adopt()
         now = plant.pose()
         data.qpos[:], data.qvel[:] = now.qpos[self._qpos], now.qvel[self._qvel]
         data.qacc_warmstart[:] = now.qacc_warmstart[self._qvel]
         data.ctrl[:] = control
-        n, at, speeds = plant.substeps, self._at, slice(self._moving, self._moving + 6)
-        poses = np.empty((horizon * n, 7))
-        rests = False
+        poses, rests = np.empty((horizon * n, 7)), False
         for hold in range(horizon):
             for i in range(hold * n, hold * n + n):
                 mujoco.mj_step(m, data)
                 poses[i] = data.qpos[at : at + 7]
-            vx, vy, vz, _, _, turn = data.qvel[speeds].tolist()
+            vx, vy, vz, _, _, turn = data.qvel[self._moving : self._moving + 6].tolist()
             if math.sqrt(vx * vx + vy * vy + vz * vz) + abs(turn) * turning_radius < _REST_SPEED:
                 rests = True
                 break
@@ -141,7 +128,7 @@ class Coasting:
 
 
 def _addresses(m: mujoco.MjModel, plant: MujocoPlant, joint: int, kind: str) -> NDArray[np.intp]:
-    """Where a joint of the machine's own model is in the plant's state ("qpos" or "dof")."""
+    """Indices of a joint of the machine's own model in the plant's state ("qpos" or "dof")."""
     name = m.joint(joint).name
     model, there = plant.model, plant.named("joint", name)
     sizes = {"qpos": (7, 4, 1, 1), "dof": (6, 3, 1, 1)}[kind]

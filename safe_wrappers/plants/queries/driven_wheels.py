@@ -8,17 +8,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.vehicle.wheel import Wheel
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.mujoco.model import inertia
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
-Array = NDArray[np.float64]
-
-_ROUND = {
-    int(mujoco.mjtGeom.mjGEOM_SPHERE),
-    int(mujoco.mjtGeom.mjGEOM_CYLINDER),
-    int(mujoco.mjtGeom.mjGEOM_CAPSULE),
-}
+_HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
+_ROUND = [int(getattr(mujoco.mjtGeom, f"mjGEOM_{shape}")) for shape in ("SPHERE", "CYLINDER", "CAPSULE")]
 _FIXED_GAIN, _NO_BIAS = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_NONE)
 _AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_AFFINE)
 _FLAT = 1e-6
@@ -27,36 +24,28 @@ _DRIVES = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT
 
 
 class WheelMotion(NamedTuple):
-    """Of n wheels, along each wheel's heading; shapes (n,).
-
-    Attributes:
-        rate: Of the wheel about its axle in the world, rad/s; positive rolls ahead.
-        ground: Speed of its centre, m/s.
-        sideways: The same to the left of the heading, m/s.
-    """
+    """Of n wheels, shapes (n,)."""
 
     rate: Array
+    """Of the wheel about its axle in the world, rad/s; positive rolls ahead."""
     ground: Array
+    """Speed of its centre along its heading, m/s."""
     sideways: Array
+    """Speed of its centre to the left of its heading, m/s."""
 
 
 class DrivenWheels:
-    """The wheels of a vehicle on level ground.
+    """The wheels of a vehicle on level ground, on the named hinges of a bound plant.
 
-    A wheel is a hinge that one or more actuators drive, all of them directly. Its radius is read from a sphere,
-    cylinder or capsule of its body: the one named like the joint, else the first that can touch something. Ahead is
-    where a positive joint rate rolls it: the axle's axis times up.
-
-    Args:
-        plant: Bound.
-        names: Of the hinges.
+    One or more actuators drive each hinge directly. The radius is that of a sphere, cylinder or capsule of its body:
+    the one named like the joint, else the first that can touch something. A positive joint rate rolls ahead.
 
     Attributes:
         feedback: Of the speed servos on each wheel, shape (n,), N m s/rad.
 
     Raises:
-        ConfigurationError: An empty list, a name twice, a joint that is no hinge or that nothing drives, a wheel
-            that a tendon or site drives, too, or one without a round geom of a radius above zero.
+        ConfigurationError: An empty list, a name twice, a joint that is not a hinge or is not driven, a wheel that a
+            tendon or site also drives, or one without a round geom of a radius above zero.
         UnknownNameError: No joint of that name.
     """
 
@@ -70,27 +59,35 @@ class DrivenWheels:
         m = plant.model
         self._joints = np.array([plant.named("joint", name) for name in names])
         for joint, name in zip(self._joints, names, strict=True):
-            if m.jnt_type[joint] != int(mujoco.mjtJoint.mjJNT_HINGE):
+            if m.jnt_type[joint] != _HINGE:
+                hinges = [m.joint(j).name for j in np.flatnonzero(m.jnt_type == _HINGE)]
                 raise ConfigurationError(
-                    f"joint {name!r} is no hinge, so it is no wheel's axle; hinges are {_hinges(plant)}"
-                )
-        direct = np.isin(m.actuator_trntype, _DRIVES)
-        self._drives = direct & (m.actuator_trnid[:, 0] == self._joints[:, None])
-        for drives, name in zip(self._drives, names, strict=True):
-            if not drives.any():
-                raise ConfigurationError(
-                    f"no actuator drives joint {name!r} directly, so its slip cannot be limited; driven are "
-                    + (
-                        ", ".join(sorted({m.joint(int(j)).name for j in m.actuator_trnid[direct, 0]}))
-                        or "none"
-                    )
+                    f"joint {name!r} is no hinge, so it is no wheel's axle; hinges are "
+                    + ", ".join(filter(None, hinges))
                 )
         self.dofs = m.jnt_dofadr[self._joints]
-        self._refuse_other_drives(plant)
+        direct = np.isin(m.actuator_trntype, _DRIVES)
+        self._drives = direct & (m.actuator_trnid[:, 0] == self._joints[:, None])
+        data = mujoco.MjData(m)
+        mujoco.mj_forward(m, data)
+        turns = plant.actuators.moment(data)[:, self.dofs].T != 0.0
+        for drives, others, name in zip(self._drives, turns & ~self._drives, names, strict=True):
+            if not drives.any():
+                driven = sorted({m.joint(int(j)).name for j in m.actuator_trnid[direct, 0]})
+                raise ConfigurationError(
+                    f"no actuator drives joint {name!r} directly, so its slip cannot be limited; driven are "
+                    + (", ".join(driven) or "none")
+                )
+            if others.any():  # `drive` does not model them
+                found = [m.actuator(int(i)).name or f"actuator #{i}" for i in np.flatnonzero(others)]
+                raise ConfigurationError(
+                    f"joint {name!r} is also driven by {', '.join(found)} through a tendon or a site, which its slip "
+                    "limit would not hold back; drive wheels by actuators on their own joints"
+                )
         self._bodies = m.jnt_bodyid[self._joints]
         self._roots = m.body_rootid[self._bodies]
         self._geoms = np.array([_round_geom(plant, int(j)) for j in self._joints])
-        # Contacts are the env's, whose geoms need not be those of the plant's model; what is no geom is the last one.
+        # Contacts are read from the env, whose geoms may differ from the plant's. The last entry is for geom -1.
         truth: mujoco.MjModel = plant.attribute("model")
         self._wheel_of_geom = np.full(truth.ngeom + 1, -1)
         for i, body in enumerate(truth.jnt_bodyid[self._joints]):
@@ -99,37 +96,17 @@ class DrivenWheels:
         self._fixed_drive: tuple[Array, Array] | None = None
         self.constants(plant)
 
-    def _refuse_other_drives(self, plant: MujocoPlant) -> None:
-        """A drive through a tendon or a site that turns a wheel would be missing in `drive`."""
-        data = mujoco.MjData(plant.model)
-        mujoco.mj_forward(plant.model, data)
-        turns = plant.actuators.moment(data)[:, self.dofs].T != 0.0
-        for others, name in zip(turns & ~self._drives, self.names, strict=True):
-            if others.any():
-                raise ConfigurationError(
-                    f"joint {name!r} is also driven by {', '.join(_actuators(plant, others))} through a tendon or a "
-                    "site, which its slip limit would not hold back; drive wheels by actuators on their own joints"
-                )
-
     def constants(self, plant: MujocoPlant) -> Wheel:
-        """Radius, inertia about the axle and damping, as the plant's model has them now; sets `feedback`, too."""
-        m = plant.model
+        """Radius, inertia about the axle and damping in the plant's present model; also sets `feedback`."""
+        m, data = plant.model, mujoco.MjData(plant.model)
         self._fixed_drive = None
-        data, column = mujoco.MjData(m), np.empty(m.nv)
         mujoco.mj_forward(m, data)
-        inertia = []
-        for dof in self.dofs:
-            unit = np.zeros(m.nv)
-            unit[dof] = 1.0
-            mujoco.mj_mulM(m, data, column, unit)
-            inertia.append(column[dof])
-        # A servo that a forcerange can clamp is no feedback while it is: its torque counts as held.
+        # The torque of a servo that a forcerange may clamp counts as constant, not as feedback.
         servos = (m.actuator_biastype == _AFFINE_BIAS) & ~m.actuator_forcelimited.astype(bool)
-        self._opposing = self._drives * np.where(
-            servos, -m.actuator_gear[:, 0] * m.actuator_biasprm[:, 2], 0.0
-        )
-        self.feedback = np.asarray((self._opposing * m.actuator_gear[:, 0]).sum(axis=1))
-        return Wheel(m.geom_size[self._geoms, 0], np.array(inertia), m.dof_damping[self.dofs])
+        gear, about_axle = m.actuator_gear[:, 0], np.diag(inertia(m, data))[self.dofs]
+        self._opposing = self._drives * np.where(servos, -gear * m.actuator_biasprm[:, 2], 0.0)
+        self.feedback = np.asarray((self._opposing * gear).sum(axis=1))
+        return Wheel(m.geom_size[self._geoms, 0], about_axle, m.dof_damping[self.dofs])
 
     def motion(self, plant: MujocoPlant) -> WheelMotion:
         """Rates and speeds over ground at the plant's present state."""
@@ -138,7 +115,7 @@ class DrivenWheels:
         mujoco.mj_comVel(m, d)
         axle = d.xaxis[self._joints]
         level = np.sqrt(axle[:, 0] ** 2 + axle[:, 1] ** 2)
-        level = np.where(level > _FLAT, level, np.inf)  # a wheel that lies flat goes nowhere
+        level = np.where(level > _FLAT, level, np.inf)  # a wheel that lies flat does not roll
         ahead_x, ahead_y = axle[:, 1] / level, -axle[:, 0] / level
         velocity = d.cvel[self._bodies]
         turn, move = velocity[:, :3], velocity[:, 3:]
@@ -149,7 +126,7 @@ class DrivenWheels:
         return WheelMotion(rate, ahead_x * vx + ahead_y * vy, ahead_x * vy - ahead_y * vx)
 
     def loads(self, model: mujoco.MjModel, data: mujoco.MjData) -> Array:
-        """Force of the ground on each wheel against gravity, shape (n,), N, from an env's model and contacts."""
+        """Vertical force of the ground on each wheel, shape (n,), N, from an env's model and contacts."""
         loads = np.zeros(len(self.names))
         pairs = data.contact.geom
         for contact, wheel in enumerate(self._wheel_of_geom[pairs].max(axis=1, initial=-1).tolist()):
@@ -159,11 +136,11 @@ class DrivenWheels:
         return loads
 
     def torque(self, data: mujoco.MjData) -> Array:
-        """Of the drives on each wheel, shape (n,), N m, without `feedback`: from an env's last physics substep."""
+        """Torque of the drives without `feedback`, shape (n,), N m, in an env's last physics substep."""
         return np.asarray(data.qfrc_actuator[self.dofs] + self._opposing @ data.actuator_velocity)
 
     def driven_by(self, controls: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Whether any of some controls, shape (nu,), drives each wheel, shape (n,)."""
+        """Which wheels, shape (n,), any of the given controls, shape (nu,), drives."""
         return np.asarray((self._drives & controls).any(axis=1))
 
     def drive(self, plant: MujocoPlant) -> tuple[Array, Array]:
@@ -199,13 +176,3 @@ def _round_geom(plant: MujocoPlant, joint: int) -> int:
             f"has {has}"
         )
     return found
-
-
-def _actuators(plant: MujocoPlant, chosen: NDArray[np.bool_]) -> list[str]:
-    return [plant.model.actuator(int(i)).name or f"actuator #{i}" for i in np.flatnonzero(chosen)]
-
-
-def _hinges(plant: MujocoPlant) -> str:
-    m = plant.model
-    kind = int(mujoco.mjtJoint.mjJNT_HINGE)
-    return ", ".join(m.joint(j).name for j in range(m.njnt) if m.jnt_type[j] == kind and m.joint(j).name)

@@ -1,13 +1,11 @@
-"""What a whole-body problem needs of a MuJoCo model: M, h, B, the contacts, and the bodies' momentum.
+"""The equations of motion of a MuJoCo model: M, h, B and the contacts.
 
     M qacc + h = B u + sum J_k' f_k
 
-holds with MuJoCo's own accelerations and forces, to rounding. The base may float (a free joint) or not.
-
-Contacts are points: what MuJoCo adds for torsional and rolling friction (condim 4 and 6) is in `moments` and in no
-force. MuJoCo's contacts give way, and its solver asks for an acceleration `J qacc` of its own, without the drift
-`dJ/dt qvel`. The drift here is that of the points of the bodies that touch just now: where a round foot rolls, that
-point is drawn into the foot (by the square of the turning rate times the radius) while the contact lasts.
+holds with MuJoCo's own accelerations and forces, to rounding. The base may float (a free joint) or not. Contacts are
+points: MuJoCo's torsional and rolling friction (condim 4 and 6) is in `moments` and in no force. MuJoCo's contacts
+are soft, and its solver ignores the drift `dJ/dt qvel`. The drift here is that of the material points that touch at
+present; under a round foot that rolls, such a point moves into the foot.
 """
 
 from typing import NamedTuple
@@ -16,29 +14,24 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.actuators import AffineActuators
-from safe_wrappers.plants.mujoco.fixed_bodies import fixed_bodies
-
-Array = NDArray[np.float64]
+from safe_wrappers.plants.mujoco.model import control_range, fixed_bodies, inertia
 
 _CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
-"""The kinds of constraints from this one on are contacts."""
+"""Constraints of this type and above are contacts."""
 
 
 class ContactPoints(NamedTuple):
-    """The contacts that MuJoCo's solver has, k of them.
-
-    A contact's force acts on its `pushed` body, and against it on `pushed_by`. In a contact with the world, the world
-    is never the pushed one.
+    """The k contacts of MuJoCo's solver. The world is never the pushed body.
 
     Attributes:
         points: Shape (k, 3), m.
         normals: Unit normals, pointing at the pushed body, shape (k, 3).
         first_tangents: The first axis of MuJoCo's friction pyramid, shape (k, 3).
-        friction: Coefficient of sliding (MuJoCo's first), shape (k,); 0 where a contact has none (condim 1).
-        pushed: Ids of bodies, shape (k,).
-        pushed_by: Ids of bodies, shape (k,).
+        friction: Coefficient of sliding (MuJoCo's first), shape (k,); 0 without friction (condim 1).
+        pushed, pushed_by: Ids of the two bodies, shape (k,).
         jacobians: Of the pushed body's velocity at the point relative to the other's, shape (k, 3, nv).
         drift: `dJ/dt qvel`, shape (k, 3), m/s^2.
         forces: On the pushed body, as MuJoCo's solver found them last, shape (k, 3), N.
@@ -64,14 +57,10 @@ class FloatingBaseTerms(NamedTuple):
 
     Attributes:
         inertia: M with armature, shape (nv, nv).
-        bias: h, shape (nv,): Coriolis, centrifugal and gravity forces, minus springs, damping and other passive
-            forces, minus forces applied from outside (`qfrc_applied`, `xfrc_applied`), minus what actuators do at
-            zero control (servos), minus constraint forces that are no contacts (joint limits, equalities, dry
-            friction in joints). The last depend on the accelerations: they are those that MuJoCo found for the
-            control that the data was made with.
-        actuation: B, shape (nv, nu): generalised force per control (gain, gear, moment arm), inside the actuators'
-            force ranges.
-        contacts: See `ContactPoints`.
+        bias: h, shape (nv,): Coriolis, centrifugal and gravity forces, minus passive and applied forces, minus the
+            actuators' forces at zero control, minus constraint forces other than contacts. The last depend on the
+            accelerations: they are those that MuJoCo found for the control in the data.
+        actuation: B, shape (nv, nu): generalised force per control, inside the actuators' force ranges.
     """
 
     inertia: Array
@@ -83,34 +72,28 @@ class FloatingBaseTerms(NamedTuple):
 def equations_of_motion(
     model: mujoco.MjModel, data: mujoco.MjData, actuators: AffineActuators | None = None
 ) -> FloatingBaseTerms:
-    """The same of any data, which must be up to date at its state (`mj_forward`).
+    """The terms at the state of the data, which are only read and must be up to date (`mj_forward`).
 
-    Args:
-        model: The model.
-        data: Is only read.
-        actuators: Of the model; None makes them, which refuses actuators that are not affine.
+    Raises:
+        UnsupportedEnvError: An actuator that is not affine in its control; not checked where `actuators` are given.
     """
     acts = AffineActuators(model) if actuators is None else actuators
-    inertia = np.empty((model.nv, model.nv))
-    for row, unit in zip(inertia, np.eye(model.nv), strict=True):
-        mujoco.mj_mulM(model, data, row, unit)
     gain, _ = acts.gain_and_bias(data.actuator_length, data.actuator_velocity)
     actuation = np.array(acts.moment(data).T * gain)
-    limited = model.actuator_ctrllimited.astype(bool)
-    low, high = model.actuator_ctrlrange.T
-    acting = np.where(limited, np.clip(data.ctrl, low, high), data.ctrl)
-    bias = actuation @ acting - data.qfrc_smooth - _other_constraints(model, data)
-    return FloatingBaseTerms(inertia, bias, actuation, contact_points(model, data))
+    others = np.zeros(model.nv)  # generalised force of all constraints but the contacts
+    if data.nefc:
+        mujoco.mj_mulJacTVec(model, data, others, np.where(data.efc_type < _CONTACT, data.efc_force, 0.0))
+    bias = actuation @ np.clip(data.ctrl, *control_range(model)) - data.qfrc_smooth - others
+    return FloatingBaseTerms(inertia(model, data), bias, actuation, contact_points(model, data))
 
 
 def contact_points(model: mujoco.MjModel, data: mujoco.MjData) -> ContactPoints:
-    """The contacts of data that are up to date at its state (`mj_forward`).
+    """The contacts of data that are up to date (`mj_forward`).
 
     Raises:
         UnsupportedEnvError: Something flexible is in contact, which has no body.
     """
-    touching = [i for i in range(data.ncon) if data.contact.efc_address[i] >= 0]
-    fixed = fixed_bodies(model)
+    touching, fixed = np.flatnonzero(data.contact.efc_address >= 0), fixed_bodies(model)
     k = len(touching)
     jacobians, drift = np.zeros((k, 3, model.nv)), np.zeros((k, 3))
     forces, moments, normals, first = (np.zeros((k, 3)) for _ in range(4))
@@ -120,16 +103,14 @@ def contact_points(model: mujoco.MjModel, data: mujoco.MjData) -> ContactPoints:
     for row, i in enumerate(touching):
         geoms = data.contact.geom[i]
         if (geoms < 0).any():
-            raise UnsupportedEnvError(
-                "something flexible is in contact, which has no body that could be pushed"
-            )
+            raise UnsupportedEnvError("something flexible is in contact, which has no body")
         one, other = (int(b) for b in model.geom_bodyid[geoms])
         # MuJoCo's normal points from the first geom to the second, and its force pushes the second.
         sign = 1.0
         if fixed[other]:
             one, other, sign = other, one, -1.0
         frame = data.contact.frame[i].reshape(3, 3)
-        mujoco.mj_contactForce(model, data, i, wrench)
+        mujoco.mj_contactForce(model, data, int(i), wrench)
         normals[row], first[row] = sign * frame[0], frame[1]
         forces[row], moments[row] = sign * (wrench[:3] @ frame), sign * (wrench[3:] @ frame)
         pushed[row], pushed_by[row] = other, one
@@ -153,12 +134,3 @@ def contact_points(model: mujoco.MjModel, data: mujoco.MjData) -> ContactPoints:
         moments=moments,
         gaps=np.array(data.contact.dist[touching]).reshape(k),
     )
-
-
-def _other_constraints(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
-    """Generalised force of the constraints that are no contacts, shape (nv,)."""
-    total = np.zeros(model.nv)
-    if data.nefc:
-        others = np.where(data.efc_type < _CONTACT, data.efc_force, 0.0)
-        mujoco.mj_mulJacTVec(model, data, total, others)
-    return total

@@ -1,4 +1,4 @@
-"""LineOfSight: which points a camera or a site of a MuJoCo model sees, by rays; all of them in one call."""
+"""LineOfSight: which points a camera or a site of a MuJoCo model sees, by rays."""
 
 import math
 from collections.abc import Sequence
@@ -8,35 +8,34 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
-
-Array = NDArray[np.float64]
+from safe_wrappers.checks import Array
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.mujoco.model import kinematics, named
 
 _TAKES_NORMALS = "normal" in (mujoco.mj_multiRay.__doc__ or "")
-"""MuJoCo's later versions want one argument more."""
+"""Later versions of MuJoCo take one more argument."""
 _SKIN_M = 1e-9
-"""A surface that is this close before the point does not hide it: the point may lie on it."""
+"""A surface this close in front of a point does not hide it: the point may lie on it."""
 
 
 class LineOfSight:
-    """Rays from a sensor to points, as the model's geoms stop them.
+    """Rays from a sensor to points, all in one call of MuJoCo.
 
-    MuJoCo's rays hit every visible geom (alpha above 0) of the groups asked for, but none of the body that the sensor
-    sits on (a sensor on the world sees the world's geoms, too). A ray that meets what moves with a tracked body,
-    before anything else, has found it.
+    Every visible geom (alpha above 0) of the given groups stops a ray, except those of the sensor's own body, unless
+    that is the world. A ray that first meets a body, or a descendant of it, has reached the points on that body.
 
     Args:
         model: Of the env; only read.
         camera: Name of a camera, or None.
         site: Name of a site, or None; one of the two.
-        view_deg: Full opening angle of the cone that is seen, degrees: around a camera's direction of view, around a
-            site's z axis. None: a camera's own `fovy`; all around for a site.
-        range_m: Farther away nothing is seen, m.
+        view_deg: Full opening angle of the visible cone, degrees, around a camera's direction of view or a site's z
+            axis. None: a camera's own `fovy`, all around for a site.
+        range_m: Range of sight, m.
         groups: Geom groups (0 to 5) that stop rays; None: all.
 
     Raises:
-        UnknownNameError: No camera or site of that name; the message lists those there are.
-        ConfigurationError: No `view_deg` for a camera that has no angle of view, being orthographic.
+        UnknownNameError: No camera or site of that name; the message lists all names.
+        ConfigurationError: No `view_deg` for an orthographic camera, which has no angle of view.
     """
 
     def __init__(
@@ -50,17 +49,12 @@ class LineOfSight:
     ) -> None:
         self.model = model
         self.data = mujoco.MjData(model)
-        """At the state of the last `look`: kinematics and velocities."""
-        self._is_camera = camera is not None
-        if camera is not None:
-            self._id = named(model, "camera", camera)
-            self.body = int(model.cam_bodyid[self._id])
-            if view_deg is None:
-                view_deg = _angle_of_view(model, self._id)
-        else:
-            self._id = named(model, "site", site or "")
-            self.body = int(model.site_bodyid[self._id])
-            view_deg = 360.0 if view_deg is None else view_deg
+        """Kinematics and velocities of the state that was read last."""
+        self._kind = "site" if camera is None else "cam"
+        self._id = named(model, "site", site or "") if camera is None else named(model, "camera", camera)
+        self.body = int(getattr(model, f"{self._kind}_bodyid")[self._id])
+        if view_deg is None:
+            view_deg = 360.0 if camera is None else _angle_of_view(model, self._id)
         self._cosine = math.cos(math.radians(0.5 * min(view_deg, 360.0)))
         self._all_around = view_deg >= 360.0
         self._range = range_m
@@ -68,53 +62,45 @@ class LineOfSight:
         if groups is not None:
             self._groups = np.zeros(mujoco.mjNGROUP, dtype=np.uint8)
             self._groups[list(groups)] = 1
-        self._root = _ancestors(model)
+        self._inside = np.eye(model.nbody, dtype=bool)
+        """Whether body i is body j or a descendant of it, shape (nbody, nbody)."""
+        for body in range(1, model.nbody):
+            self._inside[body] |= self._inside[model.body_parentid[body]]
 
     def read(self, data: mujoco.MjData) -> None:
-        """Take a state: MuJoCo's own positions lag a substep behind it after a step, these do not."""
-        mine = self.data
-        mine.qpos[:], mine.qvel[:] = data.qpos, data.qvel
-        if self.model.nmocap:
-            mine.mocap_pos[:], mine.mocap_quat[:] = data.mocap_pos, data.mocap_quat
-        mujoco.mj_kinematics(self.model, mine)
-        mujoco.mj_comPos(self.model, mine)
-        mujoco.mj_camlight(self.model, mine)
-        mujoco.mj_comVel(self.model, mine)
+        """Take the state of an env's data, whose own poses may lag a substep behind."""
+        kinematics(self.model, data, self.data)
+        mujoco.mj_camlight(self.model, self.data)
 
     @property
     def position(self) -> Array:
         """Of the sensor, shape (3,), m."""
-        return np.array(self.data.cam_xpos[self._id] if self._is_camera else self.data.site_xpos[self._id])
+        return np.array(getattr(self.data, f"{self._kind}_xpos")[self._id])
 
     @property
     def rotation(self) -> Array:
         """Of the sensor: its axes as columns, shape (3, 3)."""
-        flat = self.data.cam_xmat[self._id] if self._is_camera else self.data.site_xmat[self._id]
-        return np.array(flat).reshape(3, 3)
+        return np.array(getattr(self.data, f"{self._kind}_xmat")[self._id]).reshape(3, 3)
 
     def velocity(self, body: int) -> tuple[Array, Array]:
         """Linear velocity of a body's origin (m/s) and its angular velocity (rad/s) in world axes, (3,) each."""
         six = np.zeros(6)
-        kind = mujoco.mjtObj.mjOBJ_XBODY
-        mujoco.mj_objectVelocity(self.model, self.data, kind, body, six, 0)
+        mujoco.mj_objectVelocity(self.model, self.data, mujoco.mjtObj.mjOBJ_XBODY, body, six, 0)
         return six[3:], six[:3]
 
     def sees(self, points: Array, bodies: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Which points are seen.
+        """Which points are seen, shape (n,).
 
         Args:
             points: Shape (n, 3), m.
-            bodies: The body that each of them sits on, which does not hide it; -1 for none; shape (n,).
-
-        Returns:
-            Shape (n,).
+            bodies: Id of the body that each point is on, which does not hide it; -1 for none; shape (n,).
         """
         eye = self.position
         offsets = points - eye
         lengths = np.sqrt((offsets * offsets).sum(axis=1))
         seen = lengths <= self._range
         if not self._all_around:
-            axis = self.rotation[:, 2] * (-1.0 if self._is_camera else 1.0)
+            axis = self.rotation[:, 2] * (-1.0 if self._kind == "cam" else 1.0)
             seen &= offsets @ axis >= lengths * self._cosine - 1e-12
         which = np.flatnonzero(seen & (lengths > _SKIN_M))
         if not which.size:
@@ -129,7 +115,7 @@ class LineOfSight:
             directions.reshape(-1),
             self._groups,
             1,
-            self.body or -1,  # the world is no housing of the sensor: its walls hide things
+            self.body or -1,  # a sensor on the world does not see through walls
             hit,
             at,
             *normals,
@@ -139,13 +125,13 @@ class LineOfSight:
         hitting = hit >= 0
         blocker = self.model.geom_bodyid[np.where(hitting, hit, 0)]
         own = bodies[which]
-        itself = (own >= 0) & self._root[blocker, np.maximum(own, 0)]
+        itself = (own >= 0) & self._inside[blocker, np.maximum(own, 0)]
         seen[which] = ~hitting | itself | (at >= lengths[which] - _SKIN_M)
         return np.asarray(seen)
 
 
 def _angle_of_view(model: mujoco.MjModel, camera: int) -> float:
-    """A camera's own, degrees."""
+    """The camera's own `fovy`, degrees."""
     flat = model.cam_projection if hasattr(model, "cam_projection") else model.cam_orthographic
     if flat[camera]:
         raise ConfigurationError(
@@ -153,27 +139,3 @@ def _angle_of_view(model: mujoco.MjModel, camera: int) -> float:
             "view_deg"
         )
     return float(model.cam_fovy[camera])
-
-
-def named(model: mujoco.MjModel, kind: str, name: str) -> int:
-    """The id of a camera, site or body, or an error that lists those there are."""
-    types = {
-        "camera": (mujoco.mjtObj.mjOBJ_CAMERA, model.ncam),
-        "site": (mujoco.mjtObj.mjOBJ_SITE, model.nsite),
-        "body": (mujoco.mjtObj.mjOBJ_BODY, model.nbody),
-    }
-    which, count = types[kind]
-    found = mujoco.mj_name2id(model, which, name)
-    if found < 0:
-        there = [mujoco.mj_id2name(model, which, i) for i in range(count)]
-        listed = ", ".join(n for n in there if n) or "none"
-        raise UnknownNameError(f"the model has no {kind} {name!r}; it has: {listed}")
-    return int(found)
-
-
-def _ancestors(model: mujoco.MjModel) -> NDArray[np.bool_]:
-    """Whether body i is body j or moves with it as its descendant, shape (nbody, nbody)."""
-    inside = np.eye(model.nbody, dtype=bool)
-    for body in range(1, model.nbody):
-        inside[body] |= inside[model.body_parentid[body]]
-    return inside

@@ -1,99 +1,86 @@
-"""A point mass on two slides in a MuJoCo model: where it is, what moves it, how large it is, and its walls."""
+"""A point mass on two slides in a MuJoCo model: its joints, actuators and constants, and the walls around it."""
 
 import copy
-from dataclasses import dataclass
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.damped_axis import DampedAxis
+from safe_wrappers.control.numerics.rectangles import Rectangle, merged
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
-Array = NDArray[np.float64]
-
 _ALIGNED = 1e-6
 _EXACT = 1e-9
-"""How closely the model's own step must follow the two axes' constants on the states that are tried, m, m/s."""
-_PROBES = 12
+"""Tolerance between the model's own step and the axes' constants at the states that are tried, m and m/s."""
+_TRIED = 12
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
+_PLANE, _BOX = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_BOX)
 
 
-@dataclass(frozen=True)
-class PlanarPoint:
-    """What `planar_point` finds in a model; x first, then y.
-
-    Attributes:
-        body: Index of the body.
-        axes: Constants of the motion.
-        joints: Indices of the two slides, in qpos and in qvel.
-        actuators: Indices of their actuators.
-        origin: Where the point is at qpos = 0, m.
-    """
+class PlanarPoint(NamedTuple):
+    """A point mass in a model; of pairs x is first, then y."""
 
     body: int
+    """Index of the body."""
     axes: tuple[DampedAxis, DampedAxis]
+    """Constants of the motion."""
     joints: tuple[int, int]
+    """Indices of the two slides, in qpos and in qvel."""
     actuators: tuple[int, int]
+    """Indices of their actuators."""
     origin: tuple[float, float]
+    """Where the point is at qpos = 0, m."""
 
 
 def planar_point(plant: MujocoPlant, clip: float, body: str | None = None) -> PlanarPoint:
-    """Find the point, or say what does not fit.
+    """Find the point, measure its constants by single physics steps of the model, and check them.
 
-    The constants are measured on the model itself, one physics step at a time, and then checked against it: what
-    is not a damped point mass with a force of its own on each axis (springs, gravity, friction, another
-    integrator, coupling) does not pass.
+    Springs, gravity, friction, coupling of the axes and other integrators are refused.
 
     Args:
-        plant: Bound; its model's constants are read.
-        clip: Speed per axis to which the env clips the motion at each control step's start, m/s.
-        body: Name of the body on the two slides, in a model in which more moves; none of that may act on them. None:
-            the slides are all that moves.
+        plant: Bound.
+        clip: Speed per axis to which the env clips the motion at the start of each control step, m/s.
+        body: Name of the body on the two slides; what else moves must not act on them. None: nothing else moves.
 
     Raises:
-        UnsupportedEnvError: The model is no such point.
+        UnsupportedEnvError: The model is not such a point; the message says why.
     """
     m = plant.model
-    slides = _only_slides(m) if body is None else _slides_of(m, plant.named("body", body), body)
+    slides = _slides(m, None if body is None else plant.named("body", body))
     data = mujoco.MjData(m)
-    for joint in slides:
-        data.qpos[m.jnt_qposadr[joint]] = 0.0
+    data.qpos[m.jnt_qposadr[list(slides)]] = 0.0
     mujoco.mj_kinematics(m, data)
-    joints = _order(slides, data.xaxis)
+    joints = _along_x_and_y(slides, data.xaxis)
     if m.jnt_limited[list(slides)].any():
         _refuse("its slides must have no limits (walls stop it, not joints)")
     actuators = _actuators(m, joints, alone=body is None)
     order = int(m.jnt_qposadr[joints[0]]), int(m.jnt_qposadr[joints[1]])
     axes = _measured(plant, order, actuators, clip)
     index = int(m.jnt_bodyid[slides[0]])
-    return PlanarPoint(
-        index, axes, order, actuators, (float(data.xpos[index][0]), float(data.xpos[index][1]))
-    )
+    x, y, _ = data.xpos[index].tolist()
+    return PlanarPoint(index, axes, order, actuators, (x, y))
 
 
-def _only_slides(m: mujoco.MjModel) -> tuple[int, int]:
-    if m.nv != 2 or m.njnt != 2 or list(m.jnt_type) != [_SLIDE, _SLIDE] or m.jnt_bodyid[0] != m.jnt_bodyid[1]:
+def _slides(m: mujoco.MjModel, body: int | None) -> tuple[int, int]:
+    """Two slides of one body: of the only one that moves, or of the one with this index."""
+    slides = [j for j in range(m.njnt) if m.jnt_type[j] == _SLIDE and body in (None, m.jnt_bodyid[j])]
+    if body is None and (len(slides), m.njnt, len(set(m.jnt_bodyid.tolist()))) != (2, 2, 1):
         kinds = [mujoco.mjtJoint(k).name[6:].lower() for k in m.jnt_type]
         _refuse(f"it needs one body on two slides and nothing else that moves; the model has {kinds}")
-    return 0, 1
-
-
-def _slides_of(m: mujoco.MjModel, body: int, name: str) -> tuple[int, int]:
-    slides = [j for j in range(m.njnt) if m.jnt_bodyid[j] == body and m.jnt_type[j] == _SLIDE]
-    # Where nothing has more coordinates than rates before them, one index serves positions and speeds.
+    # With free and ball joints only after them, one index serves positions and speeds.
     if len(slides) != 2 or any(m.jnt_qposadr[j] != m.jnt_dofadr[j] for j in slides):
         _refuse(
-            f"the body {name!r} must have two slides of its own, before any free or ball joint of the model; it has "
-            f"{len(slides)}"
+            f"the body {m.body(body).name!r} must have two slides of its own, before any free or ball joint of the "
+            f"model; it has {len(slides)}"
         )
     return slides[0], slides[1]
 
 
-def _order(slides: tuple[int, int], axes: Array) -> tuple[int, int]:
-    """Which slide goes along world x and which along world y."""
+def _along_x_and_y(slides: tuple[int, int], axes: Array) -> tuple[int, int]:
+    """The slide along world x, then the one along world y."""
     for first, second in (slides, slides[::-1]):
         if np.allclose(axes[[first, second]], np.eye(3)[:2], atol=_ALIGNED):
             return first, second
@@ -125,21 +112,23 @@ def _measured(
     free.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     data = mujoco.MjData(free)
 
+    at, motors = list(order), list(actuators)
+
     def step(x: Array, v: Array, u: Array, around: np.random.Generator | None = None) -> tuple[Array, Array]:
         mujoco.mj_resetData(free, data)
-        if around is not None:  # what else moves must make no difference
+        if around is not None:  # everything else that moves must make no difference
             data.qvel[:] = around.uniform(-1.0, 1.0, m.nv)
             mujoco.mj_integratePos(free, data.qpos, data.qvel, 1.0)
             data.ctrl[:] = np.clip(around.uniform(-1.0, 1.0, m.nu), least, most)
-        data.qpos[list(order)], data.qvel[list(order)], data.ctrl[list(actuators)] = x, v, u
+        data.qpos[at], data.qvel[at], data.ctrl[motors] = x, v, u
         mujoco.mj_step(free, data)
-        return data.qpos[list(order)].copy(), data.qvel[list(order)].copy()
+        return data.qpos[at].copy(), data.qvel[at].copy()
 
     zero = np.zeros(2)
     decay = step(zero, np.ones(2), zero)[1]
     gain = step(zero, zero, high)[1] / high
     h, rng = float(m.opt.timestep), np.random.default_rng(0)
-    for _ in range(_PROBES):
+    for _ in range(_TRIED):
         x, v, u = rng.uniform(-3.0, 3.0, 2), rng.uniform(-5.0, 5.0, 2), rng.uniform(low, high)
         x_next, v_next = step(x, v, u, rng)
         expected = decay * v + gain * u
@@ -160,3 +149,65 @@ def _refuse(expectation: str) -> NoReturn:
     raise UnsupportedEnvError(
         f"this model is no point mass on two slides: {expectation}. Use Clearance for other machines."
     )
+
+
+def walls(model: mujoco.MjModel, body: int) -> tuple[list[Rectangle], float]:
+    """Everything fixed that a body, given by its index, can touch as it slides along x and y without turning.
+
+    Level floors and geoms wholly above or below the body are left out.
+
+    Returns:
+        The walls, touching ones joined, m, and the distance of the body's origin from a wall at which MuJoCo reports
+        a contact, m: the body's radius and both contact margins.
+
+    Raises:
+        UnsupportedEnvError: No geom of the body collides with anything, or something it can touch moves or is not an
+            upright box along x and y.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    welded = model.body_weldid[model.geom_bodyid]
+    carried = model.body_mocapid[model.body_rootid[model.geom_bodyid]] >= 0
+    own = np.flatnonzero((welded == body) & ((model.geom_contype > 0) | (model.geom_conaffinity > 0)))
+    if not own.size:
+        raise UnsupportedEnvError(f"body {model.body(body).name!r} has no geom that collides with anything")
+    offset = np.linalg.norm((data.geom_xpos[own] - data.xpos[body])[:, :2], axis=1)
+    radius = float((offset + model.geom_rbound[own]).max())
+    height, bound = data.geom_xpos[own, 2], model.geom_rbound[own]
+    margin = float(model.geom_margin[own].max())
+    bottom, top = float((height - bound).min()) - margin, float((height + bound).max()) + margin
+    found: list[Rectangle] = []
+    widest = 0.0
+    for g in np.flatnonzero(welded != body):
+        if not any(_collide(model, int(g), int(o)) for o in own):
+            continue
+        name = model.geom(g).name or f"#{g}"
+        turn, centre, size = data.geom_xmat[g].reshape(3, 3), data.geom_xpos[g], model.geom_size[g]
+        kind = int(model.geom_type[g])
+        if kind == _PLANE and abs(turn[2, 2]) >= 1.0 - _ALIGNED:
+            continue
+        if carried[g]:
+            raise UnsupportedEnvError(
+                f"geom {name!r} can be run into and moves; walls stand still. Use Clearance with obstacles that "
+                "the env publishes (Discs)."
+            )
+        half = np.abs(turn) @ size if kind == _BOX else np.full(3, model.geom_rbound[g])
+        gap = float(model.geom_margin[g])
+        if kind != _PLANE and (centre[2] - half[2] - gap >= top or centre[2] + half[2] + gap <= bottom):
+            continue
+        aligned = np.allclose(np.sort(np.abs(turn), axis=1), [[0.0, 0.0, 1.0]] * 3, atol=_ALIGNED)
+        if kind != _BOX or not aligned:
+            what = mujoco.mjtGeom(kind).name[7:].lower()
+            raise UnsupportedEnvError(
+                f"geom {name!r} ({what}) can be run into and is not a box along x and y. Use Clearance with "
+                "obstacles that describe it (Box, Disc, Plane)."
+            )
+        widest = max(widest, gap)
+        (x, y, _), (dx, dy, _) = centre.tolist(), half.tolist()
+        found.append((x - dx, x + dx, y - dy, y + dy))
+    return merged(found), radius + margin + widest
+
+
+def _collide(m: mujoco.MjModel, a: int, b: int) -> bool:
+    types, affinities = m.geom_contype, m.geom_conaffinity
+    return bool(types[a] & affinities[b] or types[b] & affinities[a])

@@ -1,4 +1,4 @@
-"""A planar robot in a MuJoCo model: where its joints and actuators sit, its motion, and its constants."""
+"""A planar robot in a MuJoCo model: its joints and actuators, its motion, and its constants."""
 
 import math
 
@@ -15,12 +15,12 @@ _AT_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARE
 
 
 class PlanarFrame:
-    """Where the planar robot's joints and actuators sit in the model, and its motion in the world."""
+    """A body that slides along x and y and turns about z, driven along its heading and about its hinge."""
 
     def __init__(self, plant: MujocoPlant, body: str) -> None:
         m = plant.model
         b = plant.named("body", body)
-        joints = list(range(int(m.body_jntadr[b]), int(m.body_jntadr[b]) + int(m.body_jntnum[b])))
+        joints = np.flatnonzero(m.jnt_bodyid == b).tolist()
         kinds = [int(m.jnt_type[j]) for j in joints]
         axes = m.jnt_axis[joints] if joints else np.zeros((0, 3))
         planar = (
@@ -37,24 +37,21 @@ class PlanarFrame:
                 "other machines."
             )
         self.joints = joints
-        self._q = [int(m.jnt_qposadr[j]) for j in joints]
-        self._v = [int(m.jnt_dofadr[j]) for j in joints]
-        self._origin = m.body_pos[b][:2].copy()
+        self._q, self._v = int(m.jnt_qposadr[joints[0]]), int(m.jnt_dofadr[joints[0]])
+        self._origin = m.body_pos[b][:2].tolist()
         if m.nu != 2:
             raise UnsupportedEnvError(
                 f"expected a drive and a turning actuator, the model has {m.nu} actuators"
             )
-        turning = [
-            a for a in range(2) if m.actuator_trntype[a] in _AT_JOINT and m.actuator_trnid[a, 0] == joints[2]
-        ]
+        kind, at, gear = m.actuator_trntype, m.actuator_trnid[:, 0], m.actuator_gear
+        turning = [a for a in range(2) if kind[a] in _AT_JOINT and at[a] == joints[2]]
         pushing = [
             a
             for a in range(2)
-            if m.actuator_trntype[a] == _AT_SITE
-            and m.site_bodyid[m.actuator_trnid[a, 0]] == b
-            and np.allclose(m.site_quat[m.actuator_trnid[a, 0]], [1, 0, 0, 0], atol=1e-9)
-            and np.count_nonzero(m.actuator_gear[a]) == 1
-            and m.actuator_gear[a, 0] != 0.0
+            if kind[a] == _AT_SITE
+            and m.site_bodyid[at[a]] == b
+            and np.allclose(m.site_quat[at[a]], [1, 0, 0, 0], atol=1e-9)
+            and np.flatnonzero(gear[a]).tolist() == [0]
         ]
         if len(turning) != 1 or len(pushing) != 1:
             raise UnsupportedEnvError(
@@ -64,50 +61,39 @@ class PlanarFrame:
 
     def motion(self, plant: MujocoPlant) -> Motion:
         """Position, heading and velocities in the world."""
-        q, v = plant.qpos, plant.qvel
-        a, b, c = self._q
-        d, e, f = self._v
-        return Motion(
-            float(q[a]) + float(self._origin[0]),
-            float(q[b]) + float(self._origin[1]),
-            float(q[c]),
-            float(v[d]),
-            float(v[e]),
-            float(v[f]),
-        )
+        x, y, heading = plant.qpos[self._q : self._q + 3].tolist()
+        vx, vy, turning = plant.qvel[self._v : self._v + 3].tolist()
+        return Motion(x + self._origin[0], y + self._origin[1], heading, vx, vy, turning)
 
 
 def heading_drive(plant: MujocoPlant, body: str, uncertainty: float = 0.0) -> HeadingDrive:
     """The constants of a planar robot from a plant's model.
 
     Raises:
-        UnsupportedEnvError: The model is no heading drive; the message says what does not fit.
+        UnsupportedEnvError: The model is not such a robot; the message says why.
     """
     m = plant.model
     frame = PlanarFrame(plant, body)
     b = plant.named("body", body)
     dofs = [int(m.jnt_dofadr[j]) for j in frame.joints]
     damping = m.dof_damping[dofs]
-    turn_axes = np.zeros(9)
-    mujoco.mju_quat2Mat(turn_axes, m.body_iquat[b])
-    axes = turn_axes.reshape(3, 3)
-    about_com = float(axes[2] ** 2 @ m.body_inertia[b])
+    axes = np.zeros(9)
+    mujoco.mju_quat2Mat(axes, m.body_iquat[b])
+    about_com = float(axes[6:] ** 2 @ m.body_inertia[b])
     mass, com = float(m.body_mass[b]), m.body_ipos[b]
     a, t = frame.drive_index, frame.turn_index
     fixed = int(mujoco.mjtGain.mjGAIN_FIXED)
     problems = {
         "the slides need equal damping above zero": damping[0] != damping[1] or damping[0] <= 0.0,
         "the centre of mass must lie on the heading": abs(float(com[1])) > 1e-9,
-        "the joints must have no armature or stiffness": bool(
-            m.dof_armature[dofs].any() or m.jnt_stiffness[frame.joints].any()
-        ),
+        "the joints must have no armature or stiffness": m.dof_armature[dofs].any()
+        or m.jnt_stiffness[frame.joints].any(),
         "the drive must be a plain motor": m.actuator_gaintype[a] != fixed
         or m.actuator_biastype[a] != int(mujoco.mjtBias.mjBIAS_NONE),
         "the turning actuator must be a speed servo": m.actuator_gaintype[t] != fixed
         or m.actuator_biastype[t] != int(mujoco.mjtBias.mjBIAS_AFFINE)
         or m.actuator_biasprm[t, 2] >= 0.0
-        or m.actuator_biasprm[t, 0] != 0.0
-        or m.actuator_biasprm[t, 1] != 0.0,
+        or m.actuator_biasprm[t, :2].any(),
         "the integrator must be Euler": m.opt.integrator != int(mujoco.mjtIntegrator.mjINT_EULER),
     }
     for expectation, broken in problems.items():
@@ -115,6 +101,7 @@ def heading_drive(plant: MujocoPlant, body: str, uncertainty: float = 0.0) -> He
             raise UnsupportedEnvError(f"body {body!r} is no heading drive: {expectation}. Use Clearance.")
     gear, turn_gear = float(m.actuator_gear[a, 0]), float(m.actuator_gear[t, 0])
     gain, turn_gain = float(m.actuator_gainprm[a, 0]), float(m.actuator_gainprm[t, 0])
+    yaw_clamp = float(m.actuator_forcerange[t, 1]) if m.actuator_forcelimited[t] else math.inf
     return HeadingDrive(
         mass=mass,
         damping=float(damping[0]),
@@ -125,8 +112,7 @@ def heading_drive(plant: MujocoPlant, body: str, uncertainty: float = 0.0) -> He
         drive_limit=gear * _force_limit(m, a, gain),
         yaw_gain=turn_gear * turn_gain,
         yaw_feedback=turn_gear**2 * float(m.actuator_biasprm[t, 2]),
-        yaw_limit=turn_gear
-        * (float(m.actuator_forcerange[t, 1]) if m.actuator_forcelimited[t] else math.inf),
+        yaw_limit=turn_gear * yaw_clamp,
         timestep=float(m.opt.timestep),
         substeps=plant.substeps,
         uncertainty=uncertainty,
@@ -134,7 +120,7 @@ def heading_drive(plant: MujocoPlant, body: str, uncertainty: float = 0.0) -> He
 
 
 def _force_limit(m: mujoco.MjModel, actuator: int, gain: float) -> float:
-    """The force that the actuator can give both ways: its clamp, or its control range times its gain."""
+    """The largest force in both directions: the control range times the gain, within the forcerange."""
     by_control = gain * float(min(-m.actuator_ctrlrange[actuator, 0], m.actuator_ctrlrange[actuator, 1]))
     if not m.actuator_forcelimited[actuator]:
         return by_control

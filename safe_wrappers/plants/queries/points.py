@@ -1,30 +1,21 @@
-"""Named points of a MuJoCo machine, or one point of an analytic state: how they move."""
+"""The motion of named points of a MuJoCo machine, or of one point of an analytic state."""
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 
-Array = NDArray[np.float64]
-
 
 class Points:
-    """Origins of bodies, sites and geoms (MujocoPlant), or state indices of one point (AnalyticPlant).
+    """Origins of named bodies, sites and geoms (MujocoPlant), or one point of the state (AnalyticPlant).
 
-    Args:
-        plant: Bound.
-        bodies: Names.
-        sites: Names.
-        geoms: Names.
-        position: Indices of the point's coordinates in the state.
-        velocity: Indices of its velocity, in the same order.
+    On an AnalyticPlant `position` and `velocity` are the indices of the point's coordinates and velocity in the
+    state.
 
     Raises:
-        ConfigurationError: Nothing is named that this plant can find; an unknown name with the list.
+        ConfigurationError: No point for this kind of plant, or an unknown name.
     """
 
     def __init__(
@@ -62,7 +53,7 @@ class Points:
         return [(x[self._position], x[self._velocity])]
 
     def accelerations(self) -> list[tuple[Array, Array, Array, Array]]:
-        """Position, velocity, acceleration drift and control matrix of each point."""
+        """Position, velocity, drift and control matrix of the acceleration of each point, SI."""
         if self._machine is not None:
             return [self._machine.point(kind, name) for kind, name in self._named]
         x, p, v = self._plant.state, self._position, self._velocity

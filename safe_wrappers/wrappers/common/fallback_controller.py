@@ -2,40 +2,26 @@
 
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.fallback import Fallback, FallbackFunction
 from safe_wrappers.plants.default import default_plant
 from safe_wrappers.plants.plant import Plant
-
-Array = NDArray[np.float64]
+from safe_wrappers.wrappers.common.layer import Array, Env
 
 
 class FallbackController:
-    """A fallback with the plant that it needs, bound to an env.
+    """A fallback ("brake", "hold", "zero" or a function of the plant) with the plant that it needs, bound to an env.
 
-    Args:
-        env: What is wrapped.
-        choice: "brake", "hold", "zero", or a function of the plant.
-        plant: None reads the env's MuJoCo model where the choice needs one.
-        constraint: Bound here; "brake" is its backup control, if it has one.
-
-    Attributes:
-        plant: Bound to the env; None where none is needed.
-        constraint: On the plant.
-
-    Raises:
-        ConfigurationError: "brake" on a plant that does not say what moves.
-        UnsupportedEnvError: No MuJoCo env, and no plant given.
+    `plant` None reads the env's MuJoCo model where the choice needs one. A constraint is bound here; "brake" is then
+    its backup control, if it has one.
     """
 
     def __init__(
         self,
-        env: gym.Env[Any, Any],
+        env: Env,
         choice: str | FallbackFunction,
         plant: Plant | None,
         constraint: Constraint | None = None,
@@ -44,10 +30,10 @@ class FallbackController:
         self._low, self._high = np.asarray(space.low, np.float64), np.asarray(space.high, np.float64)
         if plant is None and (callable(choice) or choice == "brake"):
             plant = default_plant(env)
+        self.plant, self.constraint = plant, None
         if plant is not None:
             plant.bind(env)
-        self.constraint = constraint.bind(plant) if constraint is not None and plant is not None else None
-        if plant is not None:
+            self.constraint = None if constraint is None else constraint.bind(plant)
             known = self.constraint is not None and self.constraint.has_backup
             if choice == "brake" and not (known or plant.can_brake):
                 raise ConfigurationError(
@@ -55,7 +41,6 @@ class FallbackController:
                     '"hold", "zero" or a function of the plant'
                 )
         self._fallback = Fallback(choice, [] if self.constraint is None else [self.constraint])
-        self.plant = plant
         self.reset()
 
     def reset(self) -> None:

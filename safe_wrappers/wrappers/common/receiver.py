@@ -1,22 +1,30 @@
 """CommandReceiver: a wrapper that is told how old a command is."""
 
 import math
-from typing import Any
+from typing import Any, Final
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.deprecation import deprecated_attribute, deprecated_method
 from safe_wrappers.errors import ActionError
 from safe_wrappers.plants.env_checks import wrappers_of
+from safe_wrappers.wrappers.common.layer import Env
+
+SAME_STEP: Final = 1e-6
+"""Control steps: times that are closer count as the same."""
+
+
+def whole_steps(time_s: float, control_dt: float) -> int:
+    """Control steps that cover a time, rounded up."""
+    return math.ceil(time_s / control_dt - SAME_STEP)
 
 
 class CommandReceiver:
     """Base of `ChunkHandover`, `LeaseExpiry`, `TeleopChannel` and the faults.
 
     An action of Gymnasium carries no time stamp, so a policy that repeats itself cannot be told from one that works.
-    Whoever carries actions (a fault, a queue, a network) calls `set_observation_time` before `step`; without a call
+    What carries actions (a fault, a queue, a network) calls `set_observation_time` before `step`; without a call
     the action was made from the newest observation.
     """
 
@@ -46,31 +54,22 @@ class CommandReceiver:
         self._observed_s = observed_s
 
     def admits(self, end: NDArray[np.float64], steps: int) -> bool:
-        """Whether a chunk may be executed; `ChunkHandover` asks before it takes one over.
-
-        Args:
-            end: The chunk's last command, shape (m,).
-            steps: Control steps from now to the end of that command.
-        """
+        """Whether a chunk may be executed that ends with this command, shape (m,), so many control steps from now."""
         return True
 
     deliver = deprecated_method("deliver", "set_observation_time")
 
 
-def receiver_inside(env: gym.Env[Any, Any]) -> CommandReceiver | None:
+def receiver_inside(env: Env) -> CommandReceiver | None:
     """The outermost receiver among an env's wrappers."""
     return next((inner for inner in wrappers_of(env) if isinstance(inner, CommandReceiver)), None)
 
 
-def action_array(action: Any, shape: tuple[int, ...]) -> NDArray[Any]:
-    """A copy of an action, in its own dtype: a policy may reuse its buffer.
-
-    Raises:
-        ActionError: No numbers, or another shape.
-    """
+def action_array(action: Any, shape: tuple[int, ...], dtype: type | None = None) -> NDArray[Any]:
+    """A copy of an action, in its own dtype unless told; an `ActionError` for another shape or no numbers."""
     try:
-        given = np.array(action)
-        given.astype(np.float64)
+        given = np.array(action, dtype)
+        given.astype(np.float64, copy=False)
     except (TypeError, ValueError):
         raise ActionError(f"expected an action of shape {shape}, got {action!r}") from None
     if given.shape != shape:

@@ -8,13 +8,9 @@ import numpy as np
 
 
 class WrapperRng:
-    """A generator that starts anew with the seed of a reset, and goes on from one episode to the next without one.
+    """Random numbers apart from the env's, which paired runs need unchanged; a reset's seed starts them anew.
 
-    Drawing from the env's generator would change its next episodes, and ruin paired runs. The env's first seed is
-    used where none was ever given.
-
-    Args:
-        stream: A name, such as the wrapper's, that keeps it apart from other generators of the same seed.
+    The env's first seed is used where none was ever given. `stream` keeps it apart from others of the same seed.
     """
 
     def __init__(self, stream: str) -> None:
@@ -30,11 +26,7 @@ class WrapperRng:
 
     @property
     def draw(self) -> np.random.Generator:
-        """The generator.
-
-        Raises:
-            gymnasium.error.ResetNeeded: Before the first reset.
-        """
+        """The generator; an error before the first reset."""
         if self._generator is None:
             raise gym.error.ResetNeeded("call reset before step")
         return self._generator

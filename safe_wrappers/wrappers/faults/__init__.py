@@ -1,11 +1,12 @@
 """What goes wrong between a policy and a robot, as seeded wrappers: to test with, and to train against."""
 
 from safe_wrappers.wrappers.faults.fault import Fault
-from safe_wrappers.wrappers.faults.on_off import FrozenPolicy, Outages
-from safe_wrappers.wrappers.faults.single_commands import (
+from safe_wrappers.wrappers.faults.kinds import (
     ClockSkew,
     DroppedRefreshes,
+    FrozenPolicy,
     Jitter,
+    Outages,
     RepeatedCommands,
 )
 

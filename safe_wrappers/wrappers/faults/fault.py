@@ -2,7 +2,7 @@
 
 import copy
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar, NamedTuple, SupportsFloat
+from typing import Any, ClassVar, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -12,28 +12,24 @@ from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.env_checks import check_timing, wrappers_of
 from safe_wrappers.stack import Layer
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
 from safe_wrappers.wrappers.common.receiver import CommandReceiver, receiver_inside
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 
 
 class Carried(NamedTuple):
-    """A command on its way.
-
-    Attributes:
-        action: What the policy gave.
-        observed_s: When the observation was returned that it was made from, s.
-    """
+    """A command on its way: what the policy gave, and when the observation was returned that it was made from, s."""
 
     action: Any
     observed_s: float
 
 
-class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, CommandReceiver, ABC):
+class Fault(LayerWrapper, CommandReceiver, ABC):
     """Base of the faults.
 
     Put it outermost: outside `LeaseExpiry` and `ChunkHandover`, which it tells how old a command is, or that none has
-    come. Without either of them inside the robot goes on with the last command, as a motor drive that holds its
-    setpoint does. Faults may be nested. A chunk is carried, lost or repeated as a whole.
+    come. Without either of them inside the robot goes on with the last command. Faults may be nested. A chunk is
+    carried, lost or repeated as a whole.
 
     Info, at every step: ``fault/active`` (bool).
 
@@ -47,9 +43,9 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
 
     _last: Any
 
-    def __init__(self, env: gym.Env[Any, Any], control_dt: float | None = None, **arguments: Any) -> None:
-        gym.utils.RecordConstructorArgs.__init__(self, control_dt=control_dt, **arguments)
-        gym.Wrapper.__init__(self, env)
+    def __init__(self, env: Env, control_dt: float | None = None, **arguments: Any) -> None:
+        self._record({"control_dt": control_dt, **arguments})
+        LayerWrapper.__init__(self, env)
         if not isinstance(env.action_space, gym.spaces.Box):
             raise ConfigurationError(f"a fault carries actions of a Box action space, got {env.action_space}")
         self._inside = receiver_inside(env)
@@ -59,14 +55,13 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
                 f"{type(self._inside).__name__} inside counts the time: leave control_dt out"
             )
         # Nested faults of one kind must not strike together.
-        same = _count(env, type(self))
-        self._nested = _count(env, Fault) > 0
+        faults = [inner for inner in wrappers_of(env) if isinstance(inner, Fault)]
+        same = sum(isinstance(inner, type(self)) for inner in faults)
+        self._nested = bool(faults)
         self.random = WrapperRng(type(self).__name__ + (f" {same + 1}" if same else ""))
         self._start()
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env, and what is on its way; the random numbers start anew with a seed."""
         observation, info = self.env.reset(seed=seed, options=options)
         self.random.reset(self.env, seed)
@@ -75,7 +70,7 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
         info[keys.FAULT_ACTIVE] = False
         return observation, info
 
-    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> Step:
         """Carry the action, or not, and step the env with what arrives."""
         given = None if self._observed_s is None else Carried(copy.copy(action), self._observed_s)
         arrived = self.carry(given, self.now_s)
@@ -116,7 +111,3 @@ class Fault(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs, Co
         self._observed_s = 0.0
         space: Any = self.env.action_space
         self._last = np.clip(np.zeros(space.shape), space.low, space.high).astype(space.dtype)
-
-
-def _count(env: gym.Env[Any, Any], kind: type[gym.Wrapper[Any, Any, Any, Any]]) -> int:
-    return sum(isinstance(inner, kind) for inner in wrappers_of(env))

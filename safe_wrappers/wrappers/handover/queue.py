@@ -1,64 +1,46 @@
 """ChunkQueue: which command a robot executes while chunks arrive late, broken or not at all."""
 
-import math
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES, join
 from safe_wrappers.control.handover.smoothstep import shortest_latched_blend, smoothstep
-
-Array = NDArray[np.float64]
+from safe_wrappers.wrappers.common.layer import Array
+from safe_wrappers.wrappers.common.receiver import whole_steps
 
 REPLACE: Final = "replace"
 ENSEMBLE: Final = "ensemble"
 BASELINES: Final = (REPLACE, ENSEMBLE)
 """What is done without a bound on the seam: the new chunk at once, or the mean of all chunks at hand."""
 
-_WHOLE: Final = 1e-6
-"""Control steps: a time that is longer than whole steps by less is meant to be those."""
-
 
 class Command(NamedTuple):
-    """What to send in a control step.
+    """What to send in a control step."""
 
-    Attributes:
-        control: Shape (m,), in the env's dtype and inside its box.
-        observed: Control step whose observation the command was made from; -1 before there was any.
-        starved: The queue is dry: the fallback gave it.
-        limited: It was held back beyond the blend to keep the rate limit.
-        took_over: A chunk took over with it.
-        seam: There is a seam before it: another chunk, another source, or the fallback began.
-        blend_steps: Control steps of the blend that begins with this command; 0 if none does.
-    """
-
-    control: NDArray[Any]
-    observed: int
-    starved: bool
-    limited: bool
-    took_over: bool
-    seam: bool
-    blend_steps: int
+    control: NDArray[Any]  # shape (m,), in the env's dtype and inside its box
+    observed: int  # control step whose observation the command was made from; -1 before there was any
+    starved: bool  # the queue is empty: the fallback gave it
+    limited: bool  # held back beyond the blend to keep the rate limit
+    took_over: bool  # a chunk took over with it
+    refused: bool  # a chunk that has arrived was refused
+    seam: bool  # there is a seam before it: another chunk, another source, or the fallback began
+    blend_steps: int  # control steps of the blend that begins with this command; 0 if none does
 
 
 class Chunk(NamedTuple):
-    """A chunk on its way, or there.
+    """A chunk on its way, or there."""
 
-    Attributes:
-        commands: Shape (h, m), the first one for the control step of the observation.
-        observed: Control step of the observation.
-        due: Control step at which it is there.
-    """
-
-    commands: Array
-    observed: int
-    due: int
+    commands: Array  # shape (h, m), the first one for the control step of the observation
+    observed: int  # control step of the observation
+    due: int  # control step at which it is there
 
 
 class _Fade(NamedTuple):
-    """A mode switch under way: from a latched command into the commands of the new source."""
+    """A change of the source under way: from a latched command into the commands of the new source."""
 
     latched: Array
     steps: int
@@ -66,41 +48,29 @@ class _Fade(NamedTuple):
 
 
 class ChunkQueue:
-    """Which command comes next. It counts control steps; it knows no clock and no env.
+    """Which command comes next, counted in control steps.
 
-    A chunk's entry j is meant for the j-th control step after its observation. A chunk that was observed at step k
-    and is there at step t is consumed from its entry t - k on: latency is what has been consumed, never an
-    estimate. It takes over from the left-over of the chunk before it, over a seam (`control/handover/seams.py`);
-    "replace" takes the new chunk at once, and "ensemble" averages what all chunks at hand ask for at a step. A queue
-    that has run dry asks the fallback.
-
-    A chunk of one has no left-over to blend with: what it asks for is sent as it is, and only a change of its
-    source (`switch`), to and from the fallback too, is faded over.
+    A chunk that was observed at step k and is there at step t is consumed from its entry t - k on: latency is
+    measured, not estimated. A chunk of one has no left-over to blend with: it is sent as it is, and only a change of
+    its source (`switch`), to and from the fallback too, is faded over.
 
     Args:
-        controls: m.
+        space: Of single commands, shape (m,); what is outside is clipped, at most to the largest number of the dtype.
         control_dt: Control interval, s.
         blend: A blend of `control/handover/seams.py`, "replace" or "ensemble".
         fewest: A blend takes at least so many control steps.
         rate_limit: Largest |du/dt| of every component, shape (m,), action units per second; infinite for none.
-        low: Action box, shape (m,); what is outside of it is clipped to it. Where it is infinite it ends at the
-            largest number of the dtype.
-        high: Likewise.
-        dtype: Of the commands.
         decay: Ensembling weighs the i-th oldest chunk by exp(-decay i).
     """
 
     def __init__(
         self,
-        controls: int,
+        space: gym.spaces.Box,
         control_dt: float,
         *,
         blend: str,
         fewest: int,
         rate_limit: Array,
-        low: Array,
-        high: Array,
-        dtype: Any,
         decay: float,
     ) -> None:
         self._control_dt, self._blend, self._fewest, self._decay = control_dt, blend, fewest, decay
@@ -108,10 +78,12 @@ class ChunkQueue:
         step = np.asarray(rate_limit * control_dt)
         # The difference of two commands, divided by the interval again, must not come out above the limit.
         self._step = np.where(step / control_dt > rate_limit, np.nextafter(step, 0.0), step)
-        largest = min(float(np.finfo(dtype).max), float(np.finfo(np.float32).max))
-        self._low, self._high = np.maximum(low, -largest), np.minimum(high, largest)
+        dtype: Any = space.dtype
         self._dtype = np.dtype(dtype)
-        self._none = np.zeros((0, controls))
+        largest = min(float(np.finfo(dtype).max), float(np.finfo(np.float32).max))
+        self._low = np.maximum(np.asarray(space.low, np.float64), -largest)
+        self._high = np.minimum(np.asarray(space.high, np.float64), largest)
+        self._none = np.zeros((0, self._low.size))
         self._source = ""
         self.reset()
 
@@ -128,15 +100,10 @@ class ChunkQueue:
         self._fade: _Fade | None = None
 
     def submit(self, commands: Array, observed: int, due: int) -> bool:
-        """A chunk is on its way; False if it is refused.
+        """A chunk, shape (h, m), observed at a control step, is on its way; False if it is refused.
 
-        Refused are a chunk with an entry that is not finite, and one whose observation is not newer than the
-        newest one heard of (a repeat), or lies in the future.
-
-        Args:
-            commands: Shape (h, m).
-            observed: Control step of its observation.
-            due: Control step at which it is there.
+        Refused are a chunk with an entry that is not finite, and one whose observation is in the future or not newer
+        than all before it.
         """
         newest = max([self._observed, *(c.observed for c in self._coming)])
         if not newest < observed <= self.now or not np.isfinite(commands).all():
@@ -149,22 +116,15 @@ class ChunkQueue:
         """Chunks that take over from now on are somebody else's; the change is blended, from the last command."""
         self._source = source
 
-    def arrived(self) -> list[Chunk]:
-        """The chunks that are there and wait for admission, the newest observation first."""
-        return [c for c in reversed(self._coming) if c.due <= self.now]
-
-    def left(self, chunk: Chunk) -> Array:
-        """The commands of a chunk from now on, shape (k, m); none if it comes too late."""
-        return chunk.commands[self.now - chunk.observed :]
-
-    def next(self, admitted: list[Chunk], fallback: Callable[[], Array]) -> Command:
+    def next(self, admits: Callable[[Array, int], bool], fallback: Callable[[], Array]) -> Command:
         """The command of this control step.
 
         Args:
-            admitted: Of the chunks that have `arrived` those that may take over, the newest first; the others are
-                refused, or overtaken.
-            fallback: Asked when nothing is planned; returns a finite control of shape (m,).
+            admits: Whether a chunk that has arrived may take over, by its last command, shape (m,), and the control
+                steps until the end of that command.
+            fallback: Called when nothing is planned; returns a finite control of shape (m,).
         """
+        admitted, refused = self._admitted(admits)
         newest = self._observed
         self._coming = [c for c in self._coming if c.due > self.now]
         seam, blend_steps = self._take_over(admitted) if admitted else (False, 0)
@@ -184,7 +144,21 @@ class ChunkQueue:
         self._sent = np.concatenate([self._sent[-DIFFERENCES + 1 :], sent[None].astype(np.float64)])
         self.now += 1
         took_over = self._observed > newest
-        return Command(sent, self._observed, starved, limited or held, took_over, seam, blend_steps)
+        return Command(sent, self._observed, starved, limited or held, took_over, refused, seam, blend_steps)
+
+    def _admitted(self, admits: Callable[[Array, int], bool]) -> tuple[list[Chunk], bool]:
+        """The chunks that may take over now, the newest observation first; and whether one was refused."""
+        admitted: list[Chunk] = []
+        refused = False
+        for chunk in reversed([c for c in self._coming if c.due <= self.now]):
+            left = chunk.commands[self.now - chunk.observed :]
+            if not (len(left) and admits(left[-1], len(left))):  # it came too late, or must not
+                refused = True
+                continue
+            admitted.append(chunk)
+            if self._blend != ENSEMBLE:
+                break
+        return admitted, refused
 
     def _take_over(self, admitted: list[Chunk]) -> tuple[bool, int]:
         """Let the newest of these take over, or all in an ensemble: whether it is a seam, and its blend's steps."""
@@ -194,7 +168,7 @@ class ChunkQueue:
         if self._blend == ENSEMBLE:
             self._averaged += reversed(admitted)
             return len(self._sent) > 0, 0
-        fresh = self.left(newest)
+        fresh = newest.commands[self.now - newest.observed :]
         if self._blend == REPLACE or len(newest.commands) == 1:
             self._plan, self._limited = fresh, np.zeros(len(fresh), dtype=bool)
             return self._blend == REPLACE and len(self._sent) > 0, 0
@@ -234,7 +208,7 @@ class ChunkQueue:
         if bounded.any():
             change = np.abs(target - self._sent[-1])[bounded]
             shortest = float(shortest_latched_blend(change, self._rate_limit[bounded]).max())
-            steps = max(steps, math.ceil(shortest / self._control_dt - _WHOLE) - 1)
+            steps = max(steps, whole_steps(shortest, self._control_dt) - 1)
         return steps
 
     def _faded(self, control: Array) -> Array:

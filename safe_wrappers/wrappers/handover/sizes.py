@@ -1,50 +1,36 @@
-"""The sizes of chunks and the bounds on their blends, checked against each other at construction."""
+"""The sizes of chunks and the bounds on their blends, checked against each other; and chunks at a slower rate."""
 
-import math
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import positive, whole_number
 from safe_wrappers.control.handover.seams import BLENDS
+from safe_wrappers.control.handover.splines import hermite_series
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.common.layer import Array
+from safe_wrappers.wrappers.common.receiver import whole_steps
 from safe_wrappers.wrappers.handover.queue import BASELINES
-
-_WHOLE: Final = 1e-6
-"""Control steps: a time that is longer than whole steps by less is meant to be those."""
-
-Array = NDArray[np.float64]
 
 
 class ChunkSizes(NamedTuple):
-    """In control steps, by the names of real-time chunking: H, s, and the least and the most of d.
+    """In control steps, by the names of real-time chunking: H, s, and the least and the most of d."""
 
-    Attributes:
-        entries: chunk_size.
-        steps_per_entry: Control steps from one entry to the next.
-        chunk: H, the control steps that a chunk has a command for; with one step per entry its entries.
-        horizon: execution_horizon s.
-        delay: The least and the largest inference_delay d; `d <= s <= H - d` holds for the largest.
-    """
-
-    entries: int
-    steps_per_entry: int
-    chunk: int
-    horizon: int
-    delay: tuple[int, int]
+    entries: int  # chunk_size
+    steps_per_entry: int  # control steps from one entry to the next
+    chunk: int  # H, the control steps that a chunk has a command for; with one step per entry its entries
+    horizon: int  # execution_horizon s
+    delay: tuple[int, int]  # the least and the largest inference_delay d; d <= s <= H - d holds for both
 
     @classmethod
     def checked(
         cls, chunk_size: Any, execution_horizon: Any, inference_delay: Any, steps_per_entry: Any
     ) -> "ChunkSizes":
         """The sizes as the user gave them, or an error that says what would fit."""
-        entries, horizon = (
-            whole_number("chunk_size", chunk_size, 1, "control steps"),
-            whole_number("execution_horizon", execution_horizon, 1, "control steps"),
-        )
+        entries = whole_number("chunk_size", chunk_size, 1, "control steps")
+        horizon = whole_number("execution_horizon", execution_horizon, 1, "control steps")
         apart = whole_number("steps_per_entry", steps_per_entry, 1, "control steps")
         if entries == 1 and apart > 1:
             raise ConfigurationError(
@@ -84,12 +70,7 @@ def blend_bounds(
     blend_time: float | None,
     rate_limit: float | Sequence[float] | None,
 ) -> tuple[int, Array]:
-    """The fewest steps of a blend, and the rate limit of every component, shape (m,), infinite where there is none.
-
-    Raises:
-        ConfigurationError: Bounds for a baseline, that are not positive, that do not fit into a chunk, or nothing to
-            blend over.
-    """
+    """The fewest steps of a blend, and the rate limit of every component, shape (m,), infinite for none."""
     if blend in BASELINES:
         if blend_time is not None or rate_limit is not None:
             raise ConfigurationError(
@@ -99,7 +80,7 @@ def blend_bounds(
         return 0, np.full(space.shape, np.inf)
     fewest, limits = 0, np.full(space.shape, np.inf)
     if blend_time is not None:
-        fewest = max(math.ceil(positive("blend_time", blend_time, "s") / control_dt - _WHOLE) - 1, 1)
+        fewest = max(whole_steps(positive("blend_time", blend_time, "s"), control_dt) - 1, 1)
         available = sizes.chunk - sizes.delay[1]
         if fewest >= available and sizes.chunk > 1:
             raise ConfigurationError(
@@ -156,3 +137,27 @@ def _rounding(space: gym.spaces.Box) -> float:
     largest = float(ends[np.isfinite(ends)].max(initial=1.0))
     dtype: Any = space.dtype
     return 2.0 * float(np.finfo(dtype).eps) * largest
+
+
+class Upsampling:
+    """Chunks of entries that lie some control steps apart, as commands on a cubic Hermite spline through the entries.
+
+    A chunk ends with its last entry. Between entries the spline may overshoot their range.
+    """
+
+    def __init__(self, entries: int, steps: int) -> None:
+        self._steps = steps
+        if steps > 1:
+            times = np.arange(entries) * float(steps)
+            unit = np.eye(entries)
+            rates = np.asarray(np.gradient(unit, axis=1)) / steps
+            # The spline is linear in the entries: one matrix for all chunks.
+            self._weights = hermite_series(times, unit, rates, np.arange((entries - 1) * steps + 1)).T
+
+    def commands(self, chunk: Array) -> Array:
+        """The commands of a chunk (H, m), shape ((H - 1) steps + 1, m); at the entries these bit for bit."""
+        if self._steps == 1:
+            return chunk
+        commands = self._weights @ chunk
+        commands[:: self._steps] = chunk
+        return commands

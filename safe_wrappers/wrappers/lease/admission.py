@@ -1,52 +1,28 @@
 """Admission: whether a chunk of position setpoints may be executed at all: is its end within reach, in its time?"""
 
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from typing import Any
 
-import gymnasium as gym
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from safe_wrappers.control.watchdog.reachability import MotionLimits, admits, jerk_limited_time
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.wrappers.common.layer import Array, Env
 
-Array = NDArray[np.float64]
-
-Measured = Callable[[gym.Env[Any, Any]], tuple[ArrayLike, ...]]
-"""Takes the env; returns what the actions are setpoints of, its velocity and, if known, its acceleration, shapes
-(m,)."""
-
-ARRIVALS: Final = ("moving", "rest")
-_EXPECTED: Final = (
-    'motion_limits is {"max_acceleration": ..., "max_speed": ..., "max_jerk": ..., "arrival": "moving" or "rest"}, '
-    "all but the first at will, the limits each a number or one for each of the"
-)
+Measured = Callable[[Env], tuple[ArrayLike, ...]]
+"""Takes the env; returns what the actions are setpoints of, velocities and, if known, accelerations, shapes (m,)."""
 
 
 class Admission:
-    """Refuses chunks that no motion within the limits could follow to their end.
+    """Refuses chunks that no motion within the limits could follow to their end; a necessary condition only.
 
-    Necessary only: what is admitted still needs its path and its stopping checked. By "moving" the end may be passed
-    at any speed (`admits`, an idealised bound); by "rest" the machine must be able to stand there in time
-    (`jerk_limited_time`, the constrained profile from the measured state).
-
-    Args:
-        env: What is wrapped.
-        motion_limits: Limits of the motion and the kind of arrival.
-        measured: None reads the lengths and velocities of the MuJoCo actuators.
-        controls: m.
-
-    Raises:
-        ConfigurationError: Limits that are none, or an acceleration that is needed and not measured.
-        UnsupportedEnvError: Nothing says where the machine is.
+    With arrival "moving" the end may be passed at any speed; with "rest" the machine must be able to stand there in
+    time. `measured` None reads the lengths and velocities of the MuJoCo actuators; `controls` is m.
     """
 
     def __init__(
-        self,
-        env: gym.Env[Any, Any],
-        motion_limits: Mapping[str, Any],
-        measured: Measured | None,
-        controls: int,
+        self, env: Env, motion_limits: Mapping[str, Any], measured: Measured | None, controls: int
     ) -> None:
         if measured is None and not hasattr(env.unwrapped, "data"):
             raise UnsupportedEnvError(
@@ -62,12 +38,15 @@ class Admission:
             if isinstance(error, ConfigurationError):
                 raise
             raise ConfigurationError(
-                f"{_EXPECTED} {controls} action components; got {motion_limits!r}"
+                'motion_limits is {"max_acceleration": ..., "max_speed": ..., "max_jerk": ..., "arrival": "moving" '
+                'or "rest"}, all but the first at will, the limits each a number or one for each of the '
+                f"{controls} action components; got {motion_limits!r}"
             ) from None
-        if arrival not in ARRIVALS:
-            raise UnknownNameError(f"arrival is {' or '.join(map(repr, ARRIVALS))}, got {arrival!r}")
+        if arrival not in ("moving", "rest"):
+            raise UnknownNameError(f"arrival is 'moving' or 'rest', got {arrival!r}")
         self._rest = arrival == "rest"
-        if self._rest and measured is None and np.isfinite(self._limits.arrays[2]).any():
+        self._needs_acceleration = self._rest and bool(np.isfinite(self._limits.arrays[2]).any())
+        if self._needs_acceleration and measured is None:
             raise ConfigurationError(
                 "arrival at rest with limited jerk starts from the measured acceleration, which MuJoCo's actuators "
                 "do not give: pass measured, a function of the env that returns positions, velocities, accelerations"
@@ -75,12 +54,7 @@ class Admission:
         self._env, self._measured = env, measured
 
     def admits(self, end: Array, duration_s: float) -> bool:
-        """Whether a chunk may be executed.
-
-        Args:
-            end: Its last command, shape (m,).
-            duration_s: From now to the end of that command, s.
-        """
+        """Whether a chunk may be executed that ends with a command (m,) after so many seconds."""
         position, velocity, acceleration = self._state()
         a_max, v_max, jerk = self._limits.arrays
         if not self._rest:
@@ -95,11 +69,9 @@ class Admission:
             data: Any = getattr(self._env.unwrapped, "data")  # noqa: B009
             return data.actuator_length, data.actuator_velocity, None
         state = self._measured(self._env)
-        if len(state) == 3:
-            return state[0], state[1], state[2]
-        if len(state) != 2 or (self._rest and np.isfinite(self._limits.arrays[2]).any()):
+        if len(state) != 3 and (len(state) != 2 or self._needs_acceleration):
             raise ConfigurationError(
                 "measured returns positions and velocities, and for an arrival at rest with limited jerk also "
                 f"accelerations; got {len(state)} values"
             )
-        return state[0], state[1], None
+        return state[0], state[1], state[2] if len(state) == 3 else None

@@ -5,9 +5,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import check_fields, non_negative, positive, settings_from
 from safe_wrappers.constraints.clearance import Clearance
@@ -17,10 +16,9 @@ from safe_wrappers.filter.constraint import BoundConstraint, Constraint
 from safe_wrappers.plants.default import default_plant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import constraint_from
+from safe_wrappers.wrappers.common.layer import Array, Env
 
-Array = NDArray[np.float64]
-
-ClearanceFunction = Callable[[gym.Env[Any, Any]], tuple[ArrayLike, ArrayLike]]
+ClearanceFunction = Callable[[Env], tuple[ArrayLike, ArrayLike]]
 """Takes the env; returns clearances (m) and the approach speeds towards them (m/s), shapes (k,)."""
 
 _ROW_TOLERANCE = 1e-9
@@ -31,19 +29,12 @@ _ROW_TOLERANCE = 1e-9
 class StoppingBudget:
     """Clearance, bounds on the motion and reserves from which a stop is worked out; shared by lease and ceiling.
 
-    For an approach speed v, worked out at every reading:
-
-        way(time) + v'^2 / (2 braking) + localisation + margin <= clearance
-
-    with the way and the speed v' after the time that a command goes on, `act_s` included, at full `acceleration`.
-    Plain data if its clearance is.
-
     Args:
         clearance: A `Clearance` or the dict of one; any other constraint, with `closing_speed`; or a function of the
             env that returns clearances in m and approach speeds in m/s, shapes (k,).
         braking: Verified lower bound on the deceleration of the fallback, m/s^2; None takes the constraint's own.
-        acceleration: Largest approach acceleration that any command may cause, m/s^2; 0 for a machine that cruises.
-            The fallback's commands count too: braking a machine that recedes pushes it towards the obstacle.
+        acceleration: Largest approach acceleration that any command may cause, the fallback's too, m/s^2; 0 for a
+            machine that cruises.
         closing_speed: For constraints other than Clearance: the fastest that their value may fall, in its unit per
             second, stopping distance and all, under any command.
         top_speed: Bound on the approach speed, m/s; None: none.
@@ -79,17 +70,19 @@ class StoppingBudget:
         check_fields(self, positive, ["braking"], "m/s^2")
         check_fields(self, positive, ["top_speed"], "m/s")
         check_fields(self, positive, ["closing_speed"], "the constraint's unit per second")
-        if self.measures_approach:
-            self._check_bounds_on_approach()
-        else:
-            self._check_closing_speed()
-
-    @property
-    def measures_approach(self) -> bool:
-        """Whether approach speeds are measured, and not only bounded by `closing_speed`."""
-        return not isinstance(self.clearance, Constraint) or self.clearance.measures_approach
-
-    def _check_bounds_on_approach(self) -> None:
+        name = type(self.clearance).__name__
+        if not self.measures_approach and self.closing_speed is None:
+            raise ConfigurationError(
+                f"{name} does not say how fast it is approached: give closing_speed, the fastest that its value may "
+                "fall, in its unit per second"
+            )
+        if not self.measures_approach and (self.braking, self.acceleration, self.top_speed) != (None,) * 3:
+            raise ConfigurationError(
+                f"the value of {name} counts braking already: give closing_speed alone, without braking, "
+                "acceleration and top_speed"
+            )
+        if not self.measures_approach:
+            return
         if self.braking is None and not isinstance(self.clearance, Clearance):
             raise ConfigurationError(
                 "braking is missing: a verified lower bound on the deceleration of the fallback, in m/s^2"
@@ -105,18 +98,10 @@ class StoppingBudget:
                 "measured: give acceleration (and top_speed)"
             )
 
-    def _check_closing_speed(self) -> None:
-        name = type(self.clearance).__name__
-        if self.closing_speed is None:
-            raise ConfigurationError(
-                f"{name} does not say how fast it is approached: give closing_speed, the fastest that its value may "
-                "fall, in its unit per second"
-            )
-        if any(given is not None for given in (self.braking, self.acceleration, self.top_speed)):
-            raise ConfigurationError(
-                f"the value of {name} counts braking already: give closing_speed alone, without braking, "
-                "acceleration and top_speed"
-            )
+    @property
+    def measures_approach(self) -> bool:
+        """Whether approach speeds are measured, and not only bounded by `closing_speed`."""
+        return not isinstance(self.clearance, Constraint) or self.clearance.measures_approach
 
 
 def budget_from(given: Any) -> StoppingBudget:
@@ -127,22 +112,12 @@ def budget_from(given: Any) -> StoppingBudget:
 
 
 class BoundBudget:
-    """A budget that measures an env.
+    """A budget that measures an env."""
 
-    Args:
-        budget: What is measured, and what a stop takes.
-        env: What is wrapped.
+    clearance: Array  # at the last `measure`, m, shape (k,); values of a constraint that measures no approach
+    speed: Array  # approach speeds, m/s, shape (k,)
 
-    Attributes:
-        constraint: The clearance, if it is a constraint: with the budget's own reserves, to be bound to the plant.
-    """
-
-    clearance: Array
-    """Clearances at the last `measure`, m, shape (k,); the values of a constraint that measures no approach."""
-    speed: Array
-    """Approach speeds, m/s, shape (k,)."""
-
-    def __init__(self, budget: StoppingBudget, env: gym.Env[Any, Any]) -> None:
+    def __init__(self, budget: StoppingBudget, env: Env) -> None:
         self._budget, self._env = budget, env
         self._measures_approach = budget.measures_approach
         given: Any = budget.clearance
@@ -165,15 +140,7 @@ class BoundBudget:
         return default_plant(self._env) if plant is None and self.constraint is not None else plant
 
     def bind(self, plant: Plant | None, bound: BoundConstraint | None = None) -> None:
-        """Measure on a plant that is bound to the env.
-
-        Args:
-            plant: None if the clearance is a function.
-            bound: The constraint on it, if it has been bound already.
-
-        Raises:
-            ConfigurationError: A constraint without a value.
-        """
+        """Measure on a plant that is bound to the env, and on the constraint if it is bound already."""
         self._bound = bound
         if bound is None and self.constraint is not None and plant is not None:
             self._bound = self.constraint.bind(plant)
@@ -214,10 +181,7 @@ class BoundBudget:
     def longest_time(self, delays_s: float = 0.0) -> float:
         """The longest time that the worst command may go on from the measured state, s; zero or less: stop now.
 
-        NaN where the measurement is not finite; inf without obstacles near.
-
-        Args:
-            delays_s: All delays but `act_s` that pass besides, s.
+        NaN where the measurement is not finite; inf without obstacles near. `delays_s` are all delays but `act_s`, s.
         """
         if not self.readable:
             return math.nan
@@ -234,22 +198,15 @@ class BoundBudget:
 
     def longest_round_trip(self, video_s: float, human_s: float) -> float:
         """The longest round trip from which an operator can stop in time, s; inf where nothing approaches."""
-        ceilings = round_trip_ceiling(
-            self.clearance,
-            self.speed,
-            video_s=video_s,
-            human_s=human_s,
-            act_s=self._budget.act_s,
-            **self._stop,
-        )
+        delays = {"video_s": video_s, "human_s": human_s, "act_s": self._budget.act_s}
+        ceilings = round_trip_ceiling(self.clearance, self.speed, **delays, **self._stop)
         return float(ceilings[self.speed > 0.0].min(initial=math.inf))
 
     def can_stop_after(self, command: Array, duration_s: float) -> bool:
         """Whether the machine can stop by itself after a command of so many seconds.
 
-        First by the declared bounds, whatever the command is; else by the rows of a `Clearance`, which know how the
-        machine answers this command. With `act_s`, and with other clearances, there are no such rows: next to the
-        limit no command is admitted then, not even one that leads away.
+        Either by the declared bounds, whatever the command is, or by the rows of a `Clearance`, which depend on the
+        command. There are none with `act_s` or with other clearances: next to the limit no command is admitted then.
         """
         if self.longest_time() >= duration_s:
             return True

@@ -6,23 +6,22 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from safe_wrappers.checks import non_negative, positive, settings_from
+from safe_wrappers.checks import check_fields, non_negative, positive, settings_from
 from safe_wrappers.control.estimation.covariance import checked_noise
+from safe_wrappers.control.numerics.spatial import from_sensor, lever_arm_velocity, to_sensor
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.queries.line_of_sight import LineOfSight
 from safe_wrappers.serialize import plain_numbers
-
-Array = NDArray[np.float64]
+from safe_wrappers.wrappers.common.layer import Array
 
 
 @dataclass
 class Sensor:
     """A camera, or any other sensor that needs a line of sight, on a body of the model.
 
-    What it measures is simulated: the tracked point's position relative to the sensor, and if asked for its velocity
-    relative to it, in the sensor's own axes, with Gaussian noise. The pose of the body it sits on is known; where
-    on the body it sits is the model's, or left out (`lever_arm`).
+    It measures the tracked point's position relative to the sensor, and if asked for its velocity relative to it, in
+    the sensor's own axes, with Gaussian noise. The pose of the body that it sits on is known.
 
     Args:
         camera: Name of a camera in the model, which looks along its own -z; or
@@ -36,7 +35,7 @@ class Sensor:
         velocity_std: Likewise of a measured velocity, m/s and m^2/s^2. None: it does not measure velocities.
         dropout: Probability that a measurement of what is in sight is lost, for each track and step, below 1.
         lever_arm: Whether the estimator knows where on its body the sensor sits. False takes it for the body's
-            origin, which is wrong wherever the body turns; it is there to show by how much.
+            origin, which is wrong wherever the body turns.
 
     Raises:
         ConfigurationError: Both or neither of camera and site, nothing measured, or a number outside its range.
@@ -61,11 +60,9 @@ class Sensor:
         for name in ("camera", "site"):
             if not isinstance(getattr(self, name), str | None):
                 raise ConfigurationError(f"{name} is a name, got {getattr(self, name)!r}")
-        if self.view_deg is not None:
-            self.view_deg = positive("view_deg", self.view_deg, "degrees")
-        if self.range_m is not None:
-            self.range_m = positive("range_m", self.range_m, "m")
-        self.dropout = non_negative("dropout", self.dropout, "probability per step")
+        check_fields(self, positive, ["view_deg"], "degrees")
+        check_fields(self, positive, ["range_m"], "m")
+        check_fields(self, non_negative, ["dropout"], "probability per step")
         if self.dropout >= 1.0:
             raise ConfigurationError(
                 f"dropout is a probability below 1: nothing would ever be measured at {self.dropout}"
@@ -81,25 +78,29 @@ class Sensor:
             setattr(self, name, plain_numbers(getattr(self, name)))
 
     def matrices(self, coordinates: int) -> tuple[Array, Array]:
-        """C (m, 2d) and the noise covariance R (m, m) for states (position, velocity) of d coordinates.
-
-        Raises:
-            ConfigurationError: A covariance of the wrong shape, not symmetric, or singular.
-        """
-        rows, blocks = [], []
+        """C (m, 2d) and the noise covariance R (m, m) for states (position, velocity) of d coordinates."""
         state = np.eye(2 * coordinates)
         parts = {"position_std": state[:coordinates], "velocity_std": state[coordinates:]}
-        for name, part in parts.items():
-            given = getattr(self, name)
-            if given is not None:
-                rows.append(part)
-                blocks.append(_noise(name, given, coordinates))
-        noise = np.zeros((sum(b.shape[0] for b in blocks),) * 2)
-        at = 0
-        for block in blocks:
-            noise[at : at + coordinates, at : at + coordinates] = block
-            at += coordinates
-        return np.concatenate(rows), noise
+        measured = {name: part for name, part in parts.items() if getattr(self, name) is not None}
+        noise = np.zeros((coordinates * len(measured),) * 2)
+        for i, name in enumerate(measured):
+            block = slice(i * coordinates, (i + 1) * coordinates)
+            noise[block, block] = _noise(name, getattr(self, name), coordinates)
+        return np.concatenate(list(measured.values())), noise
+
+    def measured(self, sight: LineOfSight, d: int, truth: Array, velocities: Array | None) -> Array:
+        """Positions (k, 3), m, and velocities (k, d), m/s, as they are measured, noise aside, shape (k, m)."""
+        body = np.array(sight.data.xpos[sight.body])
+        eye, axes = sight.position, sight.rotation
+        believed = eye if self.lever_arm else body
+        parts = []
+        if self.position_std is not None:
+            parts.append(from_sensor(to_sensor(truth, axes, eye), axes, believed)[:, :d])
+        if velocities is not None:
+            linear, angular = sight.velocity(sight.body)
+            apparent = velocities - lever_arm_velocity(linear, angular, eye - body)[:d]
+            parts.append(apparent + lever_arm_velocity(linear, angular, believed - body)[:d])
+        return np.concatenate(parts, axis=1)
 
     def data(self) -> dict[str, Any]:
         """Plain data, from which it can be made again."""

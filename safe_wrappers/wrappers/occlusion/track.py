@@ -1,37 +1,34 @@
 """Track: something that moves, and what is known of how it moves."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence, Sized
 from dataclasses import asdict, dataclass
-from typing import Any
+from fnmatch import fnmatchcase
+from typing import Any, NamedTuple
 
+import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from safe_wrappers.checks import non_negative, positive, settings_from
+from safe_wrappers.checks import check_fields, non_negative, positive, settings_from
 from safe_wrappers.control.estimation.covariance import checked_covariance
 from safe_wrappers.control.estimation.tracks import Motion
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.serialize import plain_numbers
-
-Array = NDArray[np.float64]
+from safe_wrappers.wrappers.common.layer import Array
 
 
 @dataclass
 class Track:
-    """What an `OcclusionPenalty` follows: bodies of the model, or points that the env publishes.
+    """What an `OcclusionPenalty` follows: bodies of the model, or points that the env publishes, and how they move.
 
-    Its motion is a model, and everything that is promised later rests on it: acceleration is white noise of a known
-    intensity, and the velocity either wanders freely or goes back to a mean.
-
-    At a reset the track starts from an initial fix of the declared accuracy: the true position plus noise of
-    `start_position_std`, and the mean velocity, which is known to `start_velocity_std`.
+    Acceleration is white noise of a known intensity, and the velocity either wanders freely or goes back to a mean.
+    At a reset the track starts from the true position plus noise of `start_position_std`, and from the mean velocity.
 
     Args:
         bodies: Name of a body, or a pattern ("car*", "car[012]") for every body that fits, in the model's order.
         published: Instead of bodies: name of an attribute of the env, positions of shape (k, 2) or (k, 3), m.
         acceleration_noise: Intensity q of the white acceleration noise, m^2/s^3: after t seconds unseen it adds
             q t^3 / 3 to the variance of a position. A number, one per coordinate (0 along a coordinate that does not
-            wander), or a matrix, d x d. It has no default: a guess would be a promise.
+            wander), or a matrix, d x d. It has no default.
         reversion_s: Time constant with which the velocity goes back to `mean_velocity`, s; None: it does not.
         mean_velocity: m/s, one per coordinate; zeros if left out. What the velocity is taken for at a reset, too.
         start_position_std: m, a number or one per coordinate.
@@ -64,40 +61,32 @@ class Track:
                 "say how it moves: acceleration_noise, the intensity of its white acceleration noise in m^2/s^3 (0: "
                 "it keeps its velocity exactly)"
             )
-        if self.reversion_s is not None:
-            self.reversion_s = positive("reversion_s", self.reversion_s, "s")
+        check_fields(self, positive, ["reversion_s"], "s")
         for name in ("acceleration_noise", "mean_velocity", "start_position_std", "start_velocity_std"):
             setattr(self, name, plain_numbers(getattr(self, name)))
 
     def motion(self, coordinates: int) -> Motion:
-        """The motion model for d coordinates.
-
-        Raises:
-            ConfigurationError: Numbers of the wrong count or range.
-        """
+        """The motion model for d coordinates."""
         mean = self.mean_velocity
         return Motion(
             _intensity(self.acceleration_noise, coordinates),
             np.inf if self.reversion_s is None else self.reversion_s,
-            np.zeros(coordinates) if mean is None else _each("mean_velocity", mean, coordinates, "m/s"),
+            np.zeros(coordinates)
+            if mean is None
+            else _each("mean_velocity", mean, coordinates, "m/s", signed=True),
         )
 
     def start(self, coordinates: int) -> tuple[Array, Array]:
         """Standard deviations of position and velocity at a reset, shapes (d,)."""
-        deviations = []
-        for name, unit in (("start_position_std", "m"), ("start_velocity_std", "m/s")):
-            values = _each(name, getattr(self, name), coordinates, unit)
-            for value in values:
-                non_negative(name, value, unit)
-            deviations.append(values)
-        return deviations[0], deviations[1]
+        position = _each("start_position_std", self.start_position_std, coordinates, "m")
+        return position, _each("start_velocity_std", self.start_velocity_std, coordinates, "m/s")
 
     def data(self) -> dict[str, Any]:
         """Plain data, from which it can be made again."""
         return asdict(self)
 
 
-def _each(name: str, given: Any, coordinates: int, unit: str) -> Array:
+def _each(name: str, given: Any, coordinates: int, unit: str, signed: bool = False) -> Array:
     """One number per coordinate."""
     try:
         values = np.asarray(given, dtype=np.float64)
@@ -108,16 +97,15 @@ def _each(name: str, given: Any, coordinates: int, unit: str) -> Array:
         ) from None
     if not np.isfinite(values).all():
         raise ConfigurationError(f"{name} must be finite, in {unit}, got {given!r}")
+    for value in () if signed else values:
+        non_negative(name, value, unit)
     return values
 
 
 def _intensity(given: Any, coordinates: int) -> Array:
     if isinstance(given, list) and any(isinstance(row, list) for row in given):
         return checked_covariance("acceleration_noise", given, coordinates)
-    values = _each("acceleration_noise", given, coordinates, "m^2/s^3")
-    for value in values:
-        non_negative("acceleration_noise", value, "m^2/s^3")
-    return np.diag(values)
+    return np.diag(_each("acceleration_noise", given, coordinates, "m^2/s^3"))
 
 
 def track_from(given: Any) -> Track:
@@ -128,3 +116,34 @@ def track_from(given: Any) -> Track:
         f"expected a Track, such as sw.occlusion.Track({given!r}, acceleration_noise=0.1) with the intensity in "
         f"m^2/s^3: a name alone does not say how it moves; got {given!r}"
     )
+
+
+class Tracked(NamedTuple):
+    """One thing that is tracked."""
+
+    track: Track  # which it belongs to
+    name: str  # the body's, or the attribute's with an index
+    body: int  # in the model; -1 for a published point
+
+
+def tracked_things(
+    model: mujoco.MjModel, tracks: Sequence[Track], published: Callable[[Track], Sized]
+) -> list[Tracked]:
+    """All that the tracks follow, in their order."""
+    things: list[Tracked] = []
+    there = {model.body(b).name: b for b in range(1, model.nbody) if model.body(b).name}
+    for track in tracks:
+        if track.bodies is None:
+            things += [Tracked(track, f"{track.published}[{i}]", -1) for i in range(len(published(track)))]
+            continue
+        found = [Tracked(track, name, b) for name, b in there.items() if fnmatchcase(name, track.bodies)]
+        if not found:
+            raise UnknownNameError(
+                f"the model has no body {track.bodies!r}; it has: {', '.join(there) or 'none'}"
+            )
+        things += found
+    names = [thing.name for thing in things]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ConfigurationError(f"each thing is tracked once; these are named twice: {', '.join(twice)}")
+    return things

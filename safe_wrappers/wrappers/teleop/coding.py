@@ -1,61 +1,50 @@
 """How commands and forces are written into packets: as they are, or with their energy paid for."""
 
+import heapq
 import math
-from typing import Any, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from safe_wrappers.control.teleop.passivity import ChannelLedger
+from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.control.teleop.passivity import ChannelLedger, effort_and_outgoing, to_waves
 from safe_wrappers.control.teleop.passivity_control import EnergyReference
 from safe_wrappers.control.teleop.port_checks import RunningSum, port_energy
+from safe_wrappers.control.teleop.wave_line import Rule, WaveLine
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.env_checks import refuse_changed_actions
+from safe_wrappers.wrappers.common.layer import Array, Env
 from safe_wrappers.wrappers.teleop.link import Packet
-from safe_wrappers.wrappers.teleop.port import PortReading
+from safe_wrappers.wrappers.teleop.port import PortReading, TeleopPort
 
-Array = NDArray[np.float64]
+_STORAGE_J: Final = 0.02
+"""What each end of a passivity controller may give out unpaid, unless it is said."""
 
 Coding = Literal["plain", "wave"]
 Passivity = Literal["none", "controller"]
 
 
 class Up(NamedTuple):
-    """What goes from the operator to the machine.
+    """What goes from the operator to the machine."""
 
-    Attributes:
-        action: As the operator gave it.
-        seen_s: When the image was taken that it was made from, s.
-        extra: What the coding adds.
-    """
-
-    action: Any
-    seen_s: float
-    extra: Any
+    action: Any  # as the operator gave it
+    seen_s: float  # when the image was taken that it was made from, s
+    extra: Any  # what the coding adds
 
 
 class Down(NamedTuple):
-    """What comes back.
+    """What comes back."""
 
-    Attributes:
-        observation: The env's.
-        taken_s: When, s.
-        extra: What the coding adds.
-    """
-
-    observation: Any
-    taken_s: float
-    extra: Any
+    observation: Any  # the env's
+    taken_s: float  # when, s
+    extra: Any  # what the coding adds
 
 
 class Order(NamedTuple):
-    """What is to be executed at the machine.
+    """What is to be executed at the machine."""
 
-    Attributes:
-        flow: To replace the port's entries of what would be executed; None: as it is.
-        seen_s: When the image was taken that it was made from.
-    """
-
-    flow: Array | None
-    seen_s: float
+    flow: Array | None  # to replace the port's entries of what would be executed; None: as it is
+    seen_s: float  # when the image was taken that it was made from, s
 
 
 class Given(NamedTuple):
@@ -68,16 +57,11 @@ class Given(NamedTuple):
 class PlainCoding:
     """Actions and observations as they are; the base of the others.
 
-    In each tick, in this order: `near` (the operator moves), `sent_up`, `far` (what arrived is decoded), the env's
-    step, `settle` (what truly happened), `sent_down`, `shown`.
-
-    Args:
-        reading: Of the machine's port; None: there is none, and no energies are known.
-        tick_s: s.
+    In each tick of `tick_s`, in this order: `near` (the operator moves), `sent`, `far` (what arrived is decoded), the
+    env's step, `settle` (what truly happened), `sent`, `shown`. Without a reading of a port no energies are known.
     """
 
-    storage_j = 0.0
-    """What each end may give out unpaid, J."""
+    storage_j = 0.0  # what each end may give out unpaid, J
 
     def __init__(self, reading: PortReading | None, tick_s: float) -> None:
         self._reading, self._tick_s = reading, tick_s
@@ -95,52 +79,35 @@ class PlainCoding:
         """The operator moves with this flow, or is not there; returns what the packet up carries besides."""
         return None
 
-    def sent_up(self, sequence: int, extra: Any, lost: bool) -> None:
-        """The packet left."""
+    def sent(self, up: bool, sequence: int, extra: Any, lost: bool) -> None:
+        """A packet left, up or down."""
 
     def far(self, arrived: list[Packet], newest: Up | None, flow: Array | None) -> Order:
-        """Decode what has arrived.
+        """Decode what has arrived in this tick.
 
-        Args:
-            arrived: In this tick.
-            newest: The newest command that ever has.
-            flow: What would be executed as it is, shape (m,); None: nothing of the operator's.
+        `newest` is the newest command that ever has, `flow` (m,) what would be executed as it is, None if not the
+        operator's.
         """
         if newest is not None:
             self._seen_s = newest.seen_s
         return Order(None, self._seen_s)
 
     def settle(self, flow: Array, observation: Any, obeyed: bool) -> tuple[Any, Given | None]:
-        """After the env's step: what the packet down carries besides, and what the machine was given.
+        """After the env's step with a flow (m,): what the packet down carries, and what the machine was given.
 
-        Args:
-            flow: That was executed, shape (m,).
-            observation: The env's new one.
-            obeyed: Whether it was the operator's. If not, the channel's far port was still.
+        Where the operator was not obeyed, the channel's far port was still.
         """
         if self._reading is None:
             return None, None
         acted = self._reading.acted(flow, observation)
         return None, Given(acted, flow) if obeyed else Given(self._still, self._still)
 
-    def sent_down(self, sequence: int, extra: Any, lost: bool) -> None:
-        """The packet left."""
-
     def shown(self, arrived: list[Packet], observation: Any) -> Any:
-        """The observation that the operator gets, from the newest one and all that has arrived in this tick.
-
-        Its effort is the one against which the operator has moved in this tick.
-        """
+        """The observation that the operator gets, with the effort felt in this tick."""
         return observation
 
     def account(self, moved: Array | None, shown: Any, given: Given) -> None:
-        """Add up the energies of a tick at the two ports.
-
-        Args:
-            moved: The operator's flow, shape (m,); None: he is not there.
-            shown: The observation that he gets.
-            given: Effort and flow at the machine.
-        """
+        """Add up a tick's energies: of the operator's flow (m,), None if absent, and at the machine."""
         assert self._reading is not None
         felt = self._reading.of(shown)
         moved = np.zeros_like(felt) if moved is None else moved
@@ -155,14 +122,9 @@ class PlainCoding:
 
 
 class PaidCoding(PlainCoding):
-    """Plain, but each end gives out no more energy than it has heard the other took in (`EnergyReference`).
+    """Plain, but each end gives out at most `storage_j` more energy than it has heard the other took in.
 
-    Args:
-        reading: See `PlainCoding`; needed.
-        tick_s: s.
-        limit: Of the damping force at the operator's end, N; None: none.
-        storage_j: What each end may give out beyond what it has heard of, J: the channel's initial storage is twice
-            as much.
+    `limit` is of the damping force at the operator's end, N; None: none.
     """
 
     def __init__(self, reading: PortReading, tick_s: float, limit: float | None, storage_j: float) -> None:
@@ -192,10 +154,7 @@ class PaidCoding(PlainCoding):
         return Order(None if paid is wanted else paid, order.seen_s)
 
     def _affordable(self, flow: Array, budget_j: float) -> Array:
-        """The flow, or as much of it as its energy is paid for; the effort answers it at once where it can.
-
-        Damping alone would add flow against an effort that the damper between command and machine reverses at once.
-        """
+        """The flow, or as much of it as its energy is paid for; the effort may answer the flow at once."""
         steady = port_energy(self._port.base, flow, self._tick_s)
         damped = self._port.feedthrough * port_energy(flow, flow, self._tick_s)
         if steady + damped <= budget_j:
@@ -218,3 +177,132 @@ class PaidCoding(PlainCoding):
         self._ends[0].receive(*(packet.load.extra for packet in arrived))
         self._late = self._port.of(observation)
         return self._port.replaced(observation, self._felt)
+
+
+class WaveCoding(PlainCoding):
+    """Flow and effort as waves (`impedance` in N s/m), each of which pays for what it does at the other end."""
+
+    def __init__(self, reading: PortReading, tick_s: float, impedance: float, rule: Rule) -> None:
+        super().__init__(reading, tick_s)
+        self._port, self._impedance, self._rule = reading, impedance, rule
+
+    def reset(self, observation: Any) -> None:
+        """As `PlainCoding.reset`."""
+        super().reset(observation)
+        m = self._still.size
+        self._up, self._down = (WaveLine(self._tick_s, self._rule, m) for _ in range(2))
+        self._back: list[tuple[int, Array]] = []
+        self._waiting: list[tuple[int, float]] = []
+        self._incoming = self._felt = self._still
+        self._owed_j = 0.0
+
+    def near(self, flow: Array | None) -> Any:
+        """As `PlainCoding.near`; a wave that comes back while the operator is away ends there."""
+        incoming = self._down.deliver(self._back)
+        self._back = []
+        if flow is None:
+            self._felt = self._still
+            return None
+        self._felt, outgoing = effort_and_outgoing(flow, incoming, self._impedance)
+        return outgoing
+
+    def sent(self, up: bool, sequence: int, extra: Any, lost: bool) -> None:
+        """As `PlainCoding.sent`."""
+        line = self._up if up else self._down
+        line.send(extra, sequence)
+        if lost:
+            line.lose(sequence)
+
+    def far(self, arrived: list[Packet], newest: Up | None, flow: Array | None) -> Order:
+        """As `PlainCoding.far`, from the waves alone."""
+        wave = self._up.deliver([(packet.sequence, packet.load.extra) for packet in arrived])
+        if self._rule != "queue":
+            super().far(arrived, newest, flow)  # seen as late as the newest
+        else:  # as late as the wave that is put out now, or the last one
+            for packet in arrived:
+                heapq.heappush(self._waiting, (packet.sequence, packet.load.seen_s))
+            if self._waiting:
+                self._seen_s = heapq.heappop(self._waiting)[1]
+        # What the machine took beyond what had arrived is paid first.
+        energy = self._energy(wave)
+        paid = min(self._owed_j, energy)
+        if paid > 0.0:
+            self._owed_j -= paid
+            wave = wave * math.sqrt((energy - paid) / energy)
+        self._incoming = wave
+        b = self._impedance
+        # The effort answers the flow at once where there is a damper, so both are solved for together.
+        decoded = (math.sqrt(2.0 * b) * wave - self._port.base) / (b + self._port.feedthrough)
+        return Order(decoded, self._seen_s)
+
+    def settle(self, flow: Array, observation: Any, obeyed: bool) -> tuple[Any, Given | None]:
+        """As `PlainCoding.settle`; a port that is still, because the brake acts, absorbs the wave.
+
+        Reflected waves of an operator who does not give way would pile up in the channel without bound.
+        """
+        _, given = super().settle(flow, observation, obeyed)
+        assert given is not None
+        if not obeyed:
+            return self._still, given
+        acted, moved = given
+        _, outgoing = to_waves(acted, moved, self._impedance)
+        # Where the machine saturates, or a filter inside has changed the flow, the two waves do not match.
+        left = self._energy(self._incoming) - port_energy(acted, moved, self._tick_s)
+        energy = self._energy(outgoing)
+        if left < 0.0:
+            self._owed_j -= left
+            outgoing = np.zeros_like(outgoing)
+        elif energy > left:
+            outgoing = outgoing * (math.sqrt(left / energy) * (1.0 - 1e-15))
+        return outgoing, given
+
+    def shown(self, arrived: list[Packet], observation: Any) -> Any:
+        """As `PlainCoding.shown`: what the operator felt stands where the machine's effort was."""
+        self._back += [(packet.sequence, packet.load.extra) for packet in arrived]
+        return self._port.replaced(observation, self._felt)
+
+    @property
+    def stored_j(self) -> float:
+        """Energy on its way, and of waves that have arrived and were not put out yet, J."""
+        return sum(line.in_flight_j + line.reserve_j for line in (self._up, self._down))
+
+    def _energy(self, wave: Array) -> float:
+        return 0.5 * port_energy(wave, wave, self._tick_s)
+
+
+def coding_from(
+    env: Env,
+    port: TeleopPort | None,
+    tick_s: float,
+    coding: Coding,
+    impedance: float | None,
+    passivity: Passivity,
+    damping_limit: float | None,
+    storage_j: float | None,
+    rule: Rule,
+) -> PlainCoding:
+    """The coding that a channel's arguments ask for; an error if they do not go together or a port is missing."""
+    if passivity == "none" and not (damping_limit is None and storage_j is None):
+        raise ConfigurationError('damping_limit and storage_j are for passivity="controller"')
+    storage_j = non_negative("storage_j", _STORAGE_J if storage_j is None else storage_j, "J")
+    if damping_limit is not None:
+        damping_limit = positive("damping_limit", damping_limit, "N")
+    if coding == "wave" and passivity == "controller":
+        raise ConfigurationError('waves pay for their energy: passivity="controller" is for plain coding')
+    if coding == "plain" and impedance is not None:
+        raise ConfigurationError(f'impedance is for coding="wave"; got {impedance!r} with plain coding')
+    reading = None if port is None else PortReading(env, port)
+    if coding == "plain" and passivity == "none":
+        return PlainCoding(reading, tick_s)
+    if reading is None:
+        what = 'coding="wave"' if coding == "wave" else 'passivity="controller"'
+        raise ConfigurationError(
+            f"{what} needs a port, and {env.unwrapped!r} publishes none: say which entries of the action are a flow "
+            'and which of the observation its effort, port={"flow": [0, 1], "effort": [4, 5]}'
+        )
+    refuse_changed_actions(env)
+    if coding == "plain":
+        return PaidCoding(reading, tick_s, damping_limit, storage_j)
+    if impedance is None:
+        raise ConfigurationError('coding="wave" needs an impedance, in N s/m')
+    return WaveCoding(reading, tick_s, positive("impedance", impedance, "N s/m"), rule)

@@ -5,13 +5,11 @@ import math
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
-import gymnasium as gym
-
 from safe_wrappers.checks import check_fields, non_negative, positive, settings_from
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.common.layer import Env
 from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
-from safe_wrappers.wrappers.faults.on_off import OnOffProcess
-from safe_wrappers.wrappers.faults.parameters import probability
+from safe_wrappers.wrappers.faults.kinds import OnOffProcess, probability
 
 LONGEST_DELAY_S: Final = 10.0
 """What a line remembers, s."""
@@ -21,13 +19,10 @@ LONGEST_DELAY_S: Final = 10.0
 class Link:
     """What a network does to packets in one direction; plain data.
 
-    Every packet takes `delay_s` and a random time between 0 and `jitter_s` more, drawn for each by itself. A packet
-    is lost with the probability `loss`, and surely if it is sent during an outage.
-
     Args:
         delay_s: Shortest time that a packet takes, s.
-        jitter_s: How much longer it may take, s, uniform.
-        loss: Probability that a packet is lost, from 0 to 1.
+        jitter_s: How much longer it may take, s, uniform, drawn for each packet by itself.
+        loss: Probability that a packet is lost, from 0 to 1; during an outage every one is.
         in_order: Whether a packet waits for those that were sent before it and are not lost, as in a stream. False:
             it may overtake them, as datagrams do.
         outage_between_s: Mean time from the end of an outage to the start of the next, s; None: there are none.
@@ -67,37 +62,21 @@ class Link:
 
 
 def link_from(name: str, given: Any) -> Link:
-    """A link itself, from the dict of one, or with that number of seconds as its delay.
-
-    Raises:
-        ConfigurationError: None of these.
-        UnknownNameError: A key that no link has.
-    """
+    """A link itself, from the dict of one, or with that number of seconds as its delay."""
     if isinstance(given, int | float) and not isinstance(given, bool):
         return Link(delay_s=given)
     return settings_from(Link, given, name, ", or a delay in s")
 
 
 class Packet(NamedTuple):
-    """A packet; packets compare by their numbers.
-
-    Attributes:
-        sequence: Counts the packets of a line, from 0.
-        load: What it carries.
-    """
+    """A packet, by its number on the line (from 0), which packets compare by, and what it carries."""
 
     sequence: int
     load: Any
 
 
 class Line:
-    """The packets of one direction.
-
-    Args:
-        link: What happens to them.
-        stream: A name, which keeps its random numbers apart from those of other lines.
-        slack_s: Times that are closer are the same.
-    """
+    """The packets of one direction, with random numbers of their own; times closer than `slack_s` are the same."""
 
     def __init__(self, link: Link, stream: str, slack_s: float) -> None:
         self._link, self._slack_s = link, slack_s
@@ -105,14 +84,11 @@ class Line:
         outage = link.outage_between_s, link.outage_length_s
         self._outages = None if outage[0] is None or outage[1] is None else OnOffProcess(outage[0], outage[1])
 
-    newest: Packet
-    """Of all that have arrived the one that was sent last."""
-    fresh: bool
-    """Whether it arrived at the last `receive`."""
-    late: int
-    """How many packets of the last `receive` were overtaken."""
+    newest: Packet  # of all that have arrived the one that was sent last
+    fresh: bool  # whether it arrived at the last `receive`
+    late: int  # how many packets of the last `receive` were overtaken
 
-    def reset(self, env: gym.Env[Any, Any], seed: int | None, first: Any = None) -> None:
+    def reset(self, env: Env, seed: int | None, first: Any = None) -> None:
         """Nothing is on its way, and `first` has arrived; call it after the env's own reset."""
         self._random.reset(env, seed)
         if self._outages is not None:

@@ -6,12 +6,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from safe_wrappers.checks import check_fields, non_negative, settings_from
 from safe_wrappers.errors import ConfigurationError
-
-Array = NDArray[np.float64]
+from safe_wrappers.wrappers.common.layer import Array, Env
 
 
 @dataclass(frozen=True)
@@ -51,13 +49,8 @@ class TeleopPort:
         check_fields(self, non_negative, ["feedthrough"], "N s/m")
 
 
-def port_from(given: Any, env: gym.Env[Any, Any]) -> TeleopPort | None:
-    """A port itself, from the dict of one, or what the env publishes; None if it publishes none.
-
-    Raises:
-        ConfigurationError: Neither of these, or indices that the spaces do not have.
-        UnknownNameError: A key that no port has.
-    """
+def port_from(given: Any, env: Env) -> TeleopPort | None:
+    """A port itself, from the dict of one, or what the env publishes; None if it publishes none."""
     if given is not None:
         port = settings_from(TeleopPort, given, "port")
     elif env.has_wrapper_attr("port_flow"):
@@ -72,7 +65,7 @@ def port_from(given: Any, env: gym.Env[Any, Any]) -> TeleopPort | None:
     return port
 
 
-def _check_spaces(port: TeleopPort, env: gym.Env[Any, Any]) -> None:
+def _check_spaces(port: TeleopPort, env: Env) -> None:
     action, observation = env.action_space, env.observation_space
     box = isinstance(observation, gym.spaces.Box) and len(observation.shape) == 1
     if not box or not np.issubdtype(observation.dtype or np.int64, np.floating):
@@ -88,45 +81,29 @@ def _check_spaces(port: TeleopPort, env: gym.Env[Any, Any]) -> None:
 
 
 class PortReading:
-    """The effort at a port: as observed, as foreseen, and as the env says that it acted.
+    """The effort at a port of an env: as observed, as foreseen, and as the env says that it acted."""
 
-    Args:
-        env: What is wrapped.
-        port: Its port.
-    """
-
-    def __init__(self, env: gym.Env[Any, Any], port: TeleopPort) -> None:
+    def __init__(self, env: Env, port: TeleopPort) -> None:
         self._env, self._port = env, port
+        self.feedthrough = port.feedthrough  # N s/m
         self._publishes = env.has_wrapper_attr("port_effort_acted")
 
     def reset(self, observation: Array) -> None:
         """At rest, the effort as observed."""
         self._last_flow = np.zeros(len(self._port.flow))
-        self.effort = self.of(observation)
-
-    @property
-    def feedthrough(self) -> float:
-        """N s/m."""
-        return self._port.feedthrough
-
-    effort: Array
-    """At the present state and the last command, N."""
-
-    def effort_at(self, flow: Array) -> Array:
-        """What the effort would be in the coming step with another flow, N."""
-        return self.effort + self._port.feedthrough * (flow - self._last_flow)
+        self.effort = self.of(observation)  # at the present state and the last command, N
 
     @property
     def base(self) -> Array:
-        """The same without flow, N."""
-        return self.effort - self._port.feedthrough * self._last_flow
+        """The effort without flow, N."""
+        return self.effort - self.feedthrough * self._last_flow
 
     def acted(self, flow: Array, observation: Array) -> Array:
         """The effort during the step that was made with this flow: as the env publishes it, else as foreseen, N."""
         if self._publishes:
             acted = np.array(self._env.get_wrapper_attr("port_effort_acted"), dtype=np.float64)
         else:
-            acted = self.effort_at(flow)
+            acted = self.effort + self.feedthrough * (flow - self._last_flow)
         self._last_flow = flow
         self.effort = self.of(observation)
         return acted

@@ -4,14 +4,11 @@ import math
 from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
-import gymnasium as gym
-import numpy as np
-from numpy.typing import NDArray
-
 from safe_wrappers.checks import check_fields, non_negative, positive
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint
+from safe_wrappers.wrappers.common.layer import Array, Env
 from safe_wrappers.wrappers.lease.stopping_budget import (
     BoundBudget,
     ClearanceFunction,
@@ -19,18 +16,14 @@ from safe_wrappers.wrappers.lease.stopping_budget import (
     budget_from,
 )
 
-Array = NDArray[np.float64]
-
 
 @deprecated_parameters(moved={"budget": StoppingBudget}, positional=("braking", "acceleration", "top_speed"))
 @dataclass(frozen=True)
 class RoundTripCeiling:
     """The longest round trip at which an operator may still be relied on, from the clearance and speed of the moment.
 
-        T_RTT <= (D_clear - reserves - v^2 / (2 braking)) / v - (T_video + T_human + T_act)
-
-    (`control.watchdog.leases.round_trip_ceiling`.) Whatever the round trip, an operator's command is executed only if
-    the machine can still stop by itself inside the clearance after it.
+    See `control.watchdog.leases.round_trip_ceiling`. Whatever the round trip, an operator's command is executed only
+    if the machine can still stop by itself inside the clearance after it.
 
     Args:
         budget: A `StoppingBudget` or the dict of one. Its clearance measures the approach: a `Clearance`, or a
@@ -64,39 +57,19 @@ class RoundTripCeiling:
         check_fields(self, positive, ["longest_s"], "s")
         check_fields(self, positive, ["release"], "a share of the ceiling")
         if self.release > 1.0:
-            raise ConfigurationError(
-                f"release is a share of the ceiling, above 0 and at most 1; got {self.release}"
-            )
+            raise ConfigurationError(f"release is a share of the ceiling, at most 1; got {self.release}")
 
 
 class RoundTripWatch:
-    """Measures clearance and approach, and decides whether the operator is obeyed in the coming control step.
+    """Measures clearance and approach, and decides whether the operator is obeyed in the coming control step."""
 
-    Args:
-        env: What is wrapped.
-        ceiling: What is watched.
-        control_dt: Control interval, s.
-        slack_s: Times that are closer are the same.
-    """
+    budget: BoundBudget  # to be bound to a plant
+    revoked: bool  # whether authority is revoked, as `judge` left it
+    readable: bool  # whether clearance and speed were finite when `look` was called
+    clearance_m: float  # the smallest clearance then, m; inf where nothing is near, 0 where unreadable
+    ceiling_s: float  # the longest round trip then, s, within `longest_s` of 0; the lowest where unreadable
 
-    budget: BoundBudget
-    """To be bound to a plant."""
-    revoked: bool
-    """Whether authority is revoked, as `judge` left it."""
-    readable: bool
-    """Whether clearance and speed were numbers when `look` was called."""
-    clearance_m: float
-    """The smallest clearance then, m; inf where there is nothing near, 0 where it cannot be read."""
-    ceiling_s: float
-    """The longest admissible round trip then, s, within `longest_s` of 0; the lowest there is where unreadable."""
-
-    def __init__(
-        self,
-        env: gym.Env[Any, Any],
-        ceiling: RoundTripCeiling,
-        control_dt: float,
-        slack_s: float = 0.0,
-    ) -> None:
+    def __init__(self, env: Env, ceiling: RoundTripCeiling, control_dt: float, slack_s: float = 0.0) -> None:
         self._ceiling, self._control_dt, self._slack_s = ceiling, control_dt, slack_s
         self.budget = BoundBudget(budget_from(ceiling.budget), env)
 
@@ -120,25 +93,14 @@ class RoundTripWatch:
         self.ceiling_s = min(max(highest_s, -ceiling.longest_s), ceiling.longest_s)
 
     def judge(self, command: Array, seen_s: float, round_trip_s: float, now_s: float) -> None:
-        """Revoke authority, or give it back.
-
-        Args:
-            command: What would be executed, inside the action box, shape (m,).
-            seen_s: When the image was taken that it was made from, s.
-            round_trip_s: The age of that image, s.
-            now_s: Seconds of the episode so far.
-        """
+        """Revoke authority, or give it back, for a command (m,) made from the image that was taken at `seen_s`."""
         allowed_s = self.ceiling_s
         if self.revoked and allowed_s > 0.0:
             allowed_s *= self._ceiling.release
         trusted = self.readable and round_trip_s <= allowed_s + self._slack_s
         if self.revoked:
             trusted = trusted and seen_s >= self._revoked_s - self._slack_s
-        trusted = trusted and self.can_stop_after(command)
+        trusted = trusted and self.budget.can_stop_after(command, self._control_dt)
         if not trusted and not self.revoked:
             self._revoked_s = now_s
         self.revoked = not trusted
-
-    def can_stop_after(self, command: Array) -> bool:
-        """Whether the machine can stop by itself after a command for one control step."""
-        return self.budget.can_stop_after(command, self._control_dt)

@@ -1,0 +1,343 @@
+"""Things to keep clear of, as plain data, so that a wrapper that is given them can be recorded and rebuilt."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import numpy as np
+
+from safe_wrappers.checks import non_negative, positive, settings_from
+from safe_wrappers.control.estimation.ellipsoids import ellipsoid_gap
+from safe_wrappers.control.estimation.tracks import Tracks
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.filter.constraint import Array
+from safe_wrappers.plants.plant import Plant
+
+_SHARES = (1e-4, 0.1, 0.25, 0.5, 1.0)  # of the horizon, at which growth is looked at; the first: its rate now
+
+
+class Nearest(NamedTuple):
+    """For one point and k surfaces in d dimensions."""
+
+    distance: Array  # signed, m, negative inside, shape (k,)
+    normal: Array  # unit vectors from the surface towards the point, shape (k, d)
+    velocity: Array  # of the surface, m/s, shape (k, d)
+    curvature: Array  # of the surface of equal distance through the point, along each coordinate, 1/m, (k, d)
+
+
+class Obstacle(Protocol):
+    """Anything with a nearest surface. Ours also have `distances`, for many points at once."""
+
+    def nearest(self, point: Array, plant: Plant) -> Nearest:
+        """The surfaces of this obstacle as seen from a point of shape (d,)."""
+
+
+def distances(obstacle: Obstacle, points: Array, plant: Plant) -> Array:
+    """Signed distances of points of shape (k, d) to an obstacle's n surfaces, shape (k, n), m."""
+    together = getattr(obstacle, "distances", None)
+    if together is not None:
+        return np.asarray(together(points, plant))
+    return np.stack([obstacle.nearest(point, plant).distance for point in points])
+
+
+def refuse_more_dimensions(obstacle: int, point: int, kind: str = "obstacles") -> None:
+    """Refuse an obstacle of more dimensions than the point that is kept clear of it."""
+    if obstacle > point:
+        raise ConfigurationError(f"{obstacle}-dimensional {kind} cannot meet a {point}-dimensional point")
+
+
+def _vector(name: str, values: Sequence[float], sizes: tuple[int, ...]) -> list[float]:
+    try:
+        vector = [float(v) for v in values]
+    except (TypeError, ValueError):
+        raise ConfigurationError(f"{name} must be a list of numbers, got {values!r}") from None
+    if len(vector) not in sizes or not np.isfinite(vector).all():
+        wanted = " or ".join(map(str, sizes))
+        raise ConfigurationError(f"{name} must be {wanted} finite numbers, got {values!r}")
+    return vector
+
+
+class _Round(ABC):
+    """Discs and spheres of one radius; a disc seen from three dimensions is an upright cylinder."""
+
+    radius: float
+
+    @abstractmethod
+    def centers(self, plant: Plant) -> Array:
+        """Where they are now, shape (k, d), m."""
+
+    def _velocities(self, plant: Plant) -> Array | float:
+        return 0.0
+
+    def nearest(self, point: Array, plant: Plant) -> Nearest:
+        centers = self.centers(plant)
+        d = centers.shape[1]
+        refuse_more_dimensions(d, point.size)
+        offset = point[:d] - centers
+        length = np.sqrt(np.einsum("ij,ij->i", offset, offset))
+        apart = np.where(length > 1e-12, length, 1.0)
+        normal = np.zeros((len(centers), point.size))
+        normal[:, :d] = offset / apart[:, None]
+        normal[length <= 1e-12, 0] = 1.0  # at the very centre every way out is as good
+        moving = np.zeros_like(normal)
+        moving[:, :d] = self._velocities(plant)
+        curvature = np.zeros_like(normal)
+        curvature[:, :d] = 1.0 / np.maximum(length, 1e-9)[:, None]
+        return Nearest(length - self.radius, normal, moving, curvature)
+
+    def distances(self, points: Array, plant: Plant) -> Array:
+        centers = self.centers(plant)
+        d = centers.shape[1]
+        refuse_more_dimensions(d, points.shape[1])
+        offsets = points[:, None, :d] - centers
+        return np.asarray(np.sqrt(np.einsum("kni,kni->kn", offsets, offsets)) - self.radius)
+
+
+@dataclass
+class _Still(_Round):
+    """One that stands still."""
+
+    center: Sequence[float]
+    radius: float
+    coordinates: ClassVar[int]
+
+    def __post_init__(self) -> None:
+        self.center = _vector("center", self.center, (self.coordinates,))
+        self.radius = positive("radius", self.radius, "m")
+
+    def centers(self, plant: Plant) -> Array:
+        return np.array([self.center])
+
+
+class Disc(_Still):
+    """An upright cylinder: a disc of `radius` (m) in the plane at `center` (x, y). It stands still."""
+
+    coordinates = 2
+
+
+class Sphere(_Still):
+    """A ball of `radius` (m) at `center` (x, y, z). It stands still."""
+
+    coordinates = 3
+
+
+@dataclass
+class Plane:
+    """A wall: everything behind `point` against the outward `normal` is forbidden; 1, 2 or 3 dimensions."""
+
+    point: Sequence[float]
+    normal: Sequence[float]
+
+    def __post_init__(self) -> None:
+        self.point = _vector("point", self.point, (1, 2, 3))
+        self.normal = _vector("normal", self.normal, (len(self.point),))
+        length = float(np.linalg.norm(self.normal))
+        if length < 1e-12:
+            raise ConfigurationError("normal must not be zero: it points from the wall into free space")
+        self.normal = [n / length for n in self.normal]
+
+    def nearest(self, point: Array, plant: Plant) -> Nearest:
+        d = len(self.point)
+        refuse_more_dimensions(d, point.size)
+        normal = np.zeros((1, point.size))
+        normal[0, :d] = self.normal
+        distance = normal[0, :d] @ (point[:d] - np.asarray(self.point))
+        return Nearest(np.array([distance]), normal, np.zeros_like(normal), np.zeros_like(normal))
+
+    def distances(self, points: Array, plant: Plant) -> Array:
+        offsets = points[:, : len(self.point)] - np.asarray(self.point)
+        return np.asarray((offsets @ np.asarray(self.normal))[:, None])
+
+
+@dataclass
+class Box:
+    """An axis-aligned block of `half_size` (m per axis) at `center`; 2 or 3 dimensions. It stands still."""
+
+    center: Sequence[float]
+    half_size: Sequence[float]
+
+    def __post_init__(self) -> None:
+        self.center = _vector("center", self.center, (2, 3))
+        self.half_size = _vector("half_size", self.half_size, (len(self.center),))
+        for half in self.half_size:
+            positive("half_size", half, "m")
+
+    def nearest(self, point: Array, plant: Plant) -> Nearest:
+        """One surface: a face, an edge or a corner."""
+        d = len(self.center)
+        refuse_more_dimensions(d, point.size)
+        offset = point[:d] - np.asarray(self.center)
+        beyond = np.abs(offset) - np.asarray(self.half_size)
+        side = np.where(offset < 0.0, -1.0, 1.0)
+        outside = np.maximum(beyond, 0.0)
+        distance = float(np.linalg.norm(outside))
+        normal = np.zeros((1, point.size))
+        curvature = np.zeros_like(normal)
+        if distance > 0.0:
+            normal[0, :d] = side * outside / distance
+            if int((outside > 0.0).sum()) > 1:
+                curvature[0, :d] = (outside > 0.0) / distance
+        else:
+            axis = int(np.argmax(beyond))
+            distance = float(beyond[axis])
+            normal[0, axis] = side[axis]
+        return Nearest(np.array([distance]), normal, np.zeros_like(normal), curvature)
+
+    def distances(self, points: Array, plant: Plant) -> Array:
+        offsets = points[:, : len(self.center)] - np.asarray(self.center)
+        beyond = np.abs(offsets) - np.asarray(self.half_size)
+        outside = np.sqrt((np.maximum(beyond, 0.0) ** 2).sum(axis=1))
+        return np.asarray((outside + np.minimum(beyond.max(axis=1), 0.0))[:, None])
+
+
+@dataclass
+class Discs(_Round):
+    """Discs (or spheres) whose centres the env publishes, for example `hazard_positions`.
+
+    Args:
+        attribute: Name of the env's attribute, an array of shape (k, 2) or (k, 3) in m.
+        radius: m; the robot's own radius is the constraint's business.
+        velocity_attribute: Name of an array of the same shape in m/s; None says that they stand still.
+    """
+
+    attribute: str
+    radius: float
+    velocity_attribute: str | None = None
+
+    def __post_init__(self) -> None:
+        self.radius = positive("radius", self.radius, "m")
+
+    def centers(self, plant: Plant) -> Array:
+        where = np.asarray(plant.attribute(self.attribute), dtype=np.float64)
+        if where.ndim != 2 or where.shape[1] not in (2, 3):
+            wanted = f"the env's {self.attribute} must have shape (k, 2) or (k, 3)"
+            raise ConfigurationError(f"{wanted}, got {where.shape}")
+        return where
+
+    def _velocities(self, plant: Plant) -> Array | float:
+        if self.velocity_attribute is None:
+            return 0.0
+        return np.asarray(plant.attribute(self.velocity_attribute), dtype=np.float64)
+
+
+@dataclass
+class TrackedDiscs:
+    """Discs (or balls) that an `OcclusionPenalty` inside the filter tracks.
+
+    Each is the ellipsoid of `sigmas` standard deviations about its estimate. The surface moves with the estimated
+    velocity, and grows: its speed towards the machine is the fastest at which the bound comes nearer within
+    `horizon_s` without further measurements. `Workspace` uses the distances alone, without growth.
+
+    A centre leaves its ellipsoid with the probability of the tail of `sigmas` (for Gaussian noise, a true motion
+    model and 3: 0.27 % of the time on a line, 1.1 % in the plane), each obstacle at each moment. It is no hard bound.
+
+    Args:
+        radius: m; the machine's own radius is the constraint's business.
+        sigmas: Standard deviations, at least 0; 0 takes the estimate for the truth.
+        horizon_s: How far ahead the growth counts, s: at least the time that the machine takes to brake.
+        attribute: Name of the env's attribute that has the tracks.
+
+    Source: appendix "Continuous Lyapunov and Riccati covariance dynamics".
+    """
+
+    radius: float
+    sigmas: float = 3.0
+    horizon_s: float = 1.0
+    attribute: str = "tracking"
+
+    def __post_init__(self) -> None:
+        self.radius = positive("radius", self.radius, "m")
+        self.sigmas = non_negative("sigmas", self.sigmas, "standard deviations")
+        self.horizon_s = positive("horizon_s", self.horizon_s, "s")
+
+    def tracks(self, plant: Plant) -> Tracks:
+        """The tracks that the env holds, or an error that says what is missing."""
+        tracks = plant.attribute(self.attribute)
+        if not isinstance(tracks, Tracks):
+            found = f"the env's {self.attribute} holds no tracks but {type(tracks).__name__}"
+            raise ConfigurationError(f"{found}; TrackedDiscs need an OcclusionPenalty inside the filter")
+        return tracks
+
+    def nearest(self, point: Array, plant: Plant) -> Nearest:
+        """One surface per track."""
+        tracks = self.tracks(plant)
+        d, n = tracks.coordinates, len(tracks.mean)
+        refuse_more_dimensions(d, point.size, "tracks")
+        normal, velocity = np.zeros((n, point.size)), np.zeros((n, point.size))
+        nothing = np.zeros((n, point.size))
+        offset = point[:d] - tracks.positions
+        covariances = tracks.position_covariances
+        if not (np.isfinite(offset).all() and np.isfinite(covariances).all()):
+            return Nearest(np.full(n, np.nan), normal, velocity, nothing)
+        distance, normal[:, :d] = ellipsoid_gap(offset, self.sigmas**2 * covariances)
+        velocity[:, :d] = self._velocity(tracks, normal[:, :d])
+        return Nearest(distance - self.radius, normal, velocity, nothing)
+
+    def _velocity(self, tracks: Tracks, normal: Array) -> Array:
+        """The estimated velocity, and along the normal the fastest rate at which the bound moves outwards."""
+        times = np.array([share * self.horizon_s for share in _SHARES])
+        positions, covariances = tracks.ahead(times.tolist())
+        along = ((positions - tracks.positions) * normal).sum(axis=-1)
+        grown = _deviation(covariances, normal) - _deviation(tracks.position_covariances, normal)
+        fastest = ((along + self.sigmas * grown) / times[:, None]).max(axis=0)
+        own = tracks.velocities
+        return np.asarray(own + (fastest - (own * normal).sum(axis=-1))[:, None] * normal)
+
+    def boxes(self, plant: Plant, times_s: Array) -> tuple[Array, Array]:
+        """Centres and half-widths, (k, n, d), m, of boxes that hold the bounds at times ahead, if nothing is seen."""
+        positions, covariances = self.tracks(plant).ahead(times_s.tolist())
+        variances = np.diagonal(covariances, axis1=-2, axis2=-1)
+        return positions, self.sigmas * np.sqrt(np.maximum(variances, 0.0))
+
+    def distances(self, points: Array, plant: Plant) -> Array:
+        """Shape (k, n), m, at the present bound."""
+        tracks = self.tracks(plant)
+        d, n = tracks.coordinates, len(tracks.mean)
+        offsets = points[:, None, :d] - tracks.positions
+        shapes = np.tile(self.sigmas**2 * tracks.position_covariances, (len(points), 1, 1))
+        flat = offsets.reshape(-1, d)
+        if not (np.isfinite(flat).all() and np.isfinite(shapes).all()):
+            return np.full((len(points), n), np.nan)
+        return ellipsoid_gap(flat, shapes)[0].reshape(len(points), n) - self.radius
+
+
+def _deviation(covariances: Array, normal: Array) -> Array:
+    """Standard deviations along the normals, shape (..., n)."""
+    variance = (normal * (covariances @ normal[:, :, None])[..., 0]).sum(axis=-1)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+KINDS: dict[str, type[Any]] = {k.__name__: k for k in (Disc, Sphere, Plane, Box, Discs, TrackedDiscs)}
+
+
+def obstacle_from(data: Any) -> Obstacle:
+    """An obstacle itself, or rebuilt from the plain dict that a recorded wrapper holds."""
+    if not isinstance(data, dict):
+        if hasattr(data, "nearest"):
+            return data  # type: ignore[no-any-return]
+        raise ConfigurationError(f"expected an obstacle ({', '.join(KINDS)}) or its dict, got {data!r}")
+    name = data.get("kind")
+    if name not in KINDS:
+        raise ConfigurationError(f"unknown obstacle kind {name!r}; the kinds are {', '.join(KINDS)}")
+    obstacle: Obstacle = settings_from(KINDS[name], {k: v for k, v in data.items() if k != "kind"}, name)
+    return obstacle
+
+
+def obstacles_from(
+    given: Any, name: str = "obstacles", kinds: tuple[type[Any], ...] = (), optional: bool = False
+) -> list[Any]:
+    """A list of obstacles, each itself or as its dict, of these kinds (none: all); it may be empty if `optional`.
+
+    Raises:
+        ConfigurationError: It is no such list; the message names the parameter.
+    """
+    fitting = " and ".join(kind.__name__ for kind in kinds) or "obstacles"
+    if isinstance(given, dict | str) or not isinstance(given, Sequence) or not (given or optional):
+        wanted = f"list of {fitting}" if optional else "list with at least one obstacle"
+        raise ConfigurationError(f"{name} is a {wanted}, got {given!r}")
+    found = [obstacle_from(o) for o in given]
+    for obstacle in found:
+        if kinds and not isinstance(obstacle, kinds):
+            raise ConfigurationError(f"{name} holds {fitting}, got {type(obstacle).__name__}")
+    return found

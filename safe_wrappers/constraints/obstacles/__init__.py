@@ -1,1 +1,0 @@
-"""Shapes to keep clear of, at rest, moving, or tracked with uncertainty."""

@@ -1,0 +1,94 @@
+"""What is read from a MuJoCo model: named parts, fixed bodies, control ranges, the joint-space inertia."""
+
+from fnmatch import fnmatchcase
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.checks import Array
+from safe_wrappers.errors import UnknownNameError
+
+_FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
+
+
+def named(model: mujoco.MjModel, kind: str, name: str) -> int:
+    """The id of a body, site, geom, joint, actuator or camera; for an unknown name an error that lists all."""
+    found = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
+    if found < 0:
+        known = ", ".join(names(model, kind)) or "none"
+        raise UnknownNameError(f"the model has no {kind} {name!r}; it has: {known}")
+    return int(found)
+
+
+def names(model: mujoco.MjModel, kind: str, pattern: str = "*") -> list[str]:
+    """All names of a kind that match a shell pattern."""
+    count = {"body": "nbody", "joint": "njnt", "actuator": "nu", "camera": "ncam"}.get(kind, f"n{kind}")
+    every = (getattr(model, kind)(i).name for i in range(getattr(model, count)))
+    return [n for n in every if n and fnmatchcase(n, pattern)]
+
+
+def frame(model: mujoco.MjModel, data: mujoco.MjData, kind: str, name: str) -> tuple[int, Array]:
+    """The body that carries a named frame, and the frame's origin, shape (3,), m."""
+    handle = named(model, kind, name)
+    body = handle if kind == "body" else int(getattr(model, f"{kind}_bodyid")[handle])
+    return body, getattr(data, {"body": "xpos", "site": "site_xpos", "geom": "geom_xpos"}[kind])[handle]
+
+
+def fixed_bodies(model: mujoco.MjModel) -> NDArray[np.bool_]:
+    """Bodies with no joint between them and the world, mocap bodies among them, shape (nbody,).
+
+    `body_weldid` is not enough: a mocap body is welded to the world (0) before MuJoCo 3.12, to itself from then on.
+    """
+    return np.asarray(model.body_dofnum[model.body_weldid] == 0)
+
+
+def control_range(model: mujoco.MjModel) -> tuple[Array, Array]:
+    """Smallest and largest control, shapes (nu,): ctrlrange, or -inf and inf."""
+    limited = model.actuator_ctrllimited.astype(bool)
+    low = np.where(limited, model.actuator_ctrlrange[:, 0], -np.inf)
+    return low, np.where(limited, model.actuator_ctrlrange[:, 1], np.inf)
+
+
+def kinematics(model: mujoco.MjModel, data: mujoco.MjData, own: mujoco.MjData) -> None:
+    """Compute poses and velocities at the state of the data in `own`; after a step those of the data may lag."""
+    own.qpos[:], own.qvel[:] = data.qpos, data.qvel
+    own.mocap_pos[:], own.mocap_quat[:] = data.mocap_pos, data.mocap_quat
+    mujoco.mj_kinematics(model, own)
+    mujoco.mj_comPos(model, own)
+    mujoco.mj_comVel(model, own)
+
+
+def inertia(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
+    """Joint-space inertia with armature, shape (nv, nv), kg or kg m^2."""
+    matrix = np.empty((model.nv, model.nv))
+    for row, unit in zip(matrix, np.eye(model.nv), strict=True):
+        mujoco.mj_mulM(model, data, row, unit)
+    return matrix
+
+
+def position_rate(model: mujoco.MjModel, qpos: Array, qvel: Array) -> Array:
+    """Time derivative of the positions, shape (nq,)."""
+    if model.nq == model.nv:
+        return qvel.copy()
+    rate = np.zeros(model.nq)
+    for j in range(model.njnt):
+        q, v = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
+        kind = model.jnt_type[j]
+        if kind == _FREE:
+            rate[q : q + 3] = qvel[v : v + 3]
+            q, v = q + 3, v + 3
+        if kind in (_FREE, _BALL):
+            # Angular velocities of these joints are in the body's frame; mju_derivQuat wants the world's.
+            turn = np.zeros(4)
+            mujoco.mju_mulQuatAxis(turn, qpos[q : q + 4].copy(), qvel[v : v + 3].copy())
+            rate[q : q + 4] = 0.5 * turn
+        else:
+            rate[q] = qvel[v]
+    return rate
+
+
+def weight_n(model: mujoco.MjModel) -> float:
+    """Weight of everything that moves, N; without gravity its mass in kg."""
+    gravity = float(np.linalg.norm(model.opt.gravity))
+    return float(model.body_mass[~fixed_bodies(model)].sum()) * (gravity or 1.0)

@@ -1,0 +1,71 @@
+"""CommandGate: base of the wrappers that decide whether a command or the fallback is executed."""
+
+import warnings
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers import info as keys
+from safe_wrappers.plants.env_checks import check_actions, check_timing
+from safe_wrappers.wrappers.cbf_action_filter import is_filtered
+from safe_wrappers.wrappers.common.fallback_controller import FallbackController
+from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Step
+from safe_wrappers.wrappers.common.receiver import SAME_STEP, CommandReceiver
+
+
+class CommandGate(LayerWrapper, CommandReceiver):
+    """Base of `LeaseExpiry` and `TeleopChannel`; the env has a one-dimensional Box action space."""
+
+    _fallback: FallbackController | None
+
+    def __init__(self, env: Env, control_dt: float | None) -> None:
+        LayerWrapper.__init__(self, env)
+        space = check_actions(env)
+        self.control_dt = check_timing(env, control_dt)
+        self._same_s = SAME_STEP * self.control_dt
+        self._shape, self._dtype = space.shape, space.dtype
+        self._low, self._high = (np.nan_to_num(end).astype(np.float64) for end in (space.low, space.high))
+        self._filtered = is_filtered(env)  # then the filter reports what was executed
+        self._warned = False
+
+    def _start(self, info: dict[str, Any]) -> None:
+        """Begin an episode, in which nothing has been executed yet."""
+        self._steps_done = 0
+        self._observed_s = 0.0
+        if not self._filtered:
+            info[keys.EXECUTED_ACTION] = np.zeros(self._shape)
+
+    def _boxed(self, control: Any) -> Array:
+        """Clipped to the action box, shape (m,)."""
+        return np.clip(np.asarray(control, dtype=np.float64), self._low, self._high)
+
+    def _rest(self) -> NDArray[Any]:
+        """Zero, or the action in the box that is closest to it."""
+        return self._boxed(np.zeros(self._shape)).astype(self._dtype)
+
+    def _is_finite(self, action: NDArray[Any], whose: str, consequence: str) -> bool:
+        """Whether an action is finite; the first one that is not is warned of, at the caller of `step`."""
+        numbers = action.astype(np.float64)
+        finite = bool(np.isfinite(numbers).all())
+        if not finite and not self._warned:
+            self._warned = True
+            message = f"the {whose} action is not finite ({numbers}); {consequence}"
+            warnings.warn(message, UserWarning, stacklevel=4)
+        return finite
+
+    def _execute(self, command: NDArray[Any]) -> tuple[Array, Step]:
+        """Step the env; returns what was executed, which a filter inside may have changed, and the env's answer."""
+        executed = np.array(
+            command, dtype=np.float64
+        )  # before the step: an env may scale the command in place
+        answer = self.env.step(command)
+        info = answer[4]
+        if self._filtered:
+            executed = np.array(info[keys.EXECUTED_ACTION], dtype=np.float64)
+        else:
+            info[keys.EXECUTED_ACTION] = executed.copy()
+        if self._fallback is not None:
+            self._fallback.executed(executed)
+        self._steps_done += 1
+        return executed, answer

@@ -1,0 +1,35 @@
+"""LayerWrapper: base of this library's wrappers."""
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.plants.default import PlantTemplate
+from safe_wrappers.serialize import recorded
+from safe_wrappers.stack import Layer, refuse_order
+
+Array = NDArray[np.float64]
+Env = gym.Env[Any, Any]
+Reset = tuple[Any, dict[str, Any]]
+"""What `reset` returns: observation and info."""
+Step = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
+"""What `step` returns: observation, reward, terminated, truncated and info."""
+
+
+class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
+    """A wrapper with a place in the stack, whose arguments are recorded in the env's spec."""
+
+    layer: ClassVar[Layer]
+
+    def __init__(self, env: Env) -> None:
+        refuse_order(env, self.layer, type(self).__name__)
+        gym.Wrapper.__init__(self, env)
+
+    def _record(self, arguments: Mapping[str, Any], **plain: Any) -> None:
+        """Record the constructor's arguments (its `locals()`), some as plain data; a plant as a template."""
+        if plain.get("plant") is not None:
+            plain["plant"] = PlantTemplate(plain["plant"])
+        gym.utils.RecordConstructorArgs.__init__(self, **recorded(arguments, **plain))

@@ -1,0 +1,72 @@
+"""StepMonitor: base of the monitors, which look at the physics of every control step and change nothing."""
+
+import warnings
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar
+
+import mujoco
+
+from safe_wrappers.errors import UnsupportedEnvError
+from safe_wrappers.plants.mujoco.replay import Replay
+from safe_wrappers.stack import Layer
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Step
+
+
+class StepMonitor(LayerWrapper, ABC):
+    """Makes each control step of a MuJoCo env once more, visits its physics, and warns once where it ends elsewhere.
+
+    Raises:
+        UnsupportedEnvError: No MuJoCo model.
+        ConfigurationError: A `ChunkHandover` inside, whose step is many control steps, or a second of its kind.
+    """
+
+    layer: ClassVar = Layer.MONITOR
+    partial: ClassVar[str]
+    """Its info key for steps that could not be replayed."""
+
+    def __init__(self, env: Env) -> None:
+        raw: Any = env.unwrapped
+        name = type(self).__name__
+        if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
+            raise UnsupportedEnvError(f"{name} needs an env with MuJoCo's .model and .data; {raw} has none")
+        LayerWrapper.__init__(self, env)
+        self._replay = Replay(raw)
+        self._warned = False
+
+    def step(self, action: Any) -> Step:
+        """Step the env, and look at the physics of that step."""
+        self._replay.before()
+        answer = self.env.step(action)
+        raw: Any = self.unwrapped
+        self._begin(raw.model)
+        whole = self._replay.after(self._visit)
+        if not whole:
+            self._warn(raw)
+            self._begin(raw.model)
+            self._visit(raw.data, float(raw.model.opt.timestep))
+        answer[4].update(self._figures(raw.data) | {self.partial: not whole})
+        return answer
+
+    @abstractmethod
+    def _begin(self, model: mujoco.MjModel) -> None:
+        """Forget what was visited; the env may have made itself another model, or was unpickled."""
+
+    @abstractmethod
+    def _visit(self, data: mujoco.MjData, time_s: float) -> None:
+        """Look at one evaluation of the physics, which acts for some time, s."""
+
+    @abstractmethod
+    def _figures(self, data: mujoco.MjData) -> dict[str, Any]:
+        """The info of what was visited and of the state after the step."""
+
+    def _warn(self, raw: Any) -> None:
+        if not self._warned:
+            self._warned = True
+            warnings.warn(
+                f"a control step of {raw}, made once more, does not end where the env's did: the env "
+                "changes its inputs or its state between physics substeps, or MuJoCo has reset it. For such steps "
+                f"{type(self).__name__} reads only the contacts that the step has left behind, and says so in "
+                f"info[{self.partial!r}]; forces before are missed",
+                UserWarning,
+                stacklevel=3,
+            )

@@ -1,0 +1,39 @@
+"""A projection that no solver has answered is called failed, and not infeasible: nothing has shown that it is."""
+
+import daqp
+import numpy as np
+import pytest
+import scipy.optimize
+
+import safe_wrappers as sw
+
+ROWS = np.array([[1.0, 0.2], [-0.3, 1.0]])
+
+
+def give_up(*_, **__):
+    raise RuntimeError("Maximum number of iterations reached.")
+
+
+def none_found(h, f, a, upper, lower, sense, primal_tol):
+    return np.zeros(f.size), 0.0, -1, {"lam": np.zeros(upper.size), "iterations": 1}
+
+
+@pytest.mark.parametrize(
+    ("rows", "offsets", "truth"),
+    [
+        (ROWS, [0.3, 0.2], "projected"),
+        (np.array([[1.0, 1.0], [-1.0, -1.0]]), [-0.5, -0.5], "infeasible"),
+        (ROWS, [-5.0, 0.2], "infeasible"),  # beyond the box
+    ],
+    ids=["feasible", "contradictory", "outside the box"],
+)
+def test_when_every_solver_gives_up_the_status_says_failed(monkeypatch, rows, offsets, truth):
+    nominal = [0.9, 0.8]
+    assert sw.project(nominal, rows, offsets, -1.0, 1.0).status == truth
+    with monkeypatch.context() as patch:
+        patch.setattr(daqp, "solve", none_found)
+        patch.setattr(scipy.optimize, "nnls", give_up)
+        answer = sw.project(nominal, rows, offsets, -1.0, 1.0)
+    assert answer.status == "failed"
+    assert (np.abs(answer.control) <= 1.0).all()
+    assert answer.violation == pytest.approx((rows @ answer.control - offsets).max())
