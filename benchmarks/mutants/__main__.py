@@ -76,7 +76,8 @@ def _tests(where: Path, words: tuple[str, ...]) -> None:
 
 def preload() -> None:
     """Import here what takes long, once for all the processes that run tests."""
-    os.environ |= {"MUJOCO_GL": "disabled", "OMP_NUM_THREADS": "1"}
+    # Compiled code is cached by the time of change of its own file only.
+    os.environ |= {"MUJOCO_GL": "disabled", "OMP_NUM_THREADS": "1", "SAFE_WRAPPERS_COMPILED": "0"}
     for name in ("daqp", "gymnasium", "hypothesis", "mujoco", "numpy", "scipy.optimize", "scipy.spatial"):
         importlib.import_module(name)
 

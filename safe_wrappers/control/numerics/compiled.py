@@ -8,6 +8,7 @@ machine code off. It is cached beside the sources, or in the user's cache where 
 import math
 import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -23,7 +24,16 @@ def _compiler() -> Callable[..., Any] | None:
     return numba.njit
 
 
+def _drop_stale(function: Callable[..., Any]) -> None:
+    """Delete cached code older than a source it may contain: the compiler looks at the function's own file only."""
+    source = Path(function.__code__.co_filename)
+    for index in (source.parent / "__pycache__").glob(f"{source.stem}.{function.__name__}-*.nbi"):
+        if index.stat().st_mtime < _NEWEST_SOURCE_S:
+            index.unlink(missing_ok=True)
+
+
 _COMPILE = _compiler()
+_NEWEST_SOURCE_S = max(source.stat().st_mtime for source in Path(__file__).parents[1].rglob("*.py"))
 IS_COMPILED = _COMPILE is not None
 """Whether `compiled` gives machine code in this process."""
 
@@ -35,6 +45,7 @@ def compiled(function: Function) -> Function:
     """
     if _COMPILE is None:
         return function
+    _drop_stale(function)
     options = {"error_model": "numpy", "nogil": True}
     try:
         return _COMPILE(cache=True, **options)(function)  # type: ignore[no-any-return]
