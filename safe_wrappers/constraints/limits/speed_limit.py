@@ -85,7 +85,8 @@ class BoundSpeedLimit(BoundRollout):
     def __init__(self, spec: SpeedLimit, plant: Plant) -> None:
         super().__init__(spec, plant)
         self._body = None if spec.body is None else self.plant.named("body", spec.body)
-        self._axes = ["xyz".index(letter) for letter in spec.direction.strip("+-")]
+        letters = spec.direction.strip("+-")
+        self._axes = slice("xyz".index(letters[0]), "xyz".index(letters[-1]) + 1)
         self._sign = {"+": 1.0, "-": -1.0}.get(spec.direction[0])
         self._window = self.plant.substeps if self.spec.average == "step" else 1
 
@@ -101,12 +102,13 @@ class BoundSpeedLimit(BoundRollout):
 
     def _point(self, frames: Array, centres: Array) -> Array:
         if self._body is None:
-            return np.asarray((self._shares @ centres)[..., self._axes])
-        return np.asarray(frames[..., self._body, :][..., self._axes])
+            return np.array((self._shares @ centres)[..., self._axes])
+        return np.array(frames[..., self._body, self._axes])
 
     def now(self) -> Array:
-        mass = self.plant.model.body_mass
-        self._shares = mass / mass.sum()
+        if self._body is None:
+            mass = self.plant.model.body_mass
+            self._shares = mass / mass.sum()
         pose = self.plant.pose()
         data = self.plant.published()
         self._shown = None if data is None else self._point(data.xpos, data.xipos)
@@ -133,7 +135,12 @@ class BoundSpeedLimit(BoundRollout):
         if self.spec.average == "substep" or self._shown is None:
             return left[:, None]
         shown = self._point(forecast.published_frames, forecast.published_centres)
-        return np.stack([left, self._along(shown, self._shown)], axis=1)
+        both = np.empty((len(left), 2))
+        both[:, 0], both[:, 1] = left, self._along(shown, self._shown)
+        return both
 
     def _along(self, points: Array, start: Array) -> Array:
-        return self._left(np.diff(points, axis=0, prepend=start[None]), self._window)
+        moved = points.copy()
+        moved[0] -= start
+        moved[1:] -= points[:-1]
+        return self._left(moved, self._window)

@@ -99,13 +99,14 @@ class Recorder:
             mujoco.mj_copyData(data, m, self.held)
             qpos[:n], qvel[:n] = first.qpos, first.qvel
             frames[:1], centres[:1] = first.published_frames, first.published_centres
+        q, v = data.qpos, data.qvel  # views, which stay valid
         for hold in range(0 if first is None else 1, horizon):
             self.act(data, self.braking(data) if hold else control)
             for i in range(hold * n, hold * n + n):
                 mujoco.mj_step(m, data)
                 if i == hold * n + n - 1:
                     self.settle(data)
-                qpos[i], qvel[i] = data.qpos, data.qvel
+                qpos[i], qvel[i] = q, v
             frames[hold], centres[hold] = data.xpos, data.xipos
             if hold == 0:
                 mujoco.mj_copyData(self.held, m, data)
