@@ -16,7 +16,7 @@ class Approaching(BoundRollout):
 
     def __init__(self, plant, margin=0.0, horizon=1):
         self.spec, self.plant, self._max_decrease = (
-            SimpleNamespace(margin=margin, horizon=horizon, unit="m"),
+            SimpleNamespace(margin=margin, horizon=horizon, look_ahead_below=None, unit="m"),
             plant,
             None,
         )

@@ -301,12 +301,54 @@ def test_a_reach_spares_the_forecasts_far_from_the_limit(monkeypatch):
     assert calls[0] == 1  # 1.0 - 0.4 - 0.4 is not quite the margin: looked at
 
 
+def test_a_control_that_leaves_enough_is_admitted_without_a_look_ahead():
+    # The hill again: 0.28 m/s are left after the own step of the brakes, 0.22 after full throttle's.
+    for gate, admitted in (
+        (None, [False, False]),
+        (0.3, [False, False]),
+        (0.25, [True, False]),
+        (0.2, [True, True]),
+    ):
+        env = sliders(range_="-1 1")
+        env.model.opt.gravity[0] = 5.0
+        env.data.qvel[0] = 0.6
+        mujoco.mj_forward(env.model, env.data)
+        limit, _ = watching(env, limit=1.0, direction="+x", horizon=3, look_ahead_below=gate)
+        assert [limit.admits(np.array([u])) for u in (-1.0, 1.0)] == admitted
+    for wrong in (0.0, -1.0, np.nan):
+        with pytest.raises(ConfigurationError, match="look_ahead_below must be"):
+            sw.constraints.SpeedLimit(1.0, look_ahead_below=wrong)
+
+
+@pytest.mark.parametrize("robot", ["HalfCheetah", "Hopper"])
+def test_with_a_gate_a_slow_robot_is_stepped_as_often_as_without_a_filter(monkeypatch, robot):
+    count, step = [0], mujoco.mj_step
+
+    def counted(model, data, nstep=1):
+        count[0] += nstep
+        step(model, data, nstep)
+
+    env = sw.protect(gym.make(f"Safe{robot}Velocity-v0"))
+    env.reset(seed=0)
+    monkeypatch.setattr(mujoco, "mj_step", counted)
+    for _ in range(5):
+        env.step(np.zeros(env.action_space.shape, np.float32))
+    assert count[0] == 5 * env.unwrapped.frame_skip
+
+
 # Plain data, and what is refused ------------------------------------------------------------------------------
 
 
 def test_it_is_rebuilt_from_the_spec_and_from_json():
     limit = sw.constraints.SpeedLimit(
-        1.5, "torso", "-x", average="substep", margin=0.1, horizon=4, max_decrease=0.7
+        1.5,
+        "torso",
+        "-x",
+        average="substep",
+        margin=0.1,
+        horizon=4,
+        max_decrease=0.7,
+        look_ahead_below=0.6,
     )
     filtered = sw.CBFActionFilter(gym.make("HalfCheetah-v5"), [limit])
     for spec in (filtered.spec, EnvSpec.from_json(filtered.spec.to_json())):
@@ -322,6 +364,7 @@ def test_it_is_rebuilt_from_the_spec_and_from_json():
         "margin": 0.1,
         "horizon": 4,
         "max_decrease": 0.7,
+        "look_ahead_below": 0.6,
     }
     assert constraint_from(data) == limit
     assert limit.promise == "best effort" and filtered.filter.bound[0].scale == 1.5
