@@ -108,7 +108,17 @@ def test_metadata(wheel):
     assert metadata["License-Expression"] == "MIT"
     plain = [r for r in metadata.get_all("Requires-Dist") if "extra ==" not in r]
     needed = {re.split(r"[\s<>=\[;!~]", r)[0].lower() for r in plain}
-    assert needed == {"numpy", "scipy", "gymnasium", "mujoco", "qpsolvers", "daqp", "clarabel", "ruckig"}
+    assert needed == {
+        "numpy",
+        "scipy",
+        "gymnasium",
+        "mujoco",
+        "numba",
+        "qpsolvers",
+        "daqp",
+        "clarabel",
+        "ruckig",
+    }
     mujoco = [Requirement(r) for r in metadata.get_all("Requires-Dist") if r.startswith("mujoco")]
     for version, extra, taken in (
         ("3.3.6", "", False), ("3.3.7", "", True), ("4.0.0", "", True), ("5.0.0", "", False),

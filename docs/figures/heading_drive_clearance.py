@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from _style import FORBIDDEN, INK, ON, OTHER, SAFE, bare, panels
+from safe_wrappers.plants.queries.planar_robot import PlanarFrame
 
 Array = NDArray[np.float64]
 
@@ -30,7 +31,8 @@ def braking(detail: dict[str, Any]) -> tuple[Array, Any]:
     task.set_state(task.data.qpos.copy(), qvel)
     bound: Any = filtered.filter.bound[0]
     filtered.filter.observe()
-    area = bound._path
+    heading = PlanarFrame(filtered.plant, "agent").motion(filtered.plant)
+    area = bound.drive.stopping_path(heading)
     where = [task.agent_position]
     for _ in range(150):
         filtered.filter.observe()

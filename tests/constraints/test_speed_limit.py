@@ -321,7 +321,7 @@ def test_a_control_that_leaves_enough_is_admitted_without_a_look_ahead():
 
 
 @pytest.mark.parametrize("robot", ["HalfCheetah", "Hopper"])
-def test_with_a_gate_a_slow_robot_is_stepped_as_often_as_without_a_filter(monkeypatch, robot):
+def test_with_a_gate_a_slow_robot_is_rolled_out_for_its_own_step_alone(monkeypatch, robot):
     count, step = [0], mujoco.mj_step
 
     def counted(model, data, nstep=1):
@@ -333,7 +333,8 @@ def test_with_a_gate_a_slow_robot_is_stepped_as_often_as_without_a_filter(monkey
     monkeypatch.setattr(mujoco, "mj_step", counted)
     for _ in range(5):
         env.step(np.zeros(env.action_space.shape, np.float32))
-    assert count[0] == 5 * env.unwrapped.frame_skip
+    # The rollouts, and the env's own steps: nothing is shared while somebody counts.
+    assert count[0] == 2 * 5 * env.unwrapped.frame_skip and env.plant.shared_steps == 0
 
 
 # Plain data, and what is refused ------------------------------------------------------------------------------

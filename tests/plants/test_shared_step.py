@@ -124,6 +124,24 @@ def test_the_env_keeps_its_own_step():
     assert env.plant.shared_steps == 1
 
 
+def test_who_watches_the_physics_steps_sees_all_of_them(monkeypatch):
+    env, seen, step = filtered("Hopper-v5"), [0], mujoco.mj_step
+    env.reset(seed=0)
+
+    def watched(model, data, nstep=1):
+        seen[0] += nstep * (data is env.unwrapped.data)
+        step(model, data, nstep)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(mujoco, "mj_step", watched)
+        env.step(np.zeros(3, np.float32))
+    assert seen[0] == env.unwrapped.frame_skip and env.plant.shared_steps == 0
+    raw, own = env.unwrapped, []
+    raw._step_mujoco_simulation = lambda ctrl, n: own.append(n)
+    env.step(np.zeros(3, np.float32))
+    assert own == [env.unwrapped.frame_skip] and "_step_mujoco_simulation" in vars(raw)
+
+
 def heavier():
     model = gym.make("Hopper-v5").unwrapped.model
     spec = mujoco.MjModel.from_xml_path(gym.make("Hopper-v5").unwrapped.fullpath)

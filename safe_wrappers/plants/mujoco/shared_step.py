@@ -14,6 +14,7 @@ from safe_wrappers.plants.mujoco.forecast import Recorder
 Array = NDArray[np.float64]
 
 _STATE: Final = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+_MJ_STEP: Final = mujoco.mj_step
 _KNOWN: Final = ("gymnasium.envs.mujoco.", "safe_wrappers.envs.velocity")
 """Envs whose shared step was measured equal bit for bit (`tests/plants/test_shared_step.py`)."""
 
@@ -72,6 +73,8 @@ class SharedStep:
             rollout: Holds the data at the end of the control interval.
             start: Integration state that the rollout started from.
         """
+        if mujoco.mj_step is not _MJ_STEP or "_step_mujoco_simulation" in vars(self._raw):
+            return env.step(action)  # somebody watches the physics steps, or makes them
         raw, simulate = self._raw, self._raw._step_mujoco_simulation
 
         def take_over(ctrl: Array, n_frames: int) -> None:
