@@ -162,8 +162,8 @@ class BoundConstraint:
         """The search for an admissible control, done by the constraint itself.
 
         Returns:
-            The control, shape (m,), inside the bounds; the `Stage` that found it; rows that it keeps, for rounding.
-            None: it has found none, and the search goes on as for every constraint.
+            The control, shape (m,), inside the action box and the plant's bounds; the `Stage` that found it; rows
+            that it keeps, for rounding. None: it has found none, and the search goes on as for every constraint.
         """
         return None
 

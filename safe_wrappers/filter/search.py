@@ -113,8 +113,7 @@ class SafeActionSearch:
 
     def _decide(self, proposal: Array, last: Array) -> Decision:
         if self._sole is not None:
-            low, high = np.maximum(self._low, self._plant.lower), np.minimum(self._high, self._plant.upper)
-            found = self._sole.decide(proposal, low, high)
+            found = self._sole.decide(proposal, self._low, self._high)
             if found is not None:
                 control, stage, rows = found
                 return Decision(

@@ -138,6 +138,7 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         """The whole search at once, without a solver."""
         if self.admits(proposal):
             return proposal, among.PROPOSAL, HalfSpaces.none(2)
+        low, high = np.maximum(low, self.plant.lower), np.minimum(high, self.plant.upper)
         least, most = self.plant.acting_range
         bounds = np.array(
             [self._pair(x) for x in (low, high, np.clip(least, low, high), np.clip(most, low, high))]
