@@ -4,10 +4,15 @@
 the clamp more control changes nothing, so it becomes a bound on the control.
 """
 
+import math
+from typing import Any
+
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
+from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.model import control_range, inertia
 
@@ -47,6 +52,47 @@ def _refuse(actuator: str, what: str, handled: str) -> None:
         f"actuator {actuator!r} has {what}, which MujocoPlant cannot write as f(x) + g(x) u; it handles: "
         f"{handled}. Use AnalyticPlant with your own f and g."
     )
+
+
+@compiled
+def _acting_range(
+    gain_type: NDArray[Any],
+    gain: Array,
+    bias_type: NDArray[Any],
+    bias: Array,
+    force_limited: NDArray[Any],
+    force_range: Array,
+    control_limited: NDArray[Any],
+    control_range: Array,
+    gear: Array,
+    acceleration: Array,
+    length: Array,
+    velocity: Array,
+    control_dt: float,
+    least: Array,
+    most: Array,
+) -> None:
+    """Writes `AffineActuators.acting_range` into `least` and `most`; the arrays are MuJoCo's of the actuators."""
+    for i in range(len(least)):
+        low, high = -math.inf, math.inf
+        if control_limited[i]:
+            low, high = control_range[i, 0], control_range[i, 1]
+        scale, offset = gain[i, 0], 0.0
+        if gain_type[i] == _AFFINE_GAIN:
+            scale += gain[i, 1] * length[i] + gain[i, 2] * velocity[i]
+        if bias_type[i] == _AFFINE_BIAS:
+            offset = bias[i, 0] + bias[i, 1] * length[i] + bias[i, 2] * velocity[i]
+        least[i], most[i] = low, high
+        if force_limited[i] and scale != 0.0:
+            ends = (force_range[i, 0] - offset) / scale, (force_range[i, 1] - offset) / scale
+            feedback = abs(bias[i, 2]) if bias_type[i] == _AFFINE_BIAS else 0.0
+            strongest = max(abs(force_range[i, 0]), abs(force_range[i, 1]))
+            lever = 0.0
+            for j in range(gear.shape[1]):
+                lever = max(lever, abs(gear[i, j]))
+            widen = feedback * (lever * acceleration[i] * strongest * control_dt) / abs(scale)
+            least[i] = min(max(min(ends[0], ends[1]) - widen, low), high)
+            most[i] = min(max(max(ends[0], ends[1]) + widen, low), high)
 
 
 class AffineActuators:
@@ -95,21 +141,14 @@ class AffineActuators:
         clamp within `control_dt`, s; `actuator_acc0`, acceleration per force in the reference pose, bounds how fast.
         """
         m = self._model
-        low, high = control_range(m)
-        clamped = m.actuator_forcelimited.astype(bool)
-        if not clamped.any():
-            return low, high
-        gain, bias = self.gain_and_bias(length, velocity)
-        acts = clamped & (gain != 0.0)
-        scale = np.where(acts, gain, 1.0)
-        ends = (m.actuator_forcerange - bias[:, None]) / scale[:, None]
-        feedback = np.abs(m.actuator_biastype * m.actuator_biasprm[:, 2])
-        strongest = np.abs(m.actuator_forcerange).max(axis=1)
-        reach = np.abs(m.actuator_gear).max(axis=1) * m.actuator_acc0 * strongest * control_dt
-        widen = feedback * reach / np.abs(scale)
-        least = np.where(acts, ends.min(axis=1) - widen, -np.inf)
-        most = np.where(acts, ends.max(axis=1) + widen, np.inf)
-        return np.clip(least, low, high), np.clip(most, low, high)
+        if not m.actuator_forcelimited.any():
+            return control_range(m)
+        least, most = np.empty(m.nu), np.empty(m.nu)
+        gain, bias = (m.actuator_gaintype, m.actuator_gainprm), (m.actuator_biastype, m.actuator_biasprm)
+        clamp = m.actuator_forcelimited, m.actuator_forcerange, m.actuator_ctrllimited, m.actuator_ctrlrange
+        response = m.actuator_gear, m.actuator_acc0
+        _acting_range(*gain, *bias, *clamp, *response, length, velocity, control_dt, least, most)
+        return least, most
 
     def motion_without_kinematics(self, qpos: Array, qvel: Array) -> tuple[Array, Array] | None:
         """Length and velocity of the transmissions where the joints alone determine every clamp, else None."""
