@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.control.handover.smoothstep import smoothstep
-from safe_wrappers.control.watchdog.leases import LeaseDelays
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint
@@ -145,9 +144,10 @@ class LeaseExpiry(CommandGate):
         brake_blend_time = non_negative("brake_blend_time", brake_blend_time, "s")
         self._brake_steps = whole_steps(brake_blend_time, self.control_dt)
         self._clock_error_s = non_negative("clock_error_s", clock_error_s, "s")
-        delays = {"detect_s": detect_s, "confirm_s": confirm_s, "age_s": age_s}
-        of_formula = LeaseDelays(*(non_negative(name, value, "s") for name, value in delays.items()))
-        self._delays_s = of_formula.total_s + self._brake_steps * self.control_dt + self._clock_error_s
+        self._delays_s = non_negative("detect_s", detect_s, "s") + non_negative("confirm_s", confirm_s, "s")
+        self._delays_s += non_negative("age_s", age_s, "s")
+        self._delays_s += self._brake_steps * self.control_dt
+        self._delays_s += self._clock_error_s
         self._delays_s += self._same_s  # by which a step may outlast its lease
         self._budget = BoundBudget(budget, env)
         plant = self._budget.plant_of(plant)

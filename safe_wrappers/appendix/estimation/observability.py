@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from safe_wrappers.appendix.estimation.taylor import Function, output_series
 from safe_wrappers.control.estimation.observability import (
     LONGEST_TIME_SCALE_S,
+    TOLERANCE,
     checked_system,
-    checked_tolerance,
     checked_vector,
     described_subspace,
     scale_system,
@@ -133,7 +133,7 @@ def linear_observability(
     known = state_names(names, len(a))
     scaled = scale_system(a, c)
     values = np.linalg.svd(observability_matrix(scaled.a, scaled.c), compute_uv=False)
-    basis, gap = unobservable_subspace(scaled, checked_tolerance(tolerance))
+    basis, gap = unobservable_subspace(scaled, _checked_tolerance(tolerance))
     return LinearObservability(
         rank=len(a) - basis.shape[1],
         singular_values=_padded(values, len(a)),
@@ -236,7 +236,7 @@ def nonlinear_observability(
     known = state_names(names, len(state))
     if order is not None and order < 0:
         raise ConfigurationError(f"the order of the Lie derivatives must not be negative, got {order}")
-    tolerance = checked_tolerance(tolerance)
+    tolerance = _checked_tolerance(tolerance)
     series = _certain_series(f, h, state, 2 * len(state) if order is None else order)
     rows = np.stack([_in_own_time(output) for output in series.swapaxes(0, 1)], axis=1)
     sizes = np.abs(rows).max(axis=(0, 1))
@@ -298,3 +298,12 @@ def _in_own_time(rows: Array) -> Array:
 
 def _count(values: Array, tolerance: float) -> int:
     return int((values > tolerance * values[0]).sum()) if values.size and values[0] > 0.0 else 0
+
+
+def _checked_tolerance(tolerance: float | None) -> float:
+    """The tolerance, between 0 and 1, or `TOLERANCE` for None."""
+    if tolerance is None:
+        return TOLERANCE
+    if not 0.0 < tolerance < 1.0:
+        raise ConfigurationError(f"the tolerance is a share of the scale, between 0 and 1, got {tolerance}")
+    return tolerance

@@ -194,12 +194,3 @@ def state_names(names: Sequence[str] | None, n: int) -> tuple[str, ...]:
     if isinstance(names, str) or len(names) != n or len(set(names)) != n:
         raise ConfigurationError(f"expected a name of its own for each of the {n} states, got {names!r}")
     return tuple(names)
-
-
-def checked_tolerance(tolerance: float | None) -> float:
-    """The tolerance, between 0 and 1, or `TOLERANCE` for None."""
-    if tolerance is None:
-        return TOLERANCE
-    if not 0.0 < tolerance < 1.0:
-        raise ConfigurationError(f"the tolerance is a share of the scale, between 0 and 1, got {tolerance}")
-    return tolerance

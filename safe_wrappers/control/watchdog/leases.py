@@ -13,7 +13,6 @@ A lease of zero or less means: revoke now. Rounding only shortens a lease, and i
 """
 
 import math
-from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,34 +27,6 @@ _TINY = 1e-300
 """Absolute reserve for subnormal numbers, whose relative precision is lost."""
 _LONGEST = 1e300
 """s; largest finite lease, so that nothing overflows."""
-
-
-@dataclass(frozen=True)
-class LeaseDelays:
-    """Delays in addition to the lease, in s, finite and at least 0.
-
-    Attributes:
-        detect_s: T_detect, until the end of the lease is recognised.
-        hold_s: T_hold, a confirmation window in which the last command continues.
-        age_s: t_age, age of the clearance's reading when the lease is granted.
-        act_s: T_act, until full deceleration.
-    """
-
-    detect_s: float = 0.0
-    hold_s: float = 0.0
-    age_s: float = 0.0
-    act_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ConfigurationError(f"{field.name} must be a finite time of at least 0 s, got {value!r}")
-
-    @property
-    def total_s(self) -> float:
-        """Their sum, s."""
-        return self.detect_s + self.hold_s + self.age_s + self.act_s
 
 
 def longest_lease(
@@ -82,7 +53,7 @@ def longest_lease(
         clearance: D_clear as measured `age` ago, m, shape (...).
         speed: Approach speed as measured then, m/s, positive towards the obstacle, shape (...).
         braking: Verified lower bound on the deceleration, m/s^2, shape (...).
-        delays_s: T_detect + T_hold + t_age + T_act (`LeaseDelays.total_s`), s, shape (...).
+        delays_s: T_detect + T_hold + t_age + T_act, s, shape (...).
         localisation: delta_loc, bound on the error of the clearance, m, shape (...).
         margin: delta_margin, clearance at rest, m, shape (...).
         acceleration: Largest approach acceleration that any command may cause until the brakes hold, m/s^2.
