@@ -20,7 +20,6 @@ from safe_wrappers.control.estimation.observability import (
     described_subspace,
     scale_system,
     state_names,
-    tolerance_gap,
     unobservable_subspace,
 )
 from safe_wrappers.errors import ConfigurationError
@@ -133,11 +132,12 @@ def linear_observability(
     known = state_names(names, len(a))
     scaled = scale_system(a, c)
     values = np.linalg.svd(observability_matrix(scaled.a, scaled.c), compute_uv=False)
-    basis, gap = unobservable_subspace(scaled, _checked_tolerance(tolerance))
+    tolerance = _checked_tolerance(tolerance)
+    basis, compared = unobservable_subspace(scaled, tolerance)
     return LinearObservability(
         rank=len(a) - basis.shape[1],
         singular_values=_padded(values, len(a)),
-        gap=gap,
+        gap=min((_tolerance_gap(each, tolerance) for each in compared), default=math.inf),
         unobservable=basis,
         names=described_subspace(basis, known),
         time_scale_s=scaled.time_s,
@@ -252,7 +252,7 @@ def nonlinear_observability(
     return NonlinearObservability(
         rank=ranks[-1],
         singular_values=values,
-        gap=tolerance_gap(values / (values[0] or 1.0), tolerance),
+        gap=_tolerance_gap(values / (values[0] or 1.0), tolerance),
         unobservable=basis,
         names=described_subspace(basis, known),
         rank_by_order=ranks,
@@ -307,3 +307,11 @@ def _checked_tolerance(tolerance: float | None) -> float:
     if not 0.0 < tolerance < 1.0:
         raise ConfigurationError(f"the tolerance is a share of the scale, between 0 and 1, got {tolerance}")
     return tolerance
+
+
+def _tolerance_gap(values: Array, tolerance: float) -> float:
+    """Factor by which the tolerance could be larger or smaller with the same number of values above it."""
+    kept, dropped = values[values > tolerance], values[values <= tolerance]
+    largest = dropped.max(initial=0.0)
+    below = tolerance / largest if largest > 0.0 else math.inf
+    return float(min(kept.min(initial=math.inf) / tolerance, below))

@@ -1,16 +1,12 @@
-"""Energy at a port: ledgers of ports and channels, wave variables.
+"""Energy at a port: the ledger of a channel, wave variables.
 
 Source: appendix "Passivity and Energy-Bounded Interaction". A port has an effort F (N or N m) and a flow v (m/s or
-rad/s); their product is power, *positive into the component*. A component with storage V >= 0 is passive when
+rad/s); their product is power. A channel is passive when no more energy comes out than was stored at the start and
+went in; the wave transform keeps that for a *fixed* delay only. A sum of samples is the integral only if one of the
+two is held over the interval and the other is its mean; a product of two samples is an estimate.
 
-    integral of F.v dt  >=  V(T) - V(0) + dissipated  >=  -V(0)        (the appendix's equation 2)
-
-so no more energy comes out than was stored at the start. That limits neither force nor displacement, and the wave
-transform keeps it for a *fixed* delay only. A sum of samples is the integral only if one of the two is held over the
-interval and the other is its mean; a product of two samples is an estimate.
-
-Efforts, flows and waves are numbers (a port of one component) or arrays of shape (m,); functions without memory also
-take leading batch axes, (..., m). What is not finite raises `ConfigurationError`.
+Efforts, flows and waves are numbers or arrays of shape (m,); functions without memory also take batch axes, (..., m).
+What is not finite raises `ConfigurationError`.
 """
 
 import math
@@ -65,8 +61,6 @@ def to_waves(effort: ArrayLike, flow: ArrayLike, impedance: float) -> Waves:
 
 def effort_and_outgoing(flow: ArrayLike, incoming: ArrayLike, impedance: float) -> EffortAndWave:
     """The operator's side: effort F and outgoing wave u for a known flow and the incoming wave w.
-
-    `F = b v + sqrt(2 b) w` and `u = sqrt(2 b) v + w`.
 
     Args:
         flow: v, m/s, shape (..., m), or a number.
