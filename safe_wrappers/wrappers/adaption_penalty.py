@@ -16,7 +16,7 @@ class AdaptionPenalty(LayerWrapper):
     The learner keeps its own action a, and its reward is r(s, a_safe) less `penalty + per_correction * |a_safe - a|`
     (Krasowski et al., Provably Safe Reinforcement Learning, TMLR 2023). Wrappers that scale or clip rewards belong
     inside, and `RecordInterventions` and SB3's `Monitor` too. With hindsight replay use
-    `safe_wrappers.sb3.ExecutedActionHerReplayBuffer`: `compute_reward` of a task stays the task's own.
+    `safe_wrappers.sb3.ExecutedActionHerReplayBuffer`, which takes the penalty off relabelled rewards too.
 
     Args:
         env: With a `CBFActionFilter` inside.

@@ -50,7 +50,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         blend: "smoothstep", "quintic", "hermite"; or a baseline without any bound: "replace" takes the new chunk at
             once, "ensemble" averages all chunks at hand (temporal ensembling, Zhao et al., RSS 2023).
         blend_time: s, the least duration of a blend; without it and `rate_limit` blends are as long as the left-over.
-        rate_limit: Bound on |u[k+1] - u[k]| / control interval, one or one per component, action units per second.
+        rate_limit: Bound on |u[k+1] - u[k]| / control interval, for all components or one each, action units per s.
         fallback: "brake", "hold", "zero", or a function of the plant; "brake" needs MuJoCo or a plant.
         plant: For the fallback; None reads the env's MuJoCo model.
         control_dt: Control interval, s; None reads the env's `dt`.

@@ -67,7 +67,7 @@ class LeaseExpiry(CommandGate):
         brake_blend_time: s, of the way to the fallback; it counts in the budget. 0: at once.
         clock_error_s: Bound on how wrong the times of observations may be, s; it counts in the budget.
         motion_limits: For actions that are position setpoints: {"max_acceleration": ..., "max_speed": ...,
-            "max_jerk": ..., "arrival": "moving" or "rest"}, by which chunks are refused (`Admission`).
+            "max_jerk": ..., "arrival": "moving" or "rest"}; chunks whose end is out of reach are refused.
         measured: For `motion_limits`: a function of the env that returns positions, velocities and, for an arrival at
             rest with limited jerk, accelerations; None reads the lengths of the MuJoCo actuators.
         fallback: "brake", "hold", "zero", or a function of the plant.

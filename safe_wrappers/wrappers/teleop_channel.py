@@ -52,7 +52,7 @@ class TeleopChannel(CommandGate):
         downlink: For observations, likewise.
         coding: "plain" or "wave".
         impedance: Characteristic impedance b of the waves, N s/m; for "wave".
-        passivity: "none", or for plain coding with a port "controller": no end gives out more than it heard taken in.
+        passivity: "none", or "controller" (plain coding with a port), which bounds the energy each end gives out.
         ceiling: A `RoundTripCeiling`, the dict of one, or None: authority is never revoked.
         missing: What acts while no command arrives: "hold" the last one (at first zero), "zero", or "fallback".
         wave_rule: "queue", "hold" or "zero": what a wave line puts out when packets are late.
