@@ -14,10 +14,9 @@ class AdaptionPenalty(LayerWrapper):
     """Takes a penalty off the reward at every step at which the filter changed the action.
 
     The learner keeps its own action a, and its reward is r(s, a_safe) less `penalty + per_correction * |a_safe - a|`
-    (Krasowski et al., Provably Safe Reinforcement Learning, TMLR 2023). `compute_reward` of a task with goals stays
-    the task's own; with hindsight replay use `safe_wrappers.sb3.ExecutedActionHerReplayBuffer`, which takes the
-    penalty off relabelled rewards too. Put it outside `RecordInterventions` and SB3's `Monitor`, so that these record
-    the task's own reward; wrappers that scale or clip rewards belong inside. For evaluation leave it out.
+    (Krasowski et al., Provably Safe Reinforcement Learning, TMLR 2023). Wrappers that scale or clip rewards belong
+    inside, and `RecordInterventions` and SB3's `Monitor` too. With hindsight replay use
+    `safe_wrappers.sb3.ExecutedActionHerReplayBuffer`, which takes the penalty off relabelled rewards too.
 
     Args:
         env: With a `CBFActionFilter` inside.

@@ -25,11 +25,10 @@ PRESSING: Final = 0.01
 class BalanceMonitor(StepMonitor):
     """Reports momentum, used friction and support of a robot on fixed ground; changes nothing.
 
-    Like `ContactMonitor` it makes each control step once more on data of its own, and looks at the contacts of the
-    robot with what does not move at every evaluation of the physics. There is a zero moment point only while three or
-    more contact points, not on a line, are in one plane (within 1 cm and 0.05 rad) and something presses on it.
-    Forces are those of contact points: torsional and rolling friction (condim 4 and 6) and forces of the env's own
-    are left out. Put it inside `ChunkHandover`; elsewhere its place does not matter.
+    Like `ContactMonitor` it makes each control step once more, and looks at the robot's contacts with what does not
+    move at every evaluation of the physics. There is a zero moment point only while three or more contact points, not
+    on a line, are in one plane (within 1 cm and 0.05 rad) and something presses on it. Torsional and rolling friction
+    and forces of the env's own are left out.
 
     Args:
         env: Its unwrapped env has MuJoCo's `.model` and `.data`.
@@ -41,9 +40,8 @@ class BalanceMonitor(StepMonitor):
     and ``balance/angular_momentum`` about its centre of mass (kg m^2/s), arrays (3,); ``balance/friction_used``, the
     largest ``|f_t| / (friction_share mu f_n)`` of a contact that carries at least 1 % of the weight;
     ``balance/zmp_margin`` (m), from the edge of the support polygon minus the inset, 0 without a polygon;
-    ``balance/supported`` and ``balance/airborne``, shares of the evaluations with a polygon and without a contact
-    point; ``balance/partial`` (bool): the step could not be replayed, and the figures are those of the contacts that
-    it has left behind (0 if not finite).
+    ``balance/supported`` and ``balance/airborne``, shares of the evaluations with a polygon and without a contact;
+    ``balance/partial`` (bool): not replayed, the figures are those of the contacts left behind (0 if not finite).
 
     Raises:
         UnsupportedEnvError: No MuJoCo model, or nothing of the robot can touch the fixed world with friction.

@@ -32,9 +32,8 @@ _SAFE_TOLERANCE = 1e-6
 class CBFActionFilter(LayerWrapper):
     """Filters actions through constraints, all of them in one projection.
 
-    At every step: if every constraint admits the policy's action, execute it bit for bit; else project it onto the
-    rows of all constraints and the actuator box at once, and check the answer against the rows and, where a
-    constraint can, by prediction; if nothing admissible is found, run the fallback and say so.
+    An action that every constraint admits is executed bit for bit; others are projected onto the rows of all
+    constraints and the actuator box at once, and checked; if nothing admissible is found, the fallback acts.
 
     **What it guarantees.** No non-finite action, and none outside the action space, reaches the env. The executed
     action satisfies every constraint's rows (to 1e-8 of half the box) or, where a constraint predicts the held
@@ -43,7 +42,7 @@ class CBFActionFilter(LayerWrapper):
     physics substep, whatever the fallback.
 
     **What it does not.** A "best effort" constraint, a plant outside its margins, or a start that is already
-    unsafe (warned of once per episode, counted in `cbf/unsafe`) void that. It does not clip rewards or end episodes.
+    unsafe (warned of once per episode, counted in `cbf/unsafe`) void that.
 
     Args:
         env: With a one-dimensional Box action space.

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -33,20 +33,14 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
 
     The action space becomes the chunk, shape (H, m). One `step(chunk)` is `execution_horizon` control steps (fewer
     where the episode ends); rewards are summed up. A chunk's entry j is meant for the j-th control step after its
-    observation. With an `inference_delay` of d the left-over of the chunk before goes on for d control steps, then
-    the new chunk takes over at its entry d, over a blend (`control/handover/seams.py`). Without a left-over the
-    fallback acts.
+    observation; with an `inference_delay` of d it takes over at its entry d, over a blend. Without a left-over of
+    the chunk before the fallback acts. With `chunk_size=1, execution_horizon=1` it takes actions (m,), too.
 
-    **What it guarantees.** With `rate_limit`, the commands that this wrapper sends in neighbouring control steps of
-    an episode differ by at most `rate_limit` times the control interval in every component, whatever the chunks:
-    where no blend can keep the limit the commands are held back, which is counted (`handover/limited`). A chunk with
-    an entry that is not finite is refused as a whole. Entries outside the action box are clipped to it.
-
-    **What it does not.** A filter inside may have to break the limit; `handover/peak_jerk` is measured on executed
-    commands. It does not check that a chunk is safe: `LeaseExpiry` and `CBFActionFilter` belong inside.
-
-    With `chunk_size=1, execution_horizon=1` it takes the actions (m,) of ordinary policies, too: they are held back
-    by `rate_limit` alone, and only a change of their source (`switch`, or the fallback) is blended.
+    **What it guarantees.** With `rate_limit`, the commands that it sends in neighbouring control steps of an episode
+    differ by at most `rate_limit` times the control interval in every component, whatever the chunks; commands that
+    are held back for it are counted (`handover/limited`). A chunk with an entry that is not finite is refused as a
+    whole. Entries outside the action box are clipped to it. **What it does not.** A filter inside may have to break
+    the limit. It does not check that a chunk is safe: `LeaseExpiry` and `CBFActionFilter` belong inside.
 
     Args:
         env: With a one-dimensional Box action space.
@@ -56,16 +50,13 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         blend: "smoothstep", "quintic", "hermite"; or a baseline without any bound: "replace" takes the new chunk at
             once, "ensemble" averages all chunks at hand (temporal ensembling, Zhao et al., RSS 2023).
         blend_time: s, the least duration of a blend; without it and `rate_limit` blends are as long as the left-over.
-        rate_limit: Bound on |u[k+1] - u[k]| / control interval, for every action component, or a list with one for
-            each, action units per second.
+        rate_limit: Bound on |u[k+1] - u[k]| / control interval, for all components or one each, action units per s.
         fallback: "brake", "hold", "zero", or a function of the plant; "brake" needs MuJoCo or a plant.
         plant: For the fallback; None reads the env's MuJoCo model.
         control_dt: Control interval, s; None reads the env's `dt`.
         decay: The ensemble's weights are exp(-decay i), i = 0 the oldest.
-        steps_per_entry: Control steps from one entry of a chunk to the next, with a cubic Hermite spline between; H
-            then is `(chunk_size - 1) * steps_per_entry + 1` control steps.
-        clock_error_s: Observation times that are ahead of `now_s` by no more count as now, s; a chunk that is farther
-            ahead is refused.
+        steps_per_entry: Control steps from one entry of a chunk to the next, with a cubic Hermite spline between.
+        clock_error_s: Observation times that are ahead of `now_s` by no more count as now, s; others are refused.
 
     Info, at every step (see `safe_wrappers.info`): ``handover/seam_jump``, ``handover/peak_jerk``,
     ``handover/blend_time``, ``handover/starved``, ``handover/limited``, ``handover/refused``, ``handover/latency``,
@@ -267,15 +258,6 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         }
 
 
-_MERGES: dict[str, Callable[..., Any]] = {
-    "sum": np.sum,
-    "any": np.any,
-    "max": np.max,
-    "min": np.min,
-    "mean": np.mean,
-}
-
-
 def macro_info(infos: list[dict[str, Any]]) -> dict[str, Any]:
     """The last control step's info, with each registered key merged over the steps as `InfoKey.chunk` says."""
     last = infos[-1]
@@ -284,8 +266,8 @@ def macro_info(infos: list[dict[str, Any]]) -> dict[str, Any]:
     merged: dict[str, Any] = {}
     for name, key in keys.KEYS.items():
         values = [i[name] for i in infos if name in i and (not key.where or i.get(key.where))]
-        if values and key.chunk in _MERGES:
-            value = _MERGES[key.chunk](values, axis=0)
+        if values and key.chunk != "last":
+            value = getattr(np, key.chunk)(values, axis=0)  # the others are NumPy's own names
             array = isinstance(values[-1], np.ndarray)
             merged[name] = np.asarray(value, values[-1].dtype) if array else type(values[-1])(value)
     last.update(merged)

@@ -18,9 +18,8 @@ class ContactMonitor(StepMonitor):
     """Reports forces, impulses and penetrations of a MuJoCo env's contacts; changes nothing.
 
     It sees every physics substep, and every stage of a Runge-Kutta step: each control step is made once more on data
-    of its own, from the state before it and with the inputs (controls, applied forces) that the env has left. An env
-    that changes its inputs or its state between substeps cannot be replayed. Put it inside `ChunkHandover`; elsewhere
-    its place does not matter.
+    of its own, from the state before it and with the inputs that the env has left. An env that changes its inputs or
+    its state between substeps cannot be replayed.
 
     Args:
         env: Its unwrapped env has MuJoCo's `.model` and `.data`.
@@ -31,8 +30,8 @@ class ContactMonitor(StepMonitor):
     Info, at every step (0 and False after a reset; not finite where the simulation's contacts are not):
     ``contact/peak_force`` (N), the largest normal force between two bodies, summed over their contacts;
     ``contact/impulse`` (N s) of all watched contacts; ``contact/penetration`` (m), the deepest; ``contact/residual``
-    (N m), the largest ``|gap * force|``, 0 for rigid contacts; ``contact/partial`` (bool): the step could not be
-    replayed, and the figures are those of the contacts that it has left behind, for one substep.
+    (N m), the largest ``|gap * force|``, 0 for rigid contacts; ``contact/partial`` (bool): not replayed, the figures
+    are those of the contacts left behind, for one substep.
 
     Raises:
         UnsupportedEnvError: No MuJoCo model.

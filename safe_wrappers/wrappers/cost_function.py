@@ -18,15 +18,13 @@ Judge = Callable[[Any], float]
 class CostFunction(LayerWrapper):
     """Writes ``info["cost"]`` for a task that does not judge itself; changes nothing else.
 
-    After every step, and after a reset, `fn` judges the state in which the env (not a filter's plant) now is: any
-    number above 0 is a violation. It does not see what happens within a control step. Put it next to the task, so
-    that everything outside sees the cost.
+    After every step, and after a reset, `fn` judges the state in which the env now is, not what happened within the
+    control step; any number above 0 is a violation. Put it next to the task.
 
     Args:
         env: Whose task reports no cost.
-        fn: Takes `env.unwrapped`, returns a finite number (or a bool); or its name, "module:function". It must
-            not change the env. A function that can be imported is recorded in the env's spec by its name, any
-            other one as it is, so that `gymnasium.make(env.spec)` works but `env.spec.to_json()` does not.
+        fn: Takes `env.unwrapped`, which it must not change, returns a finite number (or a bool); or its name,
+            "module:function". One that cannot be imported makes `env.spec.to_json()` fail.
 
     Info, at every step and after a reset: ``cost`` (float).
 

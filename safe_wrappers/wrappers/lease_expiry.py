@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.control.handover.smoothstep import smoothstep
-from safe_wrappers.control.watchdog.leases import LeaseDelays
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint
@@ -47,15 +46,13 @@ class LeaseExpiry(CommandGate):
 
     A lease is as long as the machine, driven on by the command at its worst, could still stop inside the clearance of
     the moment (`StoppingBudget`). A command is fresh if its observation is newer than that of the command in force
-    (`set_observation_time`; by default it is the newest one). One that is not newer is executed under the old lease;
-    one that is older, from the future or not finite is refused.
+    (`set_observation_time`). One of the same observation is executed under the old lease; one that is older, from the
+    future or not finite is refused.
 
     **What it guarantees.** If braking, acceleration, delays and bounds are what they are declared to be and the
     clearance does not shrink by itself, the machine stops inside it whenever commands stop coming, whatever the
-    commands did. No command that is not finite passes. While leases last the commands pass bit for bit.
-
-    **What it does not.** It does not check what a fresh command does; `CBFActionFilter` belongs inside. Close to an
-    obstacle no command gets a lease, not even one that leads away, unless `min_lease_s` allows it.
+    commands did. While leases last the commands pass bit for bit. **What it does not.** It does not check what a
+    fresh command does; `CBFActionFilter` belongs inside. Close to an obstacle no command gets a lease.
 
     Args:
         env: With a one-dimensional Box action space.
@@ -70,8 +67,7 @@ class LeaseExpiry(CommandGate):
         brake_blend_time: s, of the way to the fallback; it counts in the budget. 0: at once.
         clock_error_s: Bound on how wrong the times of observations may be, s; it counts in the budget.
         motion_limits: For actions that are position setpoints: {"max_acceleration": ..., "max_speed": ...,
-            "max_jerk": ..., "arrival": "moving" or "rest"}. Chunks whose end is out of reach in its time are then
-            refused.
+            "max_jerk": ..., "arrival": "moving" or "rest"}; chunks whose end is out of reach are refused.
         measured: For `motion_limits`: a function of the env that returns positions, velocities and, for an arrival at
             rest with limited jerk, accelerations; None reads the lengths of the MuJoCo actuators.
         fallback: "brake", "hold", "zero", or a function of the plant.
@@ -146,8 +142,8 @@ class LeaseExpiry(CommandGate):
         self._brake_steps = whole_steps(brake_blend_time, self.control_dt)
         self._clock_error_s = non_negative("clock_error_s", clock_error_s, "s")
         delays = {"detect_s": detect_s, "confirm_s": confirm_s, "age_s": age_s}
-        of_formula = LeaseDelays(*(non_negative(name, value, "s") for name, value in delays.items()))
-        self._delays_s = of_formula.total_s + self._brake_steps * self.control_dt + self._clock_error_s
+        detect, confirm, age = (non_negative(name, value, "s") for name, value in delays.items())
+        self._delays_s = detect + confirm + age + self._brake_steps * self.control_dt + self._clock_error_s
         self._delays_s += self._same_s  # by which a step may outlast its lease
         self._budget = BoundBudget(budget, env)
         plant = self._budget.plant_of(plant)

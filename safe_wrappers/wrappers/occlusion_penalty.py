@@ -23,33 +23,29 @@ from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 from safe_wrappers.wrappers.occlusion.sensor import Sensor, sensor_from
 from safe_wrappers.wrappers.occlusion.track import Track, track_from, tracked_things
 
-_AXES = ("x", "y", "z")
-
 
 class OcclusionPenalty(LayerWrapper):
     """Estimates what a sensor on the robot sees, and sees no more, and takes a penalty off the reward for not seeing.
 
     After every step it casts a ray to each tracked point. What is in sight is measured, with noise, and updates the
-    track's Kalman estimate; what is not grows less certain, as the Lyapunov equation says, exactly. A track's
-    permission to be relied on expires before ``sigmas * sigma`` crosses `tolerance`, one control step ahead. The
-    filter belongs outside: its `TrackPermission` and `TrackedDiscs` read the estimates.
+    track's Kalman estimate; what is not grows less certain, as the Lyapunov equation says. A track's permission to be
+    relied on expires before ``sigmas * sigma`` crosses `tolerance`, one control step ahead. The filter belongs
+    outside: its `TrackPermission` and `TrackedDiscs` read the estimates.
 
-    **What it guarantees.** If the tracked things move as declared, the sensor's noise is as declared, and nothing
-    else is measured than what is in sight, then the errors have the covariances that are given. **What it does not.**
-    A covariance is no hard bound, and says nothing of things that are not tracked.
+    **What it guarantees.** If things move and the sensor errs as declared, the errors have the covariances that are
+    given. **What it does not.** A covariance is no hard bound, and says nothing of things that are not tracked.
 
     Args:
         env: Its unwrapped env has MuJoCo's `.model` and `.data`.
         tracks: Each a `Track`, or the dict of a recorded one.
         sensor: A `Sensor`, or the name of a camera in the model.
         tolerance: Position error that the task can bear, m.
-        weight: Of the penalty, in units of the task's reward per step: times the mean, over the tracks within the
-            sensor's range, of ``min(1, sigmas * sigma / tolerance) ** 2``.
+        weight: Of the penalty, the mean of ``min(1, sigmas * sigma / tolerance) ** 2`` over the tracks within the
+            sensor's range; in units of the task's reward per step.
         sigmas: k of the bound that is compared with the tolerance.
         axes: "xy" tracks in the plane, "xyz" in space.
-        observe: Whether the observation gains, for each track, the estimated position relative to the sensor's body
-            (m, world axes), the estimated velocity (m/s) and the standard deviation along each axis (m): appended to
-            a flat Box, or under the key "tracks" of a Dict.
+        observe: Whether the observation (a flat Box, or a Dict under "tracks") gains, for each track, the estimated
+            position from the sensor's body (m, world axes), velocity (m/s) and deviation along each axis (m).
 
     Info, at every step and at reset: ``occlusion/visible``, ``occlusion/expired`` (bool arrays, one per track),
     ``occlusion/sigma`` (m, array), ``occlusion/penalty``, ``occlusion/task_reward`` (float).

@@ -107,8 +107,7 @@ class RecordInterventions(LayerWrapper):
 
     Args:
         env: The env to record.
-        path: A CSV file that gains one row per finished episode. An existing file is continued; a last line
-            that a killed process left half-written is removed first. Give every env its own file.
+        path: A CSV file, one for each env, that gains one row per finished episode; an existing one is continued.
 
     Raises:
         ConfigurationError: `path` is a folder, or a file with other columns; or a `ChunkHandover` inside.

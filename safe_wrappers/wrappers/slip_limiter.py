@@ -13,10 +13,9 @@ from safe_wrappers.wrappers.common.layer import Env
 class SlipLimiter(CBFActionFilter):
     """Keeps every driven wheel on what seems the stable side of its traction curve, with friction unknown.
 
-    It is `CBFActionFilter` with one `Traction`; put `Traction` into a filter's list to hold it together with other
-    constraints. **What it guarantees.** What `CBFActionFilter` does. **What it does not.** See `Traction`: a wheel
-    that comes to another ground, and wheels that are driven against each other, overshoot for a few control steps;
-    sideways slip is not limited. No flag marks an overshoot; ``slip/ratio`` shows it.
+    It is `CBFActionFilter` with one `Traction`. **What it guarantees.** What `CBFActionFilter` does. **What it does
+    not.** A wheel that comes to another ground overshoots for a few control steps, which ``slip/ratio`` shows and no
+    flag marks; sideways slip is not limited. See `Traction`.
 
     Args:
         env: Of MuJoCo, with a Box action space that is its model's control range.

@@ -37,17 +37,14 @@ class TeleopChannel(CommandGate):
 
     `step(action)` sends the action up, executes what has arrived at the machine, sends the observation down, and
     returns the newest that has arrived at the operator. Reward, termination and info are not delayed. With a ceiling,
-    authority is revoked and the local brake (`fallback`) acts when the round trip is too long for the clearance and
-    approach speed of the moment, or when the machine could not stop by itself after the command.
+    the local brake (`fallback`) acts when the round trip is too long for the clearance and approach speed of the
+    moment, or when the machine could not stop by itself after the command.
 
     **What it guarantees.** With a ceiling whose bounds are what they are declared to be, the machine stops inside the
-    clearance whatever the operator and the network do, from a start where it can: proved where the clearance is a
-    distance along a line that the brake acts along, best effort elsewhere or with a fallback that nobody has
-    verified. With wave coding the energy that has come out of the channel is never above what went in, less what is
-    in flight, as long as the effort is what the port says. Without delay, plain coding changes nothing, bit for bit.
-
-    **What it does not.** Passivity limits neither force nor displacement. Plain coding bounds no energy. In a step in
-    which the brake acts, or a filter inside changes the action, the channel's port counts as still.
+    clearance whatever operator and network do, from a start where it can: proved where the clearance is a distance
+    along a line that the brake acts along, best effort elsewhere or with an unverified fallback. With wave coding
+    and the effort that the port says, never more energy has come out than went in, less what is in flight.
+    **What it does not.** Passivity limits neither force nor displacement. Plain coding bounds no energy.
 
     Args:
         env: With a one-dimensional Box action space.
@@ -55,11 +52,9 @@ class TeleopChannel(CommandGate):
         downlink: For observations, likewise.
         coding: "plain" or "wave".
         impedance: Characteristic impedance b of the waves, N s/m; for "wave".
-        passivity: "none", or "controller" with plain coding and a port: each end gives out no more energy than it has
-            heard the other took in.
+        passivity: "none", or "controller" (plain coding with a port), which bounds the energy each end gives out.
         ceiling: A `RoundTripCeiling`, the dict of one, or None: authority is never revoked.
-        missing: What acts while no command has arrived in a control step: "hold" the last one (at first zero),
-            "zero", or "fallback". The entries of a wave-coded flow follow `wave_rule`.
+        missing: What acts while no command arrives: "hold" the last one (at first zero), "zero", or "fallback".
         wave_rule: "queue", "hold" or "zero": what a wave line puts out when packets are late.
         port: A `TeleopPort` or the dict of one; None: what the env publishes, if it does.
         damping_limit: Of the passivity controller's damping force at the operator, N; None: none.

@@ -35,9 +35,8 @@ class WholeBodyFilter(CBFActionFilter):
 
     **What it guarantees.** What `CBFActionFilter` does. With forecasts and a plant that is right, a step that is not
     flagged infeasible or fallback has its contact forces within cone and tolerance, and its joints in range, at every
-    evaluation of the physics. **What it does not.** All of these constraints are *best effort*, for contact: a foot
-    that comes down sideways slides whatever the torques, and the step is counted infeasible. It does not keep a robot
-    on its feet. With "pyramid" and "cone" an unflagged step can slide.
+    evaluation of the physics. **What it does not.** All of these constraints are *best effort*. With "pyramid" and
+    "cone" an unflagged step can slide. It does not keep a robot on its feet.
 
     Args:
         env: Of MuJoCo, with a Box action space that is its model's control range.
@@ -46,11 +45,9 @@ class WholeBodyFilter(CBFActionFilter):
         joint_tolerance: How far a joint may press its stop, rad or m. None leaves the joints alone.
         zmp_inset: Distance of the zero moment point from the edge of the support polygon, m, positive, wherever
             there is a polygon. None sets no bound.
-        tolerance: By how much a forecast contact force may miss its cone, as a share of the robot's weight; None is
-            0.01. For forecasts only.
-        bodies: Names of the bodies whose contacts count; None is every moving body. For forecasts only.
-        horizon: Control steps to look ahead for the joints; cover the time that braking them takes; None is 3. For
-            forecasts only.
+        tolerance: By how much a forecast force may miss its cone, as a share of the robot's weight; None is 0.01.
+        bodies: Names of the bodies whose contacts count, for forecasts; None is every moving body.
+        horizon: Control steps to look ahead for the joints, for forecasts: as many as braking takes; None is 3.
         plant: None reads the env's model.
         fallback: As of `CBFActionFilter`.
         solver: "daqp" or any installed qpsolvers backend.

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
+from safe_wrappers.appendix.watchdog.lease_delays import LeaseDelays
 from safe_wrappers.appendix.watchdog.reachability import stopping_distance
-from safe_wrappers.control.watchdog.leases import LeaseDelays, longest_lease, longest_lease_of_room
+from safe_wrappers.control.watchdog.leases import longest_lease, longest_lease_of_room
 from safe_wrappers.errors import ConfigurationError
 
 POSITIVE = st.floats(1e-3, 1e3)

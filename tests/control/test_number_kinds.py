@@ -13,10 +13,10 @@ from safe_wrappers.appendix.handover import blends, flexible_joint
 from safe_wrappers.appendix.handover import polynomials as appendix_polynomials
 from safe_wrappers.appendix.handover import splines as appendix_splines
 from safe_wrappers.appendix.legged import balance
-from safe_wrappers.appendix.teleop import passivity_controller, waves
+from safe_wrappers.appendix.teleop import energy_ledger, passivity_controller, waves
 from safe_wrappers.appendix.vehicle import slip as appendix_slip
+from safe_wrappers.appendix.watchdog import lease_delays, sampling
 from safe_wrappers.appendix.watchdog import reachability as appendix_reachability
-from safe_wrappers.appendix.watchdog import sampling
 from safe_wrappers.control.backup import stopping
 from safe_wrappers.control.contact import contact, friction_cone
 from safe_wrappers.control.estimation import covariance, kalman, observability
@@ -76,7 +76,7 @@ CALLS = {
     "predict": (kalman.predict, [[1, 2], EYE, CHAIN, EYE]),
     "update": (kalman.update, [[1, 2], EYE, [1], [[1, 0]], [[1]]]),
     "normalised_error_squared": (consistency.normalised_error_squared, [[1, 2], EYE]),
-    "lease_delays": (lambda *late: leases.LeaseDelays(*late).total_s, [1, 0, 2, 3]),
+    "lease_delays": (lambda *late: lease_delays.LeaseDelays(*late).total_s, [1, 0, 2, 3]),
     "stopping_distance": (appendix_reachability.stopping_distance, [2, 1]),
     "longest_lease": (leases.longest_lease, [1, 1, 1, 0]),
     "longest_lease, all": (leases.longest_lease, [9, 2, 1, 1, 1, 1, 1, 4]),
@@ -102,7 +102,7 @@ CALLS = {
     "effort_and_outgoing": (passivity.effort_and_outgoing, [2, 3, 4]),
     "flow_and_outgoing": (waves.flow_and_outgoing, [2, 3, 4]),
     "wave_power": (waves.wave_power, [2, 3]),
-    "EnergyLedger": (lambda *a: filled(passivity.EnergyLedger(a[0]), a[1:]), [1, 2, 3, 1, 4, 1]),
+    "EnergyLedger": (lambda *a: filled(energy_ledger.EnergyLedger(a[0]), a[1:]), [1, 2, 3, 1, 4, 1]),
     "ChannelLedger": (lambda *a: filled(passivity.ChannelLedger(a[0]), a[1:]), [1, 2, 3, 1, 4, 1, 2]),
     "PassivityObserver": (lambda *a: observed(*a), [1, 2, 3, 1]),
     "differentiate": (splines.differentiate, [[1, 2, 3]]),

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from safe_wrappers.appendix.teleop.energy_ledger import EnergyLedger
 from safe_wrappers.appendix.teleop.waves import flow_and_outgoing, from_waves, port_power, wave_power
 from safe_wrappers.control.teleop.passivity import (
     ChannelLedger,
-    EnergyLedger,
     effort_and_outgoing,
     to_waves,
 )
@@ -186,6 +186,23 @@ def test_rounding_is_not_activity():
     assert by_rounding > 5
 
 
+def test_rounding_of_a_channel_is_not_activity():
+    rng, by_rounding = np.random.default_rng(0), 0
+    for _ in range(100):
+        ledger, pieces = ChannelLedger(), rng.uniform(0.1, 1.0, size=7)
+        for piece in pieces:
+            ledger.add(piece, 0.3, 0.0, 0.0, DT)
+        ledger.add(0.0, 0.0, math.fsum(pieces.tolist()), 0.3, DT)
+        by_rounding += ledger.created_j > 0.0
+        assert ledger.passive
+        ledger.add(0.0, 0.0, 1e-9, 0.3, DT)
+        assert not ledger.passive
+    assert by_rounding > 5
+    stored = ChannelLedger(0.7)
+    stored.add(0.1, 0.3, 0.0, 0.0, 1.0, stored_j=0.73)  # 0.7 + 0.03 is a rounding below 0.73
+    assert stored.passive
+
+
 class Behind:
     """What is connected at the remote port: a damper, a spring or a mass; flow in, effort back."""
 
@@ -318,6 +335,8 @@ def test_a_lossless_line_holds_what_is_in_flight(delay, given_ports):
         (lambda: EnergyLedger().add("push", 1.0, 1.0), "number or an array"),
         (lambda: EnergyLedger().add(1.0, 1.0, 1.0, stored_j=-1.0), "stored_j"),
         (lambda: EnergyLedger().add(1.0, 1.0, 1.0, dissipated_j=math.nan), "dissipated_j"),
+        (lambda: ChannelLedger().add(1.0, 1.0, 1.0, 1.0, 0.0), "time_s"),
+        (lambda: ChannelLedger().add(1.0, 1.0, 1.0, 1.0, 1.0, stored_j=-1.0), "stored_j"),
         (lambda: ChannelLedger().add([1.0], [1.0], [1.0, 2.0], [1.0], 1.0), "effort_s and flow_s"),
     ],
 )

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from safe_wrappers.appendix.teleop.energy_ledger import EnergyLedger
 from safe_wrappers.appendix.teleop.passivity_controller import PassivityController, PassivityObserver
-from safe_wrappers.control.teleop.passivity import ChannelLedger, EnergyLedger
+from safe_wrappers.control.teleop.passivity import ChannelLedger
 from safe_wrappers.control.teleop.passivity_control import EnergyReference
 from safe_wrappers.errors import ConfigurationError
 

@@ -14,13 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 from safe_wrappers.appendix.estimation.taylor import Function, output_series
 from safe_wrappers.control.estimation.observability import (
     LONGEST_TIME_SCALE_S,
+    TOLERANCE,
     checked_system,
-    checked_tolerance,
     checked_vector,
     described_subspace,
     scale_system,
     state_names,
-    tolerance_gap,
     unobservable_subspace,
 )
 from safe_wrappers.errors import ConfigurationError
@@ -133,11 +132,12 @@ def linear_observability(
     known = state_names(names, len(a))
     scaled = scale_system(a, c)
     values = np.linalg.svd(observability_matrix(scaled.a, scaled.c), compute_uv=False)
-    basis, gap = unobservable_subspace(scaled, checked_tolerance(tolerance))
+    tolerance = _checked_tolerance(tolerance)
+    basis, compared = unobservable_subspace(scaled, tolerance)
     return LinearObservability(
         rank=len(a) - basis.shape[1],
         singular_values=_padded(values, len(a)),
-        gap=gap,
+        gap=min((_tolerance_gap(each, tolerance) for each in compared), default=math.inf),
         unobservable=basis,
         names=described_subspace(basis, known),
         time_scale_s=scaled.time_s,
@@ -236,7 +236,7 @@ def nonlinear_observability(
     known = state_names(names, len(state))
     if order is not None and order < 0:
         raise ConfigurationError(f"the order of the Lie derivatives must not be negative, got {order}")
-    tolerance = checked_tolerance(tolerance)
+    tolerance = _checked_tolerance(tolerance)
     series = _certain_series(f, h, state, 2 * len(state) if order is None else order)
     rows = np.stack([_in_own_time(output) for output in series.swapaxes(0, 1)], axis=1)
     sizes = np.abs(rows).max(axis=(0, 1))
@@ -252,7 +252,7 @@ def nonlinear_observability(
     return NonlinearObservability(
         rank=ranks[-1],
         singular_values=values,
-        gap=tolerance_gap(values / (values[0] or 1.0), tolerance),
+        gap=_tolerance_gap(values / (values[0] or 1.0), tolerance),
         unobservable=basis,
         names=described_subspace(basis, known),
         rank_by_order=ranks,
@@ -298,3 +298,20 @@ def _in_own_time(rows: Array) -> Array:
 
 def _count(values: Array, tolerance: float) -> int:
     return int((values > tolerance * values[0]).sum()) if values.size and values[0] > 0.0 else 0
+
+
+def _checked_tolerance(tolerance: float | None) -> float:
+    """The tolerance, between 0 and 1, or `TOLERANCE` for None."""
+    if tolerance is None:
+        return TOLERANCE
+    if not 0.0 < tolerance < 1.0:
+        raise ConfigurationError(f"the tolerance is a share of the scale, between 0 and 1, got {tolerance}")
+    return tolerance
+
+
+def _tolerance_gap(values: Array, tolerance: float) -> float:
+    """Factor by which the tolerance could be larger or smaller with the same number of values above it."""
+    kept, dropped = values[values > tolerance], values[values <= tolerance]
+    largest = dropped.max(initial=0.0)
+    below = tolerance / largest if largest > 0.0 else math.inf
+    return float(min(kept.min(initial=math.inf) / tolerance, below))

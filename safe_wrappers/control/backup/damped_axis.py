@@ -2,9 +2,8 @@
 
 A physics step maps speed v and control u to `v' = decay v + gain u` and moves by `timestep v'` (MuJoCo's
 semi-implicit Euler step with implicit joint damping). A control is held for `substeps` of them, so a hold is linear:
-`v_end = A v + B u`, `x_end = x + P v + Q u`. Braking is the full opposing control for as many holds as needed, and in
-the last hold `-A v / B`, which ends it at rest. The motion never turns back, and the stopping distance is piecewise
-linear in v, with a knot at each speed that n full holds remove; it is tabulated once.
+`v_end = A v + B u`, `x_end = x + P v + Q u`. Braking is the full opposing control, and in the last hold `-A v / B`,
+which ends at rest. The stopping distance is piecewise linear in v: a knot at each speed that n full holds remove.
 """
 
 import bisect
@@ -23,9 +22,7 @@ class _Stops:
 
     speeds: list[float]  # the knots, m/s, ascending from 0
     ways: list[float]  # stopping distance at each knot, m
-    totals: list[
-        float
-    ]  # with that part of the preceding hold's displacement that is proportional to the speed, m
+    totals: list[float]  # with the part of the hold before that is proportional to the speed, m
 
     def way(self, speed: float) -> float:
         """Stopping distance from a speed >= 0, m; infinite beyond the table."""

@@ -1,8 +1,7 @@
 """Positions of a point mass along evasive manoeuvres: drive in some direction, then brake to rest.
 
 A manoeuvre holds one control along each axis for some control steps (the drive phase), then brakes each axis
-separately (`damped_axis.py`). The displacement of the drive phase is linear in the present state; that of braking is
-piecewise linear in the speed at which it begins, and tabulated once. The result is exact to rounding.
+separately (`damped_axis.py`), which is tabulated once. The result is exact to rounding.
 """
 
 from typing import NamedTuple

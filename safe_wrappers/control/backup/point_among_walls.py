@@ -1,8 +1,7 @@
 """A point mass on two axes among rectangular walls: the area swept by one control step and the braking after it.
 
-Each axis brakes separately (`damped_axis.py`). The path is covered by one rectangle per hold: within a hold of
-braking the motion along each axis has one sign. After one hold the remaining rectangles are a subset of the former
-ones, so the distance from the walls never falls. If the level of the env's speed clip is not known, a single
+Each axis brakes separately (`damped_axis.py`). The path is covered by one rectangle per hold, which are fewer after
+each hold, so the distance from the walls never falls. If the level of the env's speed clip is not known, a single
 rectangle from the present position to the rest point is used: it contains the path for every clip above what one hold
 of full force can reverse.
 """

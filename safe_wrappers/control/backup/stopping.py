@@ -32,8 +32,7 @@ def predicted_approach(
 def held_stopping_distance(speed: ArrayLike, brake: float, control_dt: float) -> Array:
     """The shortest stopping distance, m, if every deceleration (m/s^2) is held for a whole interval.
 
-    The chord of `v^2 / (2 a_brake)` between whole multiples of the speed (m/s) that one hold removes. It exceeds the
-    continuous distance by at most `a_brake hold^2 / 8`, and braking along it never reverses the motion.
+    The chord of `v^2 / (2 a_brake)` between whole multiples of the speed (m/s) that one hold removes.
     """
     loss = brake * control_dt
     holds = np.maximum(np.asarray(speed, dtype=np.float64), 0.0) / loss
@@ -55,9 +54,8 @@ def sampled_acceleration_limit(
     """The largest approach acceleration, m/s^2, shape (...), that may be *held* for a whole control interval.
 
     Over the delay the commands in flight act, over the hold the new one; from there on held braking must stop the
-    machine inside the room (clearance less reserves). From outside the set it is the braking that halts inside the
-    remaining room and, without room, a retreat that shrinks the violation by 1/e in about a second. It is at least
-    `-brake` wherever `sampled_inset` is not negative; below that no admissible command may exist.
+    machine inside the room (clearance less reserves). It is at least `-brake` wherever `sampled_inset` is not
+    negative. From outside it is the braking that halts inside the remaining room or, without room, a retreat.
 
     Args:
         clearance: Measured clearance D in m, shape (...).

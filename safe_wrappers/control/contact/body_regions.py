@@ -2,9 +2,8 @@
 
 Source: ISO/TS 15066:2016, Annex A, Tables A.2 and A.3; ISO 10218-2:2025 has taken them over. **Written down from
 memory and compared with secondary sources where there were any, not with the standard's text**: before a machine
-meets a person, check every number that you use against the edition that applies to you. The limits are of pain onset
-in healthy adults. They leave out pressure (a sharp edge exceeds it far below these forces), the place in the region,
-repeated contact, and other people.
+meets a person, check every number against the edition that applies. The limits are of pain onset in healthy adults;
+they leave out pressure (a sharp edge exceeds it far below these forces) and repeated contact.
 """
 
 from dataclasses import dataclass

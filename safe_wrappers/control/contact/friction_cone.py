@@ -5,8 +5,7 @@ Source: appendix "Physical contact feasibility constraints". A force f on the ro
 
     f_n = f . n >= 0    and    |f - f_n n| <= mu f_n.
 
-This is Coulomb's law with one coefficient in every direction, and the coefficient is uncertain. The cone does not say
-that a foothold carries the load.
+This is Coulomb's law with one coefficient in every direction. It does not say that a foothold carries the load.
 """
 
 import math
@@ -73,8 +72,8 @@ def friction_pyramid(
         normals: Unit normals, pointing at the robot, shape (..., 3).
         friction: Coefficient mu, at least 0, shape (...).
         edges: Of the pyramid, at least 3.
-        first: Direction of the first edge, shape (..., 3); None chooses one (`tangents`). With four edges and the
-            first axis of a contact frame of MuJoCo, the pyramid is MuJoCo's own.
+        first: Direction of the first edge, shape (..., 3), as of `tangents`. With four edges and the first axis of
+            a contact frame of MuJoCo, the pyramid is MuJoCo's own.
 
     Returns:
         Shape (..., edges + 1, 3): one row for each side, then `-normal`.

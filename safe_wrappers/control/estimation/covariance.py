@@ -1,9 +1,8 @@
 """Covariance of an estimate without measurements: exact steps of time, and the time until a tolerance is reached.
 
 The system is linear, x' = A x + b + w, with white noise of the *intensity* Q (covariance kernel Q delta(t - s)), in
-units of x^2 / s. Without measurements the covariance follows the Lyapunov equation P' = A P + P A' + Q. Its growth
-need not be monotonic. Covariance alone bounds no error: how much probability lies outside k sigma depends on the tail
-(`safe_wrappers.appendix.estimation.sigma_coverage`).
+units of x^2 / s. Without measurements the covariance follows the Lyapunov equation P' = A P + P A' + Q. How much
+probability lies outside k sigma depends on the tail (`safe_wrappers.appendix.estimation.sigma_coverage`).
 
 Source: appendix "Continuous covariance propagation and observability"; Van Loan (1978) for the discretisation.
 """
@@ -110,15 +109,13 @@ def blind_time(
 ) -> float:
     """The first time without measurements, s, at which `sigmas` standard deviations reach a tolerance; never late.
 
-    0 if the tolerance is reached already; inf if it is not reached within the horizon. Growth need not be monotonic,
-    so the search proceeds by windows, each shown to be below the tolerance.
+    0 if it is reached already; inf if it is not reached within the horizon. Growth need not be monotonic.
 
     Args:
         P0: Covariance when the sensor was lost, shape (n, n).
         A: System matrix, 1/s, shape (n, n).
         Q: Intensity of the process noise, shape (n, n).
-        direction: D, the direction(s) of the state in which the error matters, shape (n,) or (m, n). For several, the
-            largest standard deviation over all unit combinations of them.
+        direction: D, direction(s) of the state, shape (n,) or (m, n); of several the worst unit combination counts.
         tolerance: In the units of D x, > 0.
         sigmas: k, > 0; choose it with `safe_wrappers.appendix.estimation.sigma_coverage.sigmas_for`.
         horizon_s: How far to look, s, at least 0.

@@ -1,8 +1,4 @@
-"""Signed distances of points from ellipsoids, and their normals.
-
-A moving obstacle whose position is known with a covariance lies somewhere in an ellipsoid; one that may have been
-displaced along a line, in a degenerate ellipsoid without width. Both are handled alike.
-"""
+"""Signed distances of points from ellipsoids, and their normals: of obstacles known with a covariance."""
 
 import math
 from collections.abc import Iterable
@@ -30,23 +26,19 @@ def ellipsoid_gap(offset: Array, shape: Array) -> tuple[Array, Array]:
     """Signed distances (n,), m, of points to ellipsoids, and the unit normals (n, d) along which they grow.
 
     The ellipsoid is {S^(1/2) u : |u| <= 1}, filled. S may be singular or zero: then it is flat, a segment or a point,
-    which has no inside. The signed distance is the largest of `n @ offset - sqrt(n @ S @ n)` over unit vectors n;
-    what is returned is that expression at the normal returned. Outside it is the Euclidean distance, inside minus the
-    distance to the boundary.
-
-    The distance is never overestimated, save by rounding (1e-15 of the lengths involved). It is underestimated by at
-    most 5e-8 of the longest half-axis, and that only for a shape that is (nearly) singular and not diagonal.
+    which has no inside. The signed distance is the largest of `n @ offset - sqrt(n @ S @ n)` over unit vectors n:
+    Euclidean outside, minus the distance to the boundary inside. It is never overestimated, save by rounding (1e-15
+    of the lengths involved), and underestimated by at most 5e-8 of the longest half-axis, and that only for a shape
+    that is (nearly) singular and not diagonal.
 
     Source: Moré and Sorensen, Computing a trust region step (1983), for Newton's method on the secular equation.
-    Plain floats: for the few obstacles of a control step they are faster than arrays.
 
     Args:
         offset: Point minus centre, shape (n, d), m; d is 2 or 3.
         shape: S, symmetric positive semidefinite, shape (n, d, d), m²: for k sigma of a covariance P it is k² P.
 
     Raises:
-        ConfigurationError: Other shapes, numbers that are not finite, an S that is not symmetric positive
-            semidefinite.
+        ConfigurationError: Other shapes, numbers that are not finite, an S that is not positive semidefinite.
     """
     d = _dimension(offset, shape)
     squares, bases = np.linalg.eigh(shape)

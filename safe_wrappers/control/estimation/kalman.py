@@ -4,8 +4,8 @@ It runs at every step and checks nothing: check the matrices once with `checked_
 `safe_wrappers.control.estimation.covariance`; take `transition` and `noise` from its `discretise`. The update has
 Joseph's form: symmetric and positive semidefinite for any gain, rounding included.
 
-Source: Kalman (1960); Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001),
-section 5.2. The consistency test: `safe_wrappers.appendix.estimation.consistency`.
+Source: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), section 5.2.
+The consistency test: `safe_wrappers.appendix.estimation.consistency`.
 """
 
 from typing import NamedTuple

@@ -1,8 +1,7 @@
 """Observability: which directions of a state outputs determine, named in the user's own state names.
 
-An initial error in an unobservable direction never shows in the outputs, so no filter corrects it. The result is
-structural: about ideal outputs, without noise. Full rank says that the state can be determined, not how accurately or
-how soon.
+An initial error in an unobservable direction never shows in the outputs, so no filter corrects it. Full rank says
+that the state can be determined from ideal outputs, not how accurately or how soon.
 """
 
 import math
@@ -60,24 +59,22 @@ def unobservable_directions(
     return described_subspace(basis, state_names(names, len(a)))
 
 
-def unobservable_subspace(scaled: Scaled, tolerance: float) -> tuple[Array, float]:
-    """Orthonormal basis of the unobservable directions in the states' own units, and the tolerance's gap.
+def unobservable_subspace(scaled: Scaled, tolerance: float) -> tuple[Array, list[Array]]:
+    """Orthonormal basis of the unobservable directions in the states' own units, and the singular values compared.
 
-    The largest subspace in the kernel of C that A maps into itself, by orthogonal projections; powers of A would lose
-    precision where fast and slow modes mix.
+    The largest subspace in the kernel of C that A maps into itself, by orthogonal projections.
     """
-    basis, seen = np.eye(len(scaled.a)), scaled.c
-    gap = math.inf
+    basis, seen, compared = np.eye(len(scaled.a)), scaled.c, []
     while basis.shape[1]:
         _, values, axes = np.linalg.svd(seen @ basis if seen is scaled.c else seen)
         rank = int((values > tolerance).sum())
-        gap = min(gap, tolerance_gap(values, tolerance))
+        compared.append(values)
         if rank == 0:
             break
         basis = basis @ axes[rank:].T
         moved = scaled.a @ basis
         seen = moved - basis @ (basis.T @ moved)
-    return np.linalg.qr(scaled.units[:, None] * basis)[0], gap
+    return np.linalg.qr(scaled.units[:, None] * basis)[0], compared
 
 
 def described(direction: ArrayLike, names: Sequence[str]) -> str:
@@ -135,8 +132,7 @@ def scale_system(a: Array, c: Array) -> Scaled:
 def _units(a: Array, c: Array) -> Array:
     """Units of the states, shape (n,), powers of two, in which all couplings between states are about equal.
 
-    Least squares of the entries' logarithms (Curtis and Reid, On the automatic scaling of matrices for Gaussian
-    elimination, 1972), with a time scale and a gain for each output free. It also scales chains without feedback.
+    Least squares of the entries' logarithms (Curtis and Reid, 1972), with a time scale and the outputs' gains free.
     """
     n, m = len(a), len(c)
     couplings = _logarithms(a - np.diag(np.diag(a)), np.abs(a).max())
@@ -157,14 +153,6 @@ def _logarithms(matrix: Array, largest: float) -> list[tuple[tuple[int, int], fl
     sizes = np.abs(matrix)
     places = np.argwhere(sizes > _NO_COUPLING * largest)
     return [((int(i), int(j)), float(np.log2(sizes[i, j]))) for i, j in places]
-
-
-def tolerance_gap(values: Array, tolerance: float) -> float:
-    """Factor by which the tolerance could be larger or smaller with the same number of values above it."""
-    kept, dropped = values[values > tolerance], values[values <= tolerance]
-    largest = dropped.max(initial=0.0)
-    below = tolerance / largest if largest > 0.0 else math.inf
-    return float(min(kept.min(initial=math.inf) / tolerance, below))
 
 
 def checked_system(A: ArrayLike, C: ArrayLike) -> tuple[Array, Array]:
@@ -194,12 +182,3 @@ def state_names(names: Sequence[str] | None, n: int) -> tuple[str, ...]:
     if isinstance(names, str) or len(names) != n or len(set(names)) != n:
         raise ConfigurationError(f"expected a name of its own for each of the {n} states, got {names!r}")
     return tuple(names)
-
-
-def checked_tolerance(tolerance: float | None) -> float:
-    """The tolerance, between 0 and 1, or `TOLERANCE` for None."""
-    if tolerance is None:
-        return TOLERANCE
-    if not 0.0 < tolerance < 1.0:
-        raise ConfigurationError(f"the tolerance is a share of the scale, between 0 and 1, got {tolerance}")
-    return tolerance

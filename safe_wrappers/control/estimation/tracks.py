@@ -4,9 +4,7 @@ Each track has the state (position, velocity), of one, two or three coordinates 
 
     p' = v,    v' = (mean_velocity - v) / reversion_s + w,    E[w(t) w(s)'] = q delta(t - s).
 
-Between measurements the covariance follows the Lyapunov equation, exactly; a measurement is a Kalman update. The
-coverage of k standard deviations depends on the tail (`safe_wrappers.appendix.estimation.sigma_coverage`).
-
+Between measurements the covariance follows the Lyapunov equation, exactly; a measurement is a Kalman update.
 Source: appendix "Continuous Lyapunov and Riccati covariance dynamics".
 """
 

@@ -2,8 +2,7 @@
 
 Source: appendix "Safety and Control Barrier Functions". A barrier `h` is positive inside the safe set. For `x' = f(x)
 + g(x) u` the condition `Lf h + Lg h u >= -alpha(h)` is sufficient, in continuous time, for a barrier of relative
-degree one, and only while some admissible control satisfies it; `control/backup/stopping.py` has the forms that hold
-between samples.
+degree one, while some admissible control satisfies it. Between samples: `control/backup/stopping.py`.
 """
 
 from collections.abc import Callable
@@ -75,9 +74,8 @@ def relative_degree(
 ) -> int | None:
     """The number of time derivatives of h until the control appears, at one state; None if it is above `max_degree`.
 
-    Lie derivatives are nested central differences, so the test is numerical: `tolerance` is relative to the sizes of
-    h and of each control's column of g, and each level widens the step. Units of h and of controls do not matter;
-    states should be of order one.
+    Lie derivatives are nested central differences; `tolerance` is relative to the sizes of h and of each control's
+    column of g. Units of h and of controls do not matter; states should be of order one.
     """
     point = np.asarray(x, dtype=np.float64)
     effect = np.asarray(g(point), dtype=np.float64)

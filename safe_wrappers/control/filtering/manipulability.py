@@ -7,10 +7,8 @@ loss.
 * **w does not bound the smallest singular value**, and so no joint rate. A threshold on w has to be validated for the
   machine (`validated_threshold`).
 * Rows of translation (m/rad for a hinge) and of rotation (rad/rad) do not add up. A task that has both needs a length
-  that weighs rotations (`task_rows`); w depends on it by a constant factor. A joint that slides beside one that turns
-  mixes units in the columns likewise.
-* w of all six rows is the same in each frame (`safe_wrappers.appendix.filtering.manipulability.reframed`). w of some
-  rows and singular values are not.
+  that weighs rotations (`task_rows`); w depends on it by a constant factor.
+* w of all six rows is the same in each frame; w of some rows and singular values are not.
 
 Jacobians are of shape (..., m, n); what is not finite raises `ConfigurationError`.
 """
@@ -157,8 +155,7 @@ class ValidatedThreshold:
 def validated_threshold(jacobians: ArrayLike, task_speed: float, rate_limit: ArrayLike) -> ValidatedThreshold:
     """The smallest threshold on w above which no sampled configuration needs more than the joints' rate limit.
 
-    It holds for the samples, this task speed, direction weighting, frame and joint selection, and controllers that
-    invert J by least norm. `ValidatedThreshold.unseen` bounds the rest statistically.
+    It holds for controllers that invert J by least norm. `ValidatedThreshold.unseen` bounds the rest statistically.
 
     Args:
         jacobians: Task Jacobians of sampled configurations, shape (samples, m, n).

@@ -54,18 +54,17 @@ def join(
 ) -> Seam:
     """The shortest blend from what was sent into a new stream that keeps the rate limit.
 
-    "smoothstep" mixes the two streams; the remainder of the prior stream is used if it lasts for the whole blend,
-    otherwise the last command is held. "quintic" and "hermite" bridge from the last command to the new stream with
-    matching first (hermite) and second (quintic) derivatives at both ends; a bridge that leaves the box is clipped.
-    If no blend that ends inside the new stream keeps the limit, the one that exceeds it least is rate-limited step by
-    step.
+    "smoothstep" mixes the two streams, the prior one held at the last command unless it lasts for the whole blend.
+    "quintic" and "hermite" bridge from the last command to the new stream with matching first (and, for quintic,
+    second) derivatives at both ends, clipped to the box. If no blend that ends inside the new stream keeps the limit,
+    the one that exceeds it least is rate-limited step by step.
 
     Args:
         sent: The latest commands, oldest first, shape (k, m), k >= 0; with none there is no seam.
         prior: Remaining commands of the present stream, shape (p, m), p >= 0.
         new: The new stream for the next steps, shape (n, m), n >= 1.
         control_dt: Control interval, s.
-        blend: Which blend.
+        blend: See above.
         fewest: Least number of steps of the blend (fewer only if the new stream is shorter).
         rate_limit: Largest ``|du/dt|``, action units per second: of every component, or of each, shape (m,).
         low: Action box, for the bridges, shape (m,) or a number.

@@ -1,8 +1,6 @@
 """Bumpless transfer: the smoothstep, and the shortest blend of two commands that a rate limit allows.
 
-Element by element, with NumPy's broadcasting. The limit bounds the time derivative of a command u, in units of u per
-second, not the plant's response.
-
+The limit bounds the time derivative of a command u, in units of u per second, not the plant's response.
 Source: appendix "Bumpless transfer and smoothstep blending".
 """
 

@@ -1,10 +1,8 @@
 """Quintic and cubic Hermite segments in closed form.
 
 Boundary values have any shape (...) that broadcasts, the duration (s, > 0) among them. Times of evaluation are common
-to the whole batch, and their axes come last. Positions in any unit q, velocities in q/s, and so on. A quintic matches
-position, velocity and acceleration at both ends; a cubic Hermite spline steps in acceleration at every knot. Neither
-keeps limits between its ends: see `interior_extrema`, `peak_torque` and `knot_torque_step` in
-`safe_wrappers.appendix.handover.splines`.
+to the whole batch, and their axes come last. Positions in any unit q, velocities in q/s, and so on. Neither keeps
+limits between its ends (`safe_wrappers.appendix.handover.splines`).
 
 Source: appendix "Smooth Trajectories and Bumpless Transfer".
 """
@@ -57,8 +55,7 @@ def quintic_coefficients(
 ) -> Array:
     """Coefficients (..., 6), lowest power of t first, of the quintic through two states.
 
-    Position q, velocity v and acceleration a, shape (...), at t = 0 (q0, v0, a0) and at t = duration (q1, v1, a1), in
-    s, > 0.
+    Position q, velocity v and acceleration a, shape (...), at t = 0 (q0, v0, a0) and at the duration, s (q1, v1, a1).
 
     Raises:
         ConfigurationError: A duration that is not positive, values that are not finite, shapes that do not broadcast.
@@ -118,8 +115,7 @@ def hermite_series(
 ) -> Array:
     """Samples interpolated at other times, shape (...) for one time, (..., m) for m.
 
-    Neighbouring samples are joined by a cubic, so position and velocity are continuous; acceleration at a knot is
-    that of the following segment. A value between two samples needs the later one.
+    Neighbouring samples are joined by a cubic; acceleration at a knot is that of the following segment.
 
     Args:
         times: Sample times in s, strictly rising, evenly spaced or not, shape (k,).

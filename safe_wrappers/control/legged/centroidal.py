@@ -1,12 +1,7 @@
 """Centroidal momentum: linear and angular momentum of a robot about its centre of mass.
 
-Source: appendix "Centroidal momentum dynamics". Only forces from outside change it:
-
-    d(h_lin)/dt = m c'' = sum f_k + m g,    d(h_ang)/dt = sum [(p_k - c) x f_k + tau_k].
-
-Vectors are in the world's axes; forces and moments are those on the robot; `h_lin = m c'`; `h_ang` is about the
-moving centre of mass; where both are stacked, the linear part comes first (Orin and Goswami put the angular part
-first).
+Source: appendix "Centroidal momentum dynamics". Vectors are in the world's axes; the angular momentum is about the
+moving centre of mass; where both are stacked, the linear part comes first.
 """
 
 from typing import NamedTuple

@@ -1,8 +1,7 @@
 """Bounds on joint accelerations that keep positions within their ranges until the end of a control step.
 
 Source: appendix "Hierarchical whole-body control quadratic program", its caveat: a bound at the present position does
-not cover the motion between samples. The acceleration is taken as constant over the step; contacts, above all, change
-it. Choose the horizon no shorter than stopping takes, or a later step may find no sufficient torque.
+not cover the motion between samples. Choose the horizon no shorter than stopping takes.
 """
 
 import numpy as np

@@ -4,8 +4,7 @@ Source: appendix "Physical contact feasibility constraints", third condition. Th
 plane of support, the contact forces have no tangential moment. Forces that push keep it inside the support polygon,
 the convex hull of their points; an inset keeps a distance from its edges.
 
-It assumes contacts in one plane that do not slip; contacts at several heights need `whole_body`. Crossing an edge
-does not imply a fall.
+It assumes contacts in one plane that do not slip; contacts at several heights need `whole_body`.
 """
 
 import math

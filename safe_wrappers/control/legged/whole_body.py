@@ -4,12 +4,8 @@ Source: appendix "Floating-base equations of motion" and "Hierarchical whole-bod
 
     M qacc + h = B u + sum J_k' f_k,
 
-with every f_k in its friction cone, u in the actuators' box, and the contacts' points moving as wanted. With pyramids
-inside the cones it is a quadratic program (`solve_pyramid`), with the cones a second-order cone program
-(`solve_cone`).
-
-A solution says that such forces exist at this instant, for this model, these contacts and this friction. It does not
-show that a foothold carries the load, or that the same holds a control step later.
+with every f_k in its friction cone, u in the actuators' box, and the contacts' points moving as wanted. A solution
+says that such forces exist at this instant, not that the same holds a control step later.
 """
 
 from enum import StrEnum
@@ -80,9 +76,8 @@ class WholeBodySolution(NamedTuple):
         acceleration: qacc under it and the forces, shape (nv,).
         forces: At the contacts, shape (k, 3), N, each inside its cone (and pyramid).
         status: Compares equal to its string.
-        residuals: Evaluated from the answer itself.
-        objective: Half the weighted squares that were minimised; it ranks answers to one problem. Infinite where
-            there is none.
+        residuals: See `Residuals`.
+        objective: Half the weighted squares that were minimised; infinite where there is none.
     """
 
     control: Array
@@ -129,8 +124,7 @@ def rigid_forces(problem: WholeBodyProblem, control: Array) -> tuple[Array, Arra
 def attainable_contact_acceleration(problem: WholeBodyProblem) -> Array:
     """The contact accelerations closest to the wanted ones that do not contradict each other, shape (k, 3), m/s^2.
 
-    Two points of one rigid foot keep their distance; contradictory accelerations make a problem without softness
-    infeasible. Only kinematics is considered.
+    By kinematics alone. Contradictory accelerations make a problem without softness infeasible.
     """
     motion = motion_of(problem)
     solution = np.linalg.lstsq(motion.held, motion.wanted, rcond=1e-5)[0]

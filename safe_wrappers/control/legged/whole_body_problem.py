@@ -46,10 +46,8 @@ class WholeBodyProblem:
         contact_acceleration: Wanted at the contact points, shape (k, 3), m/s^2; None is zero.
         control_weight: Of the squared distance from the nominal, positive, a number or shape (nu,).
         force_weight: Of the squared contact forces, positive, per N^2. It chooses among forces of equal effect.
-        contact_softness: 0 requires the wanted contact accelerations exactly. Larger: a miss r (m/s^2) costs `r^2 /
-            contact_softness` instead; a nominal without misses stays unchanged.
-        breaking: Contacts that are to open, shape (k,): their force is 0 and their acceleration along the normal is
-            at least the wanted one. None: no contact opens.
+        contact_softness: A missed contact acceleration r (m/s^2) costs `r^2 / contact_softness`; 0 allows none.
+        breaking: Contacts that are to open, shape (k,): force 0, normal acceleration at least the wanted; None: none.
         first_tangents: Direction of each pyramid's first edge, shape (k, 3); None for a default.
         tasks: See `Task`; with any, no control is `inactive`.
         acceleration_rows: G in `G qacc <= g`, shape (m, nv) (`predicted_position_rows` makes some).

@@ -1,7 +1,6 @@
 """Frames in space: points in a sensor's frame, and velocity at a lever arm.
 
-A pose is a rotation matrix (3, 3), whose columns are the frame's axes in the outer frame, and a position (3,), m, of
-its origin there. Accelerations: `safe_wrappers.appendix.estimation.lever_arm`.
+A pose is a rotation matrix (3, 3), whose columns are the frame's axes in the outer frame, and its origin (3,), m.
 """
 
 import numpy as np

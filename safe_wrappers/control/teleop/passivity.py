@@ -1,16 +1,12 @@
-"""Energy at a port: ledgers of ports and channels, wave variables.
+"""Energy at a port: the ledger of a channel, wave variables.
 
 Source: appendix "Passivity and Energy-Bounded Interaction". A port has an effort F (N or N m) and a flow v (m/s or
-rad/s); their product is power, *positive into the component*. A component with storage V >= 0 is passive when
+rad/s); their product is power. A channel is passive when no more energy comes out than was stored at the start and
+went in; the wave transform keeps that for a *fixed* delay only. A sum of samples is the integral only if one of the
+two is held over the interval and the other is its mean; a product of two samples is an estimate.
 
-    integral of F.v dt  >=  V(T) - V(0) + dissipated  >=  -V(0)        (the appendix's equation 2)
-
-so no more energy comes out than was stored at the start. That limits neither force nor displacement, and the wave
-transform keeps it for a *fixed* delay only. A sum of samples is the integral only if one of the two is held over the
-interval and the other is its mean; a product of two samples is an estimate.
-
-Efforts, flows and waves are numbers (a port of one component) or arrays of shape (m,); functions without memory also
-take leading batch axes, (..., m). What is not finite raises `ConfigurationError`.
+Efforts, flows and waves are numbers or arrays of shape (m,); functions without memory also take batch axes, (..., m).
+What is not finite raises `ConfigurationError`.
 """
 
 import math
@@ -66,8 +62,6 @@ def to_waves(effort: ArrayLike, flow: ArrayLike, impedance: float) -> Waves:
 def effort_and_outgoing(flow: ArrayLike, incoming: ArrayLike, impedance: float) -> EffortAndWave:
     """The operator's side: effort F and outgoing wave u for a known flow and the incoming wave w.
 
-    `F = b v + sqrt(2 b) w` and `u = sqrt(2 b) v + w`.
-
     Args:
         flow: v, m/s, shape (..., m), or a number.
         incoming: w, sqrt(W), of the same shape.
@@ -79,101 +73,20 @@ def effort_and_outgoing(flow: ArrayLike, incoming: ArrayLike, impedance: float) 
     return EffortAndWave(np.asarray(b * v + root * w), np.asarray(root * v + w))
 
 
-class EnergyLedger:
-    """Accounts the two sides of equation 2 for one component, over any number of steps.
-
-    Several ports of one component are one port whose efforts and flows are concatenated.
-
-    Args:
-        initial_storage_j: V(0), or a bound on it, at least 0 J.
-    """
-
-    def __init__(self, initial_storage_j: float = 0.0) -> None:
-        self.initial_storage_j = energy_j("initial_storage_j", initial_storage_j)
-        """V(0), J."""
-        self._absorbed = RunningSum()
-        self._dissipated = RunningSum()
-        self._rounding = 0.0
-        self._lowest = 0.0
-        self._created = 0.0
-
-    def add(
-        self,
-        effort: ArrayLike,
-        flow: ArrayLike,
-        time_s: float,
-        stored_j: float | None = None,
-        dissipated_j: float = 0.0,
-    ) -> None:
-        """Account one interval.
-
-        Args:
-            effort: F, N, shape (m,), or a number; held over the interval, or its mean.
-            flow: v, m/s, of the same shape; the mean where the effort is held, and held where it is the mean.
-            time_s: Length of the interval, > 0.
-            stored_j: V at its end, if known, at least 0; None counts as 0, the least possible.
-            dissipated_j: Energy lost as heat within the interval, if known, at least 0.
-        """
-        time = positive("time_s", time_s)
-        f, v = port_vectors(effort=effort, flow=flow)
-        stored = 0.0 if stored_j is None else energy_j("stored_j", stored_j)
-        dissipated = energy_j("dissipated_j", dissipated_j)
-        self._absorbed.add(port_energy(f, v, time))
-        self._dissipated.add(dissipated)
-        # Storage is computed from a state that is rounded at every step, so its rounding counts each time.
-        exchanged = float(np.abs(f) @ np.abs(v)) * time + dissipated
-        self._rounding += (f.size + 4) * _EPS * (exchanged + stored)
-        self._lowest = min(self._lowest, self._absorbed.value)
-        missing = stored + self._dissipated.value - self._absorbed.value - self.initial_storage_j
-        self._created = max(self._created, missing)
-
-    @property
-    def absorbed_j(self) -> float:
-        """Integral of F.v dt, J: positive into the component."""
-        return self._absorbed.value
-
-    @property
-    def dissipated_j(self) -> float:
-        """Known dissipation, J."""
-        return self._dissipated.value
-
-    @property
-    def extracted_j(self) -> float:
-        """Largest net energy extracted at any time so far, J, at least 0."""
-        return -self._lowest
-
-    @property
-    def extractable_j(self) -> float:
-        """Largest energy that may still come out, `V(0) + absorbed - dissipated`, J; below 0: not passive."""
-        return self.initial_storage_j + self.absorbed_j - self.dissipated_j
-
-    @property
-    def created_j(self) -> float:
-        """Largest violation of equation 2 so far, J, with the storage and dissipation that `add` was given."""
-        return self._created
-
-    @property
-    def rounding_j(self) -> float:
-        """Bound on the rounding of these sums and of the storage that `add` was given, J."""
-        return self._rounding + 4.0 * _EPS * self.initial_storage_j
-
-    @property
-    def passive(self) -> bool:
-        """Whether equation 2 has held at all times so far, to rounding."""
-        return self._created <= self.rounding_j
-
-
 class ChannelLedger:
     """Energy of a two-port channel with any coding, `E_ch(T) - E_ch(0) <= integral of (P_m - P_s) dt`.
 
-    F.v is positive into the channel at the port m (the operator's), and out of it at s (the remote one).
+    F.v is positive into the channel at the port m (the operator's), and out of it at s (the remote one). One
+    component: `safe_wrappers.appendix.teleop.energy_ledger`.
 
     Args:
         initial_storage_j: E_ch(0), or a bound on it, at least 0 J.
     """
 
     def __init__(self, initial_storage_j: float = 0.0) -> None:
-        self._both = EnergyLedger(initial_storage_j)
+        self._initial = energy_j("initial_storage_j", initial_storage_j)
+        self._net = RunningSum()
+        self._created = self._rounding = 0.0
 
     def add(
         self,
@@ -187,29 +100,35 @@ class ChannelLedger:
         """Account one interval of `time_s` > 0.
 
         Efforts (N) and flows (m/s) at the operator's port m and the remote port s are numbers, or of shape (m,) at
-        each port. `stored_j` is the energy in flight at its end, if known (`WaveLine.in_flight_j` and `reserve_j` of
-        both directions).
+        each port. `stored_j` is the energy in flight at its end, if known, at least 0; None counts as 0.
         """
         f_m, v_m = port_vectors(effort_m=effort_m, flow_m=flow_m)
         f_s, v_s = port_vectors(effort_s=effort_s, flow_s=flow_s)
-        self._both.add(np.concatenate([f_m, -f_s]), np.concatenate([v_m, v_s]), time_s, stored_j)
+        effort, flow = np.concatenate([f_m, -f_s]), np.concatenate([v_m, v_s])
+        time = positive("time_s", time_s)
+        stored = 0.0 if stored_j is None else energy_j("stored_j", stored_j)
+        self._net.add(port_energy(effort, flow, time))
+        # The storage is computed from waves that are rounded at every step, so its rounding counts each time.
+        exchanged = float(np.abs(effort) @ np.abs(flow)) * time
+        self._rounding += (effort.size + 4) * _EPS * (exchanged + stored)
+        self._created = max(self._created, stored - self._net.value - self._initial)
 
     @property
     def net_j(self) -> float:
         """Integral of P_m - P_s, J: net energy into the channel."""
-        return self._both.absorbed_j
+        return self._net.value
 
     @property
     def stored_j(self) -> float:
         """Largest possible energy in the channel now, `E_ch(0) + net`, J; below 0: not passive."""
-        return self._both.extractable_j
+        return self._initial + self._net.value
 
     @property
     def created_j(self) -> float:
         """Largest excess so far of energy out (or in flight) over energy in and initial storage, J."""
-        return self._both.created_j
+        return self._created
 
     @property
     def passive(self) -> bool:
         """Whether it has created no energy so far, to rounding."""
-        return self._both.passive
+        return self._created <= self._rounding + 4.0 * _EPS * self._initial

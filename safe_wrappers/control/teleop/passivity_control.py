@@ -6,9 +6,8 @@ interfaces", whose observer and controller of one port are in `safe_wrappers.app
 
 In *impedance* causality a component answers a flow with an effort, so damping adds effort along the flow; in
 *admittance* causality it answers an effort with a flow, and damping adds flow along the effort. What cannot be
-dissipated (no flow, or a limit on the damping) is a debt: reported, carried over, and dissipated as soon as possible.
-Damping is computed for the sampled flow and accounted for the actual one a tick later, so the energy may be slightly
-negative in between. Passivity bounds neither force nor clearance.
+dissipated (no flow, or a limit on the damping) is a debt, dissipated as soon as possible. Damping is computed for the
+sampled flow and accounted for the actual one a tick later, so the energy may be slightly negative in between.
 """
 
 import math
@@ -53,7 +52,7 @@ class EnergyReference:
 
     At every tick both ends `receive` what has arrived, `modify`, and send `message_j`. The sum of both ports'
     energies is then never below minus the initial storages (and debts), for any delay, reordering and loss. Power is
-    positive into the channel at *both* ends. Without initial storage two such ends may never start.
+    positive into the channel at *both* ends.
 
     Args:
         causality: Which of the two this end changes, see above.

@@ -44,7 +44,7 @@ def port_vectors(**values: ArrayLike) -> tuple[Array, Array]:
 
 def port_energy(effort: Array, flow: Array, time_s: float) -> float:
     """`F.v dt`, J; a product that is not finite is refused."""
-    # Checking the product instead of both factors saves time at every tick.
+    # The product is checked instead of both factors, which saves time at every tick.
     with np.errstate(over="ignore", invalid="ignore"):
         energy = float(effort @ flow) * time_s
     if not math.isfinite(energy):

@@ -1,15 +1,13 @@
 """One direction of a wave channel over a network with delay, jitter, reordering and loss.
 
 A wave sent for one tick carries the energy `|u|^2 / 2 * tick`. The channel stays passive if the energy put out never
-exceeds the energy that has arrived and was not put out before; a wave line accounts for all energy it puts out. Three
-rules:
+exceeds the energy that has arrived and was not put out before. Three rules:
 
 - ``"queue"``: every wave that arrives is put out once, one per tick, in the order of sending; zero while there is
-  none. Neither energy nor the wave's integral is lost to jitter, but the delay grows to that of the latest packet.
-- ``"hold"``: the newest wave that has arrived, scaled down to the reserve of energy. The shortest delay; the wave's
-  integral, and with it the position of the remote side, drifts.
+  none. The delay grows to that of the latest packet.
+- ``"hold"``: the newest wave that has arrived, scaled down to the reserve of energy. The wave's integral, and with it
+  the position of the remote side, drifts.
 - ``"zero"``: the sum of what arrives within the tick, scaled down to the energy that arrived; zero if nothing does.
-  No memory; jitter loses signal.
 
 Source: appendix "Passivity preservation via wave variables", extended from a fixed delay.
 """

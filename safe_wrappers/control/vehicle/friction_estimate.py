@@ -1,8 +1,7 @@
 """Online estimate of a traction curve's peak: its height, its slip, and their uncertainty.
 
-At small slip a measured pair of slip and friction shows the curve's slope only. So there is a hypothesis per slip of
-the peak, each with a Kalman filter of the peak's height, weighted by its likelihood. Height and weights fade with the
-distance travelled; a measurement that no hypothesis explains resets them.
+There is a hypothesis per slip of the peak, with a Kalman filter of the peak's height, weighted by its likelihood.
+Height and weights fade with the distance travelled; a measurement that no hypothesis explains resets them.
 
 Source: appendix "Wheel slip ratio and friction boundaries"; the curve's shape is the Magic Formula's. The standard
 deviations hold for white noise and curves of this shape: they are no error bound.

@@ -1,10 +1,8 @@
 """A driven wheel over one control interval: its rate under drive torque and traction force.
 
 `I w' = tau - k w - b w - r F`, with torque and force constant over the interval and k the feedback of a speed servo,
-stepped with implicit damping as MuJoCo's Euler integrators do: `w+ = decay w + gain (tau - r F)`, exactly.
-Runge-Kutta differs by a relative rate of half the time step over the time constant I / b, per time constant. Solved
-for F it is a traction-force observer without force sensor and friction model; other torques on the axle (dry
-friction, a spring) appear in F.
+stepped with implicit damping as MuJoCo's Euler integrators do: `w+ = decay w + gain (tau - r F)`, exactly. Solved for
+F it is a traction-force observer; other torques on the axle (dry friction, a spring) appear in F.
 
 Source: appendix "Wheel slip ratio and friction boundaries" (the wheel's equation).
 """

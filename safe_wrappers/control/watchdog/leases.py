@@ -6,14 +6,11 @@ fit into the clearance:
 
     travel(lease + detect + hold + age + act) + stopping distance + localisation + margin <= clearance
 
-In the appendix the machine keeps its speed until it brakes; with `acceleration` it may speed up until then. `braking`
-is a *verified lower bound* on the deceleration; it is not checked here.
-
-A lease of zero or less means: revoke now. Rounding only shortens a lease, and inputs that are not finite revoke.
+In the appendix the machine keeps its speed until it brakes; with `acceleration` it may speed up until then. A lease
+of zero or less means: revoke now. Rounding only shortens a lease, and inputs that are not finite revoke.
 """
 
 import math
-from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,34 +27,6 @@ _LONGEST = 1e300
 """s; largest finite lease, so that nothing overflows."""
 
 
-@dataclass(frozen=True)
-class LeaseDelays:
-    """Delays in addition to the lease, in s, finite and at least 0.
-
-    Attributes:
-        detect_s: T_detect, until the end of the lease is recognised.
-        hold_s: T_hold, a confirmation window in which the last command continues.
-        age_s: t_age, age of the clearance's reading when the lease is granted.
-        act_s: T_act, until full deceleration.
-    """
-
-    detect_s: float = 0.0
-    hold_s: float = 0.0
-    age_s: float = 0.0
-    act_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ConfigurationError(f"{field.name} must be a finite time of at least 0 s, got {value!r}")
-
-    @property
-    def total_s(self) -> float:
-        """Their sum, s."""
-        return self.detect_s + self.hold_s + self.age_s + self.act_s
-
-
 def longest_lease(
     clearance: ArrayLike,
     speed: ArrayLike,
@@ -70,19 +39,16 @@ def longest_lease(
 ) -> Array:
     """The longest T_lease, s, shape (...), after which a machine without renewal still stops inside the clearance.
 
-    The largest tau = T_lease + delays_s with, for approach speed v, acceleration a and braking b,
-
-        v tau + a tau^2 / 2 + (v + a tau)^2 / (2 b) + localisation + margin <= clearance
-
-    where the speed v + a tau stops growing at `top_speed`; solved exactly. Zero or less: revoke. inf for a machine
-    that recedes or stands still, cannot accelerate and has room left; -inf where an input (but `top_speed`) is not
-    finite, where the braking is not positive, and where a machine that does not approach has no room left. Never NaN.
+    With tau = T_lease + delays_s, approach speed v (at most `top_speed`), acceleration a and braking b the travel is
+    `v tau + a tau^2 / 2`, the stopping distance `(v + a tau)^2 / (2 b)`. inf for a machine that recedes or stands
+    still, cannot accelerate and has room left; -inf where an input (but `top_speed`) is not finite, where the braking
+    is not positive, and where a machine that does not approach has no room left. Never NaN.
 
     Args:
         clearance: D_clear as measured `age` ago, m, shape (...).
         speed: Approach speed as measured then, m/s, positive towards the obstacle, shape (...).
         braking: Verified lower bound on the deceleration, m/s^2, shape (...).
-        delays_s: T_detect + T_hold + t_age + T_act (`LeaseDelays.total_s`), s, shape (...).
+        delays_s: T_detect + T_hold + t_age + T_act, s, shape (...).
         localisation: delta_loc, bound on the error of the clearance, m, shape (...).
         margin: delta_margin, clearance at rest, m, shape (...).
         acceleration: Largest approach acceleration that any command may cause until the brakes hold, m/s^2.
@@ -159,11 +125,10 @@ def round_trip_ceiling(
 ) -> Array:
     """The longest network round trip, s, shape (...), at which a remote operator can still stop the machine in time.
 
-    The largest T_RTT, downlink and uplink together, with `T_RTT <= (D_clear - d_brake) / v - (T_video + T_human +
-    T_act)`. `video_s` lasts from the exposure to the operator's display (a downlink in it must not be counted twice),
-    `human_s` is the reaction (0.15 to 0.25 s in the appendix), `act_s` lasts until full deceleration; s, at least 0,
-    shape (...). Other arguments, values and errors are those of `longest_lease`. It bounds displacement, not energy
-    or contact force, and has to be computed at every control step.
+    Downlink and uplink together, `T_RTT <= (D_clear - d_brake) / v - (T_video + T_human + T_act)`. `video_s` lasts
+    from the exposure to the operator's display without the downlink, `human_s` is the reaction (0.15 to 0.25 s in the
+    appendix), `act_s` lasts until full deceleration; s, at least 0, shape (...). Other arguments, values and errors
+    are those of `longest_lease`. It bounds displacement, not energy or contact force.
     """
     _not_negative(video_s=video_s, human_s=human_s, act_s=act_s)
     video, human, act = (np.asarray(late, dtype=np.float64) for late in (video_s, human_s, act_s))
@@ -175,8 +140,7 @@ def round_trip_ceiling(
 def longest_lease_of_room(room: ArrayLike, closing_speed: ArrayLike, delays_s: ArrayLike) -> Array:
     """The longest lease, s, shape (...), from a barrier that includes the stopping distance: `h / closing - delays`.
 
-    inf where h cannot fall (closing speed <= 0) and is positive; -inf where it cannot fall and is not, and where an
-    input is not finite.
+    Where h cannot fall (closing speed <= 0): inf if it is positive, else -inf; -inf for inputs that are not finite.
 
     Args:
         room: Value h of the barrier, the clearance left after braking, in any unit U, shape (...).

@@ -1,8 +1,7 @@
 """Reachability in time: bounds on the displacement within a time, and jerk-limited motion times.
 
 Source: appendix "Trajectory transit time and reachable distance". `furthest` and `admits` are necessary bounds: no
-reachable goal is refused. `jerk_limited_time` is the duration of the constrained profile itself, solved by ruckig.
-Moves from rest to rest: `safe_wrappers.appendix.watchdog.reachability`. Metres stand for any unit of length.
+reachable goal is refused. `jerk_limited_time` is solved by ruckig. Metres stand for any unit of length.
 """
 
 import math
@@ -56,8 +55,7 @@ def furthest(
 
     The lowest (<= 0) and the highest (>= 0), shape (...) each; (inf, -inf) where the duration is negative or anything
     is not finite. No admissible motion gets farther; the bound is exact where the speed limit is not reached or the
-    jerk not limited. A start outside the limits widens them to its speed, or to the speed that its acceleration leads
-    to.
+    jerk not limited. A start outside the limits widens them.
 
     Args:
         duration: s, shape (...).
@@ -123,10 +121,9 @@ def admits(
 ) -> NDArray[np.bool_]:
     """Whether a position may be reached within a time, at any speed, axis by axis: a necessary condition.
 
-    False: no admissible motion gets there, anything is not finite, or the duration is negative. True is not
-    sufficient: path, torque and stopping remain to be checked. `goal` and `position` are in m, shape (...), the other
-    arguments those of `furthest`. An acceleration of None is not measured: the largest one is assumed, and the jerk
-    limit only matters for a start above the speed limit.
+    False: no admissible motion gets there, anything is not finite, or the duration is negative. `goal` and `position`
+    are in m, shape (...), the other arguments those of `furthest`. An acceleration of None is not measured: the
+    largest one is assumed, and the jerk limit only matters for a start above the speed limit.
     """
     if acceleration is None:
         a_max, v_max, jerk = checked_limits(max_acceleration, max_speed, max_jerk)
@@ -145,9 +142,8 @@ def admits(
 def jerk_limited_time(start: State, end: State, limits: MotionLimits) -> Array:
     """The shortest time, s, shape (...), in which all axes arrive at their end state together.
 
-    Between states of rest it is the slowest axis's own time; with moving ends it may be longer. A start outside the
-    limits is first brought back inside. inf where a state is not finite, and where the end state violates the limits:
-    too fast, too strongly accelerated, or reached only from above the speed limit.
+    A start outside the limits is first brought back inside. inf where a state is not finite, and where the end state
+    violates the limits: too fast, too strongly accelerated, or reached only from above the speed limit.
 
     Args:
         start: Position, velocity, acceleration.

@@ -56,9 +56,8 @@ class CommandGate(LayerWrapper, CommandReceiver):
 
     def _execute(self, command: NDArray[Any]) -> tuple[Array, Step]:
         """Step the env; returns what was executed, which a filter inside may have changed, and the env's answer."""
-        executed = np.array(
-            command, dtype=np.float64
-        )  # before the step: an env may scale the command in place
+        # Before the step: an env may scale the command in place.
+        executed = np.array(command, dtype=np.float64)
         answer = self.env.step(command)
         info = answer[4]
         if self._filtered:

@@ -23,7 +23,6 @@ def whole_steps(time_s: float, control_dt: float) -> int:
 class CommandReceiver:
     """Base of `ChunkHandover`, `LeaseExpiry`, `TeleopChannel` and the faults.
 
-    An action of Gymnasium carries no time stamp, so a policy that repeats itself cannot be told from one that works.
     What carries actions (a fault, a queue, a network) calls `set_observation_time` before `step`; without a call
     the action was made from the newest observation.
     """

@@ -27,9 +27,8 @@ class Carried(NamedTuple):
 class Fault(LayerWrapper, CommandReceiver, ABC):
     """Base of the faults.
 
-    Put it outermost: outside `LeaseExpiry` and `ChunkHandover`, which it tells how old a command is, or that none has
-    come. Without either of them inside the robot goes on with the last command. Faults may be nested. A chunk is
-    carried, lost or repeated as a whole.
+    Put it outermost. It tells the `CommandReceiver` inside how old a command is, or that none has come; without one
+    the robot goes on with the last command. Faults may be nested. A chunk is carried, lost or repeated as a whole.
 
     Info, at every step: ``fault/active`` (bool).
 

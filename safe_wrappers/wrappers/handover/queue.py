@@ -50,9 +50,8 @@ class _Fade(NamedTuple):
 class ChunkQueue:
     """Which command comes next, counted in control steps.
 
-    A chunk that was observed at step k and is there at step t is consumed from its entry t - k on: latency is
-    measured, not estimated. A chunk of one has no left-over to blend with: it is sent as it is, and only a change of
-    its source (`switch`), to and from the fallback too, is faded over.
+    A chunk that was observed at step k and is there at step t is consumed from its entry t - k on. A chunk of one has
+    no left-over to blend with: only a change of its source (`switch`), to and from the fallback too, is faded over.
 
     Args:
         space: Of single commands, shape (m,); what is outside is clipped, at most to the largest number of the dtype.

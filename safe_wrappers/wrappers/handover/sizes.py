@@ -56,11 +56,6 @@ class ChunkSizes(NamedTuple):
             )
         return cls(entries, apart, size, horizon, delay)
 
-    @property
-    def leftover(self) -> int:
-        """What is left of a chunk when the next one takes over, at the least."""
-        return self.chunk - self.horizon - self.delay[1]
-
 
 def blend_bounds(
     sizes: ChunkSizes,
@@ -96,7 +91,7 @@ def blend_bounds(
                 f"{control_dt} s, {resolution / control_dt:.3g}: choose a larger one"
             )
     if blend_time is None and rate_limit is None:
-        fewest = sizes.leftover
+        fewest = sizes.chunk - sizes.horizon - sizes.delay[1]  # the least left-over
         if fewest == 0:
             raise ConfigurationError(
                 f"chunk_size = {sizes.chunk}, execution_horizon = {sizes.horizon} and inference_delay = "

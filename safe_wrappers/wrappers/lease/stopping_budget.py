@@ -205,8 +205,7 @@ class BoundBudget:
     def can_stop_after(self, command: Array, duration_s: float) -> bool:
         """Whether the machine can stop by itself after a command of so many seconds.
 
-        Either by the declared bounds, whatever the command is, or by the rows of a `Clearance`, which depend on the
-        command. There are none with `act_s` or with other clearances: next to the limit no command is admitted then.
+        By the declared bounds, whatever the command is, or by the rows of a `Clearance` (without `act_s`).
         """
         if self.longest_time() >= duration_s:
             return True

@@ -20,22 +20,19 @@ from safe_wrappers.wrappers.common.layer import Array
 class Sensor:
     """A camera, or any other sensor that needs a line of sight, on a body of the model.
 
-    It measures the tracked point's position relative to the sensor, and if asked for its velocity relative to it, in
-    the sensor's own axes, with Gaussian noise. The pose of the body that it sits on is known.
+    It measures the tracked point's position (and velocity) relative to itself, in its own axes, with Gaussian noise.
 
     Args:
         camera: Name of a camera in the model, which looks along its own -z; or
         site: name of a site, which looks along its own z.
-        view_deg: Full opening angle of the cone that it sees, degrees, above 0. None: a camera's own `fovy`, and all
-            around for a site. 360 and more is all around.
+        view_deg: Full opening angle of the cone that it sees, degrees. None: a camera's `fovy`, a site's all around.
         range_m: Farther away it sees nothing, m; None: as far as there is.
         occluder_groups: Geom groups (0 to 5) that block its sight; None: all of them.
         position_std: Of a measured position, m: a number for every axis, or a covariance matrix (d x d, m^2) in world
             axes. None: it does not measure positions.
         velocity_std: Likewise of a measured velocity, m/s and m^2/s^2. None: it does not measure velocities.
         dropout: Probability that a measurement of what is in sight is lost, for each track and step, below 1.
-        lever_arm: Whether the estimator knows where on its body the sensor sits. False takes it for the body's
-            origin, which is wrong wherever the body turns.
+        lever_arm: Whether the estimator knows where on its body the sensor sits; False takes the body's origin.
 
     Raises:
         ConfigurationError: Both or neither of camera and site, nothing measured, or a number outside its range.

@@ -20,7 +20,6 @@ from safe_wrappers.wrappers.common.layer import Array
 class Track:
     """What an `OcclusionPenalty` follows: bodies of the model, or points that the env publishes, and how they move.
 
-    Acceleration is white noise of a known intensity, and the velocity either wanders freely or goes back to a mean.
     At a reset the track starts from the true position plus noise of `start_position_std`, and from the mean velocity.
 
     Args:
@@ -30,13 +29,12 @@ class Track:
             q t^3 / 3 to the variance of a position. A number, one per coordinate (0 along a coordinate that does not
             wander), or a matrix, d x d. It has no default.
         reversion_s: Time constant with which the velocity goes back to `mean_velocity`, s; None: it does not.
-        mean_velocity: m/s, one per coordinate; zeros if left out. What the velocity is taken for at a reset, too.
+        mean_velocity: m/s, one per coordinate; None: zeros.
         start_position_std: m, a number or one per coordinate.
         start_velocity_std: m/s, a number or one per coordinate.
 
     Raises:
-        ConfigurationError: Bodies and published points at once, or neither; numbers that are negative or not finite;
-            a matrix that is not symmetric and positive semidefinite.
+        ConfigurationError: Bodies and published points at once, or neither; a number or matrix out of its range.
     """
 
     bodies: str | None = None

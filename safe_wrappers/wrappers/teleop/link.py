@@ -23,8 +23,7 @@ class Link:
         delay_s: Shortest time that a packet takes, s.
         jitter_s: How much longer it may take, s, uniform, drawn for each packet by itself.
         loss: Probability that a packet is lost, from 0 to 1; during an outage every one is.
-        in_order: Whether a packet waits for those that were sent before it and are not lost, as in a stream. False:
-            it may overtake them, as datagrams do.
+        in_order: Whether a packet waits for those sent before it, as in a stream; datagrams may overtake (False).
         outage_between_s: Mean time from the end of an outage to the start of the next, s; None: there are none.
         outage_length_s: Mean length of an outage, s.
 

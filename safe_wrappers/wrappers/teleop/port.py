@@ -18,10 +18,8 @@ class TeleopPort:
 
     Args:
         flow: Entries of the action, in m/s (or rad/s).
-        effort: Entries of the observation, in N (or N m), in the same order: with which the command pushes the
-            machine, at the present state and the last command.
-        feedthrough: By how much the effort changes at once per change of the flow, N s/m: a damper between command
-            and machine.
+        effort: Entries of the observation, in N (or N m), in the same order: how the command pushes the machine now.
+        feedthrough: Change of the effort at once per change of the flow, N s/m: a damper before the machine.
 
     Raises:
         ConfigurationError: No entries, as many of the one as not of the other, or one twice.

@@ -22,12 +22,10 @@ from safe_wrappers.wrappers.lease.stopping_budget import (
 class RoundTripCeiling:
     """The longest round trip at which an operator may still be relied on, from the clearance and speed of the moment.
 
-    See `control.watchdog.leases.round_trip_ceiling`. Whatever the round trip, an operator's command is executed only
-    if the machine can still stop by itself inside the clearance after it.
+    See `control.watchdog.leases.round_trip_ceiling`. A command after which the machine could not stop is refused.
 
     Args:
-        budget: A `StoppingBudget` or the dict of one. Its clearance measures the approach: a `Clearance`, or a
-            function of the env.
+        budget: A `StoppingBudget` or the dict of one, whose clearance is a `Clearance` or a function of the env.
         video_s: T_video, exposure, encoding and display, without the downlink, s.
         human_s: T_human, the operator's reaction, s.
         longest_s: No ceiling is higher, s: an operator who is silent for longer loses authority at rest, too.
