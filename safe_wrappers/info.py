@@ -230,8 +230,7 @@ OCCLUSION_SIGMA: Final = _key("occlusion/sigma", "float64", shape="(tracks,)", u
 OCCLUSION_EXPIRED: Final = _key(
     "occlusion/expired", "bool", shape="(tracks,)", chunk="any", log="expired", entries="mean"
 )
-"""Without a measurement, `sigmas` standard deviations would cross the tolerance before the next step ends: no
-permission to rely on this track."""
+"""Without a measurement `sigmas` standard deviations would cross the tolerance in the next step: no permission."""
 OCCLUSION_PENALTY: Final = _key(
     "occlusion/penalty", "float64", unit="reward", chunk="sum", log="occlusion_penalty"
 )
@@ -271,5 +270,4 @@ EPISODE: Final = (
 EPISODE_SUMMARY: Final = _key("interventions", "dict")
 """At an episode's last step only: length, return, and the figures of `EPISODE` that the stack and the task report."""
 RUNNING: Final = tuple(_key(figure.running, "float64") for figure in EPISODE if figure.running)
-"""Every step: the episode so far; NaN where the task or the stack does not report the keys. Monitor's
-`info_keywords`."""
+"""Every step: the episode so far; NaN where nothing reports the keys. Monitor's `info_keywords`."""

@@ -53,6 +53,7 @@ class BoundTrackPermission(BoundConstraint):
 
     def __init__(self, spec: TrackPermission, plant: Plant) -> None:
         machine = require_mujoco(plant, "TrackPermission needs a MujocoPlant: it brakes a body of its model")
+        machine.require_acceleration("TrackPermission")
         super().__init__(spec, machine)
         self.plant.named("body", self.spec.body)
         names = list(self.plant.attribute("track_names"))

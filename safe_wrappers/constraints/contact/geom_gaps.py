@@ -88,7 +88,8 @@ class GeomGaps:
         """The instants of a forecast at which a contact of a pair has to be judged, in time.
 
         They are the first of every contact, the last of every control step in contact, and the first of every
-        approach after a rebound in contact. Only the geoms' poses are written into `data`.
+        approach after a rebound in contact; in between the control is held, and the approach was judged when it
+        began. Only the geoms' poses are written into `data`.
         """
         m, (a, b) = plant.model, self.pairs[pair]
         (centres, axes), (other, others) = _path(m, forecast, a), _path(m, forecast, b)
