@@ -21,8 +21,8 @@ def deprecated_parameters(
 
     Args:
         renamed: Old name to new name; a call that gives both raises a ConfigurationError.
-        moved: Parameter to the dataclass that it takes now, whose fields are accepted as keywords of the constructor
-            beside the first one at the parameter's place.
+        moved: Parameter to the dataclass that it takes now. The constructor accepts its fields as keywords; an
+            argument at the parameter's place is then the first field.
         positional: Old names of positional arguments after the present ones.
     """
     renames, moves = dict(renamed or {}), dict(moved or {})

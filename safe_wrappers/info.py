@@ -79,11 +79,12 @@ CBF_CORRECTION: Final = _key("cbf/correction", "float64", unit="action", chunk="
 CBF_CLIPPED: Final = _key("cbf/clipped", "float64", unit="action", chunk="max")
 """L2 norm of boxed minus proposed: what the action space alone took away."""
 CBF_MARGIN: Final = _key("cbf/margin", "float64", chunk="min")
-"""The smallest barrier value h of all constraints before the step, margins not taken off; 0 without one."""
+"""The smallest barrier value h before the step, in each constraint's unit, margins not taken off; 0 without one."""
 CBF_UNSAFE: Final = _key("cbf/unsafe", "bool", chunk="any")
 """Some h was negative (by more than rounding, 1e-6) or not a number before the step."""
 CBF_REFUSED: Final = _key("cbf/refused", "bool", shape="(constraints,)", chunk="any")
-"""Which constraints, in the order of `constraint_names`, refused the boxed proposal; none where it is not finite."""
+"""Which constraints, in the order of `constraint_names`, refused the boxed proposal; all False where it or
+the state is not finite."""
 CBF_STAGE: Final = _key("cbf/stage", "int64")
 """The `safe_wrappers.filter.search.Stage` that found the executed action: 0 the proposal, 1 projection on rows, 2 a
 constraint's candidate, 3 projection on new rows, 4 an overshoot, 5 a blend, 6 a backup control, 7 the fallback, 8 the

@@ -106,13 +106,10 @@ class BoundBarrier(BoundConstraint):
         gradient = self._gradient(x)
         self._rounding = _ROUNDING * (abs(self._now) + float(np.abs(gradient).max(initial=0.0)))
         drift, effect = cbf.lie_derivatives(gradient, self.plant.f, self.plant.g)
-        room = self._now - self.spec.margin
-        decay = (
-            self.spec.alpha(room) if callable(self.spec.alpha) else cbf.linear_decay(room, self.spec.alpha)
-        )
-        normal, offset = cbf.cbf_rows(
-            drift, effect, decay - 0.5 * self.spec.curvature * self.plant.control_dt
-        )
+        room, alpha = self._now - self.spec.margin, self.spec.alpha
+        decay = alpha(room) if callable(alpha) else cbf.linear_decay(room, alpha)
+        bend = 0.5 * self.spec.curvature * self.plant.control_dt
+        normal, offset = cbf.cbf_rows(drift, effect, decay - bend)
         return HalfSpaces(normal[None, :], offset.reshape(1))
 
     def slack(self, control: Array) -> float:
@@ -167,9 +164,8 @@ class BoundBarrier(BoundConstraint):
             return
         # The gradient may vanish at this very state (h = 1 - v^2 at rest): look around it before refusing.
         spread = np.random.default_rng(0).normal(size=(8, x.size)) * 0.1
-        degrees = [
-            cbf.relative_degree(self._height, self.plant.drift, self.plant.effect, x + s) for s in spread
-        ]
+        f, g = self.plant.drift, self.plant.effect
+        degrees = [cbf.relative_degree(self._height, f, g, x + s) for s in spread]
         if 1 not in degrees:
             higher = min((d for d in degrees if d is not None), default=None)
             found = f"its relative degree is {higher}" if higher else "no control acts on it"

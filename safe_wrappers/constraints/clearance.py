@@ -128,8 +128,8 @@ class BoundClearance(BoundConstraint):
         """Position, velocity, drift and control matrix of the acceleration of each point, SI."""
         if self._machine is not None:
             return [self._machine.point(kind, name) for kind, name in self._named]
-        p, v = list(self.spec.position), list(self.spec.velocity)
-        return [(self.plant.state[p], self.plant.state[v], self.plant.f[v], self.plant.g[v])]
+        x, p, v = self.plant.state, self.spec.position, self.spec.velocity
+        return [(x[p], x[v], self.plant.f[v], self.plant.g[v])]
 
     def value(self) -> Array:
         """Room left after braking, margin and state error not taken off, m, one per point and surface."""
@@ -142,9 +142,7 @@ class BoundClearance(BoundConstraint):
         if self._machine is not None:
             motions = [self._machine.motion(kind, name) for kind, name in self._named]
         else:
-            motions = [
-                (self.plant.state[list(self.spec.position)], self.plant.state[list(self.spec.velocity)])
-            ]
+            motions = [(self.plant.state[self.spec.position], self.plant.state[self.spec.velocity])]
         gaps = [self._gaps(p, v) for p, v in motions]
         return np.concatenate([g[1] for g in gaps]), np.concatenate([g[2] for g in gaps])
 

@@ -23,7 +23,7 @@ from safe_wrappers.plants.plant import Plant
 class ContactFeasibility(Constraint):
     """Keep every contact force of the robot with the fixed world inside a narrower friction cone: `|f_t| <= mu f_n`.
 
-    A simulator's forces are inside the model's cone, and a foot slides where they are on it: hence the narrower one.
+    In a simulator all forces are inside the model's cone, and those on it slide: so the required cone is narrower.
 
     Best effort: an executed control that is not flagged keeps every contact force of its control step, at every
     evaluation of the physics, within cone and tolerance, for a plant that is right. Such a control need not exist: a

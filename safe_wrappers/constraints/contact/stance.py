@@ -103,7 +103,7 @@ class BoundStance(BoundConstraint):
         self._answer: WholeBodySolution | None = None
 
     def problem(self, control: Array) -> WholeBodyProblem | None:
-        """The program of the observed state, contacts as under the first control asked about; None: not finite."""
+        """The observed state's program; the first control, shape (m,), says which contacts open. None: not finite."""
         if not self._known:
             self._known, self._problem = True, self._write_down(control)
         return self._problem

@@ -84,4 +84,5 @@ class BoundSupportMargin(BoundSlacks):
 
 def edge_distances(contacts: ContactForecast) -> list[float]:
     """Distance of the zero moment point from the polygon's edge, at every evaluation at which there is one, m."""
-    return [*map(float, support_distances(contacts.step, contacts.point, contacts.normal, contacts.force))]
+    found = support_distances(contacts.step, contacts.point, contacts.normal, contacts.force)
+    return [float(distance) for distance in found]

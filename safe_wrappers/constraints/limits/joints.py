@@ -69,7 +69,7 @@ def refuse_uncovered_stops(model: mujoco.MjModel) -> None:
 
 
 def scalar_joints(plant: MujocoPlant, names: Sequence[str] | None) -> list[int]:
-    """Ids of the named hinges and slides, or of all that an actuator drives directly; refuses to find none."""
+    """Ids of the named hinges and slides, or of all that an actuator drives directly; an error if none is."""
     model = plant.model
     if names is None:
         ids = driven_joints(model)

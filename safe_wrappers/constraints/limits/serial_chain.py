@@ -37,9 +37,8 @@ class SerialChain:
             first = int(model.body_jntadr[body])
             carriers += range(first, first + int(model.body_jntnum[body])) if first >= 0 else []
             body = int(model.body_parentid[body])
-        self.joints = np.array(
-            sorted(j for j in carriers if model.jnt_type[j] in of_joints.HINGE_OR_SLIDE), dtype=int
-        )
+        scalar = sorted(j for j in carriers if model.jnt_type[j] in of_joints.HINGE_OR_SLIDE)
+        self.joints = np.array(scalar, dtype=int)
         if not self.joints.size:
             wanted = f"no hinge or slide moves {self._what}: it has no manipulability"
             raise ConfigurationError(f"{wanted}; the model has the joints {', '.join(plant.names('joint'))}")

@@ -25,9 +25,8 @@ from safe_wrappers.plants.plant import Plant
 
 _SAMPLES = 2000  # configurations that say which manipulability can be reached
 _STILL = 1e-9  # columns with a smaller norm are zero, m or rad per rad
-_DECAY_HOLDS = (
-    2.0  # time constant of the rows, control intervals: longer brakes early, forecasts refuse shorter
-)
+# Time constant of the rows, control intervals: a longer one brakes early, a shorter one is refused by forecasts.
+_DECAY_HOLDS = 2.0
 _ALONG_S = 1e-5  # width of the difference for the curvature of w along the motion, s
 
 

@@ -84,10 +84,8 @@ class BoundWorkspace(BoundRollout):
             there = ", ".join(self.plant.names("body"))
             wanted = "name the bodies, sites or geoms to keep inside"
             raise ConfigurationError(f"{wanted}; the bodies are {there}")
-        m, named = (
-            self.plant.model,
-            {"body": self.spec.bodies, "site": self.spec.sites, "geom": self.spec.geoms},
-        )
+        m = self.plant.model
+        named = {"body": self.spec.bodies, "site": self.spec.sites, "geom": self.spec.geoms}
         bodies, sites, geoms = ([self.plant.named(kind, n) for n in names] for kind, names in named.items())
         self._bodies = np.array([*bodies, *m.site_bodyid[sites], *m.geom_bodyid[geoms]], dtype=int)
         self._offsets = np.vstack([np.zeros((len(bodies), 3)), m.site_pos[sites], m.geom_pos[geoms]])

@@ -11,9 +11,8 @@ from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
-_REST_SPEED = (
-    0.01  # m/s, of body and farthest point: slower is at rest; Safety-Gymnasium's car then moves 0.8 mm
-)
+# m/s, of the body and its farthest point: slower counts as at rest. Safety-Gymnasium's car then moves on by 0.8 mm.
+_REST_SPEED = 0.01
 # Numbers that a plant's model may have different from the env's, by kind of object.
 _ADOPTED = (
     ("nbody", int(mujoco.mjtObj.mjOBJ_BODY), ("body_mass", "body_inertia", "body_ipos", "body_iquat")),

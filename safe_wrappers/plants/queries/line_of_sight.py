@@ -12,9 +12,8 @@ from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.model import kinematics, named
 
-_TAKES_NORMALS = "normal" in (
-    mujoco.mj_multiRay.__doc__ or ""
-)  # later versions of MuJoCo take one more argument
+# Later versions of MuJoCo take one more argument.
+_TAKES_NORMALS = "normal" in (mujoco.mj_multiRay.__doc__ or "")
 _SKIN_M = 1e-9  # a surface this close in front of a point does not hide it: the point may lie on it
 
 
