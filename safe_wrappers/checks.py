@@ -53,12 +53,7 @@ def name_list(name: str, given: Any, of: str = "names", also: str = "", least: i
 
 
 def settings_from(kind: type[T], given: Any, name: str, also: str = "") -> T:
-    """An instance of the dataclass `kind`: the given one, or one made from the dict of its fields.
-
-    Raises:
-        ConfigurationError: Neither, or a field without a default is missing; `also` says what else is allowed.
-        UnknownNameError: A key that is not a field.
-    """
+    """The given instance of the dataclass `kind`, or one made from a dict of fields; `also` as in `name_list`."""
     if isinstance(given, kind):
         return given
     if not isinstance(given, Mapping):

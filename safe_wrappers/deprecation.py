@@ -21,8 +21,8 @@ def deprecated_parameters(
 
     Args:
         renamed: Old name to new name; a call that gives both raises a ConfigurationError.
-        moved: Parameter to the dataclass that it takes now. The dataclass's fields are accepted as keywords of the
-            constructor; an argument at the place of the parameter is then the dataclass's first field.
+        moved: Parameter to the dataclass that it takes now. The constructor accepts its fields as keywords; an
+            argument at the parameter's place is then the first field.
         positional: Old names of positional arguments after the present ones.
     """
     renames, moves = dict(renamed or {}), dict(moved or {})
@@ -47,9 +47,8 @@ def deprecated_parameters(
                 if name in homes:
                     new.setdefault(homes[name], {})[name] = value
                 elif renames[name] in bound.arguments:
-                    raise ConfigurationError(
-                        f"{kind.__name__}: {name} is the old name of {renames[name]}; give one"
-                    )
+                    what = f"{name} is the old name of {renames[name]}"
+                    raise ConfigurationError(f"{kind.__name__}: {what}; give one")
                 else:
                     new[renames[name]] = value
             written = []
@@ -85,15 +84,12 @@ def deprecated_names(kind: type[Any]) -> tuple[str, ...]:
 def deprecated_attribute(old: str, new: str) -> Any:
     """A property of the old name that reads and sets the attribute of the new one."""
 
-    def warn(kind: type[Any]) -> None:
-        warnings.warn(f"{kind.__name__}.{old} is deprecated; write {new}", DeprecationWarning, stacklevel=3)
-
     def read(self: Any) -> Any:
-        warn(type(self))
+        _warn(type(self), old, new)
         return getattr(self, new)
 
     def write(self: Any, value: Any) -> None:
-        warn(type(self))
+        _warn(type(self), old, new)
         setattr(self, new, value)
 
     return property(read, write, doc=f"Old name of `{new}`.")
@@ -103,10 +99,12 @@ def deprecated_method(old: str, new: str) -> Any:
     """A method that calls the one of the new name."""
 
     def method(self: Any, *args: Any, **kwargs: Any) -> Any:
-        warnings.warn(
-            f"{type(self).__name__}.{old} is deprecated; write {new}", DeprecationWarning, stacklevel=2
-        )
+        _warn(type(self), old, new)
         return getattr(self, new)(*args, **kwargs)
 
     method.__doc__ = f"Old name of `{new}`."
     return method
+
+
+def _warn(kind: type[Any], old: str, new: str) -> None:
+    warnings.warn(f"{kind.__name__}.{old} is deprecated; write {new}", DeprecationWarning, stacklevel=3)

@@ -79,13 +79,12 @@ CBF_CORRECTION: Final = _key("cbf/correction", "float64", unit="action", chunk="
 CBF_CLIPPED: Final = _key("cbf/clipped", "float64", unit="action", chunk="max")
 """L2 norm of boxed minus proposed: what the action space alone took away."""
 CBF_MARGIN: Final = _key("cbf/margin", "float64", chunk="min")
-"""The smallest barrier value h over all constraints before the step, each in its own unit, without its margin. 0
-when there is no barrier value."""
+"""The smallest barrier value h before the step, in each constraint's unit, margins not taken off; 0 without one."""
 CBF_UNSAFE: Final = _key("cbf/unsafe", "bool", chunk="any")
 """Some h was negative (by more than rounding, 1e-6) or not a number before the step."""
 CBF_REFUSED: Final = _key("cbf/refused", "bool", shape="(constraints,)", chunk="any")
-"""Which constraints, in the order of `constraint_names`, did not admit the boxed proposal; all False when nothing was
-changed, or when the state or the proposal was not finite."""
+"""Which constraints, in the order of `constraint_names`, refused the boxed proposal; all False where it or
+the state is not finite."""
 CBF_STAGE: Final = _key("cbf/stage", "int64")
 """The `safe_wrappers.filter.search.Stage` that found the executed action: 0 the proposal, 1 projection on rows, 2 a
 constraint's candidate, 3 projection on new rows, 4 an overshoot, 5 a blend, 6 a backup control, 7 the fallback, 8 the
@@ -232,8 +231,7 @@ OCCLUSION_SIGMA: Final = _key("occlusion/sigma", "float64", shape="(tracks,)", u
 OCCLUSION_EXPIRED: Final = _key(
     "occlusion/expired", "bool", shape="(tracks,)", chunk="any", log="expired", entries="mean"
 )
-"""Without a measurement, `sigmas` standard deviations would cross the tolerance before the next step ends: no
-permission to rely on this track."""
+"""Without a measurement `sigmas` standard deviations would cross the tolerance in the next step: no permission."""
 OCCLUSION_PENALTY: Final = _key(
     "occlusion/penalty", "float64", unit="reward", chunk="sum", log="occlusion_penalty"
 )
@@ -273,5 +271,4 @@ EPISODE: Final = (
 EPISODE_SUMMARY: Final = _key("interventions", "dict")
 """At an episode's last step only: length, return, and the figures of `EPISODE` that the stack and the task report."""
 RUNNING: Final = tuple(_key(figure.running, "float64") for figure in EPISODE if figure.running)
-"""Every step: the episode so far; NaN where the task or the stack does not report the keys. Monitor's
-`info_keywords`."""
+"""Every step: the episode so far; NaN where nothing reports the keys. Monitor's `info_keywords`."""

@@ -82,6 +82,8 @@ _RAIL = Clearance(
     # The pole pulls the cart while a control is held, by up to 2 mm (measured).
     margin=0.01,
 )
+# A plane, not a box: the tool cannot go round the clamp.
+_CLAMP = Plane([0.0, CLAMP_Y], [0.0, -1.0])
 
 
 def _safe_rover(
@@ -101,9 +103,8 @@ def _of_what_is_known(
     }
     chosen = chosen or ("estimated" if env.has_wrapper_attr("tracking") else "true")
     if chosen not in known:
-        raise UnknownNameError(
-            f"{option} is one of {', '.join(known)}: which positions to keep clear of; got {chosen!r}"
-        )
+        wanted = f"{option} is one of {', '.join(known)}"
+        raise UnknownNameError(f"{wanted}: which positions to keep clear of; got {chosen!r}")
     return known[chosen]
 
 
@@ -131,9 +132,8 @@ def _ant_maze(env: gym.Env[Any, Any]) -> list[Constraint]:
     fixed = (model.geom_bodyid == 0) & (model.geom_type == int(mujoco.mjtGeom.mjGEOM_BOX))
     boxes = zip(model.geom_pos[fixed], model.geom_size[fixed], strict=True)
     blocks = [(x - dx, x + dx, y - dy, y + dy) for (x, y, _), (dx, dy, _) in boxes]
-    walls = [
-        Box([(a + b) / 2.0, (c + d) / 2.0], [(b - a) / 2.0, (d - c) / 2.0]) for a, b, c, d in merged(blocks)
-    ]
+    corners = merged(blocks)
+    walls = [Box([(a + b) / 2.0, (c + d) / 2.0], [(b - a) / 2.0, (d - c) / 2.0]) for a, b, c, d in corners]
     # At 4 m/s an ant moves 1 m in five steps.
     return [Workspace(keep_out=walls, bodies=["torso"], radius=0.4, margin=0.01, horizon=5, max_decrease=1.0)]
 
@@ -155,21 +155,14 @@ def _fetch(
     middle = raw.model.geom_pos[geom] + raw.model.body("table0").pos
     half = raw.model.geom_size[geom]
     top = float(middle[2] + half[2])
-    # Goals and objects lie within 0.15 m of the gripper's start (those of FetchSlide farther away), objects are
-    # pushed from 0.06 m beyond, and a block is lifted to 0.48 m above the table. The arm reaches all of the box to 15
-    # mm.
+    # Goals and objects lie within 0.15 m of the gripper's start (in FetchSlide farther away), objects are pushed from
+    # 0.06 m beyond, and a block is lifted to 0.48 m above the table. The arm reaches all of the box to 15 mm.
     least = [float(start[0]) - 0.25, float(start[1]) - 0.25, top + 0.02]
     most = [float(start[0]) + 0.25, float(start[1]) + 0.25, top + 0.5]
     # A displacement of zero stops the gripper within one of the two control steps. In both it moves by 83 mm per axis
     # at most, and a finger that also opens or closes by 0.16 m in all (measured).
-    grip = Workspace(
-        least if low is None else low,
-        most if high is None else high,
-        sites=["robot0:grip"],
-        margin=0.001,
-        horizon=2,
-        max_decrease=0.1,
-    )
+    low, high = least if low is None else low, most if high is None else high
+    grip = Workspace(low, high, sites=["robot0:grip"], margin=0.001, horizon=2, max_decrease=0.1)
     # An upright finger's tip stays 4 mm above the table, where it still meets the lower half of block and puck.
     obstacles = [*([Box(middle.tolist(), half.tolist())] if table else []), *keep_out]
     if not obstacles:
@@ -209,15 +202,8 @@ RECIPES: dict[str, Callable[..., list[Constraint]]] = {
     # A torque of 200 N m on 1 kg m^2 for 0.02 s: one step can add 4 rad/s.
     "Reacher": _fixed(JointSpeedLimit(limit=5.0, margin=0.01, max_decrease=4.5)),
     "SafeRover": _safe_rover,
-    # A plane, not a box: the tool cannot go round the clamp.
     "TeleopContact": _fixed(
-        Clearance(
-            [Plane([0.0, CLAMP_Y], [0.0, -1.0])],
-            TELEOP_BRAKING,
-            bodies=["tool"],
-            radius=TOOL_RADIUS,
-            margin=0.001,
-        )
+        Clearance([_CLAMP], TELEOP_BRAKING, bodies=["tool"], radius=TOOL_RADIUS, margin=0.001)
     ),
     "OccludedCrossing": _occluded_crossing,
     # The tip stays over the table, clear of its top by 2.5 cm, and in front of the shoulder.

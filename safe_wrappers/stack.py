@@ -79,11 +79,7 @@ _NOT_TOGETHER: Final = {
 
 
 def refuse_order(env: gym.Env[Any, Any], layer: Layer, name: str) -> None:
-    """Refuse to put a layer, called `name` in messages, around an env with wrappers that must be outside of it.
-
-    Raises:
-        ConfigurationError: Says why, and the right order if there is one.
-    """
+    """Refuse to put a layer, called `name` in messages, around an env with wrappers that must be outside of it."""
     for inner in wrappers_of(env):
         other = getattr(inner, "layer", None)
         if not isinstance(other, Layer):

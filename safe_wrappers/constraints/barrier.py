@@ -7,14 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import non_negative, positive
-from safe_wrappers.control.filtering.cbf import (
-    acts,
-    cbf_rows,
-    lie_derivatives,
-    linear_decay,
-    numerical_gradient,
-    relative_degree,
-)
+from safe_wrappers.control.filtering import cbf
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.filter.linearize import linearize
@@ -29,16 +22,14 @@ _NO_EFFECT = 1e-7  # error of differences, as a share of h's size and of the con
 class Barrier(Constraint):
     """Keep `h(x) >= 0` by `Lf h + Lg h u >= -alpha (h - margin) + curvature * hold / 2`.
 
-    Best effort: in continuous time the set `h >= margin` is invariant while the row is feasible. The held control is
-    predicted as well: one that is not flagged keeps h at the half and at the end of the hold (AnalyticPlant) or at
-    every physics substep (MujocoPlant), for a plant and an integration that are right.
+    Best effort: a held control that is not flagged keeps `h >= 0` at the half and at the end of the hold
+    (AnalyticPlant) or at every physics substep (MujocoPlant), for a plant and an integration that are right.
 
     Args:
         h: Takes the plant's state (n,), returns a number, positive inside the safe set. The control must act on h'
             (relative degree one); this is checked at the first reset.
         gradient: Takes the state, returns dh/dx (n,). None differentiates by central differences.
-        alpha: Decay gain in 1/s (`alpha * h`), at most `1 / hold`; or an increasing function of h, with alpha(0) = 0,
-            in h units per second (extended class K).
+        alpha: Decay gain in 1/s, at most `1 / hold`; or an extended class K function of h, in h units per second.
         margin: Reserve for errors of state, model and integration, in units of h.
         curvature: Bound on -h'' while a control is held, in units of h per s^2.
 
@@ -55,9 +46,8 @@ class Barrier(Constraint):
         if not callable(self.h):
             raise ConfigurationError(f"h must be a function of the state, got {self.h!r}")
         if self.gradient is not None and not callable(self.gradient):
-            raise ConfigurationError(
-                f"gradient must be a function of the state or None, got {self.gradient!r}"
-            )
+            wanted = "gradient must be a function of the state or None"
+            raise ConfigurationError(f"{wanted}, got {self.gradient!r}")
         if callable(self.alpha):
             below, zero, above = self.alpha(-1.0), self.alpha(0.0), self.alpha(1.0)
             if zero != 0.0 or above <= 0.0 or below >= 0.0:
@@ -115,10 +105,11 @@ class BoundBarrier(BoundConstraint):
         self._now = self._height(x)
         gradient = self._gradient(x)
         self._rounding = _ROUNDING * (abs(self._now) + float(np.abs(gradient).max(initial=0.0)))
-        drift, effect = lie_derivatives(gradient, self.plant.f, self.plant.g)
-        room = self._now - self.spec.margin
-        decay = self.spec.alpha(room) if callable(self.spec.alpha) else linear_decay(room, self.spec.alpha)
-        normal, offset = cbf_rows(drift, effect, decay - 0.5 * self.spec.curvature * self.plant.control_dt)
+        drift, effect = cbf.lie_derivatives(gradient, self.plant.f, self.plant.g)
+        room, alpha = self._now - self.spec.margin, self.spec.alpha
+        decay = alpha(room) if callable(alpha) else cbf.linear_decay(room, alpha)
+        bend = 0.5 * self.spec.curvature * self.plant.control_dt
+        normal, offset = cbf.cbf_rows(drift, effect, decay - bend)
         return HalfSpaces(normal[None, :], offset.reshape(1))
 
     def slack(self, control: Array) -> float:
@@ -147,7 +138,7 @@ class BoundBarrier(BoundConstraint):
 
     def _gradient(self, x: Array) -> Array:
         if self.spec.gradient is None:
-            return numerical_gradient(self._height, x)
+            return cbf.numerical_gradient(self._height, x)
         dh = np.asarray(self.spec.gradient(x), dtype=np.float64)
         if dh.shape != x.shape:
             raise ConfigurationError(f"gradient must return the shape of the state {x.shape}, got {dh.shape}")
@@ -163,17 +154,18 @@ class BoundBarrier(BoundConstraint):
         if not np.isfinite([*x, h]).all():
             raise ConfigurationError(f"the first state must be finite and h of it too; got {x}, h = {h}")
         if self.spec.gradient is not None:
-            given, differences = self._gradient(x), numerical_gradient(self._height, x)
+            given, differences = self._gradient(x), cbf.numerical_gradient(self._height, x)
             size = abs(h) + np.abs(differences).max()
             if np.abs(given - differences).max() > 1e-2 * size:
                 raise ConfigurationError(
                     f"gradient does not fit h: at the first state it gives {given}, differences give {differences}"
                 )
-        if acts(self._gradient(x), self.plant.g, h, _NO_EFFECT):
+        if cbf.acts(self._gradient(x), self.plant.g, h, _NO_EFFECT):
             return
         # The gradient may vanish at this very state (h = 1 - v^2 at rest): look around it before refusing.
         spread = np.random.default_rng(0).normal(size=(8, x.size)) * 0.1
-        degrees = [relative_degree(self._height, self.plant.drift, self.plant.effect, x + s) for s in spread]
+        f, g = self.plant.drift, self.plant.effect
+        degrees = [cbf.relative_degree(self._height, f, g, x + s) for s in spread]
         if 1 not in degrees:
             higher = min((d for d in degrees if d is not None), default=None)
             found = f"its relative degree is {higher}" if higher else "no control acts on it"

@@ -11,8 +11,8 @@ from safe_wrappers.constraints.obstacles import Nearest, obstacles_from
 from safe_wrappers.control.backup.stopping import sampled_acceleration_limit, sampled_inset
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, HalfSpaces, Memory
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.queries.points import Points
 
 
 class _Seen(NamedTuple):
@@ -30,19 +30,13 @@ class _Seen(NamedTuple):
 class Clearance(Constraint):
     """Keep `distance - (stopping distance) >= 0` from every point to every obstacle, also between samples.
 
-    The row bounds the acceleration towards the obstacle that may be held for a control interval, so that full braking
-    afterwards still stops in front of it (`control/backup/stopping.py`). The state is predicted over the plant's
-    delay.
-
     Best effort: head on, and in one dimension, the bound is exact for the declared `braking`. Elsewhere `margin` must
     cover that the direction to the obstacle and the drift change within a hold; and several obstacles, or joint
-    limits, can ask for more than the actuators have. A machine that cannot brake in every direction needs
-    `HeadingDriveClearance`.
+    limits, can ask for more than the actuators have.
 
     Args:
         obstacles: `Disc`, `Sphere`, `Box`, `Plane`, `Discs`.
-        braking: Validated lower bound on the deceleration that the actuators can give in any direction and every
-            state of the envelope, m/s^2.
+        braking: Lower bound on the deceleration that the actuators can give in any direction and state, m/s^2.
         bodies: Names of bodies whose frame origins are kept clear (MujocoPlant).
         sites: Names of sites, likewise.
         geoms: Names of geoms: their centres, likewise.
@@ -93,7 +87,22 @@ class BoundClearance(BoundConstraint):
     def __init__(self, spec: Clearance, plant: Plant) -> None:
         plant.require_acceleration("Clearance")
         super().__init__(spec, plant)
-        self._points = Points(plant, spec.bodies, spec.sites, spec.geoms, spec.position, spec.velocity)
+        self._machine = plant if isinstance(plant, MujocoPlant) else None
+        named = {"body": spec.bodies, "site": spec.sites, "geom": spec.geoms}
+        self._named = [(kind, name) for kind, names in named.items() for name in names]
+        if self._machine is None:
+            if not spec.position:
+                raise ConfigurationError(
+                    "on an AnalyticPlant say where the point is in the state: position=[0, 1], velocity=[2, 3]"
+                )
+            return
+        if not self._named:
+            raise ConfigurationError(
+                "name the bodies, sites or geoms to keep clear; the model has the bodies "
+                + ", ".join(self._machine.names("body"))
+            )
+        for kind, name in self._named:
+            self._machine.named(kind, name)
 
     def observe(self, memory: Memory) -> None:
         self._observed: list[_Seen] | None = None
@@ -111,9 +120,16 @@ class BoundClearance(BoundConstraint):
     def _seen(self) -> list[_Seen]:
         """What every point sees, once per observation."""
         if self._observed is None:
-            every = self._points.accelerations()
+            every = self._accelerations()
             self._observed = [_Seen(*self._gaps(p, v), drift, effect) for p, v, drift, effect in every]
         return self._observed
+
+    def _accelerations(self) -> list[tuple[Array, Array, Array, Array]]:
+        """Position, velocity, drift and control matrix of the acceleration of each point, SI."""
+        if self._machine is not None:
+            return [self._machine.point(kind, name) for kind, name in self._named]
+        x, p, v = self.plant.state, self.spec.position, self.spec.velocity
+        return [(x[p], x[v], self.plant.f[v], self.plant.g[v])]
 
     def value(self) -> Array:
         """Room left after braking, margin and state error not taken off, m, one per point and surface."""
@@ -123,7 +139,11 @@ class BoundClearance(BoundConstraint):
     def approach(self) -> tuple[Array, Array]:
         """Clearances (m) and approach speeds (m/s, towards the obstacle), as measured, one per point and surface."""
         # Not through `_seen`: the accelerations, which only the rows need, are most of its work.
-        gaps = [self._gaps(p, v) for p, v in self._points.motions()]
+        if self._machine is not None:
+            motions = [self._machine.motion(kind, name) for kind, name in self._named]
+        else:
+            motions = [(self.plant.state[self.spec.position], self.plant.state[self.spec.velocity])]
+        gaps = [self._gaps(p, v) for p, v in motions]
         return np.concatenate([g[1] for g in gaps]), np.concatenate([g[2] for g in gaps])
 
     def rows(self) -> HalfSpaces:

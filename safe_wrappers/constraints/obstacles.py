@@ -225,12 +225,9 @@ class Discs(_Round):
 class TrackedDiscs:
     """Discs (or balls) that an `OcclusionPenalty` inside the filter tracks.
 
-    Each is the ellipsoid of `sigmas` standard deviations about its estimate. The surface moves with the estimated
-    velocity, and grows: its speed towards the machine is the fastest at which the bound comes nearer within
-    `horizon_s` without further measurements. `Workspace` uses the distances alone, without growth.
-
-    A centre leaves its ellipsoid with the probability of the tail of `sigmas` (for Gaussian noise, a true motion
-    model and 3: 0.27 % of the time on a line, 1.1 % in the plane), each obstacle at each moment. It is no hard bound.
+    Each is the ellipsoid of `sigmas` standard deviations about its estimate. It moves with the estimated velocity and
+    grows as it would within `horizon_s` without further measurements (not for `Workspace`). The bound is not hard: at
+    each moment the centre is outside with the probability of the tail of `sigmas`.
 
     Args:
         radius: m; the machine's own radius is the constraint's business.
@@ -327,11 +324,7 @@ def obstacle_from(data: Any) -> Obstacle:
 def obstacles_from(
     given: Any, name: str = "obstacles", kinds: tuple[type[Any], ...] = (), optional: bool = False
 ) -> list[Any]:
-    """A list of obstacles, each itself or as its dict, of these kinds (none: all); it may be empty if `optional`.
-
-    Raises:
-        ConfigurationError: It is no such list; the message names the parameter.
-    """
+    """A list of obstacles, each itself or as its dict, of these kinds (none: all); it may be empty if `optional`."""
     fitting = " and ".join(kind.__name__ for kind in kinds) or "obstacles"
     if isinstance(given, dict | str) or not isinstance(given, Sequence) or not (given or optional):
         wanted = f"list of {fitting}" if optional else "list with at least one obstacle"

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -17,8 +16,7 @@ from safe_wrappers.plants.plant import Plant
 class TrackPermission(Constraint):
     """While the permission of a track has expired, slow down to `creep` (rest), at least as hard as `braking`.
 
-    An `OcclusionPenalty` inside the filter says which tracks may be relied on. With all permissions in force there
-    are no rows.
+    An `OcclusionPenalty` inside the filter says which tracks may be relied on.
 
     Best effort: executed controls brake as declared, or the step is flagged infeasible; the drift changes within a
     held step. Where standing still is not safe, add `EscapeClearance` with `TrackedDiscs`.
@@ -36,8 +34,6 @@ class TrackPermission(Constraint):
     braking: float
     creep: float = 0.0
     tracks: Sequence[str] | None = None
-
-    needs_acceleration: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         self.braking = positive("braking", self.braking, "m/s^2")
@@ -57,6 +53,7 @@ class BoundTrackPermission(BoundConstraint):
 
     def __init__(self, spec: TrackPermission, plant: Plant) -> None:
         machine = require_mujoco(plant, "TrackPermission needs a MujocoPlant: it brakes a body of its model")
+        machine.require_acceleration("TrackPermission")
         super().__init__(spec, machine)
         self.plant.named("body", self.spec.body)
         names = list(self.plant.attribute("track_names"))

@@ -32,33 +32,26 @@ _LEAST_LOAD = 0.05  # share of the largest load seen below which a wheel counts 
 _MOST_FRICTION = 3.0  # force over load beyond which something else than the ground held the wheel
 _ROUNDING = 1e-6  # share of a control below which its change is the action space's own rounding (float32)
 _SOLVERS_NOISE = 1e-9
-
-
+# Integrators that step a servo's feedback as they step damping.
 _IMPLICIT = (int(mujoco.mjtIntegrator.mjINT_IMPLICIT), int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST))
-"""Integrators that step a servo's feedback as they step damping."""
 
 
 @dataclass
 class Traction(Constraint):
     """Keep the slip ratio of every driven wheel within `max_slip`, and below where its ground's curve seems to peak.
 
-    The wheel's own equation says which torque takes the slip to its limit by the end of the held control step. The
-    force of the ground in it is measured, from how the wheel answered the last torque, so no friction has to be
-    known. From slip and force over load the peak of the traction curve is estimated for each wheel, with its
-    uncertainty (`control/vehicle/friction_estimate.py`); the limit is half a standard deviation below it, or
-    `max_slip`. A wheel in the air is held within the limit of its ground speed.
+    Forces of the ground and the peak of each wheel's traction curve are estimated
+    (`control/vehicle/friction_estimate.py`); the limit is half a standard deviation below the peak, or `max_slip`.
 
     Best effort: a wheel whose ground stays the same for a control step ends it within the limit, up to what its force
-    and its speed over ground change otherwise than predicted. At the edge of another ground, where a wheel is
-    unloaded or hits something, and after a change of the other wheels' commands, the slip overshoots for one to three
-    steps, and comes back as fast as the drives can bring it. An overshoot is no unsafe state, so there is no `value`:
-    `slip/ratio` shows it.
+    and its speed over ground change otherwise than predicted. Where the ground, the load or the other wheels'
+    commands change, the slip overshoots for one to three steps; that is not flagged, and `slip/ratio` shows it.
 
     Args:
         wheels: Names of the wheels' hinges; each must be driven by actuators on that joint and nothing else.
         max_slip: Largest slip ratio, normalised, in (0, 1).
-        friction: Declared lower bound on the peak friction coefficient under every wheel, > 0: the ground is then
-            counted on for that much force at once. A bound that is too high lets wheels spin. None counts on nothing.
+        friction: Lower bound on the peak friction coefficient under every wheel, > 0, whose force is counted on at
+            once; too high a bound lets wheels spin. None: no bound.
         regularization: Speed below which slip is counted against it, m/s.
         margin: Slip kept free below the limit.
 
@@ -117,10 +110,10 @@ class BoundTraction(BoundConstraint):
         hint = "Traction needs a MujocoPlant: it reads the wheels from the model"
         super().__init__(spec, require_mujoco(plant, hint))
         if self.plant.delay_s > 0.0:
-            answers = (
-                f"how the wheels answer, which a plant with a delay ({self.plant.delay_s} s) predicts instead"
+            raise ConfigurationError(
+                "Traction measures the ground's force from how the wheels answer, which a plant with a delay "
+                f"({self.plant.delay_s} s) predicts instead; use delay_s=0"
             )
-            raise ConfigurationError(f"Traction measures the ground's force from {answers}; use delay_s=0")
         self.wheels = DrivenWheels(self.plant, self.spec.wheels)
         self._read_constants()
 
@@ -128,11 +121,9 @@ class BoundTraction(BoundConstraint):
         self._model_version = self.plant.model_version
         self.constants = self.wheels.constants(self.plant)
         options = self.plant.model.opt
+        implicit = int(options.integrator) in _IMPLICIT
         self._response = self.constants.response(
-            float(options.timestep),
-            self.plant.substeps,
-            self.wheels.feedback,
-            int(options.integrator) in _IMPLICIT,
+            float(options.timestep), self.plant.substeps, self.wheels.feedback, implicit
         )
 
     def start(self) -> Memory:
@@ -185,16 +176,8 @@ class BoundTraction(BoundConstraint):
         low, high = slip_window(speed, self._limit, self.spec.regularization)
         self._window = low / radius, high / radius
         # A ground speed above the prediction is slip of a braked wheel, one below it of a driven wheel.
-        self._reserve = (
-            self._kept_free(seen.faster, speed - low) / radius,
-            self._kept_free(seen.slower, high - speed) / radius,
-        )
-
-    @staticmethod
-    def _kept_free(error: Array, room: Array) -> Array:
-        """Of the room that the limit leaves, for an error of the predicted ground speed, both m/s."""
-        counted = _SPEED_ERROR_FACTOR * np.maximum(error - _SPEED_ERROR_IGNORED * room, 0.0)
-        return np.minimum(counted, (1.0 - _LEAST_LIMIT) * room)
+        below, above = _kept_free(seen.faster, speed - low), _kept_free(seen.slower, high - speed)
+        self._reserve = below / radius, above / radius
 
     def _learn(
         self, ground: Array, slip: Array, across: Array, load: Array, rolls: NDArray[np.bool_]
@@ -278,3 +261,9 @@ class BoundTraction(BoundConstraint):
             keys.SLIP_MU_ESTIMATE: self.seen.estimate.mean,
             keys.SLIP_MU_STD: self.seen.estimate.std,
         }
+
+
+def _kept_free(error: Array, room: Array) -> Array:
+    """Of the room that the limit leaves, for an error of the predicted ground speed, both m/s."""
+    counted = _SPEED_ERROR_FACTOR * np.maximum(error - _SPEED_ERROR_IGNORED * room, 0.0)
+    return np.minimum(counted, (1.0 - _LEAST_LIMIT) * room)

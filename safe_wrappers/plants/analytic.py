@@ -28,8 +28,7 @@ class AnalyticPlant(Plant):
         delay_s: Delay from measurement to effect in s; predicted over with the commands in flight.
 
     Raises:
-        ConfigurationError: Shapes that do not fit, values that are not finite, or a control interval that is wrong or
-            missing.
+        ConfigurationError: Shapes that do not fit, values that are not finite, a wrong or missing control interval.
 
     Example:
         >>> import gymnasium as gym, numpy as np, safe_wrappers as sw
@@ -127,10 +126,7 @@ class AnalyticPlant(Plant):
         return x
 
     def path(self, control: Array) -> list[Array]:
-        """States half-way and at the end of a held control, by one Runge-Kutta step.
-
-        And the end by one Euler step, by which many envs integrate.
-        """
+        """States half-way and at the end of a held control, by one Runge-Kutta step; the end by one Euler step."""
         x, hold = self._x, self.control_dt
         k1 = self.f + self.g @ control
         k2 = self._rate(x + 0.5 * hold * k1, control)

@@ -22,10 +22,9 @@ _WORKS = "Workspace, JointPositionLimit, JointSpeedLimit, SpeedLimit, Singularit
 class DisplacementPlant(MujocoPlant):
     """Actions `(dx, dy, dz, fingers)` in [-1, 1] that move a mocap body, which pulls the gripper after it.
 
-    The plant repeats the env's own step on a copy of the model, so that its forecasts are exact, bit for bit, for
-    actions in the action space's dtype; others are rounded to it first (some nm). `f`, `g`, `acceleration` and
-    `point` raise, because no acceleration follows from a displacement: constraints that need rows cannot be used,
-    those that forecast can. Braking is a displacement of zero; from full speed the gripper moves on by 4 to 6 mm.
+    The plant repeats the env's own step on a copy of the model: for actions in the action space's dtype forecasts are
+    exact, bit for bit; others are rounded to it first. `f`, `g`, `acceleration` and `point` raise: constraints that
+    forecast can be used, those that need rows cannot. Braking is a displacement of zero.
 
     Args:
         model: As in `MujocoPlant`.
@@ -37,8 +36,7 @@ class DisplacementPlant(MujocoPlant):
         blocked: Whether the env keeps the fingers closed; then the last entry of an action has no effect.
 
     Raises:
-        UnsupportedEnvError: Not an env of the Fetch kind: one mocap body welded to one body, four actions,
-            `n_substeps` and `block_gripper`.
+        UnsupportedEnvError: Not an env of the Fetch kind.
         ConfigurationError: A delay that is not a whole number of control intervals.
     """
 

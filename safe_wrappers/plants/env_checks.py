@@ -18,9 +18,8 @@ def read_attribute(env: gym.Env[Any, Any], name: str) -> Any:
         return env.get_wrapper_attr(name)
     except AttributeError:
         public = sorted(n for n in dir(env.unwrapped) if not n.startswith("_"))
-        raise UnknownNameError(
-            f"the env publishes no attribute {name!r}; it has: {', '.join(public)}"
-        ) from None
+        there = ", ".join(public)
+        raise UnknownNameError(f"the env publishes no attribute {name!r}; it has: {there}") from None
 
 
 def refuse_second_env(bound: gym.Env[Any, Any] | None, env: gym.Env[Any, Any]) -> None:
@@ -57,11 +56,7 @@ def refuse_changed_actions(env: gym.Env[Any, Any]) -> None:
 
 
 def check_timing(env: gym.Env[Any, Any], control_dt: float | None) -> float:
-    """How long one action is held, s: the env's `dt`, or `control_dt` where the env has none.
-
-    Raises:
-        ConfigurationError: Neither is given, they disagree, or it is not a finite time above 0.
-    """
+    """How long one action is held, s: the env's `dt`, or `control_dt` where the env has none; both must agree."""
     try:
         dt = float(env.get_wrapper_attr("dt"))
     except (AttributeError, TypeError, ValueError):

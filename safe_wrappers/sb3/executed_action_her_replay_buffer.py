@@ -21,13 +21,11 @@ class ExecutedActionHerReplayBuffer(ExecutedActionReplayBuffer, HerReplayBuffer)
     the task's reward for it, r' = `compute_reward(achieved, g', info)`. Of a step that the filter changed
 
     - mode "safe_action" replays (s, g', a_safe, s', r');
-    - mode "adaption_penalty" replays (s, g', a, s', r' - penalty), with the penalty that `AdaptionPenalty` took at
-      the time; SB3's own `HerReplayBuffer` would leave it out;
+    - mode "adaption_penalty" replays (s, g', a, s', r' - penalty), with what `AdaptionPenalty` took at the time;
     - mode "both" replays both.
 
     Unchanged steps are drawn as SB3 draws them, bit for bit with the same seed. The reward has to be a function of
-    the goals alone: wrappers that change rewards, such as `OcclusionPenalty`, are not in `compute_reward`. A loaded
-    buffer needs `set_env`, which `load_replay_buffer` calls.
+    the goals alone: wrappers that change rewards, such as `OcclusionPenalty`, are not in `compute_reward`.
 
     Example:
         >>> import gymnasium as gym, gymnasium_robotics, safe_wrappers as sw
@@ -43,17 +41,14 @@ class ExecutedActionHerReplayBuffer(ExecutedActionReplayBuffer, HerReplayBuffer)
         ... )
 
     Args:
-        mode: "safe_action", "both" or "adaption_penalty".
         env, n_sampled_goal, goal_selection_strategy, copy_info_dict: As in `HerReplayBuffer`; SB3 passes `env`.
-        args, more: The others as in `ExecutedActionReplayBuffer`; observations are a Dict with `observation`,
-            `achieved_goal` and `desired_goal`.
+        args, more: The others as in `ExecutedActionReplayBuffer`; observations as in `HerReplayBuffer`.
 
     Attributes:
         penalties: Modes "both" and "adaption_penalty": of each step, (buffer_size, n_envs), reward.
 
     Raises:
-        ConfigurationError: As `ExecutedActionReplayBuffer`.
-        ActionError: An executed action that is not finite.
+        ConfigurationError, ActionError: As `ExecutedActionReplayBuffer`.
     """
 
     modes: ClassVar[Sequence[str]] = ("safe_action", "both", "adaption_penalty")

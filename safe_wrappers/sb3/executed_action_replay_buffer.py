@@ -16,8 +16,7 @@ from safe_wrappers.errors import ActionError, ConfigurationError
 
 Flags = NDArray[np.bool_]
 
-_SAME: Final = 1e-3
-"""Two scaled actions that differ by less differ by rounding only, not by their unit."""
+_SAME: Final = 1e-3  # two scaled actions that differ by less differ by rounding only, not by their unit
 
 
 class ExecutedActionReplayBuffer(ReplayBuffer):
@@ -30,9 +29,8 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
     - mode "both": (s, a_safe, s', r) beside (s, a, s', r - penalty), with the task's reward r and the penalty of the
       `AdaptionPenalty` in the env. Batches are drawn uniformly from all transitions.
 
-    Unchanged steps are stored as SB3 stores them, bit for bit. A policy's action that is not finite is never stored;
-    such a step has the executed action only. Returns are one-step whatever SB3's `n_steps` says. On-policy algorithms
-    have no replay buffer.
+    Unchanged steps are stored as SB3 stores them, bit for bit. Of a step whose policy action is not finite only the
+    executed one is stored. Returns are one-step whatever SB3's `n_steps` says.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
@@ -131,9 +129,8 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         finite = np.isfinite(policy).all(axis=1)
         chosen, given = policy[finite], self._scaled(infos, keys.PROPOSED_ACTION)[finite]
         if not (np.abs(chosen - given) < _SAME).all():
-            raise self._foreign(
-                f"scaled to [-1, 1], the policy chose {chosen} and the filter was given {given}"
-            )
+            was = f"the policy chose {chosen} and the filter was given {given}"
+            raise self._foreign(f"scaled to [-1, 1], {was}")
         changed = np.array([bool(info[keys.CBF_INTERVENED]) for info in infos]) | ~finite
         # Unscaling and scaling again is not the identity in floating point: unchanged actions stay the policy's.
         executed = np.where(changed[:, None], executed, policy)

@@ -19,8 +19,6 @@ class InterventionCallback(BaseCallback):
     - `interventions/rate`, `correction_mean` and the other figures of `safe_wrappers.info.EPISODE`: over the episodes
       that ended, from `RecordInterventions`.
 
-    It reads infos only, in any VecEnv. For evaluation use `InterventionEvalCallback`.
-
     Example:
         >>> import gymnasium as gym
         >>> from stable_baselines3 import PPO

@@ -307,6 +307,7 @@ def test_it_has_no_accelerations():
         [sw.constraints.Plane([0.0, 0.0, 0.45], [0.0, 0.0, 1.0])], braking=5.0, bodies=["robot0:gripper_link"]
     ),
     sw.constraints.ImpactSpeedLimit(["robot0:l_gripper_finger_link"], ["table0"], force_limit=50.0, stiffness=1e4),
+    sw.constraints.TrackPermission("robot0:gripper_link", braking=1.0),
 ])  # fmt: skip
 def test_constraints_that_need_accelerations_are_refused_when_the_filter_is_built(constraint):
     name = type(constraint).__name__

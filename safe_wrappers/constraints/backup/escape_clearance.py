@@ -29,10 +29,8 @@ _APPROACHED = 2  # how many of those are approached
 class EscapeClearance(Constraint):
     """Keep a point mass on two axes out of obstacles, moving ones above all, by keeping an escape open.
 
-    The manoeuvres: brake at once; or go along +x, -x, +y or -y with full force for 0.3 s or 0.8 s, and brake. A
-    control is admitted if, held for one control step, it leaves one whose whole way keeps clear of where the
-    obstacles may be by then: `Discs` at constant velocity, `TrackedDiscs` anywhere inside the bound of their estimate
-    as it grows.
+    A control is admitted if, held for one control step, it leaves a manoeuvre whose whole way keeps clear of where
+    the obstacles may be by then. Manoeuvres brake at once, or go along one axis for 0.3 s or 0.8 s first.
 
     Best effort: from a state with a clear manoeuvre, the executed control leaves one, or the step is flagged; while
     every obstacle stays inside its declared bound, that manoeuvre keeps clear until the horizon. Ways are checked at
@@ -46,11 +44,10 @@ class EscapeClearance(Constraint):
         horizon_s: How far ahead, s: longer than the longest manoeuvre takes to come to rest.
 
     Raises:
-        ConfigurationError: A number outside its range, or no obstacle.
         UnsupportedEnvError: At binding: no `MujocoPlant`, or the body is no point mass on two slides.
 
-    Source: appendix "Relative degree and kinetic stopping insets" (room to brake), with the bound of "Continuous
-    Lyapunov and Riccati covariance dynamics".
+    Source: appendix "Relative degree and kinetic stopping insets", "Continuous Lyapunov and Riccati covariance
+    dynamics".
     """
 
     body: str
@@ -80,8 +77,7 @@ class BoundEscapeClearance(BoundBackupClearance):
     tolerance: float = 1e-9
     spec: EscapeClearance
     plant: MujocoPlant
-    _memory: int | None
-    """The manoeuvre that was open after the last control."""
+    _memory: int | None  # the manoeuvre that was open after the last control
 
     def __init__(self, spec: EscapeClearance, plant: Plant) -> None:
         hint = "EscapeClearance needs a MujocoPlant: it reads the point from the model"
@@ -100,10 +96,10 @@ class BoundEscapeClearance(BoundBackupClearance):
         holds = int(np.ceil(self.spec.horizon_s / self.plant.control_dt))
         longest = max(1, round(max(_GOING_S) / self.plant.control_dt))
         if holds <= longest:
-            steps = (
-                f"steps of {self.plant.control_dt:g} s: a manoeuvre takes {longest} of them before it brakes"
+            raise ConfigurationError(
+                f"horizon_s = {self.spec.horizon_s:g} s is too short for steps of {self.plant.control_dt:g} s: a "
+                f"manoeuvre takes {longest} of them before it brakes"
             )
-            raise ConfigurationError(f"horizon_s = {self.spec.horizon_s:g} s is too short for {steps}")
         bank = [Maneuver(0.0, 0.0, 0)]
         bank += [Maneuver(x, y, going) for x, y in _DIRECTIONS for going in range(1, longest + 1)]
         self._escapes = EvasiveManeuvers(point.axes, bank, np.arange(0, holds + 1, _EVERY))
@@ -121,10 +117,7 @@ class BoundEscapeClearance(BoundBackupClearance):
         return int(best[((led_to - velocity) ** 2).sum(axis=1).argmin()])
 
     def clearance(self) -> Array:
-        """Distance now from every obstacle, or from the bound of where it may be, m, shape (n,).
-
-        Not along a manoeuvre: with a way out, one may be close for a moment.
-        """
+        """Distance now, not along a manoeuvre, from every obstacle or the bound of where it may be, m, shape (n,)."""
         self._asked: list[tuple[Array, NDArray[np.intp]]] = []
         self._open = self._with_going_on(self._memory)
         joints = list(self._point.joints)
@@ -220,10 +213,7 @@ class BoundEscapeClearance(BoundBackupClearance):
         return left - self._needed() if left == left else -np.inf
 
     def _needed(self) -> float:
-        """What a way out must leave: 0, or the best that there is while that still uses up only the margin.
-
-        New estimates move what was clear a little; the manoeuvre is then followed all the same.
-        """
+        """What a way out must leave: 0, or the best that there is while new estimates use up only the margin."""
         if self._best is None:
             self._best = float(self._slacks(self._firsts()).max())
         return self._best if -self.spec.margin < self._best < 0.0 else 0.0

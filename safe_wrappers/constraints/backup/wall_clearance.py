@@ -14,8 +14,7 @@ from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.planar_point import planar_point, walls
 
-_Control = tuple[float, float]
-"""Along x and along y, in the actuators' units."""
+_Control = tuple[float, float]  # along x and along y, in the actuators' units
 
 _HAIR_M = 1e-7  # extra distance of corrections, for rounding to float32
 _NOISE_M = 1e-12  # rounding of float64 between a path and the rest of it
@@ -28,24 +27,20 @@ _HALVINGS = 5  # steps that move a correction back towards the proposal where th
 class WallClearance(Constraint):
     """Keep a point mass that is pushed along two axes out of every wall of a maze (PointMaze).
 
-    Walls and point are found in the MuJoCo model. A control is admitted if, held for one control step and followed by
-    full braking of each axis, it keeps the point clear of every fixed box. A refused one is replaced by a control
-    that slides along the wall.
+    A control is admitted if, held for one control step and followed by full braking of each axis, it keeps the point
+    clear of every fixed box of the MuJoCo model.
 
     Proved: from a safe state the point never touches a wall, at any substep or in between. The plant's mass, damping
     and gears must be the machine's, walls stand still, and `velocity_clip` is the env's. Under a plant's `delay_s`
     the state is predicted without the clip: proved up to that speed.
 
     Args:
-        margin: Fixed protective distance, beyond that at which MuJoCo reports a contact, m; covers rounding (under a
-            micrometre) and the position error.
+        margin: Beyond the distance at which MuJoCo reports a contact, m; covers rounding and the position error.
         velocity_clip: Speed along each axis to which the env clips the motion at the start of every control step, m/s
-            (PointMaze: 5). None: not known; every clip is covered, by a more cautious count at corners.
+            (PointMaze: 5). None: not known; covers every clip.
 
     Raises:
-        ConfigurationError: A number that is negative or not finite.
-        UnsupportedEnvError: At binding: not a `MujocoPlant`, not a point on two slides with a force of its own on
-            each, or walls that are not boxes along x and y.
+        UnsupportedEnvError: At binding: no `MujocoPlant`, no such point, or walls that are not boxes along x and y.
 
     Source: appendix "Relative degree and kinetic stopping insets", in two dimensions with box walls.
 
@@ -213,10 +208,7 @@ class BoundWallClearance(BoundBackupClearance):
         return at(low)
 
     def rows(self) -> HalfSpaces:
-        """Bounds on the control along x and y: a convex part of what is admitted, braking included.
-
-        For composing with other constraints' rows: alone, `suggestions` are less conservative.
-        """
+        """Bounds on the control along x and y: a convex part of what is admitted, braking included."""
         normals, offsets = [], []
         backup, room = self._backup(), self._room + _HAIR_M
         around = self._among.reached(self._motion, *backup)
@@ -229,9 +221,8 @@ class BoundWallClearance(BoundBackupClearance):
                 before = wall[2 * axis] - around[2 * axis + 1] >= around[2 * axis] - wall[2 * axis + 1]
                 sign = 1.0 if before else -1.0
                 limit = self._stopped_at(axis, wall, before, share * gap[axis] if corner else room)
-                normals.append(
-                    self._as_control(np.zeros(self.plant.model.nu), _replaced((0.0, 0.0), axis, sign))
-                )
+                normal = _replaced((0.0, 0.0), axis, sign)
+                normals.append(self._as_control(np.zeros(self.plant.model.nu), normal))
                 offsets.append(max(sign * limit, sign * backup[axis]))
         if not normals:
             return HalfSpaces.none(self.plant.model.nu)

@@ -23,12 +23,11 @@ from safe_wrappers.plants.plant import Plant
 class ContactFeasibility(Constraint):
     """Keep every contact force of the robot with the fixed world inside a narrower friction cone: `|f_t| <= mu f_n`.
 
-    In a simulator forces are inside the model's cone by construction, and a foot whose force is on the cone slides.
-    So the required cone is narrower by `friction_share`. Forces that pull are outside.
+    In a simulator all forces are inside the model's cone, and those on it slide: so the required cone is narrower.
 
     Best effort: an executed control that is not flagged keeps every contact force of its control step, at every
     evaluation of the physics, within cone and tolerance, for a plant that is right. Such a control need not exist: a
-    foot that lands sideways slides. It is no balance: a robot may fall over on feet that do not slide.
+    foot that lands sideways slides. Balance is not promised.
 
     Args:
         friction_share: Of the model's friction coefficient, in (0, 1]. MuJoCo's default cones are pyramids: above

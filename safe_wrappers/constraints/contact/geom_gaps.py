@@ -11,10 +11,10 @@ from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
 _FAR = 1e6  # largest distance that is measured, m
+# Offsets at which a distance is measured again, m.
 _BESIDE = 1e-7 * np.array(
     [[0.0, 0.0, 0.0], [1.0, 0.3, 0.2], [-0.3, 1.0, -0.5], [0.4, -0.6, 1.0], [-1.0, -0.7, -0.4]]
 )
-"""Offsets at which a distance is measured again, m."""
 _ROUND = int(mujoco.mjtGeom.mjGEOM_CAPSULE)  # up to it: planes, height fields, spheres, capsules
 _NUDGE = 1e-6  # width of the differences that give a normal, m
 _NORMAL = 1e-9  # distance below which the nearest points give no normal, m
@@ -87,9 +87,9 @@ class GeomGaps:
     ) -> Iterator[int]:
         """The instants of a forecast at which a contact of a pair has to be judged, in time.
 
-        These are the first instant of every contact, the last of every control step, and the first of every approach
-        after a rebound in contact; in between the control is held, and the approach was judged when it began. Only
-        the geoms' poses are written into `data`.
+        They are the first of every contact, the last of every control step in contact, and the first of every
+        approach after a rebound in contact; in between the control is held, and the approach was judged when it
+        began. Only the geoms' poses are written into `data`.
         """
         m, (a, b) = plant.model, self.pairs[pair]
         (centres, axes), (other, others) = _path(m, forecast, a), _path(m, forecast, b)
@@ -113,12 +113,9 @@ class GeomGaps:
 
 
 def _distance(model: mujoco.MjModel, data: mujoco.MjData, a: int, b: int, segment: Array | None) -> float:
-    """MuJoCo's distance of two geoms, m, and the nearest points into `segment`.
-
-    For about one in thirty pairs of boxes that are apart MuJoCo 3.11 returns exactly 0, or the wrong sign. So a pair
-    that seems to touch is measured again at small offsets, and the median of the results other than 0 counts. Planes,
-    spheres and capsules do not need it.
-    """
+    """MuJoCo's distance of two geoms, m, and the nearest points into `segment`."""
+    # For about one in thirty pairs of boxes that are apart MuJoCo 3.11 returns 0, or the wrong sign: they are
+    # measured again at small offsets, and the median of the results other than 0 counts. Round geoms do not need it.
     gap = mujoco.mj_geomDistance(model, data, a, b, _FAR, segment)
     if gap > 0.0 or model.geom_type[a] <= _ROUND or model.geom_type[b] <= _ROUND:
         return float(gap)

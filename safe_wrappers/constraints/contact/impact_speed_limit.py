@@ -26,34 +26,25 @@ _FIXED = 1e-12  # mobility along the normal, 1/kg, below which a geom cannot mov
 class ImpactSpeedLimit(RolloutConstraint):
     """Keep the approach speed at every contact so low that its peak force stays below a limit.
 
-    A mass m that meets a spring k at the speed v, under a push F_p, presses with at most `F_p + sqrt(F_p^2 + k m
-    v^2)`. m is the machine's effective mass at the contact point and along its normal; F_p is the push of motors,
-    gravity and centrifugal forces towards the obstacle; a pull does not count. A forecast of the held control, and
-    then of the actuated joints braking, is judged at every physics substep. In contact, the deflection counts as
-    stored energy.
+    Effective mass, push and speed at every contact come from a forecast of the held control, and then of the actuated
+    joints braking.
 
     Best effort: along the held step of an executed control that is not flagged every first touch keeps the limit, for
     a plant that is right, a contact that is a linear spring of the declared stiffness, and one pair of geoms at a
-    time; friction, and forces through other contacts and joint stops, are not counted. Obstacles are taken where they
-    are. The physics step should be at most a tenth of `appendix.contact.impact.time_to_peak`.
-
-    `value`, N: the limit less the peak that a contact at the present speed would have; before contact not below zero,
-    unless `braking` is declared.
+    time. Not counted are friction, other contacts, joint stops, and the obstacles' own way during the forecast. The
+    physics step should be at most a tenth of `appendix.contact.impact.time_to_peak`.
 
     Args:
         bodies: Names of the machine's bodies (all their geoms that can collide, or all if none can) or geoms.
         against: Names of bodies or geoms of the world; the speed of free ones counts.
         force_limit: Largest peak force, N, of each pair of geoms. None takes the region's.
-        region: Of a human body (`control.contact.body_regions`, ISO/TS 15066:2016, to be checked against its text):
-            its spring, its effective mass, and its transient force limit.
+        region: Of a human body (`control.contact.body_regions`, ISO/TS 15066:2016, to be checked against its text).
         clamped: The region cannot recoil: its quasi-static limit, and no effective mass of its own.
-        stiffness: Of the interface, N/m; with a region that of the robot's side alone (a pad), in series with the
-            region's; None is a rigid robot then.
+        stiffness: Of the interface, N/m; with a region that of the robot's side alone, where None is a rigid robot.
         effective_mass: Of the machine, kg; None has it computed at every contact.
-        braking: Deceleration, m/s^2, that the machine can give every declared point towards every obstacle from
-            everywhere: makes up for a forecast that ends before the machine stands. None relies on the forecast.
+        braking: Deceleration, m/s^2, that every point can always be given towards every obstacle. None: unknown.
         margin: Kept free below the limit, N.
-        horizon: Control steps to forecast; cover the time that braking takes, and that of a contact.
+        horizon: Control steps to forecast; cover the time of braking and of a contact.
     """
 
     bodies: Sequence[str]

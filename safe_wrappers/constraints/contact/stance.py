@@ -39,12 +39,10 @@ class Stance(Constraint):
     """Keep to torques under which standing feet could stay: the whole-body program at one instant.
 
     Contacts with the fixed world that carry force under the policy's torques are to come to rest and stay; the others
-    open. A control is admitted if forces inside the narrowed friction cones can hold them, with the driven joints
-    predicted to stay in range. Else the closest such control answers, by a quadratic program (pyramids) or a
-    second-order cone program.
+    open. A control is admitted if forces inside the narrowed friction cones can hold them.
 
-    Best effort: at this instant, for rigid contacts and a plant that is right, such forces exist. Landing feet, soft
-    contacts and changes within the control step are not in it (`ContactFeasibility` forecasts them).
+    Best effort: at this instant, for rigid contacts and a plant that is right, such forces exist. Changes within the
+    control step are not in it (`ContactFeasibility` forecasts them).
 
     Args:
         friction_share: Of the model's friction coefficient, in (0, 1].
@@ -105,10 +103,7 @@ class BoundStance(BoundConstraint):
         self._answer: WholeBodySolution | None = None
 
     def problem(self, control: Array) -> WholeBodyProblem | None:
-        """The program of the observed state, or None where it is not finite.
-
-        The first control, shape (m,), after `observe` says which contacts open.
-        """
+        """The observed state's program; the first control, shape (m,), says which contacts open. None: not finite."""
         if not self._known:
             self._known, self._problem = True, self._write_down(control)
         return self._problem
@@ -129,13 +124,8 @@ class BoundStance(BoundConstraint):
         acceleration = -(jacobians @ self.plant.qvel) / self.spec.settle_s
         limits: dict[str, Any] = {}
         if self.spec.joint_tolerance is not None:
-            joints = (
-                self._dofs,
-                self.plant.qpos[self._qpos],
-                self.plant.qvel[self._dofs],
-                self._low,
-                self._high,
-            )
+            position, speed = self.plant.qpos[self._qpos], self.plant.qvel[self._dofs]
+            joints = self._dofs, position, speed, self._low, self._high
             limits["acceleration_rows"], limits["acceleration_limits"] = predicted_position_rows(
                 *joints, self.plant.control_dt, self.plant.model.nv
             )

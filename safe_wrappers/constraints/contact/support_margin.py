@@ -19,12 +19,10 @@ from safe_wrappers.plants.plant import Plant
 class SupportMargin(Constraint):
     """Keep the zero moment point of the contact forces inside the hull of the contact points, by an inset.
 
-    It applies while there are at least three contact points in one plane that are not on a line. On two point feet,
-    in the air, or on contacts at several heights there is no polygon and no requirement.
+    Without at least three contact points in one plane that are not on a line there is no polygon and no requirement.
 
     Best effort: an executed control that is not flagged keeps the inset at every evaluation of the physics of its
-    control step at which there is a polygon, for a plant that is right. Such a control need not exist; and crossing
-    an edge predicts no particular fall.
+    control step at which there is a polygon, for a plant that is right. Such a control need not exist.
 
     Args:
         inset: m, positive: pushing forces alone keep the point inside the hull. An inset of millimetres can be
@@ -58,7 +56,7 @@ class BoundSupportMargin(BoundSlacks):
         self._known: list[tuple[ContactForecast, list[float]]] = []
 
     def _distances(self, found: ContactForecast) -> list[float]:
-        """Of a forecast, computed once: a refused control is asked about several times."""
+        """Of a forecast, computed once."""
         for other, distances in self._known:
             if other is found:
                 return distances

@@ -39,19 +39,10 @@ def _direct(model: mujoco.MjModel) -> list[int]:
 
 
 def refuse_uncovered(model: mujoco.MjModel, joints: Iterable[int], remedy: str, forces: bool = True) -> None:
-    """Refuse to take the driven joints for all where an action moves others of these joints as well.
+    """Refuse to take the driven joints for all where an action moves others of these joints (ids) as well.
 
-    It does where it is no force, pulls at a tendon or a site, or drives a ball joint. In other machines a joint that
-    nothing drives is passive.
-
-    Args:
-        model: The machine's.
-        joints: Ids of the joints in question.
-        remedy: What to do instead, for the error's message.
-        forces: Whether actions are forces; False: displacements.
-
-    Raises:
-        ConfigurationError: With the joints that would be covered, and those that would not.
+    It does where actions are displacements, not `forces`, pull at a tendon or a site, or drive a ball joint. The
+    message says which joints would be covered, which not, and the `remedy`.
     """
     covered = driven_joints(model)
     only_joints = bool(np.isin(model.actuator_trntype, _DRIVES).all()) and _direct(model) == covered
@@ -78,12 +69,7 @@ def refuse_uncovered_stops(model: mujoco.MjModel) -> None:
 
 
 def scalar_joints(plant: MujocoPlant, names: Sequence[str] | None) -> list[int]:
-    """Ids of the named joints, or of every hinge and slide that an actuator drives directly.
-
-    Raises:
-        ConfigurationError: No hinge or slide is driven, an action moves others as well, or a named joint is neither.
-        UnknownNameError: No joint of that name.
-    """
+    """Ids of the named hinges and slides, or of all that an actuator drives directly; an error if none is."""
     model = plant.model
     if names is None:
         ids = driven_joints(model)
@@ -107,20 +93,16 @@ def scalar_joints(plant: MujocoPlant, names: Sequence[str] | None) -> list[int]:
 class JointPositionLimit(RolloutConstraint):
     """Keep joint positions in a range that may be narrower than the model's own.
 
-    A forecast of the held control, and then of every actuated joint braking, has to keep the range at every substep.
-
     Best effort: an executed control that is not flagged keeps the range at every physics substep of its step, for a
     plant that is right. Gravity, coupling, contacts and passive joints can be stronger than the actuators.
 
     Args:
         lower: Smallest position, rad for hinges, m for slides; one, or one per joint. None: the model's own range.
         upper: Largest, likewise.
-        joints: Names. None: every hinge and slide that an actuator drives directly; refused where an action moves
-            others as well.
+        joints: Names. None: all that an actuator drives directly; refused where an action moves others as well.
         margin: Kept free inside the range, rad or m.
         horizon: Control steps to forecast; cover the braking time.
-        max_decrease: The farthest that a joint can move within `horizon` control steps, rad or m; states with more
-            than that left need no forecast.
+        max_decrease: The farthest that a joint can move within `horizon` control steps, rad or m. None: unknown.
     """
 
     lower: float | Sequence[float] | None = None
@@ -200,19 +182,15 @@ def _positions(name: str, given: float | Sequence[float] | None) -> float | list
 class JointSpeedLimit(RolloutConstraint):
     """Keep `|joint speed| <= limit`.
 
-    Rows bound the speed at the end of the held control step; a forecast of that step checks every physics substep.
-
     Best effort: an executed control that is not flagged keeps the limit at every physics substep of its step, for a
     plant that is right. Gravity, coupling, contacts and joint stops can be stronger than the actuators.
 
     Args:
         limit: In rad/s for hinges, m/s for slides; one number, or one per named joint.
-        joints: Names. None: every hinge and slide that an actuator drives directly; refused where an action moves
-            others as well.
+        joints: Names. None: all that an actuator drives directly; refused where an action moves others as well.
         margin: Kept free below the limit, rad/s or m/s.
         horizon: Control steps to forecast; the actuated joints brake after the first.
-        max_decrease: The most that a joint's speed can rise within `horizon` control steps, rad/s or m/s; states with
-            more than that left need no forecast.
+        max_decrease: The most that a speed can rise within `horizon` control steps, rad/s or m/s. None: unknown.
     """
 
     limit: float | Sequence[float]

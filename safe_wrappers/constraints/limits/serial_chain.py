@@ -6,12 +6,7 @@ from typing import Literal
 import mujoco
 import numpy as np
 
-from safe_wrappers.constraints.limits.joints import (
-    HINGE_OR_SLIDE,
-    driven_joints,
-    refuse_uncovered,
-    scalar_joints,
-)
+from safe_wrappers.constraints.limits import joints as of_joints
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
@@ -20,19 +15,11 @@ FrameKind = Literal["site", "body", "geom"]
 
 
 class SerialChain:
-    """Hinges and slides that carry a frame, and what their speeds do to it.
-
-    Jacobians come from the joints' axes and anchors, by forward kinematics on data of its own.
-
-    Args:
-        plant: Bound.
-        kind: "site", "body" or "geom".
-        name: Of the frame.
+    """Hinges and slides that carry a named frame, and what their speeds do to it.
 
     Attributes:
         joints: Ids of the n hinges and slides between the world and the frame, from the base on, shape (n,).
-        qpos: Their addresses in qpos, shape (n,).
-        dofs: Their addresses in qvel, shape (n,).
+        qpos, dofs: Their addresses in qpos and in qvel, shapes (n,).
         scalar: No ball and no free joint carries the frame.
 
     Raises:
@@ -50,7 +37,8 @@ class SerialChain:
             first = int(model.body_jntadr[body])
             carriers += range(first, first + int(model.body_jntnum[body])) if first >= 0 else []
             body = int(model.body_parentid[body])
-        self.joints = np.array(sorted(j for j in carriers if model.jnt_type[j] in HINGE_OR_SLIDE), dtype=int)
+        scalar = sorted(j for j in carriers if model.jnt_type[j] in of_joints.HINGE_OR_SLIDE)
+        self.joints = np.array(scalar, dtype=int)
         if not self.joints.size:
             wanted = f"no hinge or slide moves {self._what}: it has no manipulability"
             raise ConfigurationError(f"{wanted}; the model has the joints {', '.join(plant.names('joint'))}")
@@ -63,25 +51,20 @@ class SerialChain:
         self._place, self._turn, self._index = f"{kinds[kind]}xpos", f"{kinds[kind]}xmat", index
 
     def columns(self, names: Sequence[str] | None) -> list[int]:
-        """Places in `joints` of the named ones, or of those that an actuator drives directly.
-
-        Raises:
-            UnknownNameError: No joint of that name.
-            ConfigurationError: A joint that does not carry the frame, or is named twice; or none is driven.
-        """
+        """Places in `joints` of the named ones, which must carry the frame, or of those that are driven directly."""
         model = self._model
         there = ", ".join(str(model.joint(j).name) for j in self.joints)
         if names is None:
-            driven = driven_joints(model)
+            driven = of_joints.driven_joints(model)
             found = [i for i, j in enumerate(self.joints) if int(j) in driven]
             if not found:
                 wanted = f"no actuator drives a joint that moves {self._what}: name the joints that move it"
                 raise ConfigurationError(f"{wanted}; there are {there}")
             remedy = "Name those that do the task: joints=[...]"
-            refuse_uncovered(model, self.joints.tolist(), remedy, self._plant.has_acceleration)
+            of_joints.refuse_uncovered(model, self.joints.tolist(), remedy, self._plant.has_acceleration)
             return found
         places = {int(j): i for i, j in enumerate(self.joints)}
-        ids = scalar_joints(self._plant, names)
+        ids = of_joints.scalar_joints(self._plant, names)
         for j, name in zip(ids, names, strict=True):
             if j not in places:
                 wanted = f"the joint {name!r} does not move {self._what}"
@@ -99,11 +82,9 @@ class SerialChain:
             self._data.mocap_pos[:], self._data.mocap_quat[:] = data.mocap_pos, data.mocap_quat
 
     def jacobians(self, qpos: Array) -> tuple[Array, Array]:
-        """At finite positions of shape (k, nq).
+        """At finite positions (k, nq): Jacobians (k, 6, n), and the frame's axes as columns (k, 3, 3).
 
-        Returns:
-            Jacobians, shape (k, 6, n), velocity of the frame's origin over angular velocity, in the world's axes; and
-            the frame's axes as columns, shape (k, 3, 3).
+        Rows: velocity of the frame's origin, then angular velocity, in the world's axes.
         """
         model, data, joints, k = self._model, self._data, self.joints, len(qpos)
         arms, axes = np.empty((k, len(joints), 3)), np.empty((k, len(joints), 3))

@@ -25,8 +25,8 @@ from safe_wrappers.plants.plant import Plant
 
 _SAMPLES = 2000  # configurations that say which manipulability can be reached
 _STILL = 1e-9  # columns with a smaller norm are zero, m or rad per rad
+# Time constant of the rows, control intervals: a longer one brakes early, a shorter one is refused by forecasts.
 _DECAY_HOLDS = 2.0
-"""Time constant of the rows, control intervals: longer brakes early, shorter is refused by forecasts."""
 _ALONG_S = 1e-5  # width of the difference for the curvature of w along the motion, s
 
 
@@ -35,18 +35,14 @@ _ALONG_S = 1e-5  # width of the difference for the curvature of w along the moti
 class SingularityMargin(RolloutConstraint):
     """Keep the manipulability `w = sqrt(det(J J'))` of a frame, for declared task directions, above a threshold.
 
-    w bounds no joint rate, so a threshold has to be validated for the machine. With `task_speed` and `rate_limit` it
-    is the smallest w above which none of 2,000 sampled configurations needs more than the limit at that speed. With
-    as many joints as directions the sign of the determinant counts as well. `value` is w over the threshold, less 1.
+    With `task_speed` and `rate_limit` the threshold is the smallest w above which none of 2,000 sampled
+    configurations needs more than the limit at that speed. w itself bounds no joint rate.
 
-    Best effort: a forecast of the held control, and then of every actuated joint braking, keeps w. An executed
-    control that is not flagged keeps the threshold at every physics substep of its step, for a plant that is right.
-    Gravity, contacts and coupling can be stronger than the actuators. Joint rates (`JointSpeedLimit`) and torques are
-    not limited.
+    Best effort: an executed control that is not flagged keeps the threshold at every physics substep of its step, for
+    a plant that is right. Gravity, contacts and coupling can be stronger than the actuators.
 
     Args:
-        threshold: Smallest w, in m^k for k translations and hinges (times `length` to the number of rotations). None
-            needs `task_speed` and `rate_limit`.
+        threshold: Smallest w, in m^k for k translations and hinges (times `length` to the number of rotations).
         site: Name of the site whose motion the task is about; or
         body: of a body, meaning its frame's origin; or
         geom: of a geom, meaning its centre.
@@ -54,14 +50,12 @@ class SingularityMargin(RolloutConstraint):
         rotations: About these axes, some of "xyz".
         length: Length that weighs a rotation against a translation, m; needed if there are both.
         frame: Axes of directions and rotations: the "world"'s or the frame's "own".
-        joints: Names of the joints that do the task. None: those that an actuator drives directly and that move the
-            frame.
+        joints: Names of those that do the task. None: those that an actuator drives directly and that move the frame.
         task_speed: Speed that has to be possible in every direction, m/s (rad/s for rotations alone).
         rate_limit: Largest rate of each joint at that speed, rad/s for hinges, m/s for slides.
         margin: Kept free above the threshold, as a share of it.
         horizon: Control steps to forecast; cover the braking time.
-        max_decrease: The most that w can fall within `horizon` control steps, in shares of the threshold; states with
-            more than that left need no forecast.
+        max_decrease: The most that w can fall within `horizon` steps, in shares of the threshold. None: unknown.
 
     Attributes:
         validated: What the sample said of the threshold; None if it was given, or before the constraint is bound.
@@ -130,9 +124,8 @@ class BoundSingularityMargin(BoundRollout):
         idle = np.linalg.norm(self._task(sampled), axis=1).max(axis=0) < _STILL
         if self.spec.joints is not None and idle.any():
             still = self._chain.name(self._columns[int(np.argmax(idle))])
-            raise ConfigurationError(
-                f"the joint {still!r} moves {what} in none of the task's directions: leave it out"
-            )
+            nowhere = "in none of the task's directions: leave it out"
+            raise ConfigurationError(f"the joint {still!r} moves {what} {nowhere}")
         self._columns = [c for c, does_nothing in zip(self._columns, idle, strict=True) if not does_nothing]
         task = f"directions={self.spec.directions!r}, rotations={self.spec.rotations!r}"
         count, wanted = len(self._columns), len(self.spec._rows)
@@ -170,9 +163,8 @@ class BoundSingularityMargin(BoundRollout):
 
     def _chosen(self, jacobians: Array) -> Array:
         """The task's directions, weighed, and the joints that do it, shape (..., m, n)."""
-        return np.asarray(
-            jacobians[..., self.spec._rows, :][..., self._columns] * self.spec._weights[:, None]
-        )
+        chosen = jacobians[..., self.spec._rows, :][..., self._columns]
+        return np.asarray(chosen * self.spec._weights[:, None])
 
     def _in_frame(self, jacobians: Array, axes: Array) -> Array:
         """Six rows in the declared axes, shape (k, ..., 6, n)."""
@@ -215,10 +207,7 @@ class BoundSingularityMargin(BoundRollout):
         return manipulability_gradient(self._chosen(self._in_frame(jacobians, axes)), self._chosen(moved))
 
     def rows(self) -> HalfSpaces:
-        """One row `w'' + 2 a w' + a^2 (w - threshold) >= 0`, a first guess for the forecast, which decides.
-
-        Where a ball or free joint carries the frame as well, or controls are no forces: those of `BoundRollout`.
-        """
+        """One row `w'' + 2 a w' + a^2 (w - threshold) >= 0`, a first guess for the forecast, which decides."""
         if not (self._chain.scalar and self.plant.has_acceleration):
             return super().rows()
         drift, effect = self.plant.acceleration

@@ -20,8 +20,6 @@ from safe_wrappers.plants.plant import Plant
 class Upright(RolloutConstraint):
     """Keep a body's height in a range and its own z axis within an angle of the vertical.
 
-    A forecast of the held control, and then of the actuated joints braking, has to keep both at every substep.
-
     Best effort: an executed control that is not flagged keeps both at every physics substep of its step, for a plant
     that is right. It does not balance: a robot on legs can be unrecoverable long before it falls.
 
@@ -32,8 +30,7 @@ class Upright(RolloutConstraint):
         tilt: Largest angle between the body's z axis and the world's, rad; None: no bound.
         margin: Kept free, m for the heights and rad for the tilt.
         horizon: Control steps to forecast.
-        max_decrease: The most that height (m) and tilt (rad) can change within `horizon` control steps; states with
-            more than that left need no forecast.
+        max_decrease: The most that height (m) and tilt (rad) can change within `horizon` steps. None: unknown.
     """
 
     body: str = "torso"

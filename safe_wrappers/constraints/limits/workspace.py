@@ -21,7 +21,6 @@ from safe_wrappers.plants.plant import Plant
 class Workspace(RolloutConstraint):
     """Keep points of the machine inside an axis-aligned box and outside obstacles, in world coordinates.
 
-    A forecast of the held control, and then of every actuated joint braking, has to keep them at every substep.
     Moving obstacles are taken where they are.
 
     Best effort: an executed control that is not flagged keeps the workspace at every physics substep of its step, for
@@ -37,8 +36,7 @@ class Workspace(RolloutConstraint):
         radius: Of the machine around each point, m.
         margin: Kept free, m.
         horizon: Control steps to forecast; cover the braking time.
-        max_decrease: The farthest that a point can move within `horizon` control steps, m; states with more than that
-            left need no forecast.
+        max_decrease: The farthest that a point can move within `horizon` control steps, m. None: unknown.
     """
 
     low: Sequence[float | None] | None = None
@@ -84,13 +82,11 @@ class BoundWorkspace(BoundRollout):
         super().__init__(spec, plant)
         if not (self.spec.bodies or self.spec.sites or self.spec.geoms):
             there = ", ".join(self.plant.names("body"))
-            raise ConfigurationError(
-                f"name the bodies, sites or geoms to keep inside; the bodies are {there}"
-            )
+            wanted = "name the bodies, sites or geoms to keep inside"
+            raise ConfigurationError(f"{wanted}; the bodies are {there}")
         m = self.plant.model
-        bodies = [self.plant.named("body", name) for name in self.spec.bodies]
-        sites = [self.plant.named("site", name) for name in self.spec.sites]
-        geoms = [self.plant.named("geom", name) for name in self.spec.geoms]
+        named = {"body": self.spec.bodies, "site": self.spec.sites, "geom": self.spec.geoms}
+        bodies, sites, geoms = ([self.plant.named(kind, n) for n in names] for kind, names in named.items())
         self._bodies = np.array([*bodies, *m.site_bodyid[sites], *m.geom_bodyid[geoms]], dtype=int)
         self._offsets = np.vstack([np.zeros((len(bodies), 3)), m.site_pos[sites], m.geom_pos[geoms]])
 

@@ -11,26 +11,22 @@ from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
+# m/s, of the body and its farthest point: slower counts as at rest. Safety-Gymnasium's car then moves on by 0.8 mm.
 _REST_SPEED = 0.01
-"""m/s, of the body and of its farthest point as it turns: slower counts as at rest. Safety-Gymnasium's car then moves
-on by 0.8 mm (measured)."""
+# Numbers that a plant's model may have different from the env's, by kind of object.
 _ADOPTED = (
     ("nbody", int(mujoco.mjtObj.mjOBJ_BODY), ("body_mass", "body_inertia", "body_ipos", "body_iquat")),
     ("ngeom", int(mujoco.mjtObj.mjOBJ_GEOM), ("geom_friction",)),
     ("nu", int(mujoco.mjtObj.mjOBJ_ACTUATOR), ("actuator_gainprm", "actuator_forcerange")),
 )
-"""Numbers that a plant's model may have different from the env's, by kind of object."""
 
 
 class Course(NamedTuple):
     """Where the machine's body is at k instants, one per physics substep."""
 
-    places: Array
-    """Its origin from above, shape (k, 2), m."""
-    ahead: Array
-    """Its x axis from above, unit vectors, shape (k, 2)."""
-    rests: bool
-    """Whether it has come to rest by the last instant."""
+    places: Array  # its origin from above, shape (k, 2), m
+    ahead: Array  # its x axis from above, unit vectors, shape (k, 2)
+    rests: bool  # whether it has come to rest by the last instant
 
 
 class Coasting:
@@ -102,10 +98,9 @@ class Coasting:
         return math.hypot(vx, vy) + math.sqrt(wx * wx + wy * wy + wz * wz) * turning_radius
 
     def run(self, control: Array, horizon: int, turning_radius: float) -> Course:
-        """Hold a control, shape (nu,), for one control interval, then none until the machine rests.
+        """Hold a control, shape (nu,), for one control interval, then none to rest, or to `horizon` >= 1 intervals.
 
-        It ends after `horizon` >= 1 control intervals at most. `turning_radius`, m, is the distance of the machine's
-        farthest point from its origin.
+        `turning_radius`, m, is the distance of the machine's farthest point from its origin.
         """
         plant, m, data, n, at = self._plant, self._model, self._data, self._plant.substeps, self._at
         if plant.model_version != self._model_version:

@@ -18,34 +18,29 @@ _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 _ROUND = [int(getattr(mujoco.mjtGeom, f"mjGEOM_{shape}")) for shape in ("SPHERE", "CYLINDER", "CAPSULE")]
 _FIXED_GAIN, _NO_BIAS = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_NONE)
 _AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_AFFINE)
-_FLAT = 1e-6
-"""Level part of an axle's direction below which it has none."""
+_FLAT = 1e-6  # level part of an axle's direction below which it has none
 _DRIVES = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
 class WheelMotion(NamedTuple):
     """Of n wheels, shapes (n,)."""
 
-    rate: Array
-    """Of the wheel about its axle in the world, rad/s; positive rolls ahead."""
-    ground: Array
-    """Speed of its centre along its heading, m/s."""
-    sideways: Array
-    """Speed of its centre to the left of its heading, m/s."""
+    rate: Array  # of the wheel about its axle in the world, rad/s; positive rolls ahead
+    ground: Array  # speed of its centre along its heading, m/s
+    sideways: Array  # speed of its centre to the left of its heading, m/s
 
 
 class DrivenWheels:
     """The wheels of a vehicle on level ground, on the named hinges of a bound plant.
 
-    One or more actuators drive each hinge directly. The radius is that of a sphere, cylinder or capsule of its body:
-    the one named like the joint, else the first that can touch something. A positive joint rate rolls ahead.
+    The radius is that of a sphere, cylinder or capsule of the wheel's body: the one named like the joint, else the
+    first that can touch something. A positive joint rate rolls ahead.
 
     Attributes:
         feedback: Of the speed servos on each wheel, shape (n,), N m s/rad.
 
     Raises:
-        ConfigurationError: An empty list, a name twice, a joint that is not a hinge or is not driven, a wheel that a
-            tendon or site also drives, or one without a round geom of a radius above zero.
+        ConfigurationError: No names, a name twice, or no hinge with a round geom and actuators of its own.
         UnknownNameError: No joint of that name.
     """
 
@@ -61,9 +56,9 @@ class DrivenWheels:
         for joint, name in zip(self._joints, names, strict=True):
             if m.jnt_type[joint] != _HINGE:
                 hinges = [m.joint(j).name for j in np.flatnonzero(m.jnt_type == _HINGE)]
+                there = ", ".join(filter(None, hinges))
                 raise ConfigurationError(
-                    f"joint {name!r} is no hinge, so it is no wheel's axle; hinges are "
-                    + ", ".join(filter(None, hinges))
+                    f"joint {name!r} is no hinge, so it is no wheel's axle; hinges are {there}"
                 )
         self.dofs = m.jnt_dofadr[self._joints]
         direct = np.isin(m.actuator_trntype, _DRIVES)

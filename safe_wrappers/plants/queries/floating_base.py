@@ -19,8 +19,7 @@ from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.actuators import AffineActuators
 from safe_wrappers.plants.mujoco.model import control_range, fixed_bodies, inertia
 
-_CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
-"""Constraints of this type and above are contacts."""
+_CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)  # this type and those above are contacts
 
 
 class ContactPoints(NamedTuple):
@@ -121,16 +120,9 @@ def contact_points(model: mujoco.MjModel, data: mujoco.MjData) -> ContactPoints:
             mujoco.mj_jacDot(model, data, dot, None, data.contact.pos[i], body)
             jacobians[row] += side * jac
             drift[row] += side * (dot @ data.qvel)
+    points = np.array(data.contact.pos[touching]).reshape(k, 3)
+    gaps = np.array(data.contact.dist[touching]).reshape(k)
+    friction = np.where(dim > 1, data.contact.friction[touching, 0], 0.0).reshape(k)
     return ContactPoints(
-        points=np.array(data.contact.pos[touching]).reshape(k, 3),
-        normals=normals,
-        first_tangents=first,
-        friction=np.where(dim > 1, data.contact.friction[touching, 0], 0.0).reshape(k),
-        pushed=pushed,
-        pushed_by=pushed_by,
-        jacobians=jacobians,
-        drift=drift,
-        forces=forces,
-        moments=moments,
-        gaps=np.array(data.contact.dist[touching]).reshape(k),
+        points, normals, first, friction, pushed, pushed_by, jacobians, drift, forces, moments, gaps
     )

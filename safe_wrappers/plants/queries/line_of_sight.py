@@ -12,10 +12,9 @@ from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.model import kinematics, named
 
+# Later versions of MuJoCo take one more argument.
 _TAKES_NORMALS = "normal" in (mujoco.mj_multiRay.__doc__ or "")
-"""Later versions of MuJoCo take one more argument."""
-_SKIN_M = 1e-9
-"""A surface this close in front of a point does not hide it: the point may lie on it."""
+_SKIN_M = 1e-9  # a surface this close in front of a point does not hide it: the point may lie on it
 
 
 class LineOfSight:
@@ -48,8 +47,7 @@ class LineOfSight:
         groups: Sequence[int] | None,
     ) -> None:
         self.model = model
-        self.data = mujoco.MjData(model)
-        """Kinematics and velocities of the state that was read last."""
+        self.data = mujoco.MjData(model)  # kinematics and velocities of the state that was read last
         self._kind = "site" if camera is None else "cam"
         self._id = named(model, "site", site or "") if camera is None else named(model, "camera", camera)
         self.body = int(getattr(model, f"{self._kind}_bodyid")[self._id])
@@ -62,8 +60,7 @@ class LineOfSight:
         if groups is not None:
             self._groups = np.zeros(mujoco.mjNGROUP, dtype=np.uint8)
             self._groups[list(groups)] = 1
-        self._inside = np.eye(model.nbody, dtype=bool)
-        """Whether body i is body j or a descendant of it, shape (nbody, nbody)."""
+        self._inside = np.eye(model.nbody, dtype=bool)  # whether body i is body j or a descendant of it
         for body in range(1, model.nbody):
             self._inside[body] |= self._inside[model.body_parentid[body]]
 

@@ -13,8 +13,7 @@ from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
 _ALIGNED = 1e-6
-_EXACT = 1e-9
-"""Tolerance between the model's own step and the axes' constants at the states that are tried, m and m/s."""
+_EXACT = 1e-9  # tolerance between the model's own step and the axes' constants, m and m/s
 _TRIED = 12
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 _PLANE, _BOX = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_BOX)
@@ -23,16 +22,11 @@ _PLANE, _BOX = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_BOX)
 class PlanarPoint(NamedTuple):
     """A point mass in a model; of pairs x is first, then y."""
 
-    body: int
-    """Index of the body."""
-    axes: tuple[DampedAxis, DampedAxis]
-    """Constants of the motion."""
-    joints: tuple[int, int]
-    """Indices of the two slides, in qpos and in qvel."""
-    actuators: tuple[int, int]
-    """Indices of their actuators."""
-    origin: tuple[float, float]
-    """Where the point is at qpos = 0, m."""
+    body: int  # index of the body
+    axes: tuple[DampedAxis, DampedAxis]  # constants of the motion
+    joints: tuple[int, int]  # indices of the two slides, in qpos and in qvel
+    actuators: tuple[int, int]  # indices of their actuators
+    origin: tuple[float, float]  # where the point is at qpos = 0, m
 
 
 def planar_point(plant: MujocoPlant, clip: float, body: str | None = None) -> PlanarPoint:
@@ -111,7 +105,6 @@ def _measured(
     free = copy.copy(m)
     free.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     data = mujoco.MjData(free)
-
     at, motors = list(order), list(actuators)
 
     def step(x: Array, v: Array, u: Array, around: np.random.Generator | None = None) -> tuple[Array, Array]:
@@ -152,13 +145,10 @@ def _refuse(expectation: str) -> NoReturn:
 
 
 def walls(model: mujoco.MjModel, body: int) -> tuple[list[Rectangle], float]:
-    """Everything fixed that a body, given by its index, can touch as it slides along x and y without turning.
+    """The walls, touching ones joined, m, and how far off the body's origin touches one (with contact margins), m.
 
-    Level floors and geoms wholly above or below the body are left out.
-
-    Returns:
-        The walls, touching ones joined, m, and the distance of the body's origin from a wall at which MuJoCo reports
-        a contact, m: the body's radius and both contact margins.
+    Walls are all that is fixed and that a body, given by its index, can touch as it slides along x and y without
+    turning, except level floors.
 
     Raises:
         UnsupportedEnvError: No geom of the body collides with anything, or something it can touch moves or is not an
