@@ -38,7 +38,7 @@ HEADING_DRIVE = Target(
         Mutant("OVERSHOOTS: Final = (0.02, 0.1)", "OVERSHOOTS: Final = ()"),
         Mutant("BLENDS: Final = (0.1, 0.25, 0.5, 0.75)", "BLENDS: Final = (0.1, 0.25, 0.5)"),
         Mutant("    for mixed in range(2):", "    for mixed in range(0):"),
-        Mutant("    if not _admits(models, at, back, 0.0, brake):\n", "    if False:\n"),
+        Mutant("    if not admits(models, at, back, 0.0, brake):\n", "    if False:\n"),
         Mutant("unit[j] = (most[j] - least[j]) / (high[j] - low[j])", "unit[j] = 1.0"),
         Mutant("if left < at.loss and left < _needed", "if left < _needed"),
         Mutant("RECOVERY_RATE: Final = 1.0", "RECOVERY_RATE: Final = 0.0"),

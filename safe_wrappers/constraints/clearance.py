@@ -11,8 +11,8 @@ from safe_wrappers.constraints.obstacles import Nearest, obstacles_from
 from safe_wrappers.control.backup.stopping import sampled_acceleration_limit, sampled_inset
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, HalfSpaces, Memory
-from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
+from safe_wrappers.plants.queries.points import Points
 
 
 class _Seen(NamedTuple):
@@ -87,22 +87,7 @@ class BoundClearance(BoundConstraint):
     def __init__(self, spec: Clearance, plant: Plant) -> None:
         plant.require_acceleration("Clearance")
         super().__init__(spec, plant)
-        self._machine = plant if isinstance(plant, MujocoPlant) else None
-        named = {"body": spec.bodies, "site": spec.sites, "geom": spec.geoms}
-        self._named = [(kind, name) for kind, names in named.items() for name in names]
-        if self._machine is None:
-            if not spec.position:
-                raise ConfigurationError(
-                    "on an AnalyticPlant say where the point is in the state: position=[0, 1], velocity=[2, 3]"
-                )
-            return
-        if not self._named:
-            raise ConfigurationError(
-                "name the bodies, sites or geoms to keep clear; the model has the bodies "
-                + ", ".join(self._machine.names("body"))
-            )
-        for kind, name in self._named:
-            self._machine.named(kind, name)
+        self._points = Points(plant, spec.bodies, spec.sites, spec.geoms, spec.position, spec.velocity)
 
     def observe(self, memory: Memory) -> None:
         self._observed: list[_Seen] | None = None
@@ -120,16 +105,9 @@ class BoundClearance(BoundConstraint):
     def _seen(self) -> list[_Seen]:
         """What every point sees, once per observation."""
         if self._observed is None:
-            every = self._accelerations()
+            every = self._points.accelerations()
             self._observed = [_Seen(*self._gaps(p, v), drift, effect) for p, v, drift, effect in every]
         return self._observed
-
-    def _accelerations(self) -> list[tuple[Array, Array, Array, Array]]:
-        """Position, velocity, drift and control matrix of the acceleration of each point, SI."""
-        if self._machine is not None:
-            return [self._machine.point(kind, name) for kind, name in self._named]
-        x, p, v = self.plant.state, self.spec.position, self.spec.velocity
-        return [(x[p], x[v], self.plant.f[v], self.plant.g[v])]
 
     def value(self) -> Array:
         """Room left after braking, margin and state error not taken off, m, one per point and surface."""
@@ -139,11 +117,7 @@ class BoundClearance(BoundConstraint):
     def approach(self) -> tuple[Array, Array]:
         """Clearances (m) and approach speeds (m/s, towards the obstacle), as measured, one per point and surface."""
         # Not through `_seen`: the accelerations, which only the rows need, are most of its work.
-        if self._machine is not None:
-            motions = [self._machine.motion(kind, name) for kind, name in self._named]
-        else:
-            motions = [(self.plant.state[self.spec.position], self.plant.state[self.spec.velocity])]
-        gaps = [self._gaps(p, v) for p, v in motions]
+        gaps = [self._gaps(p, v) for p, v in self._points.motions()]
         return np.concatenate([g[1] for g in gaps]), np.concatenate([g[2] for g in gaps])
 
     def rows(self) -> HalfSpaces:

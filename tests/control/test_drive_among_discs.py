@@ -12,7 +12,7 @@ import pytest
 import safe_wrappers as sw
 from benchmarks import drivers
 from safe_wrappers.constraints.backup.heading_drive_clearance import BoundHeadingDriveClearance
-from safe_wrappers.control.backup import drive_among_discs as among
+from safe_wrappers.control.backup import drive_decision as among
 from safe_wrappers.control.numerics.compiled import IS_COMPILED
 
 KINDS = {
@@ -102,7 +102,7 @@ def random_scenes(count):
         stages.add(numbers[0])
         for part in (*numbers, out, *among.least_clearance(models, motion, discs, brake)):
             digest.update(np.asarray(part, dtype=np.float64).tobytes())
-        digest.update(np.float64(among.backup_drive(models, motion, discs, brake)).tobytes())
+        digest.update(np.float64(among.manoeuvre_drive(models, motion, discs, brake)).tobytes())
     return digest.hexdigest(), sorted(stages)
 
 

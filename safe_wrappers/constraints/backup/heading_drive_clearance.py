@@ -9,7 +9,7 @@ import numpy as np
 from safe_wrappers.checks import check_fields, non_negative
 from safe_wrappers.constraints.backup.base import BoundDetourClearance
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
-from safe_wrappers.control.backup import drive_among_discs as among
+from safe_wrappers.control.backup import drive_decision as among
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, Constraint, HalfSpaces
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
@@ -132,7 +132,7 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
 
         From inside a disc it drives out, whichever way is better.
         """
-        return self._pair(np.array([among.backup_drive(*self._scene), 0.0]))
+        return self._pair(np.array([among.manoeuvre_drive(*self._scene), 0.0]))
 
     def decide(self, proposal: Array, low: Array, high: Array) -> tuple[Array, int, HalfSpaces] | None:
         """The whole search at once, without a solver."""

@@ -1,0 +1,172 @@
+"""The search for the closest admissible control of a heading drive among discs, in one compiled call.
+
+The order of attempts is that of `SafeActionSearch`; the functions below it are for constraints that are not alone.
+"""
+
+from typing import Final
+
+import numpy as np
+
+from safe_wrappers.control.backup.drive_among_discs import (
+    Array,
+    Look,
+    admits,
+    backup_drive,
+    look,
+    passing_side,
+    rows,
+)
+from safe_wrappers.control.numerics.compiled import compiled
+from safe_wrappers.control.numerics.plane_projection import project_in_plane
+
+ROWS_SLACK: Final = 1e-9
+"""By how much of a control's range a projected control may break a row; prediction judges it afterwards."""
+OVERSHOOTS: Final = (0.02, 0.1)
+BLENDS: Final = (0.1, 0.25, 0.5, 0.75)
+PROPOSAL, ROWS, CANDIDATE, OVERSHOOT, BLEND, BACKUP, UNRESOLVED = 0, 1, 2, 4, 5, 6, 7
+"""What `closest_admitted` returns: a `Stage` of the search, or that none of these has found an admissible control."""
+
+
+@compiled
+def _decide(
+    models: Array,
+    at: Look,
+    proposal: Array,
+    side: float,
+    brake: bool,
+    detour: bool,
+    low: Array,
+    high: Array,
+    least: Array,
+    most: Array,
+    out: Array,
+) -> tuple[int, float, Array, Array]:
+    """The closest admissible (drive, turn) that a search finds, in the order of `filter/search.py`.
+
+    Args:
+        models: As for `_admits`.
+        at: The present state.
+        proposal: Inside the box, shape (2,).
+        side: Of a detour that goes on, or 0.
+        brake: Whether the backup manoeuvre brakes along the heading.
+        detour: Whether to try ways around before projecting.
+        low: Of the controls, shape (2,).
+        high: Of the controls, shape (2,).
+        least: The controls between which the forces still change, shape (2,), inside low and high.
+        most: Likewise.
+        out: What to execute, shape (2,).
+
+    Returns:
+        The stage that found it (UNRESOLVED: none did); the side of a detour that was tried, or 0; the rows that the
+        control keeps, shapes (k, 2) and (k,).
+    """
+    drive, turn = proposal[0], proposal[1]
+    out[0], out[1] = drive, turn
+    normals, offsets = np.zeros((0, 2)), np.zeros(0)
+    if admits(models, at, drive, turn, brake):
+        return PROPOSAL, 0.0, normals, offsets
+    way = 0.0
+    if detour:
+        way = passing_side(models, at, drive, turn, brake, side)
+        if way != 0.0:
+            around = min(max(way, low[1]), high[1])
+            for ahead in (drive, min(max(0.0, low[0]), high[0])):
+                if admits(models, at, ahead, around, brake):
+                    out[0], out[1] = ahead, around
+                    return CANDIDATE, way, normals, offsets
+    # Measured in shares of what acts: a control that saturates early must not look cheap to change.
+    unit = np.ones(2)
+    for j in range(2):
+        if most[j] > least[j]:
+            unit[j] = (most[j] - least[j]) / (high[j] - low[j])
+    force = np.minimum(np.maximum(proposal, least), most) / unit
+    inner_low, inner_high = least / unit, most / unit
+    found, exact = rows(models, at, brake)
+    scaled = found * unit
+    slack = ROWS_SLACK * max(inner_high[0] - inner_low[0], inner_high[1] - inner_low[1])
+    answer, refused = np.zeros(2), np.array([drive, turn])
+    feasible = project_in_plane(force, scaled, exact, inner_low, inner_high, slack, answer)
+    if feasible:
+        normals, offsets = found, exact
+        # A component that saturates as the policy's did stays the policy's: the force is the same.
+        for j in range(2):
+            refused[j] = proposal[j] if answer[j] == force[j] else answer[j] * unit[j]
+        if admits(models, at, refused[0], refused[1], brake):
+            out[0], out[1] = refused[0], refused[1]
+            return ROWS, way, normals, offsets
+        for share in OVERSHOOTS:
+            tighter = exact.copy()
+            for i in range(tighter.size):
+                tighter[i] -= share * max(found[i, 0] * drive + found[i, 1] * turn - exact[i], 0.0)
+            if project_in_plane(force, scaled, tighter, inner_low, inner_high, slack, answer):
+                ahead = drive if answer[0] == force[0] else answer[0] * unit[0]
+                around = turn if answer[1] == force[1] else answer[1] * unit[1]
+                if admits(models, at, ahead, around, brake):
+                    out[0], out[1] = ahead, around
+                    return OVERSHOOT, way, normals, offsets
+    none, nothing = np.zeros((0, 2)), np.zeros(0)
+    back = min(max(backup_drive(models, at, brake), low[0]), high[0])
+    if not admits(models, at, back, 0.0, brake):
+        return UNRESOLVED, way, none, nothing
+    for share in BLENDS:
+        ahead, around = refused[0] + share * (back - refused[0]), refused[1] + share * (0.0 - refused[1])
+        if admits(models, at, ahead, around, brake):
+            out[0], out[1] = ahead, around
+            return BLEND, way, none, nothing
+    for mixed in range(2):
+        ahead, around = (refused[0], 0.0) if mixed == 0 else (back, refused[1])
+        if admits(models, at, ahead, around, brake):
+            out[0], out[1] = ahead, around
+            return BLEND, way, none, nothing
+    out[0], out[1] = back, 0.0
+    return BACKUP, way, none, nothing
+
+
+@compiled
+def least_clearance(models: Array, motion: Array, discs: Array, brake: bool) -> tuple[float, int]:
+    """The stopping path's least clearance of all discs, m (NaN if one is not a number), and how many are in play."""
+    at = look(models[0], motion, discs, brake)
+    return at.least, len(at.discs)
+
+
+@compiled
+def is_admitted(models: Array, motion: Array, discs: Array, brake: bool, drive: float, turn: float) -> bool:
+    """Whether the end of a held control still has a safe stopping path."""
+    return admits(models, look(models[0], motion, discs, brake), drive, turn, brake)
+
+
+@compiled
+def secants(models: Array, motion: Array, discs: Array, brake: bool) -> tuple[Array, Array]:
+    """Half-spaces of (drive, turn) that keep the clearance, about: shapes (k, 2) and (k,)."""
+    return rows(models, look(models[0], motion, discs, brake), brake)
+
+
+@compiled
+def way_around(
+    models: Array, motion: Array, discs: Array, brake: bool, drive: float, turn: float, side: float
+) -> float:
+    """1 (left), -1 (right), or 0 with nothing to go around; `side` is that of a detour that goes on, or 0."""
+    return passing_side(models, look(models[0], motion, discs, brake), drive, turn, brake, side)
+
+
+@compiled
+def manoeuvre_drive(models: Array, motion: Array, discs: Array, brake: bool) -> float:
+    """The drive control of the backup manoeuvre."""
+    return backup_drive(models, look(models[0], motion, discs, brake), brake)
+
+
+@compiled
+def closest_admitted(
+    models: Array,
+    motion: Array,
+    discs: Array,
+    brake: bool,
+    proposal: Array,
+    side: float,
+    detour: bool,
+    bounds: Array,
+    out: Array,
+) -> tuple[int, float, Array, Array]:
+    """`_decide` from the present state; `bounds` are low, high, least and most, shape (4, 2)."""
+    at = look(models[0], motion, discs, brake)
+    return _decide(models, at, proposal, side, brake, detour, bounds[0], bounds[1], bounds[2], bounds[3], out)
