@@ -116,7 +116,7 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
         model = self.model
         self.wheel_radius = float(model.geom(WHEELS[0]).size[0])
         self._tyres = Tyres(model, WHEELS)
-        self._rates = [int(model.joint(wheel).dofadr[0]) for wheel in WHEELS]
+        self.wheel_dofs: list[int] = [int(model.joint(wheel).dofadr[0]) for wheel in WHEELS]
         self._steer = [int(model.joint(f"steer_{side}").qposadr[0]) for side in ("left", "right")]
         self._scene = Scene(model)
         self._grounds = Ground("dry", ())
@@ -259,7 +259,7 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
         heading = self.agent_heading
         cos, sin = math.cos(heading), math.sin(heading)
         relative = (self._targets - data.qpos[:2]) @ np.array([[cos, -sin], [sin, cos]])
-        rims = (self.wheel_radius * data.qvel[self._rates]).tolist()
+        rims = (self.wheel_radius * data.qvel[self.wheel_dofs]).tolist()
         sensors = [vx, vy, yaw_rate, ax, ay, *rims, self._steering_angle()]
         return np.concatenate([sensors, pseudo_lidar(relative, self._groups, 2, max_dist=_LIDAR_RANGE)])
 
@@ -335,7 +335,7 @@ class SafeRoverEnv(MujocoEnv, EzPickle):
         self.place_goal(layout.goal)
         self._scene.show(self.model, self.data, layout)
         qpos, qvel = start_state(layout, self.init_qpos, self.model.nv)
-        qvel[self._rates] = layout.speed / self.wheel_radius
+        qvel[self.wheel_dofs] = layout.speed / self.wheel_radius
         self.set_state(qpos, qvel)
 
     def place_goal(self, goal: Array) -> None:

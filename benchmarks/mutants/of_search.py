@@ -115,7 +115,7 @@ ROLLOUT = Target(
         ),
         Mutant("fallen > most + self.tolerance:", "fallen > 2.0 * most:"),
         Mutant(
-            "                stacklevel=2,\n            )\n            self._max_decrease = most = None",
+            "                stacklevel=2,\n            )\n            self.max_decrease = most = None",
             "                stacklevel=2,\n            )",
         ),
         Mutant("(*self._recent, self._least)[-self.spec.horizon :]", "(*self._recent, self._least)[-1:]"),

@@ -95,7 +95,7 @@ class BoundRollout(BoundSlacks):
     def __init__(self, spec: RolloutConstraint, plant: Plant) -> None:
         hint = "forecasts with a MuJoCo model; on an AnalyticPlant use Barrier(h) or Clearance(...)"
         super().__init__(spec, require_mujoco(plant, f"{type(spec).__name__} {hint}"))
-        self._max_decrease = spec.max_decrease
+        self.max_decrease = spec.max_decrease
 
     @abstractmethod
     def room(self, forecast: Forecast) -> Array:
@@ -115,7 +115,7 @@ class BoundRollout(BoundSlacks):
         self._least = float(self._value.min(initial=np.inf))
         self._recent, self._response = memory
         self._outside = self._violation(self._value)
-        most, fallen = self._max_decrease, max(self._recent, default=-np.inf) - self._least
+        most, fallen = self.max_decrease, max(self._recent, default=-np.inf) - self._least
         if most is not None and fallen > most + self.tolerance:
             warnings.warn(
                 f"{type(self.spec).__name__}: what is left of the limit fell by {fallen:.3g} {self.spec.unit} within "
@@ -123,11 +123,11 @@ class BoundRollout(BoundSlacks):
                 "every control is forecast",
                 stacklevel=2,
             )
-            self._max_decrease = most = None
+            self.max_decrease = most = None
         self._far = most is not None and self._least - most >= self.spec.margin + self.tolerance
 
     def executed(self, control: Array) -> Memory:
-        recent = (*self._recent, self._least)[-self.spec.horizon :] if self._max_decrease is not None else ()
+        recent = (*self._recent, self._least)[-self.spec.horizon :] if self.max_decrease is not None else ()
         return RolloutMemory(recent, self._response)
 
     def value(self) -> Array:

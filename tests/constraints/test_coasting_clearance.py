@@ -90,7 +90,7 @@ def test_no_control_is_admitted_as_long_as_its_way_is_clear():
 
 def test_far_from_everything_nothing_is_forecast():
     _, constraint, _ = bound([[3.0, 0.0]], max_decrease=0.05, max_decrease_per_speed=0.13)
-    constraint._coasting.run = None  # any forecast would fail
+    constraint.coasting.run = None  # any forecast would fail
     assert constraint.admits(FULL)
     assert constraint.value() == pytest.approx(2.8)
 
@@ -110,7 +110,7 @@ def test_the_outline_counts_where_it_should():
 def test_without_a_model_of_the_machine_alone_it_takes_the_plants():
     for alone in (None, "robot_model"):
         _, constraint, plant = bound([[0.215, 0.0]], vases=[[3.0, 3.0]], robot_model_attr=alone)
-        assert constraint._coasting._model is plant.model or alone is not None
+        assert constraint.coasting._model is plant.model or alone is not None
         assert not constraint.admits(FULL)
         assert constraint.admits(BACK)
 
@@ -122,7 +122,7 @@ def test_a_reach_that_is_broken_is_dropped_with_a_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert not constraint.admits(FULL)
-    assert constraint._max_decrease is None
+    assert constraint.max_decrease is None
 
 
 def test_what_stands_still_is_forecast_once():
@@ -131,8 +131,8 @@ def test_what_stands_still_is_forecast_once():
         env.unwrapped.step(NONE)
     plant.observe()
     constraint.admits(FULL)
-    run, calls = constraint._coasting.run, []
-    constraint._coasting.run = lambda *arguments: calls.append(arguments) or run(*arguments)
+    run, calls = constraint.coasting.run, []
+    constraint.coasting.run = lambda *arguments: calls.append(arguments) or run(*arguments)
     env.unwrapped.step(NONE)
     plant.observe()
     answer = constraint.admits(FULL)

@@ -15,7 +15,7 @@ class Approaching(BoundRollout):
     """What is left of a bound on the first control, which acts the more the later it is."""
 
     def __init__(self, plant, margin=0.0, horizon=1):
-        self.spec, self.plant, self._max_decrease = (
+        self.spec, self.plant, self.max_decrease = (
             SimpleNamespace(margin=margin, horizon=horizon, look_ahead_below=None, unit="m"),
             plant,
             None,
@@ -118,10 +118,10 @@ def test_differences_stay_inside_the_bounds(control):
 def test_rows_of_a_limit_far_away_are_none():
     plant = still_plant()
     limit = Approaching(plant)
-    limit._max_decrease = 0.1
+    limit.max_decrease = 0.1
     limit.observe(RolloutMemory())
     assert not limit.rows().offsets.size and limit.admits(np.ones(2)) and not plant.asked
-    limit._max_decrease = 0.5000001
+    limit.max_decrease = 0.5000001
     limit.observe(RolloutMemory())
     assert limit.rows().offsets.size and not limit.admits(np.ones(2))
 
@@ -129,7 +129,7 @@ def test_rows_of_a_limit_far_away_are_none():
 def test_only_as_many_states_are_remembered_as_are_looked_ahead():
     plant = still_plant()
     limit = Approaching(plant, horizon=3)
-    limit._max_decrease = 9.0
+    limit.max_decrease = 9.0
     memory = limit.start()
     for plant.left in (5.0, 4.0, 3.0, 2.0, 1.0):
         limit.observe(memory)

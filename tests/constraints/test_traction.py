@@ -142,7 +142,7 @@ def test_a_wheel_in_the_air_keeps_the_ground_speed():
     for _ in range(20):
         info = env.step(FULL)[4]
         assert (raw.wheel_loads == 0.0).all()
-        slip = slip_ratio(raw.wheel_radius * raw.data.qvel[raw._rates], raw.forward_speed, 0.5)
+        slip = slip_ratio(raw.wheel_radius * raw.data.qvel[raw.wheel_dofs], raw.forward_speed, 0.5)
         assert (np.abs(slip) < 0.11).all()
     assert (info["slip/mu_std"] == 0.5).all()  # nothing was measured
     assert before is env.constraints[0]
@@ -154,7 +154,7 @@ def test_a_wheel_that_is_braked_locked_is_let_go():
     env.reset(seed=0, options={"layout": OPEN | {"ground": "ice", "speed": 3.0}})
     raw = env.unwrapped
     qvel = raw.data.qvel.copy()
-    qvel[raw._rates] = 0.0
+    qvel[raw.wheel_dofs] = 0.0
     raw.set_state(raw.data.qpos.copy(), qvel)
     infos = [env.step(-FULL)[4] for _ in range(30)]
     assert (infos[0]["executed_action"][:4] == 1.0).all()
@@ -200,7 +200,7 @@ def test_in_one_list_with_others():
     assert max(info["slip_max"] for info in infos) < 0.16
     # Its forecast holds the tyres' forces as they are, which the margin has to cover.
     assert not any(info["cbf/unsafe"] for info in infos)
-    assert (both.unwrapped.data.qvel[both.unwrapped._rates] > 6.0).all()
+    assert (both.unwrapped.data.qvel[both.unwrapped.wheel_dofs] > 6.0).all()
     assert infos[-1]["slip/ratio"].shape == (4,)
 
 

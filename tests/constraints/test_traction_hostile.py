@@ -365,7 +365,7 @@ def test_a_state_that_is_set_costs_one_wrong_step_and_no_estimate():
         info = env.step(-FULL)[4]
     known, raw = info["slip/mu_estimate"], env.unwrapped
     qvel = np.zeros(raw.model.nv)
-    qvel[0], qvel[raw._rates] = 6.0, 0.92 * 60.0
+    qvel[0], qvel[raw.wheel_dofs] = 6.0, 0.92 * 60.0
     raw.set_state(raw.data.qpos.copy(), qvel)
     after = [env.step(-FULL)[4] for _ in range(30)]
     np.testing.assert_allclose(after[0]["slip/mu_estimate"], known, rtol=0.05)

@@ -26,7 +26,7 @@ def start(env, lateral=0.0, wheel_speed=None, **layout):
     qvel = raw.data.qvel.copy()
     qvel[1] = lateral
     if wheel_speed is not None:
-        qvel[raw._rates] = wheel_speed / raw.wheel_radius
+        qvel[raw.wheel_dofs] = wheel_speed / raw.wheel_radius
     raw.set_state(raw.data.qpos.copy(), qvel)
     return raw
 
@@ -76,7 +76,7 @@ def test_below_the_regularisation_nothing_is_learnt():
     for _ in range(12):
         info = env.step(FULL)[4]  # its report is of the state before
         learnt.append(info["slip/mu_std"][0] < 0.5)
-        fastest.append(max(raw.forward_speed, raw.wheel_radius * raw.data.qvel[raw._rates[0]]))
+        fastest.append(max(raw.forward_speed, raw.wheel_radius * raw.data.qvel[raw.wheel_dofs[0]]))
     assert learnt[1:] == [speed > 0.5 for speed in fastest[:-1]]
     assert any(learnt)
 

@@ -1,5 +1,6 @@
 """The compiled search of a heading drive among discs: the general search is its oracle."""
 
+import dataclasses
 import hashlib
 import os
 import subprocess
@@ -14,6 +15,7 @@ from benchmarks import drivers
 from safe_wrappers.constraints.backup.heading_drive_clearance import BoundHeadingDriveClearance
 from safe_wrappers.control.backup import drive_decision as among
 from safe_wrappers.control.numerics.compiled import IS_COMPILED
+from safe_wrappers.filter.engine import SafetyFilter
 
 KINDS = {
     "detour": {"detour": True},
@@ -21,6 +23,38 @@ KINDS = {
     "coasting": {"detour": True, "brake": False},
     "uncertain": {"detour": True, "uncertainty": 0.2},
 }
+
+
+class Searched(sw.constraints.HeadingDriveClearance):
+    """The same constraint, left to the general search."""
+
+    def bind(self, plant):
+        bound = super().bind(plant)
+        bound.decides = False
+        return bound
+
+
+def general_search(env):
+    """A filter of the same plant that searches."""
+    (spec,) = env.constraints
+    space = env.action_space
+    same = Searched(
+        **{field.name: getattr(spec, field.name) for field in dataclasses.fields(spec) if field.init}
+    )
+    low, high = space.low.astype(float), space.high.astype(float)
+    return SafetyFilter(env.plant, [same], "brake", "daqp", low, high)
+
+
+def both(env, searched, proposal):
+    """The decision of the constraint itself, which is executed, and that of the search."""
+    decisions = []
+    for one in (env.filter, searched):
+        one.observe()
+        decisions.append(one.filter(proposal))
+    env.env.step(decisions[0].control)
+    for one in (env.filter, searched):
+        one.executed(decisions[0].control)
+    return decisions
 
 
 def episode(options, driver, steps, seed):
@@ -31,18 +65,10 @@ def episode(options, driver, steps, seed):
     env = sw.CBFActionFilter(gym.make("SafePointGoal1-v0"), [clearance])
     env.reset(seed=seed)
     act = drivers.DRIVERS[driver](env.unwrapped, np.random.default_rng(seed))
-    search = env.filter._search
+    searched = general_search(env)
+    searched.start()
     for _ in range(steps):
-        proposal = np.asarray(act(), dtype=np.float64)
-        env.filter.observe()
-        by_itself = env.filter.filter(proposal)
-        env.filter.observe()
-        search._sole = None
-        general = env.filter.filter(proposal)
-        search._sole = env.filter.bound[0]
-        yield by_itself, general
-        env.env.step(by_itself.control)
-        env.filter.executed(by_itself.control)
+        yield both(env, searched, np.asarray(act(), dtype=np.float64))
 
 
 @pytest.mark.parametrize("driver", ["hazard-seeking", "bang-bang"])
@@ -64,18 +90,13 @@ def test_from_inside_a_disc_both_searches_lead_out():
     env = sw.CBFActionFilter(gym.make("SafePointGoal1-v0"), [clearance])
     with pytest.warns(sw.UnsafeStateWarning):
         env.reset(seed=0, options={"layout": layout})
+    searched = general_search(env)
+    searched.start()
     for _ in range(60):
-        proposal = rng.uniform(-1.0, 1.0, 2)
-        decisions = []
-        for sole in (env.filter.bound[0], None):
-            env.filter.observe()
-            env.filter._search._sole = sole
-            decisions.append(env.filter.filter(proposal))
+        decisions = both(env, searched, rng.uniform(-1.0, 1.0, 2))
         assert decisions[0].stage == decisions[1].stage
         np.testing.assert_allclose(decisions[0].control, decisions[1].control, atol=1e-9)
         changed += decisions[0].changed
-        env.env.step(decisions[0].control)
-        env.filter.executed(decisions[0].control)
     assert changed > 5
 
 

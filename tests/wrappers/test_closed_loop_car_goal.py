@@ -126,7 +126,7 @@ def test_a_mispredicted_stop_violates():
 def test_without_counting_the_way_to_rest_it_violates():
     """One forecast step of the held control alone is not enough."""
     env = sw.protect(gym.make("SafeCarGoal1-v0"), detour=False)
-    coasting = env.filter.bound[0]._coasting
+    coasting = env.filter.bound[0].coasting
     run = coasting.run
 
     def short_sighted(control, horizon, radius):

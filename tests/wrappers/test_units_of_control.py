@@ -155,7 +155,7 @@ def test_rows_of_a_forecast_keep_a_share_of_the_box_for_rounding(unit):
         )
         constraint = Forecasting(unit)
         constraint.spec, constraint.plant = SimpleNamespace(margin=0.0, horizon=1), plant
-        constraint._max_decrease = None
+        constraint.max_decrease = None
         constraint.observe(RolloutMemory())
         rows = constraint.rows()
         return np.append(rows.normals[0] * unit, rows.offsets[0])

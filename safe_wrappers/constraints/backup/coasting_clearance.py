@@ -115,12 +115,12 @@ class BoundCoastingClearance(BoundDetourClearance):
         if alone is not None and not isinstance(alone, mujoco.MjModel):
             wanted = "robot_model_attr names an attribute that holds an MjModel"
             raise ConfigurationError(f"{wanted}; {name!r} is {alone!r}")
-        self._coasting = Coasting(self.plant, spec.body, alone)
+        self.coasting = Coasting(self.plant, spec.body, alone)
         self._still = np.zeros(self.plant.model.nu)
         outline = np.reshape(spec.outline, (-1, 2))
         self._corners = convex_outline(outline) if len(outline) else outline
         self._radius = float(np.sqrt((self._corners**2).sum(axis=1)).max(initial=0.0))
-        self._max_decrease = spec.max_decrease
+        self.max_decrease = spec.max_decrease
         self._first_turns_left: bool | None = None
         self._seen = np.zeros(0)
         self._known: dict[bytes, _Outcome] = {}
@@ -132,18 +132,18 @@ class BoundCoastingClearance(BoundDetourClearance):
     def clearance(self) -> Array:
         """Of the present place from the nearest disc, margin not taken off, m, shape (1,): not along the way."""
         self._low, self._high = self.plant.acting_range
-        here = self._coasting.start()
+        here = self.coasting.start()
         self._here = here.places[0]
         way = math.inf
-        if self._max_decrease is not None:
-            way = self._max_decrease + self.spec.max_decrease_per_speed * self._coasting.speed(self._radius)
+        if self.max_decrease is not None:
+            way = self.max_decrease + self.spec.max_decrease_per_speed * self.coasting.speed(self._radius)
         self._origin = _Group(self.spec.keep_out, self.plant, None)
         self._body = _Group(self.spec.untouched, self.plant, self._corners)
         self._least = min(group.keep(here, self.spec.margin + way) for group in (self._origin, self._body))
         self._within = way
         # Rollouts are kept while nothing moves.
         discs = np.concatenate([self._origin.centers, self._body.centers]).ravel()
-        seen = np.concatenate([[self.plant.model_version], self._coasting.state(), discs])
+        seen = np.concatenate([[self.plant.model_version], self.coasting.state(), discs])
         if not (seen.shape == self._seen.shape and (np.abs(seen - self._seen) <= _STILL).all()):
             self._seen, self._known = seen, {}
         return np.array([self._least])
@@ -153,7 +153,7 @@ class BoundCoastingClearance(BoundDetourClearance):
         acting = np.minimum(np.maximum(control, self._low), self._high) + 0.0  # no -0.0: its bytes differ
         key = acting.tobytes()
         if key not in self._known:
-            course = self._coasting.run(acting, self.spec.horizon, self._radius)
+            course = self.coasting.run(acting, self.spec.horizon, self._radius)
             outcome, fallen = self._outcome(course)
             if fallen > self._within + _SAME_M:
                 warnings.warn(
@@ -161,7 +161,7 @@ class BoundCoastingClearance(BoundDetourClearance):
                     f"max_decrease of {self._within:.3g} m; from now on every control is forecast",
                     stacklevel=2,
                 )
-                self._max_decrease, self._memory, self._seen = None, Detour(), np.zeros(0)
+                self.max_decrease, self._memory, self._seen = None, Detour(), np.zeros(0)
                 self.clearance()
                 outcome, _ = self._outcome(course)
             self._known[key] = outcome
