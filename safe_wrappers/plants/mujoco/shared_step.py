@@ -73,8 +73,9 @@ class SharedStep:
             rollout: Holds the data at the end of the control interval.
             start: Integration state that the rollout started from.
         """
-        if mujoco.mj_step is not _MJ_STEP or "_step_mujoco_simulation" in vars(self._raw):
-            return env.step(action)  # somebody watches the physics steps, or makes them
+        watched = mujoco.mj_step is not _MJ_STEP or "_step_mujoco_simulation" in vars(self._raw)
+        if watched or not rollout.held_control:
+            return env.step(action)
         raw, simulate = self._raw, self._raw._step_mujoco_simulation
 
         def take_over(ctrl: Array, n_frames: int) -> None:
