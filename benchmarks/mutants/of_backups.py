@@ -40,7 +40,11 @@ HEADING_DRIVE = Target(
         Mutant("    for mixed in range(2):", "    for mixed in range(0):"),
         Mutant("    if not admits(models, at, back, 0.0, brake):\n", "    if False:\n"),
         Mutant("unit[j] = (most[j] - least[j]) / (high[j] - low[j])", "unit[j] = 1.0"),
-        Mutant("if left < at.loss and left < _needed", "if left < _needed"),
+        Mutant(
+            "if left < at.loss and left < _needed",
+            "if left < _needed",
+            equal="one hold uses up at most the loss: where more is left, at least half of the clearance is",
+        ),
         Mutant("RECOVERY_RATE: Final = 1.0", "RECOVERY_RATE: Final = 0.0"),
     ),
 )

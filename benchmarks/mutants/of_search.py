@@ -76,7 +76,7 @@ SEARCH = Target(
         Mutant(
             "self._no_rows: Rows = np.zeros((0, low.size)), np.zeros(0)",
             "self._no_rows: Rows = _NO_ROWS",
-            tests=("tests/constraints/test_heading_drive_clearance.py",),
+            tests=("tests/control/test_drive_among_discs.py",),
         ),
         Mutant(
             "least, most = np.clip(acting[0], low, high), np.clip(acting[1], low, high)",

@@ -133,7 +133,11 @@ LEASE_EXPIRY = Target(
 
 COMMAND_GATE = Target(
     "wrappers/common/command_gate.py",
-    ("tests/wrappers/test_lease_expiry.py", "tests/wrappers/test_authority_stack.py"),
+    (
+        "tests/wrappers/test_lease_over_filter.py",
+        "tests/wrappers/test_lease_expiry.py",
+        "tests/wrappers/test_authority_stack.py",
+    ),
     (Mutant("executed = np.array(info[keys.EXECUTED_ACTION], dtype=np.float64)", "pass"),),
 )
 
