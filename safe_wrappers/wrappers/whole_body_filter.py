@@ -92,7 +92,9 @@ class WholeBodyFilter(CBFActionFilter):
             if not stops(model)[0]:
                 raise UnsupportedEnvError("no driven joint has a range: pass joint_tolerance=None")
         elif horizon is not None:
-            raise ConfigurationError("horizon is for the joints, which joint_tolerance=None leaves alone")
+            raise ConfigurationError(
+                "horizon is how far joints are foreseen; joint_tolerance=None ignores them"
+            )
         constraints: list[Constraint]
         if contacts in ("pyramid", "cone"):
             for name in ("tolerance", "bodies", "horizon"):

@@ -38,7 +38,9 @@ class ChunkSizes(NamedTuple):
         delay = _delay(inference_delay)
         if horizon > size:
             has = _size(entries, apart, "")
-            raise ConfigurationError(f"execution_horizon = {horizon} is more than {has}: at most {size}")
+            raise ConfigurationError(
+                f"execution_horizon = {horizon} is more than {has}: choose it up to {size}"
+            )
         if not delay[1] <= horizon <= size - delay[1]:
             late, between = (
                 delay[1],

@@ -48,7 +48,9 @@ class Track:
     def __post_init__(self) -> None:
         if (self.bodies is None) == (self.published is None):
             given = f"bodies={self.bodies!r}, published={self.published!r}"
-            raise ConfigurationError(f"a track follows bodies, or points that the env publishes; got {given}")
+            raise ConfigurationError(
+                f"a track follows bodies by name or pattern, or published points; got {given}"
+            )
         name = self.published if self.bodies is None else self.bodies
         if not isinstance(name, str):
             raise ConfigurationError(f"bodies and published are names, got {name!r}")
