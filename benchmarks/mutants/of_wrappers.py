@@ -20,8 +20,8 @@ LEASE = Target(
             "        if self._rest:\n            return bool(",
         ),
         Mutant(
-            "(end, 0.0, 0.0), self._limits) <= duration_s",
-            "(end, 0.0, 0.0), self._limits) <= 2.0 * duration_s",
+            "return bool(least_s <= duration_s)",
+            "return bool(least_s <= 2.0 * duration_s)",
         ),
         Mutant(
             "localisation, margin = budget.localisation + own[0], budget.margin + own[1]",
@@ -58,8 +58,8 @@ LEASE = Target(
         ),
         Mutant("            self._bound.check()\n", ""),
         Mutant(
-            "self.constraint, braking=braking, margin=margin, state_error=localisation",
-            "self.constraint, braking=braking",
+            '{"braking": braking, "margin": margin, "state_error": localisation}',
+            '{"braking": braking}',
         ),
     ),
 )

@@ -78,10 +78,8 @@ def project_batch(
         lo = np.broadcast_to(np.asarray(lower, dtype=np.float64), u.shape)
         hi = np.broadcast_to(np.asarray(upper, dtype=np.float64), u.shape)
     except ValueError:
-        given = f"{np.shape(lower)} and {np.shape(upper)}"
-        raise ConfigurationError(
-            f"expected bounds of shape ({u.shape[1]},) or {u.shape}; got {given}"
-        ) from None
+        wanted, given = f"({u.shape[1]},) or {u.shape}", f"{np.shape(lower)} and {np.shape(upper)}"
+        raise ConfigurationError(f"expected bounds of shape {wanted}; got {given}") from None
     if not np.isfinite(u).all():
         where = np.flatnonzero(~np.isfinite(u).all(axis=1)).tolist()
         raise ConfigurationError(f"u_nom must be finite, replace it before projecting; rows {where} are not")

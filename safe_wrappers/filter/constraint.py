@@ -65,9 +65,7 @@ class Constraint(ABC):
         """A copy whose margin is wider by this much, in the unit of its margin."""
         if not (is_dataclass(self) and any(f.name == "margin" for f in fields(self))):
             name = type(self).__name__
-            raise ConfigurationError(
-                f"{name} has no margin to widen; give it a field `margin`, or margin=0 here"
-            )
+            raise ConfigurationError(f"{name} has no margin to widen; give it a field `margin`, or margin=0")
         own: Any = self
         wider: Self = replace(own, margin=own.margin + margin)
         return wider

@@ -96,7 +96,6 @@ class BoundDuckTyped(BoundConstraint):
         if not hasattr(self._given, "report"):
             return {}
         zero = np.zeros(self.plant.lower.size)
-        found: dict[str, Any] = self._given.report(
-            *(zero if action is None else action for action in (proposed, executed))
-        )
+        actions = (zero if action is None else action for action in (proposed, executed))
+        found: dict[str, Any] = self._given.report(*actions)
         return found

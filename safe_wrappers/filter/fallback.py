@@ -38,13 +38,7 @@ class Fallback:
         self.brakes = choice == "brake"
 
     def __call__(
-        self,
-        plant: Plant | None,
-        last: Array,
-        low: Array,
-        high: Array,
-        least: Array | None,
-        readable: bool = True,
+        self, plant: Plant | None, last: Array, low: Array, high: Array, least: Array | None, readable: bool
     ) -> Array:
         """The control, finite and clipped to the box; one that is not finite is replaced by zero.
 

@@ -24,19 +24,8 @@ from safe_wrappers.filter.problem import (
     control_unit,
     residual_scales,
 )
-from safe_wrappers.filter.qp import identity, solve_unit_rows, solve_with_daqp
+from safe_wrappers.filter.qp import Answer, identity, solve_unit_rows, solve_with_daqp
 from safe_wrappers.filter.single_row import project_single_row
-
-__all__ = [
-    "Projection",
-    "Status",
-    "box_least_squares",
-    "cast_inside",
-    "check_solver",
-    "keeps_rows",
-    "project",
-    "project_unchecked",
-]
 
 _SHORTEST = 1e-6  # rows shorter than this, or longer than its inverse, are looked at one by one
 _OVERFLOWING = 1e300  # where a sum is not finite, numbers from here on are taken as infinite
@@ -139,11 +128,7 @@ def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array, solver
         return Projection(u, Status.INACTIVE, 0.0, np.zeros(k), 0)
     unit = 1.0 if box.ordinary else control_unit(box, u, excess, length)
     if solver == "daqp" and float(length.min()) * unit > _SHORTEST and longest * unit < 1.0 / _SHORTEST:
-        answer = (
-            solve_with_daqp(identity(u.size), -u, a, b, lo, hi)
-            if unit == 1.0
-            else _daqp_in(unit, u, a, b, lo, hi)
-        )
+        answer = _daqp_in(unit, u, a, b, lo, hi)
         if answer is not None:
             control = np.minimum(np.maximum(answer[0], lo), hi)
             residual = a @ control - b
@@ -153,10 +138,10 @@ def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array, solver
     return _careful(u, a, b, lo, hi, length, slack, unit, solver)
 
 
-def _daqp_in(
-    unit: float, u: Array, a: Array, b: Array, lo: Array, hi: Array
-) -> tuple[Array, Array, int] | None:
+def _daqp_in(unit: float, u: Array, a: Array, b: Array, lo: Array, hi: Array) -> Answer | None:
     """`solve_with_daqp` with the controls in another unit."""
+    if unit == 1.0:
+        return solve_with_daqp(identity(u.size), -u, a, b, lo, hi)
     answer = solve_with_daqp(identity(u.size), -u / unit, a * unit, b, lo / unit, hi / unit)
     return answer and (answer[0] * unit, answer[1] * (unit * unit), answer[2])
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from safe_wrappers.filter.constraint import Array, BoundConstraint, HalfSpaces
 from safe_wrappers.filter.fallback import Fallback
-from safe_wrappers.filter.projection import Projection, Status, keeps_rows, project_unchecked
+from safe_wrappers.filter.problem import Projection, Status
+from safe_wrappers.filter.projection import keeps_rows, project_unchecked
 from safe_wrappers.plants.plant import Plant
 
 Rows = tuple[Array, Array]
@@ -71,15 +72,9 @@ class Decision:
 
 
 class SafeActionSearch:
-    """Finds the closest admissible control that it can, or falls back.
+    """Finds the closest admissible control in the action box (`low`, `high`, shapes (m,)) that it can, or falls back.
 
-    Args:
-        plant: Bound; observed by the caller, as the constraints are.
-        constraints: All of them.
-        fallback: Chooses when nothing admissible is found.
-        solver: For the projection.
-        low: Action box, shape (m,).
-        high: Likewise.
+    The caller observes the plant and the constraints.
     """
 
     def __init__(
@@ -116,12 +111,7 @@ class SafeActionSearch:
             found = self._sole.decide(proposal, self._low, self._high)
             if found is not None:
                 control, stage, rows = found
-                return Decision(
-                    control,
-                    Stage(stage),
-                    changed=bool((control != proposal).any()),
-                    rows=(rows.normals, rows.offsets),
-                )
+                return self._projected(proposal, control, Stage(stage), (rows.normals, rows.offsets))
         refused = bool(self._predicting) and not self._admitted(proposal)
         strict = self._rows(self._rows_only) if self._rows_only else self._no_rows
         if not refused:
@@ -260,7 +250,7 @@ class SafeActionSearch:
         return Decision(control, Stage.FALLBACK, fallback=True, infeasible=infeasible)
 
     def _fallback_control(self, least: Array | None, last: Array) -> Array:
-        return self._fallback(self._plant, last, self._low, self._high, least)
+        return self._fallback(self._plant, last, self._low, self._high, least, True)
 
     def _admitted(self, control: Array) -> bool:
         for c in self._predicting:

@@ -43,20 +43,16 @@ class AdaptionPenalty(LayerWrapper):
     def __init__(self, env: Env, penalty: float = 0.0, per_correction: float = 0.0) -> None:
         LayerWrapper.__init__(self, env)
         if not is_filtered(env):
-            raise ConfigurationError(
-                "AdaptionPenalty needs a CBFActionFilter inside, which says when an action was changed:"
-                " AdaptionPenalty(sw.protect(env), penalty=...)"
-            )
+            example = "AdaptionPenalty(sw.protect(env), penalty=...)"
+            raise ConfigurationError(f"AdaptionPenalty needs a CBFActionFilter inside: {example}")
         penalty = non_negative("penalty", penalty, "the task's reward")
         per_correction = non_negative("per_correction", per_correction, "reward per action unit")
         if penalty == 0.0 and per_correction == 0.0:
             raise ConfigurationError(
-                "AdaptionPenalty: give penalty (per changed step), per_correction (per unit of cbf/correction), or"
-                " both; with neither the learner is the naive one, which needs no wrapper"
+                "AdaptionPenalty: give penalty (per step), per_correction (per unit of cbf/correction), or both"
             )
         self._record({"penalty": penalty, "per_correction": per_correction})
-        self.penalty = penalty
-        self.per_correction = per_correction
+        self.penalty, self.per_correction = penalty, per_correction
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Resets the env; its info holds the keys of a step, as 0."""

@@ -130,9 +130,7 @@ class _Robot:
         if not moving.any():
             raise ConfigurationError(f"no body {which} moves and has mass")
         if not (can_touch_the_world(model) & self._own).any():
-            raise UnsupportedEnvError(
-                f"no body {which} can touch the fixed world with friction: there is no balance to report"
-            )
+            raise UnsupportedEnvError(f"no body {which} can touch the fixed world with friction")
         self._massive = np.flatnonzero(moving)
         self.contacts = ContactReader(model)
         self.momentum = MomentumReader(model, self._massive)

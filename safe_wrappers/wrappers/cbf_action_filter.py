@@ -98,13 +98,11 @@ class CBFActionFilter(LayerWrapper):
         self.constraint_names = _unique([type(c).__name__ for c in self.constraints])
         self.plant: Plant = plant if plant is not None else default_plant(env)
         self.plant.bind(env)
-        self._low = np.asarray(space.low, dtype=np.float64)
-        self._high = np.asarray(space.high, dtype=np.float64)
+        self._low, self._high = np.asarray(space.low, np.float64), np.asarray(space.high, np.float64)
         self.filter = SafetyFilter(self.plant, self.constraints, fallback, solver, self._low, self._high)
         self._shape, self._dtype = space.shape, space.dtype
         self._warned: set[str] = set()
-        self.filter_seconds = 0.0
-        self.filter_calls = 0
+        self.filter_seconds, self.filter_calls = 0.0, 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env and forget the episode: commands in flight, the last action, the warning."""
@@ -136,8 +134,9 @@ class CBFActionFilter(LayerWrapper):
         usable: Array | None = proposed
         if not (readable and finite):
             if readable:
-                message = f"the policy's action is not finite ({proposed}); the fallback acts"
-                self._warn_once("nonfinite", message)
+                self._warn_once(
+                    "nonfinite", f"the policy's action is not finite ({proposed}); the fallback acts"
+                )
             usable, proposed = None, np.where(np.isfinite(proposed), proposed, 0.0)
         elif not inside:
             usable = np.clip(proposed, self._low, self._high)
@@ -183,13 +182,10 @@ class CBFActionFilter(LayerWrapper):
         unsafe = not lowest >= -_SAFE_TOLERANCE
         margin = lowest if math.isfinite(lowest) else 0.0
         if unsafe:
-            self._warn_once(
-                "unsafe",
-                f"the state is outside the safe set (cbf/margin = {margin:.3g}); the filter drives it "
-                "back where it can, and promises nothing until it is inside",
-                UnsafeStateWarning,
-                stacklevel=4,
+            message = (
+                f"the state is outside the safe set (cbf/margin = {margin:.3g}); nothing is promised there"
             )
+            self._warn_once("unsafe", message, UnsafeStateWarning, stacklevel=4)
         return margin, unsafe
 
     def _warn_once(

@@ -20,9 +20,8 @@ from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import plain_numbers
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
-from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step, WrapperRng
 from safe_wrappers.wrappers.common.receiver import SAME_STEP, CommandReceiver, receiver_inside
-from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 from safe_wrappers.wrappers.handover.queue import BASELINES, ChunkQueue, Command
 from safe_wrappers.wrappers.handover.sizes import ChunkSizes, Upsampling, blend_bounds
 
@@ -123,16 +122,11 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         self._clock_error_s = non_negative("clock_error_s", clock_error_s, "s")
         self._upsampling = Upsampling(sizes.entries, sizes.steps_per_entry)
         self._controls = space.shape[0]
-        self.action_space = gym.spaces.Box(
-            np.repeat(space.low[None], sizes.entries, axis=0),
-            np.repeat(space.high[None], sizes.entries, axis=0),
-            dtype=space.dtype,
-        )
+        low, high = (np.repeat(end[None], sizes.entries, axis=0) for end in (space.low, space.high))
+        self.action_space = gym.spaces.Box(low, high, dtype=space.dtype)
         self._fallback = FallbackController(env, fallback, plant)
         fewest, rate_limits = blend_bounds(sizes, space, self.control_dt, blend, blend_time, rate_limit)
-        self._queue = ChunkQueue(
-            space, self.control_dt, blend=blend, fewest=fewest, rate_limit=rate_limits, decay=decay
-        )
+        self._queue = ChunkQueue(space, self.control_dt, blend, fewest, rate_limits, decay)
         self._inside = receiver_inside(env)
         self._random = WrapperRng(type(self).__name__)
         self._warned = False
@@ -240,12 +234,10 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         limited = sum(c.limited for c in commands)
         if limited and not self._warned:
             self._warned = True
-            warnings.warn(
-                "a command was held back to keep rate_limit: the chunk is too short for a blend that keeps it, or "
-                "moves too fast by itself (handover/limited counts the control steps)",
-                UserWarning,
-                stacklevel=3,
+            message = (
+                "a chunk is too short for a blend that keeps rate_limit, or moves too fast (handover/limited)"
             )
+            warnings.warn(message, UserWarning, stacklevel=3)
         return {
             keys.HANDOVER_SEAM_JUMP: jump,
             keys.HANDOVER_PEAK_JERK: peak,

@@ -79,10 +79,7 @@ def refuse_own_cost(task: Any, info: dict[str, Any]) -> None:
     """A task that judges itself needs no other judge, and two would contradict each other."""
     for key in (keys.COST, keys.COST_SUBSTEP):
         if key in info:
-            raise ConfigurationError(
-                f"{task} reports a cost of its own (info[{key!r}]), which another judge would hide; leave the other "
-                "one out"
-            )
+            raise ConfigurationError(f"{task} reports a cost of its own (info[{key!r}]); use one of them")
 
 
 def _imported(name: str) -> Any:

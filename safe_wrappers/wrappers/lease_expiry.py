@@ -11,7 +11,6 @@ from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.control.handover.smoothstep import smoothstep
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.default import own_plant
 from safe_wrappers.plants.env_checks import refuse_changed_actions
@@ -23,24 +22,18 @@ from safe_wrappers.wrappers.common.fallback_controller import FallbackController
 from safe_wrappers.wrappers.common.layer import Array, Env, Reset, Step
 from safe_wrappers.wrappers.common.receiver import action_array, whole_steps
 from safe_wrappers.wrappers.lease.admission import Admission, Measured
-from safe_wrappers.wrappers.lease.stopping_budget import (
-    BoundBudget,
-    ClearanceFunction,
-    StoppingBudget,
-    budget_from,
-)
+from safe_wrappers.wrappers.lease.stopping_budget import BoundBudget, BudgetLike, StoppingBudget, budget_from
+
+_RENAMED = {
+    "longest_s": "max_lease_s",
+    "least_s": "min_lease_s",
+    "reach": "motion_limits",
+    "hold_s": "control_dt",
+}
+_MOVED = ("braking", "acceleration", "closing_speed", "top_speed")
 
 
-@deprecated_parameters(
-    renamed={
-        "longest_s": "max_lease_s",
-        "least_s": "min_lease_s",
-        "reach": "motion_limits",
-        "hold_s": "control_dt",
-    },
-    moved={"budget": StoppingBudget},
-    positional=("braking", "acceleration", "closing_speed", "top_speed"),
-)
+@deprecated_parameters(renamed=_RENAMED, moved={"budget": StoppingBudget}, positional=_MOVED)
 class LeaseExpiry(CommandGate):
     """Grants every fresh command a lease, and brakes when nothing fresh has come before it runs out.
 
@@ -101,7 +94,7 @@ class LeaseExpiry(CommandGate):
     def __init__(
         self,
         env: Env,
-        budget: StoppingBudget | dict[str, Any] | Constraint | ClearanceFunction,
+        budget: BudgetLike,
         *,
         detect_s: float = 0.0,
         confirm_s: float = 0.0,
@@ -125,18 +118,14 @@ class LeaseExpiry(CommandGate):
         self._record(arguments, budget=plain_data(budget), motion_limits=limits, plant=plant)
         self._max_lease_s = positive("max_lease_s", max_lease_s, "s")
         if self._max_lease_s < self.control_dt - self._same_s:
-            raise ConfigurationError(
-                f"max_lease_s = {max_lease_s} s is less than one control step, {self.control_dt} s: no command would "
-                "ever be executed"
-            )
+            step = f"one control step, {self.control_dt} s"
+            raise ConfigurationError(f"max_lease_s = {max_lease_s} s is less than {step}")
         self._min_lease_s = non_negative("min_lease_s", min_lease_s, "s")
         if self._min_lease_s > self._max_lease_s:
             raise ConfigurationError(f"min_lease_s = {min_lease_s} s is above max_lease_s = {max_lease_s} s")
         if self._min_lease_s > 0.0 and not self._filtered:
-            raise ConfigurationError(
-                f"min_lease_s = {min_lease_s} s without a CBFActionFilter inside would let a command drive into the "
-                "obstacle: leave it 0, or put the filter inside, LeaseExpiry(sw.protect(env), ...)"
-            )
+            example = "LeaseExpiry(sw.protect(env), ...)"
+            raise ConfigurationError(f"min_lease_s above 0 needs a CBFActionFilter inside: {example}")
         self._blend_steps = whole_steps(non_negative("blend_time", blend_time, "s"), self.control_dt)
         brake_blend_time = non_negative("brake_blend_time", brake_blend_time, "s")
         self._brake_steps = whole_steps(brake_blend_time, self.control_dt)
@@ -151,9 +140,9 @@ class LeaseExpiry(CommandGate):
         self._budget.bind(plant, self._fallback.constraint)
         if motion_limits is None and measured is not None:
             raise ConfigurationError("measured is for motion_limits, which is missing: give both, or neither")
-        self._admission = (
-            None if motion_limits is None else Admission(env, motion_limits, measured, self._low.size)
-        )
+        self._admission: Admission | None = None
+        if motion_limits is not None:
+            self._admission = Admission(env, motion_limits, measured, self._low.size)
         self._start({})
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:

@@ -18,8 +18,7 @@ from safe_wrappers.plants.env_checks import read_attribute
 from safe_wrappers.plants.mujoco.binding import control_interval
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step
-from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
+from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step, WrapperRng
 from safe_wrappers.wrappers.occlusion.sensor import Sensor, sensor_from
 from safe_wrappers.wrappers.occlusion.track import Track, track_from, tracked_things
 
@@ -90,18 +89,14 @@ class OcclusionPenalty(LayerWrapper):
         arguments = dict(locals())
         raw: Any = env.unwrapped
         if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
-            raise UnsupportedEnvError(
-                f"OcclusionPenalty casts rays in MuJoCo: it needs an env with .model and .data; {raw} has none"
-            )
+            raise UnsupportedEnvError(f"OcclusionPenalty needs MuJoCo's .model and .data; {raw} has none")
         LayerWrapper.__init__(self, env)
         if isinstance(tracks, str | dict) or not isinstance(tracks, Sequence) or not tracks:
             raise ConfigurationError(f"tracks is a list with at least one Track, got {tracks!r}")
         self.tracks = [track_from(t) for t in tracks]
         self.sensor = sensor_from(sensor)
         if self.sensor.velocity_std is not None and any(t.published is not None for t in self.tracks):
-            raise ConfigurationError(
-                "velocity_std: velocities are measured of bodies; of positions that the env publishes none are known"
-            )
+            raise ConfigurationError("velocity_std: velocities are measured of bodies alone")
         self.tolerance = positive("tolerance", tolerance, "m")
         self.weight = non_negative("weight", weight, "the task's reward per step")
         self.sigmas = positive("sigmas", sigmas, "standard deviations")
@@ -109,15 +104,9 @@ class OcclusionPenalty(LayerWrapper):
             raise ConfigurationError(f"axes is 'xy' or 'xyz', got {axes!r}")
         if not isinstance(observe, bool | np.bool_):
             raise ConfigurationError(f"observe is True or False, got {observe!r}")
-        self._record(
-            arguments,
-            tracks=[t.data() for t in self.tracks],
-            sensor=self.sensor.data(),
-            tolerance=self.tolerance,
-            weight=self.weight,
-            sigmas=self.sigmas,
-            observe=bool(observe),
-        )
+        plain = {name: getattr(self, name) for name in ("tolerance", "weight", "sigmas")}
+        parts = {"tracks": [t.data() for t in self.tracks], "sensor": self.sensor.data()}
+        self._record(arguments, **parts, **plain, observe=bool(observe))
         self._raw, self._d, self._random = raw, len(axes), WrapperRng("OcclusionPenalty")
         self._control_dt = control_interval(raw)
         self._matrix, self._noise = self.sensor.matrices(self._d)
@@ -150,10 +139,8 @@ class OcclusionPenalty(LayerWrapper):
     def _published(self, track: Track) -> Array:
         points = np.asarray(read_attribute(self.env, track.published or ""), dtype=np.float64)
         if points.ndim != 2 or points.shape[1] not in (self._d, 3) or not len(points):
-            raise ConfigurationError(
-                f"the env's {track.published} must be positions of shape (k, {self._d}) or (k, 3), k >= 1, got shape "
-                f"{points.shape}; how many there are is read when the wrapper is made"
-            )
+            wanted = f"positions of shape (k, {self._d}) or (k, 3), k >= 1"
+            raise ConfigurationError(f"the env's {track.published} must be {wanted}, got {points.shape}")
         return points
 
     def _truth(self) -> tuple[Array, Array | None]:
@@ -172,10 +159,8 @@ class OcclusionPenalty(LayerWrapper):
                 points = self._published(track)
                 which = [i for i, thing in enumerate(self._things) if thing.track is track]
                 if len(points) != len(which):
-                    raise ConfigurationError(
-                        f"the env's {track.published} had {len(which)} points when the wrapper was made, and has "
-                        f"{len(points)} now; things that come and go cannot be tracked"
-                    )
+                    counts = f"had {len(which)} points when the wrapper was made, and has {len(points)} now"
+                    raise ConfigurationError(f"the env's {track.published} {counts}")
                 positions[which, 2] = sight.position[2]  # a point of the plane is looked at level
                 positions[which, : points.shape[1]] = points
         return positions, velocities
@@ -188,10 +173,8 @@ class OcclusionPenalty(LayerWrapper):
             self._look_at(self._raw.model)
             names = [thing.name for thing in self._things]
             if names != self.track_names:
-                raise ConfigurationError(
-                    f"the env has another model than when the wrapper was made, with other things to track: "
-                    f"{', '.join(names)} and not {', '.join(self.track_names)}"
-                )
+                tracked = f"{', '.join(names)} and not {', '.join(self.track_names)}"
+                raise ConfigurationError(f"the env has another model, with other things: {tracked}")
         self._time = float(self._raw.data.time)
         self._sight.read(self._raw.data)
         self._start()
@@ -228,10 +211,8 @@ class OcclusionPenalty(LayerWrapper):
         if abs(elapsed - self._control_dt) < 1e-9:
             return self._control_dt
         if elapsed < 0.0:
-            raise SafeWrappersError(
-                f"the simulation's time ran backwards by {-elapsed:g} s within a step; an estimate cannot. Reset the "
-                "env instead of setting an earlier state"
-            )
+            gone = f"backwards by {-elapsed:g} s within a step"
+            raise SafeWrappersError(f"the simulation's time ran {gone}. Reset the env instead")
         return elapsed
 
     def _start(self) -> None:
@@ -299,21 +280,13 @@ def _with_tracks(space: gym.Space[Any], size: int) -> gym.Space[Any]:
     """The observation space with so many numbers more."""
     if isinstance(space, gym.spaces.Dict):
         if "tracks" in space.spaces:
-            raise UnsupportedEnvError(
-                "the observation has an entry 'tracks' already, which the estimates would replace; rename it inside, "
-                "or pass observe=False"
-            )
+            raise UnsupportedEnvError("the observation has an entry 'tracks' already; pass observe=False")
         more = gym.spaces.Box(-np.inf, np.inf, (size,), dtype=np.float64)
         return gym.spaces.Dict({**space.spaces, "tracks": more})
-    if (
-        isinstance(space, gym.spaces.Box)
-        and len(space.shape) == 1
-        and np.issubdtype(space.dtype, np.floating)
-    ):
-        bound = np.full(size, np.inf)
-        low, high = np.concatenate([space.low, -bound]), np.concatenate([space.high, bound])
-        return gym.spaces.Box(low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype.type)
-    raise UnsupportedEnvError(
-        f"with observe=True the observation must be a flat Box of floats or a Dict, got {space}; flatten it inside, "
-        "or pass observe=False"
-    )
+    flat = isinstance(space, gym.spaces.Box) and len(space.shape) == 1
+    if not (flat and np.issubdtype(space.dtype or object, np.floating)):
+        raise UnsupportedEnvError(f"no flat Box of floats and no Dict: {space}; pass observe=False")
+    box: Any = space
+    bound = np.full(size, np.inf)
+    low, high = np.concatenate([box.low, -bound]), np.concatenate([box.high, bound])
+    return gym.spaces.Box(low.astype(box.dtype), high.astype(box.dtype), dtype=box.dtype.type)

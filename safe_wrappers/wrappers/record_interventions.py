@@ -173,8 +173,7 @@ class RecordInterventions(LayerWrapper):
         return observation, reward, terminated, truncated, info
 
     def _clear(self) -> None:
-        self._steps = 0
-        self._return = 0.0
+        self._steps, self._return = 0, 0.0
         self._tallies = [_Tally(figure) for figure in keys.EPISODE]
 
 
@@ -202,10 +201,8 @@ def _continue_file(path: Path) -> None:
             file.truncate(len(whole))
     header = whole.split(b"\n", 1)[0].decode(errors="replace").strip()
     if header and header != ",".join(COLUMNS):
-        raise ConfigurationError(
-            f"RecordInterventions: {str(path)!r} exists and has other columns ({header!r}; expected"
-            f" {','.join(COLUMNS)!r}). Give another path, or move that file away."
-        )
+        columns = f"has other columns ({header!r}; expected {','.join(COLUMNS)!r})"
+        raise ConfigurationError(f"RecordInterventions: {str(path)!r} {columns}. Give another path.")
 
 
 def _append_row(path: Path, row: dict[str, int | float | bool]) -> None:

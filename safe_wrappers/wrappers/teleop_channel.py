@@ -110,9 +110,8 @@ class TeleopChannel(CommandGate):
         choices = {"coding": Coding, "passivity": Passivity, "missing": Missing, "wave_rule": Rule}
         for name, known in choices.items():
             if arguments[name] not in get_args(known):
-                raise ConfigurationError(
-                    f"{name} is one of {', '.join(get_args(known))}; got {arguments[name]!r}"
-                )
+                there = ", ".join(get_args(known))
+                raise ConfigurationError(f"{name} is one of {there}; got {arguments[name]!r}")
         if isinstance(seed, bool) or not isinstance(seed, int):
             raise ConfigurationError(f"seed is a whole number, got {seed!r}")
         self._record(
@@ -165,13 +164,14 @@ class TeleopChannel(CommandGate):
         self._send_up(self._sendable(action), now_s)
         arrived = self._up.receive(now_s)
         command, operators = self._in_force()
-        order = self._coding.far(arrived, self._up.newest.load, self._flow_of(command) if operators else None)
-        if order.flow is not None:
-            command, operators = self._with_flow(command, order.flow), True
-        round_trip_s = now_s - order.seen_s
+        plain = self._flow_of(command) if operators else None
+        flow, seen_s = self._coding.far(arrived, self._up.newest.load, plain)
+        if flow is not None:
+            command, operators = self._with_flow(command, flow), True
+        round_trip_s = now_s - seen_s
         ceiling_s, clearance_m = self._measured
         if self._watch is not None:
-            self._watch.judge(self._boxed(command), order.seen_s, round_trip_s, now_s)
+            self._watch.judge(self._boxed(command), seen_s, round_trip_s, now_s)
         if self.revoked:
             command, operators = self._braked(), False
         executed, (observation, reward, terminated, truncated, info) = self._execute(command)

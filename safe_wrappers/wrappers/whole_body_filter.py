@@ -85,27 +85,21 @@ class WholeBodyFilter(CBFActionFilter):
         arguments = dict(locals())
         model = getattr(env.unwrapped, "model", None)
         if not isinstance(model, mujoco.MjModel):
-            raise UnsupportedEnvError(
-                f"WholeBodyFilter needs an env with MuJoCo's .model and .data; {env} has none"
-            )
+            raise UnsupportedEnvError(f"WholeBodyFilter needs MuJoCo's .model and .data; {env} has none")
         if joint_tolerance is not None:
             joint_tolerance = non_negative("joint_tolerance", joint_tolerance, "rad or m")
             refuse_uncovered_stops(model)
             if not stops(model)[0]:
-                raise UnsupportedEnvError(
-                    "no driven joint of this model has a range: joint_tolerance=None leaves the joints alone"
-                )
+                raise UnsupportedEnvError("no driven joint has a range: pass joint_tolerance=None")
         elif horizon is not None:
             raise ConfigurationError(
-                "horizon is how far to look ahead for the joints, which joint_tolerance=None leaves alone"
+                "horizon is how far joints are foreseen; joint_tolerance=None ignores them"
             )
         constraints: list[Constraint]
         if contacts in ("pyramid", "cone"):
             for name in ("tolerance", "bodies", "horizon"):
                 if arguments[name] is not None:
-                    raise ConfigurationError(
-                        f'{name} is for contacts="forecast"; the whole-body program of contacts={contacts!r} has none'
-                    )
+                    raise ConfigurationError(f'{name} is for contacts="forecast", not for {contacts!r}')
             cone: Any = "exact" if contacts == "cone" else "pyramid"
             constraints = [Stance(friction_share, cone, joint_tolerance=joint_tolerance, zmp_inset=zmp_inset)]
         elif contacts == "forecast":
@@ -114,20 +108,13 @@ class WholeBodyFilter(CBFActionFilter):
             if zmp_inset is not None:
                 constraints.append(SupportMargin(zmp_inset))
             if joint_tolerance is not None:
-                constraints.append(_within(model, joint_tolerance, HOLDS if horizon is None else horizon))
+                joints, low, high = stops(model)
+                ranges = (low - joint_tolerance).tolist(), (high + joint_tolerance).tolist()
+                names = [model.joint(j).name for j in joints]
+                horizon = HOLDS if horizon is None else horizon
+                constraints.append(JointPositionLimit(*ranges, joints=names, horizon=horizon))
         else:
             raise UnknownNameError(f'contacts is "forecast", "pyramid" or "cone", got {contacts!r}')
         plant = own_plant(plant)
         self._record(arguments, bodies=None if bodies is None else list(bodies), plant=plant)
         CBFActionFilter.__init__(self, env, constraints, plant=plant, fallback=fallback, solver=solver)
-
-
-def _within(model: mujoco.MjModel, tolerance: float, horizon: int) -> JointPositionLimit:
-    """The joints' own ranges, widened by the tolerance, rad or m."""
-    joints, low, high = stops(model)
-    return JointPositionLimit(
-        lower=(low - tolerance).tolist(),
-        upper=(high + tolerance).tolist(),
-        joints=[model.joint(j).name for j in joints],
-        horizon=horizon,
-    )

@@ -13,7 +13,8 @@ from scipy.optimize import lsq_linear, minimize
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
-from safe_wrappers.filter.projection import Status, box_least_squares, project
+from safe_wrappers.filter.problem import Status
+from safe_wrappers.filter.projection import box_least_squares, project
 
 pytestmark = pytest.mark.filterwarnings("ignore::qpsolvers.warnings.SparseConversionWarning")
 

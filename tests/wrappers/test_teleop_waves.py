@@ -242,13 +242,13 @@ def test_what_a_machine_took_unpaid_is_paid_by_the_next_waves():
     for sequence in range(14):
         wave = waves.near(np.array([0.5]))  # sqrt(2 b) v = 1 sqrt(W): half a watt
         waves.sent(True, sequence, wave, False)
-        order = waves.far([Packet(sequence, Up(None, 0.0, wave))], Up(None, 0.0, wave), None)
+        flow, _ = waves.far([Packet(sequence, Up(None, 0.0, wave))], Up(None, 0.0, wave), None)
         # At first it resists with 5 N although it said 0; then as it says.
         machine.true = np.array([5.0 if sequence == 0 else 0.0])
-        back, taken = waves.settle(order.flow, None, True)
+        back, taken = waves.settle(flow, None, True)
         waves.sent(False, sequence, back, False)
-        out += float(taken.effort @ taken.flow + 0.5 * back @ back) * tick
-        flows.append(float(order.flow[0]))
+        out += float(taken[0] @ taken[1] + 0.5 * back @ back) * tick
+        flows.append(float(flow[0]))
         if sequence == 0:
             assert out == pytest.approx(5.0 * tick)
     # 4.5 mJ too much: the next nine waves of half a millijoule are kept for it.

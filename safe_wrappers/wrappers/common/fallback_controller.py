@@ -36,10 +36,8 @@ class FallbackController:
             self.constraint = None if constraint is None else constraint.bind(plant)
             known = self.constraint is not None and self.constraint.has_backup
             if choice == "brake" and not (known or plant.can_brake):
-                raise ConfigurationError(
-                    f'"brake" needs a MujocoPlant, which knows what moves; with a {type(plant).__name__} choose '
-                    '"hold", "zero" or a function of the plant'
-                )
+                others = f'with a {type(plant).__name__} choose "hold", "zero" or a function of the plant'
+                raise ConfigurationError(f'"brake" needs a MujocoPlant; {others}')
         self._fallback = Fallback(choice, [] if self.constraint is None else [self.constraint])
         self.reset()
 

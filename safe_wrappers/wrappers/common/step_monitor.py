@@ -62,11 +62,8 @@ class StepMonitor(LayerWrapper, ABC):
     def _warn(self, raw: Any) -> None:
         if not self._warned:
             self._warned = True
-            warnings.warn(
-                f"a control step of {raw}, made once more, does not end where the env's did: the env "
-                "changes its inputs or its state between physics substeps, or MuJoCo has reset it. For such steps "
-                f"{type(self).__name__} reads only the contacts that the step has left behind, and says so in "
-                f"info[{self.partial!r}]; forces before are missed",
-                UserWarning,
-                stacklevel=3,
+            message = (
+                f"a control step of {raw}, made once more, ends elsewhere: the env changes inputs or state between "
+                f"substeps, or MuJoCo has reset it; only the contacts left behind are read (info[{self.partial!r}])"
             )
+            warnings.warn(message, UserWarning, stacklevel=3)

@@ -12,16 +12,15 @@ from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.env_checks import check_timing, wrappers_of
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step, WrapperRng
 from safe_wrappers.wrappers.common.receiver import CommandReceiver, receiver_inside
-from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
 
 
 class Carried(NamedTuple):
-    """A command on its way: what the policy gave, and when the observation was returned that it was made from, s."""
+    """A command on its way."""
 
-    action: Any
-    observed_s: float
+    action: Any  # as the policy gave it
+    observed_s: float  # when the observation was returned that it was made from, s
 
 
 class Fault(LayerWrapper, CommandReceiver, ABC):
@@ -50,9 +49,8 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
         self._inside = receiver_inside(env)
         self.control_dt = 0.0 if self._inside is not None else check_timing(env, control_dt)
         if self._inside is not None and control_dt is not None:
-            raise ConfigurationError(
-                f"{type(self._inside).__name__} inside counts the time: leave control_dt out"
-            )
+            inside = type(self._inside).__name__
+            raise ConfigurationError(f"{inside} inside counts the time: leave control_dt out")
         # Nested faults of one kind must not strike together.
         faults = [inner for inner in wrappers_of(env) if isinstance(inner, Fault)]
         same = sum(isinstance(inner, type(self)) for inner in faults)
@@ -86,11 +84,9 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
 
     @property
     def now_s(self) -> float:
-        """Seconds of the episode so far."""
         return super().now_s if self._inside is None else self._inside.now_s
 
     def admits(self, end: NDArray[np.float64], steps: int) -> bool:
-        """What the receiver inside says."""
         return self._inside is None or self._inside.admits(end, steps)
 
     def begin(self) -> None:
@@ -98,12 +94,7 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
 
     @abstractmethod
     def carry(self, given: Carried | None, now_s: float) -> Carried | None:
-        """What arrives at the robot now.
-
-        Args:
-            given: What the policy gave now; None if a fault outside lost it.
-            now_s: Seconds of the episode so far.
-        """
+        """What arrives at the robot now, of what the policy gave now; None if a fault outside lost it."""
 
     def _start(self) -> None:
         self._steps_done = 0

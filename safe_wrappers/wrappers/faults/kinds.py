@@ -2,12 +2,12 @@
 
 import math
 from abc import abstractmethod
+from typing import ClassVar
 
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.common.layer import Env
-from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
+from safe_wrappers.wrappers.common.layer import Env, WrapperRng
 from safe_wrappers.wrappers.faults.fault import Carried, Fault
 
 
@@ -20,11 +20,22 @@ def probability(name: str, value: float) -> float:
 
 
 class Struck(Fault):
-    """A fault that strikes some of the commands."""
+    """Loses the commands that it strikes, or sends the one from before instead, with its old observation time."""
+
+    repeats: ClassVar[bool] = False
 
     @abstractmethod
     def strikes(self, now_s: float) -> bool:
         """Whether it strikes the command of now; called once per step."""
+
+    def begin(self) -> None:
+        self._before: Carried | None = None
+
+    def carry(self, given: Carried | None, now_s: float) -> Carried | None:
+        if self.strikes(now_s):
+            return self._before if self.repeats else None
+        self._before = given if given is not None else self._before
+        return given
 
 
 @deprecated_parameters(renamed={"hold_s": "control_dt"})
@@ -36,7 +47,6 @@ class ShareFault(Struck):
         super().__init__(env, control_dt, share=self._share)
 
     def strikes(self, now_s: float) -> bool:
-        """Whether it strikes the next command."""
         return bool(self.random.draw.random() < self._share)
 
 
@@ -53,11 +63,9 @@ class Jitter(Fault):
         super().__init__(env, control_dt, longest_s=self._longest_s)
 
     def begin(self) -> None:
-        """Nothing is on its way."""
         self._coming: list[tuple[float, Carried]] = []
 
     def carry(self, given: Carried | None, now_s: float) -> Carried | None:
-        """The newest command that is there."""
         if given is not None:
             self._coming.append((now_s + self.random.draw.uniform(0.0, self._longest_s), given))
         there = [command for due_s, command in self._coming if due_s <= now_s]
@@ -87,7 +95,6 @@ class ClockSkew(Fault):
         self._offset_s, self._drift = offset_s, drift
 
     def carry(self, given: Carried | None, now_s: float) -> Carried | None:
-        """The command with another observation time."""
         if given is None:
             return None
         return Carried(given.action, (1.0 + self._drift) * given.observed_s + self._offset_s)
@@ -124,49 +131,28 @@ class OnOffFault(Struck):
         super().__init__(env, control_dt, mean_between_s=mean_between_s, mean_length_s=mean_length_s)
 
     def begin(self) -> None:
-        """An episode begins without the fault."""
+        super().begin()
         self._process.begin(self.random)
 
     def strikes(self, now_s: float) -> bool:
-        """Whether the fault is on now."""
         return self._process.is_on(now_s, self.random)
 
 
-class Loses(Struck):
-    """Base of the faults that lose the commands that they strike."""
-
-    def carry(self, given: Carried | None, now_s: float) -> Carried | None:
-        """The command, or nothing."""
-        return None if self.strikes(now_s) else given
-
-
-class Repeats(Struck):
-    """Base of the faults that send the command from before instead, with its old observation time."""
-
-    def begin(self) -> None:
-        """Nothing has arrived that could be repeated."""
-        super().begin()
-        self._before: Carried | None = None
-
-    def carry(self, given: Carried | None, now_s: float) -> Carried | None:
-        """The command, or the one from before."""
-        if self.strikes(now_s):
-            return self._before
-        self._before = given if given is not None else self._before
-        return given
-
-
-class DroppedRefreshes(Loses, ShareFault):
+class DroppedRefreshes(ShareFault):
     """Loses a `share` of the commands, from 0 to 1, each by itself."""
 
 
-class RepeatedCommands(Repeats, ShareFault):
+class RepeatedCommands(ShareFault):
     """Loses a `share` of the commands, from 0 to 1, each by itself, and sends the last one once more."""
 
+    repeats = True
 
-class Outages(Loses, OnOffFault):
+
+class Outages(OnOffFault):
     """Loses all commands during outages of `mean_length_s`, `mean_between_s` apart, s on average."""
 
 
-class FrozenPolicy(Repeats, OnOffFault):
+class FrozenPolicy(OnOffFault):
     """Repeats the last command from before for `mean_length_s`, then works for `mean_between_s`, on average, s."""
+
+    repeats = True

@@ -39,14 +39,6 @@ class Chunk(NamedTuple):
     due: int  # control step at which it is there
 
 
-class _Fade(NamedTuple):
-    """A change of the source under way: from a latched command into the commands of the new source."""
-
-    latched: Array
-    steps: int
-    done: int
-
-
 class ChunkQueue:
     """Which command comes next, counted in control steps.
 
@@ -66,7 +58,6 @@ class ChunkQueue:
         self,
         space: gym.spaces.Box,
         control_dt: float,
-        *,
         blend: str,
         fewest: int,
         rate_limit: Array,
@@ -96,7 +87,9 @@ class ChunkQueue:
         self._averaged: list[Chunk] = []
         self._in_force = self._source
         self._acting: str | None = None
-        self._fade: _Fade | None = None
+        self._fade: tuple[Array, int, int] | None = (
+            None  # a change of source: the latched command, steps, done
+        )
 
     def submit(self, commands: Array, observed: int, due: int) -> bool:
         """A chunk, shape (h, m), observed at a control step, is on its way; False if it is refused.
@@ -136,7 +129,7 @@ class ChunkQueue:
             # A longer chunk that takes over blends by itself; everything else starts from the last command.
             if not seam and self._blend in BLENDS:
                 blend_steps = self._fade_steps(control)
-                self._fade = _Fade(self._sent[-1], blend_steps, 0)
+                self._fade = (self._sent[-1], blend_steps, 0)
             seam = True
         self._acting = acting
         sent, held = self._sendable(self._faded(control))
@@ -171,17 +164,10 @@ class ChunkQueue:
         if self._blend == REPLACE or len(newest.commands) == 1:
             self._plan, self._limited = fresh, np.zeros(len(fresh), dtype=bool)
             return self._blend == REPLACE and len(self._sent) > 0, 0
-        joined = join(
-            self._sent,
-            self._plan,
-            fresh,
-            self._control_dt,
-            blend=self._blend,  # type: ignore[arg-type]  # checked by the wrapper
-            fewest=self._fewest,
-            rate_limit=self._rate_limit,
-            low=self._low,
-            high=self._high,
-        )
+        blend: Any = self._blend  # checked by the wrapper
+        bounds: dict[str, Any] = {"rate_limit": self._rate_limit, "low": self._low, "high": self._high}
+        motion = self._sent, self._plan, fresh
+        joined = join(*motion, self._control_dt, blend=blend, fewest=self._fewest, **bounds)
         self._plan, self._limited = joined.plan, joined.limited
         self._fade = None
         return len(self._sent) > 0, joined.steps
@@ -217,7 +203,7 @@ class ChunkQueue:
         if done >= steps:
             self._fade = None
             return control
-        self._fade = _Fade(latched, steps, done + 1)
+        self._fade = (latched, steps, done + 1)
         weight = float(smoothstep((done + 1.0) / (steps + 1.0)))
         return np.asarray(latched + weight * (control - latched))
 

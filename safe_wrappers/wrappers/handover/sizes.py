@@ -33,26 +33,23 @@ class ChunkSizes(NamedTuple):
         horizon = whole_number("execution_horizon", execution_horizon, 1, "control steps")
         apart = whole_number("steps_per_entry", steps_per_entry, 1, "control steps")
         if entries == 1 and apart > 1:
-            raise ConfigurationError(
-                f"steps_per_entry = {apart}, but one entry leads to no other: choose a longer chunk_size"
-            )
+            raise ConfigurationError(f"steps_per_entry = {apart}: one entry leads to no other")
         size = (entries - 1) * apart + 1
         delay = _delay(inference_delay)
         if horizon > size:
+            has = _size(entries, apart, "")
             raise ConfigurationError(
-                f"execution_horizon = {horizon} is more than a chunk has, {_size(entries, apart, '')}: it would run "
-                f"dry; choose it up to {size}, or longer chunks"
+                f"execution_horizon = {horizon} is more than {has}: choose it up to {size}"
             )
         if not delay[1] <= horizon <= size - delay[1]:
-            fits = (
-                f"choose s from {max(delay[1], 1)} to {size - delay[1]}, or longer chunks"
-                if 2 * delay[1] <= size
-                else f"no s fits, choose H >= {2 * delay[1]}"
+            late, between = (
+                delay[1],
+                f"choose s from {max(delay[1], 1)} to {size - delay[1]}, or longer chunks",
             )
+            fits = between if 2 * late <= size else f"no s fits, choose H >= {2 * late}"
             raise ConfigurationError(
-                f"inference_delay d = {delay[1]}, execution_horizon s = {horizon} and {_size(entries, apart, ' H')} "
-                f"break d <= s <= H - d: a chunk that comes {delay[1]} control steps late has "
-                f"{max(size - delay[1], 0)} commands left, for the {horizon} until the next; {fits}"
+                f"inference_delay d = {late}, execution_horizon s = {horizon} and {_size(entries, apart, ' H')} "
+                f"break d <= s <= H - d: a late chunk has {max(size - late, 0)} commands left; {fits}"
             )
         return cls(entries, apart, size, horizon, delay)
 
@@ -66,37 +63,31 @@ def blend_bounds(
     rate_limit: float | Sequence[float] | None,
 ) -> tuple[int, Array]:
     """The fewest steps of a blend, and the rate limit of every component, shape (m,), infinite for none."""
+    fewest, limits = 0, np.full(space.shape, np.inf)
     if blend in BASELINES:
         if blend_time is not None or rate_limit is not None:
-            raise ConfigurationError(
-                f"blend={blend!r} is a baseline that bounds nothing: leave blend_time and rate_limit out, or choose "
-                f"{', '.join(BLENDS)}"
-            )
-        return 0, np.full(space.shape, np.inf)
-    fewest, limits = 0, np.full(space.shape, np.inf)
+            bounded = ", ".join(BLENDS)
+            baseline = f"blend={blend!r} is a baseline that bounds nothing"
+            raise ConfigurationError(f"{baseline}: blend_time and rate_limit are for {bounded}")
+        return fewest, limits
     if blend_time is not None:
         fewest = max(whole_steps(positive("blend_time", blend_time, "s"), control_dt) - 1, 1)
         available = sizes.chunk - sizes.delay[1]
         if fewest >= available and sizes.chunk > 1:
-            raise ConfigurationError(
-                f"blend_time = {blend_time} s is longer than what a chunk has left when it takes over, {available} "
-                f"control steps of {control_dt} s: choose a longer chunk_size or a shorter blend_time"
-            )
+            left = f"{available} control steps of {control_dt} s"
+            longer = f"blend_time = {blend_time} s is longer than a chunk's rest, {left}"
+            raise ConfigurationError(f"{longer}: choose a longer chunk_size or a shorter blend_time")
     if rate_limit is not None:
         limits = _rate_limits(rate_limit, limits.size)
         resolution = _rounding(space)
         if (limits * control_dt <= resolution).any():
-            raise ConfigurationError(
-                f"rate_limit = {rate_limit} per second is not above what {space.dtype} resolves in steps of "
-                f"{control_dt} s, {resolution / control_dt:.3g}: choose a larger one"
-            )
+            least = f"what {space.dtype} resolves in {control_dt} s, {resolution / control_dt:.3g} per second"
+            raise ConfigurationError(f"rate_limit = {rate_limit} is not above {least}: choose a larger one")
     if blend_time is None and rate_limit is None:
         fewest = sizes.chunk - sizes.horizon - sizes.delay[1]  # the least left-over
         if fewest == 0:
-            raise ConfigurationError(
-                f"chunk_size = {sizes.chunk}, execution_horizon = {sizes.horizon} and inference_delay = "
-                f"{sizes.delay[1]} leave no left-over to blend with: pass rate_limit or blend_time"
-            )
+            given = f"chunk_size {sizes.chunk}, execution_horizon {sizes.horizon}, inference_delay {sizes.delay[1]}"
+            raise ConfigurationError(f"{given}: no left-over to blend with: pass rate_limit or blend_time")
     return fewest, limits
 
 
@@ -120,9 +111,8 @@ def _rate_limits(rate_limit: Any, controls: int) -> Array:
     if not isinstance(rate_limit, list | tuple | np.ndarray):
         return np.full(controls, positive("rate_limit", rate_limit, unit))
     if len(rate_limit) != controls:
-        raise ConfigurationError(
-            f"rate_limit is one number, or one for each of the {controls} action components; got {rate_limit!r}"
-        )
+        wanted = f"one number, or one for each of the {controls} action components"
+        raise ConfigurationError(f"rate_limit is {wanted}; got {rate_limit!r}")
     return np.array([positive("rate_limit", each, unit) for each in rate_limit])
 
 

@@ -1,6 +1,6 @@
 """Admission: whether a chunk of position setpoints may be executed at all: is its end within reach, in its time?"""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from safe_wrappers.wrappers.common.layer import Array, Env
 
 Measured = Callable[[Env], tuple[ArrayLike, ...]]
 """Takes the env; returns what the actions are setpoints of, velocities and, if known, accelerations, shapes (m,)."""
+_MEASURED = "a function of the env that returns positions (of which actions are setpoints), velocities"
 
 
 class Admission:
@@ -21,14 +22,9 @@ class Admission:
     time. `measured` None reads the lengths and velocities of the MuJoCo actuators; `controls` is m.
     """
 
-    def __init__(
-        self, env: Env, motion_limits: Mapping[str, Any], measured: Measured | None, controls: int
-    ) -> None:
+    def __init__(self, env: Env, motion_limits: Any, measured: Measured | None, controls: int) -> None:
         if measured is None and not hasattr(env.unwrapped, "data"):
-            raise UnsupportedEnvError(
-                "motion_limits needs to know where the machine is: pass measured, a function of the env that returns "
-                "the positions that the actions are setpoints of, and their velocities"
-            )
+            raise UnsupportedEnvError(f"no position known: pass measured, {_MEASURED}")
         try:
             given = dict(motion_limits)
             arrival = given.pop("arrival", "moving")
@@ -37,20 +33,17 @@ class Admission:
         except (TypeError, ValueError) as error:
             if isinstance(error, ConfigurationError):
                 raise
+            wanted = f"each a number or one for each of the {controls} action components"
             raise ConfigurationError(
-                'motion_limits is {"max_acceleration": ..., "max_speed": ..., "max_jerk": ..., "arrival": "moving" '
-                'or "rest"}, all but the first at will, the limits each a number or one for each of the '
-                f"{controls} action components; got {motion_limits!r}"
+                'motion_limits is {"max_acceleration": ..., "max_speed": ..., "max_jerk": ..., "arrival": ...}, '
+                f"{wanted}; got {motion_limits!r}"
             ) from None
         if arrival not in ("moving", "rest"):
             raise UnknownNameError(f"arrival is 'moving' or 'rest', got {arrival!r}")
         self._rest = arrival == "rest"
         self._needs_acceleration = self._rest and bool(np.isfinite(self._limits.arrays[2]).any())
         if self._needs_acceleration and measured is None:
-            raise ConfigurationError(
-                "arrival at rest with limited jerk starts from the measured acceleration, which MuJoCo's actuators "
-                "do not give: pass measured, a function of the env that returns positions, velocities, accelerations"
-            )
+            raise ConfigurationError(f"arrival at rest: pass measured, {_MEASURED}, accelerations")
         self._env, self._measured = env, measured
 
     def admits(self, end: Array, duration_s: float) -> bool:
@@ -60,9 +53,8 @@ class Admission:
         if not self._rest:
             return bool(admits(end, position, velocity, duration_s, v_max, a_max, jerk, acceleration).all())
         here = 0.0 if acceleration is None else acceleration
-        return bool(
-            jerk_limited_time((position, velocity, here), (end, 0.0, 0.0), self._limits) <= duration_s
-        )
+        least_s = jerk_limited_time((position, velocity, here), (end, 0.0, 0.0), self._limits)
+        return bool(least_s <= duration_s)
 
     def _state(self) -> tuple[ArrayLike, ArrayLike, ArrayLike | None]:
         if self._measured is None:
@@ -70,8 +62,6 @@ class Admission:
             return data.actuator_length, data.actuator_velocity, None
         state = self._measured(self._env)
         if len(state) != 3 and (len(state) != 2 or self._needs_acceleration):
-            raise ConfigurationError(
-                "measured returns positions and velocities, and for an arrival at rest with limited jerk also "
-                f"accelerations; got {len(state)} values"
-            )
+            wanted = _MEASURED + (", accelerations" if self._needs_acceleration else "")
+            raise ConfigurationError(f"measured is {wanted}; got {len(state)} values")
         return state[0], state[1], state[2] if len(state) == 3 else None

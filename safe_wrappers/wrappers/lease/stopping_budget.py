@@ -60,10 +60,8 @@ class StoppingBudget:
         if isinstance(given, dict | Constraint):
             object.__setattr__(self, "clearance", constraint_from(given))
         elif isinstance(given, type) or not callable(given):
-            raise ConfigurationError(
-                "clearance is a constraint, such as sw.constraints.Clearance(...), or a function of the env that "
-                f"returns the clearance in m and the approach speed in m/s; got {given!r}"
-            )
+            function = "a function of the env that returns clearances in m and approach speeds in m/s"
+            raise ConfigurationError(f"clearance is a constraint or {function}; got {given!r}")
         check_fields(self, non_negative, ["localisation", "margin"], "m")
         check_fields(self, non_negative, ["act_s"], "s")
         check_fields(self, non_negative, ["acceleration"], "m/s^2")
@@ -71,37 +69,26 @@ class StoppingBudget:
         check_fields(self, positive, ["top_speed"], "m/s")
         check_fields(self, positive, ["closing_speed"], "the constraint's unit per second")
         name = type(self.clearance).__name__
-        if not self.measures_approach and self.closing_speed is None:
-            raise ConfigurationError(
-                f"{name} does not say how fast it is approached: give closing_speed, the fastest that its value may "
-                "fall, in its unit per second"
-            )
-        if not self.measures_approach and (self.braking, self.acceleration, self.top_speed) != (None,) * 3:
-            raise ConfigurationError(
-                f"the value of {name} counts braking already: give closing_speed alone, without braking, "
-                "acceleration and top_speed"
-            )
         if not self.measures_approach:
+            if self.closing_speed is None:
+                raise ConfigurationError(f"{name} does not say how fast it is approached: give closing_speed")
+            if (self.braking, self.acceleration, self.top_speed) != (None,) * 3:
+                raise ConfigurationError(f"{name} counts braking already: give closing_speed alone")
             return
         if self.braking is None and not isinstance(self.clearance, Clearance):
-            raise ConfigurationError(
-                "braking is missing: a verified lower bound on the deceleration of the fallback, in m/s^2"
-            )
+            raise ConfigurationError("braking is missing: the least deceleration of the fallback, m/s^2")
         if self.acceleration is None:
-            raise ConfigurationError(
-                "acceleration is missing: the largest approach acceleration that any command may cause, in m/s^2; "
-                "0 only for a machine that cruises at constant speed"
-            )
+            raise ConfigurationError("acceleration is missing: the largest that any command may cause, m/s^2")
         if self.closing_speed is not None:
-            raise ConfigurationError(
-                "closing_speed is for constraints whose value is all that is known; here the approach speed is "
-                "measured: give acceleration (and top_speed)"
-            )
+            raise ConfigurationError("closing_speed is for constraints that measure no approach speed")
 
     @property
     def measures_approach(self) -> bool:
         """Whether approach speeds are measured, and not only bounded by `closing_speed`."""
         return not isinstance(self.clearance, Constraint) or self.clearance.measures_approach
+
+
+BudgetLike = StoppingBudget | dict[str, Any] | Constraint | ClearanceFunction
 
 
 def budget_from(given: Any) -> StoppingBudget:
@@ -131,9 +118,8 @@ class BoundBudget:
             self._stop["braking"] = braking
             if isinstance(self.constraint, Clearance):
                 # Its rows are then those of this budget.
-                self.constraint = replace(
-                    self.constraint, braking=braking, margin=margin, state_error=localisation
-                )
+                own_bounds: Any = {"braking": braking, "margin": margin, "state_error": localisation}
+                self.constraint = replace(self.constraint, **own_bounds)
 
     def plant_of(self, plant: Plant | None) -> Plant | None:
         """The plant given, else the env's MuJoCo model where the constraint needs one; to be bound before `bind`."""
@@ -222,8 +208,6 @@ class BoundBudget:
             clearance, speed = (np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in answer)
             clearance, speed = np.broadcast_arrays(clearance, speed)
         except (TypeError, ValueError):
-            raise ConfigurationError(
-                "the clearance function must return two things of the same shape, clearances in m and approach "
-                f"speeds in m/s; got {answer!r}"
-            ) from None
+            wanted = "clearances in m and approach speeds in m/s, of one shape"
+            raise ConfigurationError(f"the clearance function must return {wanted}; got {answer!r}") from None
         return clearance, speed

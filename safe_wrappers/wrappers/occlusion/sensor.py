@@ -50,10 +50,8 @@ class Sensor:
 
     def __post_init__(self) -> None:
         if (self.camera is None) == (self.site is None):
-            raise ConfigurationError(
-                f"a sensor sits at a camera or at a site: name one of the two; got camera={self.camera!r}, "
-                f"site={self.site!r}"
-            )
+            given = f"camera={self.camera!r}, site={self.site!r}"
+            raise ConfigurationError(f"a sensor sits at a camera or at a site: name one of them; got {given}")
         for name in ("camera", "site"):
             if not isinstance(getattr(self, name), str | None):
                 raise ConfigurationError(f"{name} is a name, got {getattr(self, name)!r}")
@@ -61,9 +59,7 @@ class Sensor:
         check_fields(self, positive, ["range_m"], "m")
         check_fields(self, non_negative, ["dropout"], "probability per step")
         if self.dropout >= 1.0:
-            raise ConfigurationError(
-                f"dropout is a probability below 1: nothing would ever be measured at {self.dropout}"
-            )
+            raise ConfigurationError(f"dropout is a probability below 1, got {self.dropout}")
         if self.occluder_groups is not None:
             self.occluder_groups = _groups(self.occluder_groups)
         if self.position_std is None and self.velocity_std is None:
@@ -107,9 +103,8 @@ class Sensor:
 def _groups(given: Any) -> list[int]:
     groups = list(given) if isinstance(given, Sequence | np.ndarray) else []
     if not groups or not all(isinstance(g, int | np.integer) and 0 <= g < mujoco.mjNGROUP for g in groups):
-        raise ConfigurationError(
-            f"occluder_groups is a list of geom groups, 0 to {mujoco.mjNGROUP - 1}, or None for all; got {given!r}"
-        )
+        wanted = f"a list of geom groups, 0 to {mujoco.mjNGROUP - 1}, or None for all"
+        raise ConfigurationError(f"occluder_groups is {wanted}; got {given!r}")
     return [int(g) for g in groups]
 
 

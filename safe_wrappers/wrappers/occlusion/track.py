@@ -47,32 +47,26 @@ class Track:
 
     def __post_init__(self) -> None:
         if (self.bodies is None) == (self.published is None):
+            given = f"bodies={self.bodies!r}, published={self.published!r}"
             raise ConfigurationError(
-                "a track follows bodies of the model, by name or pattern, or positions that the env publishes; got "
-                f"bodies={self.bodies!r}, published={self.published!r}"
+                f"a track follows bodies by name or pattern, or published points; got {given}"
             )
         name = self.published if self.bodies is None else self.bodies
         if not isinstance(name, str):
             raise ConfigurationError(f"bodies and published are names, got {name!r}")
         if self.acceleration_noise is None:
-            raise ConfigurationError(
-                "say how it moves: acceleration_noise, the intensity of its white acceleration noise in m^2/s^3 (0: "
-                "it keeps its velocity exactly)"
-            )
+            noise = "the intensity of its white acceleration noise in m^2/s^3"
+            raise ConfigurationError(f"acceleration_noise is missing: {noise} (0: velocity stays)")
         check_fields(self, positive, ["reversion_s"], "s")
         for name in ("acceleration_noise", "mean_velocity", "start_position_std", "start_velocity_std"):
             setattr(self, name, plain_numbers(getattr(self, name)))
 
     def motion(self, coordinates: int) -> Motion:
         """The motion model for d coordinates."""
-        mean = self.mean_velocity
-        return Motion(
-            _intensity(self.acceleration_noise, coordinates),
-            np.inf if self.reversion_s is None else self.reversion_s,
-            np.zeros(coordinates)
-            if mean is None
-            else _each("mean_velocity", mean, coordinates, "m/s", signed=True),
-        )
+        mean = 0.0 if self.mean_velocity is None else self.mean_velocity
+        velocity = _each("mean_velocity", mean, coordinates, "m/s", signed=True)
+        reversion_s = np.inf if self.reversion_s is None else self.reversion_s
+        return Motion(_intensity(self.acceleration_noise, coordinates), reversion_s, velocity)
 
     def start(self, coordinates: int) -> tuple[Array, Array]:
         """Standard deviations of position and velocity at a reset, shapes (d,)."""
@@ -90,9 +84,8 @@ def _each(name: str, given: Any, coordinates: int, unit: str, signed: bool = Fal
         values = np.asarray(given, dtype=np.float64)
         values = np.array(np.broadcast_to(values, coordinates))
     except (TypeError, ValueError):
-        raise ConfigurationError(
-            f"{name} is a number or {coordinates} numbers (one per coordinate) in {unit}, got {given!r}"
-        ) from None
+        wanted = f"a number or {coordinates} numbers (one per coordinate) in {unit}"
+        raise ConfigurationError(f"{name} is {wanted}, got {given!r}") from None
     if not np.isfinite(values).all():
         raise ConfigurationError(f"{name} must be finite, in {unit}, got {given!r}")
     for value in () if signed else values:
@@ -110,10 +103,8 @@ def track_from(given: Any) -> Track:
     """A track itself, or rebuilt from the dict of a recorded one."""
     if isinstance(given, Track | dict):
         return settings_from(Track, given, "a track")
-    raise ConfigurationError(
-        f"expected a Track, such as sw.occlusion.Track({given!r}, acceleration_noise=0.1) with the intensity in "
-        f"m^2/s^3: a name alone does not say how it moves; got {given!r}"
-    )
+    example = f"sw.occlusion.Track({given!r}, acceleration_noise=0.1)"
+    raise ConfigurationError(f"expected a Track, such as {example} (m^2/s^3); got {given!r}")
 
 
 class Tracked(NamedTuple):
@@ -136,9 +127,8 @@ def tracked_things(
             continue
         found = [Tracked(track, name, b) for name, b in there.items() if fnmatchcase(name, track.bodies)]
         if not found:
-            raise UnknownNameError(
-                f"the model has no body {track.bodies!r}; it has: {', '.join(there) or 'none'}"
-            )
+            known = ", ".join(there) or "none"
+            raise UnknownNameError(f"the model has no body {track.bodies!r}; it has: {known}")
         things += found
     names = [thing.name for thing in things]
     twice = sorted({name for name in names if names.count(name) > 1})

@@ -40,18 +40,10 @@ class Down(NamedTuple):
     extra: Any  # what the coding adds
 
 
-class Order(NamedTuple):
-    """What is to be executed at the machine."""
-
-    flow: Array | None  # to replace the port's entries of what would be executed; None: as it is
-    seen_s: float  # when the image was taken that it was made from, s
-
-
-class Given(NamedTuple):
-    """Effort and flow with which the channel acted on the machine in one tick, shapes (m,)."""
-
-    effort: Array
-    flow: Array
+Order = tuple[Array | None, float]
+"""The flow that replaces the port's entries of the command (None: none does); when its image was taken, s."""
+Given = tuple[Array, Array]
+"""Effort and flow with which the channel acted on the machine in one tick, shapes (m,)."""
 
 
 class PlainCoding:
@@ -83,14 +75,10 @@ class PlainCoding:
         """A packet left, up or down."""
 
     def far(self, arrived: list[Packet], newest: Up | None, flow: Array | None) -> Order:
-        """Decode what has arrived in this tick.
-
-        `newest` is the newest command that ever has, `flow` (m,) what would be executed as it is, None if not the
-        operator's.
-        """
+        """Decode what has arrived in this tick; `flow` (m,) is of the plain command, None if not the operator's."""
         if newest is not None:
             self._seen_s = newest.seen_s
-        return Order(None, self._seen_s)
+        return None, self._seen_s
 
     def settle(self, flow: Array, observation: Any, obeyed: bool) -> tuple[Any, Given | None]:
         """After the env's step with a flow (m,): what the packet down carries, and what the machine was given.
@@ -100,7 +88,7 @@ class PlainCoding:
         if self._reading is None:
             return None, None
         acted = self._reading.acted(flow, observation)
-        return None, Given(acted, flow) if obeyed else Given(self._still, self._still)
+        return None, (acted, flow) if obeyed else (self._still, self._still)
 
     def shown(self, arrived: list[Packet], observation: Any) -> Any:
         """The observation that the operator gets, with the effort felt in this tick."""
@@ -132,26 +120,23 @@ class PaidCoding(PlainCoding):
         self._port, self._limit, self.storage_j = reading, limit, storage_j
 
     def reset(self, observation: Any) -> None:
-        """As `PlainCoding.reset`."""
         super().reset(observation)
         near = EnergyReference("impedance", self.storage_j, self._limit)
         self._ends = near, EnergyReference("admittance", self.storage_j)
         self._late = self._felt = self._port.effort
 
     def near(self, flow: Array | None) -> Any:
-        """As `PlainCoding.near`."""
         moved = self._still if flow is None else flow
         self._felt = self._ends[0].modify(self._late, moved, self._tick_s).effort
         return self._ends[0].message_j
 
     def far(self, arrived: list[Packet], newest: Up | None, flow: Array | None) -> Order:
-        """As `PlainCoding.far`."""
         end = self._ends[1]
         end.receive(*(packet.load.extra for packet in arrived))
-        order = super().far(arrived, newest, flow)
+        _, seen_s = super().far(arrived, newest, flow)
         wanted = self._still if flow is None else flow
         paid = self._affordable(wanted, max(end.budget_j, 0.0))
-        return Order(None if paid is wanted else paid, order.seen_s)
+        return None if paid is wanted else paid, seen_s
 
     def _affordable(self, flow: Array, budget_j: float) -> Array:
         """The flow, or as much of it as its energy is paid for; the effort may answer the flow at once."""
@@ -165,15 +150,13 @@ class PaidCoding(PlainCoding):
         return flow * min(share, 1.0)
 
     def settle(self, flow: Array, observation: Any, obeyed: bool) -> tuple[Any, Given | None]:
-        """As `PlainCoding.settle`."""
         _, given = super().settle(flow, observation, obeyed)
         assert given is not None
         # Power is positive into the channel at both ends. The flow was scaled, not damped: no damping to credit.
-        self._ends[1].account(-given.effort, given.flow, self._tick_s)
+        self._ends[1].account(-given[0], given[1], self._tick_s)
         return self._ends[1].message_j, given
 
     def shown(self, arrived: list[Packet], observation: Any) -> Any:
-        """As `PlainCoding.shown`."""
         self._ends[0].receive(*(packet.load.extra for packet in arrived))
         self._late = self._port.of(observation)
         return self._port.replaced(observation, self._felt)
@@ -187,7 +170,6 @@ class WaveCoding(PlainCoding):
         self._port, self._impedance, self._rule = reading, impedance, rule
 
     def reset(self, observation: Any) -> None:
-        """As `PlainCoding.reset`."""
         super().reset(observation)
         m = self._still.size
         self._up, self._down = (WaveLine(self._tick_s, self._rule, m) for _ in range(2))
@@ -197,8 +179,7 @@ class WaveCoding(PlainCoding):
         self._owed_j = 0.0
 
     def near(self, flow: Array | None) -> Any:
-        """As `PlainCoding.near`; a wave that comes back while the operator is away ends there."""
-        incoming = self._down.deliver(self._back)
+        incoming = self._down.deliver(self._back)  # while the operator is away, it ends there
         self._back = []
         if flow is None:
             self._felt = self._still
@@ -207,14 +188,12 @@ class WaveCoding(PlainCoding):
         return outgoing
 
     def sent(self, up: bool, sequence: int, extra: Any, lost: bool) -> None:
-        """As `PlainCoding.sent`."""
         line = self._up if up else self._down
         line.send(extra, sequence)
         if lost:
             line.lose(sequence)
 
     def far(self, arrived: list[Packet], newest: Up | None, flow: Array | None) -> Order:
-        """As `PlainCoding.far`, from the waves alone."""
         wave = self._up.deliver([(packet.sequence, packet.load.extra) for packet in arrived])
         if self._rule != "queue":
             super().far(arrived, newest, flow)  # seen as late as the newest
@@ -233,16 +212,14 @@ class WaveCoding(PlainCoding):
         b = self._impedance
         # The effort answers the flow at once where there is a damper, so both are solved for together.
         decoded = (math.sqrt(2.0 * b) * wave - self._port.base) / (b + self._port.feedthrough)
-        return Order(decoded, self._seen_s)
+        return decoded, self._seen_s
 
     def settle(self, flow: Array, observation: Any, obeyed: bool) -> tuple[Any, Given | None]:
-        """As `PlainCoding.settle`; a port that is still, because the brake acts, absorbs the wave.
-
-        Reflected waves of an operator who does not give way would pile up in the channel without bound.
-        """
         _, given = super().settle(flow, observation, obeyed)
         assert given is not None
-        if not obeyed:
+        if (
+            not obeyed
+        ):  # a still port absorbs the wave; reflected ones would pile up in the channel without bound
             return self._still, given
         acted, moved = given
         _, outgoing = to_waves(acted, moved, self._impedance)
@@ -257,13 +234,12 @@ class WaveCoding(PlainCoding):
         return outgoing, given
 
     def shown(self, arrived: list[Packet], observation: Any) -> Any:
-        """As `PlainCoding.shown`: what the operator felt stands where the machine's effort was."""
         self._back += [(packet.sequence, packet.load.extra) for packet in arrived]
         return self._port.replaced(observation, self._felt)
 
     @property
     def stored_j(self) -> float:
-        """Energy on its way, and of waves that have arrived and were not put out yet, J."""
+        # Of waves that have arrived and were not put out yet, too.
         return sum(line.in_flight_j + line.reserve_j for line in (self._up, self._down))
 
     def _energy(self, wave: Array) -> float:
@@ -297,8 +273,7 @@ def coding_from(
     if reading is None:
         what = 'coding="wave"' if coding == "wave" else 'passivity="controller"'
         raise ConfigurationError(
-            f"{what} needs a port, and {env.unwrapped!r} publishes none: say which entries of the action are a flow "
-            'and which of the observation its effort, port={"flow": [0, 1], "effort": [4, 5]}'
+            f'{what} needs a port, such as port={{"flow": [0], "effort": [2]}}; {env.unwrapped!r} publishes none'
         )
     refuse_changed_actions(env)
     if coding == "plain":

@@ -7,8 +7,7 @@ from typing import Any, Final, NamedTuple
 
 from safe_wrappers.checks import check_fields, non_negative, positive, settings_from
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.common.layer import Env
-from safe_wrappers.wrappers.common.wrapper_rng import WrapperRng
+from safe_wrappers.wrappers.common.layer import Env, WrapperRng
 from safe_wrappers.wrappers.faults.kinds import OnOffProcess, probability
 
 LONGEST_DELAY_S: Final = 10.0
@@ -41,17 +40,14 @@ class Link:
     def __post_init__(self) -> None:
         check_fields(self, non_negative, ["delay_s", "jitter_s"], "s")
         if self.longest_s > LONGEST_DELAY_S:
-            raise ConfigurationError(
-                f"a line remembers packets for {LONGEST_DELAY_S:g} s; got delays of up to {self.longest_s:g} s"
-            )
+            most = f"at most {LONGEST_DELAY_S:g} s"
+            raise ConfigurationError(f"delay_s + jitter_s is {most}; got {self.longest_s:g} s")
         object.__setattr__(self, "loss", probability("loss", self.loss))
         if not isinstance(self.in_order, bool):
             raise ConfigurationError(f"in_order is True or False, got {self.in_order!r}")
         if (self.outage_between_s is None) != (self.outage_length_s is None):
-            raise ConfigurationError(
-                "an outage needs both outage_between_s and outage_length_s, in s; got "
-                f"{self.outage_between_s!r} and {self.outage_length_s!r}"
-            )
+            given = f"{self.outage_between_s!r} and {self.outage_length_s!r}"
+            raise ConfigurationError(f"an outage needs outage_between_s and outage_length_s, s; got {given}")
         check_fields(self, positive, ["outage_between_s", "outage_length_s"], "s")
 
     @property
@@ -80,8 +76,8 @@ class Line:
     def __init__(self, link: Link, stream: str, slack_s: float) -> None:
         self._link, self._slack_s = link, slack_s
         self._random = WrapperRng(stream)
-        outage = link.outage_between_s, link.outage_length_s
-        self._outages = None if outage[0] is None or outage[1] is None else OnOffProcess(outage[0], outage[1])
+        between_s, length_s = link.outage_between_s, link.outage_length_s
+        self._outages = None if between_s is None or length_s is None else OnOffProcess(between_s, length_s)
 
     newest: Packet  # of all that have arrived the one that was sent last
     fresh: bool  # whether it arrived at the last `receive`

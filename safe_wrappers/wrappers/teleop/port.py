@@ -36,14 +36,12 @@ class TeleopPort:
                 isinstance(i, int | np.integer) and not isinstance(i, bool) and i >= 0 for i in given
             )
             if not whole or not given or len(set(given)) != len(given):
-                raise ConfigurationError(
-                    f"{name} of a port is a list of indices, each at least 0 and once; got {given!r}"
-                )
+                indices = "a list of indices, each at least 0 and once"
+                raise ConfigurationError(f"{name} of a port is {indices}; got {given!r}")
             object.__setattr__(self, name, [int(i) for i in given])
         if len(self.flow) != len(self.effort):
-            raise ConfigurationError(
-                f"a port has as many efforts as flows; got flow {list(self.flow)} and effort {list(self.effort)}"
-            )
+            given = f"flow {list(self.flow)} and effort {list(self.effort)}"
+            raise ConfigurationError(f"a port has as many efforts as flows; got {given}")
         check_fields(self, non_negative, ["feedthrough"], "N s/m")
 
 
@@ -52,30 +50,20 @@ def port_from(given: Any, env: Env) -> TeleopPort | None:
     if given is not None:
         port = settings_from(TeleopPort, given, "port")
     elif env.has_wrapper_attr("port_flow"):
-        port = TeleopPort(
-            list(env.get_wrapper_attr("port_flow")),
-            list(env.get_wrapper_attr("port_effort_observed")),
-            env.get_wrapper_attr("port_feedthrough"),
-        )
+        flow, effort = (list(env.get_wrapper_attr(name)) for name in ("port_flow", "port_effort_observed"))
+        port = TeleopPort(flow, effort, env.get_wrapper_attr("port_feedthrough"))
     else:
         return None
-    _check_spaces(port, env)
-    return port
-
-
-def _check_spaces(port: TeleopPort, env: Env) -> None:
     action, observation = env.action_space, env.observation_space
     box = isinstance(observation, gym.spaces.Box) and len(observation.shape) == 1
     if not box or not np.issubdtype(observation.dtype or np.int64, np.floating):
-        raise ConfigurationError(
-            f"a port needs observations of one axis and floating numbers to find its effort in, got {observation}"
-        )
+        raise ConfigurationError(f"a port needs observations of one axis and floats, got {observation}")
     for name, indices, space in (("flow", port.flow, action), ("effort", port.effort, observation)):
         assert space.shape is not None
         if max(indices) >= space.shape[0]:
-            raise ConfigurationError(
-                f"{name} of the port is entry {max(indices)}, but there are only {space.shape[0]}: {space}"
-            )
+            wrong = f"{name} of the port is entry {max(indices)}"
+            raise ConfigurationError(f"{wrong}, but there are only {space.shape[0]}: {space}")
+    return port
 
 
 class PortReading:

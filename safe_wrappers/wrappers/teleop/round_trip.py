@@ -2,19 +2,12 @@
 
 import math
 from dataclasses import KW_ONLY, dataclass
-from typing import Any
 
 from safe_wrappers.checks import check_fields, non_negative, positive
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.wrappers.common.layer import Array, Env
-from safe_wrappers.wrappers.lease.stopping_budget import (
-    BoundBudget,
-    ClearanceFunction,
-    StoppingBudget,
-    budget_from,
-)
+from safe_wrappers.wrappers.lease.stopping_budget import BoundBudget, BudgetLike, StoppingBudget, budget_from
 
 
 @deprecated_parameters(moved={"budget": StoppingBudget}, positional=("braking", "acceleration", "top_speed"))
@@ -35,7 +28,7 @@ class RoundTripCeiling:
         ConfigurationError: A time or share that cannot be, or a clearance that measures no approach.
     """
 
-    budget: StoppingBudget | dict[str, Any] | Constraint | ClearanceFunction
+    budget: BudgetLike
     _: KW_ONLY
     video_s: float = 0.1
     human_s: float = 0.25
@@ -45,11 +38,8 @@ class RoundTripCeiling:
     def __post_init__(self) -> None:
         budget = budget_from(self.budget)
         if not budget.measures_approach:
-            raise ConfigurationError(
-                f"{type(budget.clearance).__name__} does not say how fast it is approached, which a ceiling is made "
-                "from: give a Clearance, or a function of the env that returns clearances in m and approach speeds "
-                "in m/s"
-            )
+            name = type(budget.clearance).__name__
+            raise ConfigurationError(f"{name} does not say how fast it is approached: give a Clearance")
         object.__setattr__(self, "budget", budget)
         check_fields(self, non_negative, ["video_s", "human_s"], "s")
         check_fields(self, positive, ["longest_s"], "s")
