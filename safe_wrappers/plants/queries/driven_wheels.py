@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -20,14 +19,6 @@ _FIXED_GAIN, _NO_BIAS = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjB
 _AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_AFFINE)
 _FLAT = 1e-6  # level part of an axle's direction below which it has none
 _DRIVES = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-
-
-class WheelMotion(NamedTuple):
-    """Of n wheels, shapes (n,)."""
-
-    rate: Array  # of the wheel about its axle in the world, rad/s; positive rolls ahead
-    ground: Array  # speed of its centre along its heading, m/s
-    sideways: Array  # speed of its centre to the left of its heading, m/s
 
 
 class DrivenWheels:
@@ -103,8 +94,11 @@ class DrivenWheels:
         self.feedback = np.asarray((self._opposing * gear).sum(axis=1))
         return Wheel(m.geom_size[self._geoms, 0], about_axle, m.dof_damping[self.dofs])
 
-    def motion(self, plant: MujocoPlant) -> WheelMotion:
-        """Rates and speeds over ground at the plant's present state."""
+    def motion(self, plant: MujocoPlant) -> tuple[Array, Array, Array]:
+        """Of each wheel, shapes (n,): its rate about its axle, rad/s, positive ahead; its centre's speed, m/s.
+
+        The speed is given along the wheel's heading, and to the left of it.
+        """
         m, d = plant.model, plant.pose()
         mujoco.mj_comPos(m, d)
         mujoco.mj_comVel(m, d)
@@ -118,7 +112,7 @@ class DrivenWheels:
         vx = move[:, 0] + turn[:, 1] * arm[:, 2] - turn[:, 2] * arm[:, 1]
         vy = move[:, 1] + turn[:, 2] * arm[:, 0] - turn[:, 0] * arm[:, 2]
         rate = (turn * axle).sum(axis=1)
-        return WheelMotion(rate, ahead_x * vx + ahead_y * vy, ahead_x * vy - ahead_y * vx)
+        return rate, ahead_x * vx + ahead_y * vy, ahead_x * vy - ahead_y * vx
 
     def loads(self, model: mujoco.MjModel, data: mujoco.MjData) -> Array:
         """Vertical force of the ground on each wheel, shape (n,), N, from an env's model and contacts."""

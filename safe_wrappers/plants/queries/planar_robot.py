@@ -40,9 +40,7 @@ class PlanarFrame:
         self._q, self._v = int(m.jnt_qposadr[joints[0]]), int(m.jnt_dofadr[joints[0]])
         self._origin = m.body_pos[b][:2].tolist()
         if m.nu != 2:
-            raise UnsupportedEnvError(
-                f"expected a drive and a turning actuator, the model has {m.nu} actuators"
-            )
+            raise UnsupportedEnvError(f"expected a drive and a turning actuator, the model has {m.nu}")
         kind, at, gear = m.actuator_trntype, m.actuator_trnid[:, 0], m.actuator_gear
         turning = [a for a in range(2) if kind[a] in _AT_JOINT and at[a] == joints[2]]
         pushing = [
