@@ -7,7 +7,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
-from safe_wrappers.checks import non_negative, positive, settings_from
+from safe_wrappers.checks import finite_array, non_negative, positive, settings_from
 from safe_wrappers.control.estimation.ellipsoids import ellipsoid_gap
 from safe_wrappers.control.estimation.tracks import Tracks
 from safe_wrappers.errors import ConfigurationError
@@ -48,14 +48,10 @@ def refuse_more_dimensions(obstacle: int, point: int, kind: str = "obstacles") -
 
 
 def _vector(name: str, values: Sequence[float], sizes: tuple[int, ...]) -> list[float]:
-    try:
-        vector = [float(v) for v in values]
-    except (TypeError, ValueError):
-        raise ConfigurationError(f"{name} must be a list of numbers, got {values!r}") from None
-    if len(vector) not in sizes or not np.isfinite(vector).all():
-        wanted = " or ".join(map(str, sizes))
-        raise ConfigurationError(f"{name} must be {wanted} finite numbers, got {values!r}")
-    return vector
+    vector = finite_array(name, values)
+    if vector.ndim != 1 or len(vector) not in sizes:
+        raise ConfigurationError(f"{name} must be {' or '.join(map(str, sizes))} numbers, got {values!r}")
+    return [float(v) for v in vector]
 
 
 class _Round(ABC):
@@ -261,8 +257,7 @@ class TrackedDiscs:
         tracks = self.tracks(plant)
         d, n = tracks.coordinates, len(tracks.mean)
         refuse_more_dimensions(d, point.size, "tracks")
-        normal, velocity = np.zeros((n, point.size)), np.zeros((n, point.size))
-        nothing = np.zeros((n, point.size))
+        normal, velocity, nothing = np.zeros((3, n, point.size))
         offset = point[:d] - tracks.positions
         covariances = tracks.position_covariances
         if not (np.isfinite(offset).all() and np.isfinite(covariances).all()):

@@ -96,11 +96,7 @@ def _acting_range(
 
 
 class AffineActuators:
-    """Gain, bias and acting control range of every actuator of one model.
-
-    Args:
-        model: The plant's own model; its arrays are read at every call, so they may be changed.
-    """
+    """Gain, bias and acting control range of every actuator of a model, whose arrays are read at every call."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         _refuse_unsupported(model)

@@ -310,10 +310,9 @@ class MujocoPlant(Plant):
         return p.copy(), jac @ self.qvel
 
     def point(self, kind: str, name: str) -> tuple[Array, Array, Array, Array]:
-        """Motion of the origin of a named "body", "site" or "geom".
+        """Position p, m, and velocity v, m/s, of a named "body", "site" or "geom", and its acceleration, m/s^2.
 
-        Returns:
-            p (3,) in m, v (3,) in m/s, a0 (3,) in m/s^2 and A (3, nu): `acceleration = a0 + A @ u`.
+        The last is `a0 + A @ u`: p, v and a0 of shape (3,), A of shape (3, nu).
         """
         m, d, (drift, effect) = self.model, self.data, self.acceleration
         body, p = of_model.frame(m, d, kind, name)

@@ -37,10 +37,8 @@ class DrivenWheels:
 
     def __init__(self, plant: MujocoPlant, names: Sequence[str]) -> None:
         if isinstance(names, str) or not names or len(set(names)) != len(names):
-            raise ConfigurationError(
-                f"wheels is a list of joint names, each once, got {names!r}; the model has the joints "
-                + ", ".join(plant.names("joint"))
-            )
+            wanted = f"wheels is a list of joint names, each once, got {names!r}"
+            raise ConfigurationError(f"{wanted}; the model has the joints {', '.join(plant.names('joint'))}")
         self.names = list(names)
         m = plant.model
         self._joints = np.array([plant.named("joint", name) for name in names])
@@ -48,9 +46,8 @@ class DrivenWheels:
             if m.jnt_type[joint] != _HINGE:
                 hinges = [m.joint(j).name for j in np.flatnonzero(m.jnt_type == _HINGE)]
                 there = ", ".join(filter(None, hinges))
-                raise ConfigurationError(
-                    f"joint {name!r} is no hinge, so it is no wheel's axle; hinges are {there}"
-                )
+                wanted = f"joint {name!r} is no hinge, so it is no wheel's axle"
+                raise ConfigurationError(f"{wanted}; hinges are {there}")
         self.dofs = m.jnt_dofadr[self._joints]
         direct = np.isin(m.actuator_trntype, _DRIVES)
         self._drives = direct & (m.actuator_trnid[:, 0] == self._joints[:, None])
@@ -60,10 +57,8 @@ class DrivenWheels:
         for drives, others, name in zip(self._drives, turns & ~self._drives, names, strict=True):
             if not drives.any():
                 driven = sorted({m.joint(int(j)).name for j in m.actuator_trnid[direct, 0]})
-                raise ConfigurationError(
-                    f"no actuator drives joint {name!r} directly, so its slip cannot be limited; driven are "
-                    + (", ".join(driven) or "none")
-                )
+                wanted = f"no actuator drives joint {name!r} directly, so its slip cannot be limited"
+                raise ConfigurationError(f"{wanted}; driven are {', '.join(driven) or 'none'}")
             if others.any():  # `drive` does not model them
                 found = [m.actuator(int(i)).name or f"actuator #{i}" for i in np.flatnonzero(others)]
                 raise ConfigurationError(

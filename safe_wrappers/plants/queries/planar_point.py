@@ -28,6 +28,12 @@ class PlanarPoint(NamedTuple):
     actuators: tuple[int, int]  # indices of their actuators
     origin: tuple[float, float]  # where the point is at qpos = 0, m
 
+    def control(self, like: Array, pair: Array | tuple[float, float]) -> Array:
+        """A control, shape (nu,), with other values on the two slides."""
+        whole = np.array(like)
+        whole[list(self.actuators)] = pair
+        return whole
+
 
 def planar_point(plant: MujocoPlant, clip: float, body: str | None = None) -> PlanarPoint:
     """Find the point, measure its constants by single physics steps of the model, and check them.
