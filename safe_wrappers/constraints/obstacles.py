@@ -73,12 +73,10 @@ class _Round(ABC):
         offset = point[:d] - centers
         length = np.sqrt(np.einsum("ij,ij->i", offset, offset))
         apart = np.where(length > 1e-12, length, 1.0)
-        normal = np.zeros((len(centers), point.size))
+        normal, moving, curvature = np.zeros((3, len(centers), point.size))
         normal[:, :d] = offset / apart[:, None]
         normal[length <= 1e-12, 0] = 1.0  # at the very centre every way out is as good
-        moving = np.zeros_like(normal)
         moving[:, :d] = self._velocities(plant)
-        curvature = np.zeros_like(normal)
         curvature[:, :d] = 1.0 / np.maximum(length, 1e-9)[:, None]
         return Nearest(length - self.radius, normal, moving, curvature)
 
@@ -168,8 +166,7 @@ class Box:
         side = np.where(offset < 0.0, -1.0, 1.0)
         outside = np.maximum(beyond, 0.0)
         distance = float(np.linalg.norm(outside))
-        normal = np.zeros((1, point.size))
-        curvature = np.zeros_like(normal)
+        normal, curvature = np.zeros((2, 1, point.size))
         if distance > 0.0:
             normal[0, :d] = side * outside / distance
             if int((outside > 0.0).sum()) > 1:

@@ -291,7 +291,7 @@ class _Group:
 def _checked_outline(given: Any, needed: bool) -> list[list[float]]:
     """The outline as plain data."""
     if needed and not len(given):
-        raise ConfigurationError("untouched needs the outline: [[x, y], ...] in the body's frame, m")
+        raise ConfigurationError("untouched needs the machine's outline: [[x, y], ...] in its body's frame")
     try:
         points = np.array(given, dtype=np.float64).reshape(-1, 2)
     except (TypeError, ValueError):

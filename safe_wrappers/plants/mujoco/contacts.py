@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array, name_list
+from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.plants.mujoco.forecast import RESETS
-from safe_wrappers.plants.mujoco.model import fixed_bodies, named
+from safe_wrappers.plants.mujoco.model import fixed_bodies
 from safe_wrappers.plants.mujoco.replay import evaluations
 
 # Bound of squared lengths: MuJoCo does not check the stages of the Runge-Kutta steps that are made here.
@@ -167,6 +168,11 @@ def _chosen(model: mujoco.MjModel, argument: str, names: Sequence[str] | None) -
     if names is None:
         return np.ones(model.nbody + 1, dtype=bool)
     names = name_list(argument, names, "names of bodies", "None for all")
+    known = {model.body(i).name: i for i in range(model.nbody)}
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        there = ", ".join(name for name in known if name)
+        raise UnknownNameError(f"{argument}: the model has no body {unknown[0]!r}; it has: {there}")
     chosen = np.zeros(model.nbody + 1, dtype=bool)
-    chosen[[named(model, "body", name) for name in names]] = True
+    chosen[[known[name] for name in names]] = True
     return chosen

@@ -42,7 +42,7 @@ class MujocoPlant(Plant):
 
     bounds_are_action_space: ClassVar[bool] = True
     can_brake: ClassVar[bool] = True
-    lower: Array = np.zeros(0)  # of the control, shape (nu,), once bound: ctrlrange, or -inf and inf
+    lower: Array = np.zeros(0)  #: of the control, shape (nu,), once bound: ctrlrange, or -inf and inf
     upper: Array = np.zeros(0)
 
     def __init__(

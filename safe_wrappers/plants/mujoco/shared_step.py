@@ -6,12 +6,10 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.forecast import Recorder
-
-Array = NDArray[np.float64]
 
 _STATE: Final = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _MJ_STEP: Final = mujoco.mj_step

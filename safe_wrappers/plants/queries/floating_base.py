@@ -25,17 +25,17 @@ _CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)  # this type a
 class ContactPoints(NamedTuple):
     """The k contacts of MuJoCo's solver. The world is never the pushed body."""
 
-    points: Array  # shape (k, 3), m
-    normals: Array  # unit normals, pointing at the pushed body, shape (k, 3)
-    first_tangents: Array  # the first axis of MuJoCo's friction pyramid, shape (k, 3)
-    friction: Array  # coefficient of sliding (MuJoCo's first), shape (k,); 0 without friction (condim 1)
-    pushed: NDArray[np.intp]  # ids of the bodies, shape (k,)
-    pushed_by: NDArray[np.intp]  # ids of the other bodies, shape (k,)
-    jacobians: Array  # of the pushed body's velocity at the point relative to the other's, shape (k, 3, nv)
-    drift: Array  # `dJ/dt qvel`, shape (k, 3), m/s^2
-    forces: Array  # on the pushed body, as MuJoCo's solver found them last, shape (k, 3), N
-    moments: Array  # on the pushed body about the point, shape (k, 3), N m; 0 for condim 1 and 3
-    gaps: Array  # signed distances, shape (k,), m; negative where bodies penetrate
+    points: Array  #: shape (k, 3), m
+    normals: Array  #: unit normals, pointing at the pushed body, shape (k, 3)
+    first_tangents: Array  #: the first axis of MuJoCo's friction pyramid, shape (k, 3)
+    friction: Array  #: coefficient of sliding (MuJoCo's first), shape (k,); 0 without friction (condim 1)
+    pushed: NDArray[np.intp]  #: ids of the bodies, shape (k,)
+    pushed_by: NDArray[np.intp]  #: ids of the other bodies, shape (k,)
+    jacobians: Array  #: of the pushed body's velocity at the point relative to the other's, shape (k, 3, nv)
+    drift: Array  #: `dJ/dt qvel`, shape (k, 3), m/s^2
+    forces: Array  #: on the pushed body, as MuJoCo's solver found them last, shape (k, 3), N
+    moments: Array  #: on the pushed body about the point, shape (k, 3), N m; 0 for condim 1 and 3
+    gaps: Array  #: signed distances, shape (k,), m; negative where bodies penetrate
 
 
 class FloatingBaseTerms(NamedTuple):
@@ -45,9 +45,9 @@ class FloatingBaseTerms(NamedTuple):
     forces at zero control, minus constraint forces other than contacts, as MuJoCo found them for the data's control.
     """
 
-    inertia: Array  # M with armature, shape (nv, nv)
-    bias: Array  # h, shape (nv,)
-    actuation: Array  # B, shape (nv, nu): generalised force per control, inside the actuators' force ranges
+    inertia: Array  #: M with armature, shape (nv, nv)
+    bias: Array  #: h, shape (nv,)
+    actuation: Array  #: B, shape (nv, nu): generalised force per control, inside the actuators' force ranges
     contacts: ContactPoints
 
 
