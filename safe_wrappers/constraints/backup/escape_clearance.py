@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers.checks import check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundBackupClearance
-from safe_wrappers.constraints.obstacles import TrackedDiscs, distances, obstacles_from
+from safe_wrappers.constraints.obstacles import Discs, TrackedDiscs, distances, obstacles_from
 from safe_wrappers.control.backup.evasive_maneuvers import EvasiveManeuvers, Maneuver
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, Memory
@@ -247,7 +247,8 @@ def _nearest_first(controls: Array, asked: Array) -> Array:
 
 
 def _moves(obstacle: Any) -> bool:
-    return isinstance(obstacle, TrackedDiscs) or getattr(obstacle, "velocity_attribute", None) is not None
+    tracked, published = isinstance(obstacle, TrackedDiscs), isinstance(obstacle, Discs)
+    return tracked or (published and obstacle.velocity_attribute is not None)
 
 
 def _box_distances(x: Array, y: Array, centers: Array, halves: Array) -> Array:
