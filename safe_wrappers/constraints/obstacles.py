@@ -7,7 +7,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
-from safe_wrappers.checks import finite_array, non_negative, positive, settings_from
+from safe_wrappers.checks import non_negative, positive, settings_from
 from safe_wrappers.control.estimation.ellipsoids import ellipsoid_gap
 from safe_wrappers.control.estimation.tracks import Tracks
 from safe_wrappers.errors import ConfigurationError
@@ -48,10 +48,15 @@ def refuse_more_dimensions(obstacle: int, point: int, kind: str = "obstacles") -
 
 
 def _vector(name: str, values: Sequence[float], sizes: tuple[int, ...]) -> list[float]:
-    vector = finite_array(name, values)
-    if vector.ndim != 1 or len(vector) not in sizes:
-        raise ConfigurationError(f"{name} must be {' or '.join(map(str, sizes))} numbers, got {values!r}")
-    return [float(v) for v in vector]
+    try:
+        vector = [float(v) for v in values]
+    except (TypeError, ValueError):
+        raise ConfigurationError(f"{name} must be a list of numbers, got {values!r}") from None
+    if len(vector) not in sizes or not np.isfinite(vector).all():
+        raise ConfigurationError(
+            f"{name} must be {' or '.join(map(str, sizes))} finite numbers, got {values!r}"
+        )
+    return vector
 
 
 class _Round(ABC):
@@ -250,7 +255,6 @@ class TrackedDiscs:
         return tracks
 
     def nearest(self, point: Array, plant: Plant) -> Nearest:
-        """One surface per track."""
         tracks = self.tracks(plant)
         d, n = tracks.coordinates, len(tracks.mean)
         refuse_more_dimensions(d, point.size, "tracks")

@@ -102,7 +102,6 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         return control[::-1].copy() if self._turns_first else control
 
     def admits(self, control: Array) -> bool:
-        """Predict the held control step; its end must still have a safe stopping path."""
         if not self._in_play:
             return True
         drive, turn = self._pair(control).tolist()

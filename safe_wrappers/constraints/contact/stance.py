@@ -150,7 +150,6 @@ class BoundStance(BoundConstraint):
         return np.asarray(rows.reshape(len(some), -1))
 
     def solve(self, problem: WholeBodyProblem) -> WholeBodySolution:
-        """By the specification's cone."""
         exact = self.spec.cone == "exact"
         return whole_body.solve_cone(problem) if exact else whole_body.solve_pyramid(problem, self.spec.edges)
 
