@@ -289,7 +289,6 @@ class _Group:
 
 
 def _checked_outline(given: Any, needed: bool) -> list[list[float]]:
-    """The outline as plain data."""
     if needed and not len(given):
         raise ConfigurationError("untouched needs the machine's outline: [[x, y], ...] in its body's frame")
     try:

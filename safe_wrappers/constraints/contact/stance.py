@@ -170,7 +170,6 @@ class BoundStance(BoundConstraint):
         return self.solve(replace(problem, nominal=control)).status is WholeBodyStatus.INACTIVE
 
     def _ask(self, problem: WholeBodyProblem, proposed: Array) -> WholeBodySolution:
-        """Solve for a proposal, and keep the answer."""
         self._asked, self._answer = proposed.copy(), self.solve(replace(problem, nominal=proposed))
         return self._answer
 
