@@ -74,16 +74,16 @@ class BoundBarrier(BoundConstraint):
         plant.require_acceleration("Barrier")
         super().__init__(spec, plant)
         if not callable(spec.alpha) and spec.alpha * plant.control_dt > 1.0:
-            wanted = f"alpha must be at most 1/hold = {1.0 / plant.control_dt:g}/s"
             crossing = f"alpha = {spec.alpha}/s lets h cross zero within one hold of {plant.control_dt} s"
-            raise ConfigurationError(f"{crossing}; {wanted}")
+            raise ConfigurationError(
+                f"{crossing}; alpha must be at most 1/hold = {1.0 / plant.control_dt:g}/s"
+            )
         self._degree_checked = False
 
     def observe(self, memory: Memory) -> None:
         self._row: HalfSpaces | None = None
 
     def value(self) -> Array:
-        """H at the plant's state, shape (1,)."""
         return np.array([self._height(self.plant.state)])
 
     def _height(self, x: Array) -> float:

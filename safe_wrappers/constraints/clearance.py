@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -14,16 +14,8 @@ from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, 
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.points import Points
 
-
-class _Seen(NamedTuple):
-    """The surfaces around one point, and how its acceleration depends on the control."""
-
-    near: Nearest
-    clearance: Array
-    approach: Array
-    relative: Array
-    drift: Array
-    effect: Array
+# Around one point: the surfaces, clearances, approach speeds, relative velocities, its drift and its control matrix.
+_Seen = tuple[Nearest, Array, Array, Array, Array, Array]
 
 
 @dataclass
@@ -70,10 +62,8 @@ class Clearance(Constraint):
             setattr(self, name, name_list(name, getattr(self, name), least=0))
         self.position, self.velocity = list(self.position), list(self.velocity)
         if len(self.position) != len(self.velocity) or len(self.position) > 3:
-            raise ConfigurationError(
-                "position and velocity are up to three state indices each, in the same order; got "
-                f"{self.position} and {self.velocity}"
-            )
+            wanted = "position and velocity are up to three state indices each, in the same order"
+            raise ConfigurationError(f"{wanted}; got {self.position} and {self.velocity}")
 
     def bind(self, plant: Plant) -> "BoundClearance":
         return BoundClearance(self, plant)
@@ -87,7 +77,8 @@ class BoundClearance(BoundConstraint):
     def __init__(self, spec: Clearance, plant: Plant) -> None:
         plant.require_acceleration("Clearance")
         super().__init__(spec, plant)
-        self._points = Points(plant, spec.bodies, spec.sites, spec.geoms, spec.position, spec.velocity)
+        named = {"body": spec.bodies, "site": spec.sites, "geom": spec.geoms}
+        self._points = Points(plant, named, spec.position, spec.velocity)
 
     def observe(self, memory: Memory) -> None:
         self._observed: list[_Seen] | None = None
@@ -106,13 +97,14 @@ class BoundClearance(BoundConstraint):
         """What every point sees, once per observation."""
         if self._observed is None:
             every = self._points.accelerations()
-            self._observed = [_Seen(*self._gaps(p, v), drift, effect) for p, v, drift, effect in every]
+            self._observed = [(*self._gaps(p, v), drift, effect) for p, v, drift, effect in every]
         return self._observed
 
     def value(self) -> Array:
         """Room left after braking, margin and state error not taken off, m, one per point and surface."""
         braking, hold = self.spec.braking, self.plant.control_dt
-        return np.concatenate([sampled_inset(s.clearance, s.approach, braking, hold) for s in self._seen()])
+        seen = self._seen()
+        return np.concatenate([sampled_inset(clear, speed, braking, hold) for _, clear, speed, *_ in seen])
 
     def approach(self) -> tuple[Array, Array]:
         """Clearances (m) and approach speeds (m/s, towards the obstacle), as measured, one per point and surface."""
@@ -123,16 +115,14 @@ class BoundClearance(BoundConstraint):
     def rows(self) -> HalfSpaces:
         """One row per point and surface whose limit the actuators could exceed."""
         normals, offsets = [], []
+        braking, hold = self.spec.braking, self.plant.control_dt
         strongest = np.maximum(np.abs(self.plant.lower), np.abs(self.plant.upper))
         reserve = {"state_error": self.spec.state_error, "margin": self.spec.margin}
         for near, clearance, approach, relative, drift, effect in self._seen():
-            limit = sampled_acceleration_limit(
-                clearance, approach, self.spec.braking, self.plant.control_dt, **reserve
-            )
+            limit = sampled_acceleration_limit(clearance, approach, braking, hold, **reserve)
             # approach acceleration = -n . (drift + effect u) - |sideways speed|^2 * curvature
-            bend = (
-                np.einsum("ij,ij->i", near.curvature, relative**2) - near.curvature.max(axis=1) * approach**2
-            )
+            bend = np.einsum("ij,ij->i", near.curvature, relative**2)
+            bend = bend - near.curvature.max(axis=1) * approach**2
             bend = np.where(clearance + self.spec.radius > 0.0, np.maximum(bend, 0.0), 0.0)
             normal = -near.normal @ effect
             offset = limit + near.normal @ drift + bend

@@ -53,8 +53,9 @@ def _vector(name: str, values: Sequence[float], sizes: tuple[int, ...]) -> list[
     except (TypeError, ValueError):
         raise ConfigurationError(f"{name} must be a list of numbers, got {values!r}") from None
     if len(vector) not in sizes or not np.isfinite(vector).all():
-        wanted = " or ".join(map(str, sizes))
-        raise ConfigurationError(f"{name} must be {wanted} finite numbers, got {values!r}")
+        raise ConfigurationError(
+            f"{name} must be {' or '.join(map(str, sizes))} finite numbers, got {values!r}"
+        )
     return vector
 
 
@@ -77,12 +78,10 @@ class _Round(ABC):
         offset = point[:d] - centers
         length = np.sqrt(np.einsum("ij,ij->i", offset, offset))
         apart = np.where(length > 1e-12, length, 1.0)
-        normal = np.zeros((len(centers), point.size))
+        normal, moving, curvature = np.zeros((3, len(centers), point.size))
         normal[:, :d] = offset / apart[:, None]
         normal[length <= 1e-12, 0] = 1.0  # at the very centre every way out is as good
-        moving = np.zeros_like(normal)
         moving[:, :d] = self._velocities(plant)
-        curvature = np.zeros_like(normal)
         curvature[:, :d] = 1.0 / np.maximum(length, 1e-9)[:, None]
         return Nearest(length - self.radius, normal, moving, curvature)
 
@@ -172,8 +171,7 @@ class Box:
         side = np.where(offset < 0.0, -1.0, 1.0)
         outside = np.maximum(beyond, 0.0)
         distance = float(np.linalg.norm(outside))
-        normal = np.zeros((1, point.size))
-        curvature = np.zeros_like(normal)
+        normal, curvature = np.zeros((2, 1, point.size))
         if distance > 0.0:
             normal[0, :d] = side * outside / distance
             if int((outside > 0.0).sum()) > 1:
@@ -257,12 +255,10 @@ class TrackedDiscs:
         return tracks
 
     def nearest(self, point: Array, plant: Plant) -> Nearest:
-        """One surface per track."""
         tracks = self.tracks(plant)
         d, n = tracks.coordinates, len(tracks.mean)
         refuse_more_dimensions(d, point.size, "tracks")
-        normal, velocity = np.zeros((n, point.size)), np.zeros((n, point.size))
-        nothing = np.zeros((n, point.size))
+        normal, velocity, nothing = np.zeros((3, n, point.size))
         offset = point[:d] - tracks.positions
         covariances = tracks.position_covariances
         if not (np.isfinite(offset).all() and np.isfinite(covariances).all()):

@@ -14,17 +14,12 @@ from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 
 _STEP = 1e-4  # width of the differences about braking, as a share of the control's range
-_INSTANTS = (1, 2, 3, 5, 8, 13, 21, 34, 55)
-"""Instants of a control interval that get rows, beside its last; forecasts are judged at all instants."""
+_INSTANTS = (1, 2, 3, 5, 8, 13, 21, 34, 55)  # of a control interval that get rows, beside its last
 _KEPT = 10  # control steps for which a response is kept: a guess that forecasts check
 _SAME_RESPONSE = 1  # linearisations of one step that use the kept response
 _RESOLUTION = 1e-6  # rounding of controls, as a share of half their range, for which rows are tightened
-RECOVERY_S = 0.1
-"""Time constant of recovery from a violation, s."""
-
-
-RENAMED: Final = {"holds": "horizon", "reach": "max_decrease"}
-"""Old names of parameters of its subclasses."""
+RECOVERY_S = 0.1  # time constant of recovery from a violation, s
+RENAMED: Final = {"holds": "horizon", "reach": "max_decrease"}  # old names of parameters of the subclasses
 
 
 class RolloutConstraint(Constraint):
@@ -71,11 +66,10 @@ class BoundSlacks(BoundConstraint):
 class RolloutMemory(NamedTuple):
     """What a rollout constraint remembers of an episode."""
 
-    least: tuple[
-        float, ...
-    ] = ()  # what was left at the last states, the newest last, at most `horizon` of them
+    # What was left at the last states, the newest last, at most `horizon` of them.
+    least: tuple[float, ...] = ()
+    # How what is left changes with a control, and the observation until which that is kept; None: not known.
     response: tuple[Array, int] | None = None
-    """How what is left changes with a control, and the observation until which that is kept; None: not known."""
 
 
 class BoundRollout(BoundSlacks):

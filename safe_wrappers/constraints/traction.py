@@ -120,11 +120,9 @@ class BoundTraction(BoundConstraint):
     def _read_constants(self) -> None:
         self._model_version = self.plant.model_version
         self.constants = self.wheels.constants(self.plant)
-        options = self.plant.model.opt
-        implicit = int(options.integrator) in _IMPLICIT
-        self._response = self.constants.response(
-            float(options.timestep), self.plant.substeps, self.wheels.feedback, implicit
-        )
+        options, feedback = self.plant.model.opt, self.wheels.feedback
+        hold = float(options.timestep), self.plant.substeps
+        self._response = self.constants.response(*hold, feedback, int(options.integrator) in _IMPLICIT)
 
     def start(self) -> Memory:
         n = len(self.spec.wheels)

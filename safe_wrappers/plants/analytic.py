@@ -42,6 +42,9 @@ class AnalyticPlant(Plant):
 
     control_dt: float
     """Control interval, s; where the env's `dt` is taken, it is known once the plant is bound."""
+    state: Array = np.zeros(0)  #: shape (n,), at the last observation
+    lower: Array = np.zeros(0)  #: of the control, shape (m,), once bound
+    upper: Array = np.zeros(0)  #: likewise
 
     def __init__(
         self,
@@ -63,7 +66,6 @@ class AnalyticPlant(Plant):
         self.delay_s = non_negative("delay_s", delay_s, "s")
         self._box = (lower, upper)
         self._env: Any = None
-        self._x = np.zeros(0)
         self._drift: Array | None = None
         self._effect: Array | None = None
         self._pending: deque[Array] = deque()
@@ -76,17 +78,14 @@ class AnalyticPlant(Plant):
         space = env.action_space
         assert isinstance(space, gym.spaces.Box)  # the filter has refused every other space
         m = space.shape[0]
-        low, high = (
-            np.asarray(given if given is not None else own, dtype=np.float64)
-            for given, own in zip(self._box, (space.low, space.high), strict=True)
-        )
+        low = np.asarray(space.low if self._box[0] is None else self._box[0], dtype=np.float64)
+        high = np.asarray(space.high if self._box[1] is None else self._box[1], dtype=np.float64)
         try:
-            self._lower, self._upper = np.broadcast_to(low, (m,)), np.broadcast_to(high, (m,))
+            self.lower, self.upper = np.broadcast_to(low, (m,)), np.broadcast_to(high, (m,))
         except ValueError:
-            raise ConfigurationError(
-                f"the env has {m} controls; got bounds of shape {low.shape} and {high.shape}"
-            ) from None
-        if not (self._lower <= self._upper).all():
+            shapes = f"{low.shape} and {high.shape}"
+            raise ConfigurationError(f"the env has {m} controls; got bounds of shape {shapes}") from None
+        if not (self.lower <= self.upper).all():
             raise ConfigurationError(f"lower must not exceed upper, got {low} and {high}")
         self._env = env
 
@@ -96,7 +95,7 @@ class AnalyticPlant(Plant):
         x = np.array(self._state_of(self._env.unwrapped), dtype=np.float64).reshape(-1)
         if self.delay_s > 0.0:
             x = self._after_delay(x)
-        self._x, self._drift, self._effect = x, None, None
+        self.state, self._drift, self._effect = x, None, None
 
     def executed(self, control: Array | None) -> None:
         """Remember a sent command for the delay."""
@@ -109,7 +108,7 @@ class AnalyticPlant(Plant):
         """Integrate over the commands in flight, the oldest first: it has acted in part already."""
         early = self.delay_s - self.control_dt * len(self._pending)
         if early > 0.0:  # before the first command of an episode no control acts
-            x = self.integrate(x, np.zeros(self._lower.size), early)
+            x = self.integrate(x, np.zeros(self.lower.size), early)
         for i, control in enumerate(self._pending):
             x = self.integrate(x, control, self.control_dt + (min(early, 0.0) if i == 0 else 0.0))
         return x
@@ -127,7 +126,7 @@ class AnalyticPlant(Plant):
 
     def path(self, control: Array) -> list[Array]:
         """States half-way and at the end of a held control, by one Runge-Kutta step; the end by one Euler step."""
-        x, hold = self._x, self.control_dt
+        x, hold = self.state, self.control_dt
         k1 = self.f + self.g @ control
         k2 = self._rate(x + 0.5 * hold * k1, control)
         k3 = self._rate(x + 0.5 * hold * k2, control)
@@ -139,41 +138,24 @@ class AnalyticPlant(Plant):
         return self.drift(x) + self.effect(x) @ control
 
     @property
-    def state(self) -> Array:
-        """x, shape (n,)."""
-        return self._x
-
-    @property
     def f(self) -> Array:
         """Drift at the state, shape (n,)."""
         if self._drift is None:
-            self._drift = self.drift(self._x)
-            if self._drift.shape != self._x.shape:
-                raise ConfigurationError(
-                    f"f must return the shape of the state {self._x.shape}, got {self._drift.shape}"
-                )
+            self._drift, expected = self.drift(self.state), self.state.shape
+            if self._drift.shape != expected:
+                found = self._drift.shape
+                raise ConfigurationError(f"f must return the shape of the state {expected}, got {found}")
         return self._drift
 
     @property
     def g(self) -> Array:
         """Control matrix at the state, shape (n, m)."""
         if self._effect is None:
-            self._effect, expected = self.effect(self._x), (self._x.size, self._lower.size)
-            if self._effect.shape != expected:
-                raise ConfigurationError(
-                    f"g must return shape (states, controls) = {expected}, got {self._effect.shape}"
-                )
+            self._effect, expected = self.effect(self.state), (self.state.size, self.lower.size)
+            found = self._effect.shape
+            if found != expected:
+                raise ConfigurationError(f"g must return shape (states, controls) = {expected}, got {found}")
         return self._effect
-
-    @property
-    def lower(self) -> Array:
-        """Smallest control, shape (m,)."""
-        return self._lower
-
-    @property
-    def upper(self) -> Array:
-        """Largest control, shape (m,)."""
-        return self._upper
 
     def drift(self, x: Array) -> Array:
         """The drift at any state, shape (n,)."""

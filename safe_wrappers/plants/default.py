@@ -24,9 +24,8 @@ def own_plant(plant: Any) -> Plant | None:
     if isinstance(plant, PlantTemplate):
         return copy.deepcopy(plant.plant)
     if plant is not None and not isinstance(plant, Plant):
-        raise ConfigurationError(
-            f"plant is a MujocoPlant, an AnalyticPlant or another subclass of sw.Plant, got {plant!r}"
-        )
+        wanted = "plant is a MujocoPlant, an AnalyticPlant or another subclass of sw.Plant"
+        raise ConfigurationError(f"{wanted}, got {plant!r}")
     return plant
 
 

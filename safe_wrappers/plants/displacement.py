@@ -8,11 +8,7 @@ import numpy as np
 
 from safe_wrappers.checks import Array, positive
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.plants.mujoco.displacement_step import (
-    DisplacementRecorder,
-    gripper_of,
-    moves_by_displacement,
-)
+from safe_wrappers.plants.mujoco.displacement_step import DisplacementRecorder, moves_by_displacement, welds
 from safe_wrappers.plants.mujoco.forecast import Forecast, Recorder
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
@@ -60,7 +56,7 @@ class DisplacementPlant(MujocoPlant):
         self._dtype = env.action_space.dtype
         self.blocked = bool(raw.block_gripper)
         self._pose = np.zeros(7)
-        self._body = gripper_of(raw.model)
+        self._body = welds(raw.model)[0][1]
         super().bind(env)
         self._clamped = False  # all of the action space acts
         self.gripper = self.model.body(self._body).name
@@ -73,12 +69,11 @@ class DisplacementPlant(MujocoPlant):
 
     def _check_action_space(self, env: gym.Env[Any, Any]) -> None:
         space: Any = env.action_space
-        self._lower, self._upper = (np.asarray(end, dtype=np.float64) for end in (space.low, space.high))
+        self.lower, self.upper = (np.asarray(end, dtype=np.float64) for end in (space.low, space.high))
 
     def _new_recorder(self) -> Recorder:
-        return DisplacementRecorder(
-            self.model, self.substeps, self.metres_per_unit, self._dtype, self.blocked
-        )
+        action = self.metres_per_unit, self._dtype, self.blocked
+        return DisplacementRecorder(self.model, self.substeps, *action)
 
     def observe(self) -> None:
         """Take the env's present state, and the gripper's pose as MuJoCo last evaluated it."""
@@ -93,7 +88,7 @@ class DisplacementPlant(MujocoPlant):
     def _predict_over_delay(self) -> None:
         self._load_to_step()
         idle = self._delay_steps // self.substeps - len(self._pending)
-        for control in [np.zeros(self._lower.size)] * idle + list(self._pending):
+        for control in [np.zeros(self.lower.size)] * idle + list(self._pending):
             self._recorder.act(self.data, control)
             mujoco.mj_step(self.model, self.data, self.substeps)
             self._recorder.settle(self.data)

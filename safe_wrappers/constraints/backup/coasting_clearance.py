@@ -12,6 +12,7 @@ import numpy as np
 from safe_wrappers.checks import check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundDetourClearance, Detour
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
+from safe_wrappers.constraints.rollout import RENAMED
 from safe_wrappers.control.numerics.outlines import convex_outline, distances_to_outline
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
@@ -24,18 +25,11 @@ _SAME_M = 1e-6  # rounding of a rollout: a smaller loss of clearance is none
 _STILL = 1e-9  # states (m, rad, m/s, rad/s) and places of discs that differ by less are the same
 _WAY_OUT_M = 1e-3  # gain of clearance that is asked for where zero control leaves less than the margin
 _RECOVERED = 0.5  # share of the best gain of clearance that a control has to reach from inside an obstacle
+# Shares of the drive for the outer and the inner actuator of a detour, as they are tried.
 _AROUND = ((1.0, 0.5), (1.0, 0.0), (1.0, -1.0), (-0.5, -1.0))
-"""Shares of the drive for the outer and the inner actuator of a detour, as they are tried."""
 
 
-@deprecated_parameters(
-    renamed={
-        "holds": "horizon",
-        "alone": "robot_model_attr",
-        "reach": "max_decrease",
-        "reach_s": "max_decrease_per_speed",
-    }
-)
+@deprecated_parameters(renamed={**RENAMED, "alone": "robot_model_attr", "reach_s": "max_decrease_per_speed"})
 @dataclass
 class CoastingClearance(Constraint):
     """Keep a free-moving machine out of discs, counting its whole way until it rests without control.
@@ -197,9 +191,8 @@ class BoundCoastingClearance(BoundDetourClearance):
 
     def _drives(self) -> list[Array]:
         """Full control of all actuators together and of each alone, both ways."""
-        low, high, n = self._low, self._high, self._low.size
-        alone = [np.where(np.arange(n) == i, end, 0.0) for i in range(n) for end in (low, high)]
-        return [high, low, *alone]
+        low, high = self._low, self._high
+        return [high, low, *(np.where(one, end, 0.0) for one in np.eye(low.size) for end in (low, high))]
 
     def slack(self, control: Array) -> float:
         """The least clearance on the way of a control (from inside: at the end of it), m."""
@@ -226,7 +219,8 @@ class BoundCoastingClearance(BoundDetourClearance):
 
         def beside_the_nearest() -> float:
             way = self._after(acting).way
-            x, y = self._nearest() - self._here
+            group = min((g for g in (self._origin, self._body) if g.near), key=lambda g: g.now.min())
+            x, y = group.nearest() - self._here
             # What is to the left of the way is passed on its right.
             return -1.0 if way[0] * y - way[1] * x > 0.0 else 1.0
 
@@ -238,10 +232,6 @@ class BoundCoastingClearance(BoundDetourClearance):
         pairs = np.array(_AROUND) * drive
         outer_is_first = self._first_turns_left == (side * drive > 0.0)
         return list(pairs if outer_is_first else pairs[:, ::-1])
-
-    def _nearest(self) -> Array:
-        """Centre of the disc with the least room now, shape (2,)."""
-        return min((g for g in (self._origin, self._body) if g.near), key=lambda g: g.now.min()).nearest()
 
 
 class _Outcome(NamedTuple):
@@ -293,18 +283,14 @@ class _Group:
         if self._outline is None:
             return np.asarray(np.sqrt((offsets**2).sum(axis=2)) - self._radii)
         x, y = course.ahead[:, :1], course.ahead[:, 1:]
-        local = np.stack(
-            [offsets[..., 0] * x + offsets[..., 1] * y, offsets[..., 1] * x - offsets[..., 0] * y], axis=-1
-        )
+        ahead, left = offsets[..., 0] * x + offsets[..., 1] * y, offsets[..., 1] * x - offsets[..., 0] * y
+        local = np.stack([ahead, left], axis=-1)
         return np.asarray(distances_to_outline(self._outline, local) - self._radii)
 
 
 def _checked_outline(given: Any, needed: bool) -> list[list[float]]:
-    """The outline as plain data."""
     if needed and not len(given):
-        raise ConfigurationError(
-            "untouched needs the machine's outline: [[x, y], ...] in its body's frame, m"
-        )
+        raise ConfigurationError("untouched needs the machine's outline: [[x, y], ...] in its body's frame")
     try:
         points = np.array(given, dtype=np.float64).reshape(-1, 2)
     except (TypeError, ValueError):

@@ -119,7 +119,12 @@ class BoundEscapeClearance(BoundBackupClearance):
     def clearance(self) -> Array:
         """Distance now, not along a manoeuvre, from every obstacle or the bound of where it may be, m, shape (n,)."""
         self._asked: list[tuple[Array, NDArray[np.intp]]] = []
-        self._open = self._with_going_on(self._memory)
+        which, going_on = list(self._usual), self._memory
+        if going_on is not None:
+            # The same way with one hold less to go: the manoeuvres of a direction are in the order of their lengths.
+            shorter = going_on - 1 if self._escapes.manoeuvres[going_on].holds > 1 else 0
+            which += [i for i in (going_on, shorter) if i not in which]
+        self._open = np.array(which, dtype=np.intp)
         joints = list(self._point.joints)
         self._position = self.plant.qpos[joints] + np.asarray(self._point.origin)
         self._velocity = self.plant.qvel[joints]
@@ -143,15 +148,6 @@ class BoundEscapeClearance(BoundBackupClearance):
         self._wanted = self.spec.margin + outside * np.exp(-times[1:] / _RECOVERY_S)
         self._best: float | None = None
         return np.asarray(now)
-
-    def _with_going_on(self, going_on: int | None) -> NDArray[np.intp]:
-        """The manoeuvres to look at: the usual ones, and the one that was open after the last control."""
-        which = list(self._usual)
-        if going_on is not None:
-            # The same way with one hold less to go: the manoeuvres of a direction are in the order of their lengths.
-            shorter = going_on - 1 if self._escapes.manoeuvres[going_on].holds > 1 else 0
-            which += [i for i in (going_on, shorter) if i not in which]
-        return np.array(which, dtype=np.intp)
 
     def _expected(self, obstacle: Any, times: Array) -> tuple[Array, Array]:
         """Centres and half-widths of the boxes that hold them, shapes (k, n, 2)."""
@@ -222,13 +218,8 @@ class BoundEscapeClearance(BoundBackupClearance):
         """Braking where it leaves a way out, else the first control of the one that keeps farthest away."""
         firsts = self._firsts()
         left = self._slacks(firsts).max(axis=1)
-        return self._whole(np.zeros(self.plant.model.nu), firsts[0 if left[0] >= 0.0 else int(left.argmax())])
-
-    def _whole(self, control: Array, driven: Array) -> Array:
-        """A control with other values on the two slides, shape (m,)."""
-        whole = np.array(control)
-        whole[list(self._point.actuators)] = driven
-        return whole
+        best = firsts[0 if left[0] >= 0.0 else int(left.argmax())]
+        return self._point.control(np.zeros(self.plant.model.nu), best)
 
     def _firsts(self) -> Array:
         """First controls of the manoeuvres: braking, and each direction; shape (5, 2)."""
@@ -248,7 +239,7 @@ class BoundEscapeClearance(BoundBackupClearance):
             closer = np.array(tried)
             closer = closer[self._slacks(closer).max(axis=1) >= 0.0]
             good = _nearest_first(np.concatenate([good, closer]), asked)
-        return [self._whole(control, pair) for pair in good]
+        return [self._point.control(control, pair) for pair in good]
 
 
 def _nearest_first(controls: Array, asked: Array) -> Array:
@@ -256,9 +247,8 @@ def _nearest_first(controls: Array, asked: Array) -> Array:
 
 
 def _moves(obstacle: Any) -> bool:
-    return isinstance(obstacle, TrackedDiscs) or (
-        isinstance(obstacle, Discs) and obstacle.velocity_attribute is not None
-    )
+    tracked, published = isinstance(obstacle, TrackedDiscs), isinstance(obstacle, Discs)
+    return tracked or (published and obstacle.velocity_attribute is not None)
 
 
 def _box_distances(x: Array, y: Array, centers: Array, halves: Array) -> Array:

@@ -72,9 +72,8 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
     plant: MujocoPlant
 
     def __init__(self, spec: HeadingDriveClearance, plant: Plant) -> None:
-        machine = require_mujoco(
-            plant, "HeadingDriveClearance needs a MujocoPlant: it reads the robot's model"
-        )
+        hint = "HeadingDriveClearance needs a MujocoPlant: it reads the robot's model"
+        machine = require_mujoco(plant, hint)
         self._frame = PlanarFrame(machine, spec.body)
         self._discs = np.zeros((0, 3))
         self._turns_first = self._frame.turn_index == 0
@@ -89,10 +88,10 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         """Of the stopping path from the nearest disc, margin and state error not taken off, m, shape (1,)."""
         reserve = self.spec.margin + self.spec.state_error
         centers = [obstacle.centers(self.plant)[:, :2] for obstacle in self.spec.obstacles]
-        if sum(map(len, centers)) != len(self._discs):
-            sizes = [o.radius + reserve for o in self.spec.obstacles]
-            self._discs = np.zeros((sum(map(len, centers)), 3))
-            self._discs[:, 2] = np.repeat(sizes, [*map(len, centers)])
+        counts = [len(group) for group in centers]
+        if sum(counts) != len(self._discs):
+            self._discs = np.zeros((sum(counts), 3))
+            self._discs[:, 2] = np.repeat([o.radius + reserve for o in self.spec.obstacles], counts)
         np.concatenate(centers, out=self._discs[:, :2])
         self._scene = self._models, np.array(self._frame.motion(self.plant)), self._discs, self.spec.brake
         least, self._in_play = among.least_clearance(*self._scene)
@@ -103,7 +102,6 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         return control[::-1].copy() if self._turns_first else control
 
     def admits(self, control: Array) -> bool:
-        """Predict the held control step; its end must still have a safe stopping path."""
         if not self._in_play:
             return True
         drive, turn = self._pair(control).tolist()
@@ -140,10 +138,8 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
             return proposal, among.PROPOSAL, HalfSpaces.none(2)
         low, high = np.maximum(low, self.plant.lower), np.minimum(high, self.plant.upper)
         least, most = self.plant.acting_range
-        bounds = np.array(
-            [self._pair(x) for x in (low, high, np.clip(least, low, high), np.clip(most, low, high))]
-        )
-        found = np.empty(2)
+        ends = low, high, np.clip(least, low, high), np.clip(most, low, high)
+        bounds, found = np.array([self._pair(end) for end in ends]), np.empty(2)
         stage, side, normals, offsets = among.closest_admitted(
             *self._scene, self._pair(proposal), self._kept_side(), self.spec.detour, bounds, found
         )

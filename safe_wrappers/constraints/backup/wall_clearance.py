@@ -94,7 +94,6 @@ class BoundWallClearance(BoundBackupClearance):
         return np.array([self._least + self.spec.margin] if self._among.walls else [])
 
     def admits(self, control: Array) -> bool:
-        """Whether a held control, and braking after it, keeps its distance from every wall."""
         i, j = self._point.actuators
         return self._admitted((float(control[i]), float(control[j])))
 
@@ -119,7 +118,7 @@ class BoundWallClearance(BoundBackupClearance):
 
     def backup(self) -> Array:
         """The control that is always admitted: brake both axes. From outside it leads back inside."""
-        return self._as_control(np.zeros(self.plant.model.nu), self._backup())
+        return self._point.control(np.zeros(self.plant.model.nu), self._backup())
 
     def _backup(self) -> _Control:
         """Braking; from outside the safe set, along the shortest way back to rest just inside it."""
@@ -143,11 +142,6 @@ class BoundWallClearance(BoundBackupClearance):
         target = wall[2 * axis] - gap if before else wall[2 * axis + 1] + gap
         return max(constants.low, min(constants.control_to_rest_at(x, v, target), constants.high))
 
-    def _as_control(self, like: Array, control: _Control) -> Array:
-        out = np.array(like)
-        out[list(self._point.actuators)] = control
-        return out
-
     def candidates(self, control: Array) -> list[Array]:
         """Admissible controls near a refused one, the nearest first: those that slide along the walls in its way."""
         (i, j), x_axis, y_axis = self._point.actuators, self._among.x_axis, self._among.y_axis
@@ -159,7 +153,7 @@ class BoundWallClearance(BoundBackupClearance):
         elif self.spec.velocity_clip is not None:
             found = [self._towards(c, asked) for c in found]
         found.sort(key=lambda c: math.dist(c, asked))
-        return [self._as_control(control, c) for c in found]
+        return [self._point.control(control, c) for c in found]
 
     def _turned(self, control: _Control, turns: int) -> list[_Control]:
         """Controls whose rectangle is clear, by limiting one axis or the other at each wall in the way."""
@@ -222,7 +216,7 @@ class BoundWallClearance(BoundBackupClearance):
                 sign = 1.0 if before else -1.0
                 limit = self._stopped_at(axis, wall, before, share * gap[axis] if corner else room)
                 normal = _replaced((0.0, 0.0), axis, sign)
-                normals.append(self._as_control(np.zeros(self.plant.model.nu), normal))
+                normals.append(self._point.control(np.zeros(self.plant.model.nu), normal))
                 offsets.append(max(sign * limit, sign * backup[axis]))
         if not normals:
             return HalfSpaces.none(self.plant.model.nu)

@@ -24,7 +24,6 @@ class GeomGaps:
     """Pairs of geoms, one of the machine and one of the world.
 
     Args:
-        plant: Bound.
         machine: Names of bodies (all their geoms that can collide, or all if none can) or geoms.
         world: Likewise.
 
@@ -143,9 +142,8 @@ def _geoms(plant: MujocoPlant, name: str) -> list[int]:
         return [g for g in every if m.geom_contype[g] or m.geom_conaffinity[g]] or every
     if name in geoms:
         return [plant.named("geom", name)]
-    raise UnknownNameError(
-        f"the model has no body or geom {name!r}; bodies: {', '.join(bodies)}; geoms: {', '.join(geoms)}"
-    )
+    there = f"bodies: {', '.join(bodies)}; geoms: {', '.join(geoms)}"
+    raise UnknownNameError(f"the model has no body or geom {name!r}; {there}")
 
 
 def _path(model: mujoco.MjModel, forecast: Forecast, geom: int) -> tuple[Array, Array]:

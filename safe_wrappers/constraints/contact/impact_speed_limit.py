@@ -70,9 +70,8 @@ class ImpactSpeedLimit(RolloutConstraint):
             check_fields(self, positive, (name,), unit)
         self._force, self._stiffness, self._other_mass = self._interface()
         if self.margin >= self._force:
-            raise ConfigurationError(
-                f"the margin {self.margin} N leaves nothing of the limit {self._force} N"
-            )
+            nothing = f"the margin {self.margin} N leaves nothing"
+            raise ConfigurationError(f"{nothing} of the limit {self._force} N")
 
     def _interface(self) -> tuple[float, float, float]:
         """Force limit in N, stiffness in N/m, and mass in kg of what is hit."""

@@ -13,16 +13,10 @@ from safe_wrappers.checks import check_fields, non_negative, positive, whole_num
 from safe_wrappers.constraints.contact.contact_feasibility import checked_friction_share, touching_bodies
 from safe_wrappers.constraints.limits.joints import refuse_uncovered_stops, stops
 from safe_wrappers.control.contact.friction_cone import cone_excess
+from safe_wrappers.control.legged import whole_body
 from safe_wrappers.control.legged.predicted_positions import predicted_position_rows
 from safe_wrappers.control.legged.support import common_plane, support_polygon, support_rows
-from safe_wrappers.control.legged.whole_body import (
-    WholeBodySolution,
-    WholeBodyStatus,
-    attainable_contact_acceleration,
-    rigid_forces,
-    solve_cone,
-    solve_pyramid,
-)
+from safe_wrappers.control.legged.whole_body import WholeBodySolution, WholeBodyStatus
 from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, Memory
@@ -133,24 +127,14 @@ class BoundStance(BoundConstraint):
             rows = self._balance(found.points[ground], normals, pressing)
             if rows is not None:
                 limits["force_rows"], limits["force_limits"] = rows, np.zeros(len(rows))
-        problem = WholeBodyProblem(
-            motion.inertia,
-            bias,
-            motion.actuation,
-            jacobians,
-            drift,
-            normals,
-            self.spec.friction_share * found.friction[ground],
-            self.plant.lower,
-            self.plant.upper,
-            control,
-            contact_acceleration=acceleration,
-            breaking=~pressing,
-            first_tangents=found.first_tangents[ground],
-            **limits,
-        )
+        limits |= {"contact_acceleration": acceleration, "breaking": ~pressing}
+        limits["first_tangents"] = found.first_tangents[ground]
+        contacts = jacobians, drift, normals, self.spec.friction_share * found.friction[ground]
+        controls = self.plant.lower, self.plant.upper, control
+        problem = WholeBodyProblem(motion.inertia, bias, motion.actuation, *contacts, *controls, **limits)
         # Two points of one rigid foot cannot come to rest each as it likes.
-        return replace(problem, contact_acceleration=attainable_contact_acceleration(problem))
+        attainable = whole_body.attainable_contact_acceleration(problem)
+        return replace(problem, contact_acceleration=attainable)
 
     def _balance(self, points: Array, normals: Array, pressing: NDArray[np.bool_]) -> Array | None:
         """The inset, as rows on all contact forces; None where there is no polygon."""
@@ -166,8 +150,8 @@ class BoundStance(BoundConstraint):
         return np.asarray(rows.reshape(len(some), -1))
 
     def solve(self, problem: WholeBodyProblem) -> WholeBodySolution:
-        """By the specification's cone."""
-        return solve_cone(problem) if self.spec.cone == "exact" else solve_pyramid(problem, self.spec.edges)
+        exact = self.spec.cone == "exact"
+        return whole_body.solve_cone(problem) if exact else whole_body.solve_pyramid(problem, self.spec.edges)
 
     def admits(self, control: Array) -> bool:
         """Whether the standing contacts could answer this control with forces inside their cones."""
@@ -186,7 +170,6 @@ class BoundStance(BoundConstraint):
         return self.solve(replace(problem, nominal=control)).status is WholeBodyStatus.INACTIVE
 
     def _ask(self, problem: WholeBodyProblem, proposed: Array) -> WholeBodySolution:
-        """Solve for a proposal, and keep the answer."""
         self._asked, self._answer = proposed.copy(), self.solve(replace(problem, nominal=proposed))
         return self._answer
 
@@ -203,7 +186,7 @@ class BoundStance(BoundConstraint):
         problem = self.problem(control)
         if problem is None:
             return -np.inf
-        forces, _ = rigid_forces(problem, control)
+        forces, _ = whole_body.rigid_forces(problem, control)
         missed = cone_excess(forces, problem.normals, problem.friction)
         return -float(missed.max()) / self.plant.weight_n if len(forces) else 0.0
 

@@ -93,9 +93,7 @@ class SerialChain:
         for i, q in enumerate(qpos):
             data.qpos[:] = q
             mujoco.mj_kinematics(model, data)
-            arms[i] = origin - data.xanchor[joints]
-            axes[i] = data.xaxis[joints]
-            turns[i] = turn
+            arms[i], axes[i], turns[i] = origin - data.xanchor[joints], data.xaxis[joints], turn
         linear = np.where(self._slides, axes, np.cross(axes, arms))
         angular = np.where(self._slides, 0.0, axes)
         both = np.concatenate([linear, angular], axis=-1)

@@ -9,14 +9,7 @@ import numpy as np
 from safe_wrappers.checks import check_fields, name_list, positive
 from safe_wrappers.constraints.limits.serial_chain import FrameKind, SerialChain
 from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
-from safe_wrappers.control.filtering.manipulability import (
-    ValidatedThreshold,
-    chain_derivative,
-    manipulability,
-    manipulability_gradient,
-    task_rows,
-    validated_threshold,
-)
+from safe_wrappers.control.filtering import manipulability as of_arm
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, HalfSpaces
@@ -76,7 +69,7 @@ class SingularityMargin(RolloutConstraint):
     horizon: int = 5
     max_decrease: float | None = None
 
-    validated: ValidatedThreshold | None = field(default=None, init=False, repr=False, compare=False)
+    validated: of_arm.ValidatedThreshold | None = field(default=None, init=False, repr=False, compare=False)
     unit: ClassVar[str] = "shares of the threshold"
 
     def __post_init__(self) -> None:
@@ -94,16 +87,14 @@ class SingularityMargin(RolloutConstraint):
         kinds: tuple[FrameKind, ...] = ("site", "body", "geom")
         named = [kind for kind in kinds if getattr(self, kind) is not None]
         if len(named) != 1 or not isinstance(getattr(self, named[0]), str):
-            raise ConfigurationError(
-                "name the one site, body or geom that the task moves; got "
-                + ", ".join(f"{kind}={getattr(self, kind)!r}" for kind in kinds)
-            )
+            found = ", ".join(f"{kind}={getattr(self, kind)!r}" for kind in kinds)
+            raise ConfigurationError(f"name the one site, body or geom that the task moves; got {found}")
         self._kind = named[0]
         if self.frame not in ("world", "own"):
             raise ConfigurationError(f'frame is "world" or "own", got {self.frame!r}')
         if self.joints is not None:
             self.joints = name_list("joints", self.joints, also="None for every driven joint")
-        self._rows, self._weights = task_rows(self.directions, self.rotations, self.length)
+        self._rows, self._weights = of_arm.task_rows(self.directions, self.rotations, self.length)
 
     def bind(self, plant: Plant) -> "BoundSingularityMargin":
         return BoundSingularityMargin(self, plant)
@@ -139,15 +130,14 @@ class BoundSingularityMargin(BoundRollout):
         found = np.abs(self._measure(sampled))
         most = float(found.max())
         if most < _STILL:
-            raise ConfigurationError(
-                f"{what} cannot be moved in all of these directions at once in any configuration: {task}, "
-                f"frame={self.spec.frame!r}"
-            )
+            nowhere = "cannot be moved in all of these directions at once in any configuration"
+            raise ConfigurationError(f"{what} {nowhere}: {task}, frame={self.spec.frame!r}")
         if spec.threshold is not None:
             self._threshold = spec.threshold
         else:
             assert spec.task_speed is not None and spec.rate_limit is not None
-            spec.validated = validated_threshold(self._task(sampled), spec.task_speed, spec.rate_limit)
+            jacobians = self._task(sampled)
+            spec.validated = of_arm.validated_threshold(jacobians, spec.task_speed, spec.rate_limit)
             self._threshold = spec.validated.threshold
         if self._threshold * (1.0 + self.spec.margin) >= most:
             raise ConfigurationError(
@@ -158,8 +148,7 @@ class BoundSingularityMargin(BoundRollout):
 
     def _task(self, qpos: Array) -> Array:
         """Shape (k, m, n)."""
-        jacobians, axes = self._chain.jacobians(qpos)
-        return self._chosen(self._in_frame(jacobians, axes))
+        return self._chosen(self._in_frame(*self._chain.jacobians(qpos)))
 
     def _chosen(self, jacobians: Array) -> Array:
         """The task's directions, weighed, and the joints that do it, shape (..., m, n)."""
@@ -179,7 +168,7 @@ class BoundSingularityMargin(BoundRollout):
         w = np.full(len(qpos), np.nan)
         finite = np.isfinite(qpos).all(axis=1)
         task = self._task(qpos[finite])
-        w[finite] = self._side * np.linalg.det(task) if self._signed else manipulability(task)
+        w[finite] = self._side * np.linalg.det(task) if self._signed else of_arm.manipulability(task)
         return w
 
     def now(self) -> Array:
@@ -196,15 +185,15 @@ class BoundSingularityMargin(BoundRollout):
     def _slope(self, qpos: Array) -> Array:
         """dw/dq over the chain's joints, shape (k, n)."""
         jacobians, axes = self._chain.jacobians(qpos)
-        change = chain_derivative(jacobians[:, :3], jacobians[:, 3:])
+        change = of_arm.chain_derivative(jacobians[:, :3], jacobians[:, 3:])
         if self.spec.frame == "own":
             # The axes turn with the joints, too.
             turning = np.swapaxes(jacobians[:, 3:], 1, 2)[:, :, None, None, :]  # of joint k
             blocks = np.swapaxes(jacobians.reshape(len(qpos), 2, 3, -1), 2, 3)[:, None]
             carried = np.swapaxes(np.cross(turning, blocks), 3, 4)
             change = change - carried.reshape(change.shape)
-        moved = self._in_frame(change, axes)
-        return manipulability_gradient(self._chosen(self._in_frame(jacobians, axes)), self._chosen(moved))
+        task, moved = (self._chosen(self._in_frame(part, axes)) for part in (jacobians, change))
+        return of_arm.manipulability_gradient(task, moved)
 
     def rows(self) -> HalfSpaces:
         """One row `w'' + 2 a w' + a^2 (w - threshold) >= 0`, a first guess for the forecast, which decides."""

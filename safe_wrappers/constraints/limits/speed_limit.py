@@ -135,9 +135,7 @@ class BoundSpeedLimit(BoundRollout):
         if self.spec.average == "substep" or self._shown is None:
             return left[:, None]
         shown = self._point(forecast.published_frames, forecast.published_centres)
-        both = np.empty((len(left), 2))
-        both[:, 0], both[:, 1] = left, self._along(shown, self._shown)
-        return both
+        return np.column_stack([left, self._along(shown, self._shown)])
 
     def _along(self, points: Array, start: Array) -> Array:
         moved = points.copy()

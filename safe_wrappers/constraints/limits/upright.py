@@ -53,9 +53,8 @@ class Upright(RolloutConstraint):
         if self.tilt is not None:
             self.tilt = positive("tilt", self.tilt, "rad")
             if self.tilt > math.pi or self.tilt <= self.margin:
-                raise ConfigurationError(
-                    f"tilt is an angle above the margin ({self.margin}) and at most pi, got {self.tilt}"
-                )
+                wanted = f"tilt is an angle above the margin ({self.margin}) and at most pi"
+                raise ConfigurationError(f"{wanted}, got {self.tilt}")
         low, high = self.lowest, self.highest
         if low is not None and high is not None and not high - low > 2.0 * self.margin:
             raise ConfigurationError(

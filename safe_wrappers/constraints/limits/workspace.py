@@ -99,10 +99,8 @@ class BoundWorkspace(BoundRollout):
         """Room of every point to every bound and surface, shape (k, n)."""
         k = len(points)
         low, high = np.isfinite(self.spec._low), np.isfinite(self.spec._high)
-        left = [
-            (points - self.spec._low)[:, :, low].reshape(k, -1),
-            (self.spec._high - points)[:, :, high].reshape(k, -1),
-        ]
+        above, below = (points - self.spec._low)[:, :, low], (self.spec._high - points)[:, :, high]
+        left = [above.reshape(k, -1), below.reshape(k, -1)]
         every = points.reshape(-1, 3)
         for obstacle in self.spec.keep_out:
             surfaces = distances(obstacle, every, self.plant)

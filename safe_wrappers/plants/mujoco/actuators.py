@@ -96,11 +96,7 @@ def _acting_range(
 
 
 class AffineActuators:
-    """Gain, bias and acting control range of every actuator of one model.
-
-    Args:
-        model: The plant's own model; its arrays are read at every call, so they may be changed.
-    """
+    """Gain, bias and acting control range of every actuator of a model, whose arrays are read at every call."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         _refuse_unsupported(model)
@@ -112,25 +108,15 @@ class AffineActuators:
     def gain_and_bias(self, length: Array, velocity: Array) -> tuple[Array, Array]:
         """Force per control and force at zero control, shapes (nu,) and (nu,)."""
         m = self._model
-        affine = m.actuator_gaintype == _AFFINE_GAIN
-        gain = m.actuator_gainprm[:, 0] + affine * (
-            m.actuator_gainprm[:, 1] * length + m.actuator_gainprm[:, 2] * velocity
-        )
-        biased = m.actuator_biastype == _AFFINE_BIAS
-        bias = biased * (
-            m.actuator_biasprm[:, 0] + m.actuator_biasprm[:, 1] * length + m.actuator_biasprm[:, 2] * velocity
-        )
-        return gain, bias
+        affine, biased = m.actuator_gaintype == _AFFINE_GAIN, m.actuator_biastype == _AFFINE_BIAS
+        g, b = m.actuator_gainprm, m.actuator_biasprm
+        gain = g[:, 0] + affine * (g[:, 1] * length + g[:, 2] * velocity)
+        return gain, biased * (b[:, 0] + b[:, 1] * length + b[:, 2] * velocity)
 
     def moment(self, data: mujoco.MjData) -> Array:
         """Generalised force per unit actuator force, shape (nu, nv)."""
-        mujoco.mju_sparse2dense(
-            self._moment,
-            data.actuator_moment.reshape(-1),
-            data.moment_rownnz,
-            data.moment_rowadr,
-            data.moment_colind.reshape(-1),
-        )
+        places = data.moment_rownnz, data.moment_rowadr, data.moment_colind.reshape(-1)
+        mujoco.mju_sparse2dense(self._moment, data.actuator_moment.reshape(-1), *places)
         return self._moment
 
     def acting_range(self, length: Array, velocity: Array, control_dt: float = 0.0) -> tuple[Array, Array]:
@@ -154,9 +140,8 @@ class AffineActuators:
         """Length and velocity of the transmissions where the joints alone determine every clamp, else None."""
         m = self._model
         if self._on_joints is None:
-            depends = m.actuator_forcelimited.astype(bool) & (
-                m.actuator_biasprm[:, 1:3].any(axis=1) | m.actuator_gainprm[:, 1:3].any(axis=1)
-            )
+            depends = m.actuator_biasprm[:, 1:3].any(axis=1) | m.actuator_gainprm[:, 1:3].any(axis=1)
+            depends &= m.actuator_forcelimited.astype(bool)
             depends &= (m.actuator_biastype > 0) | (m.actuator_gaintype > 0)
             scalar = np.isin(m.actuator_trntype, _JOINT_TRANSMISSIONS)
             joint = np.where(scalar, m.actuator_trnid[:, 0], 0)
@@ -178,10 +163,8 @@ def drift_and_effect(
     """
     gain, _ = actuators.gain_and_bias(data.actuator_length, data.actuator_velocity)
     least, most = actuators.acting_range(data.actuator_length, data.actuator_velocity)
-    moment = actuators.moment(data)
-    force_per_control = moment * gain[:, None]
     saturated = most <= least
-    effect = _solve_inertia(model, data, force_per_control).T
+    effect = _solve_inertia(model, data, actuators.moment(data) * gain[:, None]).T
     effect = np.where(saturated, 0.0, effect)
     return data.qacc - effect @ np.where(saturated, 0.0, np.clip(data.ctrl, least, most)), effect
 
@@ -193,14 +176,11 @@ def _solve_inertia(m: mujoco.MjModel, d: mujoco.MjData, rows: Array) -> Array:
     if not active.any():
         mujoco.mj_solveM(m, d, out, np.ascontiguousarray(rows))
         return out
-    jacobian = _constraint_jacobian(m, d)[active]
+    if mujoco.mj_isSparse(m):
+        jacobian = np.zeros((d.nefc, m.nv))
+        mujoco.mju_sparse2dense(jacobian, d.efc_J, d.efc_J_rownnz, d.efc_J_rowadr, d.efc_J_colind)
+    else:
+        jacobian = d.efc_J.reshape(d.nefc, m.nv)
+    jacobian = jacobian[active]
     stiff = inertia(m, d) + jacobian.T @ (d.efc_D[active][:, None] * jacobian)
     return np.asarray(np.linalg.solve(stiff, rows.T).T)
-
-
-def _constraint_jacobian(m: mujoco.MjModel, d: mujoco.MjData) -> Array:
-    if not mujoco.mj_isSparse(m):
-        return np.array(d.efc_J.reshape(d.nefc, m.nv))
-    dense = np.zeros((d.nefc, m.nv))
-    mujoco.mju_sparse2dense(dense, d.efc_J, d.efc_J_rownnz, d.efc_J_rowadr, d.efc_J_colind)
-    return dense

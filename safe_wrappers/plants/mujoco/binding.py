@@ -19,21 +19,17 @@ def own_model(raw: Any, given: mujoco.MjModel | None) -> mujoco.MjModel:
     """A copy of the given model, or of an unwrapped env's, or an error that says why a plant cannot use it."""
     if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
         raise UnsupportedEnvError(
-            f"{raw} has no MuJoCo .model and .data; describe it with "
-            "AnalyticPlant(f=..., g=..., state=...) instead"
+            f"{raw} has no MuJoCo .model and .data; describe it with AnalyticPlant(f=..., g=..., state=...) instead"
         )
     model = copy.copy(given if given is not None else raw.model)
-    if (model.nq, model.nv, model.nu) != (raw.model.nq, raw.model.nv, raw.model.nu):
-        raise ConfigurationError(
-            "the plant's model must have the env's joints and actuators: expected (nq, nv, nu) = "
-            f"{(raw.model.nq, raw.model.nv, raw.model.nu)}, got {(model.nq, model.nv, model.nu)}"
-        )
+    wanted, sizes = ((m.nq, m.nv, m.nu) for m in (raw.model, model))
+    if sizes != wanted:
+        must = "the plant's model must have the env's joints and actuators"
+        raise ConfigurationError(f"{must}: expected (nq, nv, nu) = {wanted}, got {sizes}")
     expected, timestep = raw.model.opt.timestep, model.opt.timestep
     if not np.isclose(timestep, expected, rtol=1e-9):
-        raise ConfigurationError(
-            f"the plant's model must take the env's physics steps: expected a timestep of {expected} s, "
-            f"got {timestep} s"
-        )
+        must = "the plant's model must take the env's physics steps"
+        raise ConfigurationError(f"{must}: expected a timestep of {expected} s, got {timestep} s")
     if model.opt.integrator > _LAST_INTEGRATOR:
         raise UnsupportedEnvError(
             "the model's integrator is 'discrete' (MuJoCo 3.13 and later), whose accelerations are those of a "

@@ -13,19 +13,16 @@ from safe_wrappers.plants.mujoco.forecast import RESETS
 from safe_wrappers.plants.mujoco.model import fixed_bodies
 from safe_wrappers.plants.mujoco.replay import evaluations
 
+# Bound of squared lengths: MuJoCo does not check the stages of the Runge-Kutta steps that are made here.
 _FASTEST = float(mujoco.mjMAXVAL) ** 2
-"""Bound of squared lengths: MuJoCo does not check the stages of the Runge-Kutta steps that are made here."""
 
 
 class NormalContact(NamedTuple):
     """One contact."""
 
-    bodies: tuple[int, int]
-    """Ids of the two bodies, the smaller first; `nbody` stands for something flexible."""
-    gap: float
-    """Signed distance, m; negative where they penetrate."""
-    force: float
-    """Along the normal, N; positive pushes them apart."""
+    bodies: tuple[int, int]  # ids, the smaller first; `nbody` stands for something flexible
+    gap: float  # signed distance, m; negative where they penetrate
+    force: float  # along the normal, N; positive pushes them apart
 
 
 class Contacts:
@@ -39,9 +36,7 @@ class Contacts:
         self, model: mujoco.MjModel, bodies: Sequence[str] | None = None, against: Sequence[str] | None = None
     ) -> None:
         self.model = model
-        one, other = (
-            _chosen(model, name, given) for name, given in (("bodies", bodies), ("against", against))
-        )
+        one, other = _chosen(model, "bodies", bodies), _chosen(model, "against", against)
         self._watched = (one[:, None] & other | other[:, None] & one).tolist()
         # The last entry is for geom -1, of something flexible.
         self._body_of_geom: list[int] = [*model.geom_bodyid.tolist(), model.nbody]
@@ -53,15 +48,9 @@ class Contacts:
         """The watched contacts, as MuJoCo has computed them last."""
         if data.ncon == 0:
             return []
-        contact, forces, found = data.contact, data.efc_force.tolist(), []
-        body = self._body_of_geom
-        for (geom1, geom2), gap, row, dim in zip(
-            contact.geom.tolist(),
-            contact.dist.tolist(),
-            contact.efc_address.tolist(),
-            contact.dim.tolist(),
-            strict=True,
-        ):
+        contact, forces, body, found = data.contact, data.efc_force.tolist(), self._body_of_geom, []
+        fields = (f.tolist() for f in (contact.geom, contact.dist, contact.efc_address, contact.dim))
+        for (geom1, geom2), gap, row, dim in zip(*fields, strict=True):
             first, second = body[geom1], body[geom2]
             if self._watched[first][second]:
                 force = sum(forces[row : row + self._rows[dim]]) if row >= 0 else 0.0
@@ -70,28 +59,20 @@ class Contacts:
 
 
 class ContactForecast(NamedTuple):
-    """Every contact of the robot with what does not move, at every evaluation of the physics of one held control.
+    """Every contact of the robot with what does not move, at every evaluation of the physics of one held control."""
 
-    Attributes:
-        steps: How many evaluations there are: one per physics substep, four with Runge-Kutta.
-        step: Which of them each contact belongs to, shape (n,).
-        body: Id of the body of the robot, shape (n,).
-        point: Shape (n, 3), m.
-        normal: Pointing at the robot, shape (n, 3).
-        force: On the robot, shape (n, 3), N.
-        friction: Coefficient of sliding that the model has for it, shape (n,); of two that differ with the direction
-            the smaller one, and 0 for a contact without friction (condim 1).
-        finite: False where numbers left MuJoCo's bounds (it then resets the state); the contacts are meaningless.
-    """
-
-    steps: int
-    step: NDArray[np.int64]
-    body: NDArray[np.int64]
-    point: Array
-    normal: Array
-    force: Array
-    friction: Array
-    finite: bool
+    steps: int  # number of evaluations: one per physics substep, four with Runge-Kutta
+    step: NDArray[np.int64]  # the evaluation that each contact belongs to, shape (n,)
+    body: NDArray[np.int64]  # id of the body of the robot, shape (n,)
+    point: Array  # shape (n, 3), m
+    normal: Array  # pointing at the robot, shape (n, 3)
+    force: Array  # on the robot, shape (n, 3), N
+    friction: (
+        Array  # of sliding, shape (n,): the smaller of two directions' coefficients; 0 without (condim 1)
+    )
+    finite: (
+        bool  # False where numbers left MuJoCo's bounds (it then resets the state): contacts are meaningless
+    )
 
 
 class ContactReader:
@@ -145,20 +126,11 @@ class ContactReader:
             none, nowhere = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
             return ContactForecast(self.count, none, none, nowhere, nowhere, nowhere, np.zeros(0), finite)
         step, which, body, side = np.array(self._kept, dtype=np.int64).T
-        points, frames, friction, dims = (
-            np.concatenate(field)[which] for field in zip(*self._copies, strict=True)
-        )
+        points, frames, slide, dims = (np.concatenate(f)[which] for f in zip(*self._copies, strict=True))
         frames, sign = frames.reshape(-1, 3, 3), side[:, None].astype(np.float64)
-        return ContactForecast(
-            steps=self.count,
-            step=step,
-            body=body,
-            point=points,
-            normal=sign * frames[:, 0],
-            force=sign * np.einsum("ki,kij->kj", np.array(self._forces)[:, :3], frames),
-            friction=np.where(dims > 1, friction[:, :2].min(axis=1), 0.0),
-            finite=finite,
-        )
+        force = sign * np.einsum("ki,kij->kj", np.array(self._forces)[:, :3], frames)
+        friction = np.where(dims > 1, slide[:, :2].min(axis=1), 0.0)
+        return ContactForecast(self.count, step, body, points, sign * frames[:, 0], force, friction, finite)
 
     def follow(self, data: mujoco.MjData, substeps: int) -> ContactForecast:
         """Step the data, with the control it has, and return the contacts of all these physics substeps."""

@@ -9,10 +9,12 @@ import numpy as np
 from safe_wrappers.checks import Array
 from safe_wrappers.plants.mujoco.forecast import Recorder
 
+# The envs add the turn to the gripper's quaternion (w, x, y, z): MuJoCo makes a unit quaternion of the sum.
 _TURN = np.array([1.0, 0.0, 1.0, 0.0])
-"""What the envs add to the gripper's quaternion (w, x, y, z): MuJoCo makes a unit quaternion of the sum."""
-_FINGERS = ("robot0:l_gripper_finger_joint", "robot0:r_gripper_finger_joint")
-"""The joints that an env with a blocked gripper sets to zero after every step."""
+_FINGERS = (
+    "robot0:l_gripper_finger_joint",
+    "robot0:r_gripper_finger_joint",
+)  # zeroed if the gripper is blocked
 
 
 def moves_by_displacement(raw: Any) -> bool:
@@ -24,24 +26,17 @@ def moves_by_displacement(raw: Any) -> bool:
         and space.shape == (4,)
         and hasattr(raw, "block_gripper")
         and hasattr(raw, "n_substeps")
-        and len(_welds(model)) == model.nmocap == 1
+        and len(welds(model)) == model.nmocap == 1
     )
 
 
-def gripper_of(model: mujoco.MjModel) -> int:
-    """The id of the body that the mocap body pulls."""
-    return _welds(model)[0][1]
-
-
-def _welds(model: mujoco.MjModel) -> list[tuple[int, int]]:
+def welds(model: mujoco.MjModel) -> list[tuple[int, int]]:
     """Mocap bodies (their mocap ids) and the bodies welded to them."""
-    found = []
-    for i in np.flatnonzero(model.eq_type == int(mujoco.mjtEq.mjEQ_WELD)):
-        first, second = int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
-        for one, other in ((first, second), (second, first)):
-            if model.body_mocapid[one] >= 0 and model.body_mocapid[other] < 0:
-                found.append((int(model.body_mocapid[one]), other))
-    return found
+    weld = model.eq_type == int(mujoco.mjtEq.mjEQ_WELD)
+    pairs = zip(model.eq_obj1id[weld].tolist(), model.eq_obj2id[weld].tolist(), strict=True)
+    mocap = model.body_mocapid.tolist()
+    both = (pair for first, second in pairs for pair in ((first, second), (second, first)))
+    return [(mocap[one], other) for one, other in both if mocap[one] >= 0 and mocap[other] < 0]
 
 
 class DisplacementRecorder(Recorder):
@@ -58,7 +53,7 @@ class DisplacementRecorder(Recorder):
         self, model: mujoco.MjModel, substeps: int, metres_per_unit: float, dtype: Any, blocked: bool
     ) -> None:
         super().__init__(model, substeps)
-        (self._mocap, self._gripper), *_ = _welds(model)
+        (self._mocap, self._gripper), *_ = welds(model)
         self._scale, self._dtype = metres_per_unit, dtype
         fingers = [model.joint(name) for name in _FINGERS] if blocked else []
         self._closed = np.array([int(joint.qposadr[0]) for joint in fingers], dtype=np.intp)

@@ -17,12 +17,9 @@ RESETS = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWA
 class Poses(NamedTuple):
     """Where the bodies are at k instants."""
 
-    frames: Array
-    """Origins of the bodies' frames, shape (k, nbody, 3), m."""
-    axes: Array
-    """Rotation matrices of the frames, shape (k, nbody, 3, 3)."""
-    centres: Array
-    """Centres of mass, shape (k, nbody, 3), m."""
+    frames: Array  # origins of the bodies' frames, shape (k, nbody, 3), m
+    axes: Array  # rotation matrices of the frames, shape (k, nbody, 3, 3)
+    centres: Array  # centres of mass, shape (k, nbody, 3), m
 
 
 class Forecast:

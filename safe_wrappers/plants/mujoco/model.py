@@ -86,9 +86,3 @@ def position_rate(model: mujoco.MjModel, qpos: Array, qvel: Array) -> Array:
         else:
             rate[q] = qvel[v]
     return rate
-
-
-def weight_n(model: mujoco.MjModel) -> float:
-    """Weight of everything that moves, N; without gravity its mass in kg."""
-    gravity = float(np.linalg.norm(model.opt.gravity))
-    return float(model.body_mass[~fixed_bodies(model)].sum()) * (gravity or 1.0)

@@ -42,6 +42,8 @@ class MujocoPlant(Plant):
 
     bounds_are_action_space: ClassVar[bool] = True
     can_brake: ClassVar[bool] = True
+    lower: Array = np.zeros(0)  #: of the control, shape (nu,), once bound: ctrlrange, or -inf and inf
+    upper: Array = np.zeros(0)
 
     def __init__(
         self, model: mujoco.MjModel | None = None, delay_s: float = 0.0, share_step: bool | None = None
@@ -61,7 +63,7 @@ class MujocoPlant(Plant):
         self.data = mujoco.MjData(self.model)
         self.actuators = AffineActuators(self.model)
         self._clamped = bool(self.model.actuator_forcelimited.any())
-        self._lower, self._upper = of_model.control_range(self.model)
+        self.lower, self.upper = of_model.control_range(self.model)
         env_checks.refuse_changed_actions(env)
         self._check_action_space(env)
         self.substeps = physics_steps(raw)
@@ -93,7 +95,7 @@ class MujocoPlant(Plant):
         return Recorder(self.model, self.substeps)
 
     def _check_action_space(self, env: gym.Env[Any, Any]) -> None:
-        check_action_space(env, self._lower, self._upper)
+        check_action_space(env, self.lower, self.upper)
 
     def perturb(self, mass: float = 1.0, damping: float = 1.0) -> None:
         """Scale the masses (and inertias) and joint damping of the plant's own model, now or once it has one."""
@@ -146,7 +148,7 @@ class MujocoPlant(Plant):
         self._keep()
 
     def _keep(self) -> None:
-        """Take the data's state as the present one."""
+        """Make the data's state the present one."""
         mujoco.mj_getState(self.model, self.data, self._snapshot, _STATE)
         self._loaded = False
 
@@ -193,21 +195,21 @@ class MujocoPlant(Plant):
 
     def _linearise(self) -> None:
         """`forward` at the control nearest to zero, about which contact forces are linearised."""
-        self.data.ctrl[:] = np.clip(0.0, self._lower, self._upper)
+        self.data.ctrl[:] = np.clip(0.0, self.lower, self.upper)
         mujoco.mj_forward(self.model, self.data)
         self._drift, self._effect = drift_and_effect(self.model, self.data, self.actuators)
 
     @property
     def f(self) -> Array:
         """Drift of (qpos, qvel), shape (nq + nv,): at zero control, with bias forces and active constraints."""
-        drift, _ = self.acceleration
-        return np.concatenate([of_model.position_rate(self.model, self.qpos, self.qvel), drift])
+        return np.concatenate(
+            [of_model.position_rate(self.model, self.qpos, self.qvel), self.acceleration[0]]
+        )
 
     @property
     def g(self) -> Array:
         """Control matrix, shape (nq + nv, nu); positions do not respond at once."""
-        _, effect = self.acceleration
-        return np.vstack([np.zeros((self.model.nq, self.model.nu)), effect])
+        return np.vstack([np.zeros((self.model.nq, self.model.nu)), self.acceleration[1]])
 
     @property
     def acceleration(self) -> tuple[Array, Array]:
@@ -216,23 +218,13 @@ class MujocoPlant(Plant):
         return self._drift, self._effect
 
     @property
-    def lower(self) -> Array:
-        """Smallest control, shape (nu,): ctrlrange, or -inf."""
-        return self._lower
-
-    @property
-    def upper(self) -> Array:
-        """Largest control, shape (nu,): ctrlrange, or inf."""
-        return self._upper
-
-    @property
     def acting_range(self) -> tuple[Array, Array]:
         """The controls between which the force still changes at some time of the control interval, shapes (nu,).
 
         Narrower than the bounds where a forcerange clamps; f + g u is not valid beyond it.
         """
         if not self._clamped:
-            return self._lower, self._upper
+            return self.lower, self.upper
         motion = self.actuators.motion_without_kinematics(self.qpos, self.qvel)
         if motion is None:
             data = self.forward()
@@ -276,7 +268,8 @@ class MujocoPlant(Plant):
     @property
     def weight_n(self) -> float:
         """Weight of everything that moves, N; without gravity its mass in kg."""
-        return of_model.weight_n(self.model)
+        gravity = float(np.linalg.norm(self.model.opt.gravity))
+        return float(self.model.body_mass[~of_model.fixed_bodies(self.model)].sum()) * (gravity or 1.0)
 
     def braking(self) -> Array:
         """The control by which a forecast brakes, at the present state, shape (nu,)."""
@@ -317,10 +310,9 @@ class MujocoPlant(Plant):
         return p.copy(), jac @ self.qvel
 
     def point(self, kind: str, name: str) -> tuple[Array, Array, Array, Array]:
-        """Motion of the origin of a named "body", "site" or "geom".
+        """Position p, m, and velocity v, m/s, of a named "body", "site" or "geom", and its acceleration, m/s^2.
 
-        Returns:
-            p (3,) in m, v (3,) in m/s, a0 (3,) in m/s^2 and A (3, nu): `acceleration = a0 + A @ u`.
+        The last is `a0 + A @ u`: p, v and a0 of shape (3,), A of shape (3, nu).
         """
         m, d, (drift, effect) = self.model, self.data, self.acceleration
         body, p = of_model.frame(m, d, kind, name)

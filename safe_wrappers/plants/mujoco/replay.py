@@ -20,8 +20,7 @@ _RATES_OF_ROTATION_VECTORS: Final = mujoco.mj_version() >= 4_000_000
 """From MuJoCo 4.0 on Runge-Kutta averages rates of the rotation vector since the step's start; before, the stages'
 angular velocities."""
 _BALL: Final = int(mujoco.mjtJoint.mjJNT_BALL)
-_ROUNDING: Final = 1e-10
-"""Tolerance of our Runge-Kutta steps against MuJoCo's: a compiler may fuse a product and a sum."""
+_ROUNDING: Final = 1e-10  # of Runge-Kutta steps against MuJoCo's: a compiler may fuse a product and a sum
 
 
 class Replay:
@@ -43,18 +42,15 @@ class Replay:
         if self._model is not self._raw.model:  # the first time, or the env has a new model
             self._model = self._raw.model
             self._data = mujoco.MjData(self._model)
-            self._inputs, self._end, self._there = (
-                np.zeros(mujoco.mj_stateSize(self._model, int(kind)))
-                for kind in (_INPUTS, _PHYSICS, _PHYSICS)
-            )
+            self._inputs = np.zeros(mujoco.mj_stateSize(self._model, int(_INPUTS)))
+            self._end, self._there = np.zeros((2, mujoco.mj_stateSize(self._model, int(_PHYSICS))))
         mujoco.mj_copyData(self._data, self._model, self._raw.data)
 
     def after(self, visit: Visit) -> bool:
         """Replay the step that the env has made since, and call `visit` at each evaluation; once per step.
 
-        Returns:
-            Whether it ends in the env's own state, bit for bit (Runge-Kutta: up to rounding). If not, what was
-            visited is not what happened in the env.
+        Returns whether it ends in the env's own state, bit for bit (Runge-Kutta: up to rounding). If not, what was
+        visited is not what happened in the env.
         """
         model: mujoco.MjModel = self._raw.model
         data, there = self._data, self._raw.data
@@ -96,21 +92,18 @@ def _runge_kutta(model: mujoco.MjModel, data: mujoco.MjData, visit: Visit) -> No
             stage[turns] = rotation_vector_rate(step_s * rate[turns], qvel[turns])
         velocity += weight * stage
         acceleration += weight * qacc
-        if model.na:
-            activation += weight * act_dot
+        activation += weight * act_dot
         if ahead:
             rate = ahead * stage
             qpos[:] = qpos0
             mujoco.mj_integratePos(model, qpos, rate, step_s)
             qvel[:] = qvel0 + step_s * (ahead * qacc)
-            if model.na:
-                act[:] = act0 + step_s * (ahead * act_dot)
+            act[:] = act0 + step_s * (ahead * act_dot)
             data.time = time + ahead * step_s
     qpos[:] = qpos0
     mujoco.mj_integratePos(model, qpos, velocity, step_s)
     qvel[:] = qvel0 + step_s * acceleration
-    if model.na:
-        act[:] = _within_ranges(model, act0 + step_s * activation)
+    act[:] = _within_ranges(model, act0 + step_s * activation)
     data.qacc_warmstart[:] = qacc
 
 

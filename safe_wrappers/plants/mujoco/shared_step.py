@@ -6,12 +6,10 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
-from numpy.typing import NDArray
 
+from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.forecast import Recorder
-
-Array = NDArray[np.float64]
 
 _STATE: Final = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _MJ_STEP: Final = mujoco.mj_step
@@ -22,16 +20,10 @@ _KNOWN: Final = ("gymnasium.envs.mujoco.", "safe_wrappers.envs.velocity")
 def shared_step(
     env: gym.Env[Any, Any], substeps: int, exact: bool, wanted: bool | None
 ) -> "SharedStep | None":
-    """What hands rollouts to an env, or None where they are not its own steps.
+    """What hands rollouts of `substeps` to an env, or None where they are not its own steps.
 
-    Args:
-        env: Any env.
-        substeps: Physics steps per control step.
-        exact: Whether rollouts start from the env's present state, on a copy of its model.
-        wanted: None: only with the envs that were measured; True: with any that does not override the step.
-
-    Raises:
-        ConfigurationError: It is wanted where it cannot be.
+    `exact` says whether rollouts start from the env's present state, on a copy of its model. `wanted` is None to take
+    the envs that were measured alone, True for any that does not override the step, or a ConfigurationError.
     """
     raw = env.unwrapped
     inherits = getattr(type(raw), "_step_mujoco_simulation", None) is MujocoEnv._step_mujoco_simulation
@@ -49,14 +41,8 @@ class SharedStep:
 
     The rollout is used only if the env is about to simulate what was rolled out: the same number of physics steps,
     the same controls and the same integration state, byte for byte. Else the env simulates as ever. What is not
-    compared is the model: the caller knows that the rollout's is the env's.
-
-    Args:
-        raw: Unwrapped env that steps as `MujocoEnv` does.
-        substeps: Physics steps per control step.
-
-    Attributes:
-        count: Env steps that were taken over from a rollout.
+    compared is the model: the caller knows that the rollout's is the env's. `count` is the number of env steps that
+    were taken over from a rollout.
     """
 
     def __init__(self, raw: Any, substeps: int) -> None:
@@ -65,14 +51,7 @@ class SharedStep:
         self.count = 0
 
     def step(self, env: gym.Env[Any, Any], action: Any, rollout: Recorder, start: Array) -> Any:
-        """`env.step(action)`, with a rollout's first control interval as its simulation where it is the same.
-
-        Args:
-            env: The env, wrapped or not.
-            action: For the env.
-            rollout: Holds the data at the end of the control interval.
-            start: Integration state that the rollout started from.
-        """
+        """`env.step(action)`, with a rollout's first control interval, from the state `start`, as its simulation."""
         watched = mujoco.mj_step is not _MJ_STEP or "_step_mujoco_simulation" in vars(self._raw)
         if watched or not rollout.held_control:
             return env.step(action)

@@ -48,10 +48,8 @@ class Coasting:
         self._model: Any = alone if alone is not None else plant.model
         m, whole = self._model, plant.model
         if m.opt.timestep != whole.opt.timestep:
-            raise ConfigurationError(
-                f"the machine's own model must take the env's physics steps of {whole.opt.timestep} s, "
-                f"it has {m.opt.timestep} s"
-            )
+            wanted = f"the machine's own model must take the env's physics steps of {whole.opt.timestep} s"
+            raise ConfigurationError(f"{wanted}, it has {m.opt.timestep} s")
         index = plant.named("body", body)
         joint = int(whole.body_jntadr[index])
         if joint < 0 or whole.jnt_type[joint] != int(mujoco.mjtJoint.mjJNT_FREE):
@@ -59,9 +57,8 @@ class Coasting:
         self._own = alone is not None
         if [m.actuator(i).name for i in range(m.nu)] != [whole.actuator(i).name for i in range(whole.nu)]:
             raise ConfigurationError("the machine's own model must have the env's actuators, in their order")
-        joints = range(m.njnt)
-        self._qpos = np.concatenate([_addresses(m, plant, j, "qpos") for j in joints])
-        self._qvel = np.concatenate([_addresses(m, plant, j, "dof") for j in joints])
+        self._qpos = np.concatenate([_addresses(m, plant, j, "qpos") for j in range(m.njnt)])
+        self._qvel = np.concatenate([_addresses(m, plant, j, "dof") for j in range(m.njnt)])
         self._at = int(m.jnt_qposadr[m.body(body).jntadr[0]])
         self._moving = int(m.jnt_dofadr[m.body(body).jntadr[0]])
         self._pose = self._qpos[self._at : self._at + 7]
@@ -124,10 +121,8 @@ class Coasting:
 
 def _addresses(m: mujoco.MjModel, plant: MujocoPlant, joint: int, kind: str) -> NDArray[np.intp]:
     """Indices of a joint of the machine's own model in the plant's state ("qpos" or "dof")."""
-    name = m.joint(joint).name
-    model, there = plant.model, plant.named("joint", name)
     sizes = {"qpos": (7, 4, 1, 1), "dof": (6, 3, 1, 1)}[kind]
-    first = int(getattr(model, f"jnt_{kind}adr")[there])
+    first = int(getattr(plant.model, f"jnt_{kind}adr")[plant.named("joint", m.joint(joint).name)])
     return np.arange(first, first + sizes[int(m.jnt_type[joint])])
 
 

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -22,14 +21,6 @@ _FLAT = 1e-6  # level part of an axle's direction below which it has none
 _DRIVES = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
-class WheelMotion(NamedTuple):
-    """Of n wheels, shapes (n,)."""
-
-    rate: Array  # of the wheel about its axle in the world, rad/s; positive rolls ahead
-    ground: Array  # speed of its centre along its heading, m/s
-    sideways: Array  # speed of its centre to the left of its heading, m/s
-
-
 class DrivenWheels:
     """The wheels of a vehicle on level ground, on the named hinges of a bound plant.
 
@@ -46,10 +37,8 @@ class DrivenWheels:
 
     def __init__(self, plant: MujocoPlant, names: Sequence[str]) -> None:
         if isinstance(names, str) or not names or len(set(names)) != len(names):
-            raise ConfigurationError(
-                f"wheels is a list of joint names, each once, got {names!r}; the model has the joints "
-                + ", ".join(plant.names("joint"))
-            )
+            wanted = f"wheels is a list of joint names, each once, got {names!r}"
+            raise ConfigurationError(f"{wanted}; the model has the joints {', '.join(plant.names('joint'))}")
         self.names = list(names)
         m = plant.model
         self._joints = np.array([plant.named("joint", name) for name in names])
@@ -57,9 +46,8 @@ class DrivenWheels:
             if m.jnt_type[joint] != _HINGE:
                 hinges = [m.joint(j).name for j in np.flatnonzero(m.jnt_type == _HINGE)]
                 there = ", ".join(filter(None, hinges))
-                raise ConfigurationError(
-                    f"joint {name!r} is no hinge, so it is no wheel's axle; hinges are {there}"
-                )
+                wanted = f"joint {name!r} is no hinge, so it is no wheel's axle"
+                raise ConfigurationError(f"{wanted}; hinges are {there}")
         self.dofs = m.jnt_dofadr[self._joints]
         direct = np.isin(m.actuator_trntype, _DRIVES)
         self._drives = direct & (m.actuator_trnid[:, 0] == self._joints[:, None])
@@ -69,10 +57,8 @@ class DrivenWheels:
         for drives, others, name in zip(self._drives, turns & ~self._drives, names, strict=True):
             if not drives.any():
                 driven = sorted({m.joint(int(j)).name for j in m.actuator_trnid[direct, 0]})
-                raise ConfigurationError(
-                    f"no actuator drives joint {name!r} directly, so its slip cannot be limited; driven are "
-                    + (", ".join(driven) or "none")
-                )
+                wanted = f"no actuator drives joint {name!r} directly, so its slip cannot be limited"
+                raise ConfigurationError(f"{wanted}; driven are {', '.join(driven) or 'none'}")
             if others.any():  # `drive` does not model them
                 found = [m.actuator(int(i)).name or f"actuator #{i}" for i in np.flatnonzero(others)]
                 raise ConfigurationError(
@@ -103,8 +89,11 @@ class DrivenWheels:
         self.feedback = np.asarray((self._opposing * gear).sum(axis=1))
         return Wheel(m.geom_size[self._geoms, 0], about_axle, m.dof_damping[self.dofs])
 
-    def motion(self, plant: MujocoPlant) -> WheelMotion:
-        """Rates and speeds over ground at the plant's present state."""
+    def motion(self, plant: MujocoPlant) -> tuple[Array, Array, Array]:
+        """Of each wheel, shapes (n,): its rate about its axle, rad/s, positive ahead; its centre's speed, m/s.
+
+        The speed is given along the wheel's heading, and to the left of it.
+        """
         m, d = plant.model, plant.pose()
         mujoco.mj_comPos(m, d)
         mujoco.mj_comVel(m, d)
@@ -118,7 +107,7 @@ class DrivenWheels:
         vx = move[:, 0] + turn[:, 1] * arm[:, 2] - turn[:, 2] * arm[:, 1]
         vy = move[:, 1] + turn[:, 2] * arm[:, 0] - turn[:, 0] * arm[:, 2]
         rate = (turn * axle).sum(axis=1)
-        return WheelMotion(rate, ahead_x * vx + ahead_y * vy, ahead_x * vy - ahead_y * vx)
+        return rate, ahead_x * vx + ahead_y * vy, ahead_x * vy - ahead_y * vx
 
     def loads(self, model: mujoco.MjModel, data: mujoco.MjData) -> Array:
         """Vertical force of the ground on each wheel, shape (n,), N, from an env's model and contacts."""

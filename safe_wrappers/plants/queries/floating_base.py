@@ -23,48 +23,31 @@ _CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)  # this type a
 
 
 class ContactPoints(NamedTuple):
-    """The k contacts of MuJoCo's solver. The world is never the pushed body.
+    """The k contacts of MuJoCo's solver. The world is never the pushed body."""
 
-    Attributes:
-        points: Shape (k, 3), m.
-        normals: Unit normals, pointing at the pushed body, shape (k, 3).
-        first_tangents: The first axis of MuJoCo's friction pyramid, shape (k, 3).
-        friction: Coefficient of sliding (MuJoCo's first), shape (k,); 0 without friction (condim 1).
-        pushed, pushed_by: Ids of the two bodies, shape (k,).
-        jacobians: Of the pushed body's velocity at the point relative to the other's, shape (k, 3, nv).
-        drift: `dJ/dt qvel`, shape (k, 3), m/s^2.
-        forces: On the pushed body, as MuJoCo's solver found them last, shape (k, 3), N.
-        moments: On the pushed body about the point, shape (k, 3), N m; 0 for condim 1 and 3.
-        gaps: Signed distances, shape (k,), m; negative where bodies penetrate.
-    """
-
-    points: Array
-    normals: Array
-    first_tangents: Array
-    friction: Array
-    pushed: NDArray[np.intp]
-    pushed_by: NDArray[np.intp]
-    jacobians: Array
-    drift: Array
-    forces: Array
-    moments: Array
-    gaps: Array
+    points: Array  #: shape (k, 3), m
+    normals: Array  #: unit normals, pointing at the pushed body, shape (k, 3)
+    first_tangents: Array  #: the first axis of MuJoCo's friction pyramid, shape (k, 3)
+    friction: Array  #: coefficient of sliding (MuJoCo's first), shape (k,); 0 without friction (condim 1)
+    pushed: NDArray[np.intp]  #: ids of the bodies, shape (k,)
+    pushed_by: NDArray[np.intp]  #: ids of the other bodies, shape (k,)
+    jacobians: Array  #: of the pushed body's velocity at the point relative to the other's, shape (k, 3, nv)
+    drift: Array  #: `dJ/dt qvel`, shape (k, 3), m/s^2
+    forces: Array  #: on the pushed body, as MuJoCo's solver found them last, shape (k, 3), N
+    moments: Array  #: on the pushed body about the point, shape (k, 3), N m; 0 for condim 1 and 3
+    gaps: Array  #: signed distances, shape (k,), m; negative where bodies penetrate
 
 
 class FloatingBaseTerms(NamedTuple):
     """The equations of motion at one state.
 
-    Attributes:
-        inertia: M with armature, shape (nv, nv).
-        bias: h, shape (nv,): Coriolis, centrifugal and gravity forces, minus passive and applied forces, minus the
-            actuators' forces at zero control, minus constraint forces other than contacts. The last depend on the
-            accelerations: they are those that MuJoCo found for the control in the data.
-        actuation: B, shape (nv, nu): generalised force per control, inside the actuators' force ranges.
+    The bias has Coriolis, centrifugal and gravity forces, minus passive and applied forces, minus the actuators'
+    forces at zero control, minus constraint forces other than contacts, as MuJoCo found them for the data's control.
     """
 
-    inertia: Array
-    bias: Array
-    actuation: Array
+    inertia: Array  #: M with armature, shape (nv, nv)
+    bias: Array  #: h, shape (nv,)
+    actuation: Array  #: B, shape (nv, nu): generalised force per control, inside the actuators' force ranges
     contacts: ContactPoints
 
 
@@ -123,6 +106,5 @@ def contact_points(model: mujoco.MjModel, data: mujoco.MjData) -> ContactPoints:
     points = np.array(data.contact.pos[touching]).reshape(k, 3)
     gaps = np.array(data.contact.dist[touching]).reshape(k)
     friction = np.where(dim > 1, data.contact.friction[touching, 0], 0.0).reshape(k)
-    return ContactPoints(
-        points, normals, first, friction, pushed, pushed_by, jacobians, drift, forces, moments, gaps
-    )
+    geometry = points, normals, first, friction, pushed, pushed_by
+    return ContactPoints(*geometry, jacobians, drift, forces, moments, gaps)

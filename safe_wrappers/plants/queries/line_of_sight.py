@@ -105,20 +105,9 @@ class LineOfSight:
         directions = offsets[which] / lengths[which, None]
         hit, at = np.full(which.size, -1, dtype=np.int32), np.zeros(which.size)
         normals = (None,) if _TAKES_NORMALS else ()
-        mujoco.mj_multiRay(
-            self.model,
-            self.data,
-            eye,
-            directions.reshape(-1),
-            self._groups,
-            1,
-            self.body or -1,  # a sensor on the world does not see through walls
-            hit,
-            at,
-            *normals,
-            which.size,
-            float(lengths[which].max()) + 1.0,
-        )
+        own_body = self.body or -1  # a sensor on the world does not see through walls
+        rays = self.model, self.data, eye, directions.reshape(-1), self._groups, 1, own_body
+        mujoco.mj_multiRay(*rays, hit, at, *normals, which.size, float(lengths[which].max()) + 1.0)
         hitting = hit >= 0
         blocker = self.model.geom_bodyid[np.where(hitting, hit, 0)]
         own = bodies[which]

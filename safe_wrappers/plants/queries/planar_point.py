@@ -28,6 +28,12 @@ class PlanarPoint(NamedTuple):
     actuators: tuple[int, int]  # indices of their actuators
     origin: tuple[float, float]  # where the point is at qpos = 0, m
 
+    def control(self, like: Array, pair: Array | tuple[float, float]) -> Array:
+        """A control, shape (nu,), with other values on the two slides."""
+        whole = np.array(like)
+        whole[list(self.actuators)] = pair
+        return whole
+
 
 def planar_point(plant: MujocoPlant, clip: float, body: str | None = None) -> PlanarPoint:
     """Find the point, measure its constants by single physics steps of the model, and check them.
@@ -78,9 +84,8 @@ def _along_x_and_y(slides: tuple[int, int], axes: Array) -> tuple[int, int]:
     for first, second in (slides, slides[::-1]):
         if np.allclose(axes[[first, second]], np.eye(3)[:2], atol=_ALIGNED):
             return first, second
-    _refuse(
-        f"its slides must go along world x and world y; they go along {axes[list(slides)].round(3).tolist()}"
-    )
+    found = axes[list(slides)].round(3).tolist()
+    _refuse(f"its slides must go along world x and world y; they go along {found}")
 
 
 def _actuators(m: mujoco.MjModel, joints: tuple[int, int], alone: bool) -> tuple[int, int]:
@@ -158,7 +163,8 @@ def walls(model: mujoco.MjModel, body: int) -> tuple[list[Rectangle], float]:
     mujoco.mj_kinematics(model, data)
     welded = model.body_weldid[model.geom_bodyid]
     carried = model.body_mocapid[model.body_rootid[model.geom_bodyid]] >= 0
-    own = np.flatnonzero((welded == body) & ((model.geom_contype > 0) | (model.geom_conaffinity > 0)))
+    types, affinities = model.geom_contype, model.geom_conaffinity
+    own = np.flatnonzero((welded == body) & ((types > 0) | (affinities > 0)))
     if not own.size:
         raise UnsupportedEnvError(f"body {model.body(body).name!r} has no geom that collides with anything")
     offset = np.linalg.norm((data.geom_xpos[own] - data.xpos[body])[:, :2], axis=1)
@@ -169,7 +175,7 @@ def walls(model: mujoco.MjModel, body: int) -> tuple[list[Rectangle], float]:
     found: list[Rectangle] = []
     widest = 0.0
     for g in np.flatnonzero(welded != body):
-        if not any(_collide(model, int(g), int(o)) for o in own):
+        if not (types[g] & affinities[own] | types[own] & affinities[g]).any():
             continue
         name = model.geom(g).name or f"#{g}"
         turn, centre, size = data.geom_xmat[g].reshape(3, 3), data.geom_xpos[g], model.geom_size[g]
@@ -196,8 +202,3 @@ def walls(model: mujoco.MjModel, body: int) -> tuple[list[Rectangle], float]:
         (x, y, _), (dx, dy, _) = centre.tolist(), half.tolist()
         found.append((x - dx, x + dx, y - dy, y + dy))
     return merged(found), radius + margin + widest
-
-
-def _collide(m: mujoco.MjModel, a: int, b: int) -> bool:
-    types, affinities = m.geom_contype, m.geom_conaffinity
-    return bool(types[a] & affinities[b] or types[b] & affinities[a])

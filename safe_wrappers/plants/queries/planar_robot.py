@@ -41,7 +41,7 @@ class PlanarFrame:
         self._origin = m.body_pos[b][:2].tolist()
         if m.nu != 2:
             raise UnsupportedEnvError(
-                f"expected a drive and a turning actuator, the model has {m.nu} actuators"
+                f"expected 2 actuators, a drive and a turning one; the model has {m.nu}"
             )
         kind, at, gear = m.actuator_trntype, m.actuator_trnid[:, 0], m.actuator_gear
         turning = [a for a in range(2) if kind[a] in _AT_JOINT and at[a] == joints[2]]
@@ -54,9 +54,8 @@ class PlanarFrame:
             and np.flatnonzero(gear[a]).tolist() == [0]
         ]
         if len(turning) != 1 or len(pushing) != 1:
-            raise UnsupportedEnvError(
-                f"body {body!r} needs one actuator along its heading (at a site) and one on its hinge"
-            )
+            wanted = "needs one actuator along its heading (at a site) and one on its hinge"
+            raise UnsupportedEnvError(f"body {body!r} {wanted}")
         self.drive_index, self.turn_index = pushing[0], turning[0]
 
     def motion(self, plant: MujocoPlant) -> Motion:

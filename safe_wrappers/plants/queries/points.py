@@ -1,6 +1,6 @@
 """The motion of named points of a MuJoCo machine, or of one point of an analytic state."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError
@@ -11,8 +11,7 @@ from safe_wrappers.plants.plant import Plant
 class Points:
     """Origins of named bodies, sites and geoms (MujocoPlant), or one point of the state (AnalyticPlant).
 
-    On an AnalyticPlant `position` and `velocity` are the indices of the point's coordinates and velocity in the
-    state.
+    `named` has the names by kind; `position` and `velocity` are the indices of the point's coordinates in the state.
 
     Raises:
         ConfigurationError: No point for this kind of plant, or an unknown name.
@@ -21,27 +20,22 @@ class Points:
     def __init__(
         self,
         plant: Plant,
-        bodies: Sequence[str],
-        sites: Sequence[str],
-        geoms: Sequence[str],
+        named: Mapping[str, Sequence[str]],
         position: Sequence[int],
         velocity: Sequence[int],
     ) -> None:
         self._plant, self._position, self._velocity = plant, list(position), list(velocity)
         self._machine = plant if isinstance(plant, MujocoPlant) else None
-        named = {"body": bodies, "site": sites, "geom": geoms}
         self._named = [(kind, name) for kind, names in named.items() for name in names]
         if self._machine is None:
             if not self._position:
-                raise ConfigurationError(
-                    "on an AnalyticPlant say where the point is in the state: position=[0, 1], velocity=[2, 3]"
-                )
+                given = "position=[0, 1], velocity=[2, 3]"
+                raise ConfigurationError(f"on an AnalyticPlant say where the point is in the state: {given}")
             return
         if not self._named:
-            raise ConfigurationError(
-                "name the bodies, sites or geoms to keep clear; the model has the bodies "
-                + ", ".join(self._machine.names("body"))
-            )
+            there = ", ".join(self._machine.names("body"))
+            wanted = "name the bodies, sites or geoms to keep clear"
+            raise ConfigurationError(f"{wanted}; the model has the bodies {there}")
         for kind, name in self._named:
             self._machine.named(kind, name)
 
