@@ -57,11 +57,11 @@ _BOTH_END_AUTHORITY: Final = "both decide when a command's authority ends; use o
 _NOT_TOGETHER: Final = {
     Layer.COST: {Layer.COST: "this env has a CostFunction already; add up the costs in one function"},
     Layer.OCCLUSION: {
-        Layer.OCCLUSION: "this env has an OcclusionPenalty already; give that one all the tracks",
+        Layer.OCCLUSION: "this env has an OcclusionPenalty already; give that one all the tracks"
     },
     Layer.FILTER: {
         Layer.FILTER: "this env is filtered already; constraints compose in one projection, so pass all of them to "
-        "one filter: CBFActionFilter(env, [*inner.constraints, more])",
+        "one filter: CBFActionFilter(env, [*inner.constraints, more])"
     },
     Layer.LEASE: dict.fromkeys((Layer.LEASE, Layer.CHANNEL), _BOTH_END_AUTHORITY),
     Layer.CHANNEL: {
@@ -69,11 +69,9 @@ _NOT_TOGETHER: Final = {
         Layer.LEASE: _BOTH_END_AUTHORITY,
     },
     Layer.ADAPTION: {
-        Layer.ADAPTION: "this env has an AdaptionPenalty already, and its penalty would be taken twice",
+        Layer.ADAPTION: "this env has an AdaptionPenalty already, and its penalty would be taken twice"
     },
-    Layer.HANDOVER: {
-        Layer.HANDOVER: "this env takes chunks already, and a chunk of chunks has no meaning",
-    },
+    Layer.HANDOVER: {Layer.HANDOVER: "this env takes chunks already, and a chunk of chunks has no meaning"},
 }
 """By the outer layer, then the inner one: why not both."""
 
