@@ -66,7 +66,9 @@ _NOT_TOGETHER: Final = {
         Layer.CHANNEL: "one network is between operator and machine; give one channel all the delay",
         Layer.LEASE: _BOTH_END_AUTHORITY,
     },
-    Layer.ADAPTION: {Layer.ADAPTION: "this env has an AdaptionPenalty; the penalty would be taken twice"},
+    Layer.ADAPTION: {
+        Layer.ADAPTION: "this env has an AdaptionPenalty already, its penalty would be taken twice"
+    },
     Layer.HANDOVER: {Layer.HANDOVER: "this env takes chunks already, and a chunk of chunks has no meaning"},
 }
 """By the outer layer, then the inner one: why not both."""
@@ -83,6 +85,6 @@ def refuse_order(env: gym.Env[Any, Any], layer: Layer, name: str) -> None:
         if other in _WRONG_WAY_ROUND.get(layer, {}):
             why = f"{_WRONG_WAY_ROUND[layer][other]}; put it outside: {inside}({name}(env, ...), ...)"
         elif layer is Layer.MONITOR and inside == name:
-            why = "the outer one would overwrite the info keys of the inner one; use one for all that it watches"
+            why = "the outer one would overwrite the info keys of the inner one; use one for everything it watches"
         if why is not None:
             raise ConfigurationError(f"{inside} inside {name}: {why}")
