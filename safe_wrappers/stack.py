@@ -67,7 +67,7 @@ _NOT_TOGETHER: Final = {
         Layer.LEASE: _BOTH_END_AUTHORITY,
     },
     Layer.ADAPTION: {
-        Layer.ADAPTION: "this env has an AdaptionPenalty already, its penalty would be taken twice"
+        Layer.ADAPTION: "the env has an AdaptionPenalty already, whose penalty would be taken twice"
     },
     Layer.HANDOVER: {Layer.HANDOVER: "this env takes chunks already, and a chunk of chunks has no meaning"},
 }
