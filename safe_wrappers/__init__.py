@@ -85,9 +85,8 @@ def __getattr__(name: str) -> _Any:
         found = getattr(_importlib.import_module(f"safe_wrappers.{_MOVED[name]}"), name)
     else:
         raise AttributeError(f"module 'safe_wrappers' has no attribute {name!r}")
-    _warnings.warn(
-        f"safe_wrappers.{name} is deprecated; write safe_wrappers.{new}", DeprecationWarning, stacklevel=2
-    )
+    message = f"safe_wrappers.{name} is deprecated; write safe_wrappers.{new}"
+    _warnings.warn(message, DeprecationWarning, stacklevel=2)
     return found
 
 

@@ -69,9 +69,7 @@ def settings_from(kind: type[T], given: Any, name: str, also: str = "") -> T:
     return kind(**given)
 
 
-def check_fields(
-    settings: Any, check: Callable[[str, float, str], float], names: Sequence[str], unit: str
-) -> None:
+def check_fields(settings: Any, check: Callable[..., float], names: Sequence[str], unit: str) -> None:
     """Check fields of a frozen dataclass by `positive` or `non_negative`; None stays where it is the default."""
     defaults = {field.name: field.default for field in fields(settings)}
     for name in names:
@@ -80,12 +78,17 @@ def check_fields(
             object.__setattr__(settings, name, check(name, value, unit))
 
 
-def finite_array(name: str, value: ArrayLike) -> Array:
-    """The value as finite float64, any shape."""
+def float_array(name: str, value: ArrayLike) -> Array:
+    """The value as float64, any shape, finite or not."""
     try:
-        array = np.asarray(value, dtype=np.float64)
+        return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
         raise ConfigurationError(f"{name} is a number or an array of numbers, got {value!r}") from None
+
+
+def finite_array(name: str, value: ArrayLike) -> Array:
+    """The value as finite float64, any shape."""
+    array = float_array(name, value)
     if not np.isfinite(array).all():
         raise ConfigurationError(f"{name} must be finite, got {array}")
     return array

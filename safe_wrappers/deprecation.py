@@ -61,12 +61,11 @@ def deprecated_parameters(
                     value = moves[parameter](**value)
                 written.append(f"{parameter}={words}")
                 bound.arguments[parameter] = value
-            warnings.warn(
+            message = (
                 f"{kind.__name__}: {', '.join(old)} {'is' if len(old) == 1 else 'are'} deprecated; write "
-                f"{kind.__name__}(..., {', '.join(written)})",
-                DeprecationWarning,
-                stacklevel=2,
             )
+            message += f"{kind.__name__}(..., {', '.join(written)})"
+            warnings.warn(message, DeprecationWarning, stacklevel=2)
             init(*bound.args, **bound.kwargs)
 
         untyped.__init__ = accepting

@@ -52,16 +52,13 @@ def protect(env: gym.Env[Any, Any], **options: Any) -> CBFActionFilter:
     robot = family.removeprefix("Safe").removesuffix("Velocity") if family.endswith("Velocity") else family
     recipe = RECIPES.get(robot, RECIPES.get(robot.partition("_")[0]))
     if recipe is None:
-        raise UnsupportedEnvError(
-            f"no recipe for {env_id or env.unwrapped!r}; there are recipes for {', '.join(sorted(RECIPES))}. "
-            f"{_by_hand(env)}"
-        )
+        known = f"there are recipes for {', '.join(sorted(RECIPES))}"
+        raise UnsupportedEnvError(f"no recipe for {env_id or env.unwrapped!r}; {known}. {_by_hand(env)}")
     of_recipe, of_filter = _options(recipe), _options(CBFActionFilter)
     for name in options:
         if name not in of_recipe + of_filter:
-            raise UnknownNameError(
-                f"protect has no option {name!r} for {family}; it has {', '.join(of_filter + of_recipe)}"
-            )
+            known = ", ".join(of_filter + of_recipe)
+            raise UnknownNameError(f"protect has no option {name!r} for {family}; it has {known}")
     constraints = recipe(env, **{n: options.pop(n) for n in of_recipe if n in options})
     return CBFActionFilter(env, constraints, **options)
 

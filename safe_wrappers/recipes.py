@@ -30,15 +30,17 @@ from safe_wrappers.envs.velocity.speed_limits import SPEED_LIMITS
 from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.filter.constraint import Constraint
 
+Env = gym.Env[Any, Any]
+Recommended = list[Constraint]
+Corner = Sequence[float | None] | None
+
 POINT_HULL_RADIUS_M = 0.1585
 """Around the Point robot's turning axis: the far corners of its nose, sqrt(0.15^2 + 0.05^2), rounded up."""
 VASE_HULL_RADIUS_M = 0.1415
 """Around a vase's centre: the corners of a square of side 0.2, rounded up."""
 
 
-def _point_goal(
-    env: gym.Env[Any, Any], detour: bool = True, brake: bool = True, uncertainty: float = 0.0
-) -> list[Constraint]:
+def _point_goal(env: Env, detour: bool = True, brake: bool = True, uncertainty: float = 0.0) -> Recommended:
     obstacles: list[Any] = [Discs("hazard_positions", radius=0.2)]
     if env.unwrapped.level.vases_cost:  # type: ignore[attr-defined]
         obstacles.append(Discs("vase_positions", radius=POINT_HULL_RADIUS_M + VASE_HULL_RADIUS_M))
@@ -47,7 +49,7 @@ def _point_goal(
     ]
 
 
-def _car_goal(env: gym.Env[Any, Any], detour: bool = True) -> list[Constraint]:
+def _car_goal(env: Env, detour: bool = True) -> Recommended:
     vases = env.unwrapped.level.vases_cost  # type: ignore[attr-defined]
     return [
         CoastingClearance(
@@ -64,10 +66,10 @@ def _car_goal(env: gym.Env[Any, Any], detour: bool = True) -> list[Constraint]:
     ]
 
 
-def _fixed(*constraints: Constraint) -> Callable[..., list[Constraint]]:
+def _fixed(*constraints: Constraint) -> Callable[..., Recommended]:
     """The recipe of constraints that are the same for every env of an id."""
 
-    def recipe(env: gym.Env[Any, Any]) -> list[Constraint]:
+    def recipe(env: Env) -> Recommended:
         return copy.deepcopy(list(constraints))
 
     return recipe
@@ -86,15 +88,11 @@ _RAIL = Clearance(
 _CLAMP = Plane([0.0, CLAMP_Y], [0.0, -1.0])
 
 
-def _safe_rover(
-    env: gym.Env[Any, Any], max_slip: float = 0.15, friction: float | None = None
-) -> list[Constraint]:
+def _safe_rover(env: Env, max_slip: float = 0.15, friction: float | None = None) -> Recommended:
     return [Traction(env.unwrapped.wheels, max_slip, friction)]  # type: ignore[attr-defined]
 
 
-def _of_what_is_known(
-    env: gym.Env[Any, Any], option: str, chosen: str, radius: float, true: str, sigmas: float
-) -> Any:
+def _of_what_is_known(env: Env, option: str, chosen: str, radius: float, true: str, sigmas: float) -> Any:
     """Discs at the true positions, at those seen last, or at the estimates of an OcclusionPenalty inside."""
     known: dict[str, Any] = {
         "true": TrackedDiscs(radius, sigmas, attribute=true),
@@ -103,12 +101,11 @@ def _of_what_is_known(
     }
     chosen = chosen or ("estimated" if env.has_wrapper_attr("tracking") else "true")
     if chosen not in known:
-        wanted = f"{option} is one of {', '.join(known)}"
-        raise UnknownNameError(f"{wanted}: which positions to keep clear of; got {chosen!r}")
+        raise UnknownNameError(f"{option} is one of {', '.join(known)}; got {chosen!r}")
     return known[chosen]
 
 
-def _occluded_crossing(env: gym.Env[Any, Any], cars: str = "", sigmas: float = 3.0) -> list[Constraint]:
+def _occluded_crossing(env: Env, cars: str = "", sigmas: float = 3.0) -> Recommended:
     raw: Any = env.unwrapped
     discs = _of_what_is_known(env, "cars", cars, raw.car_radius, "car_tracks", sigmas)
     # An escape must not lead through pillars, or over the rails at 4 m and 3.5 m.
@@ -117,7 +114,7 @@ def _occluded_crossing(env: gym.Env[Any, Any], cars: str = "", sigmas: float = 3
     return [EscapeClearance("robot", obstacles, raw.robot_radius)]
 
 
-def _patrolled_maze(env: gym.Env[Any, Any], patrols: str = "", sigmas: float = 3.0) -> list[Constraint]:
+def _patrolled_maze(env: Env, patrols: str = "", sigmas: float = 3.0) -> Recommended:
     raw: Any = env.unwrapped
     discs = _of_what_is_known(env, "patrols", patrols, raw.patrol_radius, "patrol_tracks", sigmas)
     # The escapes ignore walls: with walls as obstacles the only escape in a corridor is to stop, while evasion at the
@@ -126,7 +123,7 @@ def _patrolled_maze(env: gym.Env[Any, Any], patrols: str = "", sigmas: float = 3
     return [WallClearance(velocity_clip=5.0), aside]
 
 
-def _ant_maze(env: gym.Env[Any, Any]) -> list[Constraint]:
+def _ant_maze(env: Env) -> Recommended:
     # The torso's ball has 0.25 m; the legs reach farther and may touch.
     model: mujoco.MjModel = env.unwrapped.model  # type: ignore[attr-defined]
     fixed = (model.geom_bodyid == 0) & (model.geom_type == int(mujoco.mjtGeom.mjGEOM_BOX))
@@ -143,12 +140,8 @@ FINGER_RADIUS_M = 0.0414
 
 
 def _fetch(
-    env: gym.Env[Any, Any],
-    low: Sequence[float | None] | None = None,
-    high: Sequence[float | None] | None = None,
-    keep_out: Sequence[Any] = (),
-    table: bool = True,
-) -> list[Constraint]:
+    env: Env, low: Corner = None, high: Corner = None, keep_out: Sequence[Any] = (), table: bool = True
+) -> Recommended:
     raw: Any = env.unwrapped
     start = raw.initial_gripper_xpos
     geom = int(raw.model.body("table0").geomadr[0])
@@ -179,17 +172,15 @@ LOOK_AHEAD_BELOW: Final = {"HalfCheetah": 0.8, "Hopper": 0.7, "Walker2d": 0.7, "
 (`benchmarks/look_ahead.py`); Swimmer's were, whatever they left."""
 
 
-def _velocity(robot: str, margin: float = 0.02, horizon: int = 3) -> Callable[..., list[Constraint]]:
+def _velocity(robot: str, margin: float = 0.02, horizon: int = 3) -> Callable[..., Recommended]:
     body = None if robot == "Humanoid" else "torso"
     direction = "xy" if robot in ("Ant", "Humanoid") else "+x"
     limit, share = SPEED_LIMITS[robot], LOOK_AHEAD_BELOW.get(robot)
-    skipped = None if share is None else share * limit
-    return _fixed(
-        SpeedLimit(limit, body, direction, margin=margin, horizon=horizon, look_ahead_below=skipped)
-    )
+    below = None if share is None else share * limit
+    return _fixed(SpeedLimit(limit, body, direction, margin=margin, horizon=horizon, look_ahead_below=below))
 
 
-RECIPES: dict[str, Callable[..., list[Constraint]]] = {
+RECIPES: dict[str, Callable[..., Recommended]] = {
     **{f"SafePointGoal{level}": _point_goal for level in range(3)},
     **{f"SafeCarGoal{level}": _car_goal for level in range(3)},
     "InvertedPendulum": _fixed(_RAIL),

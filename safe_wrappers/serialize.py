@@ -14,9 +14,9 @@ from safe_wrappers.errors import UnknownNameError
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.duck_typed import duck_typed
 
-_EXPORTED = {name: getattr(constraints, name) for name in constraints.__all__}
+_EXPORTED = [getattr(constraints, name) for name in constraints.__all__ if name != "Constraint"]
 KINDS: dict[str, type[Constraint]] = {
-    name: kind for name, kind in _EXPORTED.items() if issubclass(kind, Constraint) and kind is not Constraint
+    kind.__name__: kind for kind in _EXPORTED if issubclass(kind, Constraint)
 }
 
 
@@ -42,9 +42,8 @@ def plain_data(value: Any) -> Any:
     ours = is_dataclass(kind) and kind.__module__.startswith("safe_wrappers.")
     if (not known and (not ours or isinstance(value, Constraint))) or kind is Barrier:
         return value
-    data = {
-        f.name: plain_data(getattr(value, f.name)) for f in fields(value) if f.init and f.name != "promise"
-    }
+    names = [one.name for one in fields(value) if one.init and one.name != "promise"]
+    data = {name: plain_data(getattr(value, name)) for name in names}
     return {"kind": kind.__name__, **data} if known else data
 
 

@@ -56,12 +56,10 @@ _WRONG_WAY_ROUND: Final = {
 _BOTH_END_AUTHORITY: Final = "both decide when a command's authority ends; use one of them"
 _NOT_TOGETHER: Final = {
     Layer.COST: {Layer.COST: "this env has a CostFunction already; add up the costs in one function"},
-    Layer.OCCLUSION: {
-        Layer.OCCLUSION: "this env has an OcclusionPenalty already; give that one all the tracks",
-    },
+    Layer.OCCLUSION: {Layer.OCCLUSION: "there is an OcclusionPenalty already; give that one all the tracks"},
     Layer.FILTER: {
         Layer.FILTER: "this env is filtered already; constraints compose in one projection, so pass all of them to "
-        "one filter: CBFActionFilter(env, [*inner.constraints, more])",
+        "one filter: CBFActionFilter(env, [*inner.constraints, more])"
     },
     Layer.LEASE: dict.fromkeys((Layer.LEASE, Layer.CHANNEL), _BOTH_END_AUTHORITY),
     Layer.CHANNEL: {
@@ -69,11 +67,9 @@ _NOT_TOGETHER: Final = {
         Layer.LEASE: _BOTH_END_AUTHORITY,
     },
     Layer.ADAPTION: {
-        Layer.ADAPTION: "this env has an AdaptionPenalty already, and its penalty would be taken twice",
+        Layer.ADAPTION: "the env has an AdaptionPenalty already, whose penalty would be taken twice"
     },
-    Layer.HANDOVER: {
-        Layer.HANDOVER: "this env takes chunks already, and a chunk of chunks has no meaning",
-    },
+    Layer.HANDOVER: {Layer.HANDOVER: "this env takes chunks already, and a chunk of chunks has no meaning"},
 }
 """By the outer layer, then the inner one: why not both."""
 
@@ -85,16 +81,10 @@ def refuse_order(env: gym.Env[Any, Any], layer: Layer, name: str) -> None:
         if not isinstance(other, Layer):
             continue
         inside = type(inner).__name__
-        why = _WRONG_WAY_ROUND.get(layer, {}).get(other)
-        if why is not None:
-            raise ConfigurationError(
-                f"{inside} inside {name}: {why}; put it outside: {inside}({name}(env, ...), ...)"
-            )
         why = _NOT_TOGETHER.get(layer, {}).get(other)
+        if other in _WRONG_WAY_ROUND.get(layer, {}):
+            why = f"{_WRONG_WAY_ROUND[layer][other]}; put it outside: {inside}({name}(env, ...), ...)"
+        elif layer is Layer.MONITOR and inside == name:
+            why = "the outer one would overwrite the info keys of the inner one; use one for everything it watches"
         if why is not None:
             raise ConfigurationError(f"{inside} inside {name}: {why}")
-        if layer is Layer.MONITOR and inside == name:
-            raise ConfigurationError(
-                f"{inside} inside {name}: the outer one would overwrite the info keys of the inner one; use one for "
-                "everything it watches"
-            )

@@ -3,9 +3,8 @@
 try:
     import stable_baselines3  # noqa: F401
 except ImportError as missing:
-    raise ImportError(
-        "safe_wrappers.sb3 needs stable_baselines3 and torch: pip install 'safe-wrappers[train]'"
-    ) from missing
+    needs = "safe_wrappers.sb3 needs stable_baselines3 and torch: pip install 'safe-wrappers[train]'"
+    raise ImportError(needs) from missing
 
 from safe_wrappers.sb3.executed_action_her_replay_buffer import ExecutedActionHerReplayBuffer
 from safe_wrappers.sb3.executed_action_replay_buffer import (

@@ -5,13 +5,19 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.sb3.executed_action_replay_buffer import ExecutedActionReplayBuffer, Flags, picked
+from safe_wrappers.sb3.executed_action_replay_buffer import (
+    ExecutedActionReplayBuffer,
+    Flags,
+    Indices,
+    Infos,
+    Values,
+    picked,
+)
 
 
 class ExecutedActionHerReplayBuffer(ExecutedActionReplayBuffer, HerReplayBuffer):
@@ -60,9 +66,7 @@ class ExecutedActionHerReplayBuffer(ExecutedActionReplayBuffer, HerReplayBuffer)
             # In double precision, so that a penalty comes off a relabelled reward as it came off the task's own.
             self.penalties = np.zeros(self.rewards.shape)
 
-    def _keep(
-        self, infos: Any, executed: NDArray[Any], task: NDArray[Any], changed: Flags, finite: Flags
-    ) -> None:
+    def _keep(self, infos: Infos, executed: Values, task: Values, changed: Flags, finite: Flags) -> None:
         super()._keep(infos, executed, task, changed, finite)
         self.penalties[self.pos] = np.where(finite, [info[keys.ADAPTION_PENALTY] for info in infos], 0.0)
 
@@ -90,7 +94,7 @@ class ExecutedActionHerReplayBuffer(ExecutedActionReplayBuffer, HerReplayBuffer)
         rewards[real:] = relabelled - penalties[real:]
         return self._batch(drawn, before, after, rewards, env)
 
-    def _draw(self, count: int) -> NDArray[np.int64]:
+    def _draw(self, count: int) -> Indices:
         """Slots, envs and which of the two transitions, uniformly from whole episodes, by SB3's own random calls."""
         whole = self.ep_length > 0
         first = np.flatnonzero(whole)
@@ -99,9 +103,7 @@ class ExecutedActionHerReplayBuffer(ExecutedActionReplayBuffer, HerReplayBuffer)
         slots, envs = np.unravel_index(np.concatenate([first, second])[drawn], whole.shape)
         return np.stack([slots, envs, drawn >= len(first)])
 
-    def _task_rewards(
-        self, achieved: NDArray[Any], goals: NDArray[Any], slots: NDArray[np.int64], envs: NDArray[np.int64]
-    ) -> NDArray[np.float64]:
+    def _task_rewards(self, achieved: Values, goals: Values, slots: Indices, envs: Indices) -> Values:
         """The task's rewards for having reached `achieved`, (n,)."""
         if self.env is None:
             raise ConfigurationError(

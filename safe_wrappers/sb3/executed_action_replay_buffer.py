@@ -14,7 +14,10 @@ from stable_baselines3.common.vec_env import VecNormalize
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ActionError, ConfigurationError
 
+Values = NDArray[Any]
 Flags = NDArray[np.bool_]
+Indices = NDArray[np.int64]
+Infos = list[dict[str, Any]]
 
 _SAME: Final = 1e-3  # two scaled actions that differ by less differ by rounding only, not by their unit
 
@@ -68,9 +71,7 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
     """
 
     modes: ClassVar[Sequence[str]] = ("safe_action", "both")
-    others: ClassVar[str] = (
-        "the naive learner and the one with the adaption penalty alone use SB3's own ReplayBuffer"
-    )
+    others: ClassVar[str] = "the naive learner and the adaption penalty alone use SB3's own ReplayBuffer"
 
     def __init__(
         self,
@@ -85,9 +86,8 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         **more: Any,
     ) -> None:
         if mode not in self.modes:
-            raise ConfigurationError(
-                f"mode: expected {' or '.join(map(repr, self.modes))}, got {mode!r}; {self.others}"
-            )
+            expected = " or ".join(map(repr, self.modes))
+            raise ConfigurationError(f"mode: expected {expected}, got {mode!r}; {self.others}")
         if not (isinstance(action_space, spaces.Box) and action_space.is_bounded()):
             raise ConfigurationError(f"expected a bounded Box of actions, got {action_space}")
         if isinstance(observation_space, spaces.Dict) != isinstance(self, DictReplayBuffer):
@@ -96,14 +96,10 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
                 f" and ExecutedActionReplayBuffer for all others; {type(self).__name__} got {observation_space}"
             )
         if mode == "both" and optimize_memory_usage:
-            raise ConfigurationError(
-                "mode 'both' does not work with optimize_memory_usage=True; leave it out"
-            )
-        more |= {
-            "optimize_memory_usage": optimize_memory_usage,
-            "handle_timeout_termination": handle_timeout_termination,
-        }
-        super().__init__(buffer_size, observation_space, action_space, device=device, n_envs=n_envs, **more)
+            raise ConfigurationError("mode 'both' does not work with optimize_memory_usage; leave it out")
+        more |= {"device": device, "n_envs": n_envs, "optimize_memory_usage": optimize_memory_usage}
+        more["handle_timeout_termination"] = handle_timeout_termination
+        super().__init__(buffer_size, observation_space, action_space, **more)
         self.mode = mode
         self._low, self._high = action_space.low, action_space.high
         if mode == "both":
@@ -112,13 +108,7 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
             self.changed = np.zeros(self.rewards.shape, dtype=np.bool_)
 
     def add(
-        self,
-        obs: Any,
-        next_obs: Any,
-        action: NDArray[Any],
-        reward: NDArray[Any],
-        done: NDArray[Any],
-        infos: list[dict[str, Any]],
+        self, obs: Any, next_obs: Any, action: Values, reward: Values, done: Values, infos: Infos
     ) -> None:
         """Stores one step of every env; `action` is the policy's, scaled, and `infos` hold the executed one."""
         policy = action.reshape((self.n_envs, self.action_dim))
@@ -126,11 +116,10 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         executed = self._scaled(infos, keys.EXECUTED_ACTION)
         if not np.isfinite(executed).all():
             raise ActionError(f"an executed action is not finite: {[i[keys.EXECUTED_ACTION] for i in infos]}")
-        finite = np.isfinite(policy).all(axis=1)
+        finite: Flags = np.asarray(np.isfinite(policy).all(axis=1))
         chosen, given = policy[finite], self._scaled(infos, keys.PROPOSED_ACTION)[finite]
         if not (np.abs(chosen - given) < _SAME).all():
-            was = f"the policy chose {chosen} and the filter was given {given}"
-            raise self._foreign(f"scaled to [-1, 1], {was}")
+            raise self._foreign(f"scaled to [-1, 1], the policy chose {chosen} and the filter got {given}")
         changed = np.array([bool(info[keys.CBF_INTERVENED]) for info in infos]) | ~finite
         # Unscaling and scaling again is not the identity in floating point: unchanged actions stay the policy's.
         executed = np.where(changed[:, None], executed, policy)
@@ -142,9 +131,7 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         policy = np.where(finite[:, None], policy, executed)
         super().add(obs, next_obs, policy, np.where(finite, reward, task), done, infos)
 
-    def _keep(
-        self, infos: Any, executed: NDArray[Any], task: NDArray[Any], changed: Flags, finite: Flags
-    ) -> None:
+    def _keep(self, infos: Infos, executed: Values, task: Values, changed: Flags, finite: Flags) -> None:
         """Store what SB3's buffer has no place for, at the present slot."""
         if self.mode == "both":
             self.executed_actions[self.pos], self.task_rewards[self.pos] = executed, task
@@ -159,9 +146,7 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         before, after = (picked(part, slots, envs) for part in (self.observations, self.next_observations))
         return self._batch(drawn, before, after, rewards, env)
 
-    def _batch(
-        self, drawn: NDArray[np.int64], before: Any, after: Any, rewards: Any, env: VecNormalize | None
-    ) -> Any:
+    def _batch(self, drawn: Indices, before: Any, after: Any, rewards: Any, env: VecNormalize | None) -> Any:
         """The drawn transitions with these observations and rewards, as SB3 takes them."""
         slots, envs, second = drawn
         actions = self.actions[slots, envs]
@@ -183,7 +168,7 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
             return {key: self.to_torch(value) for key, value in seen.items()}
         return self.to_torch(seen)
 
-    def _draw(self, count: int) -> NDArray[np.int64]:
+    def _draw(self, count: int) -> Indices:
         """Slots, envs and which of the two transitions (1 is the executed one), shape (3, count), uniformly."""
         drawn = np.empty((3, 0), dtype=np.int64)
         while drawn.shape[1] < count:
@@ -194,17 +179,16 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
             drawn = np.hstack([drawn, tries[:, (second == 0) | self.changed[slots, envs]]])
         return drawn[:, :count]
 
-    def _scaled(self, infos: Sequence[Mapping[str, Any]], key: str) -> NDArray[Any]:
+    def _scaled(self, infos: Infos, key: str) -> Values:
         """Actions from the infos as `policy.scale_action` makes them, (n_envs, nu), in its precision."""
         given = np.array([np.asarray(info[key], dtype=self.action_space.dtype) for info in infos])
         if given.shape[1:] != self.action_space.shape:
-            raise self._foreign(
-                f"{key} has shape {given.shape[1:]}, the action space {self.action_space.shape}"
-            )
-        scaled: NDArray[Any] = 2.0 * ((given - self._low) / (self._high - self._low)) - 1.0
+            shapes = f"{given.shape[1:]}, the action space {self.action_space.shape}"
+            raise self._foreign(f"{key} has shape {shapes}")
+        scaled: Values = 2.0 * ((given - self._low) / (self._high - self._low)) - 1.0
         return scaled.reshape((self.n_envs, self.action_dim))
 
-    def _check(self, infos: Sequence[Mapping[str, Any]]) -> None:
+    def _check(self, infos: Infos) -> None:
         for at, info in enumerate(infos):
             for key in (keys.EXECUTED_ACTION, keys.PROPOSED_ACTION, keys.CBF_INTERVENED):
                 if key not in info:
@@ -231,7 +215,7 @@ class ExecutedActionReplayBuffer(ReplayBuffer):
         )
 
 
-def picked(stored: Any, slots: NDArray[np.int64], envs: NDArray[np.int64]) -> Any:
+def picked(stored: Any, slots: Indices, envs: Indices) -> Any:
     """A copy of the observations of some slots and envs."""
     if isinstance(stored, Mapping):
         return {key: part[slots, envs] for key, part in stored.items()}

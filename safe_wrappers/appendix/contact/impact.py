@@ -20,8 +20,8 @@ infinite. Anything else raises `ConfigurationError`.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.checks import finite_array, finite_arrays
-from safe_wrappers.control.contact.contact import in_series, number_or_inf, positive
+from safe_wrappers.checks import finite_array, finite_arrays, float_array
+from safe_wrappers.control.contact.contact import in_series, positive
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -164,7 +164,7 @@ def braked_deflection(
         latency: From the first touch to the brake's action, at least 0, s.
     """
     v, m, k = _checked(speed, mass, stiffness)
-    (a,), late = finite_arrays(braking=braking), number_or_inf("latency", latency)
+    (a,), late = finite_arrays(braking=braking), float_array("latency", latency)
     if not (late >= 0.0).all():
         raise ConfigurationError(f"latency must be 0 s or more, got {late}")
     root = np.sqrt(m / k)

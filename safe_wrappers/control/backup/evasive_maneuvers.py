@@ -69,13 +69,9 @@ class EvasiveManeuvers:
         self.manoeuvres = manoeuvres
         self.instants = instants
         self._axes = axes
-        shares = ([m.x for m in manoeuvres], [m.y for m in manoeuvres])
-        self.controls = np.array(
-            [
-                [share * (axis.high if share > 0.0 else -axis.low) for share in along]
-                for axis, along in zip(axes, shares, strict=True)
-            ]
-        ).T
+        shares = np.array([(m.x, m.y) for m in manoeuvres])
+        forwards, backwards = np.array([axis.high for axis in axes]), np.array([-axis.low for axis in axes])
+        self.controls = shares * np.where(shares > 0.0, forwards, backwards)
         """Of the drive phases, shape (manoeuvres, 2)."""
         self._going = np.array([m.holds for m in manoeuvres])
         self._parts = [self._prepared(axis, self.controls[:, i]) for i, axis in enumerate(axes)]

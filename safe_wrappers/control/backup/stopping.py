@@ -21,12 +21,8 @@ def predicted_approach(
 
     `pending` is the acceleration in the delay, m/s^2: of the commands in flight, or the largest possible one.
     """
-    v = np.asarray(speed, dtype=np.float64)
-    a = np.asarray(pending, dtype=np.float64)
-    return (
-        np.asarray(clearance, dtype=np.float64) - v * delay_s - 0.5 * a * delay_s**2,
-        np.asarray(v + a * delay_s),
-    )
+    room, v, a = (np.asarray(x, dtype=np.float64) for x in (clearance, speed, pending))
+    return np.asarray(room - v * delay_s - 0.5 * a * delay_s**2), np.asarray(v + a * delay_s)
 
 
 def held_stopping_distance(speed: ArrayLike, brake: float, control_dt: float) -> Array:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.checks import finite_arrays
+from safe_wrappers.checks import finite_arrays, float_array
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -46,18 +46,10 @@ def series_stiffness(*stiffness: ArrayLike) -> Array:
 
 def positive(name: str, value: ArrayLike) -> Array:
     """Positive numbers as float64, inf included."""
-    array = number_or_inf(name, value)
+    array = float_array(name, value)
     if not (array > 0.0).all():
         raise ConfigurationError(f"{name} must be positive, got {array}")
     return array
-
-
-def number_or_inf(name: str, value: ArrayLike) -> Array:
-    """Numbers as float64, not checked for infinity."""
-    try:
-        return np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ConfigurationError(f"{name} is a number or an array of numbers, got {value!r}") from None
 
 
 def in_series(*parts: Array) -> Array:

@@ -38,9 +38,7 @@ def checked_covariance(name: str, matrix: ArrayLike, n: int | None = None) -> Ar
     """
     symmetric, smallest, largest = _symmetric(name, matrix, n)
     if smallest < -_SYMMETRY * largest:
-        raise ConfigurationError(
-            f"{name} must be positive semidefinite, its smallest eigenvalue is {smallest:.6g}"
-        )
+        raise ConfigurationError(f"{name} must be positive semidefinite, has the eigenvalue {smallest:.6g}")
     return symmetric
 
 
@@ -49,8 +47,7 @@ def checked_noise(name: str, matrix: ArrayLike, n: int | None = None) -> Array:
     symmetric, smallest, largest = _symmetric(name, matrix, n)
     if not smallest > 1e-14 * largest:
         raise ConfigurationError(
-            f"{name} must be positive definite (no measurement without noise), its smallest eigenvalue is "
-            f"{smallest:.6g} and its largest {largest:.6g}"
+            f"{name} must be positive definite but its smallest eigenvalue is {smallest:.6g}"
         )
     return symmetric
 
@@ -88,9 +85,7 @@ def discretise_drift(A: ArrayLike, b: ArrayLike, time_s: ArrayLike) -> Array:
     times = checked_times(time_s)
     drift = finite_array("b", b)
     if drift.ndim == 0 or drift.shape[-1] != len(a):
-        raise ConfigurationError(
-            f"b must have {len(a)} entries, one for each state of A, got shape {drift.shape}"
-        )
+        raise ConfigurationError(f"b must have {len(a)} entries, one per state of A, got shape {drift.shape}")
     with np.errstate(over="ignore", invalid="ignore"):
         carried = np.tensordot(integral(a, times), drift, axes=(-1, -1))
     carried = np.moveaxis(carried, times.ndim, -1)
@@ -127,10 +122,8 @@ def blind_time(
     start = checked_covariance("P0", P0, len(a))
     rows = np.atleast_2d(finite_array("direction", direction))
     if start.ndim != 2 or rows.ndim != 2 or rows.shape[1] != len(a):
-        raise ConfigurationError(
-            f"for {len(a)} states P0 has shape ({len(a)}, {len(a)}) and direction ({len(a)},) or (m, {len(a)}), "
-            f"got {start.shape} and {np.shape(direction)}"
-        )
+        given, n = f"{start.shape} and {np.shape(direction)}", len(a)
+        raise ConfigurationError(f"P0 has shape {n, n}, direction ({n},) or (m, {n}), got {given}")
     for name, value in (("tolerance", tolerance), ("sigmas", sigmas)):
         if not (math.isfinite(value) and value > 0.0):
             raise ConfigurationError(f"{name} must be finite and above 0, got {value!r}")
@@ -233,9 +226,7 @@ def _symmetric(name: str, matrix: ArrayLike, n: int | None) -> tuple[Array, floa
     turned = np.swapaxes(given, -1, -2)
     asymmetry = float(np.abs(given - turned).max(initial=0.0))
     if asymmetry > _SYMMETRY * float(np.abs(given).max(initial=0.0)):
-        raise ConfigurationError(
-            f"{name} must be symmetric, its entries differ across it by up to {asymmetry:.6g}"
-        )
+        raise ConfigurationError(f"{name} must be symmetric, its entries differ by up to {asymmetry:.6g}")
     symmetric = 0.5 * (given + turned)
     values = np.linalg.eigvalsh(symmetric)
     return symmetric, float(values.min(initial=np.inf)), float(np.abs(values).max(initial=0.0))
@@ -266,6 +257,4 @@ def checked_times(time_s: ArrayLike, name: str = "time_s") -> Array:
 def refuse_overflow(times: Array, *results: Array) -> None:
     """Refuse results that are not finite."""
     if not all(np.isfinite(result).all() for result in results):
-        raise ConfigurationError(
-            f"within time_s = {np.max(times):.6g} s an unstable mode of A grows beyond the range of floats"
-        )
+        raise ConfigurationError(f"within time_s = {np.max(times):.6g} s an unstable mode of A overflows")

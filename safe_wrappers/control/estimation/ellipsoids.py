@@ -54,13 +54,10 @@ def _dimension(offset: Array, shape: Array) -> int:
     """Dimension of the space; checks everything but the eigenvalues."""
     d = offset.shape[-1] if offset.ndim == 2 else 0
     if d not in (2, 3) or shape.shape != (*offset.shape, d):
-        raise ConfigurationError(
-            f"expected offsets (n, d) and shapes (n, d, d) with d = 2 or 3, got {offset.shape} and {shape.shape}"
-        )
+        given = f"{offset.shape} and {shape.shape}"
+        raise ConfigurationError(f"expected offsets (n, d) and shapes (n, d, d) with d = 2 or 3, got {given}")
     if not (np.isfinite(offset).all() and np.isfinite(shape).all()):
-        raise ConfigurationError(
-            f"offsets and shapes must be finite, got {offset.tolist()} and {shape.tolist()}"
-        )
+        raise ConfigurationError(f"offsets and shapes must be finite, got {offset} and {shape}")
     uneven = np.abs(shape - shape.swapaxes(1, 2))
     if uneven.any() and (uneven > _UNEVEN * np.abs(shape).max(axis=(1, 2), keepdims=True)).any():
         raise ConfigurationError(f"shapes must be symmetric, got {shape.tolist()}")

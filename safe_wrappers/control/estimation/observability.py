@@ -161,9 +161,7 @@ def checked_system(A: ArrayLike, C: ArrayLike) -> tuple[Array, Array]:
     if a.ndim != 2 or a.shape[0] != a.shape[1] or a.size == 0:
         raise ConfigurationError(f"A must be square, of shape (n, n), got {a.shape}")
     if c.ndim != 2 or c.shape[1] != len(a) or len(c) == 0:
-        raise ConfigurationError(
-            f"C must have a row for each output, shape (m, {len(a)}) for this A, got {c.shape}"
-        )
+        raise ConfigurationError(f"C: a row for each output, shape (m, {len(a)}) for this A, got {c.shape}")
     return a, c
 
 

@@ -96,10 +96,8 @@ class Tracks:
 
     def advance(self, time_s: float) -> None:
         """Predict over a time without measurements."""
-        over = self._over(time_s)
-        self.mean, self.covariance = predict(
-            self.mean, self.covariance, over.transition, over.noise, over.drift
-        )
+        transition, drift, noise = self._over(time_s)
+        self.mean, self.covariance = predict(self.mean, self.covariance, transition, noise, drift)
 
     def see(self, which: NDArray[np.intp], measured: Array, matrix: Array, noise: Array) -> None:
         """Update some tracks with measurements.
@@ -118,12 +116,8 @@ class Tracks:
         key, d = tuple(times_s), self.coordinates
         over = self._stacked.get(key)
         if over is None:
-            overs = [self._over(time_s) for time_s in key]
-            over = _Over(
-                np.stack([each.transition[:, :d] for each in overs]),
-                np.stack([each.drift[:, :d] for each in overs]),
-                np.stack([each.noise[:, :d, :d] for each in overs]),
-            )
+            parts = [(f[:, :d], b[:, :d], q[:, :d, :d]) for f, b, q in map(self._over, key)]
+            over = _Over(*(np.stack(part) for part in zip(*parts, strict=True)))
             _keep(self._stacked, key, over)
         positions = (over.transition @ self.mean[:, :, None])[..., 0] + over.drift
         spread = over.transition @ self.covariance @ over.transition.swapaxes(-1, -2)

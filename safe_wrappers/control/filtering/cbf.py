@@ -6,6 +6,7 @@ degree one, while some admissible control satisfies it. Between samples: `contro
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -86,11 +87,9 @@ def relative_degree(
         gradient = numerical_gradient(current, point, step)
         if acts(gradient, effect, height, tolerance * 10.0 ** (2 * (degree - 1))):
             return degree
-        current = _lie_along(current, f, step)
+        current = partial(_lie_along, current, f, step)
     return None
 
 
-def _lie_along(
-    h: Callable[[Array], float], f: Callable[[Array], Array], step: float
-) -> Callable[[Array], float]:
-    return lambda x: float(numerical_gradient(h, x, step) @ f(x))
+def _lie_along(h: Callable[..., float], f: Callable[..., Array], step: float, x: Array) -> float:
+    return float(numerical_gradient(h, x, step) @ f(x))

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.checks import finite_array, finite_arrays
+from safe_wrappers.checks import finite_array, finite_arrays, positive
 from safe_wrappers.control.numerics.spatial import cross
 from safe_wrappers.errors import ConfigurationError
 
@@ -111,16 +111,11 @@ def task_rows(directions: str, rotations: str, length: float | None) -> tuple[ND
         raise ConfigurationError('a task has directions (some of "xyz"), rotations, or both; got neither')
     if directions and rotations and length is None:
         raise ConfigurationError(
-            "translations (m) and rotations (rad) have no unit in common: give the length (m) by which a rotation "
-            "counts, as the tool's own"
+            "for translations and rotations give the length (m) by which a rotation counts"
         )
     if length is not None and not (directions and rotations):
-        raise ConfigurationError(
-            f"length ({length!r}) weighs rotations against translations; this task has one of them only"
-        )
-    factor = 1.0 if length is None else float(length)
-    if not (np.isfinite(factor) and factor > 0.0):
-        raise ConfigurationError(f"length must be a finite number > 0 in m, got {length!r}")
+        raise ConfigurationError("length is for translations and rotations; this task has one of them only")
+    factor = 1.0 if length is None else positive("length", length, "m")
     rows = ["xyz".index(d) for d in directions] + [3 + "xyz".index(r) for r in rotations]
     return np.array(rows), np.array([1.0] * len(directions) + [factor] * len(rotations))
 
@@ -170,10 +165,8 @@ def validated_threshold(jacobians: ArrayLike, task_speed: float, rate_limit: Arr
         raise ConfigurationError(f"jacobians has the shape (samples, m, n), samples > 0; got {j.shape}")
     speed, limit = float(finite_array("task_speed", task_speed)), finite_array("rate_limit", rate_limit)
     if speed <= 0.0 or limit.shape not in ((), (j.shape[-1],)) or not (limit > 0.0).all():
-        raise ConfigurationError(
-            f"task_speed and rate_limit are > 0, one limit or {j.shape[-1]} of them; got {task_speed!r} and "
-            f"{rate_limit!r}"
-        )
+        given = f"one limit or {j.shape[-1]} of them; got {task_speed!r} and {rate_limit!r}"
+        raise ConfigurationError(f"task_speed and rate_limit are > 0, {given}")
     w = manipulability(j)
     needed = (speed * worst_joint_rates(j) / limit).max(axis=-1)
     exceeding = needed > 1.0

@@ -10,7 +10,7 @@ Source: appendix "Smooth Trajectories and Bumpless Transfer".
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.checks import finite_arrays
+from safe_wrappers.checks import finite_array, finite_arrays
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -60,9 +60,8 @@ def quintic_coefficients(
     Raises:
         ConfigurationError: A duration that is not positive, values that are not finite, shapes that do not broadcast.
     """
-    span, q0, v0, a0, q1, v1, a1 = finite_arrays(
-        duration=positive_duration(duration), q0=q0, v0=v0, a0=a0, q1=q1, v1=v1, a1=a1
-    )
+    span = positive_duration(duration)
+    span, q0, v0, a0, q1, v1, a1 = finite_arrays(duration=span, q0=q0, v0=v0, a0=a0, q1=q1, v1=v1, a1=a1)
     way, half = q1 - q0, 0.5 * span**2
     c3 = (10.0 * way - (6.0 * v0 + 4.0 * v1) * span - (3.0 * a0 - a1) * half) / span**3
     c4 = (-15.0 * way + (8.0 * v0 + 7.0 * v1) * span + (3.0 * a0 - 2.0 * a1) * half) / span**4
@@ -70,9 +69,7 @@ def quintic_coefficients(
     return np.stack([q0, v0, 0.5 * a0, c3, c4, c5], axis=-1)
 
 
-_HERMITE = np.array(
-    [[1.0, 0.0, -3.0, 2.0], [0.0, 1.0, -2.0, 1.0], [0.0, 0.0, 3.0, -2.0], [0.0, 0.0, -1.0, 1.0]]
-)
+_HERMITE = np.array([[1, 0, -3, 2], [0, 1, -2, 1], [0, 0, 3, -2], [0, 0, -1, 1]], dtype=np.float64)
 """h00, h10, h01, h11: rows of coefficients, lowest power of s first."""
 
 
@@ -94,19 +91,15 @@ def checked_samples(
     Raises:
         ConfigurationError: For times that do not rise, shapes that do not fit, or values that are not finite.
     """
-    knots = np.asarray(times, dtype=np.float64)
-    q, v = np.asarray(positions, dtype=np.float64), np.asarray(velocities, dtype=np.float64)
+    knots = finite_array("times", times)
+    q, v = finite_array("positions", positions), finite_array("velocities", velocities)
     if knots.ndim != 1 or len(knots) < 2:
         raise ConfigurationError(f"times has shape (k,) with k >= 2, got {knots.shape}")
-    if not (np.isfinite(knots).all() and (np.diff(knots) > 0.0).all()):
-        raise ConfigurationError("times must be finite and strictly rising")
+    if not (np.diff(knots) > 0.0).all():
+        raise ConfigurationError("times must be strictly rising")
     if q.shape != v.shape or q.ndim == 0 or q.shape[-1] != len(knots):
-        raise ConfigurationError(
-            f"positions and velocities have shape (..., {len(knots)}), one entry per time on the last axis; "
-            f"got {q.shape} and {v.shape}"
-        )
-    if not (np.isfinite(q).all() and np.isfinite(v).all()):
-        raise ConfigurationError("positions and velocities must be finite")
+        wanted = f"(..., {len(knots)}), one entry per time on the last axis"
+        raise ConfigurationError(f"positions and velocities have shape {wanted}; got {q.shape} and {v.shape}")
     return knots, q, v
 
 
@@ -130,9 +123,7 @@ def hermite_series(
     knots, q, v = checked_samples(times, positions, velocities)
     asked = np.asarray(at, dtype=np.float64)
     if not ((asked >= knots[0]) & (asked <= knots[-1])).all():
-        raise ConfigurationError(
-            f"times asked for must lie within the samples, {knots[0]} s to {knots[-1]} s; nothing is extrapolated"
-        )
+        raise ConfigurationError(f"times lie within {knots[0]} s to {knots[-1]} s; nothing is extrapolated")
     i = np.clip(np.searchsorted(knots, asked, side="right") - 1, 0, len(knots) - 2)
     ends = (q[..., i], v[..., i], q[..., i + 1], v[..., i + 1])
     return hermite_at(ends, knots[i + 1] - knots[i], asked - knots[i], derivative)

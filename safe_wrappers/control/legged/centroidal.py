@@ -58,9 +58,7 @@ def checked_masses(masses: ArrayLike, positions: ArrayLike) -> tuple[Array, Arra
     """Masses (..., n), at least 0, their positive sum (...), positions (..., n, 3), centre of mass (..., 3)."""
     m, p = finite_array("masses", masses), finite_array("positions", positions)
     if m.ndim == 0 or p.ndim < 2 or p.shape[-1] != 3 or p.shape[-2] != m.shape[-1]:
-        raise ConfigurationError(
-            f"expected masses (..., n) and positions (..., n, 3), got {m.shape} and {p.shape}"
-        )
+        raise ConfigurationError(f"expected masses (..., n), positions (..., n, 3), got {m.shape}, {p.shape}")
     total = m.sum(axis=-1)
     if not ((m >= 0.0).all() and (total > 0.0).all()):
         raise ConfigurationError(f"masses must be 0 or more and not all 0, got {m}")

@@ -7,7 +7,7 @@ not cover the motion between samples. Choose the horizon no shorter than stoppin
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.checks import finite_arrays
+from safe_wrappers.checks import finite_arrays, positive
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -20,8 +20,7 @@ def largest_acceleration(distance: ArrayLike, speed: ArrayLike, horizon_s: float
     distance): the largest that returns to it by the end of the horizon.
     """
     d, v = finite_arrays(distance=distance, speed=speed)
-    if not 0.0 < horizon_s < np.inf:
-        raise ConfigurationError(f"horizon_s must be a positive number of seconds, got {horizon_s}")
+    positive("horizon_s", horizon_s, "s")
     at_end = 2.0 * (d - horizon_s * v) / horizon_s**2
     # Where the top of the parabola is before the end, the top may just reach the limit.
     top_is_inside = (d > 0.0) & (2.0 * d < horizon_s * v)
@@ -56,10 +55,8 @@ def predicted_position_rows(
     which = np.asarray(dofs)
     low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     if q.ndim != 1 or not (which.shape == low.shape == high.shape == q.shape):
-        raise ConfigurationError(
-            "expected dofs, positions, velocities, lower and upper of one shape (n,), got "
-            f"{which.shape}, {q.shape}, {v.shape}, {low.shape} and {high.shape}"
-        )
+        shapes = f"{which.shape}, {q.shape}, {low.shape} and {high.shape}"
+        raise ConfigurationError(f"expected dofs, positions, lower and upper of one shape (n,), got {shapes}")
     if not np.issubdtype(which.dtype, np.integer) or not ((which >= 0) & (which < nv)).all():
         raise ConfigurationError(f"dofs are indices from 0 to {nv - 1}, got {which}")
     if not (low <= high).all():

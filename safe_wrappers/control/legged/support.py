@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.checks import finite_array, finite_arrays
+from safe_wrappers.checks import finite_array, finite_arrays, non_negative
 from safe_wrappers.control.contact.friction_cone import tangents
 from safe_wrappers.control.numerics.outlines import convex_chain, turn
 from safe_wrappers.errors import ConfigurationError
@@ -111,8 +111,7 @@ def support_rows(points: ArrayLike, ground: Plane, inset: float) -> Array:
     """
     flat = ground.flat(points)
     corners = support_polygon(flat)
-    if not (np.isfinite(inset) and inset >= 0.0):
-        raise ConfigurationError(f"inset must be 0 m or more, got {inset}")
+    non_negative("inset", inset, "m")
     if len(corners) < 3:
         weights = np.full((1, len(flat)), -inset)
     else:

@@ -56,14 +56,9 @@ def support_distances(
     real = column < count[enough, None]
     which = order[first + np.where(real, column, 0)]
     rows = max(1, _PRODUCTS // most**3)
-    return np.concatenate(
-        [
-            _of_rows(p[at], n[at], f[at], weight, tolerance_m, float(np.cos(tolerance_rad)))
-            for at, weight in (
-                (which[i : i + rows], real[i : i + rows, :, None]) for i in range(0, len(which), rows)
-            )
-        ]
-    )
+    facing = float(np.cos(tolerance_rad))
+    blocks = [(which[i : i + rows], real[i : i + rows, :, None]) for i in range(0, len(which), rows)]
+    return np.concatenate([_of_rows(p[i], n[i], f[i], kept, tolerance_m, facing) for i, kept in blocks])
 
 
 def _of_rows(p: Array, n: Array, f: Array, real: NDArray[np.bool_], apart: float, facing: float) -> Array:
@@ -78,9 +73,8 @@ def _of_rows(p: Array, n: Array, f: Array, real: NDArray[np.bool_], apart: float
     cosine = np.einsum("rki,ri->rk", n, mean)
     f = f * real
     pressure = np.einsum("rki,ri->r", f, mean)
-    fits = (
-        (np.abs(height) <= apart).all(axis=1) & (cosine >= facing - _ROUNDING).all(axis=1) & (pressure > 0.0)
-    )
+    fits = (np.abs(height) <= apart).all(axis=1) & (cosine >= facing - _ROUNDING).all(axis=1)
+    fits &= pressure > 0.0
     p, f, mean = p[fits], f[fits], mean[fits]
     axes = tangents(mean)
     moment = np.cross(p, f).sum(axis=1)

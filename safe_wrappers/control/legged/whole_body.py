@@ -254,9 +254,8 @@ def _residuals(problem: WholeBodyProblem, control: Array, acceleration: Array, f
     if problem.force_rows is not None and problem.force_limits is not None:
         excess = problem.force_rows @ forces.reshape(-1) - problem.force_limits
         rows = max(rows, float(excess.max(initial=0.0)))
-    return Residuals(
-        float(np.abs(dynamics).max(initial=0.0)), contact, cone, float(outside.max(initial=0.0)), rows
-    )
+    missed_forces = float(np.abs(dynamics).max(initial=0.0))
+    return Residuals(missed_forces, contact, cone, float(outside.max(initial=0.0)), rows)
 
 
 def _least_violation(

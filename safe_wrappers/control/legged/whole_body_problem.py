@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.checks import non_negative, positive
+from safe_wrappers.control.contact.friction_cone import checked_friction
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -122,30 +124,22 @@ class WholeBodyProblem:
         for task in self.tasks:
             rows = len(task.target)
             if task.jacobian.shape != (rows, nv) or task.drift.shape != (rows,):
+                shapes = f"{task.jacobian.shape}, {task.drift.shape} and {task.target.shape}"
                 raise ConfigurationError(
-                    f"expected a task's jacobian (r, {nv}), drift (r,) and target (r,), got "
-                    f"{task.jacobian.shape}, {task.drift.shape} and {task.target.shape}"
+                    f"expected a task's jacobian (r, {nv}), drift and target (r,), got {shapes}"
                 )
-            if not (0.0 <= task.weight < np.inf):
-                raise ConfigurationError(f"a task's weight must be 0 or more and finite, got {task.weight}")
+            non_negative("a task's weight", task.weight, "its own unit")
             if not all(np.isfinite(a).all() for a in (task.jacobian, task.drift, task.target)):
                 raise ConfigurationError("a task must be finite")
         if not (self.lower <= self.upper).all():
             raise ConfigurationError(f"lower must not exceed upper, got {self.lower} and {self.upper}")
-        if not (self.friction >= 0.0).all():
-            raise ConfigurationError(f"friction must be 0 or more, got {self.friction}")
+        checked_friction(self.friction)
         given = np.asarray(self.control_weight, dtype=np.float64)
         weights = np.full(nu, given) if given.ndim == 0 else given
         if not (weights.shape == (nu,) and np.isfinite(weights).all() and (weights > 0.0).all()):
-            raise ConfigurationError(
-                f"control_weight must be positive and finite, one or ({nu},), got {given}"
-            )
-        if not 0.0 < self.force_weight < np.inf:
-            raise ConfigurationError(f"force_weight must be positive and finite, got {self.force_weight}")
-        if not 0.0 <= self.contact_softness < np.inf:
-            raise ConfigurationError(
-                f"contact_softness must be 0 or more and finite, got {self.contact_softness}"
-            )
+            raise ConfigurationError(f"control_weight must be positive, one or of shape ({nu},), got {given}")
+        positive("force_weight", self.force_weight, "1/N^2")
+        non_negative("contact_softness", self.contact_softness, "m^2/s^4")
         opens = np.zeros(k, bool) if self.breaking is None else np.asarray(self.breaking, bool)
         acceleration = 0.0 if self.contact_acceleration is None else self.contact_acceleration
         object.__setattr__(self, "stance", np.flatnonzero(~opens))

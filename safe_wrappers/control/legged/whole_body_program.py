@@ -167,11 +167,9 @@ def reduced_program(
     return ReducedProgram(program, 0.5 * constant, softenable, elimination)
 
 
-def _rows(
-    problem: WholeBodyProblem, elimination: Elimination, start: Array, slope: Array
-) -> tuple[Array, Array]:
+def _rows(problem: WholeBodyProblem, forces: Elimination, start: Array, slope: Array) -> tuple[Array, Array]:
     """The acceleration, force and opening rows, in this order."""
-    rows, limits = [np.zeros((0, elimination.size))], [np.zeros(0)]
+    rows, limits = [np.zeros((0, forces.size))], [np.zeros(0)]
     if problem.acceleration_rows is not None and problem.acceleration_limits is not None:
         rows.append(problem.acceleration_rows @ slope)
         limits.append(problem.acceleration_limits - problem.acceleration_rows @ start)
@@ -179,8 +177,8 @@ def _rows(
         count = len(problem.force_limits)
         part = problem.force_rows.reshape(count, len(problem.normals), 3)[:, problem.stance]
         stance = part.reshape(count, 3 * len(problem.stance))
-        rows.append(stance @ elimination.matrix)
-        limits.append(problem.force_limits - stance @ elimination.offset)
+        rows.append(stance @ forces.matrix)
+        limits.append(problem.force_limits - stance @ forces.offset)
     if problem.opening.size:
         normals = problem.normals[problem.opening]
         away = np.einsum("ki,kiv->kv", normals, problem.jacobians[problem.opening])

@@ -149,9 +149,7 @@ class Damper:
 
     def __init__(self, causality: Causality, limit: float | None) -> None:
         if causality not in get_args(Causality):
-            raise ConfigurationError(
-                f"causality must be one of {', '.join(get_args(Causality))}, got {causality!r}"
-            )
+            raise ConfigurationError(f"causality must be one of impedance, admittance, got {causality!r}")
         self._answers_effort = causality == "impedance"
         self._limit = math.inf if limit is None else positive("limit", limit)
 
@@ -165,14 +163,13 @@ class Damper:
 
     def dissipate(self, interval: Interval, owed_j: float) -> tuple[Passivated, Interval]:
         """Damp so that `owed_j` is dissipated, or as much as the limit allows."""
-        size, travel = 0.0, math.hypot(*interval.seen) * interval.time_s
-        if owed_j > 0.0 and travel > 0.0:
-            size = min(owed_j / travel, self._limit)
-        if not 0.0 < size < math.inf:
-            size = 0.0
+        speed = math.hypot(*interval.seen)
+        travel = speed * interval.time_s
+        size = min(owed_j / travel, self._limit) if owed_j > 0.0 and travel > 0.0 else 0.0
+        if 0.0 < size < math.inf:
+            interval = interval._replace(added=size * (interval.seen / speed))
         else:
-            direction = interval.seen / math.hypot(*interval.seen)
-            interval = interval._replace(added=size * direction)
+            size = 0.0
         changed = interval.answer + interval.added if size else interval.answer
         effort, flow = (changed, interval.seen) if self._answers_effort else (interval.seen, changed)
         debt = max(0.0, owed_j - size * travel)

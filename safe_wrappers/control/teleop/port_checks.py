@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.checks import finite_array
+from safe_wrappers.checks import finite_array, float_array
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -22,10 +22,7 @@ def same_shape(**values: ArrayLike) -> tuple[Array, Array]:
 
 def port_vector(name: str, value: ArrayLike) -> Array:
     """One quantity of a port as (m,); a number is (1,). `port_energy` checks that it is finite."""
-    try:
-        vector = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ConfigurationError(f"{name} is a number or an array of numbers, got {value!r}") from None
+    vector = float_array(name, value)
     if vector.ndim > 1 or vector.size == 0:
         raise ConfigurationError(f"expected {name} as a number or of shape (m,), got {vector.shape}")
     return vector.reshape(-1)
@@ -36,9 +33,7 @@ def port_vectors(**values: ArrayLike) -> tuple[Array, Array]:
     first, second = (port_vector(name, value) for name, value in values.items())
     if first.size != second.size:
         a, b = values
-        raise ConfigurationError(
-            f"expected {a} and {b} of one size, got {first.size} and {second.size} components"
-        )
+        raise ConfigurationError(f"expected {a} and {b} of one size, got {first.size} and {second.size}")
     return first, second
 
 
@@ -48,9 +43,7 @@ def port_energy(effort: Array, flow: Array, time_s: float) -> float:
     with np.errstate(over="ignore", invalid="ignore"):
         energy = float(effort @ flow) * time_s
     if not math.isfinite(energy):
-        raise ConfigurationError(
-            f"effort and flow must be finite, and so their product; got {effort} and {flow}"
-        )
+        raise ConfigurationError(f"effort, flow and so their product must be finite; got {effort}, {flow}")
     return energy
 
 

@@ -88,9 +88,7 @@ class WaveLine:
             ConfigurationError: For a wave of another shape or not finite, and a sequence number that does not rise.
         """
         if sequence <= self._last_sent:
-            raise ConfigurationError(
-                f"sequence numbers must be at least 0 and rise; got {sequence} after {self._last_sent}"
-            )
+            raise ConfigurationError(f"sequence must rise, be at least 0; {sequence} after {self._last_sent}")
         energy = self._energy(self._wave(wave))
         self._last_sent = int(sequence)
         self._flying[self._last_sent] = energy
@@ -120,18 +118,12 @@ class WaveLine:
         unknown = [sequence for sequence, _ in arrived if sequence > self._last_sent]
         if unknown:
             raise ConfigurationError(f"packets {unknown} arrived and were never sent")
-        fresh = []
-        for sequence, wave in arrived:
-            if sequence in self._flying:
-                # The energy as sent counts, not that of the received wave.
-                fresh.append((int(sequence), self._landed(sequence), wave))
+        # The energy as sent counts, not that of the received wave.
+        fresh = [(int(i), self._landed(i), wave) for i, wave in arrived if i in self._flying]
         if self.rule == "queue":
             return self._next_in_queue(fresh)
-        wanted = (
-            sum((wave for _, _, wave in fresh), np.zeros(self._components))
-            if self.rule == "zero"
-            else self._newest_of(fresh)
-        )
+        none = np.zeros(self._components)
+        wanted = sum((wave for *_, wave in fresh), none) if self.rule == "zero" else self._newest_of(fresh)
         available = self._reserve + math.fsum(energy for _, energy, _ in fresh)
         put_out, energy = self._affordable(wanted, available)
         self._put_out.add(energy)

@@ -26,9 +26,8 @@ def slip_ratio(wheel_speed: ArrayLike, ground_speed: ArrayLike, regularization: 
     """
     wheel, ground = finite_arrays(wheel_speed=wheel_speed, ground_speed=ground_speed)
     positive("regularization", regularization, "m/s")
-    return np.asarray(
-        (wheel - ground) / np.maximum(np.maximum(np.abs(wheel), np.abs(ground)), regularization)
-    )
+    larger = np.maximum(np.abs(wheel), np.abs(ground))
+    return np.asarray((wheel - ground) / np.maximum(larger, regularization))
 
 
 def slip_window(ground_speed: ArrayLike, max_slip: ArrayLike, regularization: float) -> tuple[Array, Array]:
@@ -42,10 +41,7 @@ def slip_window(ground_speed: ArrayLike, max_slip: ArrayLike, regularization: fl
     ground, slip = finite_arrays(ground_speed=ground_speed, max_slip=max_slip)
     positive("regularization", regularization, "m/s")
     if not ((slip > 0.0) & (slip < 1.0)).all():
-        raise ConfigurationError(
-            "max_slip is a normalised slip ratio in (0, 1), where 1 is a wheel that spins on the spot; got "
-            f"{max_slip!r}"
-        )
+        raise ConfigurationError(f"max_slip is a normalised slip ratio in (0, 1), got {max_slip!r}")
     return -_fastest(-ground, slip, regularization), _fastest(ground, slip, regularization)
 
 

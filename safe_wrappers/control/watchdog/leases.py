@@ -61,13 +61,8 @@ def longest_lease(
     given = (clearance, speed, braking, delays_s, localisation, margin, acceleration, top_speed)
     # Scalar arithmetic: for the few leases of a control step it is faster than arrays.
     several = np.broadcast(*(np.asarray(x, dtype=np.float64) for x in given))
-    _not_negative(
-        delays_s=delays_s,
-        localisation=localisation,
-        margin=margin,
-        acceleration=acceleration,
-        top_speed=top_speed,
-    )
+    _not_negative(delays_s=delays_s, localisation=localisation, margin=margin)
+    _not_negative(acceleration=acceleration, top_speed=top_speed)
     return np.array([_lease_or_none(*map(float, one)) for one in several]).reshape(several.shape)
 
 
@@ -78,11 +73,9 @@ def _lease_or_none(*machine: float) -> float:
         return -math.inf
 
 
-def _lease(
-    d: float, v: float, b: float, delays: float, loc: float, gap: float, a: float, top: float
-) -> float:
+def _lease(d: float, v: float, b: float, late: float, loc: float, gap: float, a: float, top: float) -> float:
     """`longest_lease` of one machine."""
-    if not (all(map(math.isfinite, (d, v, b, delays, loc, gap, a))) and b > 0.0) or math.isnan(top):
+    if not (all(map(math.isfinite, (d, v, b, late, loc, gap, a))) and b > 0.0) or math.isnan(top):
         return -math.inf
     top = max(top, v)
     braking_way = max(v, 0.0) * max(v, 0.0) / (2.0 * b)
@@ -107,7 +100,7 @@ def _lease(
         # Without the difference of two nearly equal speeds, and right for a = 0 too.
         tau = 2.0 * share * (room - braking_way) / (onset + v)
     tau = min(tau, _LONGEST)
-    lease = tau - delays - _ROUNDING * (abs(tau) + delays) - _TINY
+    lease = tau - late - _ROUNDING * (abs(tau) + late) - _TINY
     return -math.inf if math.isnan(lease) else lease
 
 
@@ -147,9 +140,8 @@ def longest_lease_of_room(room: ArrayLike, closing_speed: ArrayLike, delays_s: A
         closing_speed: Bound on how fast h may fall under any command until the brakes hold, U/s, shape (...).
         delays_s: The other four delays, s, at least 0, shape (...).
     """
-    h, closing, delays = np.broadcast_arrays(
-        *(np.asarray(x, dtype=np.float64) for x in (room, closing_speed, delays_s))
-    )
+    given = (np.asarray(x, dtype=np.float64) for x in (room, closing_speed, delays_s))
+    h, closing, delays = np.broadcast_arrays(*given)
     _not_negative(delays_s=delays)
     known = np.isfinite(h) & np.isfinite(closing) & np.isfinite(delays)
     falls = known & (closing > 0.0)
@@ -164,10 +156,6 @@ def longest_lease_of_room(room: ArrayLike, closing_speed: ArrayLike, delays_s: A
 def _not_negative(**values: ArrayLike) -> None:
     for name, value in values.items():
         # Empty arrays, of no surface near, pass.
-        least = (
-            value
-            if isinstance(value, float)
-            else float(np.min(np.asarray(value, np.float64), initial=np.inf))
-        )
+        least = value if isinstance(value, float) else np.min(np.asarray(value, np.float64), initial=np.inf)
         if least < 0.0:
             raise ConfigurationError(f"{name} must not be negative, got {least:g}")

@@ -159,9 +159,7 @@ def jerk_limited_time(start: State, end: State, limits: MotionLimits) -> Array:
         p0, v0, a0, p1, v1, a1, a_lim, v_lim, j_lim = np.broadcast_arrays(*given)
     except ValueError:
         shapes = ", ".join(str(x.shape) for x in given)
-        raise ConfigurationError(
-            f"states and limits must have shapes that fit together, got {shapes}"
-        ) from None
+        raise ConfigurationError(f"states, limits need shapes that fit together, got {shapes}") from None
     possible = np.all([np.isfinite(x) for x in (p0, v0, a0, p1, v1, a1)], axis=0)
     with np.errstate(invalid="ignore", over="ignore"):
         # With an end acceleration against the motion, the speed before was higher.
@@ -194,15 +192,12 @@ def jerk_limited_profile(
         ruckig.Ruckig(axes).calculate(request, trajectory)
     except ruckig.RuckigError as error:
         reason = str(error).strip().splitlines()[0]
+        told = [str(tuple(np.round(v, 6).tolist() for v in values)) for values in (start, end, limits)]
         raise ConfigurationError(
-            f"ruckig found no profile from (position, velocity, acceleration) {_told(start)} to {_told(end)} within "
-            f"(acceleration, speed, jerk) {_told(limits)}: {reason}"
+            "ruckig found no profile from (position, velocity, acceleration) {} to {} within (acceleration, speed, "
+            "jerk) {}: {}".format(*told, reason)
         ) from error
     return trajectory
-
-
-def _told(values: tuple[Array, ...]) -> str:
-    return str(tuple(np.round(v, 6).tolist() for v in values))
 
 
 def checked_limits(
