@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from _style import FORBIDDEN, INK, ON, OTHER, SAFE, bare, panels
+from safe_wrappers.control.backup.heading_drive import stopping_path
 from safe_wrappers.plants.queries.planar_robot import PlanarFrame
 
 Array = NDArray[np.float64]
@@ -32,7 +33,7 @@ def braking(detail: dict[str, Any]) -> tuple[Array, Any]:
     bound: Any = filtered.filter.bound[0]
     filtered.filter.observe()
     heading = PlanarFrame(filtered.plant, "agent").motion(filtered.plant)
-    area = bound.drive.stopping_path(heading)
+    area = stopping_path(bound.drive, heading, True)
     where = [task.agent_position]
     for _ in range(150):
         filtered.filter.observe()

@@ -10,7 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import safe_wrappers as sw
-from safe_wrappers.control.backup.heading_drive import Motion, StoppingPath
+from safe_wrappers.control.backup.heading_drive import (
+    Motion,
+    StoppingPath,
+    brake_control,
+    end_distance,
+    path_distance,
+    predict,
+    residual_turn_angle,
+    stopping_path,
+)
 from safe_wrappers.plants.queries.planar_robot import heading_drive
 
 
@@ -55,7 +64,7 @@ def test_prediction_is_mujocos_own_step():
             action *= 0.04  # inside the drive's clamp
         place(env, motion)
         env.step(action)
-        np.testing.assert_allclose(now(env), drive.predict(motion, *action), atol=1e-9)
+        np.testing.assert_allclose(now(env), predict(drive, motion, *action), atol=1e-9)
 
 
 def test_prediction_stays_mujocos_over_an_episode():
@@ -66,7 +75,7 @@ def test_prediction_stays_mujocos_over_an_episode():
         if k % 8 == 0:
             action = rng.choice([-1.0, 1.0], 2)
         env.step(action)
-        motion = drive.predict(motion, *action)
+        motion = predict(drive, motion, *action)
         np.testing.assert_allclose(now(env), motion, atol=1e-8)
 
 
@@ -108,7 +117,7 @@ def test_coasting_ends_exactly_where_it_should():
 
 def backup(drive, motion):
     ahead = motion.vx * math.cos(motion.heading) + motion.vy * math.sin(motion.heading)
-    return np.array([drive.brake_control(ahead), 0.0])
+    return np.array([brake_control(drive, ahead), 0.0])
 
 
 def excursion(drive, truth, brake=True, yaw=0.0, speed=1.3, runs=12, seed=4):
@@ -118,10 +127,10 @@ def excursion(drive, truth, brake=True, yaw=0.0, speed=1.3, runs=12, seed=4):
     for _ in range(runs):
         motion = random_motion(rng, speed, yaw)
         place(truth, motion)
-        path = drive.stopping_path(motion, brake)
+        path = stopping_path(drive, motion, brake)
         for _ in range(150):
             truth.step(backup(drive, now(truth)) if brake else np.zeros(2))
-            worst = max(worst, *(path.distance(float(x), float(y)) for x, y in truth._path))
+            worst = max(worst, *(path_distance(path, float(x), float(y)) for x, y in truth._path))
     return worst
 
 
@@ -160,12 +169,12 @@ def test_the_area_is_no_larger_than_it_need_be():
     place(env, motion)
     for _ in range(300):
         env.step(backup(drive, now(env)))
-    path = drive.stopping_path(motion)
+    path = stopping_path(drive, motion, True)
     end = np.array(
         [path.forward * path.ex + path.sideways * path.sx, path.forward * path.ey + path.sideways * path.sy]
     )
     assert np.linalg.norm(end - env.data.qpos[:2]) < 2e-3
-    assert path.end_distance(*env.data.qpos[:2]) == pytest.approx(
+    assert end_distance(path, *env.data.qpos[:2]) == pytest.approx(
         np.linalg.norm(end - env.data.qpos[:2]) - path.wander
     )
 
@@ -188,7 +197,7 @@ def test_the_turn_that_is_left_is_mujocos():
         for _ in range(20):
             env.step(np.zeros(2))
             headings.append(env.data.qpos[2])
-        assert drive.residual_turn_angle(rate) == pytest.approx(headings[-1], abs=6e-3)
+        assert residual_turn_angle(drive, rate) == pytest.approx(headings[-1], abs=6e-3)
 
 
 # Distance to the area -----------------------------------------------------------------------------------------
@@ -236,17 +245,17 @@ def test_distance_agrees_with_brute_force(forward, sideways, share, spread, angl
         area.append(start + sideways * s)
     expected, near = polygon_distance(np.array(area), np.array([px, py]))
     if near < 1e-3:  # on the boundary the sampling decides the sign
-        assert abs(path.distance(px, py)) < 2e-3
+        assert abs(path_distance(path, px, py)) < 2e-3
     else:
-        assert path.distance(px, py) == pytest.approx(expected, abs=1e-3)
-    assert path.end_distance(px, py) == pytest.approx(np.linalg.norm(area[2] - [px, py]))
+        assert path_distance(path, px, py) == pytest.approx(expected, abs=1e-3)
+    assert end_distance(path, px, py) == pytest.approx(np.linalg.norm(area[2] - [px, py]))
     assert path.radius >= max(np.linalg.norm(c - start) for c in area) - 1e-12
 
 
 def test_a_body_at_rest_is_a_point():
     _, _, drive = robot()
-    path = drive.stopping_path(Motion(0.5, 0.25, 1.0, 0.0, 0.0, 0.0))
-    assert path.distance(0.5, 1.25) == pytest.approx(1.0)
+    path = stopping_path(drive, Motion(0.5, 0.25, 1.0, 0.0, 0.0, 0.0), True)
+    assert path_distance(path, 0.5, 1.25) == pytest.approx(1.0)
     assert path.radius == pytest.approx(0.0, abs=1e-12)
 
 
@@ -261,10 +270,10 @@ def test_uncertainty_only_adds_area(ahead, aside, heading):
         ahead * math.sin(heading) + aside * math.cos(heading),
         0.0,
     )
-    small, large = DRIVES[0].stopping_path(motion), DRIVES[1].stopping_path(motion)
+    small, large = stopping_path(DRIVES[0], motion, True), stopping_path(DRIVES[1], motion, True)
     p, e, s = np.zeros(2), np.array([small.ex, small.ey]), np.array([small.sx, small.sy])
     for corner in (p, small.forward * e + small.crossing * s, small.forward * e + small.sideways * s):
-        assert large.distance(*corner) <= 5e-5
+        assert path_distance(large, *corner) <= 5e-5
     assert large.forward >= small.forward - 5e-5 and large.sideways >= small.sideways
 
 

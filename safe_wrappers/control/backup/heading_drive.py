@@ -8,8 +8,7 @@ damping the longest stops span a trapezoid. The distance of either from an obsta
 manoeuvre (brake along the heading, hold the heading) runs. All of this holds for MuJoCo's semi-implicit Euler step
 too.
 
-Source: appendix "Relative degree and kinetic stopping insets", for this plant. The functions are compiled; the
-methods of the tuples call them.
+Source: appendix "Relative degree and kinetic stopping insets", for this plant. The functions are compiled.
 """
 
 import math
@@ -62,14 +61,6 @@ class StoppingPath(NamedTuple):
     radius: float
     spread: bool
     wander: float = 0.0
-
-    def distance(self, px: float, py: float) -> float:
-        """`path_distance`."""
-        return path_distance(self, px, py)
-
-    def end_distance(self, px: float, py: float) -> float:
-        """`end_distance`."""
-        return end_distance(self, px, py)
 
 
 @compiled
@@ -140,26 +131,6 @@ class HeadingDrive(NamedTuple):
     substeps: int
     uncertainty: float = 0.0
 
-    @property
-    def control_dt(self) -> float:
-        """Control interval, s."""
-        return self.timestep * self.substeps
-
-    @property
-    def coast_time(self) -> float:
-        """Longest time constant of coasting, m / c, inside the uncertainty, s: coasting distance per speed."""
-        return self.mass * (1.0 + self.uncertainty) / (self.damping * (1.0 - self.uncertainty))
-
-    @property
-    def top_speed(self) -> float:
-        """Smallest terminal speed under full drive inside the uncertainty, m/s."""
-        return self.drive_limit / (self.damping * (1.0 + self.uncertainty))
-
-    @property
-    def fastest_change(self) -> float:
-        """Largest change of speed in one control step inside the uncertainty, m/s."""
-        return self.drive_limit / (self.mass * (1.0 - self.uncertainty)) * self.control_dt
-
     def corners(self) -> "list[HeadingDrive]":
         """The bodies at the corners of the uncertainty, each without uncertainty; this one if there is none."""
         if self.uncertainty == 0.0:
@@ -176,22 +147,6 @@ class HeadingDrive(NamedTuple):
             for m in factors
             for c in factors
         ]
-
-    def brake_control(self, forward_speed: float) -> float:
-        """`brake_control`."""
-        return brake_control(self, forward_speed)
-
-    def residual_turn_angle(self, yaw_rate: float) -> float:
-        """`residual_turn_angle`."""
-        return residual_turn_angle(self, yaw_rate)
-
-    def stopping_path(self, motion: Motion, brake: bool = True) -> StoppingPath:
-        """`stopping_path`."""
-        return stopping_path(self, motion, brake)
-
-    def predict(self, motion: Motion, drive: float, turn: float) -> Motion:
-        """`predict`."""
-        return predict(self, motion, drive, turn)
 
 
 @compiled

@@ -5,6 +5,7 @@ One source serves both. Without fused operations, and with `math`'s own function
 machine code off. It is cached beside the sources, or in the user's cache where that folder is read-only.
 """
 
+import contextlib
 import math
 import os
 from collections.abc import Callable
@@ -28,8 +29,9 @@ def _drop_stale(function: Callable[..., Any]) -> None:
     """Delete cached code older than a source it may contain: the compiler looks at the function's own file only."""
     source = Path(function.__code__.co_filename)
     for index in (source.parent / "__pycache__").glob(f"{source.stem}.{function.__name__}-*.nbi"):
-        if index.stat().st_mtime < _NEWEST_SOURCE_S:
-            index.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # another process was faster, or nothing may be written here
+            if index.stat().st_mtime < _NEWEST_SOURCE_S:
+                index.unlink()
 
 
 _COMPILE = _compiler()
