@@ -234,9 +234,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         limited = sum(c.limited for c in commands)
         if limited and not self._warned:
             self._warned = True
-            message = (
-                "a chunk is too short for a blend that keeps rate_limit, or moves too fast (handover/limited)"
-            )
+            message = "a command was held back to keep rate_limit: the chunk is too short or too fast (handover/limited)"
             warnings.warn(message, UserWarning, stacklevel=3)
         return {
             keys.HANDOVER_SEAM_JUMP: jump,
