@@ -234,7 +234,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         limited = sum(c.limited for c in commands)
         if limited and not self._warned:
             self._warned = True
-            message = "a command was held back to keep rate_limit: the chunk is too short or too fast (handover/limited)"
+            message = "a command was held back to keep rate_limit: the chunk is too short or fast (handover/limited)"
             warnings.warn(message, UserWarning, stacklevel=3)
         return {
             keys.HANDOVER_SEAM_JUMP: jump,
