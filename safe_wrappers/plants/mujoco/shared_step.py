@@ -59,7 +59,13 @@ class SharedStep:
 
         def take_over(ctrl: Array, n_frames: int) -> None:
             del raw._step_mujoco_simulation  # a second simulation within one step is the env's own
-            if not self._is_the_rollout(ctrl, n_frames, rollout, start):
+            mujoco.mj_getState(raw.model, raw.data, self._state, _STATE)
+            if (
+                n_frames != self._substeps
+                or np.asarray(ctrl, dtype=np.float64).tobytes() != rollout.held_control
+                or self._state.tobytes() != start.tobytes()
+                or rollout.held.warning.number.any()
+            ):
                 simulate(ctrl, n_frames)
                 return
             warned = raw.data.warning.number.copy()
@@ -73,10 +79,3 @@ class SharedStep:
             return env.step(action)
         finally:
             vars(raw).pop("_step_mujoco_simulation", None)
-
-    def _is_the_rollout(self, ctrl: Array, n_frames: int, rollout: Recorder, start: Array) -> bool:
-        same = np.asarray(ctrl, dtype=np.float64).tobytes() == rollout.held_control
-        if not same or n_frames != self._substeps or rollout.held.warning.number.any():
-            return False
-        mujoco.mj_getState(self._raw.model, self._raw.data, self._state, _STATE)
-        return self._state.tobytes() == start.tobytes()

@@ -122,7 +122,8 @@ class Coasting:
 def _addresses(m: mujoco.MjModel, plant: MujocoPlant, joint: int, kind: str) -> NDArray[np.intp]:
     """Indices of a joint of the machine's own model in the plant's state ("qpos" or "dof")."""
     sizes = {"qpos": (7, 4, 1, 1), "dof": (6, 3, 1, 1)}[kind]
-    first = int(getattr(plant.model, f"jnt_{kind}adr")[plant.named("joint", m.joint(joint).name)])
+    addresses = plant.model.jnt_qposadr if kind == "qpos" else plant.model.jnt_dofadr
+    first = int(addresses[plant.named("joint", m.joint(joint).name)])
     return np.arange(first, first + sizes[int(m.jnt_type[joint])])
 
 
