@@ -145,6 +145,7 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         )
         if side != 0.0:
             self._keep_side(side)
-        if stage == among.UNRESOLVED:
+        # Comparisons with NaN are false: an overflow must not look admitted. The search looks at it again.
+        if stage == among.UNRESOLVED or not np.isfinite(found).all():
             return None
         return self._pair(found), stage, self._half_spaces(normals, offsets)
