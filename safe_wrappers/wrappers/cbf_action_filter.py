@@ -107,22 +107,40 @@ class CBFActionFilter(LayerWrapper):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env and forget the episode: commands in flight, the last action, the warning."""
         observation, info = self.env.reset(seed=seed, options=options)
+        return observation, info | self.start_report()
+
+    def start_report(self) -> dict[str, Any]:
+        """Take the state that a reset has left: the info keys of a new episode."""
         self._warned.discard("unsafe")
         self.filter.start()
         margin, unsafe = self._margin()
-        info.update(dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0))
-        info[keys.CBF_MARGIN] = margin
-        info[keys.CBF_UNSAFE] = unsafe
-        info[keys.CBF_REFUSED] = np.zeros(len(self.constraints), dtype=bool)
+        report: dict[str, Any] = dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0)
+        report[keys.CBF_MARGIN] = margin
+        report[keys.CBF_UNSAFE] = unsafe
+        report[keys.CBF_REFUSED] = np.zeros(len(self.constraints), dtype=bool)
         # When all sub-envs of a vector env reset at once, its infos hold only the keys that a reset reports.
-        info[keys.PROPOSED_ACTION] = np.zeros(self._shape)
-        info[keys.EXECUTED_ACTION] = np.zeros(self._shape)
-        info[keys.CBF_STAGE] = int(Stage.PROPOSAL)
-        return observation, info | self.filter.info(None, None)
+        report[keys.PROPOSED_ACTION] = np.zeros(self._shape)
+        report[keys.EXECUTED_ACTION] = np.zeros(self._shape)
+        report[keys.CBF_STAGE] = int(Stage.PROPOSAL)
+        return report | self.filter.info(None, None)
 
     def step(self, action: Any) -> Step:
         """Filter the action and step the env with what may be executed."""
         started = time.perf_counter()
+        sent, report = self.judge(action)
+        self.filter_seconds += time.perf_counter() - started
+        self.filter_calls += 1
+        observation, reward, terminated, truncated, info = self.plant.step(self.env, sent)
+        info |= report
+        if self.filter.reporting:
+            info |= self.filter.info(report[keys.PROPOSED_ACTION], report[keys.EXECUTED_ACTION])
+        return observation, reward, terminated, truncated, info
+
+    def judge(self, action: Any) -> tuple[Any, dict[str, Any]]:
+        """What to send for a proposed action in the env's present state, and the step's info keys.
+
+        The env must be stepped with it next. The constraints' own keys are not among these.
+        """
         proposed: Array = action_array(action, self._shape, np.float64)
         self.filter.observe()
         margin, unsafe = self._margin()
@@ -156,25 +174,21 @@ class CBFActionFilter(LayerWrapper):
                 # What fails least may be the proposal itself, and a change may be lost in rounding.
                 intervened &= bool((executed != np.clip(proposed, self._low, self._high)).any())
         self.filter.executed(executed)
-        self.filter_seconds += time.perf_counter() - started
-        self.filter_calls += 1
-        observation, reward, terminated, truncated, info = self.plant.step(self.env, sent)
-        info[keys.CBF_INTERVENED] = intervened
-        info[keys.CBF_INFEASIBLE] = decision.infeasible
-        info[keys.CBF_FALLBACK] = decision.fallback
-        info[keys.CBF_NONFINITE] = not finite
-        info[keys.CBF_UNSAFE] = unsafe
         none = np.zeros(len(self.constraints), dtype=bool)
-        info[keys.CBF_REFUSED] = none if decision.refused is None else decision.refused
-        info[keys.CBF_CORRECTION] = correction
-        info[keys.CBF_CLIPPED] = clipped
-        info[keys.CBF_MARGIN] = margin
-        info[keys.PROPOSED_ACTION] = proposed
-        info[keys.EXECUTED_ACTION] = executed.copy()
-        info[keys.CBF_STAGE] = int(decision.stage)
-        if self.filter.reporting:
-            info |= self.filter.info(proposed, executed)
-        return observation, reward, terminated, truncated, info
+        return sent, {
+            keys.CBF_INTERVENED: intervened,
+            keys.CBF_INFEASIBLE: decision.infeasible,
+            keys.CBF_FALLBACK: decision.fallback,
+            keys.CBF_NONFINITE: not finite,
+            keys.CBF_UNSAFE: unsafe,
+            keys.CBF_REFUSED: none if decision.refused is None else decision.refused,
+            keys.CBF_CORRECTION: correction,
+            keys.CBF_CLIPPED: clipped,
+            keys.CBF_MARGIN: margin,
+            keys.PROPOSED_ACTION: proposed,
+            keys.EXECUTED_ACTION: executed.copy(),
+            keys.CBF_STAGE: int(decision.stage),
+        }
 
     def _margin(self) -> tuple[float, bool]:
         """`cbf/margin` and `cbf/unsafe`: 0 where no h is finite, unsafe where the state or an h is not a number."""
@@ -185,11 +199,11 @@ class CBFActionFilter(LayerWrapper):
             message = (
                 f"the state is outside the safe set (cbf/margin = {margin:.3g}); nothing is promised there"
             )
-            self._warn_once("unsafe", message, UnsafeStateWarning, stacklevel=4)
+            self._warn_once("unsafe", message, UnsafeStateWarning, stacklevel=5)
         return margin, unsafe
 
     def _warn_once(
-        self, what: str, message: str, category: type[Warning] = UserWarning, stacklevel: int = 3
+        self, what: str, message: str, category: type[Warning] = UserWarning, stacklevel: int = 4
     ) -> None:
         """Warn once per episode (unsafe) or filter, at the line of the caller of `step` or `reset`."""
         if what not in self._warned:
