@@ -29,6 +29,8 @@ class SafetyFilter:
     Attributes:
         bound: The constraints on the plant, in their order.
         reporting: Those of them that write info keys of their own.
+        memories: What each constraint remembers of the episode, in their order.
+        last: The control that was executed last, shape (m,).
         margin: The smallest h of the observed state; inf if there is none, NaN if the state or an h is not a number.
 
     Raises:
@@ -59,8 +61,8 @@ class SafetyFilter:
     def start(self) -> None:
         """Forget the episode, take the state of the next one, and refuse what only a state can show."""
         self.plant.executed(None)
-        self._memories = [c.start() for c in self.bound]
-        self._last = np.clip(np.zeros_like(self._low), self._low, self._high)
+        self.memories = [c.start() for c in self.bound]
+        self.last = np.clip(np.zeros_like(self._low), self._low, self._high)
         self.observe()
         for c in self.bound:
             c.check()
@@ -74,7 +76,7 @@ class SafetyFilter:
         if state - state != 0.0:
             return
         lowest = math.inf
-        for c, memory in zip(self.bound, self._memories, strict=True):
+        for c, memory in zip(self.bound, self.memories, strict=True):
             c.observe(memory)
             h = c.value()
             if h.size:
@@ -87,18 +89,18 @@ class SafetyFilter:
     def filter(self, boxed: Array | None) -> Decision:
         """The decision about a proposal inside the box, shape (m,), or about none: then the fallback proposes."""
         if self.margin != self.margin:
-            return self._search.unreadable(self._last)
+            return self._search.unreadable(self.last)
         if boxed is None:
-            return self._search.without_proposal(self._last)
-        return self._search.decide(boxed, self._last)
+            return self._search.without_proposal(self.last)
+        return self._search.decide(boxed, self.last)
 
     def executed(self, control: Array) -> None:
         """Remember what was sent, shape (m,), for the plant's delay, the constraints and a fallback that holds it."""
-        self._last = control
+        self.last = control
         self.plant.executed(control)
         if self.margin == self.margin:
             for i, c in enumerate(self.bound):
-                self._memories[i] = c.executed(control)
+                self.memories[i] = c.executed(control)
 
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
         """The constraints' own info keys about the observed state; None after a reset."""

@@ -25,7 +25,7 @@ from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step
 from safe_wrappers.wrappers.common.receiver import action_array
 
-_SAFE_TOLERANCE = 1e-6
+SAFE_TOLERANCE = 1e-6
 """h below zero by less is rounding (of float32 actions, too), in the constraints' own units."""
 
 
@@ -59,6 +59,7 @@ class CBFActionFilter(LayerWrapper):
     Attributes:
         filter: The `SafetyFilter` that decides; `filter.bound` are the constraints on the plant.
         constraint_names: Of the constraints, in the order of ``cbf/refused``: their kinds, numbered if repeated.
+        warned: What has been warned of: "nonfinite", "clipped", and "unsafe" until the next reset.
         filter_seconds: Wall time spent filtering so far; `filter_calls` says over how many steps.
 
     Raises:
@@ -101,7 +102,7 @@ class CBFActionFilter(LayerWrapper):
         self._low, self._high = np.asarray(space.low, np.float64), np.asarray(space.high, np.float64)
         self.filter = SafetyFilter(self.plant, self.constraints, fallback, solver, self._low, self._high)
         self._shape, self._dtype = space.shape, space.dtype
-        self._warned: set[str] = set()
+        self.warned: set[str] = set()
         self.filter_seconds, self.filter_calls = 0.0, 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
@@ -111,7 +112,7 @@ class CBFActionFilter(LayerWrapper):
 
     def start_report(self) -> dict[str, Any]:
         """Take the state that a reset has left: the info keys of a new episode."""
-        self._warned.discard("unsafe")
+        self.warned.discard("unsafe")
         self.filter.start()
         margin, unsafe = self._margin()
         report: dict[str, Any] = dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0)
@@ -193,7 +194,7 @@ class CBFActionFilter(LayerWrapper):
     def _margin(self) -> tuple[float, bool]:
         """`cbf/margin` and `cbf/unsafe`: 0 where no h is finite, unsafe where the state or an h is not a number."""
         lowest = self.filter.margin
-        unsafe = not lowest >= -_SAFE_TOLERANCE
+        unsafe = not lowest >= -SAFE_TOLERANCE
         margin = lowest if math.isfinite(lowest) else 0.0
         if unsafe:
             message = (
@@ -206,8 +207,8 @@ class CBFActionFilter(LayerWrapper):
         self, what: str, message: str, category: type[Warning] = UserWarning, stacklevel: int = 4
     ) -> None:
         """Warn once per episode (unsafe) or filter, at the line of the caller of `step` or `reset`."""
-        if what not in self._warned:
-            self._warned.add(what)
+        if what not in self.warned:
+            self.warned.add(what)
             warnings.warn(message, category, stacklevel=stacklevel)
 
 

@@ -19,6 +19,22 @@ from safe_wrappers.plants.mujoco.model import control_range, inertia
 _JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _AFFINE_GAIN, _AFFINE_BIAS = int(mujoco.mjtGain.mjGAIN_AFFINE), int(mujoco.mjtBias.mjBIAS_AFFINE)
 _QUADRATIC = int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC)
+CLAMPS = tuple(
+    f"actuator_{name}"
+    for name in (
+        "gaintype",
+        "gainprm",
+        "biastype",
+        "biasprm",
+        "forcelimited",
+        "forcerange",
+        "ctrllimited",
+        "ctrlrange",
+        "gear",
+        "acc0",
+    )
+)
+"""The arrays of a model that say where its actuators are clamped, as `acting_ranges` takes them."""
 _HANDLED = (
     ("transmission", "actuator_trntype", mujoco.mjtTrn, ("joint", "jointinparent", "site", "tendon")),
     ("activation dynamics", "actuator_dyntype", mujoco.mjtDyn, ("none",)),
@@ -95,6 +111,46 @@ def _acting_range(
             most[i] = min(max(max(ends[0], ends[1]) + widen, low), high)
 
 
+@compiled
+def acting_ranges(
+    gain_type: NDArray[Any],
+    gain: Array,
+    bias_type: NDArray[Any],
+    bias: Array,
+    force_limited: NDArray[Any],
+    force_range: Array,
+    control_limited: NDArray[Any],
+    control_range: Array,
+    gear: Array,
+    acceleration: Array,
+    length: Array,
+    velocity: Array,
+    control_dt: float,
+    chosen: NDArray[np.int64],
+    bounds: Array,
+) -> None:
+    """`AffineActuators.acting_range` for the `chosen` of n machines, shape (r,), into `bounds`, shape (r, 2, nu)."""
+    for r in range(len(chosen)):
+        i = chosen[r]
+        _acting_range(
+            gain_type[i],
+            gain[i],
+            bias_type[i],
+            bias[i],
+            force_limited[i],
+            force_range[i],
+            control_limited[i],
+            control_range[i],
+            gear[i],
+            acceleration[i],
+            length[i],
+            velocity[i],
+            control_dt,
+            bounds[r, 0],
+            bounds[r, 1],
+        )
+
+
 class AffineActuators:
     """Gain, bias and acting control range of every actuator of a model, whose arrays are read at every call."""
 
@@ -130,10 +186,7 @@ class AffineActuators:
         if not m.actuator_forcelimited.any():
             return control_range(m)
         least, most = np.empty(m.nu), np.empty(m.nu)
-        gain, bias = (m.actuator_gaintype, m.actuator_gainprm), (m.actuator_biastype, m.actuator_biasprm)
-        clamp = m.actuator_forcelimited, m.actuator_forcerange, m.actuator_ctrllimited, m.actuator_ctrlrange
-        response = m.actuator_gear, m.actuator_acc0
-        _acting_range(*gain, *bias, *clamp, *response, length, velocity, control_dt, least, most)
+        _acting_range(*(getattr(m, name) for name in CLAMPS), length, velocity, control_dt, least, most)
         return least, most
 
     def motion_without_kinematics(self, qpos: Array, qvel: Array) -> tuple[Array, Array] | None:

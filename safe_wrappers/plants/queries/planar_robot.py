@@ -5,6 +5,7 @@ import math
 import mujoco
 import numpy as np
 
+from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.heading_drive import HeadingDrive, Motion
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
@@ -38,7 +39,7 @@ class PlanarFrame:
             )
         self.joints = joints
         self._q, self._v = int(m.jnt_qposadr[joints[0]]), int(m.jnt_dofadr[joints[0]])
-        self._origin = m.body_pos[b][:2].tolist()
+        self.origin = m.body_pos[b][:2].tolist()  #: of the slides, in the world, m
         if m.nu != 2:
             raise UnsupportedEnvError(
                 f"expected 2 actuators, a drive and a turning one; the model has {m.nu}"
@@ -62,7 +63,11 @@ class PlanarFrame:
         """Position, heading and velocities in the world."""
         x, y, heading = plant.qpos[self._q : self._q + 3].tolist()
         vx, vy, turning = plant.qvel[self._v : self._v + 3].tolist()
-        return Motion(x + self._origin[0], y + self._origin[1], heading, vx, vy, turning)
+        return Motion(x + self.origin[0], y + self.origin[1], heading, vx, vy, turning)
+
+    def views(self, data: mujoco.MjData) -> tuple[Array, Array]:
+        """Positions of the joints, without `origin`, and their velocities: parts of the data's own arrays, (3,)."""
+        return data.qpos[self._q : self._q + 3], data.qvel[self._v : self._v + 3]
 
 
 def heading_drive(plant: MujocoPlant, body: str, uncertainty: float = 0.0) -> HeadingDrive:
