@@ -1,6 +1,7 @@
 """CBFActionFilter: executes the policy's action, or one near it that every constraint admits, or a fallback."""
 
 import copy
+import inspect
 import math
 import time
 import warnings
@@ -25,6 +26,7 @@ from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step
 from safe_wrappers.wrappers.common.receiver import action_array
 
+_WRAPPERS = __name__.rpartition(".")[0]
 SAFE_TOLERANCE = 1e-6
 """h below zero by less is rounding (of float32 actions, too), in the constraints' own units."""
 
@@ -200,16 +202,18 @@ class CBFActionFilter(LayerWrapper):
             message = (
                 f"the state is outside the safe set (cbf/margin = {margin:.3g}); nothing is promised there"
             )
-            self._warn_once("unsafe", message, UnsafeStateWarning, stacklevel=5)
+            self._warn_once("unsafe", message, UnsafeStateWarning)
         return margin, unsafe
 
-    def _warn_once(
-        self, what: str, message: str, category: type[Warning] = UserWarning, stacklevel: int = 4
-    ) -> None:
-        """Warn once per episode (unsafe) or filter, at the line of the caller of `step` or `reset`."""
-        if what not in self.warned:
-            self.warned.add(what)
-            warnings.warn(message, category, stacklevel=stacklevel)
+    def _warn_once(self, what: str, message: str, category: type[Warning] = UserWarning) -> None:
+        """Warn once per episode (unsafe) or filter, at the line that called the outermost of our wrappers."""
+        if what in self.warned:
+            return
+        self.warned.add(what)
+        level, frame = 1, inspect.currentframe()
+        while frame is not None and str(frame.f_globals.get("__name__")).startswith(_WRAPPERS):
+            level, frame = level + 1, frame.f_back
+        warnings.warn(message, category, stacklevel=level)
 
 
 def _unique(kinds: list[str]) -> list[str]:

@@ -43,8 +43,8 @@ class VectorCBFActionFilter(VectorWrapper[Any, Any, Any, Any, Any]):
         margin: See there.
 
     Attributes:
-        filters: Each env's `CBFActionFilter`, which judges but does not step.
-        filter_seconds: Wall time spent filtering so far; `filter_calls` says over how many steps of single envs.
+        filters: Each env's `CBFActionFilter`, which judges but does not step; its `filter_seconds` are its share.
+        constraint_batch: What decides all envs in one call, or None: each is decided by its own filter.
 
     Raises:
         UnsupportedEnvError: Not such a vector env.
@@ -80,13 +80,12 @@ class VectorCBFActionFilter(VectorWrapper[Any, Any, Any, Any, Any]):
         assert isinstance(space, gym.spaces.Box)  # CBFActionFilter has refused every other space
         self._low, self._high, self._dtype = space.low.astype(float), space.high.astype(float), space.dtype
         self._last = np.zeros((self.num_envs, *self._low.shape))
-        self._batch = self._constraint_batch()
+        self.constraint_batch = self._constraint_batch()
         for single in self.filters:
             single.warned = self.filters[0].warned
         self._same_step = env.metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP
         self._next_step = env.metadata.get("autoreset_mode") is AutoresetMode.NEXT_STEP
         self._ended = np.zeros(self.num_envs, dtype=bool)
-        self.filter_seconds, self.filter_calls = 0.0, 0
 
     def _constraint_batch(self) -> ConstraintBatch | None:
         bound = [single.filter.bound for single in self.filters]
@@ -112,8 +111,10 @@ class VectorCBFActionFilter(VectorWrapper[Any, Any, Any, Any, Any]):
         judged = ~self._ended if self._next_step else np.ones(self.num_envs, dtype=bool)
         sent = given.astype(np.result_type(given, self._dtype))
         reports = self._judge(given, sent, judged)
-        self.filter_seconds += time.perf_counter() - started
-        self.filter_calls += int(judged.sum())
+        each = (time.perf_counter() - started) / max(1, int(judged.sum()))
+        for single, was_judged in zip(self.filters, judged.tolist(), strict=True):
+            single.filter_seconds += each * was_judged
+            single.filter_calls += was_judged
         observations, rewards, terminated, truncated, infos = self.env.step(sent)
         self._ended = np.asarray(terminated | truncated)
         restarted = self._ended if self._same_step else ~judged
@@ -133,17 +134,17 @@ class VectorCBFActionFilter(VectorWrapper[Any, Any, Any, Any, Any]):
         reports[keys.CBF_REFUSED] = np.zeros((n, len(self.filters[0].constraints)), dtype=bool)
         reports[keys.PROPOSED_ACTION], reports[keys.EXECUTED_ACTION] = np.zeros((2, *given.shape))
         left = judged
-        if self._batch is not None:
-            left = judged & ~self._judge_together(self._batch, given, sent, judged, reports)
+        if self.constraint_batch is not None:
+            left = judged & ~self._judge_together(self.constraint_batch, given, sent, judged, reports)
         for i in np.flatnonzero(left).tolist():
             engine = self.filters[i].filter
-            if self._batch is not None:
-                engine.memories, engine.last = [self._batch.memory(i)], self._last[i].copy()
+            if self.constraint_batch is not None:
+                engine.memories, engine.last = [self.constraint_batch.memory(i)], self._last[i].copy()
             sent[i], report = self.filters[i].judge(given[i])
             for key, value in report.items():
                 reports[key][i] = value
-            if self._batch is not None:
-                self._batch.restart(i, engine.memories[0])
+            if self.constraint_batch is not None:
+                self.constraint_batch.restart(i, engine.memories[0])
         self._last[judged] = reports[keys.EXECUTED_ACTION][judged]
         return reports
 
@@ -205,8 +206,8 @@ class VectorCBFActionFilter(VectorWrapper[Any, Any, Any, Any, Any]):
             self._add_info(infos, self.filters[i].start_report(), i)
             engine = self.filters[i].filter
             self._last[i] = engine.last
-            if self._batch is not None:
-                self._batch.restart(i, engine.memories[0])
+            if self.constraint_batch is not None:
+                self.constraint_batch.restart(i, engine.memories[0])
 
 
 def single_envs(env: VectorEnv[Any, Any, Any]) -> list[gym.Env[Any, Any]]:
@@ -221,13 +222,13 @@ def single_envs(env: VectorEnv[Any, Any, Any]) -> list[gym.Env[Any, Any]]:
         inner = inner.env
     if not isinstance(inner, SyncVectorEnv):
         raise UnsupportedEnvError(
-            f"expected a SyncVectorEnv, whose envs are in this process, got {inner!r}; filter each env where it is "
-            "made: " + by_env(inner)
+            f"expected a SyncVectorEnv, whose envs are in this process, got {inner!r}; protect each env of it: "
+            + _by_env(inner)
         )
     return list(inner.envs)
 
 
-def by_env(env: VectorEnv[Any, Any, Any]) -> str:
+def _by_env(env: VectorEnv[Any, Any, Any]) -> str:
     """The line that makes the same vector env of protected envs."""
     if env.spec is None:
         envs = f"[lambda: sw.protect(gym.make(...))] * {env.num_envs}"

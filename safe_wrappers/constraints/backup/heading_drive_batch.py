@@ -36,7 +36,7 @@ class HeadingDriveBatch(ConstraintBatch):
         self._positions: list[Array] = [np.zeros(3)] * n
         self._velocities: list[Array] = [np.zeros(3)] * n
         self._joints, self._motions = np.zeros((2, 3 * n)), np.zeros((n, 6))
-        self._origins = np.array([b.frame.origin for b in bound])
+        self._origins = np.zeros((n, 2))
         self._versions: list[int] = []
         self._counts: list[int] = []
 
@@ -47,6 +47,7 @@ class HeadingDriveBatch(ConstraintBatch):
     def restart(self, env: int, memory: Detour) -> None:
         bound = self._bound[env]
         self._positions[env], self._velocities[env] = bound.frame.views(bound.plant.published())
+        self._origins[env] = bound.frame.origin
         self._sides[env], self._steps[env] = memory
 
     def memory(self, env: int) -> Detour:
