@@ -48,6 +48,7 @@ class GymnasiumVecEnv(DummyVecEnv):
                 f"one vector env takes the same options for all envs, got {self._options}"
             )
         seeds: Any = list(self._seeds)
+        observations: VecEnvObs
         observations, infos = self.vector_env.reset(seed=seeds, options=options or None)
         self.reset_infos = [single_info(infos, i) for i in range(self.num_envs)]
         self._reset_seeds()

@@ -10,7 +10,7 @@ from safe_wrappers.constraints.backup.base import Detour
 from safe_wrappers.control.backup import drive_decision as among
 from safe_wrappers.filter.constraint import Array
 from safe_wrappers.filter.constraint_batch import ConstraintBatch
-from safe_wrappers.plants.mujoco.actuators import CLAMPS, acting_ranges
+from safe_wrappers.plants.mujoco.actuators import Actuators, acting_ranges
 
 if TYPE_CHECKING:
     from safe_wrappers.constraints.backup.heading_drive_clearance import BoundHeadingDriveClearance
@@ -82,7 +82,7 @@ class HeadingDriveBatch(ConstraintBatch):
         bounds[:, :2] = self._box[envs]
         turn, on_hinge = self._bound[0].frame.turn_index, np.zeros((2, len(self._bound), 2))
         on_hinge[:, :, turn] = self._turn_gear * self._motions[:, 2::3].T
-        acting_ranges(*self._clamps, *on_hinge, dt, envs, bounds[:, 2:])
+        acting_ranges(self._actuators, on_hinge[0], on_hinge[1], dt, envs, bounds[:, 2:])
         bounds[:, 2:] = np.clip(bounds[:, 2:], bounds[:, :1], bounds[:, 1:2])
         return self._pairs(bounds)
 
@@ -109,7 +109,7 @@ class HeadingDriveBatch(ConstraintBatch):
             b.read_constants()
         models = [b.plant.model for b in self._bound]
         self._models = np.array([b.models for b in self._bound])
-        self._clamps = [np.array([getattr(m, name) for m in models]) for name in CLAMPS]
+        self._actuators = Actuators(*map(np.array, zip(*map(Actuators.of, models), strict=True)))
         turn = self._bound[0].frame.turn_index
         self._turn_gear = np.array([m.actuator_gear[turn, 0] for m in models])
         low = [np.maximum(self._low, b.plant.lower) for b in self._bound]

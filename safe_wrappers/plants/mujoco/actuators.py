@@ -5,7 +5,7 @@ the clamp more control changes nothing, so it becomes a bound on the control.
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -19,22 +19,6 @@ from safe_wrappers.plants.mujoco.model import control_range, inertia
 _JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _AFFINE_GAIN, _AFFINE_BIAS = int(mujoco.mjtGain.mjGAIN_AFFINE), int(mujoco.mjtBias.mjBIAS_AFFINE)
 _QUADRATIC = int(mujoco.mjtConstraintState.mjCNSTRSTATE_QUADRATIC)
-CLAMPS = tuple(
-    f"actuator_{name}"
-    for name in (
-        "gaintype",
-        "gainprm",
-        "biastype",
-        "biasprm",
-        "forcelimited",
-        "forcerange",
-        "ctrllimited",
-        "ctrlrange",
-        "gear",
-        "acc0",
-    )
-)
-"""The arrays of a model that say where its actuators are clamped, as `acting_ranges` takes them."""
 _HANDLED = (
     ("transmission", "actuator_trntype", mujoco.mjtTrn, ("joint", "jointinparent", "site", "tendon")),
     ("activation dynamics", "actuator_dyntype", mujoco.mjtDyn, ("none",)),
@@ -70,61 +54,60 @@ def _refuse(actuator: str, what: str, handled: str) -> None:
     )
 
 
+class Actuators(NamedTuple):
+    """MuJoCo's arrays that describe the actuators of a model, or of n models, one beside the other."""
+
+    gain_type: NDArray[Any]
+    gain: Array
+    bias_type: NDArray[Any]
+    bias: Array
+    force_limited: NDArray[Any]
+    force_range: Array
+    control_limited: NDArray[Any]
+    control_range: Array
+    gear: Array
+    acceleration: Array
+
+    @staticmethod
+    def of(m: mujoco.MjModel) -> "Actuators":
+        """The model's own arrays."""
+        kinds = m.actuator_gaintype, m.actuator_gainprm, m.actuator_biastype, m.actuator_biasprm
+        limits = m.actuator_forcelimited, m.actuator_forcerange, m.actuator_ctrllimited, m.actuator_ctrlrange
+        return Actuators(*kinds, *limits, m.actuator_gear, m.actuator_acc0)
+
+
 @compiled
 def _acting_range(
-    gain_type: NDArray[Any],
-    gain: Array,
-    bias_type: NDArray[Any],
-    bias: Array,
-    force_limited: NDArray[Any],
-    force_range: Array,
-    control_limited: NDArray[Any],
-    control_range: Array,
-    gear: Array,
-    acceleration: Array,
-    length: Array,
-    velocity: Array,
-    control_dt: float,
-    least: Array,
-    most: Array,
+    act: Actuators, length: Array, velocity: Array, control_dt: float, least: Array, most: Array
 ) -> None:
-    """Writes `AffineActuators.acting_range` into `least` and `most`; the arrays are MuJoCo's of the actuators."""
+    """Writes `AffineActuators.acting_range` into `least` and `most`."""
     for i in range(len(least)):
         low, high = -math.inf, math.inf
-        if control_limited[i]:
-            low, high = control_range[i, 0], control_range[i, 1]
-        scale, offset = gain[i, 0], 0.0
-        if gain_type[i] == _AFFINE_GAIN:
-            scale += gain[i, 1] * length[i] + gain[i, 2] * velocity[i]
-        if bias_type[i] == _AFFINE_BIAS:
-            offset = bias[i, 0] + bias[i, 1] * length[i] + bias[i, 2] * velocity[i]
+        if act.control_limited[i]:
+            low, high = act.control_range[i, 0], act.control_range[i, 1]
+        scale, offset = act.gain[i, 0], 0.0
+        if act.gain_type[i] == _AFFINE_GAIN:
+            scale += act.gain[i, 1] * length[i] + act.gain[i, 2] * velocity[i]
+        if act.bias_type[i] == _AFFINE_BIAS:
+            offset = act.bias[i, 0] + act.bias[i, 1] * length[i] + act.bias[i, 2] * velocity[i]
         least[i], most[i] = low, high
-        if force_limited[i] and scale != 0.0:
-            ends = (force_range[i, 0] - offset) / scale, (force_range[i, 1] - offset) / scale
-            feedback = abs(bias[i, 2]) if bias_type[i] == _AFFINE_BIAS else 0.0
-            strongest = max(abs(force_range[i, 0]), abs(force_range[i, 1]))
+        if act.force_limited[i] and scale != 0.0:
+            ends = (act.force_range[i, 0] - offset) / scale, (act.force_range[i, 1] - offset) / scale
+            feedback = abs(act.bias[i, 2]) if act.bias_type[i] == _AFFINE_BIAS else 0.0
+            strongest = max(abs(act.force_range[i, 0]), abs(act.force_range[i, 1]))
             lever = 0.0
-            for j in range(gear.shape[1]):
-                lever = max(lever, abs(gear[i, j]))
-            widen = feedback * (lever * acceleration[i] * strongest * control_dt) / abs(scale)
+            for j in range(act.gear.shape[1]):
+                lever = max(lever, abs(act.gear[i, j]))
+            widen = feedback * (lever * act.acceleration[i] * strongest * control_dt) / abs(scale)
             least[i] = min(max(min(ends[0], ends[1]) - widen, low), high)
             most[i] = min(max(max(ends[0], ends[1]) + widen, low), high)
 
 
 @compiled
 def acting_ranges(
-    gain_type: NDArray[Any],
-    gain: Array,
-    bias_type: NDArray[Any],
-    bias: Array,
-    force_limited: NDArray[Any],
-    force_range: Array,
-    control_limited: NDArray[Any],
-    control_range: Array,
-    gear: Array,
-    acceleration: Array,
-    length: Array,
-    velocity: Array,
+    every: Actuators,
+    lengths: Array,
+    velocities: Array,
     control_dt: float,
     chosen: NDArray[np.int64],
     bounds: Array,
@@ -132,23 +115,19 @@ def acting_ranges(
     """`AffineActuators.acting_range` for the `chosen` of n machines, shape (r,), into `bounds`, shape (r, 2, nu)."""
     for r in range(len(chosen)):
         i = chosen[r]
-        _acting_range(
-            gain_type[i],
-            gain[i],
-            bias_type[i],
-            bias[i],
-            force_limited[i],
-            force_range[i],
-            control_limited[i],
-            control_range[i],
-            gear[i],
-            acceleration[i],
-            length[i],
-            velocity[i],
-            control_dt,
-            bounds[r, 0],
-            bounds[r, 1],
+        one = Actuators(
+            every.gain_type[i],
+            every.gain[i],
+            every.bias_type[i],
+            every.bias[i],
+            every.force_limited[i],
+            every.force_range[i],
+            every.control_limited[i],
+            every.control_range[i],
+            every.gear[i],
+            every.acceleration[i],
         )
+        _acting_range(one, lengths[i], velocities[i], control_dt, bounds[r, 0], bounds[r, 1])
 
 
 class AffineActuators:
@@ -186,7 +165,7 @@ class AffineActuators:
         if not m.actuator_forcelimited.any():
             return control_range(m)
         least, most = np.empty(m.nu), np.empty(m.nu)
-        _acting_range(*(getattr(m, name) for name in CLAMPS), length, velocity, control_dt, least, most)
+        _acting_range(Actuators.of(m), length, velocity, control_dt, least, most)
         return least, most
 
     def motion_without_kinematics(self, qpos: Array, qvel: Array) -> tuple[Array, Array] | None:
