@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from benchmarks import env_step, mujoco_drivers, wrapper_cost
+from benchmarks import env_step, many_envs, mujoco_drivers, wrapper_cost
 from benchmarks.cases import PROTECTED
 
 
@@ -47,6 +47,12 @@ def test_runners_get_a_lower_limit_and_nothing_else():
 
 def test_every_timed_env_is_a_case():
     assert set(env_step.ACTIVE) <= set(PROTECTED)
+
+
+def test_many_envs_are_timed_alike_and_the_attacking_driver_is_changed():
+    quiet, attacked = (many_envs.measure(2, driver, steps=60) for driver in ("gentle", "hazard-seeking"))
+    assert quiet[3] == 0.0 < attacked[3]
+    assert quiet[1] > 1.0 and quiet[2] > 1.0
 
 
 @pytest.mark.slow
