@@ -3,8 +3,8 @@
     python -m benchmarks.many_envs
 
 SafePointGoal1 in a SyncVectorEnv: bare, with `VectorCBFActionFilter` around it, and with a filter in each env. All
-three make the same steps in turn, so that the ratios are those of one process. A slow driver needs no change, one that
-goes for the nearest hazard many.
+three make the same steps in turn, so that the ratios are those of one process. A slow driver needs no change, one
+that goes for the nearest hazard many.
 """
 
 import resource

@@ -50,7 +50,7 @@ def test_every_timed_env_is_a_case():
 
 
 def test_many_envs_are_timed_alike_and_the_attacking_driver_is_changed():
-    quiet, attacked = (many_envs.measure(2, driver, steps=60) for driver in ("gentle", "hazard-seeking"))
+    quiet, attacked = (many_envs.measure(2, driver, steps=300) for driver in ("gentle", "hazard-seeking"))
     assert quiet[3] == 0.0 < attacked[3]
     assert quiet[1] > 1.0 and quiet[2] > 1.0
 
