@@ -37,7 +37,7 @@ class Around(NamedTuple):
 def way_clearances(x: Array, y: Array, around: Around, margin: float) -> Array:
     """Distances of ways, shapes (c, m, k) as their coordinates, from whatever is nearest; inf far from everything.
 
-    Far is what no way comes nearer to than the margin. What is not a number stays.
+    Far is what no way comes nearer to than the margin.
     """
     nearest = np.full(x.shape, math.inf)
     left, right, low, high = x.min(), x.max(), y.min(), y.max()
@@ -46,34 +46,36 @@ def way_clearances(x: Array, y: Array, around: Around, margin: float) -> Array:
         lowest, highest = around.lowest[i], around.highest[i]
         across = lowest[0] - room <= right and highest[0] + room >= left
         if across and lowest[1] - room <= high and highest[1] + room >= low:
-            _from_box(x, y, around.centers[:, i], around.halves[:, i], around.sizes[i], nearest)
+            _from_box(x, y, around.centers[:, i].copy(), around.halves[:, i].copy(), around.sizes[i], nearest)
     here_x, here_y = around.here[0], around.here[1]
     reach = hypot(max(right - here_x, here_x - left), max(high - here_y, here_y - low))
+    flat_x, flat_y, flat = x.reshape(-1), y.reshape(-1), nearest.reshape(-1)
     for disc in around.discs:
         if disc[3] - reach <= margin:
-            for at in np.ndindex(x.shape):
-                across, along = x[at] - disc[0], y[at] - disc[1]
+            for i in range(flat.size):
+                across, along = flat_x[i] - disc[0], flat_y[i] - disc[1]
                 gap = math.sqrt(across * across + along * along) - disc[2]
-                if gap < nearest[at] or gap != gap:
-                    nearest[at] = gap
+                flat[i] = gap if gap < flat[i] else flat[i]
     for plane in around.planes:
         if plane[5] - reach <= margin:
-            for at in np.ndindex(x.shape):
-                gap = (x[at] - plane[0]) * plane[2] + (y[at] - plane[1]) * plane[3] - plane[4]
-                if gap < nearest[at] or gap != gap:
-                    nearest[at] = gap
+            for i in range(flat.size):
+                gap = (flat_x[i] - plane[0]) * plane[2] + (flat_y[i] - plane[1]) * plane[3] - plane[4]
+                flat[i] = gap if gap < flat[i] else flat[i]
     return nearest
 
 
 @compiled
 def _from_box(x: Array, y: Array, center: Array, half: Array, size: float, nearest: Array) -> None:
     """Take the distances from a box into account; centres and half-widths (k, 2)."""
-    for c, m, k in np.ndindex(x.shape):
-        across = max(abs(x[c, m, k] - center[k, 0]) - half[k, 0], 0.0)
-        along = max(abs(y[c, m, k] - center[k, 1]) - half[k, 1], 0.0)
-        gap = math.sqrt(across * across + along * along) - size
-        if gap < nearest[c, m, k] or gap != gap:
-            nearest[c, m, k] = gap
+    ahead_x, ahead_y = center[:, 0].copy(), center[:, 1].copy()
+    half_x, half_y = half[:, 0].copy(), half[:, 1].copy()
+    for c in range(x.shape[0]):
+        for m in range(x.shape[1]):
+            for k in range(x.shape[2]):
+                across = max(abs(x[c, m, k] - ahead_x[k]) - half_x[k], 0.0)
+                along = max(abs(y[c, m, k] - ahead_y[k]) - half_y[k], 0.0)
+                gap = math.sqrt(across * across + along * along) - size
+                nearest[c, m, k] = gap if gap < nearest[c, m, k] else nearest[c, m, k]
 
 
 @compiled
