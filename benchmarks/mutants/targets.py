@@ -1,6 +1,6 @@
 """What is mutated, by name."""
 
-from benchmarks.mutants.of_backups import COASTING, ESCAPE, HEADING_DRIVE, WALL
+from benchmarks.mutants.of_backups import COASTING, ESCAPE, HEADING_DRIVE, WALL, WAYS
 from benchmarks.mutants.of_projection import PROJECTION
 from benchmarks.mutants.of_search import ROLLOUT, SEARCH
 from benchmarks.mutants.of_wrappers import CHUNK_HANDOVER, COMMAND_GATE, HANDOVER, LEASE, LEASE_EXPIRY
@@ -13,6 +13,7 @@ TARGETS: dict[str, Target] = {
     "heading drive": HEADING_DRIVE,
     "coasting": COASTING,
     "escape": ESCAPE,
+    "ways": WAYS,
     "wall": WALL,
     "lease": LEASE,
     "lease expiry": LEASE_EXPIRY,
