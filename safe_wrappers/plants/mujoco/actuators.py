@@ -95,12 +95,79 @@ def _acting_range(
             most[i] = min(max(max(ends[0], ends[1]) + widen, low), high)
 
 
+@compiled
+def _drive(
+    gain_type: NDArray[Any],
+    gain: Array,
+    bias_type: NDArray[Any],
+    bias: Array,
+    force_limited: NDArray[Any],
+    force_range: Array,
+    control_limited: NDArray[Any],
+    control_range: Array,
+    gear: Array,
+    acceleration: Array,
+    length: Array,
+    velocity: Array,
+    control: Array,
+    moment: Array,
+    acting: Array,
+) -> None:
+    """Turns `moment` into the generalised force per control, none where saturated; `acting` takes what acts of it."""
+    least, most = np.empty(len(acting)), np.empty(len(acting))
+    _acting_range(
+        gain_type,
+        gain,
+        bias_type,
+        bias,
+        force_limited,
+        force_range,
+        control_limited,
+        control_range,
+        gear,
+        acceleration,
+        length,
+        velocity,
+        0.0,
+        least,
+        most,
+    )
+    for i in range(len(acting)):
+        scale = gain[i, 0]
+        if gain_type[i] == _AFFINE_GAIN:
+            scale += gain[i, 1] * length[i] + gain[i, 2] * velocity[i]
+        if most[i] <= least[i]:
+            scale = acting[i] = 0.0
+        else:
+            acting[i] = min(max(control[i], least[i]), most[i])
+        for j in range(moment.shape[1]):
+            moment[i, j] *= scale
+
+
+@compiled
+def _split(qacc: Array, response: Array, acting: Array) -> tuple[Array, Array]:
+    """`drift` and `effect` of `qacc = drift + effect @ acting`; `response` is the effect's transpose."""
+    drift, effect = qacc.copy(), np.empty((response.shape[1], response.shape[0]))
+    for j in range(response.shape[1]):
+        pushed = 0.0
+        for i in range(response.shape[0]):
+            effect[j, i] = response[i, j]
+            pushed += response[i, j] * acting[i]
+        drift[j] -= pushed
+    return drift, effect
+
+
 class AffineActuators:
     """Gain, bias and acting control range of every actuator of a model, whose arrays are read at every call."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         _refuse_unsupported(model)
-        self._model = model
+        self._model = m = model
+        self._constants = (
+            *(m.actuator_gaintype, m.actuator_gainprm, m.actuator_biastype, m.actuator_biasprm),
+            *(m.actuator_forcelimited, m.actuator_forcerange, m.actuator_ctrllimited, m.actuator_ctrlrange),
+            *(m.actuator_gear, m.actuator_acc0),
+        )
         self._moment = np.zeros((model.nu, model.nv))
         self._on_joints: tuple[Array, Array, Array] | None = None
         self._joints_suffice = False
@@ -130,11 +197,15 @@ class AffineActuators:
         if not m.actuator_forcelimited.any():
             return control_range(m)
         least, most = np.empty(m.nu), np.empty(m.nu)
-        gain, bias = (m.actuator_gaintype, m.actuator_gainprm), (m.actuator_biastype, m.actuator_biasprm)
-        clamp = m.actuator_forcelimited, m.actuator_forcerange, m.actuator_ctrllimited, m.actuator_ctrlrange
-        response = m.actuator_gear, m.actuator_acc0
-        _acting_range(*gain, *bias, *clamp, *response, length, velocity, control_dt, least, most)
+        _acting_range(*self._constants, length, velocity, control_dt, least, most)
         return least, most
+
+    def forces(self, data: mujoco.MjData) -> tuple[Array, Array]:
+        """Generalised force per control, shape (nu, nv), and what acts of the data's control, shape (nu,)."""
+        acting, moment = np.empty(len(self._moment)), self.moment(data)
+        motion = data.actuator_length, data.actuator_velocity
+        _drive(*self._constants, *motion, data.ctrl, moment, acting)
+        return moment, acting
 
     def motion_without_kinematics(self, qpos: Array, qvel: Array) -> tuple[Array, Array] | None:
         """Length and velocity of the transmissions where the joints alone determine every clamp, else None."""
@@ -161,12 +232,31 @@ def drift_and_effect(
 
     The data must be up to date. Exact for pyramidal friction cones.
     """
-    gain, _ = actuators.gain_and_bias(data.actuator_length, data.actuator_velocity)
-    least, most = actuators.acting_range(data.actuator_length, data.actuator_velocity)
-    saturated = most <= least
-    effect = _solve_inertia(model, data, actuators.moment(data) * gain[:, None]).T
-    effect = np.where(saturated, 0.0, effect)
-    return data.qacc - effect @ np.where(saturated, 0.0, np.clip(data.ctrl, least, most)), effect
+    forces, acting = actuators.forces(data)
+    return _split(data.qacc, _solve_inertia(model, data, forces), acting)
+
+
+@compiled
+def point_motion(
+    jacobian: Array, rate: Array, qvel: Array, drift: Array, effect: Array
+) -> tuple[Array, Array, Array]:
+    """Velocity (3,), m/s, and acceleration `a0 + A @ u`, shapes (3,) and (3, nu), m/s^2, of a point of a machine.
+
+    Args:
+        jacobian: Of the point's position, shape (3, nv).
+        rate: Its time derivative, likewise.
+        qvel: Shape (nv,).
+        drift: `qacc = drift + effect @ u`, shape (nv,).
+        effect: Likewise, shape (nv, nu).
+    """
+    v, a0, a = np.zeros(3), np.zeros(3), np.zeros((3, effect.shape[1]))
+    for i in range(3):
+        for j in range(len(qvel)):
+            v[i] += jacobian[i, j] * qvel[j]
+            a0[i] += jacobian[i, j] * drift[j] + rate[i, j] * qvel[j]
+            for k in range(effect.shape[1]):
+                a[i, k] += jacobian[i, j] * effect[j, k]
+    return v, a0, a
 
 
 def _solve_inertia(m: mujoco.MjModel, d: mujoco.MjData, rows: Array) -> Array:
@@ -174,7 +264,7 @@ def _solve_inertia(m: mujoco.MjModel, d: mujoco.MjData, rows: Array) -> Array:
     out = np.zeros_like(rows)
     active = d.efc_state == _QUADRATIC if d.nefc else np.zeros(0, bool)
     if not active.any():
-        mujoco.mj_solveM(m, d, out, np.ascontiguousarray(rows))
+        mujoco.mj_solveM(m, d, out, rows)
         return out
     if mujoco.mj_isSparse(m):
         jacobian = np.zeros((d.nefc, m.nv))
@@ -183,4 +273,4 @@ def _solve_inertia(m: mujoco.MjModel, d: mujoco.MjData, rows: Array) -> Array:
         jacobian = d.efc_J.reshape(d.nefc, m.nv)
     jacobian = jacobian[active]
     stiff = inertia(m, d) + jacobian.T @ (d.efc_D[active][:, None] * jacobian)
-    return np.asarray(np.linalg.solve(stiff, rows.T).T)
+    return np.ascontiguousarray(np.linalg.solve(stiff, rows.T).T)
