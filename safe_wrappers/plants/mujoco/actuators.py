@@ -259,18 +259,48 @@ def point_motion(
     return v, a0, a
 
 
+@compiled
+def _solve_stiff(inertia: Array, state: NDArray[Any], jacobian: Array, stiffness: Array, rows: Array) -> None:
+    """Divides `rows`, shape (nu, nv), by the inertia with its active constraints, by a Cholesky decomposition."""
+    n = len(inertia)
+    for row in range(len(state)):
+        if state[row] == _QUADRATIC:
+            for i in range(n):
+                pull = stiffness[row] * jacobian[row, i]
+                for j in range(i + 1 if pull != 0.0 else 0):
+                    inertia[i, j] += pull * jacobian[row, j]
+    for i in range(n):
+        for j in range(i + 1):
+            left = inertia[i, j]
+            for k in range(j):
+                left -= inertia[i, k] * inertia[j, k]
+            if i > j:
+                inertia[i, j] = left / inertia[j, j]
+            else:
+                inertia[i, i] = math.sqrt(left) if left > 0.0 else math.nan
+    for row in range(len(rows)):
+        for i in range(n):
+            for k in range(i):
+                rows[row, i] -= inertia[i, k] * rows[row, k]
+            rows[row, i] /= inertia[i, i]
+        for back in range(n):
+            i = n - 1 - back
+            for k in range(i + 1, n):
+                rows[row, i] -= inertia[k, i] * rows[row, k]
+            rows[row, i] /= inertia[i, i]
+
+
 def _solve_inertia(m: mujoco.MjModel, d: mujoco.MjData, rows: Array) -> Array:
     """`rows @ inv(M + J_a' D_a J_a)`: accelerations per generalised force with the active constraints."""
-    out = np.zeros_like(rows)
-    active = d.efc_state == _QUADRATIC if d.nefc else np.zeros(0, bool)
-    if not active.any():
+    out, count = np.empty_like(rows), d.nefc
+    if not (count and (d.efc_state == _QUADRATIC).any()):
         mujoco.mj_solveM(m, d, out, rows)
         return out
     if mujoco.mj_isSparse(m):
-        jacobian = np.zeros((d.nefc, m.nv))
+        jacobian = np.zeros((count, m.nv))
         mujoco.mju_sparse2dense(jacobian, d.efc_J, d.efc_J_rownnz, d.efc_J_rowadr, d.efc_J_colind)
     else:
-        jacobian = d.efc_J.reshape(d.nefc, m.nv)
-    jacobian = jacobian[active]
-    stiff = inertia(m, d) + jacobian.T @ (d.efc_D[active][:, None] * jacobian)
-    return np.ascontiguousarray(np.linalg.solve(stiff, rows.T).T)
+        jacobian = d.efc_J.reshape(count, m.nv)
+    out[:] = rows
+    _solve_stiff(inertia(m, d), d.efc_state, jacobian, d.efc_D, out)
+    return out
