@@ -8,8 +8,7 @@ import numpy as np
 
 from safe_wrappers.checks import check_fields, name_list, non_negative, positive
 from safe_wrappers.constraints.obstacles import Nearest, Plain, obstacles_from, refuse_more_dimensions
-from safe_wrappers.control.backup.approach_rows import approach_rows, approaches
-from safe_wrappers.control.numerics.surfaces import nearest_points
+from safe_wrappers.control.backup.approach_rows import approach_rows, approach_rows_of, approaches
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.plants.plant import Plant
@@ -80,16 +79,15 @@ class BoundClearance(BoundConstraint):
         self._still: Array | None = None
         if all(isinstance(o, Plain) and o.still for o in spec.obstacles):
             self._still = np.concatenate([o.surfaces(plant) for o in spec.obstacles])
+            size = self._points.coordinates
+            for surface in self._still:
+                refuse_more_dimensions(int(surface[1]), size)
 
     def observe(self, memory: Memory) -> None:
         self._observed: tuple[Array, HalfSpaces] | None = None
 
     def _near(self, p: Array) -> Nearest:
         """The surfaces around a point."""
-        if self._still is not None:
-            refuse_more_dimensions(int(self._still[:, 1].max()), p.size)
-            distance, normal, curvature = nearest_points(self._still, p)
-            return Nearest(distance, normal, np.zeros(normal.shape), curvature)
         found = [o.nearest(p, self.plant) for o in self.spec.obstacles]
         return Nearest(*(np.concatenate(part) for part in zip(*found, strict=True)))
 
@@ -97,11 +95,13 @@ class BoundClearance(BoundConstraint):
         """The rooms and the rows, once per observation."""
         if self._observed is None:
             plant, spec = self.plant, self.spec
-            timing = plant.delay_s, plant.control_dt
-            sizes = spec.radius, spec.braking, spec.state_error + spec.margin
+            always = plant.lower, plant.upper, plant.delay_s, plant.control_dt
+            always = *always, spec.radius, spec.braking, spec.state_error + spec.margin
             found = [
-                approach_rows(*self._near(p), v, drift, effect, plant.lower, plant.upper, *timing, *sizes)
-                for p, v, drift, effect in self._points.accelerations()
+                approach_rows(*self._near(p), *motion, *always)
+                if self._still is None
+                else approach_rows_of(self._still, p, *motion, *always)
+                for p, *motion in self._points.accelerations()
             ]
             parts = found[0] if len(found) == 1 else map(np.concatenate, zip(*found, strict=True))
             rooms, normals, offsets = parts

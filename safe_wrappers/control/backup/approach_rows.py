@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers.control.backup.stopping import held_limit, held_stop
 from safe_wrappers.control.numerics.compiled import compiled
+from safe_wrappers.control.numerics.surfaces import nearest_points
 
 Array = NDArray[np.float64]
 
@@ -111,3 +112,25 @@ def approach_rows(
             offsets[rows] = limit
             rows += 1
     return room, normals[:rows].copy(), offsets[:rows].copy()
+
+
+@compiled
+def approach_rows_of(
+    surfaces: Array,
+    point: Array,
+    velocity: Array,
+    drift: Array,
+    effect: Array,
+    low: Array,
+    high: Array,
+    delay_s: float,
+    control_dt: float,
+    radius: float,
+    braking: float,
+    reserve: float,
+) -> tuple[Array, Array, Array]:
+    """`approach_rows` of surfaces that stand still, as in `control/numerics/surfaces.py`, shape (k, 8)."""
+    distance, normal, curvature = nearest_points(surfaces, point)
+    still = np.zeros(normal.shape)
+    moving = velocity, drift, effect, low, high, delay_s, control_dt, radius, braking, reserve
+    return approach_rows(distance, normal, still, curvature, *moving)

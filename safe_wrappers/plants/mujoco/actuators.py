@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.errors import UnsupportedEnvError
-from safe_wrappers.plants.mujoco.model import control_range, inertia
+from safe_wrappers.plants.mujoco.model import control_range
 
 _JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _AFFINE_GAIN, _AFFINE_BIAS = int(mujoco.mjtGain.mjGAIN_AFFINE), int(mujoco.mjtBias.mjBIAS_AFFINE)
@@ -96,7 +96,7 @@ def _acting_range(
 
 
 @compiled
-def _drive(
+def _respond(
     gain_type: NDArray[Any],
     gain: Array,
     bias_type: NDArray[Any],
@@ -110,11 +110,22 @@ def _drive(
     length: Array,
     velocity: Array,
     control: Array,
+    qacc: Array,
     moment: Array,
-    acting: Array,
-) -> None:
-    """Turns `moment` into the generalised force per control, none where saturated; `acting` takes what acts of it."""
-    least, most = np.empty(len(acting)), np.empty(len(acting))
+    counts: NDArray[Any],
+    starts: NDArray[Any],
+    columns: NDArray[Any],
+    mobility: Array,
+    state: NDArray[Any],
+    jacobian: Array,
+    stiffness: Array,
+) -> tuple[Array, Array]:
+    """`drift` and `effect` of `qacc = drift + effect @ u`; `mobility`, the inverse of the inertia, is overwritten.
+
+    The arrays are MuJoCo's of the actuators, of their sparse moment, and of the constraints, whose Jacobian is dense.
+    """
+    n, controls = len(qacc), len(control)
+    least, most, moved = np.empty(controls), np.empty(controls), np.empty(n)
     _acting_range(
         gain_type,
         gain,
@@ -132,38 +143,46 @@ def _drive(
         least,
         most,
     )
-    for i in range(len(acting)):
-        scale = gain[i, 0]
-        if gain_type[i] == _AFFINE_GAIN:
-            scale += gain[i, 1] * length[i] + gain[i, 2] * velocity[i]
-        if most[i] <= least[i]:
-            scale = acting[i] = 0.0
-        else:
-            acting[i] = min(max(control[i], least[i]), most[i])
-        for j in range(moment.shape[1]):
-            moment[i, j] *= scale
-
-
-@compiled
-def _split(qacc: Array, response: Array, acting: Array) -> tuple[Array, Array]:
-    """`drift` and `effect` of `qacc = drift + effect @ acting`; `response` is the effect's transpose."""
-    drift, effect = qacc.copy(), np.empty((response.shape[1], response.shape[0]))
-    for j in range(response.shape[1]):
-        pushed = 0.0
-        for i in range(response.shape[0]):
-            effect[j, i] = response[i, j]
-            pushed += response[i, j] * acting[i]
-        drift[j] -= pushed
+    # inv(M + J' D J), one active row after another.
+    for row in range(len(state)):
+        if state[row] != _QUADRATIC:
+            continue
+        give = 1.0 / stiffness[row]
+        for i in range(n):
+            moved[i] = 0.0
+            for j in range(n):
+                moved[i] += mobility[i, j] * jacobian[row, j]
+            give += jacobian[row, i] * moved[i]
+        for i in range(n):
+            for j in range(n):
+                mobility[i, j] -= moved[i] * moved[j] / give
+    drift, effect = qacc.copy(), np.zeros((n, controls))
+    for k in range(controls):
+        if most[k] <= least[k]:
+            continue
+        scale, acting = gain[k, 0], min(max(control[k], least[k]), most[k])
+        if gain_type[k] == _AFFINE_GAIN:
+            scale += gain[k, 1] * length[k] + gain[k, 2] * velocity[k]
+        for place in range(starts[k], starts[k] + counts[k]):
+            j = columns[place]
+            for i in range(n):
+                effect[i, k] += mobility[i, j] * (moment[place] * scale)
+        for i in range(n):
+            drift[i] -= effect[i, k] * acting
     return drift, effect
 
 
 class AffineActuators:
-    """Gain, bias and acting control range of every actuator of a model, whose arrays are read at every call."""
+    """Gain, bias and acting control range of every actuator of a model, whose arrays are read at every call.
+
+    Attributes:
+        constants: MuJoCo's arrays that describe the actuators.
+    """
 
     def __init__(self, model: mujoco.MjModel) -> None:
         _refuse_unsupported(model)
         self._model = m = model
-        self._constants = (
+        self.constants = (
             *(m.actuator_gaintype, m.actuator_gainprm, m.actuator_biastype, m.actuator_biasprm),
             *(m.actuator_forcelimited, m.actuator_forcerange, m.actuator_ctrllimited, m.actuator_ctrlrange),
             *(m.actuator_gear, m.actuator_acc0),
@@ -197,15 +216,8 @@ class AffineActuators:
         if not m.actuator_forcelimited.any():
             return control_range(m)
         least, most = np.empty(m.nu), np.empty(m.nu)
-        _acting_range(*self._constants, length, velocity, control_dt, least, most)
+        _acting_range(*self.constants, length, velocity, control_dt, least, most)
         return least, most
-
-    def forces(self, data: mujoco.MjData) -> tuple[Array, Array]:
-        """Generalised force per control, shape (nu, nv), and what acts of the data's control, shape (nu,)."""
-        acting, moment = np.empty(len(self._moment)), self.moment(data)
-        motion = data.actuator_length, data.actuator_velocity
-        _drive(*self._constants, *motion, data.ctrl, moment, acting)
-        return moment, acting
 
     def motion_without_kinematics(self, qpos: Array, qvel: Array) -> tuple[Array, Array] | None:
         """Length and velocity of the transmissions where the joints alone determine every clamp, else None."""
@@ -225,15 +237,40 @@ class AffineActuators:
         return gear * qpos[q], gear * qvel[v]
 
 
-def drift_and_effect(
-    model: mujoco.MjModel, data: mujoco.MjData, actuators: AffineActuators
-) -> tuple[Array, Array]:
-    """`qacc = drift + effect @ u`, shapes (nv,) and (nv, nu), at the present set of active contacts and limits.
+class Response:
+    """How a machine's joints respond to its controls, at what `data` holds.
 
-    The data must be up to date. Exact for pyramidal friction cones.
+    Args:
+        model: Its arrays are read at every call.
+        data: Likewise.
+        actuators: Of the model.
     """
-    forces, acting = actuators.forces(data)
-    return _split(data.qacc, _solve_inertia(model, data, forces), acting)
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, actuators: AffineActuators) -> None:
+        self._model, self._data = model, data
+        places = data.moment_rownnz, data.moment_rowadr, data.moment_colind.reshape(-1)
+        moment = data.actuator_moment.reshape(-1), *places
+        motion = data.actuator_length, data.actuator_velocity, data.ctrl, data.qacc
+        self._actuation = *actuators.constants, *motion, *moment
+        self._units, self._mobility = np.eye(model.nv), np.empty((model.nv, model.nv))
+        self._free = np.zeros(0, np.int32), np.zeros((0, model.nv)), np.zeros(0)
+
+    def drift_and_effect(self) -> tuple[Array, Array]:
+        """`qacc = drift + effect @ u`, shapes (nv,) and (nv, nu), at the present set of active contacts and limits.
+
+        The data must be up to date. Exact for pyramidal friction cones.
+        """
+        m, d = self._model, self._data
+        mujoco.mj_solveM(m, d, self._mobility, self._units)
+        constraints, count = self._free, d.nefc
+        if count:
+            if mujoco.mj_isSparse(m):
+                jacobian = np.zeros((count, m.nv))
+                mujoco.mju_sparse2dense(jacobian, d.efc_J, d.efc_J_rownnz, d.efc_J_rowadr, d.efc_J_colind)
+            else:
+                jacobian = d.efc_J.reshape(count, m.nv)
+            constraints = d.efc_state, jacobian, d.efc_D
+        return _respond(*self._actuation, self._mobility, *constraints)
 
 
 @compiled
@@ -257,50 +294,3 @@ def point_motion(
             for k in range(effect.shape[1]):
                 a[i, k] += jacobian[i, j] * effect[j, k]
     return v, a0, a
-
-
-@compiled
-def _solve_stiff(inertia: Array, state: NDArray[Any], jacobian: Array, stiffness: Array, rows: Array) -> None:
-    """Divides `rows`, shape (nu, nv), by the inertia with its active constraints, by a Cholesky decomposition."""
-    n = len(inertia)
-    for row in range(len(state)):
-        if state[row] == _QUADRATIC:
-            for i in range(n):
-                pull = stiffness[row] * jacobian[row, i]
-                for j in range(i + 1 if pull != 0.0 else 0):
-                    inertia[i, j] += pull * jacobian[row, j]
-    for i in range(n):
-        for j in range(i + 1):
-            left = inertia[i, j]
-            for k in range(j):
-                left -= inertia[i, k] * inertia[j, k]
-            if i > j:
-                inertia[i, j] = left / inertia[j, j]
-            else:
-                inertia[i, i] = math.sqrt(left) if left > 0.0 else math.nan
-    for row in range(len(rows)):
-        for i in range(n):
-            for k in range(i):
-                rows[row, i] -= inertia[i, k] * rows[row, k]
-            rows[row, i] /= inertia[i, i]
-        for back in range(n):
-            i = n - 1 - back
-            for k in range(i + 1, n):
-                rows[row, i] -= inertia[k, i] * rows[row, k]
-            rows[row, i] /= inertia[i, i]
-
-
-def _solve_inertia(m: mujoco.MjModel, d: mujoco.MjData, rows: Array) -> Array:
-    """`rows @ inv(M + J_a' D_a J_a)`: accelerations per generalised force with the active constraints."""
-    out, count = np.empty_like(rows), d.nefc
-    if not (count and (d.efc_state == _QUADRATIC).any()):
-        mujoco.mj_solveM(m, d, out, rows)
-        return out
-    if mujoco.mj_isSparse(m):
-        jacobian = np.zeros((count, m.nv))
-        mujoco.mju_sparse2dense(jacobian, d.efc_J, d.efc_J_rownnz, d.efc_J_rowadr, d.efc_J_colind)
-    else:
-        jacobian = d.efc_J.reshape(count, m.nv)
-    out[:] = rows
-    _solve_stiff(inertia(m, d), d.efc_state, jacobian, d.efc_D, out)
-    return out

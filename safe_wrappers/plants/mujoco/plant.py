@@ -11,7 +11,7 @@ from safe_wrappers.checks import Array, non_negative
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants import env_checks
 from safe_wrappers.plants.mujoco import model as of_model
-from safe_wrappers.plants.mujoco.actuators import AffineActuators, drift_and_effect, point_motion
+from safe_wrappers.plants.mujoco.actuators import AffineActuators, Response, point_motion
 from safe_wrappers.plants.mujoco.binding import check_action_space, control_interval, own_model, physics_steps
 from safe_wrappers.plants.mujoco.contacts import ContactForecast, ContactReader
 from safe_wrappers.plants.mujoco.forecast import Forecast, Poses, Recorder
@@ -62,6 +62,7 @@ class MujocoPlant(Plant):
         self._raw, self._env = raw, env
         self.data = mujoco.MjData(self.model)
         self.actuators = AffineActuators(self.model)
+        self._response = Response(self.model, self.data, self.actuators)
         self._clamped = bool(self.model.actuator_forcelimited.any())
         self.lower, self.upper = of_model.control_range(self.model)
         env_checks.refuse_changed_actions(env)
@@ -218,7 +219,8 @@ class MujocoPlant(Plant):
     def acceleration(self) -> tuple[Array, Array]:
         """`qacc = drift + effect @ u`: shapes (nv,) and (nv, nu)."""
         if self._affine is None:
-            self._affine = drift_and_effect(self.model, self.forward(), self.actuators)
+            self.forward()
+            self._affine = self._response.drift_and_effect()
         return self._affine
 
     @property
