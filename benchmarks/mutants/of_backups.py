@@ -149,35 +149,39 @@ WAYS = Target(
 )
 
 WALL = Target(
-    "constraints/backup/wall_clearance.py",
-    ("tests/constraints/test_wall_corners.py", "tests/constraints/test_wall_clearance.py"),
+    "*/backup/[pw]*.py",
     (
-        Mutant("return self._left_after(control) >= self._recovery() - _NOISE_M", "return True"),
-        Mutant("min(0.0, self._least) - _NOISE_M", "0.0"),
-        Mutant("if across >= along:", "if across < along:"),
-        Mutant("_TURNS = 4", "_TURNS = 0"),
-        Mutant("self._needed = min(target, self._left_after(self._backup()))", "self._needed = target"),
-        Mutant("math.sqrt(max(room**2 - other**2, 0.0))", "room"),
-        Mutant("        found.sort(key=lambda c: math.dist(c, asked))\n", ""),
-        Mutant("for axes in ((0, 1), (1, 0))]", "for axes in ((0, 1),)]"),
+        "tests/constraints/test_point_decision.py",
+        "tests/constraints/test_wall_corners.py",
+        "tests/constraints/test_wall_clearance.py",
+    ),
+    (
+        Mutant("return _left_after(among, motion, room, control) >= needed - _NOISE_M", "return True"),
+        Mutant("min(0.0, left) - _NOISE_M", "0.0"),
+        Mutant("if across >= beside:", "if across < beside:"),
+        Mutant("_TURNS: Final = 4", "_TURNS: Final = 0"),
         Mutant(
-            "share = min(1.0, room / math.hypot(*gap)) if corner else 0.0", "share = 0.5 if corner else 0.0"
+            "return min(target, _left_after(among, motion, room, backup(among, motion, room, left)))",
+            "return target",
         ),
-        Mutant("offsets.append(max(sign * limit, sign * backup[axis]))", "offsets.append(sign * limit)"),
+        Mutant("math.sqrt(max(room * room - other * other, 0.0))", "room"),
+        Mutant("while place > 0 and away[place - 1] > far:", "while False:"),
+        Mutant("        for first in range(2):", "        for first in range(1):"),
         Mutant(
-            "return max(constants.low, min(constants.control_to_rest_at(x, v, target), constants.high))",
-            "return constants.control_to_rest_at(x, v, target)",
+            "share = min(1.0, wanted / hypot(gap[0], gap[1])) if corner else 0.0",
+            "share = 0.5 if corner else 0.0",
         ),
-        Mutant("self._room = reach + self.spec.margin", "self._room = reach"),
+        Mutant("offsets[count] = max(sign * limit, sign * halt[axis])", "offsets[count] = sign * limit"),
         Mutant(
-            "target = wall[2 * axis] - gap if before else wall[2 * axis + 1] + gap",
-            "target = wall[2 * axis] - gap",
+            "return max(constants.low, min(along.control_to_rest_at(constants, x, v, target), constants.high))",
+            "return along.control_to_rest_at(constants, x, v, target)",
         ),
-        Mutant("self._motion = self._among.clipped(motion)", "self._motion = motion"),
-        Mutant("self._least = math.nan", "self._least = 0.0"),
+        Mutant("reach + self.spec.margin, clip", "reach, clip"),
+        Mutant("target = start - gap if before else end + gap", "target = start - gap"),
+        Mutant("motion[2], motion[3] = now.vx, now.vy", "pass"),
+        Mutant("    if left != left:\n", "    if False:\n"),
         Mutant(
-            "low, high = (middle, high) if self._admitted(at(middle), _HAIR_M) else (low, middle)",
-            "low = middle",
+            "            low = middle\n        else:\n            high = middle", "            low = middle"
         ),
     ),
 )

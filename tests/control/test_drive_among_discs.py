@@ -132,11 +132,12 @@ def random_scenes(count):
     for i in range(count):
         models = certain[[0, 0]] if i % 2 else every
         motion = rng.uniform(-1.0, 1.0, 6) * [0.1, 0.1, 3.0, 1.0, 1.0, 2.0]
+        state = motion[:3], motion[3:], np.zeros(4)
         discs = np.column_stack([rng.uniform(-0.9, 0.9, (6, 2)), np.full(6, 0.1)])
         control, brake = rng.uniform(-1.0, 1.0, 2), bool(i % 3)
         numbers = among.closest_admitted(models, motion, discs, brake, control, 0.0, bool(i % 5), bounds, out)
         stages.add(numbers[0])
-        for part in (*numbers, out, *among.least_clearance(models, motion, discs, brake)):
+        for part in (*numbers, out, *among.least_clearance(*state, models, np.empty(6), discs, brake)):
             digest.update(np.asarray(part, dtype=np.float64).tobytes())
         digest.update(np.float64(among.manoeuvre_drive(models, motion, discs, brake)).tobytes())
         for part in together([(models, motion, discs, brake, control, bool(i % 5))], bounds, single=True):
@@ -172,7 +173,9 @@ def test_many_are_decided_as_each_alone_and_rounded_as_the_filter_rounds(dtype):
         scenes.append((models, motion, discs, True, rng.uniform(-1.0, 1.0, 2), True))
     least, admitted, out, stages = together(scenes, bounds, dtype == np.float32)
     for i, (_, motion, discs, brake, control, detour) in enumerate(scenes):
-        assert least[i] == among.least_clearance(models, motion, discs, brake)[0]
+        seen = np.empty(6)
+        state = motion[:3], motion[3:], np.zeros(4)
+        assert least[i] == among.least_clearance(*state, models, seen, discs, brake)[0]
         assert admitted[i] == among.is_admitted(models, motion, discs, brake, *control)
         stage, _, *rows = among.closest_admitted(
             models, motion, discs, brake, control, 0.0, detour, bounds, found

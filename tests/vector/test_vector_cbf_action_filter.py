@@ -193,7 +193,7 @@ def test_a_robot_whose_slides_start_elsewhere():
     make = functools.partial(made, "SafePointGoal1-v0", AtHazard)
     alike, together = pair(make, recommended("SafePointGoal1-v0"))
     for single in (*alike.envs, *together.filters):
-        single.filter.bound[0].frame.origin = [0.02, -0.01]
+        single.filter.bound[0].frame.place[2:] = [0.02, -0.01]
     assert play(alike, together, script(alike)) > 3
 
 

@@ -47,7 +47,7 @@ class HeadingDriveBatch(ConstraintBatch):
     def restart(self, env: int, memory: Detour) -> None:
         bound = self._bound[env]
         self._positions[env], self._velocities[env] = bound.frame.views(bound.plant.published())
-        self._origins[env] = bound.frame.origin
+        self._origins[env] = bound.frame.place[2:]
         self._sides[env], self._steps[env] = memory
 
     def memory(self, env: int) -> Detour:

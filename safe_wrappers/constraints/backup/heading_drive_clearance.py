@@ -88,8 +88,9 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
 
     def clearance(self) -> Array:
         """Of the stopping path from the nearest disc, margin and state error not taken off, m, shape (1,)."""
-        self._scene = self.models, np.array(self.frame.motion(self.plant)), self.discs(), self.spec.brake
-        least, self._in_play = among.least_clearance(*self._scene)
+        self._scene = self.models, np.empty(6), self.discs(), self.spec.brake
+        state = self.plant.qpos, self.plant.qvel, self.frame.place
+        least, self._in_play = among.least_clearance(*state, *self._scene)
         return np.array([least + self.reserve])
 
     @property

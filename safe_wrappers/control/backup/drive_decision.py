@@ -125,8 +125,18 @@ def _decide(
 
 
 @compiled
-def least_clearance(models: Array, motion: Array, discs: Array, brake: bool) -> tuple[float, int]:
-    """The stopping path's least clearance of all discs, m (NaN if one is not a number), and how many are in play."""
+def least_clearance(
+    qpos: Array, qvel: Array, place: Array, models: Array, motion: Array, discs: Array, brake: bool
+) -> tuple[float, int]:
+    """The stopping path's least clearance of all discs, m (NaN if one is not a number), and how many are in play.
+
+    Writes the `motion`, shape (6,): `place` has the indices of the first of its joints in qpos and qvel, and the
+    body's place at qpos = 0, m.
+    """
+    for i in range(3):
+        motion[i], motion[3 + i] = qpos[int(place[0]) + i], qvel[int(place[1]) + i]
+    motion[0] += place[2]
+    motion[1] += place[3]
     at = look(models[0], motion, discs, brake)
     return at.least, len(at.discs)
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.control.backup.damped_axis import DampedAxis
+from safe_wrappers.control.backup.damped_axis import DampedAxis, brake
 from safe_wrappers.control.numerics.compiled import compiled
 
 Array = NDArray[np.float64]
@@ -102,7 +102,7 @@ class EvasiveManeuvers:
         """The control of a manoeuvre's first hold from a velocity (2,), shape (2,)."""
         if self._going[which]:
             return np.array(self.controls[which])
-        return np.array([axis.brake(float(v)) for axis, v in zip(self._axes, velocity, strict=True)])
+        return np.array([brake(axis, float(v)) for axis, v in zip(self._axes, velocity, strict=True)])
 
 
 @compiled

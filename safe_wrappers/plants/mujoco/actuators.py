@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.errors import UnsupportedEnvError
-from safe_wrappers.plants.mujoco.model import control_range, inertia
+from safe_wrappers.plants.mujoco.model import control_range
 
 _JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _AFFINE_GAIN, _AFFINE_BIAS = int(mujoco.mjtGain.mjGAIN_AFFINE), int(mujoco.mjtBias.mjBIAS_AFFINE)
@@ -130,12 +130,69 @@ def acting_ranges(
         _acting_range(one, lengths[i], velocities[i], control_dt, bounds[r, 0], bounds[r, 1])
 
 
+@compiled
+def _respond(
+    act: Actuators,
+    length: Array,
+    velocity: Array,
+    control: Array,
+    qacc: Array,
+    moment: Array,
+    counts: NDArray[Any],
+    starts: NDArray[Any],
+    columns: NDArray[Any],
+    mobility: Array,
+    state: NDArray[Any],
+    jacobian: Array,
+    stiffness: Array,
+) -> tuple[Array, Array]:
+    """`drift` and `effect` of `qacc = drift + effect @ u`; `mobility`, the inverse of the inertia, is overwritten.
+
+    The arrays are MuJoCo's of the actuators, of their sparse moment, and of the constraints, whose Jacobian is dense.
+    """
+    n, controls = len(qacc), len(control)
+    least, most, moved = np.empty(controls), np.empty(controls), np.empty(n)
+    _acting_range(act, length, velocity, 0.0, least, most)
+    # inv(M + J' D J), one active row after another.
+    for row in range(len(state)):
+        if state[row] != _QUADRATIC:
+            continue
+        give = 1.0 / stiffness[row]
+        for i in range(n):
+            moved[i] = 0.0
+            for j in range(n):
+                moved[i] += mobility[i, j] * jacobian[row, j]
+            give += jacobian[row, i] * moved[i]
+        for i in range(n):
+            for j in range(n):
+                mobility[i, j] -= moved[i] * moved[j] / give
+    drift, effect = qacc.copy(), np.zeros((n, controls))
+    for k in range(controls):
+        if most[k] <= least[k]:
+            continue
+        scale, acting = act.gain[k, 0], min(max(control[k], least[k]), most[k])
+        if act.gain_type[k] == _AFFINE_GAIN:
+            scale += act.gain[k, 1] * length[k] + act.gain[k, 2] * velocity[k]
+        for place in range(starts[k], starts[k] + counts[k]):
+            j = columns[place]
+            for i in range(n):
+                effect[i, k] += mobility[i, j] * (moment[place] * scale)
+        for i in range(n):
+            drift[i] -= effect[i, k] * acting
+    return drift, effect
+
+
 class AffineActuators:
-    """Gain, bias and acting control range of every actuator of a model, whose arrays are read at every call."""
+    """Gain, bias and acting control range of every actuator of a model, whose arrays are read at every call.
+
+    Attributes:
+        constants: MuJoCo's arrays that describe the actuators.
+    """
 
     def __init__(self, model: mujoco.MjModel) -> None:
         _refuse_unsupported(model)
-        self._model = model
+        self._model = m = model
+        self.constants = Actuators.of(m)
         self._moment = np.zeros((model.nu, model.nv))
         self._on_joints: tuple[Array, Array, Array] | None = None
         self._joints_suffice = False
@@ -165,7 +222,7 @@ class AffineActuators:
         if not m.actuator_forcelimited.any():
             return control_range(m)
         least, most = np.empty(m.nu), np.empty(m.nu)
-        _acting_range(Actuators.of(m), length, velocity, control_dt, least, most)
+        _acting_range(self.constants, length, velocity, control_dt, least, most)
         return least, most
 
     def motion_without_kinematics(self, qpos: Array, qvel: Array) -> tuple[Array, Array] | None:
@@ -186,33 +243,60 @@ class AffineActuators:
         return gear * qpos[q], gear * qvel[v]
 
 
-def drift_and_effect(
-    model: mujoco.MjModel, data: mujoco.MjData, actuators: AffineActuators
-) -> tuple[Array, Array]:
-    """`qacc = drift + effect @ u`, shapes (nv,) and (nv, nu), at the present set of active contacts and limits.
+class Response:
+    """How a machine's joints respond to its controls, at what `data` holds.
 
-    The data must be up to date. Exact for pyramidal friction cones.
+    Args:
+        model: Its arrays are read at every call.
+        data: Likewise.
+        actuators: Of the model.
     """
-    gain, _ = actuators.gain_and_bias(data.actuator_length, data.actuator_velocity)
-    least, most = actuators.acting_range(data.actuator_length, data.actuator_velocity)
-    saturated = most <= least
-    effect = _solve_inertia(model, data, actuators.moment(data) * gain[:, None]).T
-    effect = np.where(saturated, 0.0, effect)
-    return data.qacc - effect @ np.where(saturated, 0.0, np.clip(data.ctrl, least, most)), effect
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, actuators: AffineActuators) -> None:
+        self._model, self._data = model, data
+        places = data.moment_rownnz, data.moment_rowadr, data.moment_colind.reshape(-1)
+        moment = data.actuator_moment.reshape(-1), *places
+        motion = data.actuator_length, data.actuator_velocity, data.ctrl, data.qacc
+        self._actuation = actuators.constants, *motion, *moment
+        self._units, self._mobility = np.eye(model.nv), np.empty((model.nv, model.nv))
+        self._free = np.zeros(0, np.int32), np.zeros((0, model.nv)), np.zeros(0)
+
+    def drift_and_effect(self) -> tuple[Array, Array]:
+        """`qacc = drift + effect @ u`, shapes (nv,) and (nv, nu), at the present set of active contacts and limits.
+
+        The data must be up to date. Exact for pyramidal friction cones.
+        """
+        m, d = self._model, self._data
+        mujoco.mj_solveM(m, d, self._mobility, self._units)
+        constraints, count = self._free, d.nefc
+        if count:
+            if mujoco.mj_isSparse(m):
+                jacobian = np.zeros((count, m.nv))
+                mujoco.mju_sparse2dense(jacobian, d.efc_J, d.efc_J_rownnz, d.efc_J_rowadr, d.efc_J_colind)
+            else:
+                jacobian = d.efc_J.reshape(count, m.nv)
+            constraints = d.efc_state, jacobian, d.efc_D
+        return _respond(*self._actuation, self._mobility, *constraints)
 
 
-def _solve_inertia(m: mujoco.MjModel, d: mujoco.MjData, rows: Array) -> Array:
-    """`rows @ inv(M + J_a' D_a J_a)`: accelerations per generalised force with the active constraints."""
-    out = np.zeros_like(rows)
-    active = d.efc_state == _QUADRATIC if d.nefc else np.zeros(0, bool)
-    if not active.any():
-        mujoco.mj_solveM(m, d, out, np.ascontiguousarray(rows))
-        return out
-    if mujoco.mj_isSparse(m):
-        jacobian = np.zeros((d.nefc, m.nv))
-        mujoco.mju_sparse2dense(jacobian, d.efc_J, d.efc_J_rownnz, d.efc_J_rowadr, d.efc_J_colind)
-    else:
-        jacobian = d.efc_J.reshape(d.nefc, m.nv)
-    jacobian = jacobian[active]
-    stiff = inertia(m, d) + jacobian.T @ (d.efc_D[active][:, None] * jacobian)
-    return np.asarray(np.linalg.solve(stiff, rows.T).T)
+@compiled
+def point_motion(
+    jacobian: Array, rate: Array, qvel: Array, drift: Array, effect: Array
+) -> tuple[Array, Array, Array]:
+    """Velocity (3,), m/s, and acceleration `a0 + A @ u`, shapes (3,) and (3, nu), m/s^2, of a point of a machine.
+
+    Args:
+        jacobian: Of the point's position, shape (3, nv).
+        rate: Its time derivative, likewise.
+        qvel: Shape (nv,).
+        drift: `qacc = drift + effect @ u`, shape (nv,).
+        effect: Likewise, shape (nv, nu).
+    """
+    v, a0, a = np.zeros(3), np.zeros(3), np.zeros((3, effect.shape[1]))
+    for i in range(3):
+        for j in range(len(qvel)):
+            v[i] += jacobian[i, j] * qvel[j]
+            a0[i] += jacobian[i, j] * drift[j] + rate[i, j] * qvel[j]
+            for k in range(effect.shape[1]):
+                a[i, k] += jacobian[i, j] * effect[j, k]
+    return v, a0, a

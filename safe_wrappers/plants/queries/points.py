@@ -39,6 +39,11 @@ class Points:
         for kind, name in self._named:
             self._machine.named(kind, name)
 
+    @property
+    def coordinates(self) -> int:
+        """Of each point."""
+        return 3 if self._machine is not None else len(self._position)
+
     def motions(self) -> list[tuple[Array, Array]]:
         """Position, m, and velocity, m/s, of each point."""
         if self._machine is not None:
