@@ -30,7 +30,7 @@ from safe_wrappers.control.backup import drive_decision as among
 Array = NDArray[np.float64]
 
 ENV_ID: Final = "SafePointGoal1-v0"
-_JITTER: Final = 1e-6  # of a borderline state, in units of the state
+_JITTER: Final = 1e-5  # of a borderline state, in units of the state
 _ROOM: Final = [0.0, *np.logspace(-9, -2, 29)]  # m: by how much a refused control is short of room
 MARGIN_32_M: Final = 1e-6
 """To add to a constraint's margin where the decision itself has 32 bits: three times the most that was ever short."""
@@ -119,7 +119,7 @@ def _is_borderline(shared: Scene, states: States, i: int) -> bool:
             qpos=states.qpos + _JITTER * rng.uniform(-1, 1, 3),
             qvel=states.qvel + _JITTER * rng.uniform(-1, 1, 3),
         )
-        for _ in range(50)
+        for _ in range(200)
     ]
     return len({by_numba(shared, other, i)[0] for other in near}) > 1
 

@@ -43,7 +43,7 @@ def test_in_the_closed_loop_it_executes_what_the_env_does_and_keeps_to_its_side(
     discs = np.column_stack([raw.hazard_positions, np.full(8, shared.room)])[None]
     kernel = warp_worlds.WorldFilter(shared, 1, 8)
     ctrl, changed, sides = wp.zeros((1, 2), dtype=wp.float32, device="cpu"), 0, set()
-    for _ in range(400):
+    for _ in range(900):
         qpos, qvel = (part.astype(np.float32).astype(float) for part in (raw.data.qpos, raw.data.qvel))
         raw.set_state(qpos, qvel)
         action = np.asarray(act()).astype(np.float32)
@@ -52,8 +52,10 @@ def test_in_the_closed_loop_it_executes_what_the_env_does_and_keeps_to_its_side(
         executed = env.step(action.astype(env.action_space.dtype))[4]["executed_action"]
         np.testing.assert_allclose(ctrl.numpy()[0], executed, atol=1e-7)
         changed += int(kernel.stages.numpy()[0] != among.PROPOSAL)
-        sides.add(float(kernel.sides.numpy()[0]))
-        assert (kernel.kept.numpy()[0] > 0) == (env.filter.bound[0]._kept_side() != 0.0)
+        side = float(kernel.sides.numpy()[0])
+        kept = env.filter.bound[0].executed(executed)
+        assert (side, kernel.kept.numpy()[0]) == (kept.side, kept.steps)
+        sides.add(side)
     assert changed > 50 and len(sides) > 1
 
 
