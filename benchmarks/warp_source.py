@@ -66,9 +66,9 @@ STATEMENTS: Final = {
 
 CONSTANTS: Final[dict[str, dict[str, float]]] = {
     "float64": {},
-    "float32": {"ROWS_SLACK": 1e-6, "_PARALLEL": 1e-6},
+    "float32": {"ROWS_SLACK": 1e-6},
 }
-"""What numbers of 32 bits cannot resolve: by how much a projected control may break a row, and parallel rows."""
+"""What numbers of 32 bits cannot resolve: by how much a projected control may break a row."""
 TABLES: Final = frozenset({"models", "discs", "normals", "bounds"})
 """Arguments and attributes that are arrays of two dimensions; all others have one."""
 

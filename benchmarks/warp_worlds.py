@@ -259,7 +259,7 @@ def reports(states: int, seed: int, device: str) -> Iterator[str]:
     )
     yield f"| states | decision | {columns} |\n|" + "---|" * 9
     kinds = [(real, real, chosen) for real, chosen in CONSTANTS.items()]
-    kinds.append(("float32", "float32, tolerances as they are", {}))
+    kinds.append(("float32", "float32, tolerance as it is", {}))
     random, driven = random_states(states, seed), closed_loop_states(states // 3, seed)
     for name, found in (("random", random), ("closed loop", driven)):
         for uncertainty in (0.0, 0.2):
