@@ -145,10 +145,10 @@ class BoundRollout(BoundSlacks):
         return self._known[key]
 
     def _slacks(self, control: Array) -> Array:
-        inside, euler = not self._outside.any(), self.spec.euler_look_ahead
-        if inside and self.spec.look_ahead_below is not None:
+        inside, euler, gate = not self._outside.any(), self.spec.euler_look_ahead, self.spec.look_ahead_below
+        if inside and gate is not None and self._least >= gate:
             held = self._least_rooms(self.plant.forecast(control, 1, euler), 1)
-            if (held >= self.spec.look_ahead_below).all():
+            if (held >= gate).all():
                 return held
         forecast = self.plant.forecast(control, self.spec.horizon, euler)
         if inside:

@@ -350,6 +350,7 @@ def test_it_is_rebuilt_from_the_spec_and_from_json():
         horizon=4,
         max_decrease=0.7,
         look_ahead_below=0.6,
+        euler_look_ahead=True,
     )
     filtered = sw.CBFActionFilter(gym.make("HalfCheetah-v5"), [limit])
     for spec in (filtered.spec, EnvSpec.from_json(filtered.spec.to_json())):
@@ -366,6 +367,7 @@ def test_it_is_rebuilt_from_the_spec_and_from_json():
         "horizon": 4,
         "max_decrease": 0.7,
         "look_ahead_below": 0.6,
+        "euler_look_ahead": True,
     }
     assert constraint_from(data) == limit
     assert limit.promise == "best effort" and filtered.filter.bound[0].scale == 1.5
