@@ -27,10 +27,12 @@ class HalfSpaces:
     Attributes:
         normals: Shape (k, m). A row that asks for nothing is left out, never padded.
         offsets: Shape (k,).
+        provisional: Tangents that are replaced by the constraint's next ones, not joined by them.
     """
 
     normals: Array
     offsets: Array
+    provisional: bool = False
 
     @staticmethod
     def none(controls: int) -> "HalfSpaces":

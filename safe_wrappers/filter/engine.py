@@ -25,6 +25,7 @@ class SafetyFilter:
         solver: "daqp" or any installed qpsolvers backend.
         low: Action box, shape (m,).
         high: Likewise.
+        dtype: Of the actions; decisions are rounded to it before they are judged.
 
     Attributes:
         bound: The constraints on the plant, in their order.
@@ -46,6 +47,7 @@ class SafetyFilter:
         solver: str,
         low: Array,
         high: Array,
+        dtype: Any = np.float64,
     ) -> None:
         self.plant = plant
         self.bound: list[BoundConstraint] = [constraint.bind(plant) for constraint in constraints]
@@ -55,7 +57,8 @@ class SafetyFilter:
             if kinds.count(kind) > 1:
                 twice = f"{kind} is in the list {kinds.count(kind)} times"
                 raise ConfigurationError(f"{twice}, and both would write the same info keys; use one")
-        self._search = SafeActionSearch(plant, self.bound, Fallback(fallback, self.bound), solver, low, high)
+        falling_back = Fallback(fallback, self.bound)
+        self._search = SafeActionSearch(plant, self.bound, falling_back, solver, low, high, dtype)
         self._low, self._high = low, high
 
     def start(self) -> None:

@@ -16,7 +16,7 @@ from safe_wrappers.errors import ConfigurationError, UnsafeStateWarning
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.engine import SafetyFilter
 from safe_wrappers.filter.fallback import FallbackFunction
-from safe_wrappers.filter.projection import cast_inside, check_solver
+from safe_wrappers.filter.projection import check_solver
 from safe_wrappers.filter.search import Stage
 from safe_wrappers.plants.default import default_plant, own_plant
 from safe_wrappers.plants.env_checks import check_actions, wrappers_of
@@ -102,8 +102,9 @@ class CBFActionFilter(LayerWrapper):
         self.plant: Plant = plant if plant is not None else default_plant(env)
         self.plant.bind(env)
         self._low, self._high = np.asarray(space.low, np.float64), np.asarray(space.high, np.float64)
-        self.filter = SafetyFilter(self.plant, self.constraints, fallback, solver, self._low, self._high)
         self._shape, self._dtype = space.shape, space.dtype
+        box = self._low, self._high
+        self.filter = SafetyFilter(self.plant, self.constraints, fallback, solver, *box, self._dtype)
         self.warned: set[str] = set()
         self.filter_seconds, self.filter_calls = 0.0, 0
 
@@ -170,8 +171,7 @@ class CBFActionFilter(LayerWrapper):
             # Bit for bit the policy's own action wherever the filter has nothing to say.
             sent, executed, correction = action, proposed.copy(), 0.0
         else:
-            sent = cast_inside(decision.control, self._dtype, *decision.rows, self._low, self._high)
-            executed = sent.astype(np.float64)
+            sent, executed = decision.control.astype(self._dtype), decision.control.copy()
             correction = float(np.linalg.norm(executed - proposed))
             if finite and readable:
                 # What fails least may be the proposal itself, and a change may be lost in rounding.
