@@ -127,10 +127,10 @@ class BoundClearance(BoundConstraint):
 
     def _near(self, always: tuple[Any, ...]) -> tuple[Array, HalfSpaces]:
         found = [
-            approach_rows(*self._surfaces(p), *motion, *always)
+            approach_rows(*self._surfaces(p), v, drift, effect, *always)
             if self._still is None
-            else approach_rows_of(self._still, p, *motion, *always)
-            for p, *motion in self._points.accelerations()
+            else approach_rows_of(self._still, p, v, drift, effect, *always)
+            for p, v, drift, effect in self._points.accelerations()
         ]
         parts = found[0] if len(found) == 1 else map(np.concatenate, zip(*found, strict=True))
         rooms, normals, offsets = parts

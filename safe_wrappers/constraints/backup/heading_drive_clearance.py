@@ -94,8 +94,8 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
             self._discs[:, 2] = np.repeat([o.radius + reserve for o in self.spec.obstacles], counts)
         np.concatenate(centers, out=self._discs[:, :2])
         self._scene = self._models, np.empty(6), self._discs, self.spec.brake
-        state = self.plant.qpos, self.plant.qvel, self._frame.place
-        least, self._in_play = among.least_clearance(*state, *self._scene)
+        qpos, qvel, place = self.plant.qpos, self.plant.qvel, self._frame.place
+        least, self._in_play = among.least_clearance(qpos, qvel, place, *self._scene)
         return np.array([least + reserve])
 
     def _pair(self, control: Array) -> Array:
