@@ -90,7 +90,7 @@ def test_a_control_changes_the_acceleration_of_a_point_by_no_more_than_its_reach
     plant = sw.MujocoPlant()
     plant.bind(env)
     points = sw.constraints.Clearance(WALLS, 1.0, bodies=bodies).bind(plant)._points
-    raw, rng, tight = env.unwrapped, np.random.default_rng(2), 0.0
+    raw, rng, tight, saturated = env.unwrapped, np.random.default_rng(2), 0.0, 0
     start = raw.data.qpos.copy()
     idle = np.clip(0.0, plant.lower, plant.upper)
     for _ in range(200):
@@ -101,9 +101,11 @@ def test_a_control_changes_the_acceleration_of_a_point_by_no_more_than_its_reach
             np.testing.assert_array_equal(reach[:6], np.r_[p, v])
             size = np.abs(drift).max() + 1.0
             now = reach[6:9]
-            acting = np.clip(
-                idle, *plant.actuators.acting_range(plant.data.actuator_length, plant.data.actuator_velocity)
-            )
+            motion = plant.data.actuator_length, plant.data.actuator_velocity
+            least, most = plant.actuators.acting_range(*motion)
+            acting = np.clip(idle, least, most)
+            assert not effect[:, most <= least].any()  # saturated: no control changes the force
+            saturated += int((most <= least).sum())
             np.testing.assert_allclose(now, drift + effect @ acting, atol=1e-9 * size)
             for normal in rng.normal(size=(5, 3)):
                 n = normal / np.linalg.norm(normal)
@@ -111,3 +113,4 @@ def test_a_control_changes_the_acceleration_of_a_point_by_no_more_than_its_reach
                 assert (np.abs(n @ effect) <= most * (1.0 + 1e-9) + 1e-12).all()
                 tight = max(tight, float((np.abs(n @ effect) / most).max()))
     assert tight > 0.4
+    assert (saturated > 10) == (case == "servo")

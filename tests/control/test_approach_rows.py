@@ -70,3 +70,17 @@ def test_plain_python_gives_the_same_bits():
     digest, rows = random_looks(200)
     assert said.stdout.split("\n")[0] == f"False {digest} {rows}"
     assert rows > 100
+
+
+def test_a_row_that_is_not_a_number_is_kept():
+    wall = np.array([[surfaces.PLANE, 1.0, -9.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
+    always = np.array([-1.0]), np.array([1.0]), 0.0, 0.05, 0.0, 2.0, 0.0
+    for drift, rows in ((0.0, 0), (np.nan, 1)):
+        found = of.approach_rows_of(
+            wall, np.zeros(1), np.zeros(1), np.array([drift]), np.ones((1, 1)), *always
+        )
+        assert found[1].shape == (rows, 1) and found[2].shape == (rows,)
+    reach = np.ones(19)
+    assert of.out_of_reach(wall, reach, *always)[1]
+    reach[6] = np.nan
+    assert not of.out_of_reach(wall, reach, *always)[1]
