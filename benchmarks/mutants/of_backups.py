@@ -74,10 +74,10 @@ COASTING = Target(
         Mutant("_RECOVERED = 0.5", "_RECOVERED = 1.1"),
         Mutant("sorted(self._drives(), key=lambda u: -self._after(u).end)[:1]", "self._drives()[:1]"),
         Mutant("close = now < room", "close = now < 0.5 * room"),
-        Mutant("offsets[..., 1] * x - offsets[..., 0] * y", "offsets[..., 1] * x + offsets[..., 0] * y"),
+        Mutant("if after.least < 0.0:", "if after.least < 0.01:"),
         Mutant(
-            "np.minimum(np.maximum(control, self._low), self._high) + 0.0",
-            "np.minimum(np.maximum(control, self._low), self._high)",
+            "np.minimum(np.maximum(control, low), high) + 0.0",
+            "np.minimum(np.maximum(control, low), high)",
         ),
         Mutant("return after.end if self._least < 0.0 else after.least", "return after.end"),
     ),

@@ -8,7 +8,12 @@ import numpy as np
 
 from safe_wrappers.checks import check_fields, name_list, non_negative, positive
 from safe_wrappers.constraints.obstacles import Nearest, Plain, obstacles_from, refuse_more_dimensions
-from safe_wrappers.control.backup.approach_rows import approach_rows, approach_rows_of, approaches
+from safe_wrappers.control.backup.approach_rows import (
+    approach_rows,
+    approach_rows_of,
+    approaches,
+    out_of_reach,
+)
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.plants.plant import Plant
@@ -76,7 +81,9 @@ class BoundClearance(BoundConstraint):
         super().__init__(spec, plant)
         named = {"body": spec.bodies, "site": spec.sites, "geom": spec.geoms}
         self._points = Points(plant, named, spec.position, spec.velocity)
+        self._none = HalfSpaces.none(plant.lower.size)
         self._still: Array | None = None
+        self._was_far = False  # a guess of what saves time
         if all(isinstance(o, Plain) and o.still for o in spec.obstacles):
             self._still = np.concatenate([o.surfaces(plant) for o in spec.obstacles])
             size = self._points.coordinates
@@ -86,7 +93,7 @@ class BoundClearance(BoundConstraint):
     def observe(self, memory: Memory) -> None:
         self._observed: tuple[Array, HalfSpaces] | None = None
 
-    def _near(self, p: Array) -> Nearest:
+    def _surfaces(self, p: Array) -> Nearest:
         """The surfaces around a point."""
         found = [o.nearest(p, self.plant) for o in self.spec.obstacles]
         return Nearest(*(np.concatenate(part) for part in zip(*found, strict=True)))
@@ -95,18 +102,39 @@ class BoundClearance(BoundConstraint):
         """The rooms and the rows, once per observation."""
         if self._observed is None:
             plant, spec = self.plant, self.spec
-            always = plant.lower, plant.upper, plant.delay_s, plant.control_dt
-            always = *always, spec.radius, spec.braking, spec.state_error + spec.margin
-            found = [
-                approach_rows(*self._near(p), *motion, *always)
-                if self._still is None
-                else approach_rows_of(self._still, p, *motion, *always)
-                for p, *motion in self._points.accelerations()
-            ]
-            parts = found[0] if len(found) == 1 else map(np.concatenate, zip(*found, strict=True))
-            rooms, normals, offsets = parts
-            self._observed = rooms, HalfSpaces(normals, offsets)
+            timing = plant.delay_s, plant.control_dt
+            always = (
+                plant.lower,
+                plant.upper,
+                *timing,
+                spec.radius,
+                spec.braking,
+                spec.state_error + spec.margin,
+            )
+            self._observed = (self._far(always) if self._was_far else None) or self._near(always)
+            self._was_far = not self._observed[1].offsets.size
         return self._observed
+
+    def _far(self, always: tuple[Any, ...]) -> tuple[Array, HalfSpaces] | None:
+        """The rooms where no control can matter; None: it may."""
+        if self._still is None or not self._points.of_machine:
+            return None
+        found = [out_of_reach(self._still, reach, *always) for reach in self._points.reaches()]
+        if not all(certain for _, certain in found):
+            return None
+        rooms = found[0][0] if len(found) == 1 else np.concatenate([rooms for rooms, _ in found])
+        return rooms, self._none
+
+    def _near(self, always: tuple[Any, ...]) -> tuple[Array, HalfSpaces]:
+        found = [
+            approach_rows(*self._surfaces(p), v, drift, effect, *always)
+            if self._still is None
+            else approach_rows_of(self._still, p, v, drift, effect, *always)
+            for p, v, drift, effect in self._points.accelerations()
+        ]
+        parts = found[0] if len(found) == 1 else map(np.concatenate, zip(*found, strict=True))
+        rooms, normals, offsets = parts
+        return rooms, HalfSpaces(normals, offsets)
 
     def value(self) -> Array:
         """Room left after braking, margin and state error not taken off, m, one per point and surface."""
@@ -118,7 +146,7 @@ class BoundClearance(BoundConstraint):
         delay_s, radius = self.plant.delay_s, self.spec.radius
         found = [
             approaches(near.distance, near.normal, near.velocity, v, delay_s, radius)
-            for near, v in ((self._near(p), v) for p, v in self._points.motions())
+            for near, v in ((self._surfaces(p), v) for p, v in self._points.motions())
         ]
         clearances, speeds = zip(*found, strict=True)
         return np.concatenate(clearances), np.concatenate(speeds)

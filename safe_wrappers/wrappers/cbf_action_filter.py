@@ -171,7 +171,8 @@ class CBFActionFilter(LayerWrapper):
             # Bit for bit the policy's own action wherever the filter has nothing to say.
             sent, executed, correction = action, proposed.copy(), 0.0
         else:
-            sent, executed = decision.control.astype(self._dtype), decision.control.copy()
+            sent = decision.control.astype(self._dtype)
+            executed = sent.astype(np.float64)
             correction = float(np.linalg.norm(executed - proposed))
             if finite and readable:
                 # What fails least may be the proposal itself, and a change may be lost in rounding.

@@ -89,8 +89,8 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
     def clearance(self) -> Array:
         """Of the stopping path from the nearest disc, margin and state error not taken off, m, shape (1,)."""
         self._scene = self.models, np.empty(6), self.discs(), self.spec.brake
-        state = self.plant.qpos, self.plant.qvel, self.frame.place
-        least, self._in_play = among.least_clearance(*state, *self._scene)
+        qpos, qvel, place = self.plant.qpos, self.plant.qvel, self.frame.place
+        least, self._in_play = among.least_clearance(qpos, qvel, place, *self._scene)
         return np.array([least + self.reserve])
 
     @property

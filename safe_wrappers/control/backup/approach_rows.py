@@ -16,6 +16,7 @@ from safe_wrappers.control.numerics.surfaces import nearest_points
 
 Array = NDArray[np.float64]
 
+_ROUNDING: Final = 1.0 + 1e-9
 _UNBOUNDED: Final = 1e12
 """A control without a bound counts as this large."""
 
@@ -44,6 +45,34 @@ def approaches(
         clearance[i] = distance[i] - delay_s * met - radius
         speed[i] = -closing
     return clearance, speed
+
+
+@compiled
+def _away(
+    normal: Array,
+    surface_velocity: Array,
+    curvature: Array,
+    velocity: Array,
+    acceleration: Array,
+    speed: float,
+    outside: bool,
+) -> float:
+    """Acceleration of the distance to a surface, m/s^2: along the normal, and of passing by on the outside."""
+    bend = sharpest = along = 0.0
+    for j in range(len(velocity)):
+        sideways = velocity[j] - surface_velocity[j]
+        bend += curvature[j] * (sideways * sideways)
+        sharpest = max(sharpest, curvature[j])
+        along += normal[j] * acceleration[j]
+    bend -= sharpest * (speed * speed)
+    return along + bend if outside and not bend <= 0.0 else along
+
+
+@compiled
+def _largest(low: float, high: float) -> float:
+    """Of the controls between two bounds."""
+    most = max(abs(low), abs(high))
+    return most if most < math.inf else _UNBOUNDED
 
 
 @compiled
@@ -89,24 +118,16 @@ def approach_rows(
     normals, offsets = np.zeros((len(distance), m)), np.empty(len(distance))
     for i in range(len(distance)):
         room[i] = clearance[i] - held_stop(speed[i], braking, control_dt)
-        # Approach acceleration = -normal . (drift + effect u) - |sideways speed|^2 * curvature.
-        bend = sharpest = along = strongest = 0.0
-        for j in range(d):
-            sideways = velocity[j] - surface_velocity[i, j]
-            bend += curvature[i, j] * (sideways * sideways)
-            sharpest = max(sharpest, curvature[i, j])
-            along += normal[i, j] * drift[j]
-        bend -= sharpest * (speed[i] * speed[i])
-        if clearance[i] + radius > 0.0 and not bend <= 0.0:
-            along += bend
-        limit = held_limit(clearance[i] - reserve, speed[i], braking, control_dt) + along
+        limit = held_limit(clearance[i] - reserve, speed[i], braking, control_dt)
+        outside = clearance[i] + radius > 0.0
+        limit += _away(normal[i], surface_velocity[i], curvature[i], velocity, drift, speed[i], outside)
+        strongest = 0.0
         for k in range(m):
             push = 0.0
             for j in range(d):
                 push -= normal[i, j] * effect[j, k]
             normals[rows, k] = push
-            most = max(abs(low[k]), abs(high[k]))
-            strongest += abs(push) * (most if most < math.inf else _UNBOUNDED)
+            strongest += abs(push) * _largest(low[k], high[k])
         # Negated, so that a row that is not a number is kept, and fails, instead of being left out.
         if not strongest <= limit:
             offsets[rows] = limit
@@ -134,3 +155,41 @@ def approach_rows_of(
     still = np.zeros(normal.shape)
     moving = velocity, drift, effect, low, high, delay_s, control_dt, radius, braking, reserve
     return approach_rows(distance, normal, still, curvature, *moving)
+
+
+@compiled
+def out_of_reach(
+    surfaces: Array,
+    reach: Array,
+    low: Array,
+    high: Array,
+    delay_s: float,
+    control_dt: float,
+    radius: float,
+    braking: float,
+    reserve: float,
+) -> tuple[Array, bool]:
+    """The rooms of `approach_rows_of`, and whether it certainly has no rows.
+
+    `reach` is what `Points.reaches` says of the point; the others are as for `approach_rows`.
+    """
+    velocity = reach[3:6]
+    distance, normal, curvature = nearest_points(surfaces, reach[:3])
+    still, none = np.zeros(normal.shape), np.zeros(3)
+    clearance, speed = approaches(distance, normal, still, velocity, delay_s, radius)
+    room, certain = np.empty(len(distance)), True
+    for i in range(len(distance)):
+        room[i] = clearance[i] - held_stop(speed[i], braking, control_dt)
+        limit = held_limit(clearance[i] - reserve, speed[i], braking, control_dt)
+        outside = clearance[i] + radius > 0.0
+        limit += _away(normal[i], none, curvature[i], velocity, reach[6:9], speed[i], outside)
+        gives = strongest = 0.0
+        for j in range(3):
+            for k in range(3):
+                gives += normal[i, j] * reach[9 + 3 * j + k] * normal[i, k]
+        for k in range(len(low)):
+            # What acts now is the control nearest to zero.
+            change = _largest(low[k], high[k]) + abs(min(max(0.0, low[k]), high[k]))
+            strongest += math.sqrt(max(gives * reach[18 + k], 0.0)) * change
+        certain = certain and strongest * _ROUNDING <= limit
+    return room, certain

@@ -108,9 +108,9 @@ def _interpolate(xs: Array, ys: Array, x: float) -> float:
         else:
             first = middle + 1
     if i == len(xs):
-        return ys[-1] if x == xs[-1] else math.inf
+        return float(ys[-1]) if x == xs[-1] else math.inf
     before = xs[i - 1]
-    return ys[i - 1] + (x - before) / (xs[i] - before) * (ys[i] - ys[i - 1])
+    return float(ys[i - 1] + (x - before) / (xs[i] - before) * (ys[i] - ys[i - 1]))
 
 
 @compiled

@@ -207,8 +207,7 @@ class AffineActuators:
 
     def moment(self, data: mujoco.MjData) -> Array:
         """Generalised force per unit actuator force, shape (nu, nv)."""
-        places = data.moment_rownnz, data.moment_rowadr, data.moment_colind.reshape(-1)
-        mujoco.mju_sparse2dense(self._moment, data.actuator_moment.reshape(-1), *places)
+        mujoco.mju_sparse2dense(self._moment, *moment_of(data))
         return self._moment
 
     def acting_range(self, length: Array, velocity: Array, control_dt: float = 0.0) -> tuple[Array, Array]:
@@ -243,6 +242,12 @@ class AffineActuators:
         return gear * qpos[q], gear * qvel[v]
 
 
+def moment_of(data: mujoco.MjData) -> tuple[Array, NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Generalised force per unit actuator force, sparse: values, and counts, starts and columns of the rows."""
+    places = data.moment_rownnz, data.moment_rowadr, data.moment_colind.reshape(-1)
+    return data.actuator_moment.reshape(-1), *places
+
+
 class Response:
     """How a machine's joints respond to its controls, at what `data` holds.
 
@@ -254,10 +259,8 @@ class Response:
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, actuators: AffineActuators) -> None:
         self._model, self._data = model, data
-        places = data.moment_rownnz, data.moment_rowadr, data.moment_colind.reshape(-1)
-        moment = data.actuator_moment.reshape(-1), *places
         motion = data.actuator_length, data.actuator_velocity, data.ctrl, data.qacc
-        self._actuation = actuators.constants, *motion, *moment
+        self._actuation = actuators.constants, *motion, *moment_of(data)
         self._units, self._mobility = np.eye(model.nv), np.empty((model.nv, model.nv))
         self._free = np.zeros(0, np.int32), np.zeros((0, model.nv)), np.zeros(0)
 

@@ -36,3 +36,6 @@ mj_forwardSkip: Final = _function("mj_forwardSkip", "aaii")  # noqa: N816 - MuJo
 mj_integratePos: Final = _function("mj_integratePos", "aaad")  # noqa: N816
 mj_contactForce: Final = _function("mj_contactForce", "aaia")  # noqa: N816
 mj_geomDistance: Final = _function("mj_geomDistance", "aaiida", measures=True)  # noqa: N816
+mj_jac: Final = _function("mj_jac", "aaaaai")
+mj_jacDot: Final = _function("mj_jacDot", "aaaaai")  # noqa: N816
+mj_solveM: Final = _function("mj_solveM", "aaaai")  # noqa: N816

@@ -318,7 +318,7 @@ class MujocoPlant(Plant):
         m, d = self.model, self.pose()
         if not self._forwarded:
             mujoco.mj_comPos(m, d)  # for the Jacobian
-        body, p = self._frame(kind, name)
+        body, p = self.frame(kind, name)
         mujoco.mj_jac(m, d, self._jacobian, None, p, body)
         return p.copy(), self._jacobian @ self.qvel
 
@@ -328,12 +328,12 @@ class MujocoPlant(Plant):
         The last is `a0 + A @ u`: p, v and a0 of shape (3,), A of shape (3, nu).
         """
         m, d, response = self.model, self.forward(), self.acceleration
-        body, p = self._frame(kind, name)
+        body, p = self.frame(kind, name)
         mujoco.mj_jac(m, d, self._jacobian, None, p, body)
         mujoco.mj_jacDot(m, d, self._jacobian_rate, None, p, body)
         return p.copy(), *point_motion(self._jacobian, self._jacobian_rate, self.qvel, *response)
 
-    def _frame(self, kind: str, name: str) -> tuple[int, Array]:
+    def frame(self, kind: str, name: str) -> tuple[int, Array]:
         """The body that carries a named frame, and a view of the frame's origin, shape (3,), m."""
         if (kind, name) not in self._frames:
             self._frames[kind, name] = of_model.frame(self.model, self.data, kind, name)
