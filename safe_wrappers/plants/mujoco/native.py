@@ -11,10 +11,10 @@ from safe_wrappers.control.numerics.compiled import IS_COMPILED
 _FOLDER: Final = Path(mujoco.__file__).parent
 _LIBRARY: Final = str(next(path for name in ("libmujoco.*", "mujoco.dll") for path in _FOLDER.glob(name)))
 if IS_COMPILED:
-    import llvmlite.binding
+    from llvmlite.binding import load_library_permanently  # type: ignore[import-untyped]
     from numba import types
 
-    llvmlite.binding.load_library_permanently(_LIBRARY)  # so that code that was cached finds the symbols
+    load_library_permanently(_LIBRARY)  # so that code that was cached finds the symbols
 
 
 def _function(name: str, kinds: str, measures: bool = False) -> Any:
