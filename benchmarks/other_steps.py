@@ -17,7 +17,7 @@ import gymnasium as gym
 import numpy as np
 
 import safe_wrappers as sw
-from benchmarks import mujoco_drivers, patrol_drivers, tracked
+from benchmarks import impact, mujoco_drivers, patrol_drivers, tracked
 from benchmarks.arm_and_wall import ArmAndWall
 from benchmarks.arms import ARMS
 from benchmarks.cases import PROTECTED
@@ -36,14 +36,12 @@ class Steps(NamedTuple):
     calm: Maker = gentle  # who does not
 
 
-class _Wall(gym.Wrapper[Any, Any, Any, Any]):
-    """Ends an approach of the arm to the wall after 20 steps; each starts in another pose."""
+class _Approaches(gym.Wrapper[Any, Any, Any, Any]):
+    """Approaches of the arm to the wall, each from another pose, as in `benchmarks.impact`."""
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        rng = np.random.default_rng(seed)
-        self._left = 20
-        pose = {"qpos": rng.uniform(-0.6, 0.6, 2), "angle": 0.0, "distance": float(rng.uniform(0.23, 0.26))}
-        return self.env.reset(seed=seed, options=pose)
+        self._left = impact.STEPS
+        return self.env.reset(seed=seed, options=impact.start(np.random.default_rng(seed)))
 
     def step(self, action: Any) -> Any:
         self._left -= 1
@@ -53,9 +51,7 @@ class _Wall(gym.Wrapper[Any, Any, Any, Any]):
 
 def _pressing(env: Any, rng: np.random.Generator) -> Driver:
     """At the wall, as hard as the arm can."""
-    from benchmarks.impact import Driver as Impact
-
-    return Impact("corner", env, rng).act
+    return impact.Driver("corner", env, rng).act
 
 
 def _pushing_out(env: Any, rng: np.random.Generator) -> Driver:
@@ -122,7 +118,7 @@ CASES: dict[str, Steps] = {
     "SingularityMargin, Reacher-v5": _arm("Reacher"),
     "SingularityMargin, Pusher-v5": _arm("Pusher"),
     "SingularityMargin, FetchReach-v4": _arm("Fetch"),
-    "ImpactSpeedLimit, arm and wall": Steps(lambda: _Wall(ArmAndWall(3e4)), _impact, _pressing),
+    "ImpactSpeedLimit, arm and wall": Steps(lambda: _Approaches(ArmAndWall(3e4)), _impact, _pressing),
     "Workspace, AntMaze_UMaze-v5": _protected("AntMaze_UMaze-v5", mujoco_drivers.running_into_walls),
     "Workspace, Pusher-v5": _protected("Pusher-v5", mujoco_drivers.speed_seeking),
 }

@@ -93,4 +93,5 @@ def _address(array: NDArray[Any]) -> int:
 
 
 def _view(address: int, size: int, kind: Any) -> NDArray[Any]:
-    return np.frombuffer((ctypes.c_char * size).from_address(address), kind)
+    memory: Any = (ctypes.c_char * size).from_address(address)
+    return np.asarray(np.frombuffer(memory, kind))

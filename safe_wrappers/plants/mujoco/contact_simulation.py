@@ -106,7 +106,7 @@ def _counts(memory: ContactMemory, body_of_geom: NDArray[np.int64], i: int) -> b
     first = 2 * memory.stride * i
     one = body_of_geom[memory.ints[first + memory.geom]]
     other = body_of_geom[memory.ints[first + memory.geom + 1]]
-    return memory.ints[first + memory.row] >= 0 and one != other and min(one, other) == 0
+    return bool(memory.ints[first + memory.row] >= 0 and one != other and min(one, other) == 0)
 
 
 @compiled
