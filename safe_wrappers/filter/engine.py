@@ -22,7 +22,7 @@ class SafetyFilter:
         plant: Bound to its env.
         constraints: Specifications; each is bound to the plant.
         fallback: "brake", "hold", "zero", or a function of the plant.
-        solver: "daqp" or any installed qpsolvers backend.
+        solver: "active-set" (compiled, exact), "daqp" or any installed qpsolvers backend.
         low: Action box, shape (m,).
         high: Likewise.
 
