@@ -50,7 +50,7 @@ def nearest(solver: str, u: Array, a: Array, b: Array, lower: Array, upper: Arra
     Arguments as of `project`, rows and numbers of usual size.
     """
     backend = solve_with_daqp if solver == "daqp" else _named(solver)
-    slacks, lengths = row_slacks(*plain(u, a, b, lower, upper))
+    _, slacks, lengths = row_slacks(*plain(u, a, b, lower, upper))
     asking = np.flatnonzero(lengths)
     if bool((b < -10.0 * slacks)[lengths == 0.0].any()):
         return None

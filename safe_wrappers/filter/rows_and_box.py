@@ -78,7 +78,7 @@ def _read(
             columns[j, i] = normals[i, j]
         idle = offsets[i] >= OVERFLOWING
         usual = usual and (idle or abs(offsets[i]) < OVERFLOWING)
-        rows[OFFSET, i] = math.inf if idle else offsets[i]
+        rows[OFFSET, i] = offsets[i]
     return _READ if usual else UNUSUAL, inside
 
 
@@ -129,7 +129,7 @@ def _measure(point: Array, columns: Array, rows: Array, slacks: Array) -> int:
         slacks[i] = FEASIBILITY_TOLERANCE * scale
         rounding = _ROUNDING * (length * max(largest, farthest) + offset)
         rows[ALLOWED, i], rows[SLACK, i] = max(EXACT_SHARE * slacks[i], rounding), 0.0
-        rows[LENGTH, i] = length if length > _SHORTEST and offset < math.inf else 0.0
+        rows[LENGTH, i] = length if length > _SHORTEST and offset < OVERFLOWING else 0.0
         asking += 1 if rows[LENGTH, i] > 0.0 else 0
     for j in range(m):
         scale = residual_scale(point[NEAR, j], 1.0, largest, widest)
@@ -330,16 +330,20 @@ def keep_rows_of_each(
 
 
 @compiled
-def row_slacks(u: Array, normals: Array, offsets: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
-    """What the nominal may miss each row by and still count as admissible, row units, and the rows' lengths, (k,).
+def row_slacks(
+    u: Array, normals: Array, offsets: Array, lower: Array, upper: Array
+) -> tuple[bool, Array, Array]:
+    """Whether a control keeps the rows as closely as an answer must; slacks and lengths of the rows, shape (k,).
 
-    The arguments are those of `keep_rows`. A row that asks for nothing has length 0.
+    The arguments are those of `keep_rows`. The slacks are what a nominal may miss the rows by, in their units; a row
+    that asks for nothing has length 0.
     """
     m, k = u.size, offsets.size
     slacks, control = np.zeros(k), np.zeros(m)
     point, columns, rows, _, _, _ = search_space(m, k, False)
-    if _read(u, normals, offsets, lower, upper, point, columns, rows, control)[0] == _READ:
+    kept = _read(u, normals, offsets, lower, upper, point, columns, rows, control)[0] == _READ
+    if kept:  # what overflows would be allowed anything
         _measure(point, columns, rows, slacks)
-    else:
-        slacks[:] = -math.inf
-    return slacks, rows[LENGTH].copy()
+        _excess(point, columns, rows, TARGET)
+        kept = _within(rows, slacks, 10.0)
+    return kept, slacks, rows[LENGTH].copy()
