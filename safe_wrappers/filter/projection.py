@@ -14,11 +14,7 @@ from numpy.typing import ArrayLike
 
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter import rows_and_box
-from safe_wrappers.filter.problem import (
-    Array,
-    Projection,
-    Status,
-)
+from safe_wrappers.filter.problem import Array, Projection, Status
 from safe_wrappers.filter.qp import control_unit, nearest, plain, solve_with_daqp
 from safe_wrappers.filter.rows_and_box import LARGEST, OVERFLOWING, keep_rows, row_slacks
 
@@ -118,17 +114,11 @@ def project_unchecked(u: Array, a: Array, b: Array, lo: Array, hi: Array, solver
 
 def _finite_rows_only(u: Array, a: Array, b: Array, lo: Array, hi: Array, solver: str) -> Projection:
     """Rows with numbers that are not finite or too large cannot be checked: respect the others, say failed."""
-    normal = (np.abs(a) < LARGEST).all(axis=1)
-    harmless = normal & (b >= OVERFLOWING)  # asks for nothing
-    fine = normal & (np.abs(b) < OVERFLOWING)
-    multipliers, control = np.zeros(b.size), np.clip(u, lo, hi)
+    fine = (np.abs(a) < LARGEST).all(axis=1) & (b > -OVERFLOWING)
+    control = np.clip(u, lo, hi)
     if bool((np.abs(u) < LARGEST).all() and (np.abs(control) < LARGEST).all()):
-        part = project_unchecked(u, a[fine], b[fine], lo, hi, solver)
-        if bool((harmless | fine).all()):
-            multipliers[fine] = part.multipliers
-            return part._replace(multipliers=multipliers)
-        control, multipliers[fine] = part.control, part.multipliers
-    return Projection(control, Status.FAILED, math.inf, multipliers, 0)
+        control = project_unchecked(u, a[fine], b[fine], lo, hi, solver).control
+    return Projection(control, Status.FAILED, math.inf, np.zeros(b.size), 0)
 
 
 def keeps_rows(control: Array, normals: Array, offsets: Array, lower: Array, upper: Array) -> bool:

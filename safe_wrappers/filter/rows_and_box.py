@@ -24,13 +24,7 @@ from safe_wrappers.control.numerics.active_set import (
     search_space,
 )
 from safe_wrappers.control.numerics.compiled import compiled, inlined
-from safe_wrappers.filter.problem import (
-    EXACT_SHARE,
-    FEASIBILITY_TOLERANCE,
-    Array,
-    half_width,
-    residual_scale,
-)
+from safe_wrappers.filter.problem import EXACT_SHARE, FEASIBILITY_TOLERANCE, Array, half_width, residual_scale
 
 INACTIVE, PROJECTED, INFEASIBLE, UNSOLVED, SEVERAL_ROWS, UNUSUAL, BAD_NOMINAL, BAD_BOX, _READ = range(9)
 """How it ended: the first three as a `Status`; no answer; a problem for a named solver; a number too large to be
@@ -162,12 +156,10 @@ def _judge(point: Array, columns: Array, rows: Array) -> bool:
 
 
 @compiled
-def _violate_least(
-    point: Array, columns: Array, rows: Array, along: Array, factors: Array, active: NDArray[np.int64]
-) -> bool:
-    """What violates the rows least, to `X` and `WEIGHT`: by least squares, then the closest that is as good."""
+def _violate_least(point: Array, columns: Array, rows: Array) -> bool:
+    """What violates the rows least, and of that the closest to the nominal, to `X` and `WEIGHT`."""
     m, k = columns.shape
-    near, _, softened, beside, factored, held = search_space(m, k, True)
+    near, _, softened, along, factors, active = search_space(m, k, True)
     for i in range(k):
         for row in range(SLACK):
             softened[row, i] = rows[row, i]
@@ -175,22 +167,12 @@ def _violate_least(
     for j in range(m):
         for row in range(X):
             near[row, j] = point[row, j]
-    if closest_point(near, columns, softened, beside, factored, held)[0] != SOLVED:
-        return False
-    _judge(near, columns, softened)
-    if not _excess(near, columns, softened, X) < math.inf:
-        return False
-    for i in range(k):
-        if rows[LENGTH, i] > 0.0:
-            rows[OFFSET, i] += max(softened[EXCESS, i], 0.0) + rows[ALLOWED, i]
-    ended, _ = closest_point(point, columns, rows, along, factors, active)
-    closest = ended == SOLVED and _judge(point, columns, rows)
-    for i in range(k):
-        rows[OFFSET, i] = softened[OFFSET, i]
-        rows[WEIGHT, i] = rows[WEIGHT, i] if closest else 0.0
+    ended, _ = closest_point(near, columns, softened, along, factors, active)
     for j in range(m):
-        point[X, j] = point[X, j] if closest else near[X, j]
-    return True
+        point[X, j] = min(max(near[X, j], point[LOW, j]), point[HIGH, j])
+    for i in range(k):
+        rows[WEIGHT, i] = softened[WEIGHT, i]
+    return ended == SOLVED and _excess(point, columns, rows, X) < math.inf
 
 
 @compiled
@@ -247,7 +229,7 @@ def _keep_rows(
     solved = ended == SOLVED and _judge(point, columns, rows)
     if ended == CONTRADICTORY:
         solved = asking == 1 and _to_corner(point, columns, rows)
-        solved = solved or _violate_least(point, columns, rows, along, factors, active)
+        solved = solved or _violate_least(point, columns, rows)
     for j in range(m):
         if solved:
             control[j] = point[X, j]

@@ -391,6 +391,7 @@ LIES = {
     "infinite called found": (True, [np.inf, 0.0]),
     "zero called not found": (False, [0.0, 0.0]),
     "infeasible point called found": (True, [0.0, 0.0]),
+    "the nominal called found": (True, [0.9, 0.8]),
     "outside of the box called found": (True, [-30.0, 2.45]),
     "nothing": (False, None),
 }
