@@ -51,7 +51,7 @@ class CBFActionFilter(LayerWrapper):
         constraints: Instances, or the plain dicts that a recorded filter holds. They are copied.
         plant: None reads the env's MuJoCo model; other envs need an `AnalyticPlant`.
         fallback: "brake", "hold", "zero", or a function of the plant that returns a control.
-        solver: "daqp" or any installed qpsolvers backend.
+        solver: "active-set" (compiled, exact), "daqp" or any installed qpsolvers backend.
         margin: Added to every constraint's own `margin`, in that constraint's unit (m, rad/s, ...).
 
     Info, at every step (see `safe_wrappers.info`): ``cbf/intervened``, ``cbf/infeasible``,
@@ -84,7 +84,7 @@ class CBFActionFilter(LayerWrapper):
         constraints: Sequence[Constraint | dict[str, Any]],
         plant: Plant | None = None,
         fallback: str | FallbackFunction = "brake",
-        solver: str = "daqp",
+        solver: str = "active-set",
         margin: float = 0.0,
     ) -> None:
         arguments = dict(locals())
