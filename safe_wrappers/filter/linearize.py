@@ -11,6 +11,7 @@ Slacks = Callable[[Array], Array]
 
 _STEP = 1e-4  # width of the differences, as a share of the control's range
 _INWARD = 0.01  # aim this share of the violation beyond the boundary, to end inside it
+_AGAIN = 0.1  # likewise of the little that a corrected tangent has left, which costs little
 _SECANTS = 2  # tangents whose slopes secants correct, after one by differences
 _DIFFERENCES = 4  # tangents by differences, in one control step
 
@@ -45,7 +46,7 @@ def differences(slacks: Slacks, control: Array, low: Array, high: Array) -> Arra
 
 def tangent_rows(base: Array, control: Array, jacobian: Array, provisional: bool = False) -> HalfSpaces:
     """Rows of slacks that are `base` at a control and change by a Jacobian, aimed a little inward where violated."""
-    wanted = _INWARD * np.maximum(-base, 0.0)
+    wanted = (_AGAIN if provisional else _INWARD) * np.maximum(-base, 0.0)
     return HalfSpaces(-jacobian, base - jacobian @ control - wanted, provisional)
 
 
