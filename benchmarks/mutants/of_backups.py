@@ -74,10 +74,10 @@ COASTING = Target(
         Mutant("_RECOVERED = 0.5", "_RECOVERED = 1.1"),
         Mutant("sorted(self._drives(), key=lambda u: -self._after(u).end)[:1]", "self._drives()[:1]"),
         Mutant("close = now < room", "close = now < 0.5 * room"),
-        Mutant("offsets[..., 1] * x - offsets[..., 0] * y", "offsets[..., 1] * x + offsets[..., 0] * y"),
+        Mutant("if after.least < 0.0:", "if after.least < 0.01:"),
         Mutant(
-            "np.minimum(np.maximum(control, self._low), self._high) + 0.0",
-            "np.minimum(np.maximum(control, self._low), self._high)",
+            "np.minimum(np.maximum(control, low), high) + 0.0",
+            "np.minimum(np.maximum(control, low), high)",
         ),
         Mutant("return after.end if self._least < 0.0 else after.least", "return after.end"),
     ),
@@ -110,7 +110,6 @@ ESCAPE = Target(
             "np.concatenate([*radii, np.zeros(0)]) + self.spec.radius",
             "np.concatenate([*radii, np.zeros(0)])",
         ),
-        Mutant("    np.maximum(along, 0.0, out=along)\n", ""),
         Mutant(
             "times = self.plant.control_dt * np.concatenate([[0.0], 1.0 + self._escapes.instants])",
             "times = self.plant.control_dt * np.concatenate([[0.0], self._escapes.instants])",
@@ -120,8 +119,8 @@ ESCAPE = Target(
             "((led_to - velocity) ** 2).sum(axis=1).argmax()",
         ),
         Mutant(
-            "if now - reach <= self.spec.radius + self.spec.margin:",
-            "if now <= self.spec.radius + self.spec.margin:",
+            "if now - float(np.hypot(abs(x - here_x).max(), abs(y - here_y).max())) <= self.spec.margin:",
+            "if now <= self.spec.margin:",
         ),
         Mutant("gap - self.spec.radius, out=nearest", "gap, out=nearest"),
         Mutant("_GOING_S = (0.3, 0.8)", "_GOING_S = (0.3,)"),
@@ -132,36 +131,57 @@ ESCAPE = Target(
     ),
 )
 
-WALL = Target(
-    "constraints/backup/wall_clearance.py",
-    ("tests/constraints/test_wall_corners.py", "tests/constraints/test_wall_clearance.py"),
+WAYS = Target(
+    "control/backup/way_clearances.py",
+    ("tests/control/test_way_clearances.py",),
     (
-        Mutant("return self._left_after(control) >= self._recovery() - _NOISE_M", "return True"),
-        Mutant("min(0.0, self._least) - _NOISE_M", "0.0"),
-        Mutant("if across >= along:", "if across < along:"),
-        Mutant("_TURNS = 4", "_TURNS = 0"),
-        Mutant("self._needed = min(target, self._left_after(self._backup()))", "self._needed = target"),
-        Mutant("math.sqrt(max(room**2 - other**2, 0.0))", "room"),
-        Mutant("        found.sort(key=lambda c: math.dist(c, asked))\n", ""),
-        Mutant("for axes in ((0, 1), (1, 0))]", "for axes in ((0, 1),)]"),
+        Mutant("along = max(abs(y[c, m, k] - ahead_y[k]) - half_y[k], 0.0)", "along = 0.0"),
+        Mutant("if disc[3] - reach <= margin:", "if disc[3] <= margin:"),
+        Mutant("if plane[5] - reach <= margin:", "if plane[5] <= margin:"),
+        Mutant("highest[1] + room >= low:", "highest[1] - room >= low:"),
         Mutant(
-            "share = min(1.0, room / math.hypot(*gap)) if corner else 0.0", "share = 0.5 if corner else 0.0"
+            "math.sqrt(across * across + along * along) - disc[2]",
+            "math.sqrt(across * across + along * along)",
         ),
-        Mutant("offsets.append(max(sign * limit, sign * backup[axis]))", "offsets.append(sign * limit)"),
+        Mutant(" + (flat_y[i] - plane[1]) * plane[3]", ""),
+        Mutant("over < left[c, m] or over != over:", "over < left[c, m]:"),
+    ),
+)
+
+WALL = Target(
+    "*/backup/[pw]*.py",
+    (
+        "tests/constraints/test_point_decision.py",
+        "tests/constraints/test_wall_corners.py",
+        "tests/constraints/test_wall_clearance.py",
+    ),
+    (
+        Mutant("return _left_after(among, motion, room, control) >= needed - _NOISE_M", "return True"),
+        Mutant("min(0.0, left) - _NOISE_M", "0.0"),
+        Mutant("if across >= beside:", "if across < beside:"),
+        Mutant("_TURNS: Final = 4", "_TURNS: Final = 0"),
         Mutant(
-            "return max(constants.low, min(constants.control_to_rest_at(x, v, target), constants.high))",
-            "return constants.control_to_rest_at(x, v, target)",
+            "return min(target, _left_after(among, motion, room, backup(among, motion, room, left)))",
+            "return target",
         ),
-        Mutant("self._room = reach + self.spec.margin", "self._room = reach"),
+        Mutant("math.sqrt(max(room * room - other * other, 0.0))", "room"),
+        Mutant("while place > 0 and away[place - 1] > far:", "while False:"),
+        Mutant("        for first in range(2):", "        for first in range(1):"),
         Mutant(
-            "target = wall[2 * axis] - gap if before else wall[2 * axis + 1] + gap",
-            "target = wall[2 * axis] - gap",
+            "share = min(1.0, wanted / hypot(gap[0], gap[1])) if corner else 0.0",
+            "share = 0.5 if corner else 0.0",
         ),
-        Mutant("self._motion = self._among.clipped(motion)", "self._motion = motion"),
-        Mutant("self._least = math.nan", "self._least = 0.0"),
+        Mutant("offsets[count] = max(sign * limit, sign * halt[axis])", "offsets[count] = sign * limit"),
         Mutant(
-            "low, high = (middle, high) if self._admitted(at(middle), _HAIR_M) else (low, middle)",
-            "low = middle",
+            "return max(constants.low, min(along.control_to_rest_at(constants, x, v, target), constants.high))",
+            "return along.control_to_rest_at(constants, x, v, target)",
+        ),
+        Mutant("reach + self.spec.margin, clip", "reach, clip"),
+        Mutant("target = start - gap if before else end + gap", "target = start - gap"),
+        Mutant("motion[2], motion[3] = now.vx, now.vy", "pass"),
+        Mutant("    if left != left:\n", "    if False:\n"),
+        Mutant(
+            "            low = middle\n        else:\n            high = middle", "            low = middle"
         ),
     ),
 )

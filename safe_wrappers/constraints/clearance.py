@@ -7,15 +7,17 @@ from typing import Any, ClassVar
 import numpy as np
 
 from safe_wrappers.checks import check_fields, name_list, non_negative, positive
-from safe_wrappers.constraints.obstacles import Nearest, obstacles_from
-from safe_wrappers.control.backup.stopping import sampled_acceleration_limit, sampled_inset
+from safe_wrappers.constraints.obstacles import Nearest, Plain, obstacles_from, refuse_more_dimensions
+from safe_wrappers.control.backup.approach_rows import (
+    approach_rows,
+    approach_rows_of,
+    approaches,
+    out_of_reach,
+)
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.points import Points
-
-# Around one point: the surfaces, clearances, approach speeds, relative velocities, its drift and its control matrix.
-_Seen = tuple[Nearest, Array, Array, Array, Array, Array]
 
 
 @dataclass
@@ -79,55 +81,76 @@ class BoundClearance(BoundConstraint):
         super().__init__(spec, plant)
         named = {"body": spec.bodies, "site": spec.sites, "geom": spec.geoms}
         self._points = Points(plant, named, spec.position, spec.velocity)
+        self._none = HalfSpaces.none(plant.lower.size)
+        self._still: Array | None = None
+        self._was_far = False  # a guess of what saves time
+        if all(isinstance(o, Plain) and o.still for o in spec.obstacles):
+            self._still = np.concatenate([o.surfaces(plant) for o in spec.obstacles])
+            size = self._points.coordinates
+            for surface in self._still:
+                refuse_more_dimensions(int(surface[1]), size)
 
     def observe(self, memory: Memory) -> None:
-        self._observed: list[_Seen] | None = None
+        self._observed: tuple[Array, HalfSpaces] | None = None
 
-    def _gaps(self, p: Array, v: Array) -> tuple[Nearest, Array, Array, Array]:
-        """Surfaces around a point: clearance, approach speed and relative velocity of each."""
+    def _surfaces(self, p: Array) -> Nearest:
+        """The surfaces around a point."""
         found = [o.nearest(p, self.plant) for o in self.spec.obstacles]
-        near = Nearest(*(np.concatenate(part) for part in zip(*found, strict=True)))
-        relative = v - near.velocity
-        # The point is predicted over the delay; what comes to meet it is too (a lower bound: distance is convex).
-        met = self.plant.delay_s * np.einsum("ij,ij->i", near.normal, near.velocity)
-        clearance = near.distance - met - self.spec.radius
-        return near, clearance, -np.einsum("ij,ij->i", near.normal, relative), relative
+        return Nearest(*(np.concatenate(part) for part in zip(*found, strict=True)))
 
-    def _seen(self) -> list[_Seen]:
-        """What every point sees, once per observation."""
+    def _look(self) -> tuple[Array, HalfSpaces]:
+        """The rooms and the rows, once per observation."""
         if self._observed is None:
-            every = self._points.accelerations()
-            self._observed = [(*self._gaps(p, v), drift, effect) for p, v, drift, effect in every]
+            plant, spec = self.plant, self.spec
+            timing = plant.delay_s, plant.control_dt
+            always = (
+                plant.lower,
+                plant.upper,
+                *timing,
+                spec.radius,
+                spec.braking,
+                spec.state_error + spec.margin,
+            )
+            self._observed = (self._far(always) if self._was_far else None) or self._near(always)
+            self._was_far = not self._observed[1].offsets.size
         return self._observed
+
+    def _far(self, always: tuple[Any, ...]) -> tuple[Array, HalfSpaces] | None:
+        """The rooms where no control can matter; None: it may."""
+        if self._still is None or not self._points.of_machine:
+            return None
+        found = [out_of_reach(self._still, reach, *always) for reach in self._points.reaches()]
+        if not all(certain for _, certain in found):
+            return None
+        rooms = found[0][0] if len(found) == 1 else np.concatenate([rooms for rooms, _ in found])
+        return rooms, self._none
+
+    def _near(self, always: tuple[Any, ...]) -> tuple[Array, HalfSpaces]:
+        found = [
+            approach_rows(*self._surfaces(p), v, drift, effect, *always)
+            if self._still is None
+            else approach_rows_of(self._still, p, v, drift, effect, *always)
+            for p, v, drift, effect in self._points.accelerations()
+        ]
+        parts = found[0] if len(found) == 1 else map(np.concatenate, zip(*found, strict=True))
+        rooms, normals, offsets = parts
+        return rooms, HalfSpaces(normals, offsets)
 
     def value(self) -> Array:
         """Room left after braking, margin and state error not taken off, m, one per point and surface."""
-        braking, hold = self.spec.braking, self.plant.control_dt
-        seen = self._seen()
-        return np.concatenate([sampled_inset(clear, speed, braking, hold) for _, clear, speed, *_ in seen])
+        return self._look()[0]
 
     def approach(self) -> tuple[Array, Array]:
         """Clearances (m) and approach speeds (m/s, towards the obstacle), as measured, one per point and surface."""
-        # Not through `_seen`: the accelerations, which only the rows need, are most of its work.
-        gaps = [self._gaps(p, v) for p, v in self._points.motions()]
-        return np.concatenate([g[1] for g in gaps]), np.concatenate([g[2] for g in gaps])
+        # Not through `_look`: the accelerations, which only the rows need, are most of its work.
+        delay_s, radius = self.plant.delay_s, self.spec.radius
+        found = [
+            approaches(near.distance, near.normal, near.velocity, v, delay_s, radius)
+            for near, v in ((self._surfaces(p), v) for p, v in self._points.motions())
+        ]
+        clearances, speeds = zip(*found, strict=True)
+        return np.concatenate(clearances), np.concatenate(speeds)
 
     def rows(self) -> HalfSpaces:
         """One row per point and surface whose limit the actuators could exceed."""
-        normals, offsets = [], []
-        braking, hold = self.spec.braking, self.plant.control_dt
-        strongest = np.maximum(np.abs(self.plant.lower), np.abs(self.plant.upper))
-        reserve = {"state_error": self.spec.state_error, "margin": self.spec.margin}
-        for near, clearance, approach, relative, drift, effect in self._seen():
-            limit = sampled_acceleration_limit(clearance, approach, braking, hold, **reserve)
-            # approach acceleration = -n . (drift + effect u) - |sideways speed|^2 * curvature
-            bend = np.einsum("ij,ij->i", near.curvature, relative**2)
-            bend = bend - near.curvature.max(axis=1) * approach**2
-            bend = np.where(clearance + self.spec.radius > 0.0, np.maximum(bend, 0.0), 0.0)
-            normal = -near.normal @ effect
-            offset = limit + near.normal @ drift + bend
-            # Negated, so that a row that is not a number is kept, and fails, instead of being left out.
-            reachable = ~(np.abs(normal) @ np.where(np.isfinite(strongest), strongest, 1e12) <= offset)
-            normals.append(normal[reachable])
-            offsets.append(offset[reachable])
-        return HalfSpaces(np.concatenate(normals), np.concatenate(offsets))
+        return self._look()[1]

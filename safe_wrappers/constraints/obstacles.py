@@ -10,6 +10,7 @@ import numpy as np
 from safe_wrappers.checks import non_negative, positive, settings_from
 from safe_wrappers.control.estimation.ellipsoids import ellipsoid_gap
 from safe_wrappers.control.estimation.tracks import Tracks
+from safe_wrappers.control.numerics.surfaces import BLOCK, NUMBERS, PLANE, ROUND, nearest_points
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.plant import Plant
@@ -59,7 +60,41 @@ def _vector(name: str, values: Sequence[float], sizes: tuple[int, ...]) -> list[
     return vector
 
 
-class _Round(ABC):
+class Plain(ABC):
+    """Planes, balls, cylinders and blocks: `control/numerics/surfaces.py` knows what is nearest."""
+
+    still: ClassVar[bool] = True
+    """Whether `surfaces` is always the same, and nothing moves."""
+
+    @abstractmethod
+    def surfaces(self, plant: Plant) -> Array:
+        """As in `control/numerics/surfaces.py`, shape (k, 8)."""
+
+    def _velocities(self, plant: Plant) -> Array | None:
+        """Of the surfaces, m/s, shape (k, coordinates), or None: they stand still."""
+        return None
+
+    def nearest(self, point: Array, plant: Plant) -> Nearest:
+        """What is nearest of every surface."""
+        surfaces = self.surfaces(plant)
+        if len(surfaces):
+            refuse_more_dimensions(int(surfaces[0, 1]), point.size)
+        distance, normal, curvature = nearest_points(surfaces, point)
+        velocities, moving = self._velocities(plant), np.zeros_like(normal)
+        if velocities is not None:
+            moving[:, : velocities.shape[1]] = velocities
+        return Nearest(distance, normal, moving, curvature)
+
+
+def _surface(kind: float, first: Sequence[float], second: Sequence[float]) -> Array:
+    """One surface, shape (1, 8)."""
+    row = np.zeros((1, NUMBERS))
+    row[0, :2] = kind, len(first)
+    row[0, 2 : 2 + len(first)], row[0, 5 : 5 + len(second)] = first, second
+    return row
+
+
+class _Round(Plain):
     """Discs and spheres of one radius; a disc seen from three dimensions is an upright cylinder."""
 
     radius: float
@@ -68,22 +103,12 @@ class _Round(ABC):
     def centers(self, plant: Plant) -> Array:
         """Where they are now, shape (k, d), m."""
 
-    def _velocities(self, plant: Plant) -> Array | float:
-        return 0.0
-
-    def nearest(self, point: Array, plant: Plant) -> Nearest:
+    def surfaces(self, plant: Plant) -> Array:
         centers = self.centers(plant)
-        d = centers.shape[1]
-        refuse_more_dimensions(d, point.size)
-        offset = point[:d] - centers
-        length = np.sqrt(np.einsum("ij,ij->i", offset, offset))
-        apart = np.where(length > 1e-12, length, 1.0)
-        normal, moving, curvature = np.zeros((3, len(centers), point.size))
-        normal[:, :d] = offset / apart[:, None]
-        normal[length <= 1e-12, 0] = 1.0  # at the very centre every way out is as good
-        moving[:, :d] = self._velocities(plant)
-        curvature[:, :d] = 1.0 / np.maximum(length, 1e-9)[:, None]
-        return Nearest(length - self.radius, normal, moving, curvature)
+        found = np.zeros((len(centers), NUMBERS))
+        found[:, 0], found[:, 1], found[:, 5] = ROUND, centers.shape[1], self.radius
+        found[:, 2 : 2 + centers.shape[1]] = centers
+        return found
 
     def distances(self, points: Array, plant: Plant) -> Array:
         centers = self.centers(plant)
@@ -122,7 +147,7 @@ class Sphere(_Still):
 
 
 @dataclass
-class Plane:
+class Plane(Plain):
     """A wall: everything behind `point` against the outward `normal` is forbidden; 1, 2 or 3 dimensions."""
 
     point: Sequence[float]
@@ -136,13 +161,8 @@ class Plane:
             raise ConfigurationError("normal must not be zero: it points from the wall into free space")
         self.normal = [n / length for n in self.normal]
 
-    def nearest(self, point: Array, plant: Plant) -> Nearest:
-        d = len(self.point)
-        refuse_more_dimensions(d, point.size)
-        normal = np.zeros((1, point.size))
-        normal[0, :d] = self.normal
-        distance = normal[0, :d] @ (point[:d] - np.asarray(self.point))
-        return Nearest(np.array([distance]), normal, np.zeros_like(normal), np.zeros_like(normal))
+    def surfaces(self, plant: Plant) -> Array:
+        return _surface(PLANE, self.point, self.normal)
 
     def distances(self, points: Array, plant: Plant) -> Array:
         offsets = points[:, : len(self.point)] - np.asarray(self.point)
@@ -150,7 +170,7 @@ class Plane:
 
 
 @dataclass
-class Box:
+class Box(Plain):
     """An axis-aligned block of `half_size` (m per axis) at `center`; 2 or 3 dimensions. It stands still."""
 
     center: Sequence[float]
@@ -162,25 +182,8 @@ class Box:
         for half in self.half_size:
             positive("half_size", half, "m")
 
-    def nearest(self, point: Array, plant: Plant) -> Nearest:
-        """One surface: a face, an edge or a corner."""
-        d = len(self.center)
-        refuse_more_dimensions(d, point.size)
-        offset = point[:d] - np.asarray(self.center)
-        beyond = np.abs(offset) - np.asarray(self.half_size)
-        side = np.where(offset < 0.0, -1.0, 1.0)
-        outside = np.maximum(beyond, 0.0)
-        distance = float(np.linalg.norm(outside))
-        normal, curvature = np.zeros((2, 1, point.size))
-        if distance > 0.0:
-            normal[0, :d] = side * outside / distance
-            if int((outside > 0.0).sum()) > 1:
-                curvature[0, :d] = (outside > 0.0) / distance
-        else:
-            axis = int(np.argmax(beyond))
-            distance = float(beyond[axis])
-            normal[0, axis] = side[axis]
-        return Nearest(np.array([distance]), normal, np.zeros_like(normal), curvature)
+    def surfaces(self, plant: Plant) -> Array:
+        return _surface(BLOCK, self.center, self.half_size)
 
     def distances(self, points: Array, plant: Plant) -> Array:
         offsets = points[:, : len(self.center)] - np.asarray(self.center)
@@ -203,6 +206,8 @@ class Discs(_Round):
     radius: float
     velocity_attribute: str | None = None
 
+    still = False
+
     def __post_init__(self) -> None:
         self.radius = positive("radius", self.radius, "m")
 
@@ -213,9 +218,9 @@ class Discs(_Round):
             raise ConfigurationError(f"{wanted}, got {where.shape}")
         return where
 
-    def _velocities(self, plant: Plant) -> Array | float:
+    def _velocities(self, plant: Plant) -> Array | None:
         if self.velocity_attribute is None:
-            return 0.0
+            return None
         return np.asarray(plant.attribute(self.velocity_attribute), dtype=np.float64)
 
 

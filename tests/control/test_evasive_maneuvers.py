@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safe_wrappers.control.backup.damped_axis import DampedAxis
+from safe_wrappers.control.backup.damped_axis import damped_axis
 from safe_wrappers.control.backup.evasive_maneuvers import EvasiveManeuvers, Maneuver
 
 AXES = (
-    DampedAxis(0.98, 0.04, 0.01, 4, -1.0, 1.0),
-    DampedAxis(1.0, 0.05, 0.02, 3, -0.7, 1.3),  # no damping, and stronger one way than the other
+    damped_axis(0.98, 0.04, 0.01, 4, -1.0, 1.0),
+    damped_axis(1.0, 0.05, 0.02, 3, -0.7, 1.3),  # no damping, and stronger one way than the other
 )
 BANK = [
     Maneuver(0.0, 0.0, 0),

@@ -64,10 +64,13 @@ def test_inside_it_is_the_shortest_way_out_along_an_axis(a, b):
 @example((0.0, 2.458, 0.0, 1.0), [(2.897, 3.0, 0.0, 1.0)], 0.43899999999999967)  # the sum is rounded, too
 def test_nearest_and_closer_agree_with_every_single_distance(around, among, limit):
     distances = [apart(around, r) for r in among]
-    assert closer(around, among, limit) == [r for r, d in zip(among, distances, strict=True) if d < limit]
-    best, found = nearest(around, among, limit)
+    rows = np.array(among, dtype=np.float64).reshape(-1, 4)
+    close = [i for i, distance in enumerate(distances) if distance < limit]
+    for first in range(len(among) + 1):
+        assert closer(around, rows, limit, first) == next((i for i in close if i >= first), -1)
+    best, found = nearest(around, rows, limit)
     assert best == min([limit, *distances])
-    assert found is None if best == limit else apart(around, found) == best
+    assert found == -1 if best == limit else apart(around, among[found]) == best
 
 
 @settings(max_examples=100, deadline=None)

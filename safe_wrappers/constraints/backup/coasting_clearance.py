@@ -13,7 +13,7 @@ from safe_wrappers.checks import check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundDetourClearance, Detour
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.constraints.rollout import RENAMED
-from safe_wrappers.control.numerics.outlines import convex_outline, distances_to_outline
+from safe_wrappers.control.numerics.outlines import clearances_on_a_course, convex_outline
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, Constraint
@@ -114,6 +114,8 @@ class BoundCoastingClearance(BoundDetourClearance):
         outline = np.reshape(spec.outline, (-1, 2))
         self._corners = convex_outline(outline) if len(outline) else outline
         self._radius = float(np.sqrt((self._corners**2).sum(axis=1)).max(initial=0.0))
+        self._origin = _Group(spec.keep_out, np.zeros((0, 2)))
+        self._body = _Group(spec.untouched, self._corners)
         self.max_decrease = spec.max_decrease
         self._first_turns_left: bool | None = None
         self._seen = np.zeros(0)
@@ -125,26 +127,28 @@ class BoundCoastingClearance(BoundDetourClearance):
 
     def clearance(self) -> Array:
         """Of the present place from the nearest disc, margin not taken off, m, shape (1,): not along the way."""
-        self._low, self._high = self.plant.acting_range
         here = self.coasting.start()
         self._here = here.places[0]
         way = math.inf
         if self.max_decrease is not None:
             way = self.max_decrease + self.spec.max_decrease_per_speed * self.coasting.speed(self._radius)
-        self._origin = _Group(self.spec.keep_out, self.plant, None)
-        self._body = _Group(self.spec.untouched, self.plant, self._corners)
-        self._least = min(group.keep(here, self.spec.margin + way) for group in (self._origin, self._body))
+        room = self.spec.margin + way
+        self._least = min(group.keep(self.plant, here, room) for group in (self._origin, self._body))
         self._within = way
+        seen = np.zeros(0)
+        if self._origin.near or self._body.near:
+            discs = np.concatenate([self._origin.discs, self._body.discs])[:, :2].ravel()
+            seen = np.concatenate([[self.plant.model_version], self.coasting.state(), discs])
         # Rollouts are kept while nothing moves.
-        discs = np.concatenate([self._origin.centers, self._body.centers]).ravel()
-        seen = np.concatenate([[self.plant.model_version], self.coasting.state(), discs])
-        if not (seen.shape == self._seen.shape and (np.abs(seen - self._seen) <= _STILL).all()):
+        still = seen.size and seen.shape == self._seen.shape and (np.abs(seen - self._seen) <= _STILL).all()
+        if not still:
             self._seen, self._known = seen, {}
         return np.array([self._least])
 
     def _after(self, control: Array) -> "_Outcome":
         """The outcome of a control, forecast once per observation."""
-        acting = np.minimum(np.maximum(control, self._low), self._high) + 0.0  # no -0.0: its bytes differ
+        low, high = self.plant.acting_range
+        acting = np.minimum(np.maximum(control, low), high) + 0.0  # no -0.0: its bytes differ
         key = acting.tobytes()
         if key not in self._known:
             course = self.coasting.run(acting, self.spec.horizon, self._radius)
@@ -177,6 +181,8 @@ class BoundCoastingClearance(BoundDetourClearance):
         after = self._after(control)
         if after.least >= self.spec.margin:
             return True
+        if after.least < 0.0:
+            return False
         rest = self._after(self._still)
         if after is rest:
             return rest.least >= 0.0
@@ -191,7 +197,7 @@ class BoundCoastingClearance(BoundDetourClearance):
 
     def _drives(self) -> list[Array]:
         """Full control of all actuators together and of each alone, both ways."""
-        low, high = self._low, self._high
+        low, high = self.plant.acting_range
         return [high, low, *(np.where(one, end, 0.0) for one in np.eye(low.size) for end in (low, high))]
 
     def slack(self, control: Array) -> float:
@@ -207,7 +213,7 @@ class BoundCoastingClearance(BoundDetourClearance):
         """What to try for a refused control, the best first: ways around, less of the same, none."""
         if self._least < 0.0:
             return sorted(self._drives(), key=lambda u: -self._after(u).end)[:1]
-        acting = np.clip(control, self._low, self._high)
+        acting = np.clip(control, *self.plant.acting_range)
         around = self._around(acting) if self.spec.detour and acting.size == 2 else []
         return [*around, 0.5 * acting, self._still]
 
@@ -244,48 +250,43 @@ class _Outcome(NamedTuple):
 
 
 class _Group:
-    """Discs that the outline, corners (c, 2) in the body's frame, or the body's origin keeps clear of.
+    """Discs that the outline, corners (c, 2) in the body's frame, keeps clear of; without corners the origin does.
 
     Attributes:
-        centers: Of all discs, shape (n, 2), m.
+        discs: Centres and radii of all, m, shape (n, 3).
         near: Whether one of them may come into play.
         now: What is left to those that may, shape (close ones,), m.
     """
 
-    def __init__(self, obstacles: Sequence[Any], plant: MujocoPlant, outline: Array | None) -> None:
-        self._outline = outline
-        where = [o.centers(plant)[:, :2] for o in obstacles]
-        self.centers = self._centers = np.concatenate([np.zeros((0, 2)), *where])
-        self._radii = np.repeat([o.radius for o in obstacles], [len(w) for w in where])
+    def __init__(self, obstacles: Sequence[Any], outline: Array) -> None:
+        self._obstacles, self._outline = obstacles, outline
+        self.discs = np.zeros((0, 3))
 
-    def keep(self, here: Course, room: float) -> float:
-        """Forget what is farther than `room`, m; the least clearance there was, m."""
-        now = self._left(here)[0] if len(self._centers) else np.zeros(0)
+    def keep(self, plant: MujocoPlant, here: Course, room: float) -> float:
+        """Take the discs that are closer than `room`, m; the least clearance of all, m."""
+        where = [o.centers(plant)[:, :2] for o in self._obstacles]
+        if sum(map(len, where)) != len(self.discs):
+            radii = np.repeat([o.radius for o in self._obstacles], [len(w) for w in where])
+            self.discs = np.zeros((len(radii), 3))
+            self.discs[:, 2] = radii
+        if where:
+            np.concatenate(where, out=self.discs[:, :2])
+        now = clearances_on_a_course(self._outline, *here[:2], self.discs)[0]
         close = now < room
-        self._centers, self._radii, self.now = self._centers[close], self._radii[close], now[close]
         self.near = bool(close.any())
+        self._close, self.now = self.discs[close], now[close]
         return float(now.min(initial=np.inf))
 
     def along(self, course: Course) -> tuple[float, float, float]:
         """Along a course: least clearance, that at its end, and the most that one of them fell, m."""
         if not self.near:
             return math.inf, math.inf, 0.0
-        left = self._left(course)
+        left = clearances_on_a_course(self._outline, *course[:2], self._close)
         return float(left.min()), float(left[-1].min()), float((self.now - left.min(axis=0)).max())
 
     def nearest(self) -> Array:
         """Centre of the disc with the least room, shape (2,), m."""
-        return np.asarray(self._centers[self.now.argmin()])
-
-    def _left(self, course: Course) -> Array:
-        """Shape (instants, discs), m."""
-        offsets = self._centers - course.places[:, None]
-        if self._outline is None:
-            return np.asarray(np.sqrt((offsets**2).sum(axis=2)) - self._radii)
-        x, y = course.ahead[:, :1], course.ahead[:, 1:]
-        ahead, left = offsets[..., 0] * x + offsets[..., 1] * y, offsets[..., 1] * x - offsets[..., 0] * y
-        local = np.stack([ahead, left], axis=-1)
-        return np.asarray(distances_to_outline(self._outline, local) - self._radii)
+        return np.asarray(self._close[self.now.argmin(), :2])
 
 
 def _checked_outline(given: Any, needed: bool) -> list[list[float]]:

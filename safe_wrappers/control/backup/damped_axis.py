@@ -6,46 +6,24 @@ semi-implicit Euler step with implicit joint damping). A control is held for `su
 which ends at rest. The stopping distance is piecewise linear in v: a knot at each speed that n full holds remove.
 """
 
-import bisect
 import math
-from dataclasses import dataclass, field
+from typing import Final, NamedTuple
 
-_MOST_HOLDS = 4096
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.control.numerics.compiled import compiled
+
+Array = NDArray[np.float64]
+
+_MOST_HOLDS: Final = 4096
 """Length of the table, in holds of full braking; the distance beyond it is infinite."""
-_FLAT = 1e9
+_FLAT: Final = 1e9
 """m/s; end of the constant part of the table above the clip."""
 
 
-@dataclass(frozen=True)
-class _Stops:
-    """Stopping distances for one direction of motion."""
-
-    speeds: list[float]  # the knots, m/s, ascending from 0
-    ways: list[float]  # stopping distance at each knot, m
-    totals: list[float]  # with the part of the hold before that is proportional to the speed, m
-
-    def way(self, speed: float) -> float:
-        """Stopping distance from a speed >= 0, m; infinite beyond the table."""
-        return _interpolate(self.speeds, self.ways, speed)
-
-    def speed(self, total: float) -> float:
-        """The inverse of `totals`; the largest tabulated speed beyond it."""
-        if total >= self.totals[-1]:
-            return self.speeds[-1]
-        return _interpolate(self.totals, self.speeds, total)
-
-
-def _interpolate(xs: list[float], ys: list[float], x: float) -> float:
-    i = bisect.bisect_right(xs, x)
-    if i == len(xs):
-        return ys[-1] if x == xs[-1] else math.inf
-    before = xs[i - 1]
-    return ys[i - 1] + (x - before) / (xs[i] - before) * (ys[i] - ys[i - 1])
-
-
-@dataclass(frozen=True)
-class DampedAxis:
-    """Constants of one axis.
+class DampedAxis(NamedTuple):
+    """Constants of one axis, made by `damped_axis`.
 
     Attributes:
         decay: Share of the speed that one physics step keeps without control, in (0, 1].
@@ -55,6 +33,13 @@ class DampedAxis:
         low: Smallest control, < 0.
         high: Largest control, > 0.
         clip: Speed to which the env clips the motion at the start of every control step, m/s; inf for none.
+        keep: A: share of the speed that one hold keeps.
+        add: B: speed that one hold adds per control, m/s.
+        drift: P: displacement in one hold per speed, s.
+        shift: Q: displacement in one hold per control, m.
+        up: Stopping from speeds >= 0, shape (3, k): the knots, m/s, ascending from 0; the distances, m; the distances
+            with the part of the hold before that is proportional to the speed, m.
+        down: Likewise, from speeds <= 0.
     """
 
     decay: float
@@ -63,94 +48,145 @@ class DampedAxis:
     substeps: int
     low: float
     high: float
-    clip: float = math.inf
+    clip: float
+    keep: float
+    add: float
+    drift: float
+    shift: float
+    up: Array
+    down: Array
 
-    keep: float = field(init=False)  # A: share of the speed that one hold keeps
-    add: float = field(init=False)  # B: speed that one hold adds per control, m/s
-    drift: float = field(init=False)  # P: displacement in one hold per speed, s
-    shift: float = field(init=False)  # Q: displacement in one hold per control, m
-    _up: _Stops = field(init=False, repr=False)
-    _down: _Stops = field(init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        keep, add, drift, shift = 1.0, 0.0, 0.0, 0.0
-        for _ in range(self.substeps):
-            keep, add = self.decay * keep, self.decay * add + self.gain
-            drift, shift = drift + self.timestep * keep, shift + self.timestep * add
-        fields = {"keep": keep, "add": add, "drift": drift, "shift": shift}
-        for name, value in fields.items():
-            object.__setattr__(self, name, value)
-        object.__setattr__(self, "_up", self._table(-self.low))
-        object.__setattr__(self, "_down", self._table(self.high))
+def damped_axis(
+    decay: float,
+    gain: float,
+    timestep: float,
+    substeps: int,
+    low: float,
+    high: float,
+    clip: float = math.inf,
+) -> DampedAxis:
+    """The axis of these constants, with its tables."""
+    keep, add, drift, shift = 1.0, 0.0, 0.0, 0.0
+    for _ in range(substeps):
+        keep, add = decay * keep, decay * add + gain
+        drift, shift = drift + timestep * keep, shift + timestep * add
+    none = np.zeros((3, 0))
+    axis = DampedAxis(
+        decay, gain, timestep, substeps, low, high, clip, keep, add, drift, shift, up=none, down=none
+    )
+    return axis._replace(up=_table(axis, -low), down=_table(axis, high))
 
-    def _table(self, brake: float) -> _Stops:
-        """The table for one direction of motion, up to the clip or to `_MOST_HOLDS` knots."""
-        loss, lost_way = self.add * brake, self.shift * brake
-        # Displacement of the last hold, per speed.
-        just_stops = self.drift - self.shift * self.keep / self.add
-        speeds, ways = [0.0, loss / self.keep], [0.0, just_stops * loss / self.keep]
-        while len(speeds) < _MOST_HOLDS and speeds[-1] < self.clip:
-            speed = (speeds[-1] + loss) / self.keep
-            ways.append(self.drift * speed - lost_way + ways[-1])
-            speeds.append(speed)
-        if speeds[-1] >= self.clip:
-            ways[-1] = _interpolate(speeds, ways, self.clip)
-            speeds[-1] = self.clip
-            speeds.append(_FLAT)
-            ways.append(ways[-1])
-        per_speed = self.shift / self.add
-        return _Stops(speeds, ways, [per_speed * v + w for v, w in zip(speeds, ways, strict=True)])
 
-    def clipped(self, v: float) -> float:
-        """The speed after the env's clip."""
-        return max(-self.clip, min(v, self.clip))
+def _table(axis: DampedAxis, brake: float) -> Array:
+    """The table for one direction of motion, up to the clip or to `_MOST_HOLDS` knots."""
+    loss, lost_way = axis.add * brake, axis.shift * brake
+    # Displacement of the last hold, per speed.
+    just_stops = axis.drift - axis.shift * axis.keep / axis.add
+    speeds, ways = [0.0, loss / axis.keep], [0.0, just_stops * loss / axis.keep]
+    while len(speeds) < _MOST_HOLDS and speeds[-1] < axis.clip:
+        speed = (speeds[-1] + loss) / axis.keep
+        ways.append(axis.drift * speed - lost_way + ways[-1])
+        speeds.append(speed)
+    if speeds[-1] >= axis.clip:
+        ways[-1] = _interpolate(np.array(speeds), np.array(ways), axis.clip)
+        speeds[-1] = axis.clip
+        speeds.append(_FLAT)
+        ways.append(ways[-1])
+    per_speed = axis.shift / axis.add
+    return np.array([speeds, ways, [per_speed * v + w for v, w in zip(speeds, ways, strict=True)]])
 
-    def step(self, x: float, v: float, u: float) -> tuple[float, float]:
-        """Position and speed at the end of a hold; `v` is already clipped."""
-        u = max(self.low, min(u, self.high))
-        return x + self.drift * v + self.shift * u, self.keep * v + self.add * u
 
-    def rest(self, x: float, v: float) -> float:
-        """Position at which braking comes to rest."""
-        return x + self._up.way(v) if v >= 0.0 else x - self._down.way(-v)
+@compiled
+def _interpolate(xs: Array, ys: Array, x: float) -> float:
+    """Between knots, from the first on; infinite beyond the last."""
+    first, i = 0, len(xs)
+    while first < i:
+        middle = (first + i) // 2
+        if x < xs[middle]:
+            i = middle
+        else:
+            first = middle + 1
+    if i == len(xs):
+        return float(ys[-1]) if x == xs[-1] else math.inf
+    before = xs[i - 1]
+    return float(ys[i - 1] + (x - before) / (xs[i] - before) * (ys[i] - ys[i - 1]))
 
-    def brake(self, v: float) -> float:
-        """The control that brakes fully, or just to rest within one hold."""
-        return max(self.low, min(-self.keep * self.clipped(v) / self.add, self.high))
 
-    def braking(self, x: float, v: float) -> list[float]:
-        """Positions at the ends of the holds of the braking manoeuvre, the present one first, rest last."""
-        v = self.clipped(v)
-        end, brake = self.rest(x, v), self.low if v >= 0.0 else self.high
-        drift, shift, keep, loss = self.drift, self.shift * brake, self.keep, self.add * brake
-        last, direction = abs(loss) / keep, 1.0 if v >= 0.0 else -1.0
-        points = [x]
-        while direction * v > last:
-            x, v = x + drift * v + shift, keep * v + loss
-            points.append(x)
-        if x != end:
-            points.append(end)
-        return points
+@compiled
+def _speed(table: Array, total: float) -> float:
+    """The inverse of the totals; the largest tabulated speed beyond them."""
+    return table[0, -1] if total >= table[2, -1] else _interpolate(table[2], table[0], total)
 
-    def extent(self, x: float, v: float, u: float) -> tuple[float, float]:
-        """Least and greatest position during a hold, its start included; `v` is already clipped."""
-        end, speed = self.step(x, v, u)
-        if self.substeps == 1 or v * speed >= 0.0:
-            return min(x, end), max(x, end)
-        u = max(self.low, min(u, self.high))
-        least = most = x
-        for _ in range(self.substeps):
-            v = self.decay * v + self.gain * u
-            x += self.timestep * v
-            least, most = min(least, x), max(most, x)
-        return least, most
 
-    def control_to_rest_at(self, x: float, v: float, target: float) -> float:
-        """The control whose hold, and braking after it, comes to rest at `target`; it may be out of bounds.
+@compiled
+def clipped(axis: DampedAxis, v: float) -> float:
+    """The speed after the env's clip."""
+    return max(-axis.clip, min(v, axis.clip))
 
-        The rest point grows with the control. `v` is already clipped.
-        """
-        per_speed = self.shift / self.add
-        way = target - x - (self.drift - per_speed * self.keep) * v
-        end = self._up.speed(way) if way >= 0.0 else -self._down.speed(-way)
-        return (end - self.keep * v) / self.add
+
+@compiled
+def step(axis: DampedAxis, x: float, v: float, u: float) -> tuple[float, float]:
+    """Position and speed at the end of a hold; `v` is already clipped."""
+    u = max(axis.low, min(u, axis.high))
+    return x + axis.drift * v + axis.shift * u, axis.keep * v + axis.add * u
+
+
+@compiled
+def rest(axis: DampedAxis, x: float, v: float) -> float:
+    """Position at which braking comes to rest."""
+    if v >= 0.0:
+        return x + _interpolate(axis.up[0], axis.up[1], v)
+    return x - _interpolate(axis.down[0], axis.down[1], -v)
+
+
+@compiled
+def brake(axis: DampedAxis, v: float) -> float:
+    """The control that brakes fully, or just to rest within one hold."""
+    return max(axis.low, min(-axis.keep * clipped(axis, v) / axis.add, axis.high))
+
+
+@compiled
+def braking(axis: DampedAxis, x: float, v: float) -> Array:
+    """Positions at the ends of the holds of the braking manoeuvre, the present one first, rest last."""
+    v = clipped(axis, v)
+    end, control = rest(axis, x, v), axis.low if v >= 0.0 else axis.high
+    shift, loss = axis.shift * control, axis.add * control
+    last, direction = abs(loss) / axis.keep, 1.0 if v >= 0.0 else -1.0
+    points, count = np.empty(_MOST_HOLDS + 2), 1
+    points[0] = x
+    while direction * v > last and count <= _MOST_HOLDS:
+        x, v = x + axis.drift * v + shift, axis.keep * v + loss
+        points[count] = x
+        count += 1
+    if x != end:
+        points[count] = end
+        count += 1
+    return points[:count]
+
+
+@compiled
+def extent(axis: DampedAxis, x: float, v: float, u: float) -> tuple[float, float]:
+    """Least and greatest position during a hold, its start included; `v` is already clipped."""
+    end, speed = step(axis, x, v, u)
+    if axis.substeps == 1 or v * speed >= 0.0:
+        return min(x, end), max(x, end)
+    u = max(axis.low, min(u, axis.high))
+    least = most = x
+    for _ in range(axis.substeps):
+        v = axis.decay * v + axis.gain * u
+        x += axis.timestep * v
+        least, most = min(least, x), max(most, x)
+    return least, most
+
+
+@compiled
+def control_to_rest_at(axis: DampedAxis, x: float, v: float, target: float) -> float:
+    """The control whose hold, and braking after it, comes to rest at `target`; it may be out of bounds.
+
+    The rest point grows with the control. `v` is already clipped.
+    """
+    per_speed = axis.shift / axis.add
+    way = target - x - (axis.drift - per_speed * axis.keep) * v
+    end = _speed(axis.up, way) if way >= 0.0 else -_speed(axis.down, -way)
+    return (end - axis.keep * v) / axis.add

@@ -7,12 +7,19 @@ of full force can reverse.
 """
 
 import math
-from dataclasses import dataclass
-from itertools import pairwise, zip_longest
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.control.backup import damped_axis as along
 from safe_wrappers.control.backup.damped_axis import DampedAxis
-from safe_wrappers.control.numerics.rectangles import Rectangle, apart, closer, nearest
+from safe_wrappers.control.numerics.compiled import compiled
+from safe_wrappers.control.numerics.rectangles import Rectangle, apart, closer, nearest, one_of
+
+Array = NDArray[np.float64]
+Pair = tuple[float, float]
+"""Numbers along x and along y."""
 
 
 class PointMotion(NamedTuple):
@@ -24,96 +31,130 @@ class PointMotion(NamedTuple):
     vy: float
 
 
-@dataclass(frozen=True)
-class PointAmongWalls:
+class PointAmongWalls(NamedTuple):
     """Two axes and the walls.
 
     Attributes:
         x_axis, y_axis: Constants of the motion.
-        walls: Rectangles, m.
+        walls: Rectangles, m, shape (n, 4).
         clip_known: The axes' `clip` is the env's own; then the path counts, not only the rectangle around it.
     """
 
     x_axis: DampedAxis
     y_axis: DampedAxis
-    walls: list[Rectangle]
+    walls: Array
     clip_known: bool
 
-    def clipped(self, motion: PointMotion) -> PointMotion:
-        """The motion after the env's clip."""
-        x, y, vx, vy = motion
-        return PointMotion(x, y, self.x_axis.clipped(vx), self.y_axis.clipped(vy))
 
-    def step(self, motion: PointMotion, ux: float, uy: float) -> PointMotion:
-        """The motion after one control step; `motion` is already clipped."""
-        x, vx = self.x_axis.step(motion.x, motion.vx, ux)
-        y, vy = self.y_axis.step(motion.y, motion.vy, uy)
-        return PointMotion(x, y, vx, vy)
-
-    def rest(self, motion: PointMotion) -> tuple[float, float]:
-        """Position at which braking comes to rest, m."""
-        return self.x_axis.rest(motion.x, motion.vx), self.y_axis.rest(motion.y, motion.vy)
-
-    def brake(self, motion: PointMotion) -> tuple[float, float]:
-        """The control of the next hold of braking."""
-        return self.x_axis.brake(motion.vx), self.y_axis.brake(motion.vy)
-
-    def held(self, motion: PointMotion, ux: float, uy: float) -> Rectangle:
-        """Rectangle that contains one control step; `motion` is already clipped."""
-        across = self.x_axis.extent(motion.x, motion.vx, ux)
-        return *across, *self.y_axis.extent(motion.y, motion.vy, uy)
-
-    def stop(self, motion: PointMotion) -> Rectangle:
-        """Rectangle that contains braking, from the present position to the rest point."""
-        return _spanned(motion.x, motion.y, *self.rest(motion))
-
-    def reached(self, motion: PointMotion, ux: float, uy: float) -> Rectangle:
-        """Rectangle that contains one control step and the braking after it."""
-        x0, x1, y0, y1 = self.held(motion, ux, uy)
-        end_x, end_y = self.rest(self.step(motion, ux, uy))
-        return min(x0, end_x), max(x1, end_x), min(y0, end_y), max(y1, end_y)
-
-    def reachable(self, motion: PointMotion, limit: float) -> list[Rectangle]:
-        """The walls that some control of one step could bring closer than `limit`, m."""
-        # Positions grow with the control along each axis, so the two extreme controls bound all.
-        low = self.reached(motion, self.x_axis.low, self.y_axis.low)
-        high = self.reached(motion, self.x_axis.high, self.y_axis.high)
-        return closer((low[0], high[1], low[2], high[3]), self.walls, limit)
-
-    def clear(self, motion: PointMotion, ux: float, uy: float, distance: float) -> bool:
-        """Whether one control step and braking after it keep a distance >= 0 from every wall."""
-        if not closer(self.reached(motion, ux, uy), self.walls, distance):
-            return True
-        if not self.clip_known or closer(self.held(motion, ux, uy), self.walls, distance):
-            return False
-        return self.distance(self.step(motion, ux, uy), distance) >= distance
-
-    def distance(self, motion: PointMotion, enough: float = math.inf) -> float:
-        """Distance of the braking path from the nearest wall, m, at most `enough`."""
-        end_x, end_y = self.rest(motion)
-        around = _spanned(motion.x, motion.y, end_x, end_y)
-        best, wall = nearest(around, self.walls, enough)
-        if wall is None or not self.clip_known or not math.isfinite(end_x + end_y):
-            return best
-        # The path contains its ends. Where one of them is as close as the rectangle, the path is, too.
-        start = apart((motion.x, motion.x, motion.y, motion.y), wall)
-        ends = min(start, apart((end_x, end_x, end_y, end_y), wall))
-        if ends <= best:
-            return best
-        best, steps = min(ends, enough), self.path(motion)
-        for wall in closer(around, self.walls, max(best, 0.0)):
-            best = min(best, *(apart(step, wall) for step in steps))
-        return best
-
-    def path(self, motion: PointMotion) -> list[Rectangle]:
-        """Rectangles that contain braking: one per hold, and the rest point."""
-        across = self.x_axis.braking(motion.x, motion.vx)
-        along = self.y_axis.braking(motion.y, motion.vy)
-        points = zip_longest(across, along)  # one axis may be at rest before the other
-        places = [(across[-1] if x is None else x, along[-1] if y is None else y) for x, y in points]
-        return [_spanned(*start, *end) for start, end in pairwise([*places, places[-1]])]
+@compiled
+def clipped(among: PointAmongWalls, motion: PointMotion) -> PointMotion:
+    """The motion after the env's clip."""
+    vx, vy = along.clipped(among.x_axis, motion.vx), along.clipped(among.y_axis, motion.vy)
+    return PointMotion(motion.x, motion.y, vx, vy)
 
 
+@compiled
+def step(among: PointAmongWalls, motion: PointMotion, ux: float, uy: float) -> PointMotion:
+    """The motion after one control step; `motion` is already clipped."""
+    x, vx = along.step(among.x_axis, motion.x, motion.vx, ux)
+    y, vy = along.step(among.y_axis, motion.y, motion.vy, uy)
+    return PointMotion(x, y, vx, vy)
+
+
+@compiled
+def rest(among: PointAmongWalls, motion: PointMotion) -> Pair:
+    """Position at which braking comes to rest, m."""
+    return along.rest(among.x_axis, motion.x, motion.vx), along.rest(among.y_axis, motion.y, motion.vy)
+
+
+@compiled
+def brake(among: PointAmongWalls, motion: PointMotion) -> Pair:
+    """The control of the next hold of braking."""
+    return along.brake(among.x_axis, motion.vx), along.brake(among.y_axis, motion.vy)
+
+
+@compiled
 def _spanned(x: float, y: float, to_x: float, to_y: float) -> Rectangle:
     """Rectangle spanned by two points."""
     return min(x, to_x), max(x, to_x), min(y, to_y), max(y, to_y)
+
+
+@compiled
+def held(among: PointAmongWalls, motion: PointMotion, ux: float, uy: float) -> Rectangle:
+    """Rectangle that contains one control step; `motion` is already clipped."""
+    x0, x1 = along.extent(among.x_axis, motion.x, motion.vx, ux)
+    y0, y1 = along.extent(among.y_axis, motion.y, motion.vy, uy)
+    return x0, x1, y0, y1
+
+
+@compiled
+def stop(among: PointAmongWalls, motion: PointMotion) -> Rectangle:
+    """Rectangle that contains braking, from the present position to the rest point."""
+    end_x, end_y = rest(among, motion)
+    return _spanned(motion.x, motion.y, end_x, end_y)
+
+
+@compiled
+def reached(among: PointAmongWalls, motion: PointMotion, ux: float, uy: float) -> Rectangle:
+    """Rectangle that contains one control step and the braking after it."""
+    x0, x1, y0, y1 = held(among, motion, ux, uy)
+    end_x, end_y = rest(among, step(among, motion, ux, uy))
+    return min(x0, end_x), max(x1, end_x), min(y0, end_y), max(y1, end_y)
+
+
+@compiled
+def reachable(among: PointAmongWalls, motion: PointMotion) -> Rectangle:
+    """Rectangle that contains what any control of one step can reach."""
+    # Positions grow with the control along each axis, so the two extreme controls bound all.
+    x_axis, y_axis = among.x_axis, among.y_axis
+    low = reached(among, motion, x_axis.low, y_axis.low)
+    high = reached(among, motion, x_axis.high, y_axis.high)
+    return low[0], high[1], low[2], high[3]
+
+
+@compiled
+def path(among: PointAmongWalls, motion: PointMotion) -> Array:
+    """Rectangles that contain braking, shape (n, 4): one per hold, and the rest point."""
+    xs = along.braking(among.x_axis, motion.x, motion.vx)
+    ys = along.braking(among.y_axis, motion.y, motion.vy)
+    n, last_x, last_y = max(len(xs), len(ys)), len(xs) - 1, len(ys) - 1
+    found = np.empty((n, 4))
+    for i in range(n):  # one axis may be at rest before the other
+        x, to_x = xs[min(i, last_x)], xs[min(i + 1, last_x)]
+        y, to_y = ys[min(i, last_y)], ys[min(i + 1, last_y)]
+        found[i, 0], found[i, 1], found[i, 2], found[i, 3] = _spanned(x, y, to_x, to_y)
+    return found
+
+
+@compiled
+def distance(among: PointAmongWalls, motion: PointMotion, enough: float = math.inf) -> float:
+    """Distance of the braking path from the nearest wall, m, at most `enough`."""
+    end_x, end_y = rest(among, motion)
+    around = _spanned(motion.x, motion.y, end_x, end_y)
+    best, wall = nearest(around, among.walls, enough)
+    if wall < 0 or not among.clip_known or not math.isfinite(end_x + end_y):
+        return best
+    # The path contains its ends. Where one of them is as close as the rectangle, the path is, too.
+    close = one_of(among.walls, wall)
+    start = apart((motion.x, motion.x, motion.y, motion.y), close)
+    ends = min(start, apart((end_x, end_x, end_y, end_y), close))
+    if ends <= best:
+        return best
+    best, steps = min(ends, enough), path(among, motion)
+    limit, wall = max(best, 0.0), -1
+    while True:
+        wall = closer(around, among.walls, limit, wall + 1)
+        if wall < 0:
+            return best
+        for i in range(len(steps)):
+            best = min(best, apart(one_of(steps, i), one_of(among.walls, wall)))
+
+
+@compiled
+def clear(among: PointAmongWalls, motion: PointMotion, ux: float, uy: float, room: float) -> bool:
+    """Whether one control step and braking after it keep a distance `room` >= 0 from every wall."""
+    if closer(reached(among, motion, ux, uy), among.walls, room) < 0:
+        return True
+    if not among.clip_known or closer(held(among, motion, ux, uy), among.walls, room) >= 0:
+        return False
+    return distance(among, step(among, motion, ux, uy), room) >= room

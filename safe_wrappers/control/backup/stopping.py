@@ -5,12 +5,17 @@ after braking, `h = D - v^2 / (2 a_brake)` with approach speed v; state error, h
 inside it. `a_brake` is a *validated lower bound* on the deceleration and is not checked here.
 """
 
+import math
+from typing import Final
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from safe_wrappers.control.numerics.compiled import compiled
+
 Array = NDArray[np.float64]
 
-_RETREAT_RATE = 1.0
+_RETREAT_RATE: Final = 1.0
 """1/s: rate at which a violation is to shrink."""
 
 
@@ -25,15 +30,55 @@ def predicted_approach(
     return np.asarray(room - v * delay_s - 0.5 * a * delay_s**2), np.asarray(v + a * delay_s)
 
 
+@compiled
+def held_stop(speed: float, brake: float, control_dt: float) -> float:
+    """`held_stopping_distance` of one speed."""
+    loss = brake * control_dt
+    holds = (0.0 if speed <= 0.0 else speed) / loss
+    whole = float(np.floor(holds))
+    return loss * control_dt * (0.5 * (whole * whole) + (whole + 0.5) * (holds - whole))
+
+
+@compiled
+def held_limit(room: float, speed: float, brake: float, control_dt: float) -> float:
+    """`sampled_acceleration_limit` for one room, m, all reserves taken off, and one speed."""
+    # In units of the speed and the distance of one hold of full braking the condition on the end speed w is
+    # w / 2 + (chord of w^2 / 2) <= left, which at whole w = k reads k (k + 1) / 2 and has slope k + 1 above it.
+    left = (room - 0.5 * speed * control_dt) / (brake * (control_dt * control_dt))
+    if left >= 0.0:
+        whole = float(np.floor(0.5 * (math.sqrt(1.0 + 8.0 * left) - 1.0)))
+        end = (whole + (left - 0.5 * whole * (whole + 1.0)) / (whole + 1.0)) * brake * control_dt
+        return (end - speed) / control_dt
+    # Otherwise the motion must reverse inside the hold, before the room ends if there is some.
+    if room > 0.0:
+        approach = 0.0 if speed <= 0.0 else speed
+        return min(-(approach * approach) / (2.0 * room), -speed / control_dt)
+    return (_RETREAT_RATE * room - speed) / control_dt
+
+
+@compiled
+def _stops(speeds: Array, brake: float, control_dt: float) -> Array:
+    found = np.empty(len(speeds))
+    for i in range(len(speeds)):
+        found[i] = held_stop(speeds[i], brake, control_dt)
+    return found
+
+
+@compiled
+def _limits(rooms: Array, speeds: Array, brake: float, control_dt: float) -> Array:
+    found = np.empty(len(rooms))
+    for i in range(len(rooms)):
+        found[i] = held_limit(rooms[i], speeds[i], brake, control_dt)
+    return found
+
+
 def held_stopping_distance(speed: ArrayLike, brake: float, control_dt: float) -> Array:
     """The shortest stopping distance, m, if every deceleration (m/s^2) is held for a whole interval.
 
     The chord of `v^2 / (2 a_brake)` between whole multiples of the speed (m/s) that one hold removes.
     """
-    loss = brake * control_dt
-    holds = np.maximum(np.asarray(speed, dtype=np.float64), 0.0) / loss
-    whole = np.floor(holds)
-    return np.asarray(loss * control_dt * (0.5 * whole**2 + (whole + 0.5) * (holds - whole)))
+    speeds = np.asarray(speed, dtype=np.float64)
+    return _stops(speeds.ravel(), float(brake), float(control_dt)).reshape(speeds.shape)
 
 
 def sampled_acceleration_limit(
@@ -64,19 +109,9 @@ def sampled_acceleration_limit(
         margin: Fixed protective distance, in m.
     """
     room0, v = predicted_approach(clearance, speed, delay_s, pending)
-    room = room0 - state_error - margin
-    # In units of the speed and the distance of one hold of full braking the condition on the end speed w is
-    # w / 2 + (chord of w^2 / 2) <= left, which at whole w = k reads k (k + 1) / 2 and has slope k + 1 above it.
-    left = (room - 0.5 * v * control_dt) / (brake * control_dt**2)
-    whole = np.floor(0.5 * (np.sqrt(1.0 + 8.0 * np.maximum(left, 0.0)) - 1.0))
-    end = (whole + (left - 0.5 * whole * (whole + 1.0)) / (whole + 1.0)) * brake * control_dt
-    # Otherwise the motion must reverse inside the hold, before the room ends if there is some.
-    approach = np.maximum(v, 0.0)
-    with np.errstate(divide="ignore", over="ignore"):
-        halting = -(approach**2) / (2.0 * np.where(room > 0.0, room, np.inf))
-    retreat = (_RETREAT_RATE * np.minimum(room, 0.0) - v) / control_dt
-    late = np.where(room > 0.0, np.minimum(halting, -v / control_dt), retreat)
-    return np.asarray(np.where(left >= 0.0, (end - v) / control_dt, late))
+    rooms, speeds = np.broadcast_arrays(room0 - state_error - margin, v)
+    found = _limits(rooms.flatten(), speeds.flatten(), float(brake), float(control_dt))
+    return found.reshape(rooms.shape)
 
 
 def sampled_inset(

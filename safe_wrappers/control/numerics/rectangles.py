@@ -1,56 +1,68 @@
 """Axis-aligned rectangles in the plane: distances, and merging of adjacent ones.
 
 The signed distance is Euclidean outside and, where two rectangles overlap, minus the shortest translation along an
-axis that separates them. Plain floats: at this size they are faster than arrays.
+axis that separates them.
 """
 
-import math
 from collections.abc import Iterable
+from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
+from safe_wrappers.control.numerics.compiled import compiled, hypot
+
+Array = NDArray[np.float64]
 Rectangle = tuple[float, float, float, float]
 """x from, x to, y from, y to, m."""
 
-_TOUCHING = 1e-9
+_TOUCHING: Final = 1e-9
 """m; edges closer than this are one edge."""
 
 
+@compiled
 def gaps(a: Rectangle, b: Rectangle) -> tuple[float, float]:
     """Signed gap along x and along y, m; negative where the rectangles overlap along that axis."""
     return max(a[0] - b[1], b[0] - a[1]), max(a[2] - b[3], b[2] - a[3])
 
 
+@compiled
 def apart(a: Rectangle, b: Rectangle) -> float:
     """Signed distance of two rectangles, m."""
     across, along = gaps(a, b)
-    return math.hypot(across, along) if across > 0.0 and along > 0.0 else max(across, along)
+    return hypot(across, along) if across > 0.0 and along > 0.0 else max(across, along)
 
 
-def closer(around: Rectangle, among: Iterable[Rectangle], limit: float) -> list[Rectangle]:
-    """The rectangles that are closer than `limit` >= 0, m."""
+@compiled
+def one_of(rectangles: Array, i: int) -> Rectangle:
+    """A rectangle of several, shape (n, 4)."""
+    return rectangles[i, 0], rectangles[i, 1], rectangles[i, 2], rectangles[i, 3]
+
+
+@compiled
+def closer(around: Rectangle, among: Array, limit: float, first: int = 0) -> int:
+    """The first of several, shape (n, 4), from an index on, that is closer than `limit` >= 0, m; -1: none is."""
     wide = limit + _TOUCHING  # sums and differences are rounded, and `apart` decides
     x0, x1, y0, y1 = around[0] - wide, around[1] + wide, around[2] - wide, around[3] + wide
-    found = [r for r in among if r[0] < x1 and r[1] > x0 and r[2] < y1 and r[3] > y0]
-    # Near a corner the Euclidean distance may be larger than along either axis.
-    return [r for r in found if apart(around, r) < limit] if found else found
+    for i in range(first, len(among)):
+        close = among[i, 0] < x1 and among[i, 1] > x0 and among[i, 2] < y1 and among[i, 3] > y0
+        # Near a corner the Euclidean distance may be larger than along either axis.
+        if close and apart(around, one_of(among, i)) < limit:
+            return i
+    return -1
 
 
-def nearest(around: Rectangle, among: Iterable[Rectangle], limit: float) -> tuple[float, Rectangle | None]:
-    """The smallest distance below `limit` and the rectangle it belongs to, or the limit and None."""
-    best, found = limit, None
-    x0, x1, y0, y1 = around
-    for r in among:
-        a, b = r[0] - x1, x0 - r[1]
-        across = a if a > b else b
-        if across >= best:
+@compiled
+def nearest(around: Rectangle, among: Array, limit: float) -> tuple[float, int]:
+    """The smallest distance below `limit` and the rectangle it belongs to, or the limit and -1."""
+    best, found = limit, -1
+    for i in range(len(among)):
+        across, along = gaps(around, one_of(among, i))
+        if across >= best or along >= best:
             continue
-        a, b = r[2] - y1, y0 - r[3]
-        along = a if a > b else b
-        if along >= best:
-            continue
-        outside = across > 0.0 and along > 0.0
-        distance = math.hypot(across, along) if outside else max(across, along)
+        distance = apart(around, one_of(among, i))
         if distance < best:
-            best, found = distance, r
+            best, found = distance, i
     return best, found
 
 

@@ -5,7 +5,7 @@ the clamp more control changes nothing, so it becomes a bound on the control.
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.errors import UnsupportedEnvError
-from safe_wrappers.plants.mujoco.model import control_range, inertia
+from safe_wrappers.plants.mujoco.model import control_range
 
 _JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _AFFINE_GAIN, _AFFINE_BIAS = int(mujoco.mjtGain.mjGAIN_AFFINE), int(mujoco.mjtBias.mjBIAS_AFFINE)
@@ -54,53 +54,145 @@ def _refuse(actuator: str, what: str, handled: str) -> None:
     )
 
 
+class Actuators(NamedTuple):
+    """MuJoCo's arrays that describe the actuators of a model, or of n models, one beside the other."""
+
+    gain_type: NDArray[Any]
+    gain: Array
+    bias_type: NDArray[Any]
+    bias: Array
+    force_limited: NDArray[Any]
+    force_range: Array
+    control_limited: NDArray[Any]
+    control_range: Array
+    gear: Array
+    acceleration: Array
+
+    @staticmethod
+    def of(m: mujoco.MjModel) -> "Actuators":
+        """The model's own arrays."""
+        kinds = m.actuator_gaintype, m.actuator_gainprm, m.actuator_biastype, m.actuator_biasprm
+        limits = m.actuator_forcelimited, m.actuator_forcerange, m.actuator_ctrllimited, m.actuator_ctrlrange
+        return Actuators(*kinds, *limits, m.actuator_gear, m.actuator_acc0)
+
+
 @compiled
 def _acting_range(
-    gain_type: NDArray[Any],
-    gain: Array,
-    bias_type: NDArray[Any],
-    bias: Array,
-    force_limited: NDArray[Any],
-    force_range: Array,
-    control_limited: NDArray[Any],
-    control_range: Array,
-    gear: Array,
-    acceleration: Array,
-    length: Array,
-    velocity: Array,
-    control_dt: float,
-    least: Array,
-    most: Array,
+    act: Actuators, length: Array, velocity: Array, control_dt: float, least: Array, most: Array
 ) -> None:
-    """Writes `AffineActuators.acting_range` into `least` and `most`; the arrays are MuJoCo's of the actuators."""
+    """Writes `AffineActuators.acting_range` into `least` and `most`."""
     for i in range(len(least)):
         low, high = -math.inf, math.inf
-        if control_limited[i]:
-            low, high = control_range[i, 0], control_range[i, 1]
-        scale, offset = gain[i, 0], 0.0
-        if gain_type[i] == _AFFINE_GAIN:
-            scale += gain[i, 1] * length[i] + gain[i, 2] * velocity[i]
-        if bias_type[i] == _AFFINE_BIAS:
-            offset = bias[i, 0] + bias[i, 1] * length[i] + bias[i, 2] * velocity[i]
+        if act.control_limited[i]:
+            low, high = act.control_range[i, 0], act.control_range[i, 1]
+        scale, offset = act.gain[i, 0], 0.0
+        if act.gain_type[i] == _AFFINE_GAIN:
+            scale += act.gain[i, 1] * length[i] + act.gain[i, 2] * velocity[i]
+        if act.bias_type[i] == _AFFINE_BIAS:
+            offset = act.bias[i, 0] + act.bias[i, 1] * length[i] + act.bias[i, 2] * velocity[i]
         least[i], most[i] = low, high
-        if force_limited[i] and scale != 0.0:
-            ends = (force_range[i, 0] - offset) / scale, (force_range[i, 1] - offset) / scale
-            feedback = abs(bias[i, 2]) if bias_type[i] == _AFFINE_BIAS else 0.0
-            strongest = max(abs(force_range[i, 0]), abs(force_range[i, 1]))
+        if act.force_limited[i] and scale != 0.0:
+            ends = (act.force_range[i, 0] - offset) / scale, (act.force_range[i, 1] - offset) / scale
+            feedback = abs(act.bias[i, 2]) if act.bias_type[i] == _AFFINE_BIAS else 0.0
+            strongest = max(abs(act.force_range[i, 0]), abs(act.force_range[i, 1]))
             lever = 0.0
-            for j in range(gear.shape[1]):
-                lever = max(lever, abs(gear[i, j]))
-            widen = feedback * (lever * acceleration[i] * strongest * control_dt) / abs(scale)
+            for j in range(act.gear.shape[1]):
+                lever = max(lever, abs(act.gear[i, j]))
+            widen = feedback * (lever * act.acceleration[i] * strongest * control_dt) / abs(scale)
             least[i] = min(max(min(ends[0], ends[1]) - widen, low), high)
             most[i] = min(max(max(ends[0], ends[1]) + widen, low), high)
 
 
+@compiled
+def acting_ranges(
+    every: Actuators,
+    lengths: Array,
+    velocities: Array,
+    control_dt: float,
+    chosen: NDArray[np.int64],
+    bounds: Array,
+) -> None:
+    """`AffineActuators.acting_range` for the `chosen` of n machines, shape (r,), into `bounds`, shape (r, 2, nu)."""
+    for r in range(len(chosen)):
+        i = chosen[r]
+        one = Actuators(
+            every.gain_type[i],
+            every.gain[i],
+            every.bias_type[i],
+            every.bias[i],
+            every.force_limited[i],
+            every.force_range[i],
+            every.control_limited[i],
+            every.control_range[i],
+            every.gear[i],
+            every.acceleration[i],
+        )
+        _acting_range(one, lengths[i], velocities[i], control_dt, bounds[r, 0], bounds[r, 1])
+
+
+@compiled
+def _respond(
+    act: Actuators,
+    length: Array,
+    velocity: Array,
+    control: Array,
+    qacc: Array,
+    moment: Array,
+    counts: NDArray[Any],
+    starts: NDArray[Any],
+    columns: NDArray[Any],
+    mobility: Array,
+    state: NDArray[Any],
+    jacobian: Array,
+    stiffness: Array,
+) -> tuple[Array, Array]:
+    """`drift` and `effect` of `qacc = drift + effect @ u`; `mobility`, the inverse of the inertia, is overwritten.
+
+    The arrays are MuJoCo's of the actuators, of their sparse moment, and of the constraints, whose Jacobian is dense.
+    """
+    n, controls = len(qacc), len(control)
+    least, most, moved = np.empty(controls), np.empty(controls), np.empty(n)
+    _acting_range(act, length, velocity, 0.0, least, most)
+    # inv(M + J' D J), one active row after another.
+    for row in range(len(state)):
+        if state[row] != _QUADRATIC:
+            continue
+        give = 1.0 / stiffness[row]
+        for i in range(n):
+            moved[i] = 0.0
+            for j in range(n):
+                moved[i] += mobility[i, j] * jacobian[row, j]
+            give += jacobian[row, i] * moved[i]
+        for i in range(n):
+            for j in range(n):
+                mobility[i, j] -= moved[i] * moved[j] / give
+    drift, effect = qacc.copy(), np.zeros((n, controls))
+    for k in range(controls):
+        if most[k] <= least[k]:
+            continue
+        scale, acting = act.gain[k, 0], min(max(control[k], least[k]), most[k])
+        if act.gain_type[k] == _AFFINE_GAIN:
+            scale += act.gain[k, 1] * length[k] + act.gain[k, 2] * velocity[k]
+        for place in range(starts[k], starts[k] + counts[k]):
+            j = columns[place]
+            for i in range(n):
+                effect[i, k] += mobility[i, j] * (moment[place] * scale)
+        for i in range(n):
+            drift[i] -= effect[i, k] * acting
+    return drift, effect
+
+
 class AffineActuators:
-    """Gain, bias and acting control range of every actuator of a model, whose arrays are read at every call."""
+    """Gain, bias and acting control range of every actuator of a model, whose arrays are read at every call.
+
+    Attributes:
+        constants: MuJoCo's arrays that describe the actuators.
+    """
 
     def __init__(self, model: mujoco.MjModel) -> None:
         _refuse_unsupported(model)
-        self._model = model
+        self._model = m = model
+        self.constants = Actuators.of(m)
         self._moment = np.zeros((model.nu, model.nv))
         self._on_joints: tuple[Array, Array, Array] | None = None
         self._joints_suffice = False
@@ -115,8 +207,7 @@ class AffineActuators:
 
     def moment(self, data: mujoco.MjData) -> Array:
         """Generalised force per unit actuator force, shape (nu, nv)."""
-        places = data.moment_rownnz, data.moment_rowadr, data.moment_colind.reshape(-1)
-        mujoco.mju_sparse2dense(self._moment, data.actuator_moment.reshape(-1), *places)
+        mujoco.mju_sparse2dense(self._moment, *moment_of(data))
         return self._moment
 
     def acting_range(self, length: Array, velocity: Array, control_dt: float = 0.0) -> tuple[Array, Array]:
@@ -130,10 +221,7 @@ class AffineActuators:
         if not m.actuator_forcelimited.any():
             return control_range(m)
         least, most = np.empty(m.nu), np.empty(m.nu)
-        gain, bias = (m.actuator_gaintype, m.actuator_gainprm), (m.actuator_biastype, m.actuator_biasprm)
-        clamp = m.actuator_forcelimited, m.actuator_forcerange, m.actuator_ctrllimited, m.actuator_ctrlrange
-        response = m.actuator_gear, m.actuator_acc0
-        _acting_range(*gain, *bias, *clamp, *response, length, velocity, control_dt, least, most)
+        _acting_range(self.constants, length, velocity, control_dt, least, most)
         return least, most
 
     def motion_without_kinematics(self, qpos: Array, qvel: Array) -> tuple[Array, Array] | None:
@@ -154,33 +242,64 @@ class AffineActuators:
         return gear * qpos[q], gear * qvel[v]
 
 
-def drift_and_effect(
-    model: mujoco.MjModel, data: mujoco.MjData, actuators: AffineActuators
-) -> tuple[Array, Array]:
-    """`qacc = drift + effect @ u`, shapes (nv,) and (nv, nu), at the present set of active contacts and limits.
+def moment_of(data: mujoco.MjData) -> tuple[Array, NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Generalised force per unit actuator force, sparse: values, and counts, starts and columns of the rows."""
+    places = data.moment_rownnz, data.moment_rowadr, data.moment_colind.reshape(-1)
+    return data.actuator_moment.reshape(-1), *places
 
-    The data must be up to date. Exact for pyramidal friction cones.
+
+class Response:
+    """How a machine's joints respond to its controls, at what `data` holds.
+
+    Args:
+        model: Its arrays are read at every call.
+        data: Likewise.
+        actuators: Of the model.
     """
-    gain, _ = actuators.gain_and_bias(data.actuator_length, data.actuator_velocity)
-    least, most = actuators.acting_range(data.actuator_length, data.actuator_velocity)
-    saturated = most <= least
-    effect = _solve_inertia(model, data, actuators.moment(data) * gain[:, None]).T
-    effect = np.where(saturated, 0.0, effect)
-    return data.qacc - effect @ np.where(saturated, 0.0, np.clip(data.ctrl, least, most)), effect
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, actuators: AffineActuators) -> None:
+        self._model, self._data = model, data
+        motion = data.actuator_length, data.actuator_velocity, data.ctrl, data.qacc
+        self._actuation = actuators.constants, *motion, *moment_of(data)
+        self._units, self._mobility = np.eye(model.nv), np.empty((model.nv, model.nv))
+        self._free = np.zeros(0, np.int32), np.zeros((0, model.nv)), np.zeros(0)
+
+    def drift_and_effect(self) -> tuple[Array, Array]:
+        """`qacc = drift + effect @ u`, shapes (nv,) and (nv, nu), at the present set of active contacts and limits.
+
+        The data must be up to date. Exact for pyramidal friction cones.
+        """
+        m, d = self._model, self._data
+        mujoco.mj_solveM(m, d, self._mobility, self._units)
+        constraints, count = self._free, d.nefc
+        if count:
+            if mujoco.mj_isSparse(m):
+                jacobian = np.zeros((count, m.nv))
+                mujoco.mju_sparse2dense(jacobian, d.efc_J, d.efc_J_rownnz, d.efc_J_rowadr, d.efc_J_colind)
+            else:
+                jacobian = d.efc_J.reshape(count, m.nv)
+            constraints = d.efc_state, jacobian, d.efc_D
+        return _respond(*self._actuation, self._mobility, *constraints)
 
 
-def _solve_inertia(m: mujoco.MjModel, d: mujoco.MjData, rows: Array) -> Array:
-    """`rows @ inv(M + J_a' D_a J_a)`: accelerations per generalised force with the active constraints."""
-    out = np.zeros_like(rows)
-    active = d.efc_state == _QUADRATIC if d.nefc else np.zeros(0, bool)
-    if not active.any():
-        mujoco.mj_solveM(m, d, out, np.ascontiguousarray(rows))
-        return out
-    if mujoco.mj_isSparse(m):
-        jacobian = np.zeros((d.nefc, m.nv))
-        mujoco.mju_sparse2dense(jacobian, d.efc_J, d.efc_J_rownnz, d.efc_J_rowadr, d.efc_J_colind)
-    else:
-        jacobian = d.efc_J.reshape(d.nefc, m.nv)
-    jacobian = jacobian[active]
-    stiff = inertia(m, d) + jacobian.T @ (d.efc_D[active][:, None] * jacobian)
-    return np.asarray(np.linalg.solve(stiff, rows.T).T)
+@compiled
+def point_motion(
+    jacobian: Array, rate: Array, qvel: Array, drift: Array, effect: Array
+) -> tuple[Array, Array, Array]:
+    """Velocity (3,), m/s, and acceleration `a0 + A @ u`, shapes (3,) and (3, nu), m/s^2, of a point of a machine.
+
+    Args:
+        jacobian: Of the point's position, shape (3, nv).
+        rate: Its time derivative, likewise.
+        qvel: Shape (nv,).
+        drift: `qacc = drift + effect @ u`, shape (nv,).
+        effect: Likewise, shape (nv, nu).
+    """
+    v, a0, a = np.zeros(3), np.zeros(3), np.zeros((3, effect.shape[1]))
+    for i in range(3):
+        for j in range(len(qvel)):
+            v[i] += jacobian[i, j] * qvel[j]
+            a0[i] += jacobian[i, j] * drift[j] + rate[i, j] * qvel[j]
+            for k in range(effect.shape[1]):
+                a[i, k] += jacobian[i, j] * effect[j, k]
+    return v, a0, a

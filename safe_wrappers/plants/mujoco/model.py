@@ -61,9 +61,9 @@ def kinematics(model: mujoco.MjModel, data: mujoco.MjData, own: mujoco.MjData) -
 
 def inertia(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
     """Joint-space inertia with armature, shape (nv, nv), kg or kg m^2."""
-    matrix = np.empty((model.nv, model.nv))
-    for row, unit in zip(matrix, np.eye(model.nv), strict=True):
-        mujoco.mj_mulM(model, data, row, unit)
+    matrix, units = np.empty((model.nv, model.nv)), np.eye(model.nv)
+    for i in range(model.nv):
+        mujoco.mj_mulM(model, data, matrix[i], units[i])
     return matrix
 
 

@@ -11,7 +11,7 @@ from safe_wrappers.checks import Array, non_negative
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants import env_checks
 from safe_wrappers.plants.mujoco import model as of_model
-from safe_wrappers.plants.mujoco.actuators import AffineActuators, drift_and_effect
+from safe_wrappers.plants.mujoco.actuators import AffineActuators, Response, point_motion
 from safe_wrappers.plants.mujoco.binding import check_action_space, control_interval, own_model, physics_steps
 from safe_wrappers.plants.mujoco.contacts import ContactForecast, ContactReader
 from safe_wrappers.plants.mujoco.forecast import Forecast, Poses, Recorder
@@ -62,13 +62,17 @@ class MujocoPlant(Plant):
         self._raw, self._env = raw, env
         self.data = mujoco.MjData(self.model)
         self.actuators = AffineActuators(self.model)
+        self._response = Response(self.model, self.data, self.actuators)
         self._clamped = bool(self.model.actuator_forcelimited.any())
         self.lower, self.upper = of_model.control_range(self.model)
         env_checks.refuse_changed_actions(env)
         self._check_action_space(env)
+        self._idle = np.clip(0.0, self.lower, self.upper)
         self.substeps = physics_steps(raw)
         self.control_dt = env_checks.check_timing(env, control_interval(raw))
         self._nq, self._nv = int(self.model.nq), int(self.model.nv)
+        self._jacobian, self._jacobian_rate = np.zeros((2, 3, self._nv))
+        self._frames: dict[tuple[str, str], tuple[int, Array]] = {}
         self._delay_steps = int(np.ceil(self.delay_s / self.model.opt.timestep - 1e-9))
         self._pending = deque(maxlen=max(1, -(-self._delay_steps // self.substeps)))
         self._snapshot = np.zeros(mujoco.mj_stateSize(self.model, _STATE))
@@ -116,6 +120,7 @@ class MujocoPlant(Plant):
     def _forget(self) -> None:
         """Called when the state or the model has changed."""
         self._loaded = self._forwarded = False
+        self._affine: tuple[Array, Array] | None = None
         self._recorder.forget()
         self._forecasts: dict[tuple[bytes, bool], Forecast] = {}
         self._contact_forecasts: dict[bytes, ContactForecast] = {}
@@ -195,9 +200,8 @@ class MujocoPlant(Plant):
 
     def _linearise(self) -> None:
         """`forward` at the control nearest to zero, about which contact forces are linearised."""
-        self.data.ctrl[:] = np.clip(0.0, self.lower, self.upper)
+        self.data.ctrl[:] = self._idle
         mujoco.mj_forward(self.model, self.data)
-        self._drift, self._effect = drift_and_effect(self.model, self.data, self.actuators)
 
     @property
     def f(self) -> Array:
@@ -214,8 +218,10 @@ class MujocoPlant(Plant):
     @property
     def acceleration(self) -> tuple[Array, Array]:
         """`qacc = drift + effect @ u`: shapes (nv,) and (nv, nu)."""
-        self.forward()
-        return self._drift, self._effect
+        if self._affine is None:
+            self.forward()
+            self._affine = self._response.drift_and_effect()
+        return self._affine
 
     @property
     def acting_range(self) -> tuple[Array, Array]:
@@ -312,22 +318,26 @@ class MujocoPlant(Plant):
         m, d = self.model, self.pose()
         if not self._forwarded:
             mujoco.mj_comPos(m, d)  # for the Jacobian
-        body, p = of_model.frame(m, d, kind, name)
-        jac = np.zeros((3, m.nv))
-        mujoco.mj_jac(m, d, jac, None, p, body)
-        return p.copy(), jac @ self.qvel
+        body, p = self.frame(kind, name)
+        mujoco.mj_jac(m, d, self._jacobian, None, p, body)
+        return p.copy(), self._jacobian @ self.qvel
 
     def point(self, kind: str, name: str) -> tuple[Array, Array, Array, Array]:
         """Position p, m, and velocity v, m/s, of a named "body", "site" or "geom", and its acceleration, m/s^2.
 
         The last is `a0 + A @ u`: p, v and a0 of shape (3,), A of shape (3, nu).
         """
-        m, d, (drift, effect) = self.model, self.data, self.acceleration
-        body, p = of_model.frame(m, d, kind, name)
-        jac, jac_dot = np.zeros((3, m.nv)), np.zeros((3, m.nv))
-        mujoco.mj_jac(m, d, jac, None, p, body)
-        mujoco.mj_jacDot(m, d, jac_dot, None, p, body)
-        return p.copy(), jac @ self.qvel, jac @ drift + jac_dot @ self.qvel, jac @ effect
+        m, d, response = self.model, self.forward(), self.acceleration
+        body, p = self.frame(kind, name)
+        mujoco.mj_jac(m, d, self._jacobian, None, p, body)
+        mujoco.mj_jacDot(m, d, self._jacobian_rate, None, p, body)
+        return p.copy(), *point_motion(self._jacobian, self._jacobian_rate, self.qvel, *response)
+
+    def frame(self, kind: str, name: str) -> tuple[int, Array]:
+        """The body that carries a named frame, and a view of the frame's origin, shape (3,), m."""
+        if (kind, name) not in self._frames:
+            self._frames[kind, name] = of_model.frame(self.model, self.data, kind, name)
+        return self._frames[kind, name]
 
     def named(self, kind: str, name: str) -> int:
         """The id of a body, site, geom, joint or actuator; for an unknown name an error that lists all."""

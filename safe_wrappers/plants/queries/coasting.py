@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array
+from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
@@ -128,6 +129,15 @@ def _addresses(m: mujoco.MjModel, plant: MujocoPlant, joint: int, kind: str) -> 
 
 
 def _course(poses: Array, rests: bool) -> Course:
-    w, x, y, z = poses[:, 3:].T
-    ahead = np.stack([1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)], axis=1)
-    return Course(poses[:, :2], ahead / np.sqrt((ahead**2).sum(axis=1))[:, None], rests)
+    ahead = np.empty((len(poses), 2))
+    _headings(poses, ahead)
+    return Course(poses[:, :2], ahead, rests)
+
+
+@compiled
+def _headings(poses: Array, ahead: Array) -> None:
+    for i in range(len(poses)):
+        w, x, y, z = poses[i, 3], poses[i, 4], poses[i, 5], poses[i, 6]
+        to_x, to_y = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)
+        length = math.sqrt(to_x * to_x + to_y * to_y)
+        ahead[i, 0], ahead[i, 1] = to_x / length, to_y / length

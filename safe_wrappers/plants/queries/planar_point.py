@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from safe_wrappers.checks import Array
-from safe_wrappers.control.backup.damped_axis import DampedAxis
+from safe_wrappers.control.backup.damped_axis import DampedAxis, damped_axis
 from safe_wrappers.control.numerics.rectangles import Rectangle, merged
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
@@ -137,7 +137,7 @@ def _measured(
                 f"springs, gravity or friction along them; Euler integrator); one step is {wrong:.2g} off that"
             )
     x_axis, y_axis = (
-        DampedAxis(float(decay[i]), float(gain[i]), h, plant.substeps, float(low[i]), float(high[i]), clip)
+        damped_axis(float(decay[i]), float(gain[i]), h, plant.substeps, float(low[i]), float(high[i]), clip)
         for i in range(2)
     )
     return x_axis, y_axis

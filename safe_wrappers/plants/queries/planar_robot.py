@@ -5,7 +5,8 @@ import math
 import mujoco
 import numpy as np
 
-from safe_wrappers.control.backup.heading_drive import HeadingDrive, Motion
+from safe_wrappers.checks import Array
+from safe_wrappers.control.backup.heading_drive import HeadingDrive
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
@@ -15,7 +16,14 @@ _AT_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARE
 
 
 class PlanarFrame:
-    """A body that slides along x and y and turns about z, driven along its heading and about its hinge."""
+    """A body that slides along x and y and turns about z, driven along its heading and about its hinge.
+
+    Attributes:
+        joints: Indices of the two slides and of the hinge.
+        place: Indices of the first slide in qpos and qvel, and where the body is at qpos = 0, x and y, m.
+        drive_index: Of the actuator along the heading.
+        turn_index: Of the one on the hinge.
+    """
 
     def __init__(self, plant: MujocoPlant, body: str) -> None:
         m = plant.model
@@ -37,8 +45,8 @@ class PlanarFrame:
                 "other machines."
             )
         self.joints = joints
-        self._q, self._v = int(m.jnt_qposadr[joints[0]]), int(m.jnt_dofadr[joints[0]])
-        self._origin = m.body_pos[b][:2].tolist()
+        first = m.jnt_qposadr[joints[0]], m.jnt_dofadr[joints[0]]
+        self.place = np.array([*first, *m.body_pos[b][:2]], dtype=np.float64)
         if m.nu != 2:
             raise UnsupportedEnvError(
                 f"expected 2 actuators, a drive and a turning one; the model has {m.nu}"
@@ -58,11 +66,10 @@ class PlanarFrame:
             raise UnsupportedEnvError(f"body {body!r} {wanted}")
         self.drive_index, self.turn_index = pushing[0], turning[0]
 
-    def motion(self, plant: MujocoPlant) -> Motion:
-        """Position, heading and velocities in the world."""
-        x, y, heading = plant.qpos[self._q : self._q + 3].tolist()
-        vx, vy, turning = plant.qvel[self._v : self._v + 3].tolist()
-        return Motion(x + self._origin[0], y + self._origin[1], heading, vx, vy, turning)
+    def views(self, data: mujoco.MjData) -> tuple[Array, Array]:
+        """Positions and velocities of the joints, without the body's place: parts of the data's arrays, (3,)."""
+        q, v = int(self.place[0]), int(self.place[1])
+        return data.qpos[q : q + 3], data.qvel[v : v + 3]
 
 
 def heading_drive(plant: MujocoPlant, body: str, uncertainty: float = 0.0) -> HeadingDrive:
