@@ -59,14 +59,9 @@ check: lint test
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
 	@touch $@
 
+# One table, six minutes: beside bare envs, other packages, and the version before.
 bench: .venv/bench
-	$(BIN)/python -m benchmarks.projection
-	$(BIN)/python -m benchmarks.filter_call
-	$(BIN)/python -m benchmarks.env_step
-	$(BIN)/python -m benchmarks.env_task_step
-	$(BIN)/python -m benchmarks.wrapper_cost
-	$(BIN)/python -m benchmarks.occlusion_cost
-	$(BIN)/python -m benchmarks.training_time
+	$(BIN)/python -m benchmarks.bench
 
 # Every long figure of the README and docs/results: about six hours on two cores.
 figures: .venv/installed
@@ -91,6 +86,10 @@ figures: .venv/installed
 	$(BIN)/python -m benchmarks.friction_cones
 	$(BIN)/python -m benchmarks.whole_body
 	$(BIN)/python -m benchmarks.teleop
+	$(BIN)/python -m benchmarks.scaling
+	$(BIN)/python -m benchmarks.wrapper_cost
+	$(BIN)/python -m benchmarks.occlusion_cost
+	$(BIN)/python -m benchmarks.training_time
 
 .venv/docs: .venv/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'

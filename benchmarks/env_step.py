@@ -1,16 +1,14 @@
 """What the filter adds to an env step: beside each filtered env runs one without that makes the same steps.
 
-    python -m benchmarks.env_step
-
-Inactive: the filter admits the action (a slow driver). Active: it projects it (a driver that goes for the limit;
-steps of the fallback are left out). The ratio is the median over steps of the time with the filter over the time
-without. Runners that act at random are slower than their published limits, so for them the limit of the active
-rows is lower; the filter's work is the same.
+`bench` makes the rows of its table of these. Inactive: the filter admits the action (a slow driver). Active: it
+projects it (a driver that goes for the limit; steps of the fallback are left out). The ratio is the median over steps
+of the time with the filter over the time without. Runners that act at random are slower than their published limits,
+so for them the limit of the active rows is lower; the filter's work is the same.
 """
 
 import dataclasses
+import math
 import time
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +17,7 @@ import gymnasium as gym
 import numpy as np
 
 import safe_wrappers as sw
-from benchmarks import mujoco_drivers
+from benchmarks import car_drivers, mujoco_drivers
 from benchmarks.cases import PROTECTED
 from benchmarks.drivers import DRIVERS, Driver
 from benchmarks.mujoco_drivers import Maker
@@ -29,9 +27,20 @@ Filter = Callable[[gym.Env[Any, Any]], sw.CBFActionFilter]
 
 @dataclass(frozen=True)
 class Figures:
-    """Medians over the steps that were looked for, and how many of all there were of them."""
+    """Medians over the steps that were looked for.
+
+    Attributes:
+        share: Of all steps, those that were looked for.
+        infeasible: Of all steps, those without an admissible action.
+        correction: Mean length of what was changed, in units of the action; NaN if nothing was.
+        without_us: Of the env's step alone.
+        with_us: Of the step with the filter.
+        ratio: Median of the steps' ratios.
+    """
 
     share: float
+    infeasible: float
+    correction: float
     without_us: float
     with_us: float
     ratio: float
@@ -56,12 +65,16 @@ def slower(limit: float) -> Filter:
 ACTIVE: dict[str, tuple[Maker, Filter]] = {
     "SafePointGoal1-v0": (DRIVERS["hazard-seeking"], sw.protect),
     "SafePointGoal2-v0": (DRIVERS["hazard-seeking"], sw.protect),
+    "SafeCarGoal1-v0": (car_drivers.DRIVERS["full throttle"], sw.protect),
     "InvertedPendulum-v5, on after the fall": (mujoco_drivers.end_seeking, sw.protect),
     "Reacher-v5": (mujoco_drivers.speed_seeking, sw.protect),
     "SafeHalfCheetahVelocity-v0": (mujoco_drivers.pulse, slower(0.3)),
     "SafeAntVelocity-v0": (mujoco_drivers.pulse, slower(0.3)),
+    "SafeHopperVelocity-v0": (mujoco_drivers.pulse, slower(0.2)),
+    "SafeSwimmerVelocity-v0": (mujoco_drivers.pulse, slower(0.05)),
     "SafeHumanoidVelocity-v0": (mujoco_drivers.pulse, slower(0.2)),
     "PointMaze_UMaze-v3": (mujoco_drivers.wall_seeking, sw.protect),
+    "FetchReach-v4": (PROTECTED["FetchReach-v4"].drivers["corner-seeking"], sw.protect),
 }
 
 
@@ -79,7 +92,7 @@ def measure(name: str, driver: Maker, protect: Filter, active: bool, steps: int 
     env, bare = protect(case.make()), case.make()
     act = driver(env.unwrapped, np.random.default_rng(0))
     kind: Any = env.action_space.dtype
-    times, over, seed = [], True, 0
+    times, corrections, infeasible, over, seed = [], [], 0, True, 0
     for _ in range(steps):
         if over:
             seed += 1
@@ -94,29 +107,16 @@ def measure(name: str, driver: Maker, protect: Filter, active: bool, steps: int 
         bare.step(executed)
         end = time.perf_counter()
         over = truncated or (terminated and not case.past_termination)
+        infeasible += info["cbf/infeasible"]
+        if info["cbf/intervened"]:
+            corrections.append(info["cbf/correction"])
         if info["cbf/intervened"] == active and not info["cbf/fallback"]:
             times.append((end - begin_bare, between - begin))
+    if not times:
+        return Figures(0.0, infeasible / steps, math.nan, math.nan, math.nan, math.nan)
     bare_us, with_us = 1e6 * np.array(times).T
     share, ratio = len(times) / steps, float(np.median(with_us / bare_us))
-    return Figures(share, float(np.median(bare_us)), float(np.median(with_us)), ratio)
-
-
-def main() -> None:
-    """Print the table."""
-    warnings.simplefilter("ignore")
-    print(
-        "| env | filter | share of the steps | step (us) | with filter (us) | ratio |\n|---|---|---|---|---|---|"
+    correction = float(np.mean(corrections)) if corrections else math.nan
+    return Figures(
+        share, infeasible / steps, correction, float(np.median(bare_us)), float(np.median(with_us)), ratio
     )
-    for name, (driver, protect) in ACTIVE.items():
-        for active in (False, True):
-            chosen = (driver, protect) if active else (gentle, sw.protect)
-            found = measure(name, *chosen, active=active)
-            print(
-                f"| {name} | {'active' if active else 'inactive'} | {found.share:.0%} "
-                f"| {found.without_us:.0f} | {found.with_us:.0f} | {found.ratio:.2f} |",
-                flush=True,
-            )
-
-
-if __name__ == "__main__":
-    main()

@@ -45,7 +45,7 @@ class Recorded(BoundSpeedLimit):
 
     def slacks(self, control: Any) -> Any:
         """As ever."""
-        left = self._room(self.plant.forecast(control, self.spec.horizon)) - self.spec.margin
+        left = self.room(self.plant.forecast(control, self.spec.horizon)) - self.spec.margin
         own = len(left) // self.spec.horizon
         self.seen.append((float(left[:own].min()), float(left[own:].min())))
         return super().slacks(control)

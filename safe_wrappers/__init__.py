@@ -32,6 +32,7 @@ from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
 from safe_wrappers.wrappers.slip_limiter import SlipLimiter
 from safe_wrappers.wrappers.teleop_channel import TeleopChannel
+from safe_wrappers.wrappers.vector_cbf_action_filter import VectorCBFActionFilter
 from safe_wrappers.wrappers.whole_body_filter import WholeBodyFilter
 
 __all__ = [
@@ -55,6 +56,7 @@ __all__ = [
     "StoppingBudget",
     "TeleopChannel",
     "UnsafeStateWarning",
+    "VectorCBFActionFilter",
     "WholeBodyFilter",
     "constraints",
     "faults",

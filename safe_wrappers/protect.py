@@ -2,17 +2,21 @@
 
 import inspect
 from collections.abc import Callable
-from typing import Any
+from typing import Any, overload
 
 import gymnasium as gym
 import mujoco
 
 from safe_wrappers.constraints.limits.joints import JointSpeedLimit
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants.env_checks import check_actions
 from safe_wrappers.recipes import RECIPES
 from safe_wrappers.stack import refuse_order
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
+from safe_wrappers.wrappers.vector_cbf_action_filter import VectorCBFActionFilter, single_envs
+
+VectorEnv = gym.vector.VectorEnv[Any, Any, Any]
 
 
 def protect_options() -> frozenset[str]:
@@ -25,11 +29,15 @@ def _options(takes: Callable[..., Any]) -> list[str]:
     return [name for name in inspect.signature(takes).parameters if name not in ("env", "constraints")]
 
 
-def protect(env: gym.Env[Any, Any], **options: Any) -> CBFActionFilter:
-    """Wrap a known env with the constraints that we recommend and test for it.
+@overload
+def protect(env: gym.Env[Any, Any], **options: Any) -> CBFActionFilter: ...
+@overload
+def protect(env: VectorEnv, **options: Any) -> VectorCBFActionFilter: ...
+def protect(env: gym.Env[Any, Any] | VectorEnv, **options: Any) -> CBFActionFilter | VectorCBFActionFilter:
+    """Wrap a known env, or a vector env of it, with the constraints that we recommend and test for it.
 
     Args:
-        env: Made by `gymnasium.make`; its id without the version selects the recipe.
+        env: Made by `gymnasium.make`; its id without the version selects the recipe. Or a `SyncVectorEnv` of one id.
         options: Those of `CBFActionFilter`, with `margin` added to the recipe's own. SafePointGoal also takes
             `detour` (go around a hazard instead of stopping before it, default True), `brake` (count on the drive to
             stop, default True) and `uncertainty` (of mass and damping, a fraction, default 0); SafeCarGoal takes
@@ -37,17 +45,32 @@ def protect(env: gym.Env[Any, Any], **options: Any) -> CBFActionFilter:
             fingers) and `table` (keep the fingers off it, default True).
 
     Raises:
-        UnsupportedEnvError: Not a single env, or no recipe for it; the message has the lines that protect it by hand.
+        UnsupportedEnvError: No env, or no recipe for it; the message has the lines that protect it by hand.
         ConfigurationError: A layer inside that belongs outside, such as `RecordInterventions`.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
         >>> env = sw.protect(gym.make("SafePointGoal1-v0"))
     """
+    if isinstance(env, gym.vector.VectorEnv):
+        envs = single_envs(env)
+        if len({_env_id(single) for single in envs}) > 1:
+            ids = sorted({_env_id(single) for single in envs})
+            raise UnsupportedEnvError(f"expected a vector env of one id, got {ids}; protect each env of it")
+        return VectorCBFActionFilter(env, _recommended(envs[0], options), **options)
     if not isinstance(env, gym.Env):
-        raise UnsupportedEnvError(f"expected one env, got {env!r}; {_of_no_env(env)}")
+        raise UnsupportedEnvError(f"expected one env, or a vector env, got {env!r}; {_of_no_env(env)}")
     refuse_order(env, CBFActionFilter.layer, "protect")
-    env_id = env.spec.id if env.spec is not None else ""
+    return CBFActionFilter(env, _recommended(env, options), **options)
+
+
+def _env_id(env: gym.Env[Any, Any]) -> str:
+    return env.spec.id if env.spec is not None else ""
+
+
+def _recommended(env: gym.Env[Any, Any], options: dict[str, Any]) -> list[Constraint]:
+    """The recipe's constraints; takes its options out of all."""
+    env_id = _env_id(env)
     family = env_id.rpartition("/")[2].rpartition("-v")[0].removesuffix("Dense")
     robot = family.removeprefix("Safe").removesuffix("Velocity") if family.endswith("Velocity") else family
     recipe = RECIPES.get(robot, RECIPES.get(robot.partition("_")[0]))
@@ -59,8 +82,7 @@ def protect(env: gym.Env[Any, Any], **options: Any) -> CBFActionFilter:
         if name not in of_recipe + of_filter:
             known = ", ".join(of_filter + of_recipe)
             raise UnknownNameError(f"protect has no option {name!r} for {family}; it has {known}")
-    constraints = recipe(env, **{n: options.pop(n) for n in of_recipe if n in options})
-    return CBFActionFilter(env, constraints, **options)
+    return recipe(env, **{n: options.pop(n) for n in of_recipe if n in options})
 
 
 def _by_hand(env: gym.Env[Any, Any]) -> str:
@@ -108,12 +130,6 @@ def _of_no_env(given: Any) -> str:
     """What to write instead, where the argument is not an env."""
     if isinstance(given, str):
         return f"write protect(gym.make({given!r}))"
-    if isinstance(given, gym.vector.VectorEnv):
-        if given.spec is None:
-            envs = f"[lambda: sw.protect(gym.make(...))] * {given.num_envs}"
-            return f"protect each env of it: gym.vector.{type(given.unwrapped).__name__}({envs})"
-        options = "".join(f"{name}={value!r}, " for name, value in given.spec.kwargs.items())
-        return f"protect each env of it: gym.make_vec({given.spec.id!r}, {options}wrappers=[sw.protect])"
     if hasattr(given, "num_envs"):
         return f"protect each env of it: make_vec_env(..., n_envs={given.num_envs}, wrapper_class=sw.protect)"
     return "write protect(gym.make(...))"

@@ -315,9 +315,8 @@ def test_an_env_without_mujoco_gets_lines_for_it(env_id):
         assert info["cbf/margin"] >= 0.0 or info["cbf/unsafe"]
 
 
-@pytest.mark.parametrize("mode", ["sync", "async"])
-def test_a_vector_env_is_told_how_to_protect_each_env(mode):
-    vector = gym.make_vec("Reacher-v5", num_envs=2, vectorization_mode=mode, max_episode_steps=7)
+def test_an_asynchronous_vector_env_is_told_how_to_protect_each_env():
+    vector = gym.make_vec("Reacher-v5", num_envs=2, vectorization_mode="async", max_episode_steps=7)
     message = refusal(vector)
     vector.close()
     protected = eval(message.partition("protect each env of it: ")[2], {"gym": gym, "sw": sw})
@@ -327,13 +326,25 @@ def test_a_vector_env_is_told_how_to_protect_each_env(mode):
     protected.close()
 
 
-def test_vector_envs_of_other_makes_are_told_too():
-    by_hand = gym.vector.SyncVectorEnv([lambda: gym.make("Reacher-v5")] * 3)
-    code = refusal(by_hand).partition("protect each env of it: ")[2]
-    assert (
-        eval(code.replace("...", "'Reacher-v5'"), {"gym": gym, "sw": sw}).reset(seed=0)[1]["cbf/margin"].size
-        == 3
+def test_a_synchronous_vector_env_gets_one_filter_for_all_and_takes_the_same_options():
+    envs = sw.protect(
+        gym.make_vec("SafePointGoal1-v0", 2, vectorization_mode="sync"), detour=False, margin=0.1
     )
+    assert isinstance(envs, sw.VectorCBFActionFilter)
+    one = sw.protect(gym.make("SafePointGoal1-v0"), detour=False, margin=0.1)
+    assert [single.constraints for single in envs.filters] == [one.constraints] * 2
+    ids = [lambda: gym.make("SafePointGoal1-v0"), lambda: gym.make("SafePointGoal2-v0")]
+    mixed = gym.vector.SyncVectorEnv(ids, observation_mode="different")
+    assert "expected a vector env of one id, got ['SafePointGoal1-v0', 'SafePointGoal2-v0']" in refusal(mixed)
+
+
+def test_vector_envs_of_other_makes_are_told_too():
+    by_hand = gym.vector.AsyncVectorEnv([lambda: gym.make("Reacher-v5")] * 3)
+    code = refusal(by_hand).partition("protect each env of it: ")[2]
+    by_hand.close()
+    made = eval(code.replace("...", "'Reacher-v5'"), {"gym": gym, "sw": sw})
+    assert made.reset(seed=0)[1]["cbf/margin"].size == 3
+    made.close()
     make_vec_env = pytest.importorskip("stable_baselines3.common.env_util").make_vec_env
     code = refusal(make_vec_env("Reacher-v5", 2)).partition("protect each env of it: ")[2]
     made = eval(code.replace("...", "'Reacher-v5'"), {"make_vec_env": make_vec_env, "sw": sw})

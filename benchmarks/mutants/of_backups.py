@@ -110,7 +110,6 @@ ESCAPE = Target(
             "np.concatenate([*radii, np.zeros(0)]) + self.spec.radius",
             "np.concatenate([*radii, np.zeros(0)])",
         ),
-        Mutant("    np.maximum(along, 0.0, out=along)\n", ""),
         Mutant(
             "times = self.plant.control_dt * np.concatenate([[0.0], 1.0 + self._escapes.instants])",
             "times = self.plant.control_dt * np.concatenate([[0.0], self._escapes.instants])",
@@ -120,8 +119,8 @@ ESCAPE = Target(
             "((led_to - velocity) ** 2).sum(axis=1).argmax()",
         ),
         Mutant(
-            "if now - reach <= self.spec.radius + self.spec.margin:",
-            "if now <= self.spec.radius + self.spec.margin:",
+            "if now - float(np.hypot(abs(x - here_x).max(), abs(y - here_y).max())) <= self.spec.margin:",
+            "if now <= self.spec.margin:",
         ),
         Mutant("gap - self.spec.radius, out=nearest", "gap, out=nearest"),
         Mutant("_GOING_S = (0.3, 0.8)", "_GOING_S = (0.3,)"),
@@ -129,6 +128,23 @@ ESCAPE = Target(
             "return left - self._needed() if left == left else -np.inf",
             "return left if left == left else -np.inf",
         ),
+    ),
+)
+
+WAYS = Target(
+    "control/backup/way_clearances.py",
+    ("tests/control/test_way_clearances.py",),
+    (
+        Mutant("along = max(abs(y[c, m, k] - ahead_y[k]) - half_y[k], 0.0)", "along = 0.0"),
+        Mutant("if disc[3] - reach <= margin:", "if disc[3] <= margin:"),
+        Mutant("if plane[5] - reach <= margin:", "if plane[5] <= margin:"),
+        Mutant("highest[1] + room >= low:", "highest[1] - room >= low:"),
+        Mutant(
+            "math.sqrt(across * across + along * along) - disc[2]",
+            "math.sqrt(across * across + along * along)",
+        ),
+        Mutant(" + (flat_y[i] - plane[1]) * plane[3]", ""),
+        Mutant("over < left[c, m] or over != over:", "over < left[c, m]:"),
     ),
 )
 

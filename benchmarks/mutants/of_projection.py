@@ -2,62 +2,73 @@
 
 from benchmarks.mutants.target import Mutant, Target
 
+_TESTS = (
+    "tests/filter/test_projection_failed.py",
+    "tests/control/test_projection.py",
+    "tests/control/test_projection_scale.py",
+    "tests/control/test_projection_batch.py",
+    "tests/filter",
+)
+
 PROJECTION = Target(
     "filter/**/*.py",
-    ("tests/control/test_projection.py", "tests/control/test_projection_scale.py", "tests/filter"),
+    _TESTS,
     (
-        Mutant("FEASIBILITY_TOLERANCE = 1e-9", "FEASIBILITY_TOLERANCE = 1e-6"),
-        Mutant("EXACT_SHARE = 1e-3", "EXACT_SHARE = 1e3"),
-        Mutant("_SOFT = 1e-8", "_SOFT = 1e-2"),
-        Mutant("ORDINARY_BOX = 16.0", "ORDINARY_BOX = 1e9"),
-        Mutant("kept = normals @ control - offsets <= 10.0 *", "kept = normals @ control - offsets <= 1e7 *"),
-        Mutant("return bool((kept & np.isfinite(length)).all())", "return bool(kept.all())"),
-        Mutant("if inside and dot <= limit:", "if dot <= limit:"),
-        Mutant("        if leave <= 0.0:\n            continue\n", ""),
-        Mutant("    events.sort()\n", ""),
-        Mutant("        falling += change\n", ""),
-        Mutant("        value -= falling * (at - lam)\n", ""),
-        Mutant("lam += (value - limit) / falling", "lam = (value - limit) / falling"),
-        Mutant("x = bottom if x < bottom else top", "x = top"),
-        Mutant("if excess > slack and falling > 0.0:", "if False:"),
+        Mutant("FEASIBILITY_TOLERANCE: Final = 1e-9", "FEASIBILITY_TOLERANCE: Final = 1e-6"),
+        Mutant("EXACT_SHARE: Final = 1e-3", "EXACT_SHARE: Final = 1e3"),
+        Mutant("_SOFT: Final = 1e-8", "_SOFT: Final = 1e-2"),
+        Mutant("ORDINARY_BOX: Final = 16.0", "ORDINARY_BOX: Final = 1e9"),
+        Mutant("kept = _within(rows, slacks, 10.0)", "kept = _within(rows, slacks, 1e7)"),
+        Mutant("control)[0] == _READ\n", "control)[0] >= 0\n"),
         Mutant(
-            "hopeless = bool((lowest > b + slack).any())",
-            "hopeless = False",
-            equal="only saves time: what no corner of the box meets has no projection, as the solver finds",
+            "_excess(point, columns, rows, TARGET) == 0.0 and inside:",
+            "_excess(point, columns, rows, TARGET) == 0.0:",
         ),
-        Mutant("hopeless = bool((lowest > b + slack).any())", "hopeless = True"),
-        Mutant(
-            "np.where(a > 0.0, a * hi, np.where(a < 0.0, a * lo, 0.0))",
-            "np.where(a > 0.0, a * lo, np.where(a < 0.0, a * hi, 0.0))",
-        ),
-        Mutant("    if excess <= 10.0 * slack:\n", "    if True:\n"),
+        Mutant("    if inside and _within(rows, slacks, 1.0):", "    if _within(rows, slacks, 1.0):"),
+        Mutant("    if not _within(rows, slacks, 10.0):\n", "    if False:\n"),
+        Mutant("    if named and asking > 1:", "    if named and asking > 0:"),
+        Mutant("usual = usual and abs(normals[i, j]) < LARGEST", "usual = usual"),
+        Mutant("length > _SHORTEST and offset < OVERFLOWING", "length > _SHORTEST"),
+        Mutant("corner = point[LOW, j] if slope > 0.0", "corner = point[LOW, j] if slope < 0.0"),
+        Mutant("& (b > -OVERFLOWING)", "& (b < OVERFLOWING)"),
+        Mutant("rows[WEIGHT, i] = softened[WEIGHT, i]", "rows[WEIGHT, i] = 0.0"),
+        Mutant("Projection(control, Status.FAILED, math.inf,", "Projection(control, Status.FAILED, 0.0,"),
         Mutant("if not np.isfinite(x).all() or bool((g @ x - h > allowed).any()):", "if False:"),
-        Mutant("- x).max()) > _OPTIMALITY_TOLERANCE:", "- x).max()) > 1e9:"),
-        Mutant("relaxed = np.maximum(h, g @ least) + 0.1 * allowed", "relaxed = h + 0.1 * allowed"),
-        Mutant(
-            "harmless = (length < _OVERFLOWING) & (b >= _OVERFLOWING)", "harmless = np.zeros(b.size, bool)"
-        ),
-        Mutant(
-            "violation = part.violation if status is not Status.FAILED else math.inf",
-            "violation = part.violation",
-        ),
-        Mutant("multipliers = weights[: h.size] / left[-1]", "multipliers = weights[: h.size]"),
-        Mutant(
-            "status = Status.FAILED if (feasible or not solved) else Status.INFEASIBLE",
-            "status = Status.INFEASIBLE",
-        ),
-        Mutant("unit = 1.0 if box.ordinary else control_unit(box, u, excess, length)", "unit = 1.0"),
-        Mutant("answer[1] * (unit * unit)", "answer[1]"),
-        Mutant("weights * unit / norm", "weights"),
-        Mutant(
-            'if answer is None and solver != "daqp":',
-            "if False:",
-            equal="another way to the same answer: by distance, where a named solver and its least violation fail",
-        ),
+        Mutant("- x).max()) <= _OPTIMALITY_TOLERANCE:", "- x).max()) <= 1e9:"),
+        Mutant("    if solver != OWN:  # its failure", "    if False:  # its failure"),
+        Mutant("multipliers[asking] = answer[1] * unit / norm", "multipliers[asking] = answer[1]"),
         Mutant(
             'np.maximum(info["lam"][n:], 0.0)',
             'info["lam"][n:]',
             equal="daqp's multipliers of rows without a lower bound are not negative",
         ),
+    ),
+)
+
+ACTIVE_SET = Target(
+    "control/numerics/active_set.py",
+    _TESTS,
+    (
+        Mutant("_DEPENDENT: Final = 1e-13", "_DEPENDENT: Final = 1e-6"),
+        Mutant("_DEPENDENT: Final = 1e-13", "_DEPENDENT: Final = 0.0"),
+        Mutant("            along[SHARE, a] += part\n", "            along[SHARE, a] = part\n"),
+        Mutant("square > _CANCELLED * whole:", "True:"),
+        Mutant(
+            "    for _ in range(2):\n        for a in range(count):\n            i = active[a]",
+            "    for _ in range(0):\n        for a in range(count):\n            i = active[a]",
+        ),
+        Mutant("            used, place = rows[WEIGHT, i] / change, a\n", "            pass\n"),
+        Mutant(
+            "                used, place = point[PRESSURE, j] / push, count + j\n", "                pass\n"
+        ),
+        Mutant("held = held or active[a] == i", "pass"),
+        Mutant("point[PRESSURE, j] = abs(target - point[X, j])", "point[PRESSURE, j] = 0.0"),
+        Mutant(
+            "            start, count = place, count - 1\n",
+            "            start, count = count - 1, count - 1\n",
+        ),
+        Mutant("over -= step * square", "pass"),
+        Mutant("weight += step", "weight = step"),
+        Mutant("            point[SIDE, place - count] = 0.0\n", "            pass\n"),
     ),
 )

@@ -15,13 +15,28 @@ SEARCH = Target(
         Mutant("_BLENDS = (0.1, 0.25, 0.5, 0.75)", "_BLENDS = (0.1, 0.25, 0.5)"),
         Mutant("for j in range(target.size):", "for j in range(0):"),
         Mutant("            return Decision(backup, Stage.BACKUP)", "            pass"),
-        Mutant("if self._keeps(target, strict):", "if False:"),
+        Mutant("backup is not None or self._keeps(target, strict)", "backup is not None"),
+        Mutant("self.shorten(proposal, target, strict) if admitted", "target if admitted"),
+        Mutant(
+            "return True, self.shorten(proposal, control, strict), joined", "return True, control, joined"
+        ),
+        Mutant("_TRIES = 3", "_TRIES = 2"),
+        Mutant("_TRIES = 3", "_TRIES = 4"),
+        Mutant("_WORTH = 0.05", "_WORTH = 0.0"),
+        Mutant("_BEYOND = 0.05", "_BEYOND = 0.0"),
+        Mutant("            nearer = self._rounded(proposal", "            nearer = np.asarray(proposal"),
+        Mutant(
+            "if result.status is Status.INACTIVE:\n            return result, control",
+            "if True:\n            return result, control",
+        ),
+        Mutant("_SECANTS = 2", "_SECANTS = 1"),
+        Mutant("_SECANTS = 2", "_SECANTS = 3"),
+        Mutant("_DIFFERENCES = 4", "_DIFFERENCES = 3"),
+        Mutant("_DIFFERENCES = 4", "_DIFFERENCES = 5"),
+        Mutant("provisional=corrected is not None", "provisional=False"),
+        Mutant("and slacks[:k].min() < 0.0", ""),
         Mutant("_LINEARIZATIONS = 6", "_LINEARIZATIONS = 5"),
         Mutant("_LINEARIZATIONS = 6", "_LINEARIZATIONS = 7"),
-        Mutant(
-            "(True, control, _NO_ROWS) if self._keeps(control, strict)",
-            "(True, control, _NO_ROWS) if self._admitted(control)",
-        ),
         Mutant("(not contradictory or self._within(control, strict))", "True"),
         Mutant(
             "and (not contradictory or self._within(control, strict))",
@@ -37,11 +52,11 @@ SEARCH = Target(
             f"if control is not None]{_FIRST_KEPT}self._admitted(control)",
         ),
         Mutant(
-            "every = (np.clip(control, self._low, self._high) for control in known)",
+            "every = (self._rounded(control, *strict) for control in known)",
             "every = (control for control in known)",
         ),
         Mutant(
-            "[np.clip(control, self._low, self._high) for control in known if",
+            "[self._rounded(control, *strict) for control in known if",
             "[control for control in known if",
         ),
         Mutant(
@@ -50,7 +65,7 @@ SEARCH = Target(
         ),
         Mutant("*(u for u in self._tried if self._within(u, strict))]", "*self._tried]"),
         Mutant("*(u for u in self._tried if self._within(u, strict))]", "]"),
-        Mutant("max(-c.slack(control) / c.scale", "max(-c.slack(control)"),
+        Mutant("(c.slack(control) / c.scale for", "(c.slack(control) for"),
         Mutant("if not self._fallback.brakes:", "if False:"),
         Mutant(
             "if least is target else Stage.LEAST_VIOLATION",

@@ -1,7 +1,7 @@
 """What is mutated, by name."""
 
-from benchmarks.mutants.of_backups import COASTING, ESCAPE, HEADING_DRIVE, WALL
-from benchmarks.mutants.of_projection import PROJECTION
+from benchmarks.mutants.of_backups import COASTING, ESCAPE, HEADING_DRIVE, WALL, WAYS
+from benchmarks.mutants.of_projection import ACTIVE_SET, PROJECTION
 from benchmarks.mutants.of_search import ROLLOUT, SEARCH
 from benchmarks.mutants.of_wrappers import CHUNK_HANDOVER, COMMAND_GATE, HANDOVER, LEASE, LEASE_EXPIRY
 from benchmarks.mutants.target import Target
@@ -9,10 +9,12 @@ from benchmarks.mutants.target import Target
 TARGETS: dict[str, Target] = {
     "search": SEARCH,
     "projection": PROJECTION,
+    "active set": ACTIVE_SET,
     "rollout": ROLLOUT,
     "heading drive": HEADING_DRIVE,
     "coasting": COASTING,
     "escape": ESCAPE,
+    "ways": WAYS,
     "wall": WALL,
     "lease": LEASE,
     "lease expiry": LEASE_EXPIRY,

@@ -82,9 +82,10 @@ class BoundBarrier(BoundConstraint):
 
     def observe(self, memory: Memory) -> None:
         self._row: HalfSpaces | None = None
+        self._now = self._height(self.plant.state)
 
     def value(self) -> Array:
-        return np.array([self._height(self.plant.state)])
+        return np.array([self._now])
 
     def _height(self, x: Array) -> float:
         value = self.spec.h(x)
@@ -102,15 +103,14 @@ class BoundBarrier(BoundConstraint):
 
     def _condition(self) -> HalfSpaces:
         x = self.plant.state
-        self._now = self._height(x)
         gradient = self._gradient(x)
-        self._rounding = _ROUNDING * (abs(self._now) + float(np.abs(gradient).max(initial=0.0)))
-        drift, effect = cbf.lie_derivatives(gradient, self.plant.f, self.plant.g)
+        self._rounding = _ROUNDING * (abs(self._now) + max(map(abs, gradient.tolist()), default=0.0))
         room, alpha = self._now - self.spec.margin, self.spec.alpha
-        decay = alpha(room) if callable(alpha) else cbf.linear_decay(room, alpha)
+        decay = alpha(room) if callable(alpha) else alpha * room
         bend = 0.5 * self.spec.curvature * self.plant.control_dt
-        normal, offset = cbf.cbf_rows(drift, effect, decay - bend)
-        return HalfSpaces(normal[None, :], offset.reshape(1))
+        # The condition of `cbf.cbf_rows`, for one barrier without its conversions.
+        drift, effect = gradient @ self.plant.f, gradient @ self.plant.g
+        return HalfSpaces(-effect[None, :], np.array([drift + (decay - bend)]))
 
     def slack(self, control: Array) -> float:
         """Not measured: whether a control is admitted is all that is known."""

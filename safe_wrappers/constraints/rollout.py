@@ -8,7 +8,7 @@ import numpy as np
 
 from safe_wrappers.checks import check_fields, non_negative, positive, whole_number
 from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, HalfSpaces, Memory
-from safe_wrappers.filter.linearize import linearize, tangent_rows
+from safe_wrappers.filter.linearize import Tangents, differences, linearize, tangent_rows
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
@@ -33,6 +33,7 @@ class RolloutConstraint(Constraint):
     horizon: int
     max_decrease: float | None
     look_ahead_below: float | None = None
+    euler_look_ahead: bool = False
     unit: ClassVar[str] = "units of the value"
 
     def _check_shared(self) -> None:
@@ -104,6 +105,8 @@ class BoundRollout(BoundSlacks):
 
     def observe(self, memory: RolloutMemory) -> None:
         self._value = self.now()
+        self._known: dict[tuple[int, bytes], Array] = {}
+        self._tangents = Tangents(self.slacks, self._slopes)
         self._linear: HalfSpaces | None = None
         self._linearized = 0
         self._least = float(self._value.min(initial=np.inf))
@@ -132,17 +135,46 @@ class BoundRollout(BoundSlacks):
         return np.asarray(np.minimum(value - self.spec.margin, 0.0))
 
     def slacks(self, control: Array) -> Array:
-        """What is left of what is asked for along the forecast of a control, shape (k,); wanted >= 0."""
-        inside = not self._outside.any()
-        if inside and self.spec.look_ahead_below is not None:
-            held = self.room(self.plant.forecast(control, 1)) - self.spec.margin
-            if (held >= self.spec.look_ahead_below).all():
-                return np.asarray(held.min(axis=0))
-        left = self.room(self.plant.forecast(control, self.spec.horizon)) - self.spec.margin
+        """What is left of what is asked for along the forecast of a control, shape (k,); wanted >= 0.
+
+        In time: the least room in every control interval, bound by bound.
+        """
+        key = self.plant.model_version, control.tobytes()
+        if key not in self._known:
+            self._known[key] = self._slacks(control)
+        return self._known[key]
+
+    def _slacks(self, control: Array) -> Array:
+        inside, euler, gate = not self._outside.any(), self.spec.euler_look_ahead, self.spec.look_ahead_below
+        if inside and gate is not None and self._least >= gate:
+            held = self._least_rooms(self.plant.forecast(control, 1, euler), 1)
+            if (held >= gate).all():
+                return held
+        forecast = self.plant.forecast(control, self.spec.horizon, euler)
         if inside:
-            return np.asarray(left.min(axis=0))
-        # From outside, bound by bound: no farther out on the way, and closer at the end.
+            return self._least_rooms(forecast, self.spec.horizon)
+        return self._back_inside(forecast)
+
+    def _least_rooms(self, forecast: Forecast, holds: int) -> Array:
+        left = self.room(forecast) - self.spec.margin
+        return np.asarray(left.reshape(holds, -1, left.shape[1]).min(axis=1).ravel())
+
+    def _back_inside(self, forecast: Forecast) -> Array:
+        """From outside, bound by bound: no farther out on the way, and closer at the end."""
+        left = self.room(forecast) - self.spec.margin
         return np.concatenate([left.min(axis=0) - self._outside, left[-1] - self._closer()])
+
+    def _slopes(self, control: Array) -> Array:
+        """How the slacks change with a control, shape (k, nu), by differences of sketches of the forecast.
+
+        Left out are those of the control intervals after the last one in which a bound is violated most.
+        """
+        plant, horizon, box = self.plant, self.spec.horizon, (self.plant.lower, self.plant.upper)
+        if self._outside.any():
+            return differences(lambda u: self._back_inside(plant.sketch(u, horizon)), control, *box)
+        left = self.slacks(control).reshape(horizon, -1)
+        needed = int(np.where(left.min(axis=0) < 0.0, left.argmin(axis=0), 0).max()) + 1
+        return differences(lambda u: self._least_rooms(plant.sketch(u, needed), needed), control, *box)
 
     def _closer(self) -> Array:
         """What is left of the present violations at the end of a forecast, <= 0, shape (n,)."""
@@ -154,7 +186,7 @@ class BoundRollout(BoundSlacks):
 
     def linearize(self, control: Array) -> HalfSpaces:
         if self.plant.has_acceleration:
-            return super().linearize(control)
+            return self._tangents.about(control)
         self._linearized += 1
         if self._linearized > _SAME_RESPONSE:
             self._respond(control)

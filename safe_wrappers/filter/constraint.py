@@ -1,15 +1,18 @@
 """What a constraint is: a specification, and what it becomes on a plant."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.plant import Plant
+
+if TYPE_CHECKING:
+    from safe_wrappers.filter.constraint_batch import ConstraintBatch
 
 Array = NDArray[np.float64]
 Promise = Literal["proved", "best effort"]
@@ -24,10 +27,12 @@ class HalfSpaces:
     Attributes:
         normals: Shape (k, m). A row that asks for nothing is left out, never padded.
         offsets: Shape (k,).
+        provisional: Tangents that are replaced by the constraint's next ones, not joined by them.
     """
 
     normals: Array
     offsets: Array
+    provisional: bool = False
 
     @staticmethod
     def none(controls: int) -> "HalfSpaces":
@@ -162,6 +167,16 @@ class BoundConstraint:
         Returns:
             The control, shape (m,), inside the action box and the plant's bounds; the `Stage` that found it; rows
             that it keeps, for rounding. None: it has found none, and the search goes on as for every constraint.
+        """
+        return None
+
+    @classmethod
+    def batch(
+        cls, bound: Sequence[Self], low: Array, high: Array, dtype: np.dtype[Any]
+    ) -> "ConstraintBatch | None":
+        """The same constraint on the plants of n envs, decided in one call, or None: one by one.
+
+        Asked where each is the only constraint of its env; `low`, `high` and `dtype` are the action space's.
         """
         return None
 

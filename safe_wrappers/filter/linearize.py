@@ -6,15 +6,20 @@ import numpy as np
 
 from safe_wrappers.filter.constraint import Array, HalfSpaces
 
+Slacks = Callable[[Array], Array]
+"""Control (m,) to what is left of the requirement along the held step, (k,); wanted >= 0."""
+
 _STEP = 1e-4  # width of the differences, as a share of the control's range
 _INWARD = 0.01  # aim this share of the violation beyond the boundary, to end inside it
+_SECANTS = 2  # tangents whose slopes secants correct, after one by differences
+_DIFFERENCES = 4  # tangents by differences, in one control step
 
 
-def linearize(slacks: Callable[[Array], Array], control: Array, low: Array, high: Array) -> HalfSpaces:
+def linearize(slacks: Slacks, control: Array, low: Array, high: Array) -> HalfSpaces:
     """Linearise predicted slacks about a control.
 
     Args:
-        slacks: Control (m,) to what is left of the requirement along the held step, (k,); wanted >= 0.
+        slacks: Of a control.
         control: The refused control, shape (m,).
         low: Bounds that the differences stay inside, shape (m,).
         high: Likewise.
@@ -22,18 +27,64 @@ def linearize(slacks: Callable[[Array], Array], control: Array, low: Array, high
     Returns:
         k rows `-J u <= slacks(control) - J control`, aimed a little inward where a slack is negative.
     """
+    return tangent_rows(slacks(control), control, differences(slacks, control, low, high))
+
+
+def differences(slacks: Slacks, control: Array, low: Array, high: Array) -> Array:
+    """How slacks change with a control, shape (k, m); the differences stay inside the bounds, shapes (m,)."""
     base = slacks(control)
     width = np.where(np.isfinite(high - low), _STEP * (high - low), _STEP)
     width = np.where(control + width > high, -width, width)
-    jacobian = np.empty((base.size, control.size))
-    for j in range(control.size):
+    jacobian = np.zeros((base.size, control.size))
+    for j in np.flatnonzero(width):
         moved = control.copy()
         moved[j] += width[j]
-        jacobian[:, j] = (slacks(moved) - base) / width[j] if width[j] else 0.0
-    return tangent_rows(base, control, jacobian)
+        jacobian[:, j] = (slacks(moved) - base) / width[j]
+    return jacobian
 
 
-def tangent_rows(base: Array, control: Array, jacobian: Array) -> HalfSpaces:
+def tangent_rows(base: Array, control: Array, jacobian: Array, provisional: bool = False) -> HalfSpaces:
     """Rows of slacks that are `base` at a control and change by a Jacobian, aimed a little inward where violated."""
     wanted = _INWARD * np.maximum(-base, 0.0)
-    return HalfSpaces(-jacobian, base - jacobian @ control - wanted)
+    return HalfSpaces(-jacobian, base - jacobian @ control - wanted, provisional)
+
+
+class Tangents:
+    """Tangents of the slacks of one control step, where differences are dear.
+
+    One is made by differences. The next ones have its slopes, corrected so that they explain what the slacks have
+    changed by since (Broyden's secant update); they are provisional. Then differences are made again.
+
+    Args:
+        slacks: Of a control.
+        slopes: How the first of them change with it, shape (k or less, m), by differences.
+    """
+
+    def __init__(self, slacks: Slacks, slopes: Slacks) -> None:
+        self._of, self._by_differences = slacks, slopes
+        self._control: Array | None = None
+        self._secants = self._made = 0
+
+    def about(self, control: Array) -> HalfSpaces:
+        """The tangents about a refused control; no rows: there were enough."""
+        slacks, known, corrected = self._of(control), self._control, None
+        if known is not None and self._secants < _SECANTS:
+            corrected = self._corrected(control - known, slacks)
+        if corrected is None:
+            stuck = known is not None and not self._secants and np.array_equal(control, known)
+            if stuck or self._made == _DIFFERENCES:
+                return HalfSpaces.none(control.size)
+            self._made, self._secants, self._slopes = self._made + 1, 0, self._by_differences(control)
+        else:
+            self._secants, self._slopes = self._secants + 1, corrected
+        self._control, self._slacks = control, slacks[: len(self._slopes)]
+        return tangent_rows(self._slacks, control, self._slopes, provisional=corrected is not None)
+
+    def _corrected(self, step: Array, slacks: Array) -> Array | None:
+        """The slopes after a secant update; None: it cannot be made, or they are not those of what is violated."""
+        k = len(self._slopes)
+        unexplained = slacks[:k] - self._slacks - self._slopes @ step
+        square = float(step @ step)
+        if not (square > 0.0 and np.isfinite(unexplained).all() and slacks[:k].min() < 0.0):
+            return None
+        return np.asarray(self._slopes + np.outer(unexplained, step / square))

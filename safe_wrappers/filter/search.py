@@ -6,6 +6,7 @@ Each stage is a method that returns the control it has found, or None; `Decision
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +14,16 @@ from numpy.typing import NDArray
 from safe_wrappers.filter.constraint import Array, BoundConstraint, HalfSpaces
 from safe_wrappers.filter.fallback import Fallback
 from safe_wrappers.filter.problem import Projection, Status
-from safe_wrappers.filter.projection import keeps_rows, project_unchecked
+from safe_wrappers.filter.projection import cast_inside, keeps_rows, project_unchecked
 from safe_wrappers.plants.plant import Plant
 
 Rows = tuple[Array, Array]
 """`normals @ u <= offsets`: shapes (k, m) and (k,)."""
-_NO_ROWS: Rows = (np.zeros((0, 0)), np.zeros(0))
 
-_LINEARIZATIONS = 6  # how often a refused control is answered by linearising anew about it
+_LINEARIZATIONS = 6  # how often a refused control is answered by tangents that are not provisional
+_TRIES = 3  # to shorten an admitted correction
+_WORTH = 0.05  # share of a correction that a try must promise to take off
+_BEYOND = 0.05  # aim of a try beyond the boundary, as a share of the proposal's violation
 _OVERSHOOTS = (0.02, 0.1)  # shares by which a refused correction is made larger
 _BLENDS = (0.1, 0.25, 0.5, 0.75)  # shares of the way from a refused control to the backup control
 
@@ -53,11 +56,10 @@ class Decision:
     """What to execute and how it was found.
 
     Attributes:
-        control: Shape (m,), finite, inside the box.
+        control: Shape (m,), finite, inside the box, a number of the action space's dtype.
         stage: What found it.
         infeasible: Nothing that was tried is admitted by every constraint.
         changed: It is not the proposal.
-        rows: The half-spaces that it satisfies, for rounding.
         refused: Which constraints did not admit the proposal, shape (number of constraints,); None: none did.
         fallback: The fallback chose it.
     """
@@ -66,7 +68,6 @@ class Decision:
     stage: Stage
     infeasible: bool = False
     changed: bool = True
-    rows: Rows = _NO_ROWS
     refused: NDArray[np.bool_] | None = None
     fallback: bool = False
 
@@ -74,6 +75,7 @@ class Decision:
 class SafeActionSearch:
     """Finds the closest admissible control in the action box (`low`, `high`, shapes (m,)) that it can, or falls back.
 
+    Controls are rounded to the action space's `dtype` before they are judged: what was admitted is executed.
     The caller observes the plant and the constraints.
     """
 
@@ -85,7 +87,9 @@ class SafeActionSearch:
         solver: str,
         low: Array,
         high: Array,
+        dtype: Any = np.float64,
     ) -> None:
+        self._dtype = np.dtype(dtype)
         self._plant, self._fallback, self._solver, self._low, self._high = plant, fallback, solver, low, high
         self._constraints = list(constraints)
         self._predicting = [c for c in constraints if c.predicts]
@@ -111,7 +115,8 @@ class SafeActionSearch:
             found = self._sole.decide(proposal, self._low, self._high)
             if found is not None:
                 control, stage, rows = found
-                return self._projected(proposal, control, Stage(stage), (rows.normals, rows.offsets))
+                control = self._rounded(control, rows.normals, rows.offsets)
+                return self._projected(proposal, control, Stage(stage))
         refused = bool(self._predicting) and not self._admitted(proposal)
         strict = self._rows(self._rows_only) if self._rows_only else self._no_rows
         if not refused:
@@ -123,7 +128,7 @@ class SafeActionSearch:
             if result.status in (Status.INFEASIBLE, Status.FAILED):
                 return self._unprojected(result.status, control, last)
             if not self._predicting or self._admitted(control):
-                return self._projected(proposal, control, Stage.ROWS, strict)
+                return self._projected(proposal, control, Stage.ROWS)
         else:
             candidate = self.candidate(proposal, strict)
             if candidate is not None:
@@ -133,7 +138,7 @@ class SafeActionSearch:
     def candidate(self, proposal: Array, strict: Rows) -> Array | None:
         """The first candidate of a constraint that keeps the rows and every prediction."""
         known = (control for c in self._constraints for control in c.candidates(proposal))
-        every = (np.clip(control, self._low, self._high) for control in known)
+        every = (self._rounded(control, *strict) for control in known)
         return next((control for control in every if self._keeps(control, strict)), None)
 
     def _search(self, proposal: Array, strict: Rows, last: Array) -> Decision:
@@ -147,45 +152,73 @@ class SafeActionSearch:
         if result.status in (Status.INFEASIBLE, Status.FAILED):
             return self._unprojected(result.status, control, last)
         if self._admitted(control):
-            return self._projected(proposal, control, Stage.ROWS, rows)
+            return self._projected(proposal, control, Stage.ROWS)
         admitted, control, rows = self.relinearize(proposal, control, rows, strict)
         if admitted:
-            return self._projected(proposal, control, Stage.RELINEARIZED, rows)
+            return self._projected(proposal, control, Stage.RELINEARIZED)
         return self._nearby(proposal, control, rows, strict, last)
 
     def relinearize(
         self, proposal: Array, control: Array, rows: Rows, strict: Rows
     ) -> tuple[bool, Array, Rows]:
         """Project again with rows linearised about each refused answer: whether one is admitted, it, its rows."""
-        for left in reversed(range(_LINEARIZATIONS)):
-            tangents = self._tangents(control)
-            if not tangents[1].size:
+        joined, left = rows, _LINEARIZATIONS
+        while left:
+            tangents = [c.linearize(control) for c in self._predicting if not c.admits(control)]
+            lasting = self._stacked([t for t in tangents if not t.provisional])
+            rows = _joined(rows, lasting)
+            joined = _joined(rows, self._stacked([t for t in tangents if t.provisional]))
+            if not any(t.offsets.size for t in tangents):
                 break
-            rows = _joined(rows, tangents)
-            result, control = self._project(proposal, *rows)
+            result, control = self._project(proposal, *joined)
             if result.status is Status.FAILED:
                 break
-            if not left:
-                return (True, control, _NO_ROWS) if self._keeps(control, strict) else (False, control, rows)
+            left -= lasting[1].size > 0
             # Where guesses and rows contradict each other, the answer violates both least: the rows count.
             contradictory = result.status is Status.INFEASIBLE
             if self._admitted(control) and (not contradictory or self._within(control, strict)):
-                return True, control, rows
-        return False, control, rows
+                return True, self.shorten(proposal, control, strict), joined
+        return False, control, joined
+
+    def shorten(self, proposal: Array, control: Array, strict: Rows) -> Array:
+        """An admitted control, or one nearer to the refused proposal that is admitted as well, on the line between.
+
+        By secants of the room that is left; halfway where they were wrong.
+        """
+        refused, kept, found = 0.0, 1.0, control
+        below, above = self._room(proposal), self._room(control)
+        for _ in range(_TRIES):
+            right = refused == 0.0 and np.isfinite(above - below) and above > below
+            share = max(-(1.0 + _BEYOND) * below / (above - below), 0.1) if right else 0.5
+            share = refused + share * (kept - refused)
+            if kept - share < _WORTH:
+                break
+            nearer = self._rounded(proposal + share * (control - proposal), *strict)
+            if self._keeps(nearer, strict):
+                kept, above, found = share, self._room(nearer), nearer
+            else:
+                refused = share
+        return found
+
+    def _room(self, control: Array) -> float:
+        """The least slack of what predicts, in shares of the scales."""
+        return min((c.slack(control) / c.scale for c in self._predicting), default=np.inf)
 
     def _nearby(self, proposal: Array, control: Array, rows: Rows, strict: Rows, last: Array) -> Decision:
         """More of the same correction, a backup control, or something in between; else the least violation."""
         more = self.overshoot(proposal, rows)
         if more is not None:
-            return Decision(more, Stage.OVERSHOOT, rows=rows)
+            return Decision(more, Stage.OVERSHOOT)
         backup = self.backup(strict)
         target = backup if backup is not None else self._fallback_control(control, last)
-        blended = self.blend(control, target, strict)
+        admitted = backup is not None or self._keeps(target, strict)
+        nearer = self.shorten(proposal, target, strict) if admitted else target
+        blended = nearer if nearer is not target else self.blend(control, target, strict)
         if blended is not None:
             return Decision(blended, Stage.BLEND)
         if backup is not None:
             return Decision(backup, Stage.BACKUP)
-        if self._keeps(target, strict):
+        if admitted:
             return Decision(target, Stage.FALLBACK, fallback=True)
         least = self.least_violation(target, strict)
         stage = Stage.FALLBACK if least is target else Stage.LEAST_VIOLATION
@@ -203,15 +236,15 @@ class SafeActionSearch:
     def backup(self, strict: Rows) -> Array | None:
         """The first backup control of a constraint that keeps the rows and every prediction."""
         known = (c.backup() for c in self._constraints)
-        every = [np.clip(control, self._low, self._high) for control in known if control is not None]
+        every = [self._rounded(control, *strict) for control in known if control is not None]
         return next((control for control in every if self._keeps(control, strict)), None)
 
     def blend(self, control: Array, target: Array, strict: Rows) -> Array | None:
         """A refused control moved towards a target, along the line and then but for one component."""
         for share in _BLENDS:
-            blended = control + share * (target - control)
+            blended = self._rounded(control + share * (target - control), *strict)
             if self._keeps(blended, strict):
-                return np.asarray(blended)
+                return blended
         for j in range(target.size):
             mixed = target.copy()
             mixed[j] = control[j]
@@ -223,11 +256,7 @@ class SafeActionSearch:
         """Of all that was tried and the target, what violates least; the target if the fallback is not "brake"."""
         if not self._fallback.brakes:
             return target
-
-        def violation(control: Array) -> float:
-            return max(-c.slack(control) / c.scale for c in self._predicting)
-
-        return min([target, *(u for u in self._tried if self._within(u, strict))], key=violation)
+        return max([target, *(u for u in self._tried if self._within(u, strict))], key=self._room)
 
     def without_proposal(self, last: Array) -> Decision:
         """The fallback's control, filtered like a policy's: for a proposal that is not finite."""
@@ -240,17 +269,23 @@ class SafeActionSearch:
     def unreadable(self, last: Array) -> Decision:
         """The fallback alone: a state or a barrier that is not a number says nothing about any control."""
         control = self._fallback(self._plant, last, self._low, self._high, None, readable=False)
-        return Decision(control, Stage.FALLBACK, fallback=True)
+        return Decision(self._rounded(control, *self._no_rows), Stage.FALLBACK, fallback=True)
 
-    def _projected(self, proposal: Array, control: Array, stage: Stage, rows: Rows) -> Decision:
-        return Decision(control, stage, changed=bool((control != proposal).any()), rows=rows)
+    def _projected(self, proposal: Array, control: Array, stage: Stage) -> Decision:
+        return Decision(control, stage, changed=bool((control != proposal).any()))
 
     def _unprojected(self, status: Status, least: Array, last: Array) -> Decision:
         control, infeasible = self._fallback_control(least, last), status is Status.INFEASIBLE
         return Decision(control, Stage.FALLBACK, fallback=True, infeasible=infeasible)
 
     def _fallback_control(self, least: Array | None, last: Array) -> Array:
-        return self._fallback(self._plant, last, self._low, self._high, least, True)
+        control = self._fallback(self._plant, last, self._low, self._high, least, True)
+        return self._rounded(control, *self._no_rows)
+
+    def _rounded(self, control: Array, normals: Array, offsets: Array) -> Array:
+        """A control inside the box, rounded as the env's action will be, towards the inside of its rows."""
+        cast = cast_inside(control, self._dtype, normals, offsets, self._low, self._high)
+        return np.asarray(cast, dtype=np.float64)
 
     def _admitted(self, control: Array) -> bool:
         for c in self._predicting:
@@ -269,9 +304,6 @@ class SafeActionSearch:
     def _rows(self, asked: list[BoundConstraint]) -> Rows:
         return self._stacked([c.rows() for c in asked])
 
-    def _tangents(self, control: Array) -> Rows:
-        return self._stacked([c.linearize(control) for c in self._predicting if not c.admits(control)])
-
     def _stacked(self, parts: list[HalfSpaces]) -> Rows:
         if len(parts) == 1:
             return parts[0].normals, parts[0].offsets
@@ -280,6 +312,14 @@ class SafeActionSearch:
         return np.concatenate([p.normals for p in parts]), np.concatenate([p.offsets for p in parts])
 
     def _project(self, boxed: Array, normals: Array, offsets: Array) -> tuple[Projection, Array]:
+        """The projection, and its control as it can be executed."""
+        result, control = self._projection(boxed, normals, offsets)
+        if result.status is Status.INACTIVE:
+            return result, control
+        rows = (normals, offsets) if result.status is Status.PROJECTED else self._no_rows
+        return result, self._rounded(control, *rows)
+
+    def _projection(self, boxed: Array, normals: Array, offsets: Array) -> tuple[Projection, Array]:
         lower, upper = self._plant.lower, self._plant.upper
         low, high = np.maximum(self._low, lower), np.minimum(self._high, upper)
         nominal = boxed if bool(((boxed >= low) & (boxed <= high)).all()) else np.clip(boxed, low, high)

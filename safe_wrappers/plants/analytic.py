@@ -127,15 +127,19 @@ class AnalyticPlant(Plant):
     def path(self, control: Array) -> list[Array]:
         """States half-way and at the end of a held control, by one Runge-Kutta step; the end by one Euler step."""
         x, hold = self.state, self.control_dt
+        half = 0.5 * hold
         k1 = self.f + self.g @ control
-        k2 = self._rate(x + 0.5 * hold * k1, control)
-        k3 = self._rate(x + 0.5 * hold * k2, control)
+        k2 = self._rate(x + half * k1, control)
+        k3 = self._rate(x + half * k2, control)
         k4 = self._rate(x + hold * k3, control)
         end = x + hold / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
-        return [x + 0.5 * hold * k3, end, x + hold * k1]
+        return [x + half * k3, end, x + hold * k1]
 
     def _rate(self, x: Array, control: Array) -> Array:
-        return self.drift(x) + self.effect(x) @ control
+        drift, effect = self._f(x), self._g(x)
+        if type(drift) is not np.ndarray or type(effect) is not np.ndarray:
+            drift, effect = self.drift(x), self.effect(x)
+        return np.asarray(drift + effect @ control)
 
     @property
     def f(self) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 from safe_wrappers.checks import Array, positive
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.mujoco.displacement_step import DisplacementRecorder, moves_by_displacement, welds
-from safe_wrappers.plants.mujoco.forecast import Forecast, Recorder
+from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
 _WORKS = "Workspace, JointPositionLimit, JointSpeedLimit, SpeedLimit, SingularityMargin, Upright"
@@ -37,6 +37,7 @@ class DisplacementPlant(MujocoPlant):
     """
 
     has_acceleration: ClassVar[bool] = False
+    _recorder: DisplacementRecorder
 
     def __init__(
         self, model: mujoco.MjModel | None = None, delay_s: float = 0.0, metres_per_unit: float = 0.05
@@ -71,9 +72,9 @@ class DisplacementPlant(MujocoPlant):
         space: Any = env.action_space
         self.lower, self.upper = (np.asarray(end, dtype=np.float64) for end in (space.low, space.high))
 
-    def _new_recorder(self) -> Recorder:
+    def _new_recorder(self) -> DisplacementRecorder:
         action = self.metres_per_unit, self._dtype, self.blocked
-        return DisplacementRecorder(self.model, self.substeps, *action)
+        return DisplacementRecorder(self.model, self.data, self.substeps, *action)
 
     def observe(self) -> None:
         """Take the env's present state, and the gripper's pose as MuJoCo last evaluated it."""
@@ -95,11 +96,11 @@ class DisplacementPlant(MujocoPlant):
         self._keep()
         self._pose[:3], self._pose[3:] = self.data.xpos[self._body], self.data.xquat[self._body]
 
-    def forecast(self, control: Array, horizon: int = 1) -> Forecast:
+    def forecast(self, control: Array, horizon: int = 1, euler: bool = False) -> Forecast:
         """A displacement, shape (4,), for one control interval, then none."""
         if self.blocked:  # the last entry has no effect: share the forecast
             control = np.append(control[:3], 0.0)
-        return super().forecast(control, horizon)
+        return super().forecast(control, horizon, euler)
 
     def _linearise(self) -> None:
         mujoco.mj_forward(self.model, self.data)

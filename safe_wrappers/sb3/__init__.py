@@ -11,12 +11,14 @@ from safe_wrappers.sb3.executed_action_replay_buffer import (
     ExecutedActionDictReplayBuffer,
     ExecutedActionReplayBuffer,
 )
+from safe_wrappers.sb3.gymnasium_vec_env import GymnasiumVecEnv
 from safe_wrappers.sb3.intervention_callback import InterventionCallback, InterventionEvalCallback
 
 __all__ = [
     "ExecutedActionDictReplayBuffer",
     "ExecutedActionHerReplayBuffer",
     "ExecutedActionReplayBuffer",
+    "GymnasiumVecEnv",
     "InterventionCallback",
     "InterventionEvalCallback",
 ]

@@ -1,6 +1,7 @@
 """CBFActionFilter: executes the policy's action, or one near it that every constraint admits, or a fallback."""
 
 import copy
+import inspect
 import math
 import time
 import warnings
@@ -15,7 +16,7 @@ from safe_wrappers.errors import ConfigurationError, UnsafeStateWarning
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.engine import SafetyFilter
 from safe_wrappers.filter.fallback import FallbackFunction
-from safe_wrappers.filter.projection import cast_inside, check_solver
+from safe_wrappers.filter.projection import check_solver
 from safe_wrappers.filter.search import Stage
 from safe_wrappers.plants.default import default_plant, own_plant
 from safe_wrappers.plants.env_checks import check_actions, wrappers_of
@@ -25,7 +26,8 @@ from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step
 from safe_wrappers.wrappers.common.receiver import action_array
 
-_SAFE_TOLERANCE = 1e-6
+_WRAPPERS = __name__.rpartition(".")[0]
+SAFE_TOLERANCE = 1e-6
 """h below zero by less is rounding (of float32 actions, too), in the constraints' own units."""
 
 
@@ -49,7 +51,7 @@ class CBFActionFilter(LayerWrapper):
         constraints: Instances, or the plain dicts that a recorded filter holds. They are copied.
         plant: None reads the env's MuJoCo model; other envs need an `AnalyticPlant`.
         fallback: "brake", "hold", "zero", or a function of the plant that returns a control.
-        solver: "daqp" or any installed qpsolvers backend.
+        solver: "active-set" (compiled, exact), "daqp" or any installed qpsolvers backend.
         margin: Added to every constraint's own `margin`, in that constraint's unit (m, rad/s, ...).
 
     Info, at every step (see `safe_wrappers.info`): ``cbf/intervened``, ``cbf/infeasible``,
@@ -59,6 +61,7 @@ class CBFActionFilter(LayerWrapper):
     Attributes:
         filter: The `SafetyFilter` that decides; `filter.bound` are the constraints on the plant.
         constraint_names: Of the constraints, in the order of ``cbf/refused``: their kinds, numbered if repeated.
+        warned: What has been warned of: "nonfinite", "clipped", and "unsafe" until the next reset.
         filter_seconds: Wall time spent filtering so far; `filter_calls` says over how many steps.
 
     Raises:
@@ -81,7 +84,7 @@ class CBFActionFilter(LayerWrapper):
         constraints: Sequence[Constraint | dict[str, Any]],
         plant: Plant | None = None,
         fallback: str | FallbackFunction = "brake",
-        solver: str = "daqp",
+        solver: str = "active-set",
         margin: float = 0.0,
     ) -> None:
         arguments = dict(locals())
@@ -99,30 +102,49 @@ class CBFActionFilter(LayerWrapper):
         self.plant: Plant = plant if plant is not None else default_plant(env)
         self.plant.bind(env)
         self._low, self._high = np.asarray(space.low, np.float64), np.asarray(space.high, np.float64)
-        self.filter = SafetyFilter(self.plant, self.constraints, fallback, solver, self._low, self._high)
         self._shape, self._dtype = space.shape, space.dtype
-        self._warned: set[str] = set()
+        box = self._low, self._high
+        self.filter = SafetyFilter(self.plant, self.constraints, fallback, solver, *box, self._dtype)
+        self.warned: set[str] = set()
         self.filter_seconds, self.filter_calls = 0.0, 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env and forget the episode: commands in flight, the last action, the warning."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self._warned.discard("unsafe")
+        return observation, info | self.start_report()
+
+    def start_report(self) -> dict[str, Any]:
+        """Take the state that a reset has left: the info keys of a new episode."""
+        self.warned.discard("unsafe")
         self.filter.start()
         margin, unsafe = self._margin()
-        info.update(dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0))
-        info[keys.CBF_MARGIN] = margin
-        info[keys.CBF_UNSAFE] = unsafe
-        info[keys.CBF_REFUSED] = np.zeros(len(self.constraints), dtype=bool)
+        report: dict[str, Any] = dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0)
+        report[keys.CBF_MARGIN] = margin
+        report[keys.CBF_UNSAFE] = unsafe
+        report[keys.CBF_REFUSED] = np.zeros(len(self.constraints), dtype=bool)
         # When all sub-envs of a vector env reset at once, its infos hold only the keys that a reset reports.
-        info[keys.PROPOSED_ACTION] = np.zeros(self._shape)
-        info[keys.EXECUTED_ACTION] = np.zeros(self._shape)
-        info[keys.CBF_STAGE] = int(Stage.PROPOSAL)
-        return observation, info | self.filter.info(None, None)
+        report[keys.PROPOSED_ACTION] = np.zeros(self._shape)
+        report[keys.EXECUTED_ACTION] = np.zeros(self._shape)
+        report[keys.CBF_STAGE] = int(Stage.PROPOSAL)
+        return report | self.filter.info(None, None)
 
     def step(self, action: Any) -> Step:
         """Filter the action and step the env with what may be executed."""
         started = time.perf_counter()
+        sent, report = self.judge(action)
+        self.filter_seconds += time.perf_counter() - started
+        self.filter_calls += 1
+        observation, reward, terminated, truncated, info = self.plant.step(self.env, sent)
+        info |= report
+        if self.filter.reporting:
+            info |= self.filter.info(report[keys.PROPOSED_ACTION], report[keys.EXECUTED_ACTION])
+        return observation, reward, terminated, truncated, info
+
+    def judge(self, action: Any) -> tuple[Any, dict[str, Any]]:
+        """What to send for a proposed action in the env's present state, and the step's info keys.
+
+        The env must be stepped with it next. The constraints' own keys are not among these.
+        """
         proposed: Array = action_array(action, self._shape, np.float64)
         self.filter.observe()
         margin, unsafe = self._margin()
@@ -149,52 +171,50 @@ class CBFActionFilter(LayerWrapper):
             # Bit for bit the policy's own action wherever the filter has nothing to say.
             sent, executed, correction = action, proposed.copy(), 0.0
         else:
-            sent = cast_inside(decision.control, self._dtype, *decision.rows, self._low, self._high)
+            sent = decision.control.astype(self._dtype)
             executed = sent.astype(np.float64)
             correction = float(np.linalg.norm(executed - proposed))
             if finite and readable:
                 # What fails least may be the proposal itself, and a change may be lost in rounding.
                 intervened &= bool((executed != np.clip(proposed, self._low, self._high)).any())
         self.filter.executed(executed)
-        self.filter_seconds += time.perf_counter() - started
-        self.filter_calls += 1
-        observation, reward, terminated, truncated, info = self.plant.step(self.env, sent)
-        info[keys.CBF_INTERVENED] = intervened
-        info[keys.CBF_INFEASIBLE] = decision.infeasible
-        info[keys.CBF_FALLBACK] = decision.fallback
-        info[keys.CBF_NONFINITE] = not finite
-        info[keys.CBF_UNSAFE] = unsafe
         none = np.zeros(len(self.constraints), dtype=bool)
-        info[keys.CBF_REFUSED] = none if decision.refused is None else decision.refused
-        info[keys.CBF_CORRECTION] = correction
-        info[keys.CBF_CLIPPED] = clipped
-        info[keys.CBF_MARGIN] = margin
-        info[keys.PROPOSED_ACTION] = proposed
-        info[keys.EXECUTED_ACTION] = executed.copy()
-        info[keys.CBF_STAGE] = int(decision.stage)
-        if self.filter.reporting:
-            info |= self.filter.info(proposed, executed)
-        return observation, reward, terminated, truncated, info
+        return sent, {
+            keys.CBF_INTERVENED: intervened,
+            keys.CBF_INFEASIBLE: decision.infeasible,
+            keys.CBF_FALLBACK: decision.fallback,
+            keys.CBF_NONFINITE: not finite,
+            keys.CBF_UNSAFE: unsafe,
+            keys.CBF_REFUSED: none if decision.refused is None else decision.refused,
+            keys.CBF_CORRECTION: correction,
+            keys.CBF_CLIPPED: clipped,
+            keys.CBF_MARGIN: margin,
+            keys.PROPOSED_ACTION: proposed,
+            keys.EXECUTED_ACTION: executed.copy(),
+            keys.CBF_STAGE: int(decision.stage),
+        }
 
     def _margin(self) -> tuple[float, bool]:
         """`cbf/margin` and `cbf/unsafe`: 0 where no h is finite, unsafe where the state or an h is not a number."""
         lowest = self.filter.margin
-        unsafe = not lowest >= -_SAFE_TOLERANCE
+        unsafe = not lowest >= -SAFE_TOLERANCE
         margin = lowest if math.isfinite(lowest) else 0.0
         if unsafe:
             message = (
                 f"the state is outside the safe set (cbf/margin = {margin:.3g}); nothing is promised there"
             )
-            self._warn_once("unsafe", message, UnsafeStateWarning, stacklevel=4)
+            self._warn_once("unsafe", message, UnsafeStateWarning)
         return margin, unsafe
 
-    def _warn_once(
-        self, what: str, message: str, category: type[Warning] = UserWarning, stacklevel: int = 3
-    ) -> None:
-        """Warn once per episode (unsafe) or filter, at the line of the caller of `step` or `reset`."""
-        if what not in self._warned:
-            self._warned.add(what)
-            warnings.warn(message, category, stacklevel=stacklevel)
+    def _warn_once(self, what: str, message: str, category: type[Warning] = UserWarning) -> None:
+        """Warn once per episode (unsafe) or filter, at the line that called the outermost of our wrappers."""
+        if what in self.warned:
+            return
+        self.warned.add(what)
+        level, frame = 1, inspect.currentframe()
+        while frame is not None and str(frame.f_globals.get("__name__")).startswith(_WRAPPERS):
+            level, frame = level + 1, frame.f_back
+        warnings.warn(message, category, stacklevel=level)
 
 
 def _unique(kinds: list[str]) -> list[str]:

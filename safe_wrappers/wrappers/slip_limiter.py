@@ -25,7 +25,7 @@ class SlipLimiter(CBFActionFilter):
         regularization: Speed below which slip is counted against it, m/s.
         plant: None reads the env's model.
         fallback: As of `CBFActionFilter`. "brake" here brakes as hard as the slip limit allows.
-        solver: "daqp" or any installed qpsolvers backend.
+        solver: "active-set" (compiled, exact), "daqp" or any installed qpsolvers backend.
         margin: Slip kept free below the limit.
 
     Info, at every step: the keys of `CBFActionFilter` (``cbf/margin`` stays 0), and arrays with one entry
@@ -55,7 +55,7 @@ class SlipLimiter(CBFActionFilter):
         regularization: float = 0.5,
         plant: Plant | None = None,
         fallback: str | FallbackFunction = "brake",
-        solver: str = "daqp",
+        solver: str = "active-set",
         margin: float = 0.0,
     ) -> None:
         arguments = dict(locals())

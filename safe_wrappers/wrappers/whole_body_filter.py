@@ -50,7 +50,7 @@ class WholeBodyFilter(CBFActionFilter):
         horizon: Control steps to look ahead for the joints, for forecasts: as many as braking takes; None is 3.
         plant: None reads the env's model.
         fallback: As of `CBFActionFilter`.
-        solver: "daqp" or any installed qpsolvers backend.
+        solver: "active-set" (compiled, exact), "daqp" or any installed qpsolvers backend.
 
     Info, at every step: the keys of `CBFActionFilter`, ``whole_body/contacts``, ``whole_body/cone_margin``, and for
     forecasts with a `zmp_inset` ``whole_body/zmp_margin`` and ``whole_body/supported``.
@@ -80,7 +80,7 @@ class WholeBodyFilter(CBFActionFilter):
         horizon: int | None = None,
         plant: Plant | None = None,
         fallback: str | FallbackFunction = "brake",
-        solver: str = "daqp",
+        solver: str = "active-set",
     ) -> None:
         arguments = dict(locals())
         model = getattr(env.unwrapped, "model", None)

@@ -1,11 +1,13 @@
 """The timed benchmarks: what they compare takes the same steps, and they report what they looked for."""
 
+import math
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
 import safe_wrappers as sw
-from benchmarks import env_step, mujoco_drivers, wrapper_cost
+from benchmarks import bench, env_step, many_envs, mujoco_drivers, peers, scaling, wrapper_cost
 from benchmarks.cases import PROTECTED
 
 
@@ -15,6 +17,7 @@ def test_inactive_and_active_steps_are_told_apart():
     assert quiet.share == 1.0 and pushed.share > 0.5
     assert 1.0 < quiet.ratio < pushed.ratio
     assert 0.0 < quiet.without_us < quiet.with_us
+    assert quiet.infeasible == 0.0 and math.isnan(quiet.correction) and pushed.correction > 0.1
 
 
 def test_both_envs_take_the_same_steps(monkeypatch):
@@ -47,6 +50,44 @@ def test_runners_get_a_lower_limit_and_nothing_else():
 
 def test_every_timed_env_is_a_case():
     assert set(env_step.ACTIVE) <= set(PROTECTED)
+
+
+def test_many_envs_are_timed_alike_and_the_attacking_driver_is_changed():
+    quiet, attacked = (many_envs.measure(2, driver, steps=300) for driver in ("gentle", "hazard-seeking"))
+    assert quiet[3] == 0.0 < attacked[3]
+    assert min(quiet) >= 0.0 < min(attacked)
+
+
+@pytest.mark.parametrize("active", [False, True])
+def test_peers_get_problems_that_are_active_or_not(active):
+    for u, normals, offsets, low, high in peers.problems(2, 8, active, count=20):
+        status = sw.project(u, normals, offsets, low, high).status
+        assert status == ("projected" if active else "inactive")
+    env = peers.DoubleIntegrator()
+    filtered = peers.wall_filter(env, constraints=2)
+    for env.x, u in peers.states(active)[:20]:
+        assert filtered.step(u)[4]["cbf/intervened"] == active
+
+
+def test_a_row_of_the_table_compares_with_the_version_before():
+    times = {"ours": 2.0, "other": 8.0}
+    (row,) = bench.peer_rows(times, {"ours": 4.0, "other": 8.0}).values()
+    old = row | {"inactive": 0.5, "active": 0.25}
+    assert bench.line("a", "b", row, old) == "| a | b | 2 | 4 | 0.25 | 0.50 |  |  | 0.50 / 2.00 |"
+    steps = row | {"infeasible": 0.125, "correction": 0.3}
+    assert bench.line("a", "b", steps, None) == "| a | b | 2 | 4 | 0.25 | 0.50 | 12.5% | 0.3 |  |"
+
+
+def test_rows_are_chosen_by_words(monkeypatch):
+    monkeypatch.setattr(bench, "env_row", lambda name, steps: {"name": name})
+    assert [row for row, _, _ in bench.measured(["Goal1"], 1)] == ["SafePointGoal1-v0", "SafeCarGoal1-v0"]
+
+
+@pytest.mark.parametrize("name", ["discs", "look-ahead"])
+def test_decisions_are_timed_at_every_size(monkeypatch, name):
+    monkeypatch.setattr(scaling, "STEPS", 20)
+    measure, counts = scaling.GROWTH[name]
+    assert min(measure(counts[0]), measure(counts[-1])) > 0.0
 
 
 @pytest.mark.slow

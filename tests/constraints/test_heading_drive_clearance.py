@@ -28,14 +28,14 @@ def filtered(layout=None, velocity=(0.0, 0.0, 0.0), **options):
 def test_a_control_must_be_safe_for_every_corner_of_the_uncertainty():
     env = filtered({"agent": [-0.3, 0.0, 0.0]}, uncertainty=0.25)
     (limit,), raw = env.filter.bound, env.unwrapped
-    every, push = limit._models, np.array([0.05, 0.0])
+    every, push = limit.models, np.array([0.05, 0.0])
     assert len(every) == 1 + 4  # the body, and its corners
 
     def refused(x, models):
         qpos, qvel = raw.data.qpos.copy(), raw.data.qvel.copy()
         qpos[0], qvel[0] = x, 0.9
         raw.set_state(qpos, qvel)
-        limit._models = models
+        limit.models = models
         env.filter.observe()
         return not limit.admits(push)
 

@@ -16,7 +16,9 @@ class Approaching(BoundRollout):
 
     def __init__(self, plant, margin=0.0, horizon=1):
         self.spec, self.plant, self.max_decrease = (
-            SimpleNamespace(margin=margin, horizon=horizon, look_ahead_below=None, unit="m"),
+            SimpleNamespace(
+                margin=margin, horizon=horizon, look_ahead_below=None, euler_look_ahead=False, unit="m"
+            ),
             plant,
             None,
         )
@@ -33,9 +35,9 @@ def still_plant():
     plant = SimpleNamespace(
         has_acceleration=False, lower=-np.ones(2), upper=np.ones(2), control_dt=0.1, observation_id=0
     )
-    plant.left, plant.gain, plant.asked = 0.5, 1.0, []
+    plant.left, plant.gain, plant.asked, plant.model_version = 0.5, 1.0, [], 0
 
-    def forecast(control, horizon):
+    def forecast(control, horizon, euler=False):
         plant.asked.append(np.array(control))
         return control
 

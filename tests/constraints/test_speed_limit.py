@@ -16,6 +16,7 @@ from judged_loops import Scene, flagged, sliders
 import safe_wrappers as sw
 from safe_wrappers.envs.velocity.speed_limits import SPEED_LIMITS
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.plants.mujoco.forecast import Recorder
 from safe_wrappers.serialize import constraint_from, plain_data
 
 PLANAR = ("Ant", "Humanoid")
@@ -279,9 +280,9 @@ def test_an_executed_control_that_is_not_flagged_costs_nothing(robot):
 def test_a_reach_spares_the_forecasts_far_from_the_limit(monkeypatch):
     calls, real = [0], sw.MujocoPlant.forecast
 
-    def counted(self, control, horizon=1):
+    def counted(self, *asked):
         calls[0] += 1
-        return real(self, control, horizon)
+        return real(self, *asked)
 
     monkeypatch.setattr(sw.MujocoPlant, "forecast", counted)
     for max_decrease, spent in ((None, 10), (3.0, 0)):
@@ -322,19 +323,18 @@ def test_a_control_that_leaves_enough_is_admitted_without_a_look_ahead():
 
 @pytest.mark.parametrize("robot", ["HalfCheetah", "Hopper"])
 def test_with_a_gate_a_slow_robot_is_rolled_out_for_its_own_step_alone(monkeypatch, robot):
-    count, step = [0], mujoco.mj_step
+    count, simulate = [0], Recorder.simulate
 
-    def counted(model, data, nstep=1):
-        count[0] += nstep
-        step(model, data, nstep)
+    def counted(self, begin, end, *rest):
+        count[0] += end - begin
+        return simulate(self, begin, end, *rest)
 
     env = sw.protect(gym.make(f"Safe{robot}Velocity-v0"))
     env.reset(seed=0)
-    monkeypatch.setattr(mujoco, "mj_step", counted)
+    monkeypatch.setattr(Recorder, "simulate", counted)
     for _ in range(5):
         env.step(np.zeros(env.action_space.shape, np.float32))
-    # The rollouts, and the env's own steps: nothing is shared while somebody counts.
-    assert count[0] == 2 * 5 * env.unwrapped.frame_skip and env.plant.shared_steps == 0
+    assert count[0] == env.plant.shared_steps == 5
 
 
 # Plain data, and what is refused ------------------------------------------------------------------------------
@@ -350,6 +350,7 @@ def test_it_is_rebuilt_from_the_spec_and_from_json():
         horizon=4,
         max_decrease=0.7,
         look_ahead_below=0.6,
+        euler_look_ahead=True,
     )
     filtered = sw.CBFActionFilter(gym.make("HalfCheetah-v5"), [limit])
     for spec in (filtered.spec, EnvSpec.from_json(filtered.spec.to_json())):
@@ -366,6 +367,7 @@ def test_it_is_rebuilt_from_the_spec_and_from_json():
         "horizon": 4,
         "max_decrease": 0.7,
         "look_ahead_below": 0.6,
+        "euler_look_ahead": True,
     }
     assert constraint_from(data) == limit
     assert limit.promise == "best effort" and filtered.filter.bound[0].scale == 1.5

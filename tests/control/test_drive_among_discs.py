@@ -16,6 +16,7 @@ from safe_wrappers.constraints.backup.heading_drive_clearance import BoundHeadin
 from safe_wrappers.control.backup import drive_decision as among
 from safe_wrappers.control.numerics.compiled import IS_COMPILED
 from safe_wrappers.filter.engine import SafetyFilter
+from safe_wrappers.filter.projection import cast_inside
 
 KINDS = {
     "detour": {"detour": True},
@@ -100,6 +101,20 @@ def test_from_inside_a_disc_both_searches_lead_out():
     assert changed > 5
 
 
+def together(scenes, bounds, single):
+    """Least clearances, verdicts, controls and stages of scenes that are alike in `brake` and `detour`."""
+    models, motions, discs, controls = (np.array([s[k] for s in scenes]) for k in (0, 1, 2, 4))
+    brake, detour, n = scenes[0][3], scenes[0][5], len(scenes)
+    first = np.arange(n + 1) * len(scenes[0][2])
+    scene = models, motions, np.concatenate(discs), first, brake, controls
+    least, admitted, out, stages = np.empty(n), np.empty(n, bool), controls.copy(), np.zeros(n, np.int64)
+    among.admit_each(*scene, least, admitted)
+    refused = np.flatnonzero(~admitted)
+    corners = np.broadcast_to(bounds, (len(refused), 4, 2)).copy()
+    among.decide_each(*scene, refused, np.zeros(n), detour, corners, single, out, stages)
+    return least, admitted, out, stages
+
+
 def random_scenes(count):
     """Every function on random scenes, as one digest."""
     rng, digest = np.random.default_rng(7), hashlib.sha256()
@@ -125,6 +140,8 @@ def random_scenes(count):
         for part in (*numbers, out, *among.least_clearance(*state, models, np.empty(6), discs, brake)):
             digest.update(np.asarray(part, dtype=np.float64).tobytes())
         digest.update(np.float64(among.manoeuvre_drive(models, motion, discs, brake)).tobytes())
+        for part in together([(models, motion, discs, brake, control, bool(i % 5))], bounds, single=True):
+            digest.update(part.tobytes())
     return digest.hexdigest(), sorted(stages)
 
 
@@ -141,3 +158,32 @@ def test_plain_python_gives_the_same_bits():
     digest, stages = random_scenes(400)
     assert said.stdout.split("\n")[0] == f"False {digest} {stages}"
     assert {among.PROPOSAL, among.ROWS, among.CANDIDATE, among.UNRESOLVED} <= set(stages)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_many_are_decided_as_each_alone_and_rounded_as_the_filter_rounds(dtype):
+    env = sw.protect(gym.make("SafePointGoal1-v0"))
+    drive = env.filter.bound[0].drive
+    models = np.array([drive, *drive.corners()], dtype=np.float64)
+    rng, bounds, found = np.random.default_rng(3), np.array([[-1.0, -1.0], [1.0, 1.0]] * 2), np.empty(2)
+    scenes = []
+    for _ in range(400):
+        motion = rng.uniform(-1.0, 1.0, 6) * [0.1, 0.1, 3.0, 1.0, 1.0, 2.0]
+        discs = np.column_stack([rng.uniform(-0.9, 0.9, (6, 2)), np.full(6, 0.1)])
+        scenes.append((models, motion, discs, True, rng.uniform(-1.0, 1.0, 2), True))
+    least, admitted, out, stages = together(scenes, bounds, dtype == np.float32)
+    for i, (_, motion, discs, brake, control, detour) in enumerate(scenes):
+        seen = np.empty(6)
+        state = motion[:3], motion[3:], np.zeros(4)
+        assert least[i] == among.least_clearance(*state, models, seen, discs, brake)[0]
+        assert admitted[i] == among.is_admitted(models, motion, discs, brake, *control)
+        stage, _, *rows = among.closest_admitted(
+            models, motion, discs, brake, control, 0.0, detour, bounds, found
+        )
+        assert stage == stages[i]
+        if stage != among.PROPOSAL:
+            sent = cast_inside(found, np.dtype(dtype), *rows, *bounds[:2])
+            np.testing.assert_array_equal(out[i], sent.astype(np.float64))
+        else:
+            np.testing.assert_array_equal(out[i], control)
+    assert {among.PROPOSAL, among.ROWS, among.CANDIDATE} <= set(stages.tolist())

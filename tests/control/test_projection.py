@@ -6,13 +6,13 @@ import daqp
 import numpy as np
 import pytest
 import qpsolvers
-import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear, minimize
 
 import safe_wrappers as sw
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.filter import projection, rows_and_box
 from safe_wrappers.filter.problem import Status
 from safe_wrappers.filter.projection import box_least_squares, project
 
@@ -391,6 +391,7 @@ LIES = {
     "infinite called found": (True, [np.inf, 0.0]),
     "zero called not found": (False, [0.0, 0.0]),
     "infeasible point called found": (True, [0.0, 0.0]),
+    "the nominal called found": (True, [0.9, 0.8]),
     "outside of the box called found": (True, [-30.0, 2.45]),
     "nothing": (False, None),
 }
@@ -451,25 +452,34 @@ def test_a_backend_that_raises_is_replaced(monkeypatch, error):
 
 @pytest.mark.parametrize("flag", [-1, 0, 1])
 @pytest.mark.parametrize("x", [[np.nan, np.nan], [0.0, 0.0]])
-def test_when_every_backend_lies_the_status_says_failed(monkeypatch, flag, x):
+def test_when_every_solver_lies_the_status_says_failed(monkeypatch, flag, x):
     def solve(h, f, a, bupper, blower, sense, primal_tol):
         return np.resize(np.array(x), f.size), 0.0, flag, {"lam": np.zeros(bupper.size), "iterations": 1}
 
-    def give_up(*_):
-        raise RuntimeError("Maximum number of iterations reached.")
+    def give_up(u, a, b, lo, hi, named, control, multipliers):
+        control[:], multipliers[:] = np.clip(u, lo, hi), 0.0
+        return rows_and_box.UNSOLVED, float((a @ control - b).max()), 99
 
     with monkeypatch.context() as patch:
         patch.setattr(daqp, "solve", solve)
-        if (
-            flag < 1 or np.isnan(x).any()
-        ):  # least squares help where there is no answer to judge feasibility by
-            assert project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0).status == "projected"
-        patch.setattr(scipy.optimize, "nnls", give_up)
-        answer = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0)
-    assert answer.status in ("failed", "infeasible")
-    assert np.isfinite(answer.control).all() and (np.abs(answer.control) <= 1.0).all()
-    assert answer.violation == pytest.approx(max(0.0, (NORMALS @ answer.control - OFFSETS).max()))
+        # A named solver that has no answer is replaced.
+        assert project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0, solver="daqp").status == "projected"
+        patch.setattr(projection, "keep_rows", give_up)
+        for solver in ("active-set", "daqp"):
+            answer = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0, solver=solver)
+            assert answer.status == "failed" and not answer.multipliers.any()
+            np.testing.assert_array_equal(answer.control, NOMINAL)
+            assert answer.violation == pytest.approx((NORMALS @ NOMINAL - OFFSETS).max())
     assert project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0).status == "projected"
+
+
+def test_what_the_active_set_gives_up_is_left_to_daqp(monkeypatch):
+    truth = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0)
+    monkeypatch.setattr(projection, "keep_rows", lambda *_: (rows_and_box.UNSOLVED, 0.0, 99))
+    answer = project(NOMINAL, NORMALS, OFFSETS, -1.0, 1.0)
+    assert answer.status == "projected"
+    np.testing.assert_allclose(answer.control, truth.control, atol=1e-9)
+    np.testing.assert_allclose(answer.multipliers, truth.multipliers, atol=1e-9)
 
 
 def test_an_infeasible_solve_does_not_poison_the_next():

@@ -40,9 +40,7 @@ def batches(draw):
 
 def compare(problems):
     """Every answer of the batch is that of `project`: statuses the same, controls to 1e-12 of the box."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(batch, "_FEW", 0)
-        answer = sw.project_batch(*problems)
+    answer = sw.project_batch(*problems)
     for i, problem in enumerate(zip(*problems, strict=True)):
         single = project(*problem)
         assert answer.status[i] == single.status
@@ -91,7 +89,8 @@ def test_rows_that_ask_for_nothing_change_nothing():
     assert answer.multipliers.shape == (2, 3) and answer.multipliers[0, 0] == pytest.approx(0.7)
 
 
-def test_only_problems_that_need_it_reach_the_solver(monkeypatch):
+@pytest.mark.parametrize(("solver", "reach_it"), [("active-set", []), ("daqp", [1, 2])])
+def test_only_problems_of_several_rows_reach_a_named_solver(monkeypatch, solver, reach_it):
     asked = []
 
     def counted(u, *rest):
@@ -99,14 +98,13 @@ def test_only_problems_that_need_it_reach_the_solver(monkeypatch):
         return project_unchecked(u, *rest)
 
     monkeypatch.setattr(batch, "project_unchecked", counted)
-    monkeypatch.setattr(batch, "_FEW", 0)
     u = np.array([[0.1, 0.1], [0.9, 0.1], [0.9, 0.9], [0.9, 0.9]])
     normals = np.tile(np.eye(2), (4, 1, 1))
     offsets = np.array([[0.5, 0.5], [0.5, 0.5], [0.5, 0.5], [-9.0, math.inf]])
-    answer = sw.project_batch(u, normals, offsets, -1.0, 1.0)
+    answer = sw.project_batch(u, normals, offsets, -1.0, 1.0, solver=solver)
     assert answer.status.tolist() == ["inactive", "projected", "projected", "infeasible"]
     np.testing.assert_allclose(answer.controls, [[0.1, 0.1], [0.5, 0.1], [0.5, 0.5], [-1.0, 0.9]], atol=1e-12)
-    np.testing.assert_array_equal(asked, [u[2]])  # two rows at once
+    np.testing.assert_array_equal(np.reshape(asked, (-1, 2)), u[reach_it])
     assert answer.violation[3] == 8.0
 
 
@@ -125,19 +123,6 @@ def test_arguments_are_not_written_to_and_no_memory_is_shared():
     answer.controls[:] = 7.0
     for array, copy in zip(arguments, copies, strict=True):
         np.testing.assert_array_equal(array, copy)
-
-
-def test_a_few_problems_are_solved_one_by_one():
-    problems = (
-        np.array([[0.9], [0.1]]),
-        np.ones((2, 1, 1)),
-        np.full((2, 1), 0.5),
-        -np.ones((2, 1)),
-        np.ones((2, 1)),
-    )
-    few, arrays = sw.project_batch(*problems), compare(problems)
-    for one, other in zip(few, arrays, strict=True):
-        np.testing.assert_array_equal(one, other)
 
 
 def test_an_empty_batch():

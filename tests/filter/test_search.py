@@ -1,5 +1,6 @@
 """The search for an admissible action, stage by stage: what each one tries, in which order, and what it refuses."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from fake_constraints import LAST, Predicting, Rows, Still, decide, only, search, still_plant
@@ -73,7 +74,6 @@ def test_rows_alone_are_projected_on():
     decision = decide((1.0, 0.5), LEFT, Rows(((0.0, 1.0), 0.2)))
     keeps(decision, 0.0, 0.2)
     assert decision.stage is Stage.ROWS and decision.changed and not decision.fallback
-    assert decision.rows[1].tolist() == [0.0, 0.2]
     assert decision.refused.tolist() == [True, True]
 
 
@@ -151,9 +151,6 @@ def test_a_refused_control_is_linearised_up_to_six_times(steps):
     decision = decide((1.0, 0.5), creeping(lambda u: 1.0001 - 0.1 * steps - u[0]))
     keeps(decision, 1.0 - 0.1 * steps, 0.5)
     assert decision.stage is Stage.RELINEARIZED
-    assert len(decision.rows[1]) == (
-        steps if steps < 6 else 0
-    )  # the last answer has no rows to be rounded by
 
 
 def test_and_not_seven_times():
@@ -181,8 +178,86 @@ def test_tangents_that_are_no_numbers_end_it():
     tangents = [((np.nan, 0.0), 0.3), ((1.0, 0.0), 0.3)]
     broken = Predicting(lambda u: 0.5 - u[0], tangents=lambda u: tangents, control=(-1.0, 0.5))
     decision = decide((1.0, 0.5), broken)
-    keeps(decision, 0.17, 0.5)  # blended with the backup
+    keeps(decision, 0.475, 0.5)  # towards the backup, by 5 % of the violation beyond the boundary
     assert decision.stage is Stage.BLEND
+
+
+def test_provisional_tangents_give_way_to_the_next_ones():
+    limits, provisional = iter([0.9, -0.5, 0.6]), iter([False, True, True])
+
+    class Guessing(Predicting):
+        def linearize(self, control):
+            return sw.HalfSpaces(np.array([[1.0, 0.0]]), np.array([next(limits)]), next(provisional))
+
+    admitted, control, rows = search(Guessing(only((0.6, 1.0)))).relinearize(
+        np.ones(2), np.ones(2), NONE, NONE
+    )
+    assert admitted
+    np.testing.assert_allclose(control, [0.6, 1.0])
+    np.testing.assert_allclose(rows[1], [0.9, 0.6])
+
+
+# Shortening -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("limit", [0.5, 0.0, -0.6])
+def test_an_admitted_correction_is_shortened_to_what_is_needed(limit):
+    found = search(Predicting(lambda u: limit - u[0])).shorten(np.ones(2), np.array([-1.0, 1.0]), NONE)
+    np.testing.assert_allclose(found, [1.0 - 1.05 * (1.0 - limit), 1.0])
+
+
+def test_where_room_is_not_in_proportion_it_goes_halfway():
+    asked = []
+
+    def slack(u):
+        asked.append(float(u[0]))
+        return 1.0 if u[0] <= 0.2 else -0.1
+
+    found = search(Predicting(slack)).shorten(np.ones(2), np.array([-1.0, 1.0]), NONE)
+    # By the secant a tenth of the way, then half of what is left, then half of that.
+    assert set(np.round(asked, 9)) == {1.0, -1.0, 0.8, -0.1, 0.35}
+    assert found[0] == pytest.approx(-0.1)
+
+
+def test_a_correction_that_cannot_be_shortened_by_much_is_not_tried_again():
+    asked = []
+
+    def slack(u):
+        asked.append(float(u[0]))
+        return 0.02 - u[0]
+
+    control = np.array([0.0, 1.0])
+    assert search(Predicting(slack)).shorten(np.ones(2), control, NONE) is control
+    assert set(asked) == {1.0, 0.0}
+
+
+def test_what_is_shortened_keeps_the_rows():
+    strict = np.array([[1.0, 0.0]]), np.array([-0.4])
+    found = search(Predicting(lambda u: 0.5 - u[0])).shorten(np.ones(2), np.array([-1.0, 1.0]), strict)
+    assert found[0] <= -0.4 and found[0] > -1.0
+
+
+# Rounding ---------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_executed_is_what_was_judged():
+    judged = []
+
+    def slack(u):
+        judged.append(tuple(u))
+        return 1.0 / 3.0 - u[0] * u[0] - 0.1 * u[1]
+
+    def tangents(u):
+        value = slack(u)
+        return [((2.0 * u[0], 0.1), value + 2.0 * u[0] * u[0] + 0.1 * u[1])]
+
+    env = sw.CBFActionFilter(Still32(), [Fake(Predicting(slack, tangents=tangents))], plant=still_plant())
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        executed = env.step(rng.uniform(-1.0, 1.0, 2).astype(np.float32))[4]["executed_action"]
+        assert tuple(executed) in judged and slack(executed) >= -1e-9
+        np.testing.assert_array_equal(executed, executed.astype(np.float32))
 
 
 # Rows that contradict each other ----------------------------------------------------------------------------------
@@ -358,6 +433,12 @@ class Fake(sw.Constraint):
 
     def bind(self, plant):
         return self.bound
+
+
+class Still32(Still):
+    """Its actions are rounded."""
+
+    action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
 
 
 def reported(bound, action, **options):

@@ -73,6 +73,21 @@ def test_the_shared_step_is_the_env_s_own_bit_for_bit(env_id):
     assert taken_over == 0 if env_id == "InvertedPendulum-v5" else taken_over > 50
 
 
+@pytest.mark.parametrize("env_id", ["SafeHopperVelocity-v0", "Reacher-v5"])
+def test_steps_that_the_filter_changes_are_shared_too(env_id):
+    shared, own = filtered(env_id), filtered(env_id, share_step=False)
+    rng, changed, over, low = np.random.default_rng(1), 0, True, shared.action_space.low
+    for step in range(300):
+        if over:
+            shared.reset(seed=step), own.reset(seed=step)
+        if step % 15 == 0:
+            action = np.where(rng.random(low.size) < 0.5, low, -low)
+        one, two = shared.step(action), own.step(action)
+        np.testing.assert_array_equal(one[0], two[0])
+        changed, over = changed + one[4]["cbf/intervened"], one[2] or one[3]
+    assert changed > 20 and shared.plant.shared_steps > 290
+
+
 class Pushed(gym.Wrapper):
     """Changes the state, the force or the control between the filter's decision and the simulation."""
 

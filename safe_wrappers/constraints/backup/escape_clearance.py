@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from safe_wrappers.checks import check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundBackupClearance
-from safe_wrappers.constraints.obstacles import Discs, TrackedDiscs, distances, obstacles_from
+from safe_wrappers.constraints.obstacles import Disc, Discs, Plane, TrackedDiscs, distances, obstacles_from
 from safe_wrappers.control.backup.evasive_maneuvers import EvasiveManeuvers, Maneuver
+from safe_wrappers.control.backup.way_clearances import Around, least_left, way_clearances
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, Memory
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
@@ -23,6 +24,7 @@ _DIRECTIONS = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 _RECOVERY_S = 0.4  # time constant, s, with which the way out of a violation must come clear
 _BLENDS = (0.2, 0.4, 0.6, 0.8)  # shares of the way from a refused control to one that leaves a way out
 _APPROACHED = 2  # how many of those are approached
+_COMPILED = (Disc, Discs, Plane)  # obstacles that stand still, in `Around`
 
 
 @dataclass
@@ -135,19 +137,40 @@ class BoundEscapeClearance(BoundBackupClearance):
         centers = np.concatenate([none, *(c for c, _ in parts)], axis=1)
         halves = np.concatenate([none, *(h for _, h in parts)], axis=1)
         radii = [np.full(c.shape[1], o.radius) for (c, _), o in zip(parts, self._moving, strict=True)]
-        here = self._position[None]
-        fixed = [distances(o, here, self.plant)[0] for o in self._fixed]
-        moving = _box_distances(here[:, 0], here[:, 1], centers[:1], halves[:1])[0]
-        self._near_fixed = [float(f.min(initial=np.inf)) for f in fixed]
-        self._sizes = np.concatenate([*radii, np.zeros(0)]) + self.spec.radius
-        now = np.concatenate([moving - self._sizes, *(f - self.spec.radius for f in fixed)])
-        self._boxes = centers[1:], halves[1:]
-        self._lowest, self._highest = (centers - halves).min(axis=0), (centers + halves).max(axis=0)
+        sizes = np.concatenate([*radii, np.zeros(0)]) + self.spec.radius
+        offsets = np.maximum(np.abs(self._position - centers[0]) - halves[0], 0.0)
+        moving = np.sqrt((offsets * offsets).sum(axis=1)) - sizes
+        fixed = [distances(o, self._position[None], self.plant)[0] - self.spec.radius for o in self._fixed]
+        now = np.concatenate([moving, *fixed])
+        near = [float(f.min(initial=np.inf)) for f in fixed]
+        self._others = [(o, d) for o, d in zip(self._fixed, near, strict=True) if type(o) not in _COMPILED]
+        bounds = (centers - halves).min(axis=0), (centers + halves).max(axis=0)
+        still = self._discs(near), self._planes(near)
+        self._around = Around(centers[1:], halves[1:], sizes, *bounds, *still, self._position)
         # From outside, the violation must shrink along the way.
         outside = min(float(now.min(initial=np.inf)) - self.spec.margin, 0.0)
         self._wanted = self.spec.margin + outside * np.exp(-times[1:] / _RECOVERY_S)
         self._best: float | None = None
-        return np.asarray(now)
+        return now
+
+    def _discs(self, near: list[float]) -> Array:
+        """For `Around`; of clearances now of the fixed obstacles."""
+        parts = [np.zeros((0, 4))]
+        for obstacle, now in zip(self._fixed, near, strict=True):
+            if type(obstacle) in (Disc, Discs):
+                centers = obstacle.centers(self.plant)[:, :2]
+                rest = np.tile([obstacle.radius + self.spec.radius, now], (len(centers), 1))
+                parts.append(np.concatenate([centers, rest], axis=1))
+        return np.concatenate(parts)
+
+    def _planes(self, near: list[float]) -> Array:
+        """For `Around`; of clearances now of the fixed obstacles."""
+        rows = [
+            [*_flat(obstacle.point), *_flat(obstacle.normal), self.spec.radius, now]
+            for obstacle, now in zip(self._fixed, near, strict=True)
+            if type(obstacle) is Plane
+        ]
+        return np.array(rows).reshape(-1, 6)
 
     def _expected(self, obstacle: Any, times: Array) -> tuple[Array, Array]:
         """Centres and half-widths of the boxes that hold them, shapes (k, n, 2)."""
@@ -173,28 +196,16 @@ class BoundEscapeClearance(BoundBackupClearance):
         """What every way out after each of some held controls (c, 2) leaves, wanted >= 0, shape (c, manoeuvres)."""
         position, velocity = self._held(controls)
         x, y = self._escapes.paths(position, velocity, self._open)
-        left = (self._clearances(x, y) - self._wanted).min(axis=-1)
-        self._asked.append((velocity, self._open[left.argmax(axis=1)]))
-        return np.asarray(left)
-
-    def _clearances(self, x: Array, y: Array) -> Array:
-        """Distance of ways from whatever is nearest, margin not taken off; shapes (c, m, k) as the ways'."""
-        (left, low), (right, high) = (float(x.min()), float(y.min())), (float(x.max()), float(y.max()))
-        nearest = np.full(x.shape, np.inf)
-        room = self._sizes[:, None] + self.spec.margin
-        near = ((self._lowest - room <= (right, high)) & (self._highest + room >= (left, low))).all(axis=1)
-        centers, halves = self._boxes
-        for i in np.flatnonzero(near):
-            gap = _box_distances(x, y, centers[:, i], halves[:, i])
-            np.minimum(nearest, gap - self._sizes[i], out=nearest)
-        here_x, here_y = self._position
-        reach = float(np.hypot(max(right - here_x, here_x - left), max(high - here_y, here_y - low)))
-        for obstacle, now in zip(self._fixed, self._near_fixed, strict=True):
-            if now - reach <= self.spec.radius + self.spec.margin:
+        nearest = way_clearances(x, y, self._around, self.spec.margin)
+        for obstacle, now in self._others:
+            here_x, here_y = self._position
+            if now - float(np.hypot(abs(x - here_x).max(), abs(y - here_y).max())) <= self.spec.margin:
                 points = np.stack([x.ravel(), y.ravel()], axis=1)
                 gap = distances(obstacle, points, self.plant).min(axis=1, initial=np.inf).reshape(x.shape)
                 np.minimum(nearest, gap - self.spec.radius, out=nearest)
-        return nearest
+        left = least_left(nearest, self._wanted)
+        self._asked.append((velocity, self._open[left.argmax(axis=1)]))
+        return left
 
     def _driven(self, control: Array) -> Array:
         return np.asarray(control)[list(self._point.actuators)]
@@ -251,12 +262,6 @@ def _moves(obstacle: Any) -> bool:
     return tracked or (published and obstacle.velocity_attribute is not None)
 
 
-def _box_distances(x: Array, y: Array, centers: Array, halves: Array) -> Array:
-    """Distances of points (..., k) from boxes, 0 inside; centres and half-widths (k, 2)."""
-    across = np.abs(x - centers[..., 0])
-    across -= halves[..., 0]
-    along = np.abs(y - centers[..., 1])
-    along -= halves[..., 1]
-    np.maximum(across, 0.0, out=across)
-    np.maximum(along, 0.0, out=along)
-    return np.asarray(np.sqrt(across * across + along * along))
+def _flat(values: Sequence[float]) -> tuple[float, float]:
+    """X and y of what may have x alone."""
+    return (values[0], values[1]) if len(values) > 1 else (values[0], 0.0)

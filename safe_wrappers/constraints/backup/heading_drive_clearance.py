@@ -2,16 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 from safe_wrappers.checks import check_fields, non_negative
 from safe_wrappers.constraints.backup.base import BoundDetourClearance
+from safe_wrappers.constraints.backup.heading_drive_batch import HeadingDriveBatch
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.backup import drive_decision as among
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, Constraint, HalfSpaces
+from safe_wrappers.filter.constraint_batch import ConstraintBatch
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.queries.planar_robot import PlanarFrame, heading_drive
@@ -74,33 +76,41 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
     def __init__(self, spec: HeadingDriveClearance, plant: Plant) -> None:
         hint = "HeadingDriveClearance needs a MujocoPlant: it reads the robot's model"
         machine = require_mujoco(plant, hint)
-        self._frame = PlanarFrame(machine, spec.body)
+        self.frame = PlanarFrame(machine, spec.body)
         self._discs = np.zeros((0, 3))
-        self._turns_first = self._frame.turn_index == 0
+        self.turns_first = self.frame.turn_index == 0
         super().__init__(spec, machine)
 
     def read_constants(self) -> None:
         """The drive, and the bodies at the corners of its uncertainty: each must keep what is needed."""
         self.drive = heading_drive(self.plant, self.spec.body, self.spec.uncertainty)
-        self._models = np.array([self.drive, *self.drive.corners()], dtype=np.float64)
+        self.models = np.array([self.drive, *self.drive.corners()], dtype=np.float64)
 
     def clearance(self) -> Array:
         """Of the stopping path from the nearest disc, margin and state error not taken off, m, shape (1,)."""
-        reserve = self.spec.margin + self.spec.state_error
+        self._scene = self.models, np.empty(6), self.discs(), self.spec.brake
+        qpos, qvel, place = self.plant.qpos, self.plant.qvel, self.frame.place
+        least, self._in_play = among.least_clearance(qpos, qvel, place, *self._scene)
+        return np.array([least + self.reserve])
+
+    @property
+    def reserve(self) -> float:
+        """Margin and state error, m."""
+        return float(self.spec.margin + self.spec.state_error)
+
+    def discs(self) -> Array:
+        """x, y and the distance to keep from there, margin and state error in it, m, shape (n, 3)."""
         centers = [obstacle.centers(self.plant)[:, :2] for obstacle in self.spec.obstacles]
         counts = [len(group) for group in centers]
         if sum(counts) != len(self._discs):
             self._discs = np.zeros((sum(counts), 3))
-            self._discs[:, 2] = np.repeat([o.radius + reserve for o in self.spec.obstacles], counts)
+            self._discs[:, 2] = np.repeat([o.radius + self.reserve for o in self.spec.obstacles], counts)
         np.concatenate(centers, out=self._discs[:, :2])
-        self._scene = self._models, np.empty(6), self._discs, self.spec.brake
-        qpos, qvel, place = self.plant.qpos, self.plant.qvel, self._frame.place
-        least, self._in_play = among.least_clearance(qpos, qvel, place, *self._scene)
-        return np.array([least + reserve])
+        return self._discs
 
     def _pair(self, control: Array) -> Array:
         """Drive and turn, shape (2,); the same swap leads back."""
-        return control[::-1].copy() if self._turns_first else control
+        return control[::-1].copy() if self.turns_first else control
 
     def admits(self, control: Array) -> bool:
         if not self._in_play:
@@ -113,7 +123,7 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         return self._half_spaces(*among.secants(*self._scene))
 
     def _half_spaces(self, normals: Array, offsets: Array) -> HalfSpaces:
-        return HalfSpaces(normals[:, ::-1].copy() if self._turns_first else normals, offsets)
+        return HalfSpaces(normals[:, ::-1].copy() if self.turns_first else normals, offsets)
 
     def candidates(self, control: Array) -> list[Array]:
         """Controls that lead around the disc in the way, to be tried before a refused control is projected."""
@@ -132,6 +142,13 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         From inside a disc it drives out, whichever way is better.
         """
         return self._pair(np.array([among.manoeuvre_drive(*self._scene), 0.0]))
+
+    @classmethod
+    def batch(
+        cls, bound: Sequence[Self], low: Array, high: Array, dtype: np.dtype[Any]
+    ) -> ConstraintBatch | None:
+        direct = all(b.plant.published() is not None for b in bound) and dtype in (np.float32, np.float64)
+        return HeadingDriveBatch(bound, low, high, dtype) if direct else None
 
     def decide(self, proposal: Array, low: Array, high: Array) -> tuple[Array, int, HalfSpaces] | None:
         """The whole search at once, without a solver."""

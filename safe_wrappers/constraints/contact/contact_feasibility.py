@@ -1,5 +1,6 @@
 """ContactFeasibility: the ground's forces on the robot stay inside their friction cones."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from safe_wrappers import info as keys
 from safe_wrappers.checks import check_fields, name_list, non_negative, positive
 from safe_wrappers.constraints.rollout import BoundSlacks
-from safe_wrappers.control.contact.friction_cone import normal_and_tangential
+from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Array, Constraint
 from safe_wrappers.plants.mujoco.contacts import can_touch_the_world
@@ -69,6 +70,7 @@ class BoundContactFeasibility(BoundSlacks):
         self._index = np.full(self.plant.model.nbody, -1)
         self._index[chosen] = np.arange(chosen.size)
         self._size = chosen.size
+        self._model_version, self._weight_n = self.plant.model_version, self.plant.weight_n
 
     def _resting(self, name: str, touching: NDArray[np.bool_]) -> int:
         i = self.plant.named("body", name)
@@ -86,14 +88,10 @@ class BoundContactFeasibility(BoundSlacks):
         found = self.plant.contact_forecast(control)
         if not found.finite:
             return np.full(self._size, np.nan)
-        worst = np.full(self._size, np.inf)
-        which = self._index[found.body]
-        seen = which >= 0
-        normal, tangential = normal_and_tangential(found.force[seen], found.normal[seen])
-        held = self.spec.friction_share * found.friction[seen] * normal
-        inside = held - np.linalg.norm(tangential, axis=1)
-        np.minimum.at(worst, which[seen], np.minimum(inside, normal) / self.plant.weight_n)
-        return worst
+        if self._model_version != self.plant.model_version:
+            self._model_version, self._weight_n = self.plant.model_version, self.plant.weight_n
+        held = self.spec.friction_share, self._weight_n
+        return _worst(found.body, found.normal, found.force, found.friction, self._index, self._size, *held)
 
     def slacks(self, control: Array) -> Array:
         """What is left of the cone, tolerance added and margin taken off, per body, shares of the weight."""
@@ -114,6 +112,33 @@ def require_contacts(plant: Plant, asker: str) -> MujocoPlant:
     """The plant, if it can forecast contact forces."""
     hint = "forecasts contact forces with a MuJoCo model; an AnalyticPlant has none"
     return require_mujoco(plant, f"{asker} {hint}")
+
+
+@compiled
+def _worst(
+    body: NDArray[np.int64],
+    normals: Array,
+    forces: Array,
+    friction: Array,
+    index: NDArray[np.int64],
+    size: int,
+    share: float,
+    weight: float,
+) -> Array:
+    """Of each of the bodies that have an index, shape (size,), as `cone_excess` measures it with a share."""
+    worst = np.full(size, np.inf)
+    for i in range(len(body)):
+        which = index[body[i]]
+        if which < 0:
+            continue
+        n, f = normals[i], forces[i]
+        along = f[0] * n[0] + f[1] * n[1] + f[2] * n[2]
+        x, y, z = f[0] - along * n[0], f[1] - along * n[1], f[2] - along * n[2]
+        inside = share * friction[i] * along - math.sqrt(x * x + y * y + z * z)
+        least = (along if along < inside else inside) / weight
+        if least < worst[which] or least != least:  # what is not a number stays
+            worst[which] = least
+    return worst
 
 
 def checked_friction_share(share: float) -> float:

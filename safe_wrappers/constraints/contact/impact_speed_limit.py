@@ -136,7 +136,6 @@ class BoundImpactSpeedLimit(BoundRollout):
         self._gaps = GeomGaps(self.plant, self.spec.bodies, self.spec.against)
         self._probe = mujoco.MjData(m)
         self._integration = np.zeros(mujoco.mj_stateSize(m, int(mujoco.mjtState.mjSTATE_INTEGRATION)))
-        self._control: Array | None = None
         self._limit = self.spec._force - self.spec.margin
         self._jacobians = [np.zeros((3, m.nv)) for _ in range(4)]
         self._mobile = np.zeros((1, m.nv))
@@ -210,7 +209,6 @@ class BoundImpactSpeedLimit(BoundRollout):
 
     def now(self) -> Array:
         m, d = self.plant.model, self._probe
-        self._known: dict[tuple[int, bytes], Array] = {}
         data, what = self.plant.pose(), int(mujoco.mjtState.mjSTATE_INTEGRATION)
         mujoco.mj_getState(m, data, self._integration, what)
         mujoco.mj_setState(m, d, self._integration, what)
@@ -236,13 +234,6 @@ class BoundImpactSpeedLimit(BoundRollout):
     def _violation(self, value: Array) -> Array:
         return self._lost
 
-    def slacks(self, control: Array) -> Array:
-        key = self.plant.model_version, control.tobytes()
-        if key not in self._known:
-            self._control = control
-            self._known[key] = super().slacks(control)
-        return self._known[key]
-
     def room(self, forecast: Forecast) -> Array:
         k, pairs = len(forecast.qpos), len(self._gaps.pairs)
         if not np.isfinite(forecast.qpos[-1]).all():
@@ -258,7 +249,7 @@ class BoundImpactSpeedLimit(BoundRollout):
         room = np.full((k, pairs), 0.5 * self._limit)
         for instant, those in touched.items():
             # At the end of the held step another control takes over.
-            control = self._control if instant < soon or instant == 0 else None
+            control = forecast.control if instant < soon or instant == 0 else None
             self.place(forecast.qpos[instant], forecast.qvel[instant], control)
             for pair in those:
                 contact = self.contact(pair)

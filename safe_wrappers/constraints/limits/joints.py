@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import name_list, positive
-from safe_wrappers.constraints.rollout import RECOVERY_S, RENAMED, BoundRollout, RolloutConstraint
+from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
 from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
@@ -239,19 +239,10 @@ class BoundJointSpeedLimit(BoundRollout):
 
     def now(self) -> Array:
         """Speed left below the limit, per joint, rad/s or m/s."""
-        self._speeds = np.abs(self.plant.qvel[self._dofs])
-        return np.asarray(self._limits - self._speeds)
+        return np.asarray(self._limits - np.abs(self.plant.qvel[self._dofs]))
 
     def room(self, forecast: Forecast) -> Array:
         return np.asarray(self._limits - np.abs(forecast.qvel[:, self._dofs]))
-
-    def slacks(self, control: Array) -> Array:
-        """What is left below the bound along the forecast and at its end, per joint, shape (2 k,)."""
-        left = self.room(self.plant.forecast(control, self.spec.horizon)) - self.spec.margin
-        over = np.maximum(self._speeds - self._bound, 0.0)
-        # From above the bound, joint by joint: never faster on the way, and closer at the end.
-        decay = np.exp(-self.spec.horizon * self.plant.control_dt / RECOVERY_S)
-        return np.concatenate([left.min(axis=0) + over, left[-1] + over * decay])
 
     def rows(self) -> HalfSpaces:
         """Two rows per joint that could reach its limit within the hold; none where controls are no forces."""

@@ -3,9 +3,11 @@
 The order of attempts is that of `SafeActionSearch`; the functions below it are for constraints that are not alone.
 """
 
+import math
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from safe_wrappers.control.backup.drive_among_discs import (
     Array,
@@ -180,3 +182,85 @@ def closest_admitted(
     """`_decide` from the present state; `bounds` are low, high, least and most, shape (4, 2)."""
     at = look(models[0], motion, discs, brake)
     return _decide(models, at, proposal, side, brake, detour, bounds[0], bounds[1], bounds[2], bounds[3], out)
+
+
+@compiled
+def _round_inside(out: Array, normals: Array, offsets: Array, low: Array, high: Array) -> None:
+    """`cast_inside` of `filter/projection.py` to single precision, in place."""
+    sent, worst, most = np.empty(2, dtype=np.float32), -1, 0.0
+    for j in range(2):
+        sent[j] = np.float32(min(max(out[j], low[j]), high[j]))
+    for i in range(len(offsets)):
+        limit = max(offsets[i], normals[i, 0] * out[0] + normals[i, 1] * out[1])
+        excess = normals[i, 0] * float(sent[0]) + normals[i, 1] * float(sent[1]) - limit
+        if worst < 0 or excess > most:
+            worst, most = i, excess
+    for j in range(2):
+        if worst >= 0 and most > 0.0 and normals[worst, j] != 0.0:
+            towards = np.float32(-math.inf if normals[worst, j] > 0.0 else math.inf)
+            sent[j] = min(max(np.nextafter(sent[j], towards), np.float32(low[j])), np.float32(high[j]))
+        out[j] = float(sent[j])
+
+
+@compiled
+def admit_each(
+    models: Array,
+    motions: Array,
+    discs: Array,
+    first: NDArray[np.int64],
+    brake: bool,
+    proposals: Array,
+    least: Array,
+    admitted: NDArray[np.bool_],
+) -> None:
+    """Judges n robots.
+
+    Args:
+        models: As for one, of each, shape (n, 1 + c, 13).
+        motions: Likewise, shape (n, 6).
+        discs: All robots' discs, one after the other, shape (d, 3).
+        first: Where each robot's discs begin, and the end, shape (n + 1,).
+        brake: Whether the backup manoeuvre brakes along the heading.
+        proposals: (drive, turn), shape (n, 2).
+        least: Written: the least clearance of each, m, shape (n,), NaN if one is not a number.
+        admitted: Written: whether its proposal is admitted, shape (n,).
+    """
+    for i in range(len(motions)):
+        at = look(models[i, 0], motions[i], discs[first[i] : first[i + 1]], brake)
+        least[i] = at.least
+        admitted[i] = admits(models[i], at, proposals[i, 0], proposals[i, 1], brake)
+
+
+@compiled
+def decide_each(
+    models: Array,
+    motions: Array,
+    discs: Array,
+    first: NDArray[np.int64],
+    brake: bool,
+    proposals: Array,
+    chosen: NDArray[np.int64],
+    sides: Array,
+    detour: bool,
+    bounds: Array,
+    single: bool,
+    out: Array,
+    stages: NDArray[np.int64],
+) -> None:
+    """`closest_admitted` for the `chosen` of n robots, shape (r,), rounded to what is sent.
+
+    `sides`, shape (n,), hold the sides of detours that go on, and get those that were tried; `bounds` has shape
+    (r, 4, 2); `single` says whether controls are sent with single precision. `out`, shape (n, 2), and `stages`,
+    shape (n,), are written.
+    """
+    for r in range(len(chosen)):
+        i = chosen[r]
+        at = look(models[i, 0], motions[i], discs[first[i] : first[i + 1]], brake)
+        low, high, least, most = bounds[r, 0], bounds[r, 1], bounds[r, 2], bounds[r, 3]
+        stage, side, normals, offsets = _decide(
+            models[i], at, proposals[i], sides[i], brake, detour, low, high, least, most, out[i]
+        )
+        sides[i] = side
+        if single:
+            _round_inside(out[i], normals, offsets, low, high)
+        stages[i] = stage if math.isfinite(out[i, 0]) and math.isfinite(out[i, 1]) else UNRESOLVED

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.control.backup.damped_axis import DampedAxis, brake
+from safe_wrappers.control.numerics.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -31,17 +32,8 @@ class _Braking(NamedTuple):
     speeds: Array
     ways: Array
 
-    def at(self, speed: Array, holds: NDArray[np.intp]) -> Array:
-        """Displacements for speeds (c, m) >= 0 after the given holds (m, k), shape (c, m, k)."""
-        last = len(self.speeds) - 1
-        i = np.minimum(np.maximum(self.speeds.searchsorted(speed, side="right"), 1), last)
-        low, high = self.speeds[i - 1], self.speeds[i]
-        share = ((speed - low) / (high - low))[..., None]
-        before, behind = self.ways[(i - 1)[..., None], holds], self.ways[i[..., None], holds]
-        return np.asarray(before + share * (behind - before))
 
-
-class _Prepared(NamedTuple):
+class Prepared(NamedTuple):
     """Drive phases as maps of an axis's speed, and the braking after them; m manoeuvres, k instants."""
 
     drift: Array
@@ -51,7 +43,6 @@ class _Prepared(NamedTuple):
     after: NDArray[np.intp]
     forwards: _Braking
     backwards: _Braking
-    symmetric: bool
 
 
 class EvasiveManeuvers:
@@ -74,9 +65,11 @@ class EvasiveManeuvers:
         self.controls = shares * np.where(shares > 0.0, forwards, backwards)
         """Of the drive phases, shape (manoeuvres, 2)."""
         self._going = np.array([m.holds for m in manoeuvres])
-        self._parts = [self._prepared(axis, self.controls[:, i]) for i, axis in enumerate(axes)]
+        x, y = (self._prepared(axis, self.controls[:, i]) for i, axis in enumerate(axes))
+        self.prepared = x, y
+        """For `ways`."""
 
-    def _prepared(self, axis: DampedAxis, controls: Array) -> _Prepared:
+    def _prepared(self, axis: DampedAxis, controls: Array) -> Prepared:
         n = int(self.instants[-1])
         keep, add = np.ones(n + 1), np.zeros(n + 1)  # speed after k holds, per speed and per control
         drift, shift = np.zeros(n + 1), np.zeros(n + 1)  # and the displacement
@@ -85,7 +78,7 @@ class EvasiveManeuvers:
             drift[k + 1] = drift[k] + axis.drift * keep[k]
             shift[k + 1] = shift[k] + axis.drift * add[k] + axis.shift
         steps = np.minimum(self.instants, self._going[:, None])  # holds of the drive phase completed by then
-        return _Prepared(
+        return Prepared(
             drift[steps],
             shift[steps] * controls[:, None],
             keep[self._going],
@@ -93,7 +86,6 @@ class EvasiveManeuvers:
             self.instants - steps,
             _braking(axis, -axis.low, n),
             _braking(axis, axis.high, n),
-            axis.high == -axis.low,
         )
 
     def paths(self, position: Array, velocity: Array, which: NDArray[np.intp]) -> tuple[Array, Array]:
@@ -104,25 +96,49 @@ class EvasiveManeuvers:
             velocity: Shape (c, 2), m/s.
             which: Indices of manoeuvres, shape (m,).
         """
-        along = []
-        for i, p in enumerate(self._parts):
-            v = velocity[:, i, None]
-            end = p.keep[which] * v + p.add[which]  # (c, m): the speed at which braking begins
-            after = p.after[which]
-            if p.symmetric:
-                braked = np.sign(end)[..., None] * p.forwards.at(np.abs(end), after)
-            else:
-                ahead, back = np.maximum(end, 0.0), np.maximum(-end, 0.0)
-                braked = p.forwards.at(ahead, after) - p.backwards.at(back, after)
-            gone = p.drift[which] * v[..., None] + p.shift[which]
-            along.append(position[:, i, None, None] + (gone + braked))
-        return along[0], along[1]
+        return ways(self.prepared, position, velocity, which)
 
     def first(self, which: int, velocity: Array) -> Array:
         """The control of a manoeuvre's first hold from a velocity (2,), shape (2,)."""
         if self._going[which]:
             return np.array(self.controls[which])
         return np.array([brake(axis, float(v)) for axis, v in zip(self._axes, velocity, strict=True)])
+
+
+@compiled
+def ways(
+    prepared: tuple[Prepared, Prepared], position: Array, velocity: Array, which: NDArray[np.intp]
+) -> tuple[Array, Array]:
+    """As `EvasiveManeuvers.paths`, which says what the arguments are."""
+    count, instants = which.size, prepared[0].after.shape[1]
+    x, y = np.empty((len(position), count, instants)), np.empty((len(position), count, instants))
+    for c in range(len(position)):
+        for m in range(count):
+            _way(prepared[0], position[c, 0], velocity[c, 0], which[m], x[c, m])
+            _way(prepared[1], position[c, 1], velocity[c, 1], which[m], y[c, m])
+    return x, y
+
+
+@compiled
+def _way(p: Prepared, start: float, speed: float, which: int, way: Array) -> None:
+    """Write one manoeuvre's positions along an axis."""
+    end = p.keep[which] * speed + p.add[which]  # the speed at which braking begins
+    table = p.forwards if end >= 0.0 else p.backwards
+    speeds, size = table.speeds, abs(end)
+    low, high = 1, speeds.size - 1
+    while low < high:  # the first knot beyond, or the last one
+        middle = (low + high) // 2
+        if size < speeds[middle]:
+            high = middle
+        else:
+            low = middle + 1
+    share = (size - speeds[low - 1]) / (speeds[low] - speeds[low - 1])
+    direction = 1.0 if end >= 0.0 else -1.0
+    for k in range(way.size):
+        holds = p.after[which, k]
+        before, behind = table.ways[low - 1, holds], table.ways[low, holds]
+        gone = p.drift[which, k] * speed + p.shift[which, k]
+        way[k] = start + (gone + direction * (before + share * (behind - before)))
 
 
 def _braking(axis: DampedAxis, brake: float, holds: int) -> _Braking:

@@ -35,7 +35,7 @@ def _drop_stale(function: Callable[..., Any]) -> None:
 
 
 _COMPILE = _compiler()
-_NEWEST_SOURCE_S = max(source.stat().st_mtime for source in Path(__file__).parents[1].rglob("*.py"))
+_NEWEST_SOURCE_S = max(source.stat().st_mtime for source in Path(__file__).parents[2].rglob("*.py"))
 IS_COMPILED = _COMPILE is not None
 """Whether `compiled` gives machine code in this process."""
 
@@ -45,10 +45,19 @@ def compiled(function: Function) -> Function:
 
     It may call only other compiled functions, `math`, and NumPy's plain indexing; tuples may be named.
     """
+    return _compile(function, inline=False)
+
+
+def inlined(function: Function) -> Function:
+    """`compiled` into its callers: a call counts references to every array that it hands on, which takes time."""
+    return _compile(function, inline=True)
+
+
+def _compile(function: Function, inline: bool) -> Function:
     if _COMPILE is None:
         return function
     _drop_stale(function)
-    options = {"error_model": "numpy", "nogil": True}
+    options = {"error_model": "numpy", "nogil": True, "forceinline": inline}
     try:
         return _COMPILE(cache=True, **options)(function)  # type: ignore[no-any-return]
     except RuntimeError:  # no folder to cache in

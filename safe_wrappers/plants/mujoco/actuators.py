@@ -5,7 +5,7 @@ the clamp more control changes nothing, so it becomes a bound on the control.
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -54,59 +54,85 @@ def _refuse(actuator: str, what: str, handled: str) -> None:
     )
 
 
+class Actuators(NamedTuple):
+    """MuJoCo's arrays that describe the actuators of a model, or of n models, one beside the other."""
+
+    gain_type: NDArray[Any]
+    gain: Array
+    bias_type: NDArray[Any]
+    bias: Array
+    force_limited: NDArray[Any]
+    force_range: Array
+    control_limited: NDArray[Any]
+    control_range: Array
+    gear: Array
+    acceleration: Array
+
+    @staticmethod
+    def of(m: mujoco.MjModel) -> "Actuators":
+        """The model's own arrays."""
+        kinds = m.actuator_gaintype, m.actuator_gainprm, m.actuator_biastype, m.actuator_biasprm
+        limits = m.actuator_forcelimited, m.actuator_forcerange, m.actuator_ctrllimited, m.actuator_ctrlrange
+        return Actuators(*kinds, *limits, m.actuator_gear, m.actuator_acc0)
+
+
 @compiled
 def _acting_range(
-    gain_type: NDArray[Any],
-    gain: Array,
-    bias_type: NDArray[Any],
-    bias: Array,
-    force_limited: NDArray[Any],
-    force_range: Array,
-    control_limited: NDArray[Any],
-    control_range: Array,
-    gear: Array,
-    acceleration: Array,
-    length: Array,
-    velocity: Array,
-    control_dt: float,
-    least: Array,
-    most: Array,
+    act: Actuators, length: Array, velocity: Array, control_dt: float, least: Array, most: Array
 ) -> None:
-    """Writes `AffineActuators.acting_range` into `least` and `most`; the arrays are MuJoCo's of the actuators."""
+    """Writes `AffineActuators.acting_range` into `least` and `most`."""
     for i in range(len(least)):
         low, high = -math.inf, math.inf
-        if control_limited[i]:
-            low, high = control_range[i, 0], control_range[i, 1]
-        scale, offset = gain[i, 0], 0.0
-        if gain_type[i] == _AFFINE_GAIN:
-            scale += gain[i, 1] * length[i] + gain[i, 2] * velocity[i]
-        if bias_type[i] == _AFFINE_BIAS:
-            offset = bias[i, 0] + bias[i, 1] * length[i] + bias[i, 2] * velocity[i]
+        if act.control_limited[i]:
+            low, high = act.control_range[i, 0], act.control_range[i, 1]
+        scale, offset = act.gain[i, 0], 0.0
+        if act.gain_type[i] == _AFFINE_GAIN:
+            scale += act.gain[i, 1] * length[i] + act.gain[i, 2] * velocity[i]
+        if act.bias_type[i] == _AFFINE_BIAS:
+            offset = act.bias[i, 0] + act.bias[i, 1] * length[i] + act.bias[i, 2] * velocity[i]
         least[i], most[i] = low, high
-        if force_limited[i] and scale != 0.0:
-            ends = (force_range[i, 0] - offset) / scale, (force_range[i, 1] - offset) / scale
-            feedback = abs(bias[i, 2]) if bias_type[i] == _AFFINE_BIAS else 0.0
-            strongest = max(abs(force_range[i, 0]), abs(force_range[i, 1]))
+        if act.force_limited[i] and scale != 0.0:
+            ends = (act.force_range[i, 0] - offset) / scale, (act.force_range[i, 1] - offset) / scale
+            feedback = abs(act.bias[i, 2]) if act.bias_type[i] == _AFFINE_BIAS else 0.0
+            strongest = max(abs(act.force_range[i, 0]), abs(act.force_range[i, 1]))
             lever = 0.0
-            for j in range(gear.shape[1]):
-                lever = max(lever, abs(gear[i, j]))
-            widen = feedback * (lever * acceleration[i] * strongest * control_dt) / abs(scale)
+            for j in range(act.gear.shape[1]):
+                lever = max(lever, abs(act.gear[i, j]))
+            widen = feedback * (lever * act.acceleration[i] * strongest * control_dt) / abs(scale)
             least[i] = min(max(min(ends[0], ends[1]) - widen, low), high)
             most[i] = min(max(max(ends[0], ends[1]) + widen, low), high)
 
 
 @compiled
+def acting_ranges(
+    every: Actuators,
+    lengths: Array,
+    velocities: Array,
+    control_dt: float,
+    chosen: NDArray[np.int64],
+    bounds: Array,
+) -> None:
+    """`AffineActuators.acting_range` for the `chosen` of n machines, shape (r,), into `bounds`, shape (r, 2, nu)."""
+    for r in range(len(chosen)):
+        i = chosen[r]
+        one = Actuators(
+            every.gain_type[i],
+            every.gain[i],
+            every.bias_type[i],
+            every.bias[i],
+            every.force_limited[i],
+            every.force_range[i],
+            every.control_limited[i],
+            every.control_range[i],
+            every.gear[i],
+            every.acceleration[i],
+        )
+        _acting_range(one, lengths[i], velocities[i], control_dt, bounds[r, 0], bounds[r, 1])
+
+
+@compiled
 def _respond(
-    gain_type: NDArray[Any],
-    gain: Array,
-    bias_type: NDArray[Any],
-    bias: Array,
-    force_limited: NDArray[Any],
-    force_range: Array,
-    control_limited: NDArray[Any],
-    control_range: Array,
-    gear: Array,
-    acceleration: Array,
+    act: Actuators,
     length: Array,
     velocity: Array,
     control: Array,
@@ -126,23 +152,7 @@ def _respond(
     """
     n, controls = len(qacc), len(control)
     least, most, moved = np.empty(controls), np.empty(controls), np.empty(n)
-    _acting_range(
-        gain_type,
-        gain,
-        bias_type,
-        bias,
-        force_limited,
-        force_range,
-        control_limited,
-        control_range,
-        gear,
-        acceleration,
-        length,
-        velocity,
-        0.0,
-        least,
-        most,
-    )
+    _acting_range(act, length, velocity, 0.0, least, most)
     # inv(M + J' D J), one active row after another.
     for row in range(len(state)):
         if state[row] != _QUADRATIC:
@@ -160,9 +170,9 @@ def _respond(
     for k in range(controls):
         if most[k] <= least[k]:
             continue
-        scale, acting = gain[k, 0], min(max(control[k], least[k]), most[k])
-        if gain_type[k] == _AFFINE_GAIN:
-            scale += gain[k, 1] * length[k] + gain[k, 2] * velocity[k]
+        scale, acting = act.gain[k, 0], min(max(control[k], least[k]), most[k])
+        if act.gain_type[k] == _AFFINE_GAIN:
+            scale += act.gain[k, 1] * length[k] + act.gain[k, 2] * velocity[k]
         for place in range(starts[k], starts[k] + counts[k]):
             j = columns[place]
             for i in range(n):
@@ -182,11 +192,7 @@ class AffineActuators:
     def __init__(self, model: mujoco.MjModel) -> None:
         _refuse_unsupported(model)
         self._model = m = model
-        self.constants = (
-            *(m.actuator_gaintype, m.actuator_gainprm, m.actuator_biastype, m.actuator_biasprm),
-            *(m.actuator_forcelimited, m.actuator_forcerange, m.actuator_ctrllimited, m.actuator_ctrlrange),
-            *(m.actuator_gear, m.actuator_acc0),
-        )
+        self.constants = Actuators.of(m)
         self._moment = np.zeros((model.nu, model.nv))
         self._on_joints: tuple[Array, Array, Array] | None = None
         self._joints_suffice = False
@@ -215,7 +221,7 @@ class AffineActuators:
         if not m.actuator_forcelimited.any():
             return control_range(m)
         least, most = np.empty(m.nu), np.empty(m.nu)
-        _acting_range(*self.constants, length, velocity, control_dt, least, most)
+        _acting_range(self.constants, length, velocity, control_dt, least, most)
         return least, most
 
     def motion_without_kinematics(self, qpos: Array, qvel: Array) -> tuple[Array, Array] | None:
@@ -254,7 +260,7 @@ class Response:
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, actuators: AffineActuators) -> None:
         self._model, self._data = model, data
         motion = data.actuator_length, data.actuator_velocity, data.ctrl, data.qacc
-        self._actuation = *actuators.constants, *motion, *moment_of(data)
+        self._actuation = actuators.constants, *motion, *moment_of(data)
         self._units, self._mobility = np.eye(model.nv), np.empty((model.nv, model.nv))
         self._free = np.zeros(0, np.int32), np.zeros((0, model.nv)), np.zeros(0)
 

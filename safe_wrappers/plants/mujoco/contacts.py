@@ -8,10 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import Array, name_list
+from safe_wrappers.control.numerics.compiled import IS_COMPILED
 from safe_wrappers.errors import UnknownNameError
+from safe_wrappers.plants.mujoco.contact_memory import ContactMemory, contact_memory
+from safe_wrappers.plants.mujoco.contact_simulation import simulate
 from safe_wrappers.plants.mujoco.forecast import RESETS
 from safe_wrappers.plants.mujoco.model import fixed_bodies
-from safe_wrappers.plants.mujoco.replay import evaluations
+from safe_wrappers.plants.mujoco.replay import RATES_OF_ROTATION_VECTORS, RK4, evaluations
 
 # Bound of squared lengths: MuJoCo does not check the stages of the Runge-Kutta steps that are made here.
 _FASTEST = float(mujoco.mjMAXVAL) ** 2
@@ -78,7 +81,8 @@ class ContactForecast(NamedTuple):
 class ContactReader:
     """Reads the contacts of a model's moving bodies with the fixed world.
 
-    `read` only copies MuJoCo's arrays; `forecast` evaluates all of them at once, because Python is slow.
+    `read` only copies MuJoCo's arrays; `forecast` evaluates all of them at once, because Python is slow. `follow`
+    simulates in compiled code where it can (no activations; from MuJoCo 4.0 on no Runge-Kutta).
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
@@ -87,7 +91,12 @@ class ContactReader:
         # The last entry is for geom -1, of something flexible: it moves, but is not a body of the robot.
         bodies = np.where(fixed, 0, np.arange(model.nbody))
         self._body_of_geom: list[int] = [*bodies[model.geom_bodyid].tolist(), -1]
+        self._bodies = np.array(self._body_of_geom, dtype=np.int64)
         self._wrench = np.zeros(6)
+        self._memory: ContactMemory | None = None
+        self._compiles = IS_COMPILED and not model.na
+        if model.opt.integrator == RK4 and RATES_OF_ROTATION_VECTORS:
+            self._compiles = False
         self.clear()
 
     def clear(self) -> None:
@@ -134,8 +143,13 @@ class ContactReader:
 
     def follow(self, data: mujoco.MjData, substeps: int) -> ContactForecast:
         """Step the data, with the control it has, and return the contacts of all these physics substeps."""
-        self.clear()
         data.warning.number[RESETS] = 0
+        memory = self._memory_of(data) if self._compiles else None
+        found, inside = self._visited(data, substeps) if memory is None else self._compiled(memory, substeps)
+        return found._replace(finite=inside and not data.warning.number[RESETS].any())
+
+    def _visited(self, data: mujoco.MjData, substeps: int) -> tuple[ContactForecast, bool]:
+        self.clear()
         inside = True
 
         def visit(at: mujoco.MjData, _: float) -> None:
@@ -146,7 +160,25 @@ class ContactReader:
         for _ in range(substeps):
             evaluations(self._model, data, visit)
         inside = inside and bool(data.qvel @ data.qvel < _FASTEST and data.qpos @ data.qpos < _FASTEST)
-        return self.forecast(finite=inside and not data.warning.number[RESETS].any())
+        return self.forecast(inside), inside
+
+    def _memory_of(self, data: mujoco.MjData) -> ContactMemory | None:
+        """Of the data, also where this object is a copy of the one that knew another's."""
+        known = self._memory
+        if known is None or known.data != data._address or known.model != self._model._address:
+            self._memory = known = contact_memory(self._model, data)
+        return known
+
+    def _compiled(self, memory: ContactMemory, substeps: int) -> tuple[ContactForecast, bool]:
+        """The same as `_visited`, faster."""
+        options = self._model.opt
+        stages = options.integrator == RK4
+        how = substeps, float(options.timestep), stages, _FASTEST
+        kinds, numbers, inside = simulate(memory, self._bodies, *how)
+        parts = numbers[:, :3], numbers[:, 3:6], numbers[:, 6:9], numbers[:, 9]
+        return ContactForecast(
+            substeps * (4 if stages else 1), kinds[:, 0], kinds[:, 1], *parts, inside
+        ), inside
 
 
 def can_touch_the_world(model: mujoco.MjModel) -> NDArray[np.bool_]:

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from safe_wrappers.checks import Array
-from safe_wrappers.plants.mujoco.forecast import Recorder
+from safe_wrappers.plants.mujoco.forecast import RESETS, Recorder
 
 # The envs add the turn to the gripper's quaternion (w, x, y, z): MuJoCo makes a unit quaternion of the sum.
 _TURN = np.array([1.0, 0.0, 1.0, 0.0])
@@ -43,16 +43,22 @@ class DisplacementRecorder(Recorder):
     """Forecasts under displacements of the gripper; braking is a displacement of zero.
 
     Args:
-        model, substeps: As in `Recorder`.
+        model, data, substeps: As in `Recorder`.
         metres_per_unit: Displacement of an action of 1, m.
         dtype: Of the env's actions; the env scales them in this precision.
         blocked: Whether the env keeps the fingers closed.
     """
 
     def __init__(
-        self, model: mujoco.MjModel, substeps: int, metres_per_unit: float, dtype: Any, blocked: bool
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        substeps: int,
+        metres_per_unit: float,
+        dtype: Any,
+        blocked: bool,
     ) -> None:
-        super().__init__(model, substeps)
+        super().__init__(model, data, substeps)
         (self._mocap, self._gripper), *_ = welds(model)
         self._scale, self._dtype = metres_per_unit, dtype
         fingers = [model.joint(name) for name in _FINGERS] if blocked else []
@@ -66,6 +72,22 @@ class DisplacementRecorder(Recorder):
         data.mocap_pos[self._mocap] = data.xpos[self._gripper] + self._scale * step[:3]
         data.mocap_quat[self._mocap] = data.xquat[self._gripper] + _TURN
         data.ctrl[:] = data.qpos[self._servoed] + self._servo_acts * step[3]
+
+    def simulate(self, begin: int, end: int, path: Array, published: Array, euler: bool = False) -> int:
+        """As `Recorder.simulate`, with what the env does at the start and at the end of each control interval."""
+        m, data, n, nq = self._model, self._data, self.substeps, self.nq
+        for hold in range(begin, end):
+            if hold:
+                self.act(data, self.braking(data))
+            for i in range(hold * n, hold * n + n):
+                mujoco.mj_step(m, data)
+                if i == hold * n + n - 1:
+                    self.settle(data)
+                path[i, :nq], path[i, nq:] = data.qpos, data.qvel
+            published[hold, 0], published[hold, 1] = data.xpos, data.xipos
+            if data.warning.number[RESETS].any():
+                return hold
+        return end
 
     def settle(self, data: mujoco.MjData) -> None:
         """Put a blocked gripper's fingers back to zero, and update the poses."""

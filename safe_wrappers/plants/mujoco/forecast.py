@@ -1,17 +1,22 @@
 """A forecast: what a MuJoCo model does under a held control, and under braking after it."""
 
-from typing import NamedTuple
+from collections import deque
+from typing import Final, NamedTuple
 
 import mujoco
 import numpy as np
 
 from safe_wrappers.checks import Array
+from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.plants.mujoco.model import control_range
+from safe_wrappers.plants.mujoco.native import mj_kinematics, mj_step
 
 _BRAKING = 0.5
 """Share of an actuated joint's own motion that braking takes away per control interval; more would chatter."""
+_HELD: Final = 4  # forecasts whose data are held: the admitted one is among the latest
 RESETS = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
 """The warnings after which MuJoCo resets the state."""
+_EULER: Final = int(mujoco.mjtIntegrator.mjINT_EULER)
 
 
 class Poses(NamedTuple):
@@ -26,16 +31,21 @@ class Forecast:
     """The machine after every physics substep of a forecast.
 
     Attributes:
+        control: The one that is held, shape (nu,).
         qpos, qvel: Positions, shape (k, nq), and velocities, shape (k, nv); NaN from the control interval on in which
             MuJoCo had to reset the state.
+        path: Both, shape (k, nq + nv).
         published_frames, published_centres: `data.xpos` and `data.xipos` as MuJoCo leaves them at the end of every
             control interval, shapes (holds, nbody, 3), m. They lag behind the state: by one substep after Euler
             steps, to the last stage after Runge-Kutta steps.
+        published: Both, shape (holds, 2, nbody, 3), m.
     """
 
-    def __init__(self, recorder: "Recorder", qpos: Array, qvel: Array, frames: Array, centres: Array) -> None:
-        self._recorder, self.qpos, self.qvel = recorder, qpos, qvel
-        self.published_frames, self.published_centres = frames, centres
+    def __init__(self, recorder: "Recorder", control: Array, path: Array, published: Array) -> None:
+        self._recorder, self.control, self.path, self.published = recorder, control, path, published
+        nq = recorder.nq
+        self.qpos, self.qvel = path[:, :nq], path[:, nq:]
+        self.published_frames, self.published_centres = published[:, 0], published[:, 1]
         self._poses: dict[int, Poses] = {}
 
     def poses(self, every: int = 1) -> Poses:
@@ -46,86 +56,234 @@ class Forecast:
 
     def first(self, horizon: int) -> "Forecast":
         """Its first control intervals."""
-        if horizon == len(self.published_frames):
+        if horizon == len(self.published):
             return self
-        k = len(self.qpos) // len(self.published_frames) * horizon
-        published = self.published_frames[:horizon], self.published_centres[:horizon]
-        return Forecast(self._recorder, self.qpos[:k], self.qvel[:k], *published)
+        k = len(self.path) // len(self.published) * horizon
+        return Forecast(self._recorder, self.control, self.path[:k], self.published[:horizon])
+
+
+class _Machine(NamedTuple):
+    """What compiled code needs of a model and its data: their addresses, and views of the data."""
+
+    model: int
+    data: int
+    ctrl: Array
+    qpos: Array
+    qvel: Array
+    lengths: Array
+    speeds: Array
+    frames: Array
+    centres: Array
+    warnings: Array
+
+
+class _Braking(NamedTuple):
+    """Servos are told `rest + per_length * length`, less the damping of their speeds, in the range; shapes (nu,)."""
+
+    rest: Array
+    per_length: Array
+    damping: Array
+    low: Array
+    high: Array
+
+
+@compiled
+def _brake(law: _Braking, lengths: Array, speeds: Array, control: Array) -> None:
+    """Write the control that brakes."""
+    for j in range(control.size):
+        told = law.rest[j] + law.per_length[j] * lengths[j] - law.damping[j] * speeds[j]
+        if told < law.low[j]:
+            told = law.low[j]
+        if told > law.high[j]:
+            told = law.high[j]
+        control[j] = told
+
+
+@compiled
+def _simulate(
+    machine: _Machine,
+    law: _Braking,
+    begin: int,
+    end: int,
+    substeps: int,
+    euler: bool,
+    path: Array,
+    published: Array,
+) -> int:
+    """Simulate control intervals, of which all but the first one (0) brake; how many are whole.
+
+    With `euler` the intervals publish, as after Runge-Kutta steps, poses that do not lag by a substep.
+    Written are the state after every substep, (k, nq + nv), and what the ends publish, (horizon, 2, nbody, 3).
+    """
+    nq, nv, bodies = machine.qpos.size, machine.qvel.size, len(machine.frames)
+    for hold in range(begin, end):
+        if hold:
+            _brake(law, machine.lengths, machine.speeds, machine.ctrl)
+        for i in range(hold * substeps, (hold + 1) * substeps):
+            mj_step(machine.model, machine.data)
+            for j in range(nq):
+                path[i, j] = machine.qpos[j]
+            for j in range(nv):
+                path[i, nq + j] = machine.qvel[j]
+        if euler:
+            mj_kinematics(machine.model, machine.data)
+        for j in range(bodies):
+            for axis in range(3):
+                published[hold, 0, j, axis] = machine.frames[j, axis]
+                published[hold, 1, j, axis] = machine.centres[j, axis]
+        for warned in machine.warnings:
+            if warned:
+                return hold
+    return end
+
+
+@compiled
+def _kinematics(
+    machine: _Machine, turned: Array, qpos: Array, frames: Array, centres: Array, axes: Array
+) -> None:
+    """Write the poses of positions (k, nq), as `Poses` has them."""
+    for i in range(len(qpos)):
+        for j in range(machine.qpos.size):
+            machine.qpos[j] = qpos[i, j]
+        mj_kinematics(machine.model, machine.data)
+        for j in range(len(machine.frames)):
+            for axis in range(3):
+                frames[i, j, axis] = machine.frames[j, axis]
+                centres[i, j, axis] = machine.centres[j, axis]
+            for entry in range(9):
+                axes[i, j, entry] = turned[j, entry]
+
+
+def _machine(model: mujoco.MjModel, data: mujoco.MjData) -> _Machine:
+    motion = data.qpos, data.qvel, data.actuator_length, data.actuator_velocity
+    seen = data.xpos, data.xipos, data.warning.number[RESETS]
+    return _Machine(model._address, data._address, data.ctrl, *motion, *seen)
 
 
 class Recorder:
     """Steps the plant's own model and keeps what a forecast holds; `substeps` are those of a control interval.
 
     Attributes:
-        held: Data at the end of the latest forecast's first control interval.
-        held_control: Bytes of the control of that interval; empty: there is none from the present state.
+        held: Data at the ends of the latest forecasts' first control intervals, the oldest first, with the bytes of
+            the controls that were held; None: there is none from the present state.
     """
 
-    def __init__(self, model: mujoco.MjModel, substeps: int) -> None:
-        self._model, self._substeps = model, substeps
-        self.held, self.held_control = mujoco.MjData(model), b""
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, substeps: int) -> None:
+        self._model, self._data, self.substeps, self.nq = model, data, substeps, int(model.nq)
+        self.is_runge_kutta = int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
+        self.held = deque[tuple[bytes | None, mujoco.MjData]](
+            (None, mujoco.MjData(model)) for _ in range(_HELD)
+        )
         self._still = mujoco.MjData(model)
-        self._low, self._high = control_range(model)
+        self._moving, self._posed = _machine(model, data), _machine(model, self._still)
         # A unit force accelerates its joints by acc0 (in the reference pose), a transmission by gear times that.
         control_dt = substeps * model.opt.timestep
         gain, gear = model.actuator_gainprm[:, 0], np.abs(model.actuator_gear).max(axis=1)
         response = model.actuator_acc0 * gear * gain * control_dt
         acts = response != 0.0
-        self._damping = np.where(acts, _BRAKING / np.where(acts, response, 1.0), 0.0)
+        damping = np.where(acts, _BRAKING / np.where(acts, response, 1.0), 0.0)
         # At rest a servo must push neither way: a position servo's target is where it is, a speed servo's is zero.
         biased = model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)
         bias = np.where(biased[:, None], model.actuator_biasprm[:, :3], 0.0)
-        self._rest = -bias[:, :2] / np.where(acts, gain, 1.0)[:, None]
-        self._damping[bias[:, 2] != 0.0] = 0.0  # it has damping of its own
+        rest, per_length = -bias[:, :2].T / np.where(acts, gain, 1.0)
+        damping[bias[:, 2] != 0.0] = 0.0  # it has damping of its own
+        self._law = _Braking(rest.copy(), per_length.copy(), damping, *control_range(model))
 
     def record(
-        self, data: mujoco.MjData, control: Array, horizon: int, first: Forecast | None = None
+        self, control: Array, horizon: int, first: Forecast | None = None, euler: bool = False
     ) -> Forecast:
         """Hold a control, shape (nu,), for one control interval; in the others each actuator brakes its own joints.
 
-        `data` starts at the present state and is left at the end, after `horizon` >= 1 control intervals. With
-        `first`, the forecast of `held_control` over one interval, it goes on from there.
+        The data starts at the present state and is left at the end, after `horizon` >= 1 control intervals. With
+        `first`, its forecast over one interval, it goes on from there if the data is still held. With `euler` the
+        intervals that brake are simulated by Euler steps, where the model's own are Runge-Kutta's, which cost four.
         """
-        m, n = self._model, self._substeps
-        qpos, qvel = np.empty((horizon * n, m.nq)), np.empty((horizon * n, m.nv))
-        frames, centres = np.empty((horizon, m.nbody, 3)), np.empty((horizon, m.nbody, 3))
-        if first is None:
-            data.warning.number[RESETS] = 0
-            self.place(data)
+        m, data, n = self._model, self._data, self.substeps
+        path, published = self._empty(horizon)
+        held = None if first is None else self.held_after(control)
+        if first is None or held is None:
+            self._begin(control)
+            whole = self.simulate(0, 1, path, published)
+            _, oldest = self.held.popleft()
+            mujoco.mj_copyData(oldest, m, data)
+            self.held.append((control.tobytes(), oldest))
         else:
-            mujoco.mj_copyData(data, m, self.held)
-            qpos[:n], qvel[:n] = first.qpos, first.qvel
-            frames[:1], centres[:1] = first.published_frames, first.published_centres
-        q, v = data.qpos, data.qvel  # views, which stay valid
-        for hold in range(0 if first is None else 1, horizon):
-            self.act(data, self.braking(data) if hold else control)
-            for i in range(hold * n, hold * n + n):
-                mujoco.mj_step(m, data)
-                if i == hold * n + n - 1:
-                    self.settle(data)
-                qpos[i], qvel[i] = q, v
-            frames[hold], centres[hold] = data.xpos, data.xipos
-            if hold == 0:
-                mujoco.mj_copyData(self.held, m, data)
-                self.held_control = control.tobytes()
-            if data.warning.number[RESETS].any():
-                # After a reset, MuJoCo's response to numbers out of bounds, all numbers may look plausible.
-                qpos[hold * n :] = qvel[hold * n :] = frames[hold:] = centres[hold:] = np.nan
-                break
-        return Forecast(self, qpos, qvel, frames, centres)
+            whole = 1
+            mujoco.mj_copyData(data, m, held)
+            path[:n], published[:1] = first.path, first.published
+        if whole and horizon > 1:
+            whole = (self._by_euler_steps if euler else self.simulate)(1, horizon, path, published)
+        return self._forecast(control, path, published, whole)
+
+    def held_after(self, control: Array) -> mujoco.MjData | None:
+        """The data at the end of a control interval from the present state, if it is still held."""
+        key = control.tobytes()
+        return next((data for known, data in self.held if known == key), None)
+
+    def forget(self) -> None:
+        """Called when the present state has changed: what is held belongs to another one."""
+        self.held = deque((None, data) for _, data in self.held)
+
+    def sketch(self, control: Array, horizon: int) -> Forecast:
+        """A forecast as `record` makes it, but by Euler steps from the start; nothing is held."""
+        path, published = self._empty(horizon)
+        self._begin(control)
+        whole = self._by_euler_steps(0, horizon, path, published)
+        return self._forecast(control, path, published, whole)
+
+    def _empty(self, horizon: int) -> tuple[Array, Array]:
+        m = self._model
+        return np.empty((horizon * self.substeps, m.nq + m.nv)), np.empty((horizon, 2, m.nbody, 3))
+
+    def _begin(self, control: Array) -> None:
+        self._data.warning.number[RESETS] = 0
+        self.place(self._data)
+        self.act(self._data, control)
+
+    def _forecast(self, control: Array, path: Array, published: Array, whole: int) -> Forecast:
+        if whole < len(published):
+            # After a reset, MuJoCo's response to numbers out of bounds, all numbers may look plausible.
+            path[whole * self.substeps :] = published[whole:] = np.nan
+        return Forecast(self, control.copy(), path, published)
+
+    def _by_euler_steps(self, begin: int, end: int, path: Array, published: Array) -> int:
+        if not self.is_runge_kutta:
+            return self.simulate(begin, end, path, published)
+        # Only Euler steps write these two; the env's own data have none of it.
+        written = self._data.qH, self._data.qHDiagInv
+        before = [part.copy() for part in written]
+        option = self._model.opt
+        option.integrator, own = _EULER, option.integrator
+        try:
+            return self.simulate(begin, end, path, published, euler=True)
+        finally:
+            option.integrator = own
+            for part, kept in zip(written, before, strict=True):
+                part[:] = kept
+
+    def simulate(self, begin: int, end: int, path: Array, published: Array, euler: bool = False) -> int:
+        """Go on with control intervals, braking in all but the first one; how many from 0 on are whole.
+
+        Args:
+            begin: The first of them; in interval 0 a control acts already.
+            end: The one after the last.
+            path: The states after each substep of all intervals, to be written to, shape (k, nq + nv).
+            published: Likewise what the intervals' ends publish, shape (intervals, 2, nbody, 3).
+            euler: The steps are Euler's in the place of Runge-Kutta's.
+        """
+        extent = begin, end, self.substeps, euler
+        whole: int = _simulate(self._moving, self._law, *extent, path, published)
+        return whole
 
     def act(self, data: mujoco.MjData, control: Array) -> None:
         """Give the machine a control, as its env does at the start of a control interval."""
         data.ctrl[:] = control
 
-    def settle(self, data: mujoco.MjData) -> None:
-        """What the env does to its data at the end of a control interval."""
-
     def braking(self, data: mujoco.MjData) -> Array:
         """Every actuator against its own motion, shape (nu,); read once per control interval, as controllers do."""
-        at_rest = self._rest[:, 0] + self._rest[:, 1] * data.actuator_length
-        control = at_rest - self._damping * data.actuator_velocity
-        return np.asarray(np.minimum(np.maximum(control, self._low), self._high))
+        control = np.empty(self._model.nu)
+        _brake(self._law, data.actuator_length, data.actuator_velocity, control)
+        return control
 
     def place(self, data: mujoco.MjData) -> None:
         """Take the places of mocap bodies, which positions do not determine, for later calls of `poses`."""
@@ -134,11 +292,7 @@ class Recorder:
 
     def poses(self, qpos: Array) -> Poses:
         """Forward kinematics of positions of shape (k, nq)."""
-        m, data, k = self._model, self._still, len(qpos)
-        poses = Poses(np.empty((k, m.nbody, 3)), np.empty((k, m.nbody, 3, 3)), np.empty((k, m.nbody, 3)))
-        for i, q in enumerate(qpos):
-            data.qpos[:] = q
-            mujoco.mj_kinematics(m, data)
-            poses.frames[i], poses.centres[i] = data.xpos, data.xipos
-            poses.axes[i] = data.xmat.reshape(-1, 3, 3)
-        return poses
+        k, bodies = len(qpos), self._model.nbody
+        frames, centres, axes = np.empty((k, bodies, 3)), np.empty((k, bodies, 3)), np.empty((k, bodies, 9))
+        _kinematics(self._posed, self._still.xmat, qpos, frames, centres, axes)
+        return Poses(frames, axes.reshape(k, bodies, 3, 3), centres)

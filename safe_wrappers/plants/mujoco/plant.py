@@ -96,7 +96,7 @@ class MujocoPlant(Plant):
         return self._shared.step(env, action, self._recorder, self._snapshot)
 
     def _new_recorder(self) -> Recorder:
-        return Recorder(self.model, self.substeps)
+        return Recorder(self.model, self.data, self.substeps)
 
     def _check_action_space(self, env: gym.Env[Any, Any]) -> None:
         check_action_space(env, self.lower, self.upper)
@@ -121,8 +121,8 @@ class MujocoPlant(Plant):
         """Called when the state or the model has changed."""
         self._loaded = self._forwarded = False
         self._affine: tuple[Array, Array] | None = None
-        self._recorder.held_control = b""
-        self._forecasts: dict[bytes, Forecast] = {}
+        self._recorder.forget()
+        self._forecasts: dict[tuple[bytes, bool], Forecast] = {}
         self._contact_forecasts: dict[bytes, ContactForecast] = {}
 
     def observe(self) -> None:
@@ -241,19 +241,28 @@ class MujocoPlant(Plant):
         """Diagonal of the joint-space inertia, shape (nv,), kg or kg m^2."""
         return np.diag(of_model.inertia(self.model, self.forward()))
 
-    def forecast(self, control: Array, horizon: int = 1) -> Forecast:
+    def forecast(self, control: Array, horizon: int = 1, euler: bool = False) -> Forecast:
         """A control, shape (nu,), held for one control interval, then every actuator brakes its own motion.
 
-        `horizon` >= 1 counts all control intervals. Braking is one way to continue, not the best one. A forecast is
-        kept until the next observation, so that constraints share it.
+        `horizon` >= 1 counts all control intervals. Braking, with `euler` by Euler steps, is one way to continue, not
+        the best one. A forecast is kept until the next observation, so that constraints share it.
         """
         key = control.tobytes()
-        known = self._forecasts.get(key)
-        if known is None or len(known.published_frames) < horizon:
-            first = known.first(1) if known is not None and self._recorder.held_control == key else None
+        known = self._forecasts.get((key, euler))
+        if known is None or len(known.published) < horizon:
+            known = known or self._forecasts.get((key, not euler))
             self._load_to_step()
-            known = self._forecasts[key] = self._recorder.record(self.data, control, horizon, first)
+            known = self._recorder.record(control, horizon, known and known.first(1), euler)
+            self._forecasts[key, euler] = known
         return known.first(horizon)
+
+    def sketch(self, control: Array, horizon: int) -> Forecast:
+        """A forecast by Euler steps alone, of little price where the model's are Runge-Kutta's; not kept."""
+        known = self._forecasts.get((control.tobytes(), False))
+        if known is not None and len(known.published) >= horizon and not self._recorder.is_runge_kutta:
+            return known.first(horizon)
+        self._load_to_step()
+        return self._recorder.sketch(control, horizon)
 
     def contact_forecast(self, control: Array) -> ContactForecast:
         """Contacts with the fixed world while a control, shape (nu,), is held for one interval; kept as forecasts."""
@@ -302,8 +311,7 @@ class MujocoPlant(Plant):
 
     def path(self, control: Array) -> list[Array]:
         """The states (qpos, qvel) after each physics substep of a held control."""
-        forecast = self.forecast(control)
-        return list(np.hstack([forecast.qpos, forecast.qvel]))
+        return list(self.forecast(control).path)
 
     def motion(self, kind: str, name: str) -> tuple[Array, Array]:
         """Position (3,), m, and velocity (3,), m/s, of a named frame's origin; much cheaper than `point`."""

@@ -12,11 +12,11 @@ Visit = Callable[[mujoco.MjData, float], None]
 
 _INPUTS: Final = mujoco.mjtState.mjSTATE_USER
 _PHYSICS: Final = mujoco.mjtState.mjSTATE_PHYSICS
-_RK4: Final = int(mujoco.mjtIntegrator.mjINT_RK4)
+RK4: Final = int(mujoco.mjtIntegrator.mjINT_RK4)
 _FROM_POSITIONS: Final = int(mujoco.mjtStage.mjSTAGE_NONE)
 _STAGES: Final = ((0.5, 1.0 / 6.0), (0.5, 1.0 / 3.0), (1.0, 1.0 / 3.0), (0.0, 1.0 / 6.0))
 """Where the next evaluation is, in time steps, and the weight of this one."""
-_RATES_OF_ROTATION_VECTORS: Final = mujoco.mj_version() >= 4_000_000
+RATES_OF_ROTATION_VECTORS: Final = mujoco.mj_version() >= 4_000_000
 """From MuJoCo 4.0 on Runge-Kutta averages rates of the rotation vector since the step's start; before, the stages'
 angular velocities."""
 _BALL: Final = int(mujoco.mjtJoint.mjJNT_BALL)
@@ -63,14 +63,14 @@ class Replay:
             evaluations(model, data, visit)
         mujoco.mj_getState(model, data, self._end, int(_PHYSICS))
         mujoco.mj_getState(model, there, self._there, int(_PHYSICS))
-        if model.opt.integrator == _RK4:
+        if model.opt.integrator == RK4:
             return bool(np.allclose(self._end, self._there, rtol=_ROUNDING, atol=_ROUNDING))
         return np.array_equal(self._end, self._there)
 
 
 def evaluations(model: mujoco.MjModel, data: mujoco.MjData, visit: Visit) -> None:
     """Make one physics substep and visit its evaluations of the physics; Runge-Kutta has four."""
-    if model.opt.integrator == _RK4:
+    if model.opt.integrator == RK4:
         _runge_kutta(model, data, visit)
         return
     mujoco.mj_step(model, data)  # it leaves the forces that it has integrated in the data
@@ -88,7 +88,7 @@ def _runge_kutta(model: mujoco.MjModel, data: mujoco.MjData, visit: Visit) -> No
         mujoco.mj_forwardSkip(model, data, _FROM_POSITIONS, 1)
         visit(data, weight * step_s)
         stage = qvel.copy()
-        if _RATES_OF_ROTATION_VECTORS and turns.size:
+        if RATES_OF_ROTATION_VECTORS and turns.size:
             stage[turns] = rotation_vector_rate(step_s * rate[turns], qvel[turns])
         velocity += weight * stage
         acceleration += weight * qacc

@@ -53,23 +53,24 @@ class SharedStep:
     def step(self, env: gym.Env[Any, Any], action: Any, rollout: Recorder, start: Array) -> Any:
         """`env.step(action)`, with a rollout's first control interval, from the state `start`, as its simulation."""
         watched = mujoco.mj_step is not _MJ_STEP or "_step_mujoco_simulation" in vars(self._raw)
-        if watched or not rollout.held_control:
+        if watched:
             return env.step(action)
         raw, simulate = self._raw, self._raw._step_mujoco_simulation
 
         def take_over(ctrl: Array, n_frames: int) -> None:
             del raw._step_mujoco_simulation  # a second simulation within one step is the env's own
             mujoco.mj_getState(raw.model, raw.data, self._state, _STATE)
+            held = rollout.held_after(np.asarray(ctrl, dtype=np.float64))
             if (
-                n_frames != self._substeps
-                or np.asarray(ctrl, dtype=np.float64).tobytes() != rollout.held_control
+                held is None
+                or n_frames != self._substeps
                 or self._state.tobytes() != start.tobytes()
-                or rollout.held.warning.number.any()
+                or held.warning.number.any()
             ):
                 simulate(ctrl, n_frames)
                 return
             warned = raw.data.warning.number.copy()
-            mujoco.mj_copyData(raw.data, raw.model, rollout.held)
+            mujoco.mj_copyData(raw.data, raw.model, held)
             raw.data.warning.number[:] = warned
             mujoco.mj_rnePostConstraint(raw.model, raw.data)
             self.count += 1

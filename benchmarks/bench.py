@@ -1,0 +1,121 @@
+"""What the filter costs, in one table: beside bare envs, other packages, and the version before.
+
+    python -m benchmarks.bench              # about six minutes; writes results/bench.json
+    python -m benchmarks.bench Reacher project
+
+A row divides the time of ours by that of what it is compared with, where the filter changes nothing (inactive) and
+where it does (active); 1.0 is no cost. Both sides run in turn in one process. Infeasible: share of the active
+driver's steps; correction: mean length of its changes, in units of the action. Before: how this run's ratios compare
+with those of the committed results, inactive and active; below 1 is faster.
+"""
+
+import argparse
+import json
+import math
+import subprocess
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import safe_wrappers as sw
+from benchmarks import env_step, peers
+
+RESULT = Path(__file__).parent / "results" / "bench.json"
+HEAD = """| what | over | inactive (us) | active (us) | inactive | active | infeasible | correction | before |
+|---|---|---|---|---|---|---|---|---|"""
+Row = dict[str, Any]
+
+
+def env_row(name: str, steps: int) -> Row:
+    """A filtered env over the bare one."""
+    driver, protect = env_step.ACTIVE[name]
+    quiet = env_step.measure(name, env_step.gentle, sw.protect, active=False, steps=steps)
+    pushed = env_step.measure(name, driver, protect, active=True, steps=steps)
+    return {
+        "inactive_us": quiet.with_us,
+        "active_us": pushed.with_us,
+        "inactive": quiet.ratio,
+        "active": pushed.ratio,
+        "active_share": pushed.share,
+        "infeasible": pushed.infeasible,
+        "correction": pushed.correction,
+    }
+
+
+def peer_rows(inactive: peers.Times, active: peers.Times) -> dict[str, Row]:
+    """Ours over each of the others."""
+    ours, *others = active
+    return {
+        other: {
+            "inactive_us": inactive[ours],
+            "active_us": active[ours],
+            "inactive": inactive[ours] / inactive[other],
+            "active": active[ours] / active[other],
+        }
+        for other in others
+    }
+
+
+def measured(wanted: list[str], steps: int) -> Iterator[tuple[str, str, Row]]:
+    """What, over what, and the figures, for rows whose name holds one of the words."""
+
+    def asked(what: str) -> bool:
+        return not wanted or any(word in what for word in wanted)
+
+    for name in filter(asked, env_step.ACTIVE):
+        yield name, "the env", env_row(name, steps)
+    calls = {f"project, {m} x {k}": (peers.projections, (m, k)) for m, k in peers.SIZES}
+    calls |= {f"project_batch, {m} x {k}": (peers.batches, (m, k)) for m, k in peers.SIZES}
+    calls["double integrator"] = (peers.filter_calls, ())  # type: ignore[assignment]
+    for what in filter(asked, calls):
+        measure, size = calls[what]
+        for other, row in peer_rows(measure(*size, active=False), measure(*size, active=True)).items():
+            yield what, other, row
+
+
+def committed() -> dict[str, Row]:
+    """The results of the last commit, none outside of a repository."""
+    path = f"HEAD:./{RESULT.name}"
+    said = subprocess.run(["git", "show", path], cwd=RESULT.parent, capture_output=True, text=True)
+    rows: dict[str, Row] = json.loads(said.stdout) if said.returncode == 0 else {}
+    return rows
+
+
+def line(what: str, over: str, row: Row, old: Row | None) -> str:
+    """One line of the table."""
+    rare = [
+        f"{row[key]:{form}}" if key in row else ""
+        for key, form in (("infeasible", ".1%"), ("correction", ".2g"))
+    ]
+    before = "" if old is None else " / ".join(f"{row[key] / old[key]:.2f}" for key in ("inactive", "active"))
+    us = (
+        f"{row[key]:.3g}" if row[key] < 100.0 else f"{row[key]:.0f}" for key in ("inactive_us", "active_us")
+    )
+    ratios = (f"{row[key]:.2f}" if row[key] >= 0.1 else f"{row[key]:.1g}" for key in ("inactive", "active"))
+    return f"| {' | '.join([what, over, *us, *ratios, *rare, before])} |"
+
+
+def main() -> None:
+    """Measure, print, and write the results if every row was asked for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("words", nargs="*", help="only rows whose name holds one of these")
+    parser.add_argument("--steps", type=int, default=1500, help="of each env")
+    arguments = parser.parse_args()
+    warnings.simplefilter("ignore")
+    old, rows = committed(), {}
+    print(HEAD)
+    for what, over, row in measured(arguments.words, arguments.steps):
+        key = f"{what} over {over}"
+        rows[key] = {
+            name: None if math.isnan(value) else float(f"{value:.4g}") for name, value in row.items()
+        }
+        print(line(what, over, row, old.get(key)), flush=True)
+    if not arguments.words:
+        RESULT.write_text(json.dumps(rows, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
