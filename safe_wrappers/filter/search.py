@@ -115,6 +115,8 @@ class SafeActionSearch:
             found = self._sole.decide(proposal, self._low, self._high)
             if found is not None:
                 control, stage, rows = found
+                if control is proposal:
+                    return Decision(proposal, Stage.PROPOSAL, changed=False)
                 control = self._rounded(control, rows.normals, rows.offsets)
                 return self._projected(proposal, control, Stage(stage))
         refused = bool(self._predicting) and not self._admitted(proposal)

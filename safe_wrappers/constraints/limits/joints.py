@@ -2,13 +2,15 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from safe_wrappers.checks import name_list, positive
 from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
+from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, HalfSpaces
@@ -233,7 +235,7 @@ class BoundJointSpeedLimit(BoundRollout):
         ids = scalar_joints(self.plant, self.spec.joints)
         self._dofs = self.plant.model.jnt_dofadr[ids]
         self._limits = per_joint("limit", self.spec.limit, len(ids))
-        self._bound = self._limits - self.spec.margin
+        self._bound = np.asarray(self._limits - self.spec.margin)
 
     def now(self) -> Array:
         """Speed left below the limit, per joint, rad/s or m/s."""
@@ -246,13 +248,42 @@ class BoundJointSpeedLimit(BoundRollout):
         """Two rows per joint that could reach its limit within the hold; none where controls are no forces."""
         if not self.plant.has_acceleration:
             return super().rows()
-        v, (a0, a) = self.plant.qvel[self._dofs], (part[self._dofs] for part in self.plant.acceleration)
-        strongest = np.maximum(np.abs(self.plant.lower), np.abs(self.plant.upper))
-        # No push, not NaN, where an actuator without effect is infinitely strong.
-        pushes = np.abs(a) * np.where(a == 0.0, 0.0, strongest)
-        highest = np.abs(v) + self.plant.control_dt * (np.abs(a0) + pushes.sum(axis=1))
-        near = highest > self._bound
-        normals = np.vstack([a[near], -a[near]])
-        room = self._bound[near] / self.plant.control_dt
-        rate, bias = v[near] / self.plant.control_dt, a0[near]
-        return HalfSpaces(normals, np.concatenate([room - rate - bias, room + rate + bias]))
+        bounds = self.plant.lower, self.plant.upper, self._bound
+        rows = _speed_rows(
+            self._dofs, self.plant.qvel, *self.plant.acceleration, *bounds, self.plant.control_dt
+        )
+        return HalfSpaces(*rows)
+
+
+@compiled
+def _speed_rows(
+    dofs: NDArray[Any],
+    qvel: Array,
+    drift: Array,
+    effect: Array,
+    low: Array,
+    high: Array,
+    bound: Array,
+    control_dt: float,
+) -> tuple[Array, Array]:
+    """The rows of `BoundJointSpeedLimit`, `qacc = drift + effect @ u`: all upper ones, then all lower ones."""
+    near = np.zeros(len(dofs), np.bool_)
+    for i in range(len(dofs)):
+        dof, pushes = dofs[i], 0.0
+        for k in range(len(low)):
+            # No push, not NaN, where an actuator without effect is infinitely strong.
+            if effect[dof, k] != 0.0:
+                pushes += abs(effect[dof, k]) * max(abs(low[k]), abs(high[k]))
+        near[i] = abs(qvel[dof]) + control_dt * (abs(drift[dof]) + pushes) > bound[i]
+    count, row = 0, 0
+    for i in range(len(dofs)):
+        count += near[i]
+    normals, offsets = np.empty((2 * count, len(low))), np.empty(2 * count)
+    for i in range(len(dofs)):
+        if near[i]:
+            dof, room, rate = dofs[i], bound[i] / control_dt, qvel[dofs[i]] / control_dt
+            for k in range(len(low)):
+                normals[row, k], normals[count + row, k] = effect[dof, k], -effect[dof, k]
+            offsets[row], offsets[count + row] = room - rate - drift[dof], room + rate + drift[dof]
+            row += 1
+    return normals, offsets
