@@ -178,7 +178,7 @@ def test_tangents_that_are_no_numbers_end_it():
     tangents = [((np.nan, 0.0), 0.3), ((1.0, 0.0), 0.3)]
     broken = Predicting(lambda u: 0.5 - u[0], tangents=lambda u: tangents, control=(-1.0, 0.5))
     decision = decide((1.0, 0.5), broken)
-    keeps(decision, 0.475, 0.5)  # towards the backup, by 5 % of the violation beyond the boundary
+    keeps(decision, 0.17, 0.5)  # blended with the backup
     assert decision.stage is Stage.BLEND
 
 
@@ -204,6 +204,14 @@ def test_provisional_tangents_give_way_to_the_next_ones():
 def test_an_admitted_correction_is_shortened_to_what_is_needed(limit):
     found = search(Predicting(lambda u: limit - u[0])).shorten(np.ones(2), np.array([-1.0, 1.0]), NONE)
     np.testing.assert_allclose(found, [1.0 - 1.05 * (1.0 - limit), 1.0])
+
+
+def test_a_fallback_that_is_admitted_is_shortened_before_it_is_executed():
+    decision = decide(
+        (1.0, 0.5), Predicting(lambda u: 0.5 - u[0]), fallback=lambda plant: np.array([-1.0, 0.5])
+    )
+    keeps(decision, 0.475, 0.5)  # by 5 % of the violation beyond the boundary
+    assert decision.stage is Stage.BLEND and not decision.fallback
 
 
 def test_where_room_is_not_in_proportion_it_goes_halfway():
