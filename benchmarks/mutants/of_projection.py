@@ -4,6 +4,7 @@ from benchmarks.mutants.target import Mutant, Target
 
 _TESTS = (
     "tests/filter/test_projection_failed.py",
+    "tests/control/test_active_set.py",
     "tests/control/test_projection.py",
     "tests/control/test_projection_scale.py",
     "tests/control/test_projection_batch.py",
