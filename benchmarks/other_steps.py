@@ -4,7 +4,7 @@
     python -m benchmarks.other_steps Rover Pusher
 
 Beside each filtered env runs one without the filter, but with everything else around it, that makes the same steps.
-The ratio is the median over steps of the time with the filter over the time without.
+The ratio is the median over steps of the CPU time with the filter over that without.
 """
 
 import sys
@@ -55,7 +55,7 @@ def _pressing(env: Any, rng: np.random.Generator) -> Driver:
 
 
 def _pushing_out(env: Any, rng: np.random.Generator) -> Driver:
-    """To the stretched arm: Reacher's second joint towards its singular pose, Fetch's hand out of reach."""
+    """Into random corners of the action space, for random times: an arm ends stretched or out of reach."""
     low, high = (bound.astype(np.float64) for bound in (env.action_space.low, env.action_space.high))
     state: dict[str, Any] = {"left": 0, "action": high}
 

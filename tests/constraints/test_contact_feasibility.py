@@ -10,6 +10,8 @@ from contact_judge import DRIVERS, ConeJudge, touches
 from judged_loops import Scene, flagged
 
 import safe_wrappers as sw
+from safe_wrappers.constraints.contact.contact_feasibility import _worst
+from safe_wrappers.control.contact.friction_cone import cone_excess
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.serialize import constraint_from, plain_data
 
@@ -308,3 +310,17 @@ def test_the_judge_reads_forces_that_carry_the_weight():
         env.step(np.zeros(6))
     forces = np.array([force for _, _, _, force, _ in touches(env.model, env.data)])
     assert forces[:, 2].sum() == pytest.approx(env.model.body_mass[1:].sum() * 9.81, rel=0.02)
+
+
+def test_the_worst_of_each_body_is_that_of_the_cone_and_what_is_no_number_stays():
+    rng, index = np.random.default_rng(3), np.array([-1, 1, 0, 2])
+    normals = rng.normal(size=(60, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    forces, friction, body = rng.normal(size=(60, 3)), rng.uniform(0.0, 1.0, 60), rng.integers(0, 3, 60)
+    found = _worst(body, normals, forces, friction, index, 3, 0.7, 5.0)
+    excess = cone_excess(forces, normals, 0.7 * friction)
+    expected = [-excess[body == b].max() / 5.0 for b in (2, 1)]
+    np.testing.assert_allclose(found, [*expected, np.inf], atol=1e-12)
+    forces[np.flatnonzero(body == 2)[0]] = np.nan
+    found = _worst(body, normals, forces, friction, index, 3, 0.7, 5.0)
+    assert np.isnan(found[0]) and found[1] == pytest.approx(expected[1])

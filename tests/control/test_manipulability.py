@@ -18,6 +18,7 @@ from safe_wrappers.control.filtering.manipulability import (
     chain_derivative,
     manipulability,
     manipulability_gradient,
+    signed_manipulability,
     validated_threshold,
     worst_joint_rates,
 )
@@ -366,3 +367,22 @@ SIX = np.eye(6, 7)
 def test_nonsense_is_refused(call, message):
     with pytest.raises(ConfigurationError, match=message):
         call()
+
+
+@given(j=jacobians)
+@settings(deadline=None, max_examples=200)
+def test_one_by_reflections_is_the_determinant_or_the_product_of_singular_values(j):
+    m, n = j.shape
+    scale = max(float(np.prod(np.linalg.norm(j, axis=1))), 1e-300)  # Hadamard's bound
+    found = signed_manipulability(j.T.copy())
+    if m == n:
+        assert abs(found - np.linalg.det(j)) <= 1e-13 * scale
+    else:
+        assert abs(abs(found) - float(manipulability(j))) <= 1e-13 * scale
+
+
+def test_one_by_reflections_is_zero_at_rank_loss():
+    assert signed_manipulability(np.array([[1.0, 2.0], [2.0, 4.0], [0.1, 0.2]])) == 0.0
+    assert signed_manipulability(np.zeros((2, 2))) == 0.0
+    assert signed_manipulability(np.ones((1, 2))) == 0.0
+    assert signed_manipulability(np.array([[0.0, 1.0], [1.0, 0.0]])) == -1.0

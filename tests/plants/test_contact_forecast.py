@@ -221,6 +221,7 @@ def test_compiled_code_is_used_where_it_can_be():
     plant = bound(gym.make("HalfCheetah-v5"))
     reader = ContactReader(plant.model)
     assert reader._compiles and reader._memory_of(plant.data) is not None
+    assert copy.deepcopy(reader)._memory is None  # of data that the copy does not hold
     filtered = '<general name="slow" joint="hip" dyntype="filter" dynprm="0.1" ctrlrange="-1 1"/>'
     assert not ContactReader(Legs(act=filtered).model)._compiles
 

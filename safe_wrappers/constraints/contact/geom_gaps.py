@@ -1,18 +1,13 @@
 """Pairs of geoms of machine and world: their distances, and when they touch along a forecast."""
 
-import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.mujoco.forecast import Forecast
-from safe_wrappers.plants.mujoco.native import mj_geomDistance
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
 _FAR = 1e6  # largest distance that is measured, m
@@ -66,7 +61,7 @@ class GeomGaps:
     def nearest(self, model: mujoco.MjModel, data: mujoco.MjData, pair: int) -> tuple[float, Array, Array]:
         """Distance (m), the unit normal from the machine to the world, and the nearest points of both, shape (6,)."""
         a, b = self.pairs[pair]
-        gap = _distance(_measured(model, data, a, b), self._segment)
+        gap = _distance(model, data, a, b, self._segment)
         between = self._segment[3:] - self._segment[:3]
         length = float(np.linalg.norm(between))
         points = self._segment.copy()
@@ -77,19 +72,18 @@ class GeomGaps:
     def _steepest(self, model: mujoco.MjModel, data: mujoco.MjData, a: int, b: int) -> Array:
         """The direction in which moving the machine's geom shortens the distance most: a normal, by differences."""
         place, steepest = data.geom_xpos[a].copy(), np.zeros(3)
-        pair, nearest = _measured(model, data, a, b), np.zeros(6)
         for axis, nudge in enumerate(_NUDGE * np.eye(3)):
             ends = []
             for moved in (place - nudge, place + nudge):
                 data.geom_xpos[a] = moved
-                ends.append(_distance(pair, nearest))
+                ends.append(_distance(model, data, a, b, None))
             steepest[axis] = ends[0] - ends[1]
         data.geom_xpos[a] = place
         return np.asarray(steepest / max(float(np.linalg.norm(steepest)), _NUDGE**2))
 
     def touched(
         self, plant: MujocoPlant, forecast: Forecast, data: mujoco.MjData, pair: int
-    ) -> NDArray[np.int64]:
+    ) -> Iterator[int]:
         """The instants of a forecast at which a contact of a pair has to be judged, in time.
 
         They are the first of every contact, the last of every control step in contact, and the first of every
@@ -100,96 +94,41 @@ class GeomGaps:
         (centres, axes), (other, others) = _path(m, forecast, a), _path(m, forecast, b)
         steps = _farthest(m, a, centres, axes) + _farthest(m, b, other, others)
         way = np.concatenate([[0.0], np.cumsum(steps)])
-        paths = _Path(centres, axes, other, others, way)
-        return _touched(_measured(m, data, a, b), paths, float(self.touch[pair]), plant.substeps)
-
-
-class _Measured(NamedTuple):
-    """Two geoms of a model whose distance is measured, and views of where they are in the data."""
-
-    model: int
-    data: int
-    one: int
-    other: int
-    round: bool  # one of them is
-    places: Array  # of all geoms
-    turns: Array
-
-
-class _Path(NamedTuple):
-    """Centres (k, 3) and axes (k, 3, 3) of two geoms, and how far they have moved together at most, (k,), m."""
-
-    centres: Array
-    axes: Array
-    other: Array
-    others: Array
-    way: Array
-
-
-def _measured(model: mujoco.MjModel, data: mujoco.MjData, a: int, b: int) -> _Measured:
-    is_round = bool(model.geom_type[a] <= _ROUND or model.geom_type[b] <= _ROUND)
-    return _Measured(model._address, data._address, a, b, is_round, data.geom_xpos, data.geom_xmat)
-
-
-@compiled
-def _touched(pair: _Measured, path: _Path, touch: float, substeps: int) -> NDArray[np.int64]:
-    """As `GeomGaps.touched`."""
-    k, instant, count = len(path.way), 0, 0
-    found, segment = np.empty(k, np.int64), np.zeros(6)
-    before, back = math.inf, False  # distance at the instant before, if in contact; whether it grew
-    while instant < k:
-        for i in range(3):
-            pair.places[pair.one, i] = path.centres[instant, i]
-            pair.places[pair.other, i] = path.other[instant, i]
-            for j in range(3):
-                pair.turns[pair.one, 3 * i + j] = path.axes[instant, i, j]
-                pair.turns[pair.other, 3 * i + j] = path.others[instant, i, j]
-        gap = _distance(pair, segment)
-        if gap <= touch:
-            ends = (instant + 1) % substeps == 0
-            if before == math.inf or ends or (back and gap < before):
-                found[count] = instant
-                count += 1
-            back, before = before < gap, gap
-            instant += 1
-        else:
-            before, back = math.inf, False
-            free, instant = path.way[instant] + gap - touch, instant + 1
-            while instant < k and path.way[instant] < free:
+        k, touch, instant = len(centres), self.touch[pair], 0
+        before, back = np.inf, False  # distance at the instant before, if in contact; whether it grew
+        while instant < k:
+            data.geom_xpos[a], data.geom_xmat[a] = centres[instant], axes[instant].ravel()
+            data.geom_xpos[b], data.geom_xmat[b] = other[instant], others[instant].ravel()
+            gap = _distance(m, data, a, b, None)
+            if gap <= touch:
+                ends = (instant + 1) % plant.substeps == 0
+                if before == np.inf or ends or (back and gap < before):
+                    yield instant
+                before, back = gap, before < gap
                 instant += 1
-    return found[:count]
+            else:
+                before, back = np.inf, False
+                instant = max(instant + 1, int(np.searchsorted(way, way[instant] + gap - touch)))
 
 
-@compiled
-def _geom_distance(pair: _Measured, segment: Array) -> float:
-    return float(mj_geomDistance(pair.model, pair.data, pair.one, pair.other, _FAR, segment.ctypes.data))
-
-
-@compiled
-def _distance(pair: _Measured, segment: Array) -> float:
-    """MuJoCo's distance of the geoms, m, and the nearest points into `segment`, shape (6,)."""
+def _distance(model: mujoco.MjModel, data: mujoco.MjData, a: int, b: int, segment: Array | None) -> float:
+    """MuJoCo's distance of two geoms, m, and the nearest points into `segment`."""
     # For about one in thirty pairs of boxes that are apart MuJoCo 3.11 returns 0, or the wrong sign: they are
     # measured again at small offsets, and the median of the results other than 0 counts. Round geoms do not need it.
-    gap = _geom_distance(pair, segment)
-    if gap > 0.0 or pair.round:
-        return gap
-    place = pair.places[pair.one]
-    start, answers, chosen, count = place.copy(), np.empty(len(_BESIDE)), np.empty(len(_BESIDE), np.int64), 0
-    for beside in range(len(_BESIDE)):
-        place[:] = start + _BESIDE[beside]
-        answers[beside] = _geom_distance(pair, segment)
-        if answers[beside] != 0.0:
-            at = count  # in order of the answers
-            while at and answers[chosen[at - 1]] > answers[beside]:
-                chosen[at] = chosen[at - 1]
-                at -= 1
-            chosen[at] = beside
-            count += 1
-    middle = chosen[count // 2] if count else len(_BESIDE) // 2
-    place[:] = start + _BESIDE[middle]
-    _geom_distance(pair, segment)
-    place[:] = start
-    return float(answers[middle])
+    gap = mujoco.mj_geomDistance(model, data, a, b, _FAR, segment)
+    if gap > 0.0 or model.geom_type[a] <= _ROUND or model.geom_type[b] <= _ROUND:
+        return float(gap)
+    place, answers = data.geom_xpos[a].copy(), []
+    for beside in _BESIDE:
+        data.geom_xpos[a] = place + beside
+        answers.append((float(mujoco.mj_geomDistance(model, data, a, b, _FAR, None)), beside))
+    there = sorted((a for a in answers if a[0] != 0.0), key=lambda a: a[0]) or answers
+    gap, beside = there[len(there) // 2]
+    if segment is not None:
+        data.geom_xpos[a] = place + beside
+        mujoco.mj_geomDistance(model, data, a, b, _FAR, segment)
+    data.geom_xpos[a] = place
+    return gap
 
 
 def _geoms(plant: MujocoPlant, name: str) -> list[int]:

@@ -1,7 +1,7 @@
 """The contacts of a MuJoCo model, as they are and as forecast: which bodies, how far apart, how much force."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -99,6 +99,9 @@ class ContactReader:
             self._compiles = False
         self.clear()
 
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_memory": None}  # a copy reads other data
+
     def clear(self) -> None:
         """Forget what has been read."""
         self.count = 0
@@ -163,7 +166,6 @@ class ContactReader:
         return self.forecast(inside), inside
 
     def _memory_of(self, data: mujoco.MjData) -> ContactMemory | None:
-        """Of the data, also where this object is a copy of the one that knew another's."""
         known = self._memory
         if known is None or known.data != data._address or known.model != self._model._address:
             self._memory = known = contact_memory(self._model, data)

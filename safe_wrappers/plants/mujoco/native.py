@@ -17,16 +17,14 @@ if IS_COMPILED:
     load_library_permanently(_LIBRARY)  # so that code that was cached finds the symbols
 
 
-def _function(name: str, kinds: str, measures: bool = False) -> Any:
-    """The function of that name, of addresses (a), whole numbers (i) and numbers (d); of what it returns, numbers."""
+def _function(name: str, kinds: str) -> Any:
+    """The function of that name, of addresses (a), whole numbers (i) and numbers (d); what it returns is left."""
     if IS_COMPILED:
         known = {"a": types.intp, "i": types.intc, "d": types.double}
-        found = types.double if measures else types.void
-        return types.ExternalFunction(name, found(*[known[kind] for kind in kinds]))
+        return types.ExternalFunction(name, types.void(*[known[kind] for kind in kinds]))
     function = getattr(ctypes.CDLL(_LIBRARY), name)
     plain = {"a": ctypes.c_void_p, "i": ctypes.c_int, "d": ctypes.c_double}
-    function.argtypes = [plain[kind] for kind in kinds]
-    function.restype = ctypes.c_double if measures else None
+    function.argtypes, function.restype = [plain[kind] for kind in kinds], None
     return function
 
 
@@ -35,7 +33,6 @@ mj_kinematics: Final = _function("mj_kinematics", "aa")
 mj_forwardSkip: Final = _function("mj_forwardSkip", "aaii")  # noqa: N816 - MuJoCo's name
 mj_integratePos: Final = _function("mj_integratePos", "aaad")  # noqa: N816
 mj_contactForce: Final = _function("mj_contactForce", "aaia")  # noqa: N816
-mj_geomDistance: Final = _function("mj_geomDistance", "aaiida", measures=True)  # noqa: N816
 mj_jac: Final = _function("mj_jac", "aaaaai")
 mj_jacDot: Final = _function("mj_jacDot", "aaaaai")  # noqa: N816
 mj_solveM: Final = _function("mj_solveM", "aaaai")  # noqa: N816
