@@ -185,6 +185,20 @@ def closest_admitted(
 
 
 @compiled
+def bounds_of(
+    low: Array, high: Array, lower: Array, upper: Array, least: Array, most: Array, turns_first: bool
+) -> Array:
+    """The bounds of `closest_admitted` from the action box, the plant's bounds and its acting range, shapes (2,)."""
+    bounds = np.empty((4, 2))
+    for j in range(2):
+        place = 1 - j if turns_first else j
+        bottom, top = max(low[j], lower[j]), min(high[j], upper[j])
+        bounds[0, place], bounds[1, place] = bottom, top
+        bounds[2, place], bounds[3, place] = min(max(least[j], bottom), top), min(max(most[j], bottom), top)
+    return bounds
+
+
+@compiled
 def _round_inside(out: Array, normals: Array, offsets: Array, low: Array, high: Array) -> None:
     """`cast_inside` of `filter/projection.py` to single precision, in place."""
     sent, worst, most = np.empty(2, dtype=np.float32), -1, 0.0
