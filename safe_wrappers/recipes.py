@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import gymnasium as gym
@@ -170,6 +171,8 @@ def _fetch(
 LOOK_AHEAD_BELOW: Final = {"HalfCheetah": 0.8, "Hopper": 0.7, "Walker2d": 0.7, "Ant": 0.8, "Humanoid": 0.7}
 """Shares of the speed limit. Controls that left more after their own step were never refused by the look-ahead
 (`benchmarks/look_ahead.py`); Swimmer's were, whatever they left."""
+EULER_LOOK_AHEAD: Final = ("Hopper", "Walker2d")
+"""Robots on which a look-ahead by Euler steps leaves no more steps infeasible (`benchmarks/euler_look_ahead.py`)."""
 
 
 def _velocity(robot: str, margin: float = 0.02, horizon: int = 3) -> Callable[..., Recommended]:
@@ -177,7 +180,8 @@ def _velocity(robot: str, margin: float = 0.02, horizon: int = 3) -> Callable[..
     direction = "xy" if robot in ("Ant", "Humanoid") else "+x"
     limit, share = SPEED_LIMITS[robot], LOOK_AHEAD_BELOW.get(robot)
     below = None if share is None else share * limit
-    return _fixed(SpeedLimit(limit, body, direction, margin=margin, horizon=horizon, look_ahead_below=below))
+    ahead = SpeedLimit(limit, body, direction, margin=margin, horizon=horizon, look_ahead_below=below)
+    return _fixed(replace(ahead, euler_look_ahead=robot in EULER_LOOK_AHEAD))
 
 
 RECIPES: dict[str, Callable[..., Recommended]] = {

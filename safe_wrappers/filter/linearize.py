@@ -1,6 +1,7 @@
 """Half-spaces from predicted slacks, linearised about a control that the prediction has refused."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,6 +12,7 @@ Slacks = Callable[[Array], Array]
 
 _STEP = 1e-4  # width of the differences, as a share of the control's range
 _INWARD = 0.01  # aim this share of the violation beyond the boundary, to end inside it
+_AGAIN = 0.1  # likewise of the little that is left when a tangent is corrected
 _SECANTS = 2  # tangents whose slopes secants correct, after one by differences
 _DIFFERENCES = 4  # tangents by differences, in one control step
 
@@ -43,10 +45,10 @@ def differences(slacks: Slacks, control: Array, low: Array, high: Array) -> Arra
     return jacobian
 
 
-def tangent_rows(base: Array, control: Array, jacobian: Array, provisional: bool = False) -> HalfSpaces:
+def tangent_rows(base: Array, control: Array, jacobian: Array, inward: float = _INWARD) -> HalfSpaces:
     """Rows of slacks that are `base` at a control and change by a Jacobian, aimed a little inward where violated."""
-    wanted = _INWARD * np.maximum(-base, 0.0)
-    return HalfSpaces(-jacobian, base - jacobian @ control - wanted, provisional)
+    wanted = inward * np.maximum(-base, 0.0)
+    return HalfSpaces(-jacobian, base - jacobian @ control - wanted)
 
 
 class Tangents:
@@ -78,7 +80,9 @@ class Tangents:
         else:
             self._secants, self._slopes = self._secants + 1, corrected
         self._control, self._slacks = control, slacks[: len(self._slopes)]
-        return tangent_rows(self._slacks, control, self._slopes, provisional=corrected is not None)
+        if corrected is None:
+            return tangent_rows(self._slacks, control, self._slopes)
+        return replace(tangent_rows(self._slacks, control, self._slopes, _AGAIN), provisional=True)
 
     def _corrected(self, step: Array, slacks: Array) -> Array | None:
         """The slopes after a secant update; None: it cannot be made, or they are not those of what is violated."""

@@ -70,7 +70,17 @@ class Plant(ABC):
 
     def step(self, env: gym.Env[Any, Any], action: Any) -> Any:
         """Step the env with what may be executed; what `env.step` returns."""
-        return env.step(action)
+        self.offer_rollout()
+        try:
+            return env.step(action)
+        finally:
+            self.withdraw_rollout()
+
+    def offer_rollout(self) -> None:  # noqa: B027 - most plants have none
+        """Before the env's step: let it take over what has been simulated for the decision."""
+
+    def withdraw_rollout(self) -> None:  # noqa: B027
+        """After the env's step: nothing of the offer is left in the env."""
 
     @abstractmethod
     def executed(self, control: Array | None) -> None:

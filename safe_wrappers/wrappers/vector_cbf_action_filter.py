@@ -115,7 +115,7 @@ class VectorCBFActionFilter(VectorWrapper[Any, Any, Any, Any, Any]):
         for single, was_judged in zip(self.filters, judged.tolist(), strict=True):
             single.filter_seconds += each * was_judged
             single.filter_calls += was_judged
-        observations, rewards, terminated, truncated, infos = self.env.step(sent)
+        observations, rewards, terminated, truncated, infos = self._step(sent, judged)
         self._ended = np.asarray(terminated | truncated)
         restarted = self._ended if self._same_step else ~judged
         self._report(infos, reports, judged & ~restarted)
@@ -123,6 +123,18 @@ class VectorCBFActionFilter(VectorWrapper[Any, Any, Any, Any, Any]):
             self._report(infos["final_info"], reports, restarted)
         self._start(infos, restarted)
         return observations, rewards, terminated, truncated, infos
+
+    def _step(self, sent: NDArray[Any], judged: Mask) -> Any:
+        """Step the envs; what was simulated for the decisions is not simulated again."""
+        decided = () if self.constraint_batch is not None else np.flatnonzero(judged).tolist()
+        plants = [self.filters[i].plant for i in decided]
+        try:
+            for plant in plants:
+                plant.offer_rollout()
+            return self.env.step(sent)
+        finally:
+            for plant in plants:
+                plant.withdraw_rollout()
 
     def _judge(self, given: NDArray[Any], sent: NDArray[Any], judged: Mask) -> dict[str, NDArray[Any]]:
         """Write what to send where it is not what was given; the info keys of all envs, shape (n, ...)."""

@@ -52,6 +52,9 @@ def test_the_rows_pass_a_little_inside_of_where_the_slopes_say():
     rows = tangents(lambda u: 3.0 * u - 1.0).about(u)
     np.testing.assert_allclose(rows.normals, -3.0 * np.eye(2), atol=1e-9)
     np.testing.assert_allclose(rows.offsets, -1.0 - 0.01 * (1.0 - 3.0 * u), atol=1e-9)
+    corrected = tangents(lambda u: 3.0 * u - 1.0)
+    corrected.about(np.array([-0.9, -0.9]))
+    np.testing.assert_allclose(corrected.about(u).offsets, -1.0 - 0.1 * (1.0 - 3.0 * u), atol=1e-9)
 
 
 def test_a_control_that_came_back_unchanged_ends_it():

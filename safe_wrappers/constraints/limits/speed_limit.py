@@ -115,9 +115,8 @@ class BoundSpeedLimit(BoundRollout):
             mass = self.plant.model.body_mass
             self._shares = mass / mass.sum()
         pose = self.plant.pose()
-        data = self.plant.published()
-        counts = data is not None and self.spec.average == "step"
-        self._published = self._point(data.xpos, data.xipos).copy() if counts else None
+        data = self.plant.published() if self.spec.average == "step" else None
+        self._published = None if data is None else self._point(data.xpos, data.xipos).copy()
         before, self._here = self._before, self._point(pose.xpos, pose.xipos).copy()
         if before is None or self.spec.average == "substep":
             # What the last substep shows; at a reset nothing else has moved yet that could be measured.

@@ -89,11 +89,15 @@ class MujocoPlant(Plant):
         """Env steps that were taken over from a rollout since binding."""
         return 0 if self._shared is None else self._shared.count
 
-    def step(self, env: gym.Env[Any, Any], action: Any) -> Any:
-        """Step the env; what a rollout of the same controls has simulated already is not simulated again."""
-        if self._shared is None:
-            return env.step(action)
-        return self._shared.step(env, action, self._recorder, self._snapshot)
+    def offer_rollout(self) -> None:
+        """What a rollout of the same controls has simulated already, the env need not simulate again."""
+        if self._shared is not None:
+            self._shared.offer(self._recorder, self._snapshot)
+
+    def withdraw_rollout(self) -> None:
+        """Leave the env as it was, if it has not used the rollout."""
+        if self._shared is not None:
+            self._shared.withdraw()
 
     def _new_recorder(self) -> Recorder:
         return Recorder(self.model, self.data, self.substeps)

@@ -48,14 +48,15 @@ class SharedStep:
     def __init__(self, raw: Any, substeps: int) -> None:
         self._raw, self._substeps = raw, substeps
         self._state = np.zeros(mujoco.mj_stateSize(raw.model, _STATE))
+        self._offered: Any = None
         self.count = 0
 
-    def step(self, env: gym.Env[Any, Any], action: Any, rollout: Recorder, start: Array) -> Any:
-        """`env.step(action)`, with a rollout's first control interval, from the state `start`, as its simulation."""
-        watched = mujoco.mj_step is not _MJ_STEP or "_step_mujoco_simulation" in vars(self._raw)
-        if watched:
-            return env.step(action)
-        raw, simulate = self._raw, self._raw._step_mujoco_simulation
+    def offer(self, rollout: Recorder, start: Array) -> None:
+        """Let a rollout's first control interval, from the state `start`, be the env's next simulation."""
+        raw = self._raw
+        if mujoco.mj_step is not _MJ_STEP or "_step_mujoco_simulation" in vars(raw):
+            return
+        simulate = raw._step_mujoco_simulation
 
         def take_over(ctrl: Array, n_frames: int) -> None:
             del raw._step_mujoco_simulation  # a second simulation within one step is the env's own
@@ -75,8 +76,10 @@ class SharedStep:
             mujoco.mj_rnePostConstraint(raw.model, raw.data)
             self.count += 1
 
-        raw._step_mujoco_simulation = take_over
-        try:
-            return env.step(action)
-        finally:
-            vars(raw).pop("_step_mujoco_simulation", None)
+        self._offered = raw._step_mujoco_simulation = take_over
+
+    def withdraw(self) -> None:
+        """Leave the env as it was, if it has not used what was offered."""
+        if vars(self._raw).get("_step_mujoco_simulation") is self._offered:
+            vars(self._raw).pop("_step_mujoco_simulation", None)
+        self._offered = None
