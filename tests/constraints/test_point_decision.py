@@ -35,9 +35,8 @@ class Searched(sw.constraints.WallClearance):
 def test_the_stage_and_the_control_are_those_of_the_general_search(options, substeps):
     env = sw.CBFActionFilter(PointWorld(substeps, clip=5.0), [sw.constraints.WallClearance(**options)])
     low, high = (end.astype(np.float64) for end in (env.action_space.low, env.action_space.high))
-    searched = SafetyFilter(
-        env.plant, [Searched(**options)], "brake", "daqp", low, high, env.action_space.dtype
-    )
+    box = low, high, env.action_space.dtype
+    searched = SafetyFilter(env.plant, [Searched(**options)], "brake", "daqp", *box)
     rng, stages = np.random.default_rng(3), []
     for episode in range(12):
         env.reset(seed=episode)

@@ -43,6 +43,9 @@ def general_search(env):
         **{field.name: getattr(spec, field.name) for field in dataclasses.fields(spec) if field.init}
     )
     low, high = space.low.astype(float), space.high.astype(float)
+    # In double precision: rounding would hide what differs, and where it is a tie make a difference of its own.
+    env.filter = SafetyFilter(env.plant, env.constraints, "brake", "daqp", low, high)
+    env.filter.start()
     return SafetyFilter(env.plant, [same], "brake", "daqp", low, high)
 
 

@@ -154,10 +154,8 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         """The whole search at once, without a solver."""
         if self.admits(proposal):
             return proposal, among.PROPOSAL, HalfSpaces.none(2)
-        low, high = np.maximum(low, self.plant.lower), np.minimum(high, self.plant.upper)
-        least, most = self.plant.acting_range
-        ends = low, high, np.clip(least, low, high), np.clip(most, low, high)
-        bounds, found = np.array([self._pair(end) for end in ends]), np.empty(2)
+        plant, found = self.plant, np.empty(2)
+        bounds = among.bounds_of(low, high, plant.lower, plant.upper, *plant.acting_range, self.turns_first)
         stage, side, normals, offsets = among.closest_admitted(
             *self._scene, self._pair(proposal), self._kept_side(), self.spec.detour, bounds, found
         )

@@ -25,6 +25,7 @@ ROWS_SLACK: Final = 1e-9
 """By how much of a control's range a projected control may break a row; prediction judges it afterwards."""
 OVERSHOOTS: Final = (0.02, 0.1)
 BLENDS: Final = (0.1, 0.25, 0.5, 0.75)
+TRIES: Final = 3
 PROPOSAL, ROWS, CANDIDATE, OVERSHOOT, BLEND, BACKUP, UNRESOLVED = 0, 1, 2, 4, 5, 6, 7
 """What `closest_admitted` returns: a `Stage` of the search, or that none of these has found an admissible control."""
 
@@ -110,6 +111,16 @@ def _decide(
     back = min(max(backup_drive(models, at, brake), low[0]), high[0])
     if not admits(models, at, back, 0.0, brake):
         return UNRESOLVED, way, none, nothing
+    far, near = 0.0, 1.0  # shares of the way from the proposal to the backup: refused, and admitted
+    for _ in range(TRIES):
+        share = far + 0.5 * (near - far)
+        ahead, around = drive + share * (back - drive), turn + share * (0.0 - turn)
+        if admits(models, at, ahead, around, brake):
+            near, out[0], out[1] = share, ahead, around
+        else:
+            far = share
+    if near < 1.0:
+        return BLEND, way, none, nothing
     for share in BLENDS:
         ahead, around = refused[0] + share * (back - refused[0]), refused[1] + share * (0.0 - refused[1])
         if admits(models, at, ahead, around, brake):
@@ -182,6 +193,20 @@ def closest_admitted(
     """`_decide` from the present state; `bounds` are low, high, least and most, shape (4, 2)."""
     at = look(models[0], motion, discs, brake)
     return _decide(models, at, proposal, side, brake, detour, bounds[0], bounds[1], bounds[2], bounds[3], out)
+
+
+@compiled
+def bounds_of(
+    low: Array, high: Array, lower: Array, upper: Array, least: Array, most: Array, turns_first: bool
+) -> Array:
+    """The bounds of `closest_admitted` from the action box, the plant's bounds and its acting range, shapes (2,)."""
+    bounds = np.empty((4, 2))
+    for j in range(2):
+        place = 1 - j if turns_first else j
+        bottom, top = max(low[j], lower[j]), min(high[j], upper[j])
+        bounds[0, place], bounds[1, place] = bottom, top
+        bounds[2, place], bounds[3, place] = min(max(least[j], bottom), top), min(max(most[j], bottom), top)
+    return bounds
 
 
 @compiled

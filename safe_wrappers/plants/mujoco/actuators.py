@@ -182,6 +182,17 @@ def _respond(
     return drift, effect
 
 
+@compiled
+def _on_joints(
+    gear: Array, positions: NDArray[Any], velocities: NDArray[Any], qpos: Array, qvel: Array
+) -> tuple[Array, Array]:
+    """Length and velocity of transmissions on joints at these indices of qpos and qvel."""
+    length, velocity = np.empty(len(gear)), np.empty(len(gear))
+    for i in range(len(gear)):
+        length[i], velocity[i] = gear[i] * qpos[positions[i]], gear[i] * qvel[velocities[i]]
+    return length, velocity
+
+
 class AffineActuators:
     """Gain, bias and acting control range of every actuator of a model, whose arrays are read at every call.
 
@@ -238,8 +249,7 @@ class AffineActuators:
             self._on_joints = (scalar * m.actuator_gear[:, 0], m.jnt_qposadr[joint], m.jnt_dofadr[joint])
         if not self._joints_suffice:
             return None
-        gear, q, v = self._on_joints
-        return gear * qpos[q], gear * qvel[v]
+        return _on_joints(*self._on_joints, qpos, qvel)
 
 
 def moment_of(data: mujoco.MjData) -> tuple[Array, NDArray[Any], NDArray[Any], NDArray[Any]]:
