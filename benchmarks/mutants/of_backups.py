@@ -36,6 +36,7 @@ HEADING_DRIVE = Target(
         Mutant("return brake_control(body, ahead) if brake else 0.0,", "return brake_control(body, ahead),"),
         Mutant("if way != 0.0:", "if False:"),
         Mutant("OVERSHOOTS: Final = (0.02, 0.1)", "OVERSHOOTS: Final = ()"),
+        Mutant("TRIES: Final = 3", "TRIES: Final = 2"),
         Mutant("BLENDS: Final = (0.1, 0.25, 0.5, 0.75)", "BLENDS: Final = (0.1, 0.25, 0.5)"),
         Mutant("    for mixed in range(2):", "    for mixed in range(0):"),
         Mutant("    if not admits(models, at, back, 0.0, brake):\n", "    if False:\n"),
