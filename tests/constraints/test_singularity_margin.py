@@ -529,3 +529,16 @@ TIP = {"body": "fingertip", "directions": "xy"}
 def test_nonsense_is_refused(arguments, error, message):
     with pytest.raises(error, match=message):
         sw.CBFActionFilter(gym.make("Reacher-v5"), [sw.constraints.SingularityMargin(**arguments)])
+
+
+def test_a_pose_with_a_position_that_is_no_number_has_no_manipulability():
+    plant = sw.MujocoPlant()
+    plant.bind(gym.make("Reacher-v5"))
+    limit = sw.constraints.SingularityMargin(1e-4, body="fingertip", directions="xy").bind(plant)
+    qpos = np.tile([0.3, 0.8, 0.1, 0.1], (3, 1))
+    qpos[1, 2], qpos[2, 0] = (
+        np.nan,
+        np.inf,
+    )  # the target's position, which does not carry the arm, and the arm's own
+    found = limit._measure(qpos)
+    assert found[0] == pytest.approx(0.1 * 0.11 * np.sin(0.8)) and np.isnan(found[1:]).all()
