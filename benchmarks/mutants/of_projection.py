@@ -17,7 +17,7 @@ PROJECTION = Target(
     (
         Mutant("FEASIBILITY_TOLERANCE: Final = 1e-9", "FEASIBILITY_TOLERANCE: Final = 1e-6"),
         Mutant("EXACT_SHARE: Final = 1e-3", "EXACT_SHARE: Final = 1e3"),
-        Mutant("_SOFT: Final = 1e-8", "_SOFT: Final = 1e-2"),
+        Mutant("_SOFT: Final = 1e-10", "_SOFT: Final = 1e-2"),
         Mutant("ORDINARY_BOX: Final = 16.0", "ORDINARY_BOX: Final = 1e9"),
         Mutant("kept = _within(rows, slacks, 10.0)", "kept = _within(rows, slacks, 1e7)"),
         Mutant("control)[0] == _READ\n", "control)[0] >= 0\n"),

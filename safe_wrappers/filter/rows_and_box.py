@@ -35,7 +35,7 @@ LARGEST: Final = 1e150
 OVERFLOWING: Final = 1e300
 """An offset from here on asks for nothing."""
 _SHORTEST: Final = 1e-150  # rows below this are zero
-_SOFT: Final = 1e-8  # weight of the distance from the nominal beside squared violations
+_SOFT: Final = 1e-10  # weight of the distance from the nominal beside squared violations
 _ROUNDING: Final = 1e-15  # share of the numbers that are compared which round-off may leave
 _OPTIMAL: Final = (
     1e-9  # what the multipliers' control may differ from the answer by, as a share of the controls

@@ -118,6 +118,12 @@ def test_a_row_that_cannot_be_checked_is_not_kept(size):
     assert not keeps_rows(one, np.array([[size]]), one, -one, one)
 
 
+def test_an_offset_that_nothing_keeps_is_not_kept_in_a_wide_box():
+    assert not keeps_rows(
+        np.ones(1), np.ones((1, 1)), np.array([-math.inf]), -1e3 * np.ones(1), 1e3 * np.ones(1)
+    )
+
+
 def test_entries_of_very_different_size_in_one_row():
     # Two components end at a bound; the third carries the rest with a hundred-thousandth of the first's slope.
     u, slope = np.array([0.2, 0.0, -1000.0]), np.array([[640.0, -11000.0, -0.0855]])
@@ -190,6 +196,15 @@ def test_a_thin_slab_between_parallel_rows():
         answer = project([0.5, 0.9], [[0.6, 0.8], [-0.6, -0.8]], [0.3 + gap, -0.3], -1.0, 1.0)
         assert answer.status == status
         assert [0.6, 0.8] @ answer.control == pytest.approx(0.3, abs=2e-6)
+
+
+def test_rows_that_contradict_each_other_by_less_than_an_answer_may_miss_them():
+    normals, u = np.array([[0.6, 0.8], [-0.6, -0.8]]), np.array([0.9, 0.9])
+    answer = project(u, normals, [-0.3, 0.3 - 1e-9], -1.0, 1.0)
+    assert answer.status == "projected" and 0.0 < answer.violation < 2e-9
+    np.testing.assert_allclose(
+        np.clip(u - answer.multipliers @ normals, -1.0, 1.0), answer.control, atol=1e-6
+    )
 
 
 @settings(max_examples=50, deadline=None)
