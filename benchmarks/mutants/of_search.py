@@ -15,7 +15,7 @@ SEARCH = Target(
         Mutant("_BLENDS = (0.1, 0.25, 0.5, 0.75)", "_BLENDS = (0.1, 0.25, 0.5)"),
         Mutant("for j in range(target.size):", "for j in range(0):"),
         Mutant("            return Decision(backup, Stage.BACKUP)", "            pass"),
-        Mutant("backup is None and self._keeps(target, strict)", "False"),
+        Mutant("backup is not None or self._keeps(target, strict)", "backup is not None"),
         Mutant("self.shorten(proposal, target, strict) if admitted", "target if admitted"),
         Mutant(
             "return True, self.shorten(proposal, control, strict), joined", "return True, control, joined"

@@ -213,7 +213,7 @@ class SafeActionSearch:
             return Decision(more, Stage.OVERSHOOT)
         backup = self.backup(strict)
         target = backup if backup is not None else self._fallback_control(control, last)
-        admitted = backup is None and self._keeps(target, strict)
+        admitted = backup is not None or self._keeps(target, strict)
         nearer = self.shorten(proposal, target, strict) if admitted else target
         blended = nearer if nearer is not target else self.blend(control, target, strict)
         if blended is not None:

@@ -67,8 +67,6 @@ def episode(options, driver, steps, seed):
         [sw.constraints.Discs("hazard_positions", 0.2)], **options
     )
     env = sw.CBFActionFilter(gym.make("SafePointGoal1-v0"), [clearance])
-    low, high = env.action_space.low.astype(float), env.action_space.high.astype(float)
-    env.filter = SafetyFilter(env.plant, [clearance], "brake", "daqp", low, high)  # not rounded
     env.reset(seed=seed)
     act = drivers.DRIVERS[driver](env.unwrapped, np.random.default_rng(seed))
     searched = general_search(env)

@@ -178,7 +178,7 @@ def test_tangents_that_are_no_numbers_end_it():
     tangents = [((np.nan, 0.0), 0.3), ((1.0, 0.0), 0.3)]
     broken = Predicting(lambda u: 0.5 - u[0], tangents=lambda u: tangents, control=(-1.0, 0.5))
     decision = decide((1.0, 0.5), broken)
-    keeps(decision, 0.17, 0.5)  # blended with the backup
+    keeps(decision, 0.475, 0.5)  # towards the backup, by 5 % of the violation beyond the boundary
     assert decision.stage is Stage.BLEND
 
 
