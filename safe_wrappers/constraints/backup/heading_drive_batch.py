@@ -40,6 +40,11 @@ class HeadingDriveBatch(ConstraintBatch):
         self._versions: list[int] = []
         self._counts: list[int] = []
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        for i in range(len(self._bound)):  # a copy reads the data of the copied envs
+            self.restart(i, self.memory(i))
+
     def _pairs(self, controls: Array) -> Array:
         """(Drive, turn) from controls, shape (..., 2); the same swap leads back."""
         return controls[..., ::-1] if self._bound[0].turns_first else controls

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.errors import UnsupportedEnvError
-from safe_wrappers.plants.mujoco.model import control_range
+from safe_wrappers.plants.mujoco.model import Remade, control_range
 
 _JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _AFFINE_GAIN, _AFFINE_BIAS = int(mujoco.mjtGain.mjGAIN_AFFINE), int(mujoco.mjtBias.mjBIAS_AFFINE)
@@ -193,7 +193,7 @@ def _on_joints(
     return length, velocity
 
 
-class AffineActuators:
+class AffineActuators(Remade):
     """Gain, bias and acting control range of every actuator of a model, whose arrays are read at every call.
 
     Attributes:
@@ -258,7 +258,7 @@ def moment_of(data: mujoco.MjData) -> tuple[Array, NDArray[Any], NDArray[Any], N
     return data.actuator_moment.reshape(-1), *places
 
 
-class Response:
+class Response(Remade):
     """How a machine's joints respond to its controls, at what `data` holds.
 
     Args:

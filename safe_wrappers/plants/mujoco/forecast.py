@@ -8,7 +8,7 @@ import numpy as np
 
 from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.compiled import compiled
-from safe_wrappers.plants.mujoco.model import control_range
+from safe_wrappers.plants.mujoco.model import Remade, control_range
 from safe_wrappers.plants.mujoco.native import mj_kinematics, mj_step
 
 _BRAKING = 0.5
@@ -160,7 +160,7 @@ def _machine(model: mujoco.MjModel, data: mujoco.MjData) -> _Machine:
     return _Machine(model._address, data._address, data.ctrl, *motion, *seen)
 
 
-class Recorder:
+class Recorder(Remade):
     """Steps the plant's own model and keeps what a forecast holds; `substeps` are those of a control interval.
 
     Attributes:

@@ -1,6 +1,7 @@
 """What is read from a MuJoCo model: named parts, fixed bodies, control ranges, the joint-space inertia."""
 
 from fnmatch import fnmatchcase
+from typing import Any, Self
 
 import mujoco
 import numpy as np
@@ -10,6 +11,21 @@ from safe_wrappers.checks import Array
 from safe_wrappers.errors import UnknownNameError
 
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
+
+
+class Remade:
+    """Base of what keeps addresses or views of MuJoCo's memory: a copy is made anew, from copies of the arguments."""
+
+    def __new__(cls, *arguments: Any) -> Self:
+        """Remember the arguments."""
+        made = super().__new__(cls)
+        made._arguments = arguments
+        return made
+
+    _arguments: tuple[Any, ...]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), self._arguments
 
 
 def named(model: mujoco.MjModel, kind: str, name: str) -> int:
@@ -28,11 +44,35 @@ def names(model: mujoco.MjModel, kind: str, pattern: str = "*") -> list[str]:
     return [n for n in every if n and fnmatchcase(n, pattern)]
 
 
-def frame(model: mujoco.MjModel, data: mujoco.MjData, kind: str, name: str) -> tuple[int, Array]:
-    """The body that carries a named frame, and the frame's origin, shape (3,), m."""
-    handle = named(model, kind, name)
-    body = handle if kind == "body" else int(getattr(model, f"{kind}_bodyid")[handle])
-    return body, getattr(data, {"body": "xpos", "site": "site_xpos", "geom": "geom_xpos"}[kind])[handle]
+class Frames(Remade):
+    """Named frames of a machine: the body that carries each, and a view of its origin in the data."""
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        self._model, self._data = model, data
+        self._known: dict[tuple[str, str], tuple[int, Array]] = {}
+        self._jacobian: Array = np.zeros((3, model.nv))
+        self._rate: Array = np.zeros((3, model.nv))
+
+    def of(self, kind: str, name: str) -> tuple[int, Array]:
+        """The body that carries a frame, and the frame's origin, shape (3,), m."""
+        if (kind, name) not in self._known:
+            handle = named(self._model, kind, name)
+            body = handle if kind == "body" else int(getattr(self._model, f"{kind}_bodyid")[handle])
+            positions = getattr(self._data, {"body": "xpos", "site": "site_xpos", "geom": "geom_xpos"}[kind])
+            self._known[kind, name] = body, positions[handle]
+        return self._known[kind, name]
+
+    def jacobian(self, kind: str, name: str) -> tuple[Array, Array]:
+        """The origin, and its Jacobian, shape (3, nv)."""
+        body, p = self.of(kind, name)
+        mujoco.mj_jac(self._model, self._data, self._jacobian, None, p, body)
+        return p, self._jacobian
+
+    def jacobian_rate(self, kind: str, name: str) -> Array:
+        """The time derivative of the Jacobian, shape (3, nv)."""
+        body, p = self.of(kind, name)
+        mujoco.mj_jacDot(self._model, self._data, self._rate, None, p, body)
+        return self._rate
 
 
 def fixed_bodies(model: mujoco.MjModel) -> NDArray[np.bool_]:

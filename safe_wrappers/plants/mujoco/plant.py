@@ -71,8 +71,7 @@ class MujocoPlant(Plant):
         self.substeps = physics_steps(raw)
         self.control_dt = env_checks.check_timing(env, control_interval(raw))
         self._nq, self._nv = int(self.model.nq), int(self.model.nv)
-        self._jacobian, self._jacobian_rate = np.zeros((2, 3, self._nv))
-        self._frames: dict[tuple[str, str], tuple[int, Array]] = {}
+        self._frames = of_model.Frames(self.model, self.data)
         self._delay_steps = int(np.ceil(self.delay_s / self.model.opt.timestep - 1e-9))
         self._pending = deque(maxlen=max(1, -(-self._delay_steps // self.substeps)))
         self._snapshot = np.zeros(mujoco.mj_stateSize(self.model, _STATE))
@@ -319,29 +318,24 @@ class MujocoPlant(Plant):
 
     def motion(self, kind: str, name: str) -> tuple[Array, Array]:
         """Position (3,), m, and velocity (3,), m/s, of a named frame's origin; much cheaper than `point`."""
-        m, d = self.model, self.pose()
+        data = self.pose()
         if not self._forwarded:
-            mujoco.mj_comPos(m, d)  # for the Jacobian
-        body, p = self.frame(kind, name)
-        mujoco.mj_jac(m, d, self._jacobian, None, p, body)
-        return p.copy(), self._jacobian @ self.qvel
+            mujoco.mj_comPos(self.model, data)  # for the Jacobian
+        p, jacobian = self._frames.jacobian(kind, name)
+        return p.copy(), jacobian @ self.qvel
 
     def point(self, kind: str, name: str) -> tuple[Array, Array, Array, Array]:
         """Position p, m, and velocity v, m/s, of a named "body", "site" or "geom", and its acceleration, m/s^2.
 
         The last is `a0 + A @ u`: p, v and a0 of shape (3,), A of shape (3, nu).
         """
-        m, d, response = self.model, self.forward(), self.acceleration
-        body, p = self.frame(kind, name)
-        mujoco.mj_jac(m, d, self._jacobian, None, p, body)
-        mujoco.mj_jacDot(m, d, self._jacobian_rate, None, p, body)
-        return p.copy(), *point_motion(self._jacobian, self._jacobian_rate, self.qvel, *response)
+        response = self.acceleration
+        p, jacobian = self._frames.jacobian(kind, name)
+        return p.copy(), *point_motion(jacobian, self._frames.jacobian_rate(kind, name), self.qvel, *response)
 
     def frame(self, kind: str, name: str) -> tuple[int, Array]:
         """The body that carries a named frame, and a view of the frame's origin, shape (3,), m."""
-        if (kind, name) not in self._frames:
-            self._frames[kind, name] = of_model.frame(self.model, self.data, kind, name)
-        return self._frames[kind, name]
+        return self._frames.of(kind, name)
 
     def named(self, kind: str, name: str) -> int:
         """The id of a body, site, geom, joint or actuator; for an unknown name an error that lists all."""

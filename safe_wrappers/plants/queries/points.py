@@ -9,6 +9,7 @@ from safe_wrappers.checks import Array
 from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.actuators import moment_of
+from safe_wrappers.plants.mujoco.model import Remade
 from safe_wrappers.plants.mujoco.native import mj_jac, mj_jacDot, mj_solveM
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
@@ -61,7 +62,7 @@ def _reach(
             found[18 + k] += forces[k, j] * responses[k, j]
 
 
-class Points:
+class Points(Remade):
     """Origins of named bodies, sites and geoms (MujocoPlant), or one point of the state (AnalyticPlant).
 
     `named` has the names by kind; `position` and `velocity` are the indices of the point's coordinates in the state.
