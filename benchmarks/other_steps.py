@@ -130,7 +130,7 @@ def measure(case: Steps, active: bool, steps: int = 1000) -> Figures:
     env = case.protect(case.make())
     act = (case.attack if active else case.calm)(env.unwrapped, np.random.default_rng(0))
     kind: Any = env.action_space.dtype
-    times, over, seed = [], True, 0
+    times, infeasible, corrections, over, seed = [], 0, [], True, 0
     for _ in range(steps):
         if over:
             seed += 1
@@ -145,13 +145,18 @@ def measure(case: Steps, active: bool, steps: int = 1000) -> Figures:
         bare.step(executed)
         end = time.process_time()
         over = terminated or truncated
+        infeasible += info["cbf/infeasible"]
+        if info["cbf/intervened"]:
+            corrections.append(info["cbf/correction"])
         if info["cbf/intervened"] == active and not info["cbf/fallback"]:
             times.append((end - begin_bare, between - begin))
+    correction = float(np.mean(corrections)) if corrections else np.nan
+    shares = len(times) / steps, infeasible / steps
     if not times:
-        return Figures(0.0, np.nan, np.nan, np.nan)
+        return Figures(*shares, correction, np.nan, np.nan, np.nan)
     bare_us, with_us = 1e6 * np.array(times).T
-    share, ratio = len(times) / steps, float(np.median(with_us / bare_us))
-    return Figures(share, float(np.median(bare_us)), float(np.median(with_us)), ratio)
+    ratio = float(np.median(with_us / bare_us))
+    return Figures(*shares, correction, float(np.median(bare_us)), float(np.median(with_us)), ratio)
 
 
 def main() -> None:

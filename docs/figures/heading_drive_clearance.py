@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 import safe_wrappers as sw
 from _style import FORBIDDEN, INK, ON, OTHER, SAFE, bare, panels
-from safe_wrappers.control.backup.heading_drive import stopping_path
-from safe_wrappers.plants.queries.planar_robot import PlanarFrame
+from safe_wrappers.control.backup.heading_drive import Motion, stopping_path
 
 Array = NDArray[np.float64]
 
@@ -32,8 +31,7 @@ def braking(detail: dict[str, Any]) -> tuple[Array, Any]:
     task.set_state(task.data.qpos.copy(), qvel)
     bound: Any = filtered.filter.bound[0]
     filtered.filter.observe()
-    heading = PlanarFrame(filtered.plant, "agent").motion(filtered.plant)
-    area = stopping_path(bound.drive, heading, True)
+    area = stopping_path(bound.drive, Motion(*task.data.qpos[:3], *task.data.qvel[:3]), True)
     where = [task.agent_position]
     for _ in range(150):
         filtered.filter.observe()
