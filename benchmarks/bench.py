@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import safe_wrappers as sw
-from benchmarks import env_step, peers
+from benchmarks import env_step, many_envs, peers
 
 RESULT = Path(__file__).parent / "results" / "bench.json"
 HEAD = """| what | over | inactive (us) | active (us) | inactive | active | infeasible | correction | before |
@@ -41,6 +41,13 @@ def env_row(name: str, steps: int) -> Row:
         "infeasible": pushed.infeasible,
         "correction": pushed.correction,
     }
+
+
+def vector_row() -> Row:
+    """One filter for 64 envs over the bare vector env; active: a driver that has a third of its steps changed."""
+    (quiet, calm, _, _), (pushed, busy, _, share) = (many_envs.measure(64, d) for d in many_envs.DRIVEN)
+    times = {"inactive_us": quiet * calm, "active_us": pushed * busy}
+    return times | {"inactive": calm, "active": busy, "active_share": share}
 
 
 def peer_rows(inactive: peers.Times, active: peers.Times) -> dict[str, Row]:
@@ -65,6 +72,8 @@ def measured(wanted: list[str], steps: int) -> Iterator[tuple[str, str, Row]]:
 
     for name in filter(asked, env_step.ACTIVE):
         yield name, "the env", env_row(name, steps)
+    if asked("SafePointGoal1-v0, 64 envs"):
+        yield "SafePointGoal1-v0, 64 envs", "the vector env", vector_row()
     calls = {f"project, {m} x {k}": (peers.projections, (m, k)) for m, k in peers.SIZES}
     calls |= {f"project_batch, {m} x {k}": (peers.batches, (m, k)) for m, k in peers.SIZES}
     calls["double integrator"] = (peers.filter_calls, ())  # type: ignore[assignment]

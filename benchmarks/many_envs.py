@@ -22,6 +22,7 @@ from benchmarks.drivers import DRIVERS
 from benchmarks.env_step import gentle
 
 ENV = "SafePointGoal1-v0"
+DRIVEN = ("gentle", "hazard-seeking")
 NUMBERS = (1, 4, 16, 64, 256, 1024)
 
 
@@ -68,7 +69,7 @@ def main(numbers: Sequence[int] = NUMBERS) -> None:
     )
     print("|---|---|---|---|---|---|---|")
     for n in numbers:
-        for driver in ("gentle", "hazard-seeking"):
+        for driver in DRIVEN:
             bare, together, each, changed = measure(n, driver)
             memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
             print(

@@ -53,7 +53,7 @@ def test_every_timed_env_is_a_case():
 
 
 def test_many_envs_are_timed_alike_and_the_attacking_driver_is_changed():
-    quiet, attacked = (many_envs.measure(2, driver, steps=300) for driver in ("gentle", "hazard-seeking"))
+    quiet, attacked = (many_envs.measure(2, driver, steps=300) for driver in many_envs.DRIVEN)
     assert quiet[3] == 0.0 < attacked[3]
     assert min(quiet) >= 0.0 < min(attacked)
 
@@ -80,7 +80,14 @@ def test_a_row_of_the_table_compares_with_the_version_before():
 
 def test_rows_are_chosen_by_words(monkeypatch):
     monkeypatch.setattr(bench, "env_row", lambda name, steps: {"name": name})
-    assert [row for row, _, _ in bench.measured(["Goal1"], 1)] == ["SafePointGoal1-v0", "SafeCarGoal1-v0"]
+    monkeypatch.setattr(bench.many_envs, "measure", lambda n, driver: (50.0, 1.5, 2.0, 0.25))
+    (_, _, row), *_ = bench.measured(["64 envs"], 1)
+    assert row["inactive_us"] == 75.0 and row["active"] == 1.5 and row["active_share"] == 0.25
+    assert [row for row, _, _ in bench.measured(["Goal1-v0"], 1)] == [
+        "SafePointGoal1-v0",
+        "SafeCarGoal1-v0",
+        "SafePointGoal1-v0, 64 envs",
+    ]
 
 
 @pytest.mark.parametrize("name", ["discs", "look-ahead"])
