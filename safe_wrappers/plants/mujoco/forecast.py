@@ -171,9 +171,7 @@ class Recorder(Remade):
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, substeps: int) -> None:
         self._model, self._data, self.substeps, self.nq = model, data, substeps, int(model.nq)
         self.is_runge_kutta = int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
-        self.held = deque[tuple[bytes | None, mujoco.MjData]](
-            (None, mujoco.MjData(model)) for _ in range(_HELD)
-        )
+        self.held = deque[tuple[bytes | None, mujoco.MjData]]()
         self._still = mujoco.MjData(model)
         self._moving, self._posed = _machine(model, data), _machine(model, self._still)
         # A unit force accelerates its joints by acc0 (in the reference pose), a transmission by gear times that.
@@ -204,7 +202,8 @@ class Recorder(Remade):
         if first is None or held is None:
             self._begin(control)
             whole = self.simulate(0, 1, path, published)
-            _, oldest = self.held.popleft()
+            # Data are large: only plants that forecast have these.
+            oldest = self.held.popleft()[1] if len(self.held) == _HELD else mujoco.MjData(m)
             mujoco.mj_copyData(oldest, m, data)
             self.held.append((control.tobytes(), oldest))
         else:
