@@ -83,6 +83,12 @@ def fixed_bodies(model: mujoco.MjModel) -> NDArray[np.bool_]:
     return np.asarray(model.body_dofnum[model.body_weldid] == 0)
 
 
+def weight_n(model: mujoco.MjModel) -> float:
+    """Weight of everything that moves, N; without gravity its mass in kg."""
+    gravity = float(np.linalg.norm(model.opt.gravity))
+    return float(model.body_mass[~fixed_bodies(model)].sum()) * (gravity or 1.0)
+
+
 def control_range(model: mujoco.MjModel) -> tuple[Array, Array]:
     """Smallest and largest control, shapes (nu,): ctrlrange, or -inf and inf."""
     limited = model.actuator_ctrllimited.astype(bool)

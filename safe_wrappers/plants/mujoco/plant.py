@@ -24,20 +24,17 @@ _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 class MujocoPlant(Plant):
     """`x = (qpos, qvel)`, `x' = f + g u`, through the actuators and the active constraints.
 
-    f and g hold for the present set of active contacts and limits; a contact that opens or closes within the control
-    interval changes them. They are exact for pyramidal friction cones. The env's own model and data are only read.
+    f and g hold for the present set of active contacts and limits, and are exact for pyramidal friction cones. The
+    env's own model and data are only read.
 
     Args:
         model: The filter's model; None copies the env's. Pass another (other masses) to test mismatch.
-        delay_s: Evidence age plus detection plus actuation delay in s; the state is predicted over it, on this
-            plant's model, with the commands in flight.
-        share_step: Let the rollout of the executed control be the env's step, which saves simulating it twice. None:
-            with envs where that was measured equal bit for bit (Gymnasium's MuJoCo envs, and ours on velocity);
-            True: with any env that does not override `MujocoEnv`'s simulation step and leaves its model alone.
+        delay_s: Evidence age plus detection plus actuation delay in s, over which this plant's model predicts.
+        share_step: Let the rollout of the executed control be the env's step. None: with envs where that was measured
+            equal bit for bit; True: with any that keeps `MujocoEnv`'s simulation step and leaves its model alone.
 
     Raises:
-        UnsupportedEnvError: No MuJoCo model, an actuator that is not affine, or an action space that is not the
-            model's control range.
+        UnsupportedEnvError: No MuJoCo model, an actuator that is not affine, or actions that are not controls.
     """
 
     bounds_are_action_space: ClassVar[bool] = True
@@ -71,7 +68,7 @@ class MujocoPlant(Plant):
         self.substeps = physics_steps(raw)
         self.control_dt = env_checks.check_timing(env, control_interval(raw))
         self._nq, self._nv = int(self.model.nq), int(self.model.nv)
-        self._frames = of_model.Frames(self.model, self.data)
+        self.frames = of_model.Frames(self.model, self.data)
         self._delay_steps = int(np.ceil(self.delay_s / self.model.opt.timestep - 1e-9))
         self._pending = deque(maxlen=max(1, -(-self._delay_steps // self.substeps)))
         self._snapshot = np.zeros(mujoco.mj_stateSize(self.model, _STATE))
@@ -286,8 +283,7 @@ class MujocoPlant(Plant):
     @property
     def weight_n(self) -> float:
         """Weight of everything that moves, N; without gravity its mass in kg."""
-        gravity = float(np.linalg.norm(self.model.opt.gravity))
-        return float(self.model.body_mass[~of_model.fixed_bodies(self.model)].sum()) * (gravity or 1.0)
+        return of_model.weight_n(self.model)
 
     def braking(self) -> Array:
         """The control by which a forecast brakes, at the present state, shape (nu,)."""
@@ -321,7 +317,7 @@ class MujocoPlant(Plant):
         data = self.pose()
         if not self._forwarded:
             mujoco.mj_comPos(self.model, data)  # for the Jacobian
-        p, jacobian = self._frames.jacobian(kind, name)
+        p, jacobian = self.frames.jacobian(kind, name)
         return p.copy(), jacobian @ self.qvel
 
     def point(self, kind: str, name: str) -> tuple[Array, Array, Array, Array]:
@@ -330,12 +326,8 @@ class MujocoPlant(Plant):
         The last is `a0 + A @ u`: p, v and a0 of shape (3,), A of shape (3, nu).
         """
         response = self.acceleration
-        p, jacobian = self._frames.jacobian(kind, name)
-        return p.copy(), *point_motion(jacobian, self._frames.jacobian_rate(kind, name), self.qvel, *response)
-
-    def frame(self, kind: str, name: str) -> tuple[int, Array]:
-        """The body that carries a named frame, and a view of the frame's origin, shape (3,), m."""
-        return self._frames.of(kind, name)
+        p, jacobian = self.frames.jacobian(kind, name)
+        return p.copy(), *point_motion(jacobian, self.frames.jacobian_rate(kind, name), self.qvel, *response)
 
     def named(self, kind: str, name: str) -> int:
         """The id of a body, site, geom, joint or actuator; for an unknown name an error that lists all."""

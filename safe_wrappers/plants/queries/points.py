@@ -127,7 +127,7 @@ class Points(Remade):
         data = plant.forward()
         for kind, name in self._named:
             numbers = np.empty(18 + plant.lower.size)
-            frame = plant.frame(kind, name)
+            frame = plant.frames.of(kind, name)
             _reach(plant.model._address, data._address, *frame, *self._state, *self._motors, numbers)
             found.append(numbers)
         return found
