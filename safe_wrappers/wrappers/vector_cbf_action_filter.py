@@ -66,7 +66,7 @@ class VectorCBFActionFilter(VectorWrapper[Any, Any, Any, Any, Any]):
         constraints: Sequence[Constraint | dict[str, Any]],
         plant: Plant | None = None,
         fallback: str | FallbackFunction = "brake",
-        solver: str = "daqp",
+        solver: str = "active-set",
         margin: float = 0.0,
     ) -> None:
         super().__init__(env)

@@ -1,5 +1,7 @@
 """GymnasiumVecEnv gives an SB3 learner what a DummyVecEnv of filtered envs gives."""
 
+import csv
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ import safe_wrappers as sw
 
 pytest.importorskip("stable_baselines3")
 from stable_baselines3 import PPO
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from safe_wrappers.sb3 import GymnasiumVecEnv, InterventionCallback
@@ -80,14 +83,16 @@ def test_options_reach_the_envs_and_are_the_same_for_all():
         vec_env.reset()
 
 
-def test_a_learner_trains_on_it_and_its_log_has_the_interventions():
+def test_a_learner_trains_on_it_and_its_log_has_the_interventions(tmp_path):
     envs = SyncVectorEnv([point_goal] * 4, autoreset_mode=AutoresetMode.SAME_STEP)
-    callback = InterventionCallback()
-    learner = PPO(
-        "MlpPolicy", VecMonitor(GymnasiumVecEnv(sw.protect(envs))), n_steps=32, batch_size=64, seed=0
-    )
-    learner.learn(256, callback=callback)
+    vec_env = VecMonitor(GymnasiumVecEnv(sw.protect(envs)))
+    learner = PPO("MlpPolicy", vec_env, n_steps=32, batch_size=64, seed=0)
+    learner.set_logger(configure(str(tmp_path), ["csv"]))
+    learner.learn(256, callback=InterventionCallback())
     assert len(learner.ep_info_buffer) == 4 * (64 // HORIZON)
+    with (tmp_path / "progress.csv").open() as file:
+        rates = [row["interventions/step_rate"] for row in csv.DictReader(file)]
+    assert len(rates) == 2 and all(0.0 <= float(rate) <= 1.0 for rate in rates) and float(rates[0]) > 0.0
 
 
 def test_another_autoreset_mode_is_refused_with_the_way_out():

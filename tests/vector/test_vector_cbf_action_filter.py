@@ -6,6 +6,7 @@ The oracle is Gymnasium's own vector env around `CBFActionFilter`s.
 import copy
 import dataclasses
 import functools
+import inspect
 import warnings
 
 import gymnasium as gym
@@ -246,6 +247,13 @@ def test_a_state_that_is_not_a_number_runs_the_fallback_and_a_start_outside_is_w
         infos = [envs.step(np.ones((3, 2), np.float32))[4] for envs in (alike, together)]
     assert infos[1]["cbf/fallback"][0] and infos[1]["cbf/unsafe"][:2].all()
     assert_same(*infos)
+
+
+def test_its_arguments_and_defaults_are_those_of_the_single_filter():
+    one, many = (inspect.signature(kind.__init__) for kind in (sw.CBFActionFilter, sw.VectorCBFActionFilter))
+    assert [(p.name, p.default) for p in one.parameters.values()] == [
+        (p.name, p.default) for p in many.parameters.values()
+    ]
 
 
 def test_actions_of_another_shape_and_other_vector_envs_are_refused():
