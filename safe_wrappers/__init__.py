@@ -20,12 +20,14 @@ from safe_wrappers.filter.projection import project
 from safe_wrappers.plants import AnalyticPlant, MujocoPlant, Plant
 from safe_wrappers.protect import protect
 from safe_wrappers.wrappers import faults, occlusion, teleop
+from safe_wrappers.wrappers.action_repeat import ActionRepeat
 from safe_wrappers.wrappers.adaption_penalty import AdaptionPenalty
 from safe_wrappers.wrappers.balance_monitor import BalanceMonitor
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.chunk_handover import ChunkHandover
 from safe_wrappers.wrappers.contact_monitor import ContactMonitor
 from safe_wrappers.wrappers.cost_function import CostFunction
+from safe_wrappers.wrappers.filter_observation import FilterObservation
 from safe_wrappers.wrappers.lease.stopping_budget import StoppingBudget
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
@@ -36,6 +38,7 @@ from safe_wrappers.wrappers.vector_cbf_action_filter import VectorCBFActionFilte
 from safe_wrappers.wrappers.whole_body_filter import WholeBodyFilter
 
 __all__ = [
+    "ActionRepeat",
     "AdaptionPenalty",
     "AnalyticPlant",
     "BalanceMonitor",
@@ -45,6 +48,7 @@ __all__ = [
     "Constraint",
     "ContactMonitor",
     "CostFunction",
+    "FilterObservation",
     "HalfSpaces",
     "LeaseExpiry",
     "MujocoPlant",

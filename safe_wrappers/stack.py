@@ -17,6 +17,7 @@ class Layer(Enum):
     FILTER = auto()
     LEASE = auto()
     CHANNEL = auto()
+    OBSERVATION = auto()
     MONITOR = auto()
     ADAPTION = auto()
     RECORDER = auto()
@@ -39,6 +40,7 @@ _WRONG_WAY_ROUND: Final = {
     },
     Layer.FILTER: {
         Layer.RECORDER: "it would see no report of the filter, and count no intervention",
+        Layer.OBSERVATION: "it shows what the filter inside of it decides by",
         **dict.fromkeys((Layer.LEASE, Layer.CHANNEL, Layer.HANDOVER, Layer.FAULT), _LAST_WORD),
     },
     Layer.LEASE: {
@@ -48,6 +50,10 @@ _WRONG_WAY_ROUND: Final = {
     Layer.CHANNEL: {
         Layer.RECORDER: "it would see no revoked authority",
         **dict.fromkeys((Layer.HANDOVER, Layer.FAULT), _NETWORK),
+    },
+    Layer.OBSERVATION: {
+        Layer.CHANNEL: "what the filter sees now would stand beside an image that is delayed",
+        **_PER_CHUNK,
     },
     **dict.fromkeys((Layer.MONITOR, Layer.ADAPTION, Layer.RECORDER), _PER_CHUNK),
 }
@@ -69,6 +75,7 @@ _NOT_TOGETHER: Final = {
     Layer.ADAPTION: {
         Layer.ADAPTION: "the env has an AdaptionPenalty already, whose penalty would be taken twice"
     },
+    Layer.OBSERVATION: {Layer.OBSERVATION: "the observation shows what the filter decides by already"},
     Layer.HANDOVER: {Layer.HANDOVER: "this env takes chunks already, and a chunk of chunks has no meaning"},
 }
 """By the outer layer, then the inner one: why not both."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.control.numerics.nearest_discs import squashed
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.plant import Plant
 
@@ -131,6 +132,19 @@ class BoundConstraint:
     def value(self) -> Array:
         """The barriers h, shape (k,), positive inside; the margin is not taken off. k may be 0: nothing is near."""
         return np.zeros(0)
+
+    def feature_count(self, neighbours: int) -> int:
+        """How many `features` there are, at every state."""
+        return 1
+
+    def features(self, neighbours: int) -> Array:
+        """What a learner may be shown of the observed state, in [-1, 1], shape (feature_count,).
+
+        The first is the smallest h, squashed: `scale` is 0.5, and 1 is none at all. A constraint with obstacles adds
+        the `neighbours` nearest.
+        """
+        lowest = float(self.value().min(initial=np.inf))
+        return np.array([squashed(lowest, self.scale)])
 
     def approach(self) -> tuple[Array, Array] | None:
         """Clearances in m and approach speeds in m/s, shapes (k,), or None: they are not measured."""

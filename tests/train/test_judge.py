@@ -186,7 +186,7 @@ def test_wrong_judges_are_refused(env, message):
 def test_limits_cannot_judge_where_there_is_no_filter():
     settings = SETTINGS | {"env": {"id": "Reacher-v5", "judge": "constraints"}, "arms": {"bare": {}}}
     with pytest.raises(
-        sw.SafeWrappersError, match=r"env\.judge: there is no filter whose constraints could judge"
+        sw.SafeWrappersError, match=r"env\.judge: there is no filter whose constraints could be used"
     ):
         parse_experiment(settings)
     given = parse_experiment(settings | {"evaluation": {"filter": "protect"}})

@@ -53,7 +53,7 @@ def parse_experiment(settings: Mapping[str, Any]) -> ExperimentConfig:
                 " but evaluation would put a filter on (evaluation.filter, or that of another arm). Give the arm an"
                 " experiment of its own, or set evaluation.filter to none."
             )
-    return replace(experiment, arms=tuple(_judged(arm, experiment) for arm in experiment.arms))
+    return replace(experiment, arms=tuple(_with_constraints(arm, experiment) for arm in experiment.arms))
 
 
 def _mapping(value: Any, where: str) -> dict[str, Any]:
@@ -61,17 +61,19 @@ def _mapping(value: Any, where: str) -> dict[str, Any]:
     return checked
 
 
-def _judged(arm: ArmConfig, experiment: ExperimentConfig) -> ArmConfig:
-    """With the filter whose constraints judge: the same one for all arms, so that they can be compared."""
-    if arm.env.judge is None:
+def _with_constraints(arm: ArmConfig, experiment: ExperimentConfig) -> ArmConfig:
+    """With the filter whose constraints judge or are observed: the same one for all arms, to compare them."""
+    wanted = [key for key in ("judge", "observation") if getattr(arm.env, key) is not None]
+    if not wanted:
         return arm
-    judge = experiment.evaluation_filter
-    if judge.kind == "none":
+    chosen = experiment.evaluation_filter
+    if chosen.kind == "none":
+        instead = ", or use env.cost: module:function" if "judge" in wanted else ""
         raise ConfigurationError(
-            "env.judge: there is no filter whose constraints could judge; give an arm or the evaluation one "
-            "(evaluation: {filter: protect}), or use env.cost: module:function."
+            f"env.{wanted[0]}: there is no filter whose constraints could be used; give an arm or the evaluation one "
+            f"(evaluation: {{filter: protect}}){instead}."
         )
-    return replace(arm, env=replace(arm.env, judge=replace(judge, lease=None)))
+    return replace(arm, env=replace(arm.env, **dict.fromkeys(wanted, replace(chosen, lease=None))))
 
 
 def _arm(name: str, own: Mapping[str, Any], common: Mapping[str, Any]) -> ArmConfig:

@@ -138,7 +138,8 @@ class FilterConfig(Section):
         return {"kind": self.kind, "kwargs": arguments, "factory": self.factory or "", "lease": self.lease}
 
 
-def _judge(given: Any) -> Any:
+def _of_all_arms(given: Any) -> Any:
+    """`constraints`, those of the evaluation's filter, the same for all arms."""
     if isinstance(given, FilterConfig | None):
         return given
     check_name(given, ("constraints",))
@@ -164,8 +165,11 @@ class EnvConfig(Section):
     cost: FunctionName | None = None
     """`module:function` that judges a task without a cost of its own: [CostFunction](wrappers/cost-function.md), in
     all arms, in training and evaluation."""
-    judge: Annotated[FilterConfig | None, BeforeValidator(_judge)] = None
+    judge: Annotated[FilterConfig | None, BeforeValidator(_of_all_arms)] = None
     """`constraints`: the evaluation filter's own limits judge such a task, read from its true state, in all arms."""
+    observation: Annotated[FilterConfig | None, BeforeValidator(_of_all_arms)] = None
+    """`constraints`: policies observe what the filter decides by, in training and evaluation
+    ([FilterObservation](wrappers/filter-observation.md)); without a filter, what the evaluation's filter would."""
 
     @model_validator(mode="after")
     def _has_one_judge(self) -> EnvConfig:
@@ -260,6 +264,10 @@ class ArmConfig(Section):
     learner: LearnerConfig = NAIVE
     """What the learner sees where the filter changed an action: see [`learner`](#learner)."""
     normalize: NormalizeConfig = NormalizeConfig()
+    action_repeat: Count = 1
+    """Control steps for which an action of the policy is held, in training and evaluation
+    ([ActionRepeat](wrappers/action-repeat.md)). The filter checks each, and `total_steps` counts the policy's
+    actions."""
     n_envs: Count = 1
     """Envs of a run."""
     vec_env: Literal["dummy", "subproc"] = "dummy"
@@ -286,6 +294,8 @@ class ArmConfig(Section):
             del values["learner"]
         if self.filter.lease is None:
             del values["filter"]["lease"]
+        if self.action_repeat == 1:
+            del values["action_repeat"]
         if self.env.judge is not None:
             values["env"]["judge"] = self.env.judge.plain()
         values["env"] = {

@@ -13,7 +13,7 @@ from .stack import make_stack
 
 
 class TrainedPolicy:
-    """The policy of a checkpoint with the observation scaling that it was trained with.
+    """The policy of a checkpoint, with the observation scaling and the action repeat that it was trained with.
 
     Args:
         arm: The arm that was trained.
@@ -25,9 +25,21 @@ class TrainedPolicy:
         scaled = checkpoint.load_normalize(DummyVecEnv([lambda: make_stack(arm.env, FilterConfig())]))
         self._normalize = scaled if isinstance(scaled, VecNormalize) else None
         scaled.close()
+        self._repeat = arm.action_repeat
+        self.begin()
+
+    def begin(self) -> None:
+        """Start an episode: its first action is the policy's."""
+        self._held, self._left = None, 0
 
     def __call__(self, observation: Any) -> Any:
-        """The action for an observation as the env gives it."""
+        """The action of a control step, for an observation as the env gives it."""
+        if self._left == 0:
+            self._held, self._left = self._decide(observation), self._repeat
+        self._left -= 1
+        return self._held
+
+    def _decide(self, observation: Any) -> Any:
         if self._normalize is not None:
             observation = self._normalize.normalize_obs(observation)
         return self._model.predict(observation, deterministic=True)[0]

@@ -12,9 +12,12 @@ from stable_baselines3.common.monitor import Monitor
 import safe_wrappers
 from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants import MujocoPlant
 from safe_wrappers.wrappers.adaption_penalty import AdaptionPenalty
+from safe_wrappers.wrappers.cbf_action_filter import is_filtered
 from safe_wrappers.wrappers.cost_function import CostFunction
 from safe_wrappers.wrappers.faults import FAULTS
+from safe_wrappers.wrappers.filter_observation import FilterObservation
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
@@ -29,7 +32,7 @@ from .judge import ConstraintJudge
 def make_stack(
     env: EnvConfig, action_filter: FilterConfig, learner: LearnerConfig = NAIVE
 ) -> gym.Env[Any, Any]:
-    """Makes the task; judge, OcclusionPenalty, filter, lease if any; recorder, faults, Monitor, AdaptionPenalty.
+    """Makes the task; judge, OcclusionPenalty, filter, lease, FilterObservation if any; recorder, faults, Monitor.
 
     The recorder counts the task's own reward, whatever the learner sees. Monitor does too, but for OcclusionPenalty,
     which is inside of it.
@@ -56,9 +59,12 @@ def make_stack(
             task = OcclusionPenalty(task, **env.occlusion)
         except TypeError as error:
             raise ConfigurationError(f"env.occlusion: {error}") from None
+    observed = None if env.observation is None else _filtered(task, env.observation)
     task = _filtered(task, action_filter)
     if action_filter.lease is not None:
         task = _leased(task, action_filter.lease)
+    if observed is not None:
+        task = _with_features(task, observed)
     recorded: gym.Env[Any, Any] = RecordInterventions(task)
     for name, arguments in env.faults.items():
         try:
@@ -85,6 +91,19 @@ def _filtered(task: gym.Env[Any, Any], action_filter: FilterConfig) -> gym.Env[A
             ) from error
         return filtered
     return task
+
+
+def _with_features(task: gym.Env[Any, Any], observed: gym.Env[Any, Any]) -> FilterObservation:
+    """The task with what its filter decides by; without one, what a filter around it, which is not stepped, would."""
+    if is_filtered(task):
+        return FilterObservation(task)
+    if not is_filtered(observed):
+        raise ConfigurationError(
+            "env.observation: the filter has no constraints to observe (a CBFActionFilter has)"
+        )
+    plant = observed.get_wrapper_attr("plant")
+    plant = None if isinstance(plant, MujocoPlant) else plant
+    return FilterObservation(task, observed.get_wrapper_attr("constraints"), plant)
 
 
 def _leased(task: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> LeaseExpiry:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from safe_wrappers.errors import RunStateError
+from safe_wrappers.wrappers.action_repeat import ActionRepeat
 
 from ..config import ArmConfig
 from ..processes.parent import end_with_parent
@@ -28,9 +29,13 @@ _ENDED: Final = (
 
 def make_vec_env(arm: ArmConfig) -> VecEnv:
     """Makes `arm.n_envs` envs, as `arm.vec_env` says."""
-    make: Callable[[], gym.Env[Any, Any]] = functools.partial(make_stack, arm.env, arm.filter, arm.learner)
-    makes = [make] * arm.n_envs
+    makes = [functools.partial(_training_env, arm)] * arm.n_envs
     return DummyVecEnv(makes) if arm.vec_env == "dummy" else ProcessVecEnv(makes)
+
+
+def _training_env(arm: ArmConfig) -> gym.Env[Any, Any]:
+    env = make_stack(arm.env, arm.filter, arm.learner)
+    return env if arm.action_repeat == 1 else ActionRepeat(env, arm.action_repeat)
 
 
 class ProcessVecEnv(SubprocVecEnv):

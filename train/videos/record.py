@@ -154,6 +154,7 @@ def record_video(
     film = Film(stride=stride_of(longest or 1))
     try:
         observation, _ = env.reset(seed=shown.episode_seed)
+        policy.begin()
         done = False
         while not done:
             if film.wants_frame:

@@ -4,6 +4,9 @@ import math
 from abc import abstractmethod
 from typing import Any, ClassVar, NamedTuple
 
+import numpy as np
+
+from safe_wrappers.control.numerics.nearest_discs import NUMBERS
 from safe_wrappers.filter.constraint import Array, BoundConstraint, Memory
 from safe_wrappers.plants.plant import Plant
 
@@ -84,6 +87,18 @@ class BoundDetourClearance(BoundBackupClearance):
     detour_steps: ClassVar[int]
     """Control steps for which a side is kept after it was last needed, so that candidates do not alternate."""
     _memory: Detour
+
+    @abstractmethod
+    def nearest(self, neighbours: int) -> Array:
+        """The nearest discs in the machine's frame: see `control/numerics/nearest_discs.py`."""
+
+    def feature_count(self, neighbours: int) -> int:
+        return 2 + NUMBERS * neighbours
+
+    def features(self, neighbours: int) -> Array:
+        """The clearance, the side of the present detour by the share of its time that is left, the nearest discs."""
+        left = self._kept_side() * self._memory.steps / self.detour_steps
+        return np.concatenate([super().features(neighbours), [left], self.nearest(neighbours)])
 
     def start(self) -> Memory:
         return Detour()

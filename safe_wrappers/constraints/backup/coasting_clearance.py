@@ -13,6 +13,7 @@ from safe_wrappers.checks import check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundDetourClearance, Detour
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.constraints.rollout import RENAMED
+from safe_wrappers.control.numerics.nearest_discs import nearest_discs
 from safe_wrappers.control.numerics.outlines import clearances_on_a_course, convex_outline
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
@@ -128,7 +129,7 @@ class BoundCoastingClearance(BoundDetourClearance):
     def clearance(self) -> Array:
         """Of the present place from the nearest disc, margin not taken off, m, shape (1,): not along the way."""
         here = self.coasting.start()
-        self._here = here.places[0]
+        self._here, self._ahead = here.places[0], here.ahead[0]
         way = math.inf
         if self.max_decrease is not None:
             way = self.max_decrease + self.spec.max_decrease_per_speed * self.coasting.speed(self._radius)
@@ -144,6 +145,12 @@ class BoundCoastingClearance(BoundDetourClearance):
         if not still:
             self._seen, self._known = seen, {}
         return np.array([self._least])
+
+    def nearest(self, neighbours: int) -> Array:
+        discs = np.concatenate([self._origin.discs, self._body.discs])
+        (x, y), (ahead_x, ahead_y) = self._here, self._ahead
+        vx, vy = self.coasting.velocity()
+        return nearest_discs(discs, x, y, math.atan2(ahead_y, ahead_x), vx, vy, neighbours)
 
     def _after(self, control: Array) -> "_Outcome":
         """The outcome of a control, forecast once per observation."""

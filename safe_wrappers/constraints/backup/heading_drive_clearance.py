@@ -11,6 +11,7 @@ from safe_wrappers.constraints.backup.base import BoundDetourClearance
 from safe_wrappers.constraints.backup.heading_drive_batch import HeadingDriveBatch
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.backup import drive_decision as among
+from safe_wrappers.control.numerics.nearest_discs import nearest_discs
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, Constraint, HalfSpaces
 from safe_wrappers.filter.constraint_batch import ConstraintBatch
@@ -107,6 +108,10 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
             self._discs[:, 2] = np.repeat([o.radius + self.reserve for o in self.spec.obstacles], counts)
         np.concatenate(centers, out=self._discs[:, :2])
         return self._discs
+
+    def nearest(self, neighbours: int) -> Array:
+        _, (x, y, heading, vx, vy, _), discs, _ = self._scene
+        return nearest_discs(discs, x, y, heading, vx, vy, neighbours)
 
     def _pair(self, control: Array) -> Array:
         """Drive and turn, shape (2,); the same swap leads back."""

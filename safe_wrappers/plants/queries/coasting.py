@@ -90,6 +90,10 @@ class Coasting:
         """The machine's present positions and velocities: m, rad, quaternions, m/s, rad/s."""
         return np.concatenate([self._plant.qpos[self._qpos], self._plant.qvel[self._qvel]])
 
+    def velocity(self) -> Array:
+        """Of the body's origin along world x and y, m/s, shape (2,)."""
+        return self._plant.qvel[self._motion[:2]]
+
     def speed(self, turning_radius: float) -> float:
         """Present speed of its origin, plus that of a point at this distance as it turns, m/s."""
         vx, vy, _, wx, wy, wz = self._plant.qvel[self._motion].tolist()
