@@ -193,7 +193,7 @@ def scene(env: sw.CBFActionFilter) -> Scene:
     low, high = bound.plant.lower, bound.plant.upper
     bounds = np.array([low, high, np.clip(least, low, high), np.clip(most, low, high)])
     room = group.radius + bound.spec.margin + bound.spec.state_error
-    return Scene(bound._models, bounds, room, bound.spec.brake, bound.spec.detour)
+    return Scene(bound.models, bounds, room, bound.spec.brake, bound.spec.detour)
 
 
 class WorldFilter:
