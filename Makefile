@@ -16,8 +16,10 @@ test test-library test-slow fuzz: export MUJOCO_GL ?= disabled
 demo: .venv/installed
 	$(BIN)/safe-wrappers compare configs/demo.yaml --report
 
+# The order of files is that of tests/conftest.py.
+PARALLEL = -n 2 --dist loadfile --no-loadscope-reorder
 test: .venv/installed
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest $(PARALLEL)
 
 # The library alone, without torch and gymnasium-robotics: make test-library PYTHON=python3.13 MUJOCO=4.0.0
 MUJOCO = $(shell sed -n 's/^mujoco==//p' constraints.txt)
@@ -26,7 +28,7 @@ test-library:
 	$(PYTHON) -m venv --clear $(LIBRARY_VENV)
 	sed 's/^mujoco==.*/mujoco==$(MUJOCO)/' constraints.txt > $(LIBRARY_VENV)/constraints.txt
 	$(LIBRARY_VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c $(LIBRARY_VENV)/constraints.txt -e '.[test]'
-	$(LIBRARY_VENV)/bin/python -m pytest -n 2 --dist loadfile --ignore tests/train --ignore tests/sb3
+	$(LIBRARY_VENV)/bin/python -m pytest $(PARALLEL) --ignore tests/train --ignore tests/sb3
 
 test-slow: .venv/installed
 	$(BIN)/python -m pytest -n 2 -m slow

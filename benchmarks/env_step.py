@@ -79,17 +79,33 @@ ACTIVE: dict[str, tuple[Maker, Filter]] = {
 
 
 def measure(name: str, driver: Maker, protect: Filter, active: bool, steps: int = 1500) -> Figures:
-    """Step both envs alike and time them.
+    """`compare` on a case of the protected envs."""
+    case = PROTECTED[name]
+    return compare(case.make, protect, driver, active, steps, time.perf_counter, case.past_termination)
+
+
+def compare(
+    make: Callable[[], gym.Env[Any, Any]],
+    protect: Filter,
+    driver: Maker,
+    active: bool,
+    steps: int,
+    clock: Callable[[], float],
+    past_termination: bool = False,
+) -> Figures:
+    """Step a filtered env and a bare one alike and time them.
 
     Args:
-        name: Of a case.
-        driver: Of the filtered env; the other one is given what was executed.
+        make: Makes either env, without the filter.
         protect: Puts the filter on.
+        driver: Of the filtered env; the other one is given what was executed.
         active: Look for steps that were projected, or for steps that were not changed.
         steps: In all.
+        clock: What time is taken of, s.
+        past_termination: Step on where the env ends.
     """
-    case = PROTECTED[name]
-    env, bare = protect(case.make()), case.make()
+    bare = make()
+    env = protect(make())
     act = driver(env.unwrapped, np.random.default_rng(0))
     kind: Any = env.action_space.dtype
     times, corrections, infeasible, over, seed = [], [], 0, True, 0
@@ -99,24 +115,23 @@ def measure(name: str, driver: Maker, protect: Filter, active: bool, steps: int 
             env.reset(seed=seed)
             bare.reset(seed=seed)
         action = np.asarray(act(), dtype=kind)
-        begin = time.perf_counter()
+        begin = clock()
         _, _, terminated, truncated, info = env.step(action)
-        between = time.perf_counter()
+        between = clock()
         executed = info["executed_action"].astype(kind)
-        begin_bare = time.perf_counter()
+        begin_bare = clock()
         bare.step(executed)
-        end = time.perf_counter()
-        over = truncated or (terminated and not case.past_termination)
+        end = clock()
+        over = truncated or (terminated and not past_termination)
         infeasible += info["cbf/infeasible"]
         if info["cbf/intervened"]:
             corrections.append(info["cbf/correction"])
         if info["cbf/intervened"] == active and not info["cbf/fallback"]:
             times.append((end - begin_bare, between - begin))
-    if not times:
-        return Figures(0.0, infeasible / steps, math.nan, math.nan, math.nan, math.nan)
-    bare_us, with_us = 1e6 * np.array(times).T
-    share, ratio = len(times) / steps, float(np.median(with_us / bare_us))
     correction = float(np.mean(corrections)) if corrections else math.nan
-    return Figures(
-        share, infeasible / steps, correction, float(np.median(bare_us)), float(np.median(with_us)), ratio
-    )
+    shares = len(times) / steps, infeasible / steps
+    if not times:
+        return Figures(*shares, correction, math.nan, math.nan, math.nan)
+    bare_us, with_us = 1e6 * np.array(times).T
+    ratio = float(np.median(with_us / bare_us))
+    return Figures(*shares, correction, float(np.median(bare_us)), float(np.median(with_us)), ratio)

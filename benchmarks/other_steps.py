@@ -23,7 +23,7 @@ from benchmarks.arms import ARMS
 from benchmarks.cases import PROTECTED
 from benchmarks.crossing_drivers import DRIVERS as CROSSING
 from benchmarks.drivers import Driver
-from benchmarks.env_step import Figures, Filter, gentle
+from benchmarks.env_step import Figures, Filter, compare, gentle
 from benchmarks.mujoco_drivers import Maker
 
 
@@ -125,38 +125,9 @@ CASES: dict[str, Steps] = {
 
 
 def measure(case: Steps, active: bool, steps: int = 1000) -> Figures:
-    """Step both envs alike and time the steps that the filter changed without its fallback, or left alone."""
-    bare = case.make()
-    env = case.protect(case.make())
-    act = (case.attack if active else case.calm)(env.unwrapped, np.random.default_rng(0))
-    kind: Any = env.action_space.dtype
-    times, infeasible, corrections, over, seed = [], 0, [], True, 0
-    for _ in range(steps):
-        if over:
-            seed += 1
-            env.reset(seed=seed)
-            bare.reset(seed=seed)
-        action = np.asarray(act(), dtype=kind)
-        begin = time.process_time()
-        _, _, terminated, truncated, info = env.step(action)
-        between = time.process_time()
-        executed = info["executed_action"].astype(kind)
-        begin_bare = time.process_time()
-        bare.step(executed)
-        end = time.process_time()
-        over = terminated or truncated
-        infeasible += info["cbf/infeasible"]
-        if info["cbf/intervened"]:
-            corrections.append(info["cbf/correction"])
-        if info["cbf/intervened"] == active and not info["cbf/fallback"]:
-            times.append((end - begin_bare, between - begin))
-    correction = float(np.mean(corrections)) if corrections else np.nan
-    shares = len(times) / steps, infeasible / steps
-    if not times:
-        return Figures(*shares, correction, np.nan, np.nan, np.nan)
-    bare_us, with_us = 1e6 * np.array(times).T
-    ratio = float(np.median(with_us / bare_us))
-    return Figures(*shares, correction, float(np.median(bare_us)), float(np.median(with_us)), ratio)
+    """CPU time of the steps that the filter changed without its fallback, or left alone."""
+    driver = case.attack if active else case.calm
+    return compare(case.make, case.protect, driver, active, steps, time.process_time)
 
 
 def main() -> None:

@@ -12,7 +12,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 import safe_wrappers as sw
-from benchmarks.warp_source import CONSTANTS, ROOTS, STATEMENTS, TABLES, Translator
+from benchmarks.warp_source import CONSTANTS, ROOTS, TABLES, Translator
 from safe_wrappers.control.backup import drive_decision as among
 
 Array = NDArray[np.float64]
@@ -193,7 +193,7 @@ def scene(env: sw.CBFActionFilter) -> Scene:
     low, high = bound.plant.lower, bound.plant.upper
     bounds = np.array([low, high, np.clip(least, low, high), np.clip(most, low, high)])
     room = group.radius + bound.spec.margin + bound.spec.state_error
-    return Scene(bound._models, bounds, room, bound.spec.brake, bound.spec.detour)
+    return Scene(bound.models, bounds, room, bound.spec.brake, bound.spec.detour)
 
 
 class WorldFilter:
@@ -220,7 +220,7 @@ class WorldFilter:
         rows = discs * (len(shared.models) - 1)
         size = 57 + 11 * discs + 16 * rows  # each array of the source, in every call
         kernel = _KERNEL.format(size=size, unresolved=among.UNRESOLVED, detour_steps=_DETOUR_STEPS)
-        source = Translator(STATEMENTS, TABLES, CONSTANTS[real] if constants is None else constants)
+        source = Translator(TABLES, CONSTANTS[real] if constants is None else constants)
         self._kernel = warp_module(source.translate(ROOTS) + "\n\n" + kernel, real).decide_worlds
         self._device, self._n = device, n
         number = getattr(wp, real)

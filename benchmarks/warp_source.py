@@ -2,8 +2,7 @@
 
 Warp compiles a smaller Python than Numba: one type of number, no chained comparisons, no short forms for arrays, and
 arrays of a size that is known only when a world is looked at have to live in a buffer that the kernel owns (`arena`;
-its first number counts what is taken). Statements that no rule covers are given by hand. What no
-rule knows, Warp refuses; a statement by hand that the source no longer has is an error here.
+its first number counts what is taken). What no rule knows, Warp refuses.
 """
 
 import ast
@@ -19,51 +18,6 @@ from safe_wrappers.control.backup import drive_decision as among
 Function = Callable[..., Any]
 
 ROOTS: Final = (among.closest_admitted, among.manoeuvre_drive)
-STATEMENTS: Final = {
-    "bounds[place], order[place] = bounds[place - 1], order[place - 1]": """
-        bounds[place] = bounds[place - 1]
-        for column in range(3):
-            order[place, column] = order[place - 1, column]
-        """,
-    "bounds[place], order[place] = bound, discs[i]": """
-        bounds[place] = bound
-        for column in range(3):
-            order[place, column] = discs[i, column]
-        """,
-    "all_normals[:k], all_offsets[:k] = normals, offsets": """
-        for i in range(k):
-            all_normals[i, 0] = normals[i, 0]
-            all_normals[i, 1] = normals[i, 1]
-            all_offsets[i] = offsets[i]
-        """,
-    "unit = np.ones(2)": "unit = pair(arena, Real(1.0), Real(1.0))",
-    "force = np.minimum(np.maximum(proposal, least), most) / unit": """
-        force = take(arena, 2)
-        for j in range(2):
-            force[j] = smaller(larger(proposal[j], least[j]), most[j]) / unit[j]
-        """,
-    "inner_low, inner_high = least / unit, most / unit": """
-        inner_low = pair(arena, least[0] / unit[0], least[1] / unit[1])
-        inner_high = pair(arena, most[0] / unit[0], most[1] / unit[1])
-        """,
-    "scaled = found * unit": """
-        scaled = take_rows(arena, len(found), 2)
-        for i in range(len(found)):
-            scaled[i, 0] = found[i, 0] * unit[0]
-            scaled[i, 1] = found[i, 1] * unit[1]
-        """,
-    "answer, refused = np.zeros(2), np.array([drive, turn])": """
-        answer = take(arena, 2)
-        refused = pair(arena, drive, turn)
-        """,
-    "tighter = exact.copy()": """
-        tighter = take(arena, len(exact))
-        for i in range(len(exact)):
-            tighter[i] = exact[i]
-        """,
-}
-"""Statements of the source, and what Warp is given instead."""
-
 CONSTANTS: Final[dict[str, dict[str, float]]] = {
     "float64": {},
     "float32": {"ROWS_SLACK": 1e-6},
@@ -77,30 +31,25 @@ _NAMES: Final = {"min": "smaller", "max": "larger", "log1p": "log1p", "copysign"
 
 @dataclass
 class Translator:
-    """What is given by hand, and what is translated so far.
+    """What is translated so far.
 
     Attributes:
-        statements: Assignments of the source, and what Warp is given instead.
         tables: Names of arguments and attributes that are arrays of two dimensions; all others have one.
         constants: Values of module constants that replace the source's.
     """
 
-    statements: dict[str, str]
     tables: frozenset[str]
     constants: dict[str, float]
 
     def __post_init__(self) -> None:
-        self.by_hand = {
-            ast.unparse(ast.parse(s)): textwrap.dedent(t).strip() for s, t in self.statements.items()
-        }
-        self.unused = set(self.by_hand) | set(self.constants)
+        self.unused = set(self.constants)
         self.parts: dict[str, str] = {}
 
     def translate(self, roots: Sequence[Function]) -> str:
         """The source of compiled functions, and of all that they call, for Warp.
 
         Raises:
-            ValueError: A statement or a constant that the source does not have, or one that no rule covers.
+            ValueError: A constant that the source does not have, or a statement that no rule covers.
         """
         for root in roots:
             self.add(root)
@@ -168,10 +117,6 @@ class _Translation(ast.NodeTransformer):
     def visit_Assign(self, node: ast.Assign) -> Any:
         (target,), value = node.targets, node.value
         written = ast.unparse(ast.Assign([target], value, lineno=0))
-        if written in self._job.by_hand:
-            self._job.unused.discard(written)
-            self._takes = self._takes or "arena" in self._job.by_hand[written]
-            return ast.parse(self._job.by_hand[written]).body
         if isinstance(value, ast.Subscript) and isinstance(value.value, ast.Call):  # one of several results
             assert isinstance(value.slice, ast.Constant)
             rest = [ast.Name("other", ast.Store()), ast.Name("other", ast.Store())]

@@ -126,8 +126,9 @@ def _is_borderline(shared: Scene, states: States, i: int) -> bool:
 
 
 def _short(shared: Scene, states: States, i: int, control: Any) -> float:
-    motion = np.concatenate([states.qpos[i], states.qvel[i]])
-    if among.least_clearance(shared.models, motion, states.discs[i], shared.brake)[0] < 0.0:
+    motion, place = np.empty(6), np.zeros(4)
+    scene = shared.models, motion, states.discs[i], shared.brake
+    if among.least_clearance(states.qpos[i], states.qvel[i], place, *scene)[0] < 0.0:
         return 0.0  # it has to recover, at a rate
     drive, turn = map(float, control)
     for room in _ROOM:

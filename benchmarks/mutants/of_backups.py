@@ -180,7 +180,7 @@ WALL = Target(
         Mutant("reach + self.spec.margin, clip", "reach, clip"),
         Mutant("target = start - gap if before else end + gap", "target = start - gap"),
         Mutant("motion[2], motion[3] = now.vx, now.vy", "pass"),
-        Mutant("    if left != left:\n", "    if False:\n"),
+        Mutant("    return left >= -HAIR_M", "    return not left < -HAIR_M"),
         Mutant(
             "            low = middle\n        else:\n            high = middle", "            low = middle"
         ),

@@ -1,6 +1,7 @@
 """The golden traces: what the protected envs did when they were recorded, they do today, bit for bit."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -8,12 +9,17 @@ import numpy as np
 import pytest
 
 from benchmarks import golden_traces
-from benchmarks.golden_traces import NOT_COMPARABLE, RECORDED, SHORT, differences, runs
+from benchmarks.golden_traces import NOT_COMPARABLE, RECORDED, SAME_BITS, SHORT, differences, runs
+
+
+def command(*words):
+    """In the environment that it would make for itself, and in one process: others run tests beside it."""
+    line = [sys.executable, "-m", "benchmarks.golden_traces", "--workers", "1", *words]
+    return subprocess.run(line, capture_output=True, text=True, env=os.environ | SAME_BITS)
 
 
 def compare(*words):
-    command = [sys.executable, "-m", "benchmarks.golden_traces", *words]
-    done = subprocess.run(command, capture_output=True, text=True)
+    done = command(*words)
     if done.returncode == NOT_COMPARABLE:
         pytest.skip(done.stdout.strip())
     return done
@@ -77,13 +83,5 @@ def test_other_arithmetic_is_not_compared(tmp_path):
     recorded = json.loads(RECORDED.read_text())
     recorded["arithmetic"]["probe"] = "00"
     (tmp_path / "other.json").write_text(json.dumps(recorded))
-    command = [
-        sys.executable,
-        "-m",
-        "benchmarks.golden_traces",
-        "--short",
-        "--recorded",
-        str(tmp_path / "other.json"),
-    ]
-    done = subprocess.run(command, capture_output=True, text=True)
+    done = command("--short", "--recorded", str(tmp_path / "other.json"))
     assert done.returncode == NOT_COMPARABLE and done.stdout.startswith("not comparable: ")

@@ -68,5 +68,5 @@ def test_a_constraint_that_believes_in_a_softer_wall_is_seen(monkeypatch):
     def softer(*args, stiffness, **more):
         return honest(*args, stiffness=stiffness / 4.0, **more)
 
-    monkeypatch.setattr(benchmark.sw, "ImpactSpeedLimit", softer)
+    monkeypatch.setattr(benchmark.sw.constraints, "ImpactSpeedLimit", softer)
     assert benchmark.run(benchmark.Job(True, 0, 20))["exceeded"] > 0

@@ -334,9 +334,10 @@ def test_a_delay_is_predicted():
     assert late.value()[0] < at_once.value()[0] - 0.08
 
 
-def test_a_state_that_is_not_a_number_admits_nothing():
+@pytest.mark.parametrize(("at", "velocity"), [((np.nan, 0.0), (0.0, 0.0)), ((0.0, 0.0), (0.0, np.nan))])
+def test_a_state_that_is_not_a_number_admits_nothing(at, velocity):
     env = filtered(velocity_clip=5.0)
-    limit = placed(env, (np.nan, 0.0))
+    limit = placed(env, at, velocity)
     assert np.isnan(limit.value()).all()
     assert not limit.admits(np.zeros(2))
     assert np.isfinite(limit.backup()).all()

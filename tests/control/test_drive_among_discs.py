@@ -163,6 +163,18 @@ def test_plain_python_gives_the_same_bits():
     assert {among.PROPOSAL, among.ROWS, among.CANDIDATE, among.UNRESOLVED} <= set(stages)
 
 
+def test_a_quarter_of_a_refused_correction_is_tried_before_the_backup_alone():
+    env = sw.protect(gym.make("SafePointGoal1-v0"))
+    models = np.array([env.filter.bound[0].drive._replace(uncertainty=0.0)] * 2, dtype=np.float64)
+    motion, discs = np.array([0.05, -0.05, 0.24, 0.28, 0.28, 1.78]), np.array([[0.2, -0.01, 0.15]])
+    bounds, found = np.array([[-1.0, -1.0], [1.0, 1.0], [-0.05, -1.0], [0.05, 1.0]]), np.empty(2)
+    coasting = models, motion, discs, False
+    stage, *_ = among.closest_admitted(*coasting, np.array([1.0, -1.0]), 0.0, False, bounds, found)
+    assert stage == among.BLEND and among.is_admitted(*coasting, *found)
+    backup = np.array([among.manoeuvre_drive(*coasting), 0.0])
+    assert not among.is_admitted(*coasting, *(backup + 2.0 * (found - backup)))  # half of it
+
+
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_many_are_decided_as_each_alone_and_rounded_as_the_filter_rounds(dtype):
     env = sw.protect(gym.make("SafePointGoal1-v0"))

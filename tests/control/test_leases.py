@@ -30,7 +30,7 @@ def used(lease, speed, braking, delays, localisation, margin, acceleration, top=
     return max(way, Fraction(0)) + fixed
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(
     st.floats(0.0, 1e4, allow_subnormal=False),
     st.floats(-50.0, 50.0),

@@ -19,7 +19,7 @@ def projected(u, rows, slack=1e-9):
     return table[:, :2], table[:, 2], out if found else None
 
 
-@settings(max_examples=400)
+@settings(max_examples=200)
 @given(PAIRS, ROWS)
 def test_it_is_the_closest_point_that_a_solver_finds(u, rows):
     normals, offsets, answer = projected(u, rows)

@@ -75,26 +75,8 @@ def damped_axis(
     axis = DampedAxis(
         decay, gain, timestep, substeps, low, high, clip, keep, add, drift, shift, up=none, down=none
     )
-    return axis._replace(up=_table(axis, -low), down=_table(axis, high))
-
-
-def _table(axis: DampedAxis, brake: float) -> Array:
-    """The table for one direction of motion, up to the clip or to `_MOST_HOLDS` knots."""
-    loss, lost_way = axis.add * brake, axis.shift * brake
-    # Displacement of the last hold, per speed.
-    just_stops = axis.drift - axis.shift * axis.keep / axis.add
-    speeds, ways = [0.0, loss / axis.keep], [0.0, just_stops * loss / axis.keep]
-    while len(speeds) < _MOST_HOLDS and speeds[-1] < axis.clip:
-        speed = (speeds[-1] + loss) / axis.keep
-        ways.append(axis.drift * speed - lost_way + ways[-1])
-        speeds.append(speed)
-    if speeds[-1] >= axis.clip:
-        ways[-1] = _interpolate(np.array(speeds), np.array(ways), axis.clip)
-        speeds[-1] = axis.clip
-        speeds.append(_FLAT)
-        ways.append(ways[-1])
-    per_speed = axis.shift / axis.add
-    return np.array([speeds, ways, [per_speed * v + w for v, w in zip(speeds, ways, strict=True)]])
+    along = float(keep), float(add), float(drift), float(shift)
+    return axis._replace(up=_table(*along, -low, clip), down=_table(*along, high, clip))
 
 
 @compiled
@@ -111,6 +93,28 @@ def _interpolate(xs: Array, ys: Array, x: float) -> float:
         return float(ys[-1]) if x == xs[-1] else math.inf
     before = xs[i - 1]
     return float(ys[i - 1] + (x - before) / (xs[i] - before) * (ys[i] - ys[i - 1]))
+
+
+@compiled
+def _table(keep: float, add: float, drift: float, shift: float, brake: float, clip: float) -> Array:
+    """The table for one direction of motion, up to the clip or to `_MOST_HOLDS` knots."""
+    loss, lost_way, per_speed = add * brake, shift * brake, shift / add
+    # Displacement of the last hold, per speed.
+    just_stops = drift - shift * keep / add
+    table = np.zeros((3, _MOST_HOLDS + 1))
+    speed, way, k = loss / keep, just_stops * loss / keep, 1
+    table[0, 1], table[1, 1], table[2, 1] = speed, way, per_speed * speed + way
+    while k < _MOST_HOLDS - 1 and speed < clip:
+        k += 1
+        speed = (speed + loss) / keep
+        way = drift * speed - lost_way + way
+        table[0, k], table[1, k], table[2, k] = speed, way, per_speed * speed + way
+    if speed >= clip:
+        way = _interpolate(table[0, : k + 1], table[1, : k + 1], clip)
+        table[0, k], table[1, k], table[2, k] = clip, way, per_speed * clip + way
+        k += 1
+        table[0, k], table[1, k], table[2, k] = _FLAT, way, per_speed * _FLAT + way
+    return table[:, : k + 1].copy()
 
 
 @compiled

@@ -93,9 +93,13 @@ def look(constants: Array, motion: Array, discs: Array, brake: bool) -> Look:
             return Look(now, path, order[:0], math.nan, loss, swivel)
         place = i
         while place > 0 and bounds[place - 1] > bound:
-            bounds[place], order[place] = bounds[place - 1], order[place - 1]
+            bounds[place] = bounds[place - 1]
+            for j in range(3):
+                order[place, j] = order[place - 1, j]
             place -= 1
-        bounds[place], order[place] = bound, discs[i]
+        bounds[place] = bound
+        for j in range(3):
+            order[place, j] = discs[i, j]
     for i in range(n):
         if not bounds[i] < best:
             break

@@ -78,16 +78,20 @@ def _decide(
                     out[0], out[1] = ahead, around
                     return CANDIDATE, way, normals, offsets
     # Measured in shares of what acts: a control that saturates early must not look cheap to change.
-    unit = np.ones(2)
+    unit, force, inner_low, inner_high = np.zeros(2), np.zeros(2), np.zeros(2), np.zeros(2)
     for j in range(2):
+        unit[j] = 1.0
         if most[j] > least[j]:
             unit[j] = (most[j] - least[j]) / (high[j] - low[j])
-    force = np.minimum(np.maximum(proposal, least), most) / unit
-    inner_low, inner_high = least / unit, most / unit
+        force[j] = min(max(proposal[j], least[j]), most[j]) / unit[j]
+        inner_low[j], inner_high[j] = least[j] / unit[j], most[j] / unit[j]
     found, exact = rows(models, at, brake)
-    scaled = found * unit
+    scaled, tighter = np.zeros((exact.size, 2)), np.zeros(exact.size)
+    for i in range(exact.size):
+        scaled[i, 0], scaled[i, 1] = found[i, 0] * unit[0], found[i, 1] * unit[1]
     slack = ROWS_SLACK * max(inner_high[0] - inner_low[0], inner_high[1] - inner_low[1])
-    answer, refused = np.zeros(2), np.array([drive, turn])
+    answer, refused = np.zeros(2), np.zeros(2)
+    refused[0], refused[1] = drive, turn
     feasible = project_in_plane(force, scaled, exact, inner_low, inner_high, slack, answer)
     if feasible:
         normals, offsets = found, exact
@@ -98,9 +102,9 @@ def _decide(
             out[0], out[1] = refused[0], refused[1]
             return ROWS, way, normals, offsets
         for share in OVERSHOOTS:
-            tighter = exact.copy()
-            for i in range(tighter.size):
-                tighter[i] -= share * max(found[i, 0] * drive + found[i, 1] * turn - exact[i], 0.0)
+            for i in range(exact.size):
+                excess = max(found[i, 0] * drive + found[i, 1] * turn - exact[i], 0.0)
+                tighter[i] = exact[i] - share * excess
             if project_in_plane(force, scaled, tighter, inner_low, inner_high, slack, answer):
                 ahead = drive if answer[0] == force[0] else answer[0] * unit[0]
                 around = turn if answer[1] == force[1] else answer[1] * unit[1]

@@ -89,9 +89,10 @@ def _recovery(among: PointAmongWalls, motion: PointMotion, room: float, left: fl
 def admits(
     among: PointAmongWalls, motion: PointMotion, room: float, left: float, control: Pair, spare: float
 ) -> bool:
-    """Whether a control keeps the room, and `spare` beyond it, m; from outside: whether it shrinks the violation."""
-    if left != left:
-        return False
+    """Whether a control keeps the room, and `spare` beyond it, m; from outside: whether it shrinks the violation.
+
+    Where `left` is not a number nothing is admitted: it is not inside, and no comparison with it is true.
+    """
     if not _is_inside(left):
         needed = _recovery(among, motion, room, left)
         return _left_after(among, motion, room, control) >= needed - _NOISE_M

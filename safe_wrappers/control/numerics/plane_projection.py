@@ -45,7 +45,8 @@ def project_in_plane(
     """
     k = offsets.size
     all_normals, all_offsets = np.zeros((k + 4, 2)), np.zeros(k + 4)
-    all_normals[:k], all_offsets[:k] = normals, offsets
+    for i in range(k):
+        all_normals[i, 0], all_normals[i, 1], all_offsets[i] = normals[i, 0], normals[i, 1], offsets[i]
     for j in range(2):
         all_normals[k + 2 * j, j], all_offsets[k + 2 * j] = 1.0, high[j]
         all_normals[k + 2 * j + 1, j], all_offsets[k + 2 * j + 1] = -1.0, -low[j]
