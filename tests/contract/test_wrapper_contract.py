@@ -36,7 +36,11 @@ def _joint_speed(env):
 
 EXAMPLES = {
     "AdaptionPenalty": {
-        "a constant and a part that grows": (TASK, lambda: {"penalty": 0.5, "per_correction": 0.25})
+        "a constant and a part that grows": (TASK, lambda: {"penalty": 0.5, "per_correction": 0.25}),
+        "the square, and one that levels off": (
+            TASK,
+            lambda: {"per_squared": 0.5, "bounded": 0.25, "scale": 0.5},
+        ),
     },
     "BalanceMonitor": {
         "everything": ("HalfCheetah-v5", dict),

@@ -75,7 +75,7 @@ KINDS = {
     "naive": "naive",
     "adaption_penalty": f"{{kind: adaption_penalty, penalty: {PENALTY}}}",
     "safe_action": "safe_action",
-    "both": f"{{kind: both, penalty: {PENALTY}, per_correction: 1.0}}",
+    "both": f"{{kind: both, penalty: {PENALTY}, per_correction: 1.0, per_squared: 2.0, bounded: 3.0, scale: 0.5}}",
 }
 TAKEN = [("SAC", kind) for kind in KINDS] + [("PPO", "naive"), ("PPO", "adaption_penalty")]
 
@@ -116,7 +116,8 @@ def test_training_has_what_the_kind_says_and_the_rows_have_the_tasks_return(
     if arm.learner.penalised:
         paid, own = np.array(watch.paid), [[i[keys.ADAPTION_TASK_REWARD] for i in row] for row in infos]
         corrections = np.array([[info[keys.CBF_CORRECTION] for info in row] for row in infos])
-        charged = changed * (PENALTY + arm.learner.per_correction * corrections)
+        by_size = corrections + 2.0 * corrections**2 + 3.0 * (1.0 - np.exp(-((corrections / 0.5) ** 2)))
+        charged = changed * (PENALTY + by_size * (kind == "both"))
         np.testing.assert_allclose(paid, np.array(own) - charged, rtol=1e-5)
     else:
         assert keys.ADAPTION_PENALTY not in infos[0, 0]
@@ -222,6 +223,17 @@ def test_short_and_long_forms(fake_experiment):
     assert learner("") == learner("naive") == NAIVE == LearnerConfig("naive", 0.0, 0.0)
     assert learner("safe_action") == learner("{kind: safe_action}") == LearnerConfig("safe_action")
     assert learner("{kind: both, penalty: 2, per_correction: 3e-1}") == LearnerConfig("both", 2, 0.3)
+    bounded = learner("{kind: adaption_penalty, bounded: 2, scale: 0.5}")
+    assert bounded == LearnerConfig("adaption_penalty", bounded=2.0, scale=0.5)
+
+
+def test_folders_from_before_penalties_by_size_are_still_their_learners(fake_experiment):
+    def recorded(learner):
+        return one_arm(fake_experiment, learner).arms[0].fingerprint()["learner"]
+
+    old = {"kind": "both", "penalty": 1.0, "per_correction": 0.0}
+    assert recorded("{kind: both, penalty: 1}") == old
+    assert recorded("{kind: both, penalty: 1, bounded: 2, scale: 3}") == old | {"bounded": 2.0, "scale": 3.0}
 
 
 @pytest.mark.parametrize(
@@ -248,7 +260,10 @@ def test_unknown_names_are_refused(fake_experiment, learner, message):
         ("{penalty: 1}", [], "naive takes no penalty"),
         ("{kind: safe_action, penalty: 1}", [], "safe_action takes no penalty; adaption_penalty and both do"),
         ("{kind: naive, per_correction: 1}", [], "naive takes no penalty"),
-        ("[both]", [], r"learner: expected a mapping of kind, penalty, per_correction; got \['both'\]"),
+        ("{kind: naive, bounded: 1}", [], "naive takes no penalty"),
+        ("{kind: both, penalty: 1, scale: 2}", [], "scale belongs to bounded"),
+        ("{kind: both, bounded: 1, scale: 0}", [], "learner.scale: .* greater than 0, got 0"),
+        ("[both]", [], r"learner: expected a mapping of kind, penalty, .*, scale; got \['both'\]"),
         ("safe_action", ["arms.a.filter=none"], "without a filter no action is ever changed"),
         ("safe_action", ["hyperparameters.n_steps=3"], "safe_action has one-step returns, .*n_steps is 3"),
         (
@@ -279,7 +294,11 @@ def test_n_steps_and_the_naive_and_penalised_learners_go_together(fake_experimen
 def test_the_stack_puts_the_penalty_outside_recorder_and_monitor(fake_experiment):
     (arm,) = one_arm(fake_experiment, KINDS["both"]).arms
     env = make_stack(arm.env, arm.filter, arm.learner)
-    assert isinstance(env, sw.AdaptionPenalty) and (env.penalty, env.per_correction) == (PENALTY, 1.0)
+    assert isinstance(env, sw.AdaptionPenalty)
+    assert {name: getattr(env, name) for name in arm.learner.penalties} == arm.learner.penalties
+    assert arm.learner.penalties == {
+        "penalty": PENALTY, "per_correction": 1.0, "per_squared": 2.0, "bounded": 3.0, "scale": 0.5
+    }  # fmt: skip
     assert isinstance(env.env, Monitor) and isinstance(env.env.env, sw.RecordInterventions)
     assert isinstance(make_stack(arm.env, arm.filter), Monitor)
     with pytest.raises(ConfigurationError, match="AdaptionPenalty needs a CBFActionFilter inside"):

@@ -68,7 +68,7 @@ def make_stack(
     monitored = Monitor(recorded, info_keywords=keys.RUNNING)
     if not learner.penalised:
         return monitored
-    return AdaptionPenalty(monitored, penalty=learner.penalty, per_correction=learner.per_correction)
+    return AdaptionPenalty(monitored, **learner.penalties)
 
 
 def _filtered(task: gym.Env[Any, Any], action_filter: FilterConfig) -> gym.Env[Any, Any]:
