@@ -173,6 +173,10 @@ EXAMPLES = {
         ),
     },
     "RecordInterventions": {"no arguments": (TASK, dict)},
+    "SafeActionMap": {
+        "from the backup": (TASK, dict),
+        "from the filter's answer": (TASK, lambda: {"anchor": "closest"}),
+    },
     "SlipLimiter": {
         "all wheels": ("SafeRover-v0", lambda: {"wheels": list(WHEELS)}),
         "the rear ones, with options": (
@@ -251,7 +255,9 @@ EXAMPLES = {
 }
 """Wrapper name -> what it shows -> (env id, function of its arguments): plain data or what becomes it."""
 
-INSIDE = {"AdaptionPenalty": lambda env: sw.CBFActionFilter(env, [_clearance()])}
+INSIDE = dict.fromkeys(
+    ("AdaptionPenalty", "SafeActionMap"), lambda env: sw.CBFActionFilter(env, [_clearance()])
+)
 """Wrapper name -> the wrapper that it needs inside."""
 
 CHUNKED = ("ChunkHandover",)

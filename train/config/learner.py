@@ -9,9 +9,14 @@ from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.safe_action_map import ANCHORS
 
 from .section import Section
-from .types import Number
+from .types import Number, matching
+
+_ANCHOR: Final = "centre"
+_NAMED: Final = ", ".join(ANCHORS)
+AnchorName = Annotated[str, matching(rf"{'|'.join(ANCHORS)}|[\w.]+:\w+", f"{_NAMED} or 'module:function'")]
 
 
 @dataclass(frozen=True)
@@ -22,8 +27,9 @@ class LearnerConfig(Section):
     _PENALISED: ClassVar = ("adaption_penalty", "both")
     _PENALTIES: ClassVar = ("penalty", "per_correction", "per_squared", "bounded", "scale")
 
-    kind: Literal["naive", "adaption_penalty", "safe_action", "both"] = "naive"
-    """The last two are for SAC, TD3, DDPG, TQC and CrossQ."""
+    kind: Literal["naive", "adaption_penalty", "safe_action", "both", "safe_set_map"] = "naive"
+    """`safe_action` and `both` are for SAC, TD3, DDPG, TQC and CrossQ. `safe_set_map` is a
+    [SafeActionMap](wrappers/safe-action-map.md) around the filter, in training and evaluation."""
     penalty: Annotated[Number, Field(ge=0)] = 0.0
     """For `adaption_penalty` and `both`: taken off the reward of a changed step."""
     per_correction: Annotated[Number, Field(ge=0)] = 0.0
@@ -34,6 +40,8 @@ class LearnerConfig(Section):
     """For the same: taken off times `1 - exp(-(correction / scale)^2)`, so that no correction costs more."""
     scale: Annotated[Number, Field(gt=0)] = 1.0
     """Of `bounded`, in action units."""
+    anchor: AnchorName = _ANCHOR
+    """For `safe_set_map`: `centre`, `backup`, `closest`, or `module:function`, a function of the env."""
 
     @model_validator(mode="after")
     def _has_a_penalty_if_it_needs_one(self) -> LearnerConfig:
@@ -49,6 +57,8 @@ class LearnerConfig(Section):
             raise ConfigurationError(
                 f"scale belongs to bounded: {{kind: {self.kind}, bounded: 0.1, scale: 0.5}}."
             )
+        if self.anchor != _ANCHOR and not self.maps:
+            raise ConfigurationError(f"{self.kind} takes no anchor; safe_set_map does.")
         return self
 
     @property
@@ -65,6 +75,16 @@ class LearnerConfig(Section):
     def penalised(self) -> bool:
         """Whether the reward is reduced where the action was changed."""
         return self.kind in self._PENALISED
+
+    @property
+    def maps(self) -> bool:
+        """Whether the policy's actions are mapped onto the admitted ones."""
+        return self.kind == "safe_set_map"
+
+    @property
+    def in_evaluation(self) -> LearnerConfig:
+        """What is left of it in evaluation: a map, which is part of the policy's interface, and nothing else."""
+        return self if self.maps else NAIVE
 
     @property
     def stores_executed(self) -> bool:

@@ -1,4 +1,4 @@
-"""The whole stack of one env, from the task to SB3's Monitor, and in training the learner's penalty around it."""
+"""The whole stack of one env, from the task to SB3's Monitor, with the learner's map inside or its penalty around."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from safe_wrappers.wrappers.faults import FAULTS
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
+from safe_wrappers.wrappers.safe_action_map import SafeActionMap
 
 from ..config import NAIVE, EnvConfig, FilterConfig, LearnerConfig
 from ..config.env_ids import check_env_id
@@ -29,7 +30,7 @@ from .judge import ConstraintJudge
 def make_stack(
     env: EnvConfig, action_filter: FilterConfig, learner: LearnerConfig = NAIVE
 ) -> gym.Env[Any, Any]:
-    """Makes the task; judge, OcclusionPenalty, filter, lease if any; recorder, faults, Monitor, AdaptionPenalty.
+    """Makes the task; judge, OcclusionPenalty, filter, lease, map if any; recorder, faults, Monitor, AdaptionPenalty.
 
     The recorder counts the task's own reward, whatever the learner sees. Monitor does too, but for OcclusionPenalty,
     which is inside of it.
@@ -37,7 +38,8 @@ def make_stack(
     Args:
         env: The task.
         action_filter: The filter around it.
-        learner: In training the arm's; in evaluation left out, so that no return ever holds a penalty.
+        learner: In training the arm's; in evaluation its `in_evaluation`, so that no return ever holds a penalty.
+            Without a filter there is nothing to map onto, and no map.
 
     Raises:
         ConfigurationError: The task or the filter refuses its settings.
@@ -59,6 +61,9 @@ def make_stack(
     task = _filtered(task, action_filter)
     if action_filter.lease is not None:
         task = _leased(task, action_filter.lease)
+    if learner.maps and action_filter.kind != "none":
+        named = ":" in learner.anchor
+        task = SafeActionMap(task, _function(learner.anchor, "learner.anchor") if named else learner.anchor)
     recorded: gym.Env[Any, Any] = RecordInterventions(task)
     for name, arguments in env.faults.items():
         try:
