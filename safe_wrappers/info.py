@@ -141,6 +141,13 @@ ADAPTION_PENALTY: Final = _key("adaption/penalty", "float64", unit="reward", chu
 ADAPTION_TASK_REWARD: Final = _key("adaption/task_reward", "float64", unit="reward", chunk="sum")
 """The task's own reward of this step, before the penalty."""
 
+# SafeActionMap, every step -----------------------------------------------------------------------------------
+MAP_SCALE: Final = _key("map/scale", "float64", chunk="min", log="map_scale")
+"""By what the distance of the policy's action from the anchor was multiplied, from 0 to 1; 1: the action is
+unchanged."""
+MAP_ANCHOR: Final = _key("map/anchor", "bool", chunk="min")
+"""There was an admitted anchor; else the filter was given the policy's action."""
+
 # ChunkHandover, every step: of its chunk of control steps --------------------------------------------------------
 HANDOVER_SEAM_JUMP: Final = _key("handover/seam_jump", "float64", shape="(3,)", unit="action")
 """The largest first, second and third difference of the executed commands whose newest command is in a blend or one

@@ -15,6 +15,7 @@ class Layer(Enum):
     COST = auto()
     OCCLUSION = auto()
     FILTER = auto()
+    MAP = auto()
     LEASE = auto()
     CHANNEL = auto()
     OBSERVATION = auto()
@@ -43,7 +44,12 @@ _WRONG_WAY_ROUND: Final = {
         Layer.OBSERVATION: "it shows what the filter inside of it decides by",
         **dict.fromkeys((Layer.LEASE, Layer.CHANNEL, Layer.HANDOVER, Layer.FAULT), _LAST_WORD),
     },
+    Layer.MAP: {
+        Layer.FAULT: "actions are mapped for the state in which they are executed, and it delays them",
+        **_PER_CHUNK,
+    },
     Layer.LEASE: {
+        Layer.MAP: "its brake is no policy's action, and would be mapped like one",
         Layer.RECORDER: "it would count no lease that expires",
         **dict.fromkeys((Layer.HANDOVER, Layer.FAULT), _AGE),
     },
@@ -59,6 +65,7 @@ _WRONG_WAY_ROUND: Final = {
 }
 """By the outer layer, then the inner one: why this order is wrong. The reverse is right."""
 
+_LATER: Final = "actions are mapped for the state in which they are executed, and the channel delays them"
 _BOTH_END_AUTHORITY: Final = "both decide when a command's authority ends; use one of them"
 _NOT_TOGETHER: Final = {
     Layer.COST: {Layer.COST: "this env has a CostFunction already; add up the costs in one function"},
@@ -67,8 +74,13 @@ _NOT_TOGETHER: Final = {
         Layer.FILTER: "this env is filtered already; constraints compose in one projection, so pass all of them to "
         "one filter: CBFActionFilter(env, [*inner.constraints, more])"
     },
+    Layer.MAP: {
+        Layer.MAP: "the env's actions are mapped already; use one map",
+        Layer.CHANNEL: f"{_LATER}; use one of them",
+    },
     Layer.LEASE: dict.fromkeys((Layer.LEASE, Layer.CHANNEL), _BOTH_END_AUTHORITY),
     Layer.CHANNEL: {
+        Layer.MAP: f"{_LATER}; use one of them",
         Layer.CHANNEL: "one network is between operator and machine; give one channel all the delay",
         Layer.LEASE: _BOTH_END_AUTHORITY,
     },

@@ -60,6 +60,8 @@ class SafetyFilter:
         falling_back = Fallback(fallback, self.bound)
         self._search = SafeActionSearch(plant, self.bound, falling_back, solver, low, high, dtype)
         self._low, self._high = low, high
+        self._narrower = not plant.bounds_are_action_space
+        self._all_predict = all(c.predicts for c in self.bound)
 
     def start(self) -> None:
         """Forget the episode, take the state of the next one, and refuse what only a state can show."""
@@ -96,6 +98,16 @@ class SafetyFilter:
         if boxed is None:
             return self._search.without_proposal(self.last)
         return self._search.decide(boxed, self.last)
+
+    def admits(self, control: Array) -> bool:
+        """Whether a finite control inside the box, shape (m,), would be executed as it is in the observed state."""
+        plant = self.plant
+        if self._narrower and not ((control >= plant.lower) & (control <= plant.upper)).all():
+            return False
+        acting = None if self._all_predict else plant.acting_range
+        # Rows speak of forces, which saturate; predictions know that by themselves.
+        force = control if acting is None else np.clip(control, *acting)
+        return all(c.admits(control if c.predicts else force) for c in self.bound)
 
     def executed(self, control: Array) -> None:
         """Remember what was sent, shape (m,), for the plant's delay, the constraints and a fallback that holds it."""

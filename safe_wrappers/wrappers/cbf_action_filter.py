@@ -106,6 +106,7 @@ class CBFActionFilter(LayerWrapper):
         box = self._low, self._high
         self.filter = SafetyFilter(self.plant, self.constraints, fallback, solver, *box, self._dtype)
         self.warned: set[str] = set()
+        self._observed = False
         self.filter_seconds, self.filter_calls = 0.0, 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
@@ -116,6 +117,7 @@ class CBFActionFilter(LayerWrapper):
     def start_report(self) -> dict[str, Any]:
         """Take the state that a reset has left: the info keys of a new episode."""
         self.warned.discard("unsafe")
+        self._observed = False
         self.filter.start()
         margin, unsafe = self._margin()
         report: dict[str, Any] = dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0)
@@ -140,13 +142,23 @@ class CBFActionFilter(LayerWrapper):
             info |= self.filter.info(report[keys.PROPOSED_ACTION], report[keys.EXECUTED_ACTION])
         return observation, reward, terminated, truncated, info
 
+    def observe(self) -> None:
+        """Take the env's present state ahead of `step`, for a wrapper outside that asks `filter` about it.
+
+        `step` then decides in this state, and has to be what happens to the env next.
+        """
+        self.filter.observe()
+        self._observed = True
+
     def judge(self, action: Any) -> tuple[Any, dict[str, Any]]:
         """What to send for a proposed action in the env's present state, and the step's info keys.
 
         The env must be stepped with it next. The constraints' own keys are not among these.
         """
         proposed: Array = action_array(action, self._shape, np.float64)
-        self.filter.observe()
+        if not self._observed:
+            self.filter.observe()
+        self._observed = False
         margin, unsafe = self._margin()
         readable = self.filter.margin == self.filter.margin
         # False for NaN too, so that one comparison clears the common case.

@@ -37,7 +37,11 @@ def _joint_speed(env):
 EXAMPLES = {
     "ActionRepeat": {"four control steps": (TASK, lambda: {"repeat": 4})},
     "AdaptionPenalty": {
-        "a constant and a part that grows": (TASK, lambda: {"penalty": 0.5, "per_correction": 0.25})
+        "a constant and a part that grows": (TASK, lambda: {"penalty": 0.5, "per_correction": 0.25}),
+        "the square, and one that levels off": (
+            TASK,
+            lambda: {"per_squared": 0.5, "bounded": 0.25, "scale": 0.5},
+        ),
     },
     "BalanceMonitor": {
         "everything": ("HalfCheetah-v5", dict),
@@ -177,6 +181,10 @@ EXAMPLES = {
         ),
     },
     "RecordInterventions": {"no arguments": (TASK, dict)},
+    "SafeActionMap": {
+        "from the backup": (TASK, dict),
+        "from the filter's answer": (TASK, lambda: {"anchor": "closest"}),
+    },
     "SlipLimiter": {
         "all wheels": ("SafeRover-v0", lambda: {"wheels": list(WHEELS)}),
         "the rear ones, with options": (
@@ -255,7 +263,9 @@ EXAMPLES = {
 }
 """Wrapper name -> what it shows -> (env id, function of its arguments): plain data or what becomes it."""
 
-INSIDE = {"AdaptionPenalty": lambda env: sw.CBFActionFilter(env, [_clearance()])}
+INSIDE = dict.fromkeys(
+    ("AdaptionPenalty", "SafeActionMap"), lambda env: sw.CBFActionFilter(env, [_clearance()])
+)
 """Wrapper name -> the wrapper that it needs inside."""
 
 CHUNKED = ("ChunkHandover",)

@@ -2,7 +2,7 @@
 
 import gymnasium as gym
 import numpy as np
-from line_world import HOLD, PENALTY, PER_CORRECTION, WALL, BehindTheWall, Line, drift, push, read
+from line_world import HOLD, PENALTIES, WALL, BehindTheWall, Line, drift, push, read
 from stable_baselines3.common.monitor import Monitor
 
 import safe_wrappers as sw
@@ -55,4 +55,4 @@ def filtered(wall=WALL, task=GoalLine):
 
 
 def penalised(wall=WALL, task=GoalLine):
-    return sw.AdaptionPenalty(filtered(wall, task), penalty=PENALTY, per_correction=PER_CORRECTION)
+    return sw.AdaptionPenalty(filtered(wall, task), **PENALTIES)

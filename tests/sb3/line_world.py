@@ -9,7 +9,13 @@ from stable_baselines3.common.monitor import Monitor
 import safe_wrappers as sw
 from safe_wrappers.filter.constraint import BoundConstraint
 
-HOLD, WALL, PENALTY, PER_CORRECTION = 0.1, -0.3, 5.0, 0.5
+HOLD, WALL = 0.1, -0.3
+PENALTIES = {"penalty": 5.0, "per_correction": 0.5, "per_squared": 0.25, "bounded": 2.0, "scale": 0.7}
+
+
+def cost(correction):
+    """What a changed step costs, by those penalties."""
+    return 5.0 + 0.5 * correction + 0.25 * correction**2 + 2.0 * (1.0 - np.exp(-((correction / 0.7) ** 2)))
 
 
 class Line(gym.Env):
@@ -85,7 +91,7 @@ def filtered(wall=WALL):
 
 
 def penalised(wall=WALL):
-    return sw.AdaptionPenalty(filtered(wall), penalty=PENALTY, per_correction=PER_CORRECTION)
+    return sw.AdaptionPenalty(filtered(wall), **PENALTIES)
 
 
 def filtered_dict():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from goal_line import BonusLine, filtered, penalised
-from line_world import HOLD, PENALTY, PER_CORRECTION, WALL
+from line_world import HOLD, WALL, cost
 from scipy import stats
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
@@ -60,7 +60,7 @@ class Drawn:
         # The filter lets through what it can: a transition of which the wall stopped a part has the policy's action.
         self.refused = self.sent - self.moved > 1e-4
         correction = np.where(self.refused, self.sent - self.moved, 0.0)
-        self.charged = self.refused * PENALTY + PER_CORRECTION * correction
+        self.charged = self.refused * cost(correction)
 
     def rows(self):
         return np.stack([getattr(self, name) for name in sorted(vars(self))])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete
-from line_world import HOLD, PENALTY, PER_CORRECTION, WALL, filtered, penalised
+from line_world import HOLD, WALL, cost, filtered, penalised
 from scipy import stats
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -93,7 +93,7 @@ def check(model, record, mode):
     # As SB3 scales them, in float32; what was not changed is what SB3 would have stored, bit for bit.
     executed = model.policy.scale_action(given.astype(np.float32)[..., None])
     executed = np.where(changed[..., None], executed, stored)
-    charged = task - (PENALTY + PER_CORRECTION * (sent - given)) * changed
+    charged = task - cost(sent - given) * changed
     same = {
         "observations": record["observed"],
         "next_observations": record["after"],  # the env's last observation, not the next episode's first

@@ -16,6 +16,7 @@ from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.constraint import BoundConstraint
 from safe_wrappers.sb3 import ExecutedActionReplayBuffer
 from safe_wrappers.train.config import NAIVE, EvaluationConfig, FilterConfig, LearnerConfig
+from safe_wrappers.train.evaluation.episode_selection import ShownEpisode
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
 from safe_wrappers.train.run import stack as stack_module
 from safe_wrappers.train.run import training as run_module
@@ -23,6 +24,7 @@ from safe_wrappers.train.run.checkpoint import latest_checkpoint
 from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.train.run.training import train_run
 from safe_wrappers.train.tables import read_rows
+from safe_wrappers.train.videos import record as record_module
 
 WALL = 0.0  # in the middle of where episodes start
 PENALTY = 1000.0
@@ -59,6 +61,14 @@ def shield(env):
     return sw.CBFActionFilter(env, [BehindTheWall()], plant=plant)
 
 
+def left(env):
+    """Away from the wall, as fast as the point goes."""
+    return [-1.0, 0.0]
+
+
+MAP = "{kind: safe_set_map, anchor: 'test_learner:left'}"
+
+
 def one_arm(fake_experiment, learner, *overrides, algorithm="SAC"):
     """An experiment of one filtered arm."""
     settings = {
@@ -75,7 +85,7 @@ KINDS = {
     "naive": "naive",
     "adaption_penalty": f"{{kind: adaption_penalty, penalty: {PENALTY}}}",
     "safe_action": "safe_action",
-    "both": f"{{kind: both, penalty: {PENALTY}, per_correction: 1.0}}",
+    "both": f"{{kind: both, penalty: {PENALTY}, per_correction: 1.0, per_squared: 2.0, bounded: 3.0, scale: 0.5}}",
 }
 TAKEN = [("SAC", kind) for kind in KINDS] + [("PPO", "naive"), ("PPO", "adaption_penalty")]
 
@@ -116,7 +126,8 @@ def test_training_has_what_the_kind_says_and_the_rows_have_the_tasks_return(
     if arm.learner.penalised:
         paid, own = np.array(watch.paid), [[i[keys.ADAPTION_TASK_REWARD] for i in row] for row in infos]
         corrections = np.array([[info[keys.CBF_CORRECTION] for info in row] for row in infos])
-        charged = changed * (PENALTY + arm.learner.per_correction * corrections)
+        by_size = corrections + 2.0 * corrections**2 + 3.0 * (1.0 - np.exp(-((corrections / 0.5) ** 2)))
+        charged = changed * (PENALTY + by_size * (kind == "both"))
         np.testing.assert_allclose(paid, np.array(own) - charged, rtol=1e-5)
     else:
         assert keys.ADAPTION_PENALTY not in infos[0, 0]
@@ -170,6 +181,69 @@ def test_evaluation_never_has_the_penalty(fake_experiment, monkeypatch, algorith
     assert json.loads((evaluation_folder(folder) / "evaluation.json").read_text())["timesteps"] == 256
 
 
+@pytest.mark.parametrize("algorithm", ["SAC", "PPO"])
+def test_a_map_is_in_training_and_wherever_the_filter_is_on_in_evaluation(
+    fake_experiment, monkeypatch, algorithm
+):
+    experiment = one_arm(fake_experiment, MAP, algorithm=algorithm)
+    (arm,) = experiment.arms
+    folder = experiment.run_folder(arm, 0)
+    watch = Watch()
+    monkeypatch.setattr(run_module, "InterventionCallback", lambda: watch)
+    train_run(arm, 0, folder, Reports().progress)
+    infos = np.array(watch.infos).ravel()
+    anchored = np.array([info[keys.MAP_ANCHOR] for info in infos])
+    assert anchored.any() and not any(info[keys.CBF_INTERVENED] for info in infos[anchored])
+    assert min(info[keys.MAP_SCALE] for info in infos) < 1.0
+    assert keys.ADAPTION_PENALTY not in infos[0]
+
+    evaluate_run(arm, 0, folder, EvaluationConfig(episodes=3, seed=7), FilterConfig(), Reports().progress)
+    model = latest_checkpoint(folder / "checkpoints", pytest.fail).load_model(algorithm, None, "cpu")
+
+    def returns(env):
+        for seed in (7, 8, 9):
+            observation, done, total = env.reset(seed=seed)[0], False, 0.0
+            while not done:
+                action = model.predict(observation, deterministic=True)[0]
+                observation, reward, _, done, info = env.step(action)
+                total += reward
+            assert (keys.MAP_SCALE in info) == (keys.CBF_INTERVENED in info)
+            yield total
+
+    for condition, action_filter in (("filter_off", FilterConfig()), ("filter_on", arm.filter)):
+        rows = read_rows(evaluation_folder(folder) / f"{condition}.csv")
+        env = make_stack(arm.env, action_filter, arm.learner)
+        assert [row["return"] for row in rows] == pytest.approx(list(returns(env)), abs=1e-6)
+
+
+def test_a_film_has_the_map_as_well(fake_experiment, monkeypatch, tmp_path):
+    experiment = one_arm(fake_experiment, MAP, algorithm="PPO")
+    (arm,) = experiment.arms
+    folder = experiment.run_folder(arm, 0)
+    train_run(arm, 0, folder, Reports().progress)
+    made = []
+
+    class MadeError(Exception):
+        pass
+
+    def stack(*arguments):
+        made.extend(arguments)
+        raise MadeError
+
+    monkeypatch.setattr(record_module, "make_stack", stack)
+    with pytest.raises(MadeError):
+        record_module.record_video(
+            arm, ShownEpisode(0, 7, ""), folder, arm.filter, tmp_path / "film", Reports().progress
+        )
+    assert made[1:] == [arm.filter, arm.learner]
+    assert [
+        LearnerConfig(kind, 1.0 * (kind == "both")).in_evaluation for kind in ("both", "safe_action")
+    ] == [
+        NAIVE,
+        NAIVE,
+    ]
+
+
 def test_a_killed_run_goes_on_with_its_two_transitions(fake_experiment, monkeypatch):
     experiment = one_arm(fake_experiment, KINDS["both"], "n_envs=1", "checkpoint_every=64")
     (arm,) = experiment.arms
@@ -204,8 +278,9 @@ def test_a_folder_from_before_there_was_a_choice_is_still_the_naive_learners(fak
 def test_another_learner_is_another_run(fake_experiment):
     experiments = [one_arm(fake_experiment, learner) for learner in KINDS.values()]
     experiments.append(one_arm(fake_experiment, "{kind: both, penalty: 999.0, per_correction: 1.0}"))
+    experiments += [one_arm(fake_experiment, learner) for learner in ("safe_set_map", MAP)]
     seen = [json.dumps(e.arms[0].fingerprint(), sort_keys=True) for e in experiments]
-    assert len(set(seen)) == 5
+    assert len(set(seen)) == 7
     first, second = experiments[0], experiments[3]
     folder = first.run_folder(first.arms[0], 0)
     train_run(first.arms[0], 0, folder, Reports().progress)
@@ -222,6 +297,17 @@ def test_short_and_long_forms(fake_experiment):
     assert learner("") == learner("naive") == NAIVE == LearnerConfig("naive", 0.0, 0.0)
     assert learner("safe_action") == learner("{kind: safe_action}") == LearnerConfig("safe_action")
     assert learner("{kind: both, penalty: 2, per_correction: 3e-1}") == LearnerConfig("both", 2, 0.3)
+    bounded = learner("{kind: adaption_penalty, bounded: 2, scale: 0.5}")
+    assert bounded == LearnerConfig("adaption_penalty", bounded=2.0, scale=0.5)
+
+
+def test_folders_from_before_penalties_by_size_are_still_their_learners(fake_experiment):
+    def recorded(learner):
+        return one_arm(fake_experiment, learner).arms[0].fingerprint()["learner"]
+
+    old = {"kind": "both", "penalty": 1.0, "per_correction": 0.0}
+    assert recorded("{kind: both, penalty: 1}") == old
+    assert recorded("{kind: both, penalty: 1, bounded: 2, scale: 3}") == old | {"bounded": 2.0, "scale": 3.0}
 
 
 @pytest.mark.parametrize(
@@ -248,7 +334,14 @@ def test_unknown_names_are_refused(fake_experiment, learner, message):
         ("{penalty: 1}", [], "naive takes no penalty"),
         ("{kind: safe_action, penalty: 1}", [], "safe_action takes no penalty; adaption_penalty and both do"),
         ("{kind: naive, per_correction: 1}", [], "naive takes no penalty"),
-        ("[both]", [], r"learner: expected a mapping of kind, penalty, per_correction; got \['both'\]"),
+        ("{kind: naive, bounded: 1}", [], "naive takes no penalty"),
+        ("{kind: both, penalty: 1, scale: 2}", [], "scale belongs to bounded"),
+        ("{kind: safe_set_map, penalty: 1}", [], "safe_set_map takes no penalty"),
+        ("{kind: both, penalty: 1, anchor: closest}", [], "both takes no anchor; safe_set_map does"),
+        ("{kind: safe_set_map, anchor: brake}", [], "expected centre, backup, closest or 'module:function'"),
+        ("safe_set_map", ["arms.a.filter=none"], "without a filter no action is ever changed"),
+        ("{kind: both, bounded: 1, scale: 0}", [], "learner.scale: .* greater than 0, got 0"),
+        ("[both]", [], r"learner: expected a mapping of kind, penalty, .*, anchor; got \['both'\]"),
         ("safe_action", ["arms.a.filter=none"], "without a filter no action is ever changed"),
         ("safe_action", ["hyperparameters.n_steps=3"], "safe_action has one-step returns, .*n_steps is 3"),
         (
@@ -279,8 +372,26 @@ def test_n_steps_and_the_naive_and_penalised_learners_go_together(fake_experimen
 def test_the_stack_puts_the_penalty_outside_recorder_and_monitor(fake_experiment):
     (arm,) = one_arm(fake_experiment, KINDS["both"]).arms
     env = make_stack(arm.env, arm.filter, arm.learner)
-    assert isinstance(env, sw.AdaptionPenalty) and (env.penalty, env.per_correction) == (PENALTY, 1.0)
+    assert isinstance(env, sw.AdaptionPenalty)
+    assert {name: getattr(env, name) for name in arm.learner.penalties} == arm.learner.penalties
+    assert arm.learner.penalties == {
+        "penalty": PENALTY, "per_correction": 1.0, "per_squared": 2.0, "bounded": 3.0, "scale": 0.5
+    }  # fmt: skip
     assert isinstance(env.env, Monitor) and isinstance(env.env.env, sw.RecordInterventions)
     assert isinstance(make_stack(arm.env, arm.filter), Monitor)
     with pytest.raises(ConfigurationError, match="AdaptionPenalty needs a CBFActionFilter inside"):
         make_stack(arm.env, FilterConfig(factory="fake_task:shield"), arm.learner)
+
+
+def test_the_map_is_around_filter_and_lease_and_inside_of_the_recorder(fake_experiment):
+    (arm,) = one_arm(fake_experiment, MAP).arms
+    env = make_stack(arm.env, arm.filter, arm.learner)
+    assert isinstance(env, Monitor) and isinstance(env.env.env, sw.SafeActionMap)
+    assert isinstance(env.env.env.env, sw.CBFActionFilter)
+    assert env.env.env.anchor is left
+    (backup,) = one_arm(fake_experiment, "safe_set_map").arms
+    with pytest.raises(ConfigurationError, match="no constraint of this filter knows a backup control"):
+        make_stack(backup.env, backup.filter, backup.learner)
+    (missing,) = one_arm(fake_experiment, "{kind: safe_set_map, anchor: 'test_learner:lift'}").arms
+    with pytest.raises(UnknownNameError, match="unknown name 'lift'"):
+        make_stack(missing.env, missing.filter, missing.learner)

@@ -1,6 +1,8 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from worlds import Cart, SpeedRow, cart_plant
 
 import safe_wrappers as sw
@@ -35,17 +37,32 @@ def drive(env, steps=40, seed=0):
 
 
 @pytest.mark.parametrize(
-    ("penalty", "per_correction"), [(0.5, 0.0), (0.0, 2.0), (0.5, 2.0), (np.float32(3), 0)]
+    ("penalty", "per_correction", "per_squared", "bounded", "scale"),
+    [
+        (0.5, 0.0, 0.0, 0.0, 1.0),
+        (0.0, 2.0, 0.0, 0.0, 1.0),
+        (0.5, 2.0, 0.0, 0.0, 1.0),
+        (np.float32(3), 0, 0, 0, 1),
+        (0.0, 0.0, 4.0, 0.0, 1.0),
+        (0.0, 0.0, 0.0, 0.5, 1.0),
+        (0.0, 0.0, 0.0, 0.5, 0.2),
+        (0.5, 2.0, 4.0, 0.5, 0.2),
+    ],
 )
-def test_a_changed_step_costs_what_the_formula_says_and_no_other(penalty, per_correction):
-    penalised, plain = drive(sw.AdaptionPenalty(filtered(), penalty, per_correction)), drive(filtered())
+def test_a_changed_step_costs_what_the_formula_says_and_no_other(
+    penalty, per_correction, per_squared, bounded, scale
+):
+    given = penalty, per_correction, per_squared, bounded, scale
+    penalised, plain = drive(sw.AdaptionPenalty(filtered(), *given)), drive(filtered())
     changed = 0
     for (push, speed, observation, reward, *_, info), (_, _, same, task, *_) in zip(
         penalised, plain, strict=True
     ):
         # The filter in closed form: no push above the one that reaches the limit within this step.
         correction = float(push[0]) - min(float(push[0]), (LIMIT - speed) / 0.1)
-        expected = penalty + per_correction * correction if correction > 0 else 0.0
+        bend = 1.0 - np.exp(-((correction / scale) ** 2))
+        cost = penalty + per_correction * correction + per_squared * correction**2 + bounded * bend
+        expected = cost if correction > 0 else 0.0
         changed += correction > 0
         assert info[keys.ADAPTION_PENALTY] == pytest.approx(expected, abs=1e-6)
         assert info[keys.ADAPTION_TASK_REWARD] == task
@@ -65,6 +82,16 @@ def test_an_unchanged_step_keeps_the_reward_object_that_the_task_gave():
     env = sw.AdaptionPenalty(Kept(filtered()), penalty=1.0)
     env.reset(seed=0)
     assert env.step(np.zeros(1, np.float32))[1] is env.env.reward
+
+
+@given(st.floats(0.0, 1e3), st.floats(0.0, 1e3), st.floats(1e-3, 1e3))
+def test_the_bounded_penalty_grows_with_the_correction_and_stays_below_its_weight(one, other, scale):
+    env = sw.AdaptionPenalty(filtered(), bounded=0.25, scale=scale)
+    less, more = sorted((one, other))
+    assert 0.0 <= env.of(less) <= env.of(more) <= 0.25
+    assert env.of(scale) == pytest.approx(0.25 * 0.63212, rel=1e-4)
+    small = 1e-6 * scale
+    assert env.of(small) == pytest.approx(0.25e-12, rel=1e-6)  # a parabola near zero, without cancellation
 
 
 def test_a_non_finite_action_costs_the_constant_and_a_finite_amount():
@@ -109,7 +136,14 @@ def test_a_recorder_inside_keeps_the_tasks_return():
             lambda: sw.AdaptionPenalty(sw.RecordInterventions(sw.AdaptionPenalty(filtered(), 1.0)), 1.0),
             "has an AdaptionPenalty already",
         ),
-        (lambda: sw.AdaptionPenalty(filtered()), "give penalty .*, per_correction .*, or both"),
+        (
+            lambda: sw.AdaptionPenalty(filtered()),
+            "give penalty .*, per_correction .*, per_squared .*, bounded .*, or several",
+        ),
+        (lambda: sw.AdaptionPenalty(filtered(), 1.0, scale=0.5), "scale = 0.5 says .* give bounded"),
+        (lambda: sw.AdaptionPenalty(filtered(), bounded=1.0, scale=0.0), "scale must be a finite number > 0"),
+        (lambda: sw.AdaptionPenalty(filtered(), per_squared=-1.0), "per_squared must be a finite number"),
+        (lambda: sw.AdaptionPenalty(filtered(), bounded=np.inf), "bounded must be a finite number >= 0"),
         (lambda: sw.AdaptionPenalty(filtered(), -1.0), "penalty must be a finite number >= 0"),
         (lambda: sw.AdaptionPenalty(filtered(), np.nan), "penalty must be a finite number >= 0"),
         (lambda: sw.AdaptionPenalty(filtered(), 1.0, np.inf), "per_correction must be a finite number >= 0"),

@@ -2,14 +2,13 @@
 
 from .experiment import parse_experiment
 from .file import read_config
+from .learner import NAIVE, LearnerConfig
 from .models import (
-    NAIVE,
     ArmConfig,
     EnvConfig,
     EvaluationConfig,
     ExperimentConfig,
     FilterConfig,
-    LearnerConfig,
     NormalizeConfig,
 )
 

@@ -9,11 +9,10 @@ import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, StrictBool, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, StrictBool, model_validator
 from pydantic.dataclasses import dataclass
-from pydantic_core import ArgsKwargs
 
 from safe_wrappers.deprecation import deprecated_names
 from safe_wrappers.errors import ConfigurationError
@@ -26,8 +25,10 @@ from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 from .algorithm_settings import HER
 from .algorithms import check_algorithm
 from .env_ids import check_env_id
+from .learner import NAIVE, LearnerConfig
 from .names import check_name
-from .types import Count, FolderName, FunctionName, NonNegative, Number
+from .section import Section
+from .types import Count, FolderName, FunctionName, NonNegative
 
 Options = dict[str, Any]
 
@@ -69,27 +70,6 @@ def _check_faults(given: dict[str, Options]) -> dict[str, Options]:
         for name in arguments:
             check_name(name, _arguments(FAULTS[fault]), fault)
     return given
-
-
-@dataclass(frozen=True, config=ConfigDict(extra="forbid", use_attribute_docstrings=True))
-class Section:
-    """A mapping in a config. A key without a value has its default; a bare text stands for the key `text_is`."""
-
-    text_is: ClassVar[str] = ""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _read(cls, given: Any) -> Any:
-        if given is None or isinstance(given, (cls, ArgsKwargs)):
-            return given or {}
-        if isinstance(given, str) and cls.text_is:
-            return {cls.text_is: given}
-        names = [field.name for field in fields(cls)]
-        if not isinstance(given, Mapping):
-            raise ConfigurationError(f"expected a mapping of {', '.join(names)}; got {given!r}.")
-        for name in given:
-            check_name(name, names)
-        return {name: value for name, value in given.items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -179,46 +159,6 @@ class EnvConfig(Section):
 
 
 @dataclass(frozen=True)
-class LearnerConfig(Section):
-    """What the learner sees where the filter changed its action, by the names of Krasowski et al. (TMLR 2023)."""
-
-    text_is: ClassVar[str] = "kind"
-    _PENALISED: ClassVar = ("adaption_penalty", "both")
-
-    kind: Literal["naive", "adaption_penalty", "safe_action", "both"] = "naive"
-    """The last two are for SAC, TD3, DDPG, TQC and CrossQ."""
-    penalty: Annotated[Number, Field(ge=0)] = 0.0
-    """For `adaption_penalty` and `both`: taken off the reward of a changed step."""
-    per_correction: Annotated[Number, Field(ge=0)] = 0.0
-    """For the same: taken off per unit of correction."""
-
-    @model_validator(mode="after")
-    def _has_a_penalty_if_it_needs_one(self) -> LearnerConfig:
-        given = bool(self.penalty or self.per_correction)
-        if self.penalised and not given:
-            raise ConfigurationError(
-                f"{self.kind} needs a penalty in units of the task's reward, per changed step or per unit of"
-                f" correction: {{kind: {self.kind}, penalty: 0.1}} or {{kind: {self.kind}, per_correction: 0.1}}."
-            )
-        if given and not self.penalised:
-            raise ConfigurationError(f"{self.kind} takes no penalty; {' and '.join(self._PENALISED)} do.")
-        return self
-
-    @property
-    def penalised(self) -> bool:
-        """Whether the reward is reduced where the action was changed."""
-        return self.kind in self._PENALISED
-
-    @property
-    def stores_executed(self) -> bool:
-        """Whether the replay buffer holds executed actions."""
-        return self.kind in ("safe_action", "both")
-
-
-NAIVE: Final = LearnerConfig()
-
-
-@dataclass(frozen=True)
 class NormalizeConfig(Section):
     """What SB3's VecNormalize scales."""
 
@@ -292,6 +232,8 @@ class ArmConfig(Section):
         # As in the folders of runs that were made before there was a choice.
         if self.learner == NAIVE:
             del values["learner"]
+        else:
+            values["learner"] = self.learner.plain()
         if self.filter.lease is None:
             del values["filter"]["lease"]
         if self.action_repeat == 1:

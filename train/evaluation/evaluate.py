@@ -110,7 +110,7 @@ class _Evaluation:
     """The episodes of one condition, and the steps recorded on the way."""
 
     def __init__(self, arm: ArmConfig, used: FilterConfig) -> None:
-        self._env = make_stack(arm.env, used)
+        self._env = make_stack(arm.env, used, arm.learner.in_evaluation)
         self.steps = StepRecorder(self._env)
 
     def episodes(

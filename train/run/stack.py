@@ -1,4 +1,4 @@
-"""The whole stack of one env, from the task to SB3's Monitor, and in training the learner's penalty around it."""
+"""The whole stack of one env, from the task to SB3's Monitor, with the learner's map inside or its penalty around."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from safe_wrappers.wrappers.filter_observation import FilterObservation
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
+from safe_wrappers.wrappers.safe_action_map import SafeActionMap
 
 from ..config import NAIVE, EnvConfig, FilterConfig, LearnerConfig
 from ..config.env_ids import check_env_id
@@ -32,7 +33,7 @@ from .judge import ConstraintJudge
 def make_stack(
     env: EnvConfig, action_filter: FilterConfig, learner: LearnerConfig = NAIVE
 ) -> gym.Env[Any, Any]:
-    """Makes the task; judge, OcclusionPenalty, filter, lease, FilterObservation if any; recorder, faults, Monitor.
+    """Makes the task; judge, OcclusionPenalty, filter, lease, map, FilterObservation if any; recorder, faults, Monitor.
 
     The recorder counts the task's own reward, whatever the learner sees. Monitor does too, but for OcclusionPenalty,
     which is inside of it.
@@ -40,7 +41,8 @@ def make_stack(
     Args:
         env: The task.
         action_filter: The filter around it.
-        learner: In training the arm's; in evaluation left out, so that no return ever holds a penalty.
+        learner: In training the arm's; in evaluation its `in_evaluation`, so that no return ever holds a penalty.
+            Without a filter there is nothing to map onto, and no map.
 
     Raises:
         ConfigurationError: The task or the filter refuses its settings.
@@ -63,6 +65,9 @@ def make_stack(
     task = _filtered(task, action_filter)
     if action_filter.lease is not None:
         task = _leased(task, action_filter.lease)
+    if learner.maps and action_filter.kind != "none":
+        named = ":" in learner.anchor
+        task = SafeActionMap(task, _function(learner.anchor, "learner.anchor") if named else learner.anchor)
     if observed is not None:
         task = _with_features(task, observed)
     recorded: gym.Env[Any, Any] = RecordInterventions(task)
@@ -74,7 +79,7 @@ def make_stack(
     monitored = Monitor(recorded, info_keywords=keys.RUNNING)
     if not learner.penalised:
         return monitored
-    return AdaptionPenalty(monitored, penalty=learner.penalty, per_correction=learner.per_correction)
+    return AdaptionPenalty(monitored, **learner.penalties)
 
 
 def _filtered(task: gym.Env[Any, Any], action_filter: FilterConfig) -> gym.Env[Any, Any]:

@@ -147,7 +147,8 @@ def record_video(
     """
     checkpoint = finished_checkpoint(arm, shown.seed, run_folder)
     policy = TrainedPolicy(arm, checkpoint)
-    env = make_stack(replace(arm.env, kwargs={**arm.env.kwargs, "render_mode": "rgb_array"}), used)
+    filmed = replace(arm.env, kwargs={**arm.env.kwargs, "render_mode": "rgb_array"})
+    env = make_stack(filmed, used, arm.learner.in_evaluation)
     # One speed for all conditions, also where one of them ends early.
     longest = env.spec.max_episode_steps if env.spec is not None else None
     judged = False

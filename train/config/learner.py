@@ -1,0 +1,95 @@
+"""LearnerConfig: what the learner sees where the filter changed its action."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Annotated, Any, ClassVar, Final, Literal
+
+from pydantic import Field, model_validator
+from pydantic.dataclasses import dataclass
+
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.safe_action_map import ANCHORS
+
+from .section import Section
+from .types import Number, matching
+
+_ANCHOR: Final = "centre"
+_NAMED: Final = ", ".join(ANCHORS)
+AnchorName = Annotated[str, matching(rf"{'|'.join(ANCHORS)}|[\w.]+:\w+", f"{_NAMED} or 'module:function'")]
+
+
+@dataclass(frozen=True)
+class LearnerConfig(Section):
+    """What the learner sees where the filter changed its action, by the names of Krasowski et al. (TMLR 2023)."""
+
+    text_is: ClassVar[str] = "kind"
+    _PENALISED: ClassVar = ("adaption_penalty", "both")
+    _PENALTIES: ClassVar = ("penalty", "per_correction", "per_squared", "bounded", "scale")
+
+    kind: Literal["naive", "adaption_penalty", "safe_action", "both", "safe_set_map"] = "naive"
+    """`safe_action` and `both` are for SAC, TD3, DDPG, TQC and CrossQ. `safe_set_map` is a
+    [SafeActionMap](wrappers/safe-action-map.md) around the filter, in training and evaluation."""
+    penalty: Annotated[Number, Field(ge=0)] = 0.0
+    """For `adaption_penalty` and `both`: taken off the reward of a changed step."""
+    per_correction: Annotated[Number, Field(ge=0)] = 0.0
+    """For the same: taken off per unit of correction."""
+    per_squared: Annotated[Number, Field(ge=0)] = 0.0
+    """For the same: taken off per squared unit of correction."""
+    bounded: Annotated[Number, Field(ge=0)] = 0.0
+    """For the same: taken off times `1 - exp(-(correction / scale)^2)`, so that no correction costs more."""
+    scale: Annotated[Number, Field(gt=0)] = 1.0
+    """Of `bounded`, in action units."""
+    anchor: AnchorName = _ANCHOR
+    """For `safe_set_map`: `centre`, `backup`, `closest`, or `module:function`, a function of the env."""
+
+    @model_validator(mode="after")
+    def _has_a_penalty_if_it_needs_one(self) -> LearnerConfig:
+        given = bool(self.penalty or self.per_correction or self.per_squared or self.bounded)
+        if self.penalised and not given:
+            raise ConfigurationError(
+                f"{self.kind} needs a penalty in units of the task's reward, per changed step or by the size of the"
+                f" correction: {{kind: {self.kind}, penalty: 0.1}}, or per_correction, per_squared or bounded."
+            )
+        if given and not self.penalised:
+            raise ConfigurationError(f"{self.kind} takes no penalty; {' and '.join(self._PENALISED)} do.")
+        if self.scale != 1.0 and not self.bounded:
+            raise ConfigurationError(
+                f"scale belongs to bounded: {{kind: {self.kind}, bounded: 0.1, scale: 0.5}}."
+            )
+        if self.anchor != _ANCHOR and not self.maps:
+            raise ConfigurationError(f"{self.kind} takes no anchor; safe_set_map does.")
+        return self
+
+    @property
+    def penalties(self) -> dict[str, float]:
+        """The arguments of the AdaptionPenalty."""
+        return {name: getattr(self, name) for name in self._PENALTIES}
+
+    def plain(self) -> dict[str, Any]:
+        """As in the folders of runs that were made before there were more keys than three."""
+        old, naive = ("kind", "penalty", "per_correction"), asdict(NAIVE)
+        return {key: value for key, value in asdict(self).items() if key in old or value != naive[key]}
+
+    @property
+    def penalised(self) -> bool:
+        """Whether the reward is reduced where the action was changed."""
+        return self.kind in self._PENALISED
+
+    @property
+    def maps(self) -> bool:
+        """Whether the policy's actions are mapped onto the admitted ones."""
+        return self.kind == "safe_set_map"
+
+    @property
+    def in_evaluation(self) -> LearnerConfig:
+        """What is left of it in evaluation: a map, which is part of the policy's interface, and nothing else."""
+        return self if self.maps else NAIVE
+
+    @property
+    def stores_executed(self) -> bool:
+        """Whether the replay buffer holds executed actions."""
+        return self.kind in ("safe_action", "both")
+
+
+NAIVE: Final = LearnerConfig()
