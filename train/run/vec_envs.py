@@ -18,6 +18,7 @@ from safe_wrappers.errors import RunStateError
 
 from ..config import ArmConfig
 from ..processes.parent import end_with_parent
+from .reset_options import ResetOptions
 from .stack import make_stack
 
 _ENDED: Final = (
@@ -28,9 +29,15 @@ _ENDED: Final = (
 
 def make_vec_env(arm: ArmConfig) -> VecEnv:
     """Makes `arm.n_envs` envs, as `arm.vec_env` says."""
-    make: Callable[[], gym.Env[Any, Any]] = functools.partial(make_stack, arm.env, arm.filter, arm.learner)
+    make: Callable[[], gym.Env[Any, Any]] = functools.partial(make_training_env, arm)
     makes = [make] * arm.n_envs
     return DummyVecEnv(makes) if arm.vec_env == "dummy" else ProcessVecEnv(makes)
+
+
+def make_training_env(arm: ArmConfig) -> gym.Env[Any, Any]:
+    """One env as the arm trains in it."""
+    env = make_stack(arm.env, arm.filter, arm.learner)
+    return ResetOptions(env, arm.env.reset_options) if arm.env.reset_options else env
 
 
 class ProcessVecEnv(SubprocVecEnv):
