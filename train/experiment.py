@@ -15,8 +15,16 @@ from .evaluation.summary import Summary, summarize, write_summary
 from .hyperparameters import check_task
 from .processes.parallel import Job, run_jobs
 from .processes.stopping import Interrupted
+from .run.margins import check_margins
 from .run.start import Start
-from .run.training import check_finished, check_folder, check_start, is_outgrown, standing, train_run
+from .run.training import (
+    check_finished,
+    check_folder,
+    check_start,
+    is_outgrown,
+    standing,
+    train_run,
+)
 from .run.vec_envs import make_training_env
 from .videos.record import delete_videos, record_videos
 
@@ -36,6 +44,7 @@ def train_experiment(experiment: ExperimentConfig, console: Console) -> None:
         check_task(arm, env)
         if arm.env.reset_options:
             env.reset()  # the task alone knows its options
+        check_margins(arm, env)
         env.close()
         start = _start(experiment, arm, experiment.seeds[0])
         if start is not None:

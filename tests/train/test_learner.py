@@ -248,7 +248,11 @@ def test_unknown_names_are_refused(fake_experiment, learner, message):
         ("{penalty: 1}", [], "naive takes no penalty"),
         ("{kind: safe_action, penalty: 1}", [], "safe_action takes no penalty; adaption_penalty and both do"),
         ("{kind: naive, per_correction: 1}", [], "naive takes no penalty"),
-        ("[both]", [], r"learner: expected a mapping of kind, penalty, per_correction; got \['both'\]"),
+        (
+            "[both]",
+            [],
+            r"learner: expected a mapping of kind, penalty, per_correction, margin_curriculum; got \['both'\]",
+        ),
         ("safe_action", ["arms.a.filter=none"], "without a filter no action is ever changed"),
         ("safe_action", ["hyperparameters.n_steps=3"], "safe_action has one-step returns, .*n_steps is 3"),
         (

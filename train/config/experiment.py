@@ -10,7 +10,7 @@ from safe_wrappers.errors import ConfigurationError
 
 from .algorithm_settings import HER, check_hyperparameters
 from .algorithms import DETERMINISTIC, DISCRETE, OFF_POLICY, ON_POLICY
-from .models import ArmConfig, ExperimentConfig, default_buffer_size
+from .models import NAIVE, ArmConfig, ExperimentConfig, default_buffer_size
 from .names import check_name
 from .types import validate
 
@@ -136,9 +136,10 @@ def _check_actions(arm: ArmConfig, where: str) -> None:
 
 def _check_learner(arm: ArmConfig, where: str) -> None:
     kind = arm.learner.kind
-    if kind != "naive" and arm.filter.kind == "none":
+    if arm.learner != NAIVE and arm.filter.kind == "none":
         raise ConfigurationError(
-            f"{where}: without a filter no action is ever changed; leave `learner` out, or give the arm a filter."
+            f"{where}: without a filter no action is ever changed, and there is no margin; leave `learner` out, or"
+            " give the arm a filter."
         )
     if not arm.learner.stores_executed:
         return

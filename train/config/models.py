@@ -135,6 +135,19 @@ class EnvConfig(Section):
 
 
 @dataclass(frozen=True)
+class MarginCurriculumConfig(Section):
+    """How the margin of an arm's filter changes in training, in hundredths of the way."""
+
+    start: Annotated[Number, Field(ge=0)]
+    """Added margin at the first step, in the constraints' own unit; never below 0, so that constraints keep at least
+    their own."""
+    end: Annotated[Number, Field(ge=0)] = 0.0
+    """Added margin from `until` on; linear between."""
+    until: Annotated[Number, Field(gt=0, le=1)] = 1.0
+    """Share of `total_steps`."""
+
+
+@dataclass(frozen=True)
 class LearnerConfig(Section):
     """What the learner sees where the filter changed its action, by the names of Krasowski et al. (TMLR 2023)."""
 
@@ -147,6 +160,9 @@ class LearnerConfig(Section):
     """For `adaption_penalty` and `both`: taken off the reward of a changed step."""
     per_correction: Annotated[Number, Field(ge=0)] = 0.0
     """For the same: taken off per unit of correction."""
+    margin_curriculum: MarginCurriculumConfig | None = None
+    """A margin that the arm's filter adds in training and that changes; see [its
+    keys](concepts/learner.md#a-margin-that-changes). Evaluation has the filter as it is configured."""
 
     @model_validator(mode="after")
     def _has_a_penalty_if_it_needs_one(self) -> LearnerConfig:
@@ -247,6 +263,8 @@ class ArmConfig(Section):
         # As in the folders of runs that were made before there was a choice.
         if self.learner == NAIVE:
             del values["learner"]
+        elif self.learner.margin_curriculum is None:
+            del values["learner"]["margin_curriculum"]
         if self.start_from is None:
             del values["start_from"]
         if self.filter.lease is None:
