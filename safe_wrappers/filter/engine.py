@@ -39,6 +39,8 @@ class SafetyFilter:
         UnknownNameError: No fallback of that name.
     """
 
+    margin: float
+
     def __init__(
         self,
         plant: Plant,
