@@ -73,6 +73,8 @@ figures: .venv/installed
 	$(BIN)/python -m benchmarks.adversarial --off --steps 100000
 	$(BIN)/python -m benchmarks.adversarial --robot car --steps 500000
 	$(BIN)/python -m benchmarks.adversarial --robot car --off --steps 49000 --parts 1
+	$(BIN)/python -m benchmarks.trained_adversary --anew
+	$(BIN)/python -m benchmarks.starts
 	$(BIN)/python -m benchmarks.protected --steps 3000
 	$(BIN)/python -m benchmarks.protected --hard --steps 100000
 	$(BIN)/python -m benchmarks.admission

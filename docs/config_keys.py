@@ -20,7 +20,12 @@ _TYPES = {
     Path: "path",
     dict: "mapping",
 }
-_WRITTEN = {"arms": "mapping", "env.judge": "`constraints`"}
+_WRITTEN = {
+    "arms": "mapping",
+    "env.judge": "`constraints`",
+    "env.observation": "`constraints`",
+    "learner.margin_curriculum": "mapping",
+}
 """Types in YAML where Python has another one."""
 
 

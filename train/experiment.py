@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -13,13 +15,22 @@ from .evaluation.summary import Summary, summarize, write_summary
 from .hyperparameters import check_task
 from .processes.parallel import Job, run_jobs
 from .processes.stopping import Interrupted
-from .run.stack import make_stack
-from .run.training import check_finished, check_folder, is_outgrown, standing, train_run
+from .run.margins import check_margins
+from .run.start import Start
+from .run.training import (
+    check_finished,
+    check_folder,
+    check_start,
+    is_outgrown,
+    standing,
+    train_run,
+)
+from .run.vec_envs import make_training_env
 from .videos.record import delete_videos, record_videos
 
 
 def train_experiment(experiment: ExperimentConfig, console: Console) -> None:
-    """Trains what is not trained yet, arms times seeds in parallel.
+    """Trains what is not trained yet, arms times seeds in parallel; first the arms that others begin with.
 
     Raises:
         ConfigurationError: A task, a filter or an algorithm refuses its settings; nothing has been started.
@@ -29,16 +40,27 @@ def train_experiment(experiment: ExperimentConfig, console: Console) -> None:
     """
     # All arms and folders before the first step: nobody should learn after an hour that the last one is wrong.
     for arm in experiment.arms:
-        env = make_stack(arm.env, arm.filter, arm.learner)
+        env = make_training_env(arm)
         check_task(arm, env)
+        if arm.env.reset_options:
+            env.reset()  # the task alone knows its options
+        check_margins(arm, env)
         env.close()
+        start = _start(experiment, arm, experiment.seeds[0])
+        if start is not None:
+            check_start(arm, start)
         for seed in experiment.seeds:
             check_folder(arm, seed, experiment.run_folder(arm, seed))
     for arm in experiment.arms:
         if any(is_outgrown(arm, experiment.run_folder(arm, seed)) for seed in experiment.seeds):
             delete_videos(experiment, arm)
+
+    def training(arm: ArmConfig, seed: int) -> Callable[..., None]:
+        return functools.partial(train_run, start=_start(experiment, arm, seed))
+
     try:
-        _run(experiment, console, "Training", lambda arm: arm.total_steps, "steps", train_run, ())
+        for arms in _generations(experiment):
+            _run(experiment, arms, console, "Training", lambda arm: arm.total_steps, "steps", training, ())
     except Interrupted as stop:
         stop.standing = [
             f"{arm.name} seed {seed}: {standing(arm, experiment.run_folder(arm, seed))}"
@@ -60,7 +82,8 @@ def evaluate_experiment(experiment: ExperimentConfig, console: Console) -> None:
             check_finished(arm, experiment.run_folder(arm, seed))
     episodes = (1 if experiment.evaluation_filter.kind == "none" else 2) * experiment.evaluation.episodes
     arguments = (experiment.evaluation, experiment.evaluation_filter)
-    _run(experiment, console, "Evaluation", lambda _: episodes, "episodes", evaluate_run, arguments)
+    every, evaluation = experiment.arms, lambda *_: evaluate_run
+    _run(experiment, every, console, "Evaluation", lambda _: episodes, "episodes", evaluation, arguments)
     record_videos(experiment, console)
 
 
@@ -71,13 +94,33 @@ def summarize_experiment(experiment: ExperimentConfig) -> Summary:
     return summary
 
 
+def _start(experiment: ExperimentConfig, arm: ArmConfig, seed: int) -> Start | None:
+    """Whose policy a run begins with."""
+    if arm.start_from is None:
+        return None
+    source = experiment.begins_with(arm)
+    if source is None:
+        return Start(arm.start_from, Path(arm.start_from))
+    return Start(source.name, experiment.run_folder(source, seed), source)
+
+
+def _generations(experiment: ExperimentConfig) -> Iterator[list[ArmConfig]]:
+    """The arms, those first that others begin with."""
+    left = list(experiment.arms)
+    while left:
+        ready = [arm for arm in left if experiment.begins_with(arm) not in left]
+        yield ready
+        left = [arm for arm in left if arm not in ready]
+
+
 def _run(
     experiment: ExperimentConfig,
+    arms: Sequence[ArmConfig],
     console: Console,
     title: str,
     total: Callable[[ArmConfig], int],
     unit: str,
-    call: Callable[..., None],
+    call: Callable[[ArmConfig, int], Callable[..., None]],
     more: tuple[Any, ...],
 ) -> None:
     # Seeds outside, arms inside: after the first wave there is already a pair to look at.
@@ -86,10 +129,10 @@ def _run(
             f"{title.lower()} {arm.name} seed {seed}",
             total(arm),
             unit,
-            call,
+            call(arm, seed),
             (arm, seed, experiment.run_folder(arm, seed), *more),
         )
         for seed in experiment.seeds
-        for arm in experiment.arms
+        for arm in arms
     ]
     run_jobs(jobs, experiment.workers, console, title)

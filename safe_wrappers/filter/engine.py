@@ -39,6 +39,8 @@ class SafetyFilter:
         UnknownNameError: No fallback of that name.
     """
 
+    margin: float
+
     def __init__(
         self,
         plant: Plant,
@@ -71,6 +73,16 @@ class SafetyFilter:
         self.observe()
         for c in self.bound:
             c.check()
+
+    def take_over(self, before: "SafetyFilter") -> None:
+        """Go on in the episode of another filter of the same plant and the same kinds of constraints.
+
+        It is to be observed next. Before an episode there is nothing to go on with.
+        """
+        if hasattr(before, "memories"):
+            for c in self.bound:
+                c.start()
+            self.memories, self.last, self.margin = before.memories, before.last, before.margin
 
     def observe(self) -> None:
         """Take the env's present state, and `margin` from it."""

@@ -13,6 +13,7 @@ from safe_wrappers.sb3.executed_action_replay_buffer import (
 )
 from safe_wrappers.sb3.gymnasium_vec_env import GymnasiumVecEnv
 from safe_wrappers.sb3.intervention_callback import InterventionCallback, InterventionEvalCallback
+from safe_wrappers.sb3.margin_curriculum import MarginCurriculum
 
 __all__ = [
     "ExecutedActionDictReplayBuffer",
@@ -21,4 +22,5 @@ __all__ = [
     "GymnasiumVecEnv",
     "InterventionCallback",
     "InterventionEvalCallback",
+    "MarginCurriculum",
 ]

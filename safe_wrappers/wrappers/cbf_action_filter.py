@@ -60,6 +60,7 @@ class CBFActionFilter(LayerWrapper):
 
     Attributes:
         filter: The `SafetyFilter` that decides; `filter.bound` are the constraints on the plant.
+        added_margin: Added to every constraint's own; `set_margin` changes it.
         constraint_names: Of the constraints, in the order of ``cbf/refused``: their kinds, numbered if repeated.
         warned: What has been warned of: "nonfinite", "clipped", and "unsafe" until the next reset.
         filter_seconds: Wall time spent filtering so far; `filter_calls` says over how many steps.
@@ -94,20 +95,52 @@ class CBFActionFilter(LayerWrapper):
         if isinstance(constraints, str | dict) or not isinstance(constraints, Sequence) or not constraints:
             raise ConfigurationError(f"constraints is a list with at least one, got {constraints!r}")
         own = [copy.deepcopy(c) for c in [*map(constraint_from, constraints)]]
-        margin = non_negative("margin", margin, "the constraints' own units")
+        self.added_margin = margin = non_negative("margin", margin, "the constraints' own units")
         check_solver(solver)
         self._record(arguments, constraints=[plain_data(c) for c in own], plant=plant, margin=margin)
-        self.constraints: list[Constraint] = [c.widened(margin) for c in own] if margin else own
+        self._own = own
+        self.constraints: list[Constraint] = self._widened(margin)
         self.constraint_names = _unique([type(c).__name__ for c in self.constraints])
         self.plant: Plant = plant if plant is not None else default_plant(env)
         self.plant.bind(env)
         self._low, self._high = np.asarray(space.low, np.float64), np.asarray(space.high, np.float64)
         self._shape, self._dtype = space.shape, space.dtype
-        box = self._low, self._high
-        self.filter = SafetyFilter(self.plant, self.constraints, fallback, solver, *box, self._dtype)
+        self._fallback, self._solver = fallback, solver
+        self.filter = self._filter()
         self.warned: set[str] = set()
         self._observed = False
         self.filter_seconds, self.filter_calls = 0.0, 0
+
+    def _widened(self, margin: float) -> list[Constraint]:
+        return [c.widened(margin) for c in self._own] if margin else self._own
+
+    def _filter(self) -> SafetyFilter:
+        box = self._low, self._high
+        return SafetyFilter(self.plant, self.constraints, self._fallback, self._solver, *box, self._dtype)
+
+    def set_margin(self, margin: float) -> None:
+        """Add this to every constraint's own margin from the next decision on, in place of `margin`.
+
+        What constraints remember of the episode stays. From a state that a wider margin finds too near, constraints
+        lead back, as from every such state. Not for the filters inside a `VectorCBFActionFilter`, which decides for
+        them.
+
+        Args:
+            margin: At least 0, in each constraint's own unit.
+
+        Raises:
+            ConfigurationError: It is negative, or leaves nothing of some limit; the margin stays as it was.
+        """
+        margin = non_negative("margin", margin, "the constraints' own units")
+        before = self.filter, self.constraints
+        try:
+            self.constraints = self._widened(margin)
+            self.filter = self._filter()
+        except ConfigurationError:
+            self.filter, self.constraints = before
+            raise
+        self.added_margin = margin
+        self.filter.take_over(before[0])
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env and forget the episode: commands in flight, the last action, the warning."""

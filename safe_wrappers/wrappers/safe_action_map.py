@@ -40,8 +40,8 @@ class SafeActionMap(LayerWrapper):
     itself is always asked about. The edge is found to a thousandth of the ray. The box ends where the actuators
     saturate: beyond, actions differ in nothing.
 
-    **What it asks** is what the filter asks, many times in a step (up to 5 + 8 actions, and "centre" up to 13 for each
-    component), which is dear where constraints forecast.
+    **What it asks** is what the filter asks, many times in a step (up to 5 + 8 actions, and "centre" up to 13 for
+    each component), which is dear where constraints forecast.
 
     Args:
         env: With a `CBFActionFilter` inside, and a bounded action space.

@@ -41,6 +41,11 @@ def test_every_config_of_the_repo_is_valid(path):
         assert kept == without | {f"{name}_penalty": cars for name, cars in without.items()}
         weights = {arm.name: (arm.env.occlusion or {}).get("weight", 0.0) for arm in experiment.arms}
         assert all((weight > 0.0) == name.endswith("_penalty") for name, weight in weights.items())
+    elif path.stem == "pointgoal1_margins":
+        assert kinds == {"no_hazards": "none"} | dict.fromkeys(
+            ("naive", "wide_first", "fine_tuned"), "protect"
+        )
+        assert [arm.start_from for arm in experiment.arms] == [None, None, None, "no_hazards"]
     else:
         assert kinds == {"unfiltered": "none", "filtered": "protect"}
 

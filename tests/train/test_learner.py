@@ -341,7 +341,11 @@ def test_unknown_names_are_refused(fake_experiment, learner, message):
         ("{kind: safe_set_map, anchor: brake}", [], "expected centre, backup, closest or 'module:function'"),
         ("safe_set_map", ["arms.a.filter=none"], "without a filter no action is ever changed"),
         ("{kind: both, bounded: 1, scale: 0}", [], "learner.scale: .* greater than 0, got 0"),
-        ("[both]", [], r"learner: expected a mapping of kind, penalty, .*, anchor; got \['both'\]"),
+        (
+            "[both]",
+            [],
+            r"learner: expected a mapping of kind, penalty, .*, anchor, margin_curriculum; got \['both'\]",
+        ),
         ("safe_action", ["arms.a.filter=none"], "without a filter no action is ever changed"),
         ("safe_action", ["hyperparameters.n_steps=3"], "safe_action has one-step returns, .*n_steps is 3"),
         (

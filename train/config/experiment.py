@@ -10,13 +10,13 @@ from safe_wrappers.errors import ConfigurationError
 
 from .algorithm_settings import HER, check_hyperparameters
 from .algorithms import DETERMINISTIC, DISCRETE, OFF_POLICY, ON_POLICY
-from .models import ArmConfig, ExperimentConfig, default_buffer_size
+from .models import NAIVE, ArmConfig, ExperimentConfig, default_buffer_size
 from .names import check_name
 from .types import validate
 
 _EXPERIMENT_KEYS: Final = tuple(field.name for field in fields(ExperimentConfig))
 _ARM_KEYS: Final = tuple(field.name for field in fields(ArmConfig) if field.name != "name")
-_COMMON_KEYS: Final = tuple(key for key in _ARM_KEYS if key not in ("filter", "learner"))
+_COMMON_KEYS: Final = tuple(key for key in _ARM_KEYS if key not in ("filter", "learner", "start_from"))
 
 
 def parse_experiment(settings: Mapping[str, Any]) -> ExperimentConfig:
@@ -53,12 +53,37 @@ def parse_experiment(settings: Mapping[str, Any]) -> ExperimentConfig:
                 " but evaluation would put a filter on (evaluation.filter, or that of another arm). Give the arm an"
                 " experiment of its own, or set evaluation.filter to none."
             )
+    for arm in experiment.arms:
+        _check_start(arm, experiment)
     return replace(experiment, arms=tuple(_with_constraints(arm, experiment) for arm in experiment.arms))
 
 
 def _mapping(value: Any, where: str) -> dict[str, Any]:
     checked: dict[str, Any] = validate(dict[Any, Any] | None, value, where) or {}
     return checked
+
+
+def _check_start(arm: ArmConfig, experiment: ExperimentConfig) -> None:
+    where = f"arms.{arm.name}.start_from"
+    if arm.start_from is None or arm.start_from.endswith(".zip"):
+        return
+    others = [other.name for other in experiment.arms if other is not arm]
+    if not others:
+        raise ConfigurationError(
+            f"{where}: expected another arm, and there is none, or a file *.zip; got {arm.start_from!r}."
+        )
+    check_name(arm.start_from, others, f"{where} (an arm, or a file *.zip)")
+    chain, source = [arm], experiment.begins_with(arm)
+    while source is not None:
+        if source in chain:
+            names = " <- ".join(each.name for each in [*chain, source])
+            raise ConfigurationError(f"{where}: no arm can be trained first: {names}.")
+        chain, source = [*chain, source], experiment.begins_with(source)
+    if chain[1].algorithm != arm.algorithm:
+        raise ConfigurationError(
+            f"{where}: {chain[1].name} is trained with {chain[1].algorithm}, this arm with {arm.algorithm}; a policy"
+            " goes on with the algorithm that it was trained with."
+        )
 
 
 def _with_constraints(arm: ArmConfig, experiment: ExperimentConfig) -> ArmConfig:
@@ -113,9 +138,10 @@ def _check_actions(arm: ArmConfig, where: str) -> None:
 
 def _check_learner(arm: ArmConfig, where: str) -> None:
     kind = arm.learner.kind
-    if kind != "naive" and arm.filter.kind == "none":
+    if arm.learner != NAIVE and arm.filter.kind == "none":
         raise ConfigurationError(
-            f"{where}: without a filter no action is ever changed; leave `learner` out, or give the arm a filter."
+            f"{where}: without a filter no action is ever changed, and there is no margin; leave `learner` out, or"
+            " give the arm a filter."
         )
     if not arm.learner.stores_executed:
         return

@@ -20,6 +20,19 @@ AnchorName = Annotated[str, matching(rf"{'|'.join(ANCHORS)}|[\w.]+:\w+", f"{_NAM
 
 
 @dataclass(frozen=True)
+class MarginCurriculumConfig(Section):
+    """How the margin of an arm's filter changes in training, in hundredths of the way."""
+
+    start: Annotated[Number, Field(ge=0)]
+    """Added margin at the first step, in the constraints' own unit; never below 0, so that constraints keep at least
+    their own."""
+    end: Annotated[Number, Field(ge=0)] = 0.0
+    """Added margin from `until` on; linear between."""
+    until: Annotated[Number, Field(gt=0, le=1)] = 1.0
+    """Share of `total_steps`."""
+
+
+@dataclass(frozen=True)
 class LearnerConfig(Section):
     """What the learner sees where the filter changed its action, by the names of Krasowski et al. (TMLR 2023)."""
 
@@ -42,6 +55,9 @@ class LearnerConfig(Section):
     """Of `bounded`, in action units."""
     anchor: AnchorName = _ANCHOR
     """For `safe_set_map`: `centre`, `backup`, `closest`, or `module:function`, a function of the env."""
+    margin_curriculum: MarginCurriculumConfig | None = None
+    """A margin that the arm's filter adds in training and that changes; see [its
+    keys](concepts/learner.md#a-margin-that-changes). Evaluation has the filter as it is configured."""
 
     @model_validator(mode="after")
     def _has_a_penalty_if_it_needs_one(self) -> LearnerConfig:

@@ -5,27 +5,24 @@ The tables of `docs/config.md` are made of them.
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, fields
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, StrictBool, model_validator
 from pydantic.dataclasses import dataclass
 
-from safe_wrappers.deprecation import deprecated_names
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.protect import protect_options
-from safe_wrappers.wrappers.faults import FAULTS
-from safe_wrappers.wrappers.lease.stopping_budget import StoppingBudget
-from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 
 from .algorithm_settings import HER
 from .algorithms import check_algorithm
+from .arguments import arguments, check_faults, check_lease, with_keys
 from .env_ids import check_env_id
 from .learner import NAIVE, LearnerConfig
+from .learner import MarginCurriculumConfig as MarginCurriculumConfig  # for the docs: all sections are here
 from .names import check_name
 from .section import Section
 from .types import Count, FolderName, FunctionName, NonNegative
@@ -33,56 +30,17 @@ from .types import Count, FolderName, FunctionName, NonNegative
 Options = dict[str, Any]
 
 
-def _keys(names: Iterable[str]) -> AfterValidator:
-    """A mapping may have these keys."""
-    valid = tuple(names)
-
-    def check(given: Any) -> Any:
-        for name in given or {}:
-            check_name(name, valid)
-        return given
-
-    return AfterValidator(check)
-
-
-def _arguments(of: Callable[..., Any], *not_in_yaml: str) -> list[str]:
-    return [name for name in inspect.signature(of).parameters if name not in ("env", *not_in_yaml)]
-
-
-def _lease(given: Any) -> Any:
-    """Arguments of a LeaseExpiry; those of its budget may stand beside it, as they once did."""
-    valid = (*_arguments(LeaseExpiry, "plant", "measured"), *deprecated_names(LeaseExpiry))
-    for name in given or {}:
-        check_name(name, valid)
-    budget = (given or {}).get("budget")
-    if not isinstance(budget, Mapping | None):
-        raise ConfigurationError(
-            f"lease.budget: expected a mapping of a StoppingBudget's fields, got {budget!r}"
-        )
-    for name in budget or ():
-        check_name(name, [field.name for field in fields(StoppingBudget)], "budget")
-    return given
-
-
-def _check_faults(given: dict[str, Options]) -> dict[str, Options]:
-    for fault, arguments in given.items():
-        check_name(fault, FAULTS)
-        for name in arguments:
-            check_name(name, _arguments(FAULTS[fault]), fault)
-    return given
-
-
 @dataclass(frozen=True)
 class FilterConfig(Section):
     """Which filter: `none`, `protect`, or a mapping. A lease without a clearance is given the filter's constraint."""
 
-    protect: Annotated[Options | None, _keys(protect_options() - {"plant"})] = None
+    protect: Annotated[Options | None, with_keys(protect_options() - {"plant"})] = None
     """Options of `safe_wrappers.protect`, such as `margin` (added to the recipe's own)."""
     factory: FunctionName | None = None
     """`module:function`: called with the env, returns it filtered."""
     kwargs: Options = Field(default_factory=dict)
     """Further arguments of the factory."""
-    lease: Annotated[Options | None, AfterValidator(_lease)] = None
+    lease: Annotated[Options | None, AfterValidator(check_lease)] = None
     """Arguments of a [LeaseExpiry](wrappers/lease-expiry.md) around the filter."""
 
     @model_validator(mode="before")
@@ -137,10 +95,13 @@ class EnvConfig(Section):
     'safe-wrappers[robotics]'`). `module:Id-v0` imports the module first."""
     kwargs: Options = Field(default_factory=dict)
     """Passed to `gymnasium.make`."""
-    faults: Annotated[dict[str, Options], AfterValidator(_check_faults)] = Field(default_factory=dict)
+    reset_options: Options = Field(default_factory=dict)
+    """Options of every reset in training, such as `{layout: {hazards: []}}` of the goal tasks. Evaluation resets
+    without them: every arm is judged on the task itself."""
+    faults: Annotated[dict[str, Options], AfterValidator(check_faults)] = Field(default_factory=dict)
     """[Faults](wrappers/faults.md) between policy and robot, in training and evaluation: a wrapper's name and its
     arguments, the innermost first."""
-    occlusion: Annotated[Options | None, _keys(_arguments(OcclusionPenalty))] = None
+    occlusion: Annotated[Options | None, with_keys(arguments(OcclusionPenalty))] = None
     """Arguments of an [OcclusionPenalty](wrappers/occlusion-penalty.md) around the task, inside the filter."""
     cost: FunctionName | None = None
     """`module:function` that judges a task without a cost of its own: [CostFunction](wrappers/cost-function.md), in
@@ -203,6 +164,9 @@ class ArmConfig(Section):
     """`none`, `protect`, or the keys of [`filter`](#filter)."""
     learner: LearnerConfig = NAIVE
     """What the learner sees where the filter changed an action: see [`learner`](#learner)."""
+    start_from: str | None = None
+    """An arm of this experiment, whose policy of the same seed this one begins with, or an SB3 file `*.zip`: see
+    [fine-tuning](concepts/learner.md#fine-tuning)."""
     normalize: NormalizeConfig = NormalizeConfig()
     action_repeat: Count = 1
     """Control steps for which an action of the policy is held, in training and evaluation
@@ -234,6 +198,8 @@ class ArmConfig(Section):
             del values["learner"]
         else:
             values["learner"] = self.learner.plain()
+        if self.start_from is None:
+            del values["start_from"]
         if self.filter.lease is None:
             del values["filter"]["lease"]
         if self.action_repeat == 1:
@@ -270,6 +236,10 @@ class ExperimentConfig(Section):
     def run_folder(self, arm: ArmConfig, seed: int) -> Path:
         """Where one run lies."""
         return self.folder / arm.name / f"seed_{seed}"
+
+    def begins_with(self, arm: ArmConfig) -> ArmConfig | None:
+        """The arm whose policy an arm begins with; None: none, or a file's."""
+        return next((other for other in self.arms if other.name == arm.start_from), None)
 
     @property
     def evaluation_filter(self) -> FilterConfig:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import platform
+from collections.abc import Iterator
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from typing import Final
@@ -10,6 +12,7 @@ from typing import Final
 import yaml
 
 from ..config import ExperimentConfig
+from ..run.start import START_FILE
 from .markup import details, table, text
 
 _PACKAGES: Final = (
@@ -54,7 +57,20 @@ def about(experiment: ExperimentConfig) -> str:
     steps = sorted({arm.total_steps for arm in experiment.arms})
     how_long = f"{steps[0]:,}" if len(steps) == 1 else f"{steps[0]:,} to {steps[-1]:,}"
     seeds = len(experiment.seeds)
+    begun = "".join(f" {sentence}" for sentence in _begun(experiment))
     return (
         f"{kinds}, {how_long} steps, {seeds} seed{'s' * (seeds > 1)}; evaluation on"
-        f" {experiment.evaluation.episodes} episodes, the same ones for every arm and seed."
+        f" {experiment.evaluation.episodes} episodes, the same ones for every arm and seed.{begun}"
     )
+
+
+def _begun(experiment: ExperimentConfig) -> Iterator[str]:
+    """What arms began with that did not begin at random, as their runs recorded it."""
+    for arm in experiment.arms:
+        path = experiment.run_folder(arm, experiment.seeds[0]) / START_FILE
+        if path.exists():
+            start = json.loads(path.read_text())
+            yield (
+                f"Arm {arm.name} began with the policy of {start['from']} after {start['timesteps']:,} steps, which"
+                " do not count as its own."
+            )

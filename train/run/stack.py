@@ -33,7 +33,7 @@ from .judge import ConstraintJudge
 def make_stack(
     env: EnvConfig, action_filter: FilterConfig, learner: LearnerConfig = NAIVE
 ) -> gym.Env[Any, Any]:
-    """Makes the task; judge, OcclusionPenalty, filter, lease, map, FilterObservation if any; recorder, faults, Monitor.
+    """Makes the task; judge, OcclusionPenalty, filter, lease, map, FilterObservation; recorder, faults, Monitor.
 
     The recorder counts the task's own reward, whatever the learner sees. Monitor does too, but for OcclusionPenalty,
     which is inside of it.

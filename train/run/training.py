@@ -6,6 +6,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,7 +16,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from safe_wrappers.errors import RunStateError
 from safe_wrappers.sb3 import InterventionCallback
@@ -35,8 +36,10 @@ from .callbacks import (
     StopCallback,
     TrainingStopped,
 )
-from .checkpoint import Checkpoint, latest_checkpoint, save_checkpoint
-from .vec_envs import make_vec_env
+from .checkpoint import MODEL, Checkpoint, latest_checkpoint, save_checkpoint
+from .margins import margin_curriculum
+from .start import START_FILE, Policy, Start, begin_with, policy_of_file, policy_of_model, refuse_misfit
+from .vec_envs import make_training_env, make_vec_env
 
 RUN_FILE: Final = "run.json"
 FINISHED_FILE: Final = "finished.json"
@@ -44,7 +47,9 @@ CHECKPOINTS: Final = "checkpoints"
 EVALUATION: Final = "evaluation"
 
 
-def train_run(arm: ArmConfig, seed: int, folder: Path, progress: Progress) -> None:
+def train_run(
+    arm: ArmConfig, seed: int, folder: Path, progress: Progress, start: Start | None = None
+) -> None:
     """Trains one arm with one seed, or goes on where the folder's last checkpoint stands.
 
     A finished run is left as it is, unless the arm's `total_steps` were raised: then it goes on, and its evaluation,
@@ -60,8 +65,10 @@ def train_run(arm: ArmConfig, seed: int, folder: Path, progress: Progress) -> No
         seed: For the networks, the exploration and the envs.
         folder: The run's own folder.
         progress: Where to report to.
+        start: Whose policy a new run begins with; None: one drawn at random.
 
     Raises:
+        ConfigurationError: The policy to begin with does not fit.
         RunStateError: The folder belongs to another config, another process is at work in it, or all its
             checkpoints are damaged.
         RunStoppedError: SIGTERM came; says from which step the run will go on.
@@ -75,7 +82,7 @@ def train_run(arm: ArmConfig, seed: int, folder: Path, progress: Progress) -> No
         checkpoint = latest_checkpoint(folder / CHECKPOINTS, progress.say)
         envs = make_vec_env(arm)
         try:
-            _train(arm, seed, folder, envs, checkpoint, progress)
+            _train(arm, seed, folder, envs, checkpoint, progress, start)
         finally:
             envs.close()
 
@@ -87,10 +94,17 @@ def _train(
     envs: VecEnv,
     checkpoint: Checkpoint | None,
     progress: Progress,
+    start: Start | None,
 ) -> None:
     say = progress.say
     model = _new_model(arm, seed, envs) if checkpoint is None else _continued(arm, envs, checkpoint, say)
+    begun = None
+    if start is not None and checkpoint is None:
+        begun = begin_with(model, f"arms.{arm.name}", start.name, _file_of(start, seed))
     _claim_folder(arm, seed, folder)
+    if begun is not None:
+        write_json(folder / START_FILE, begun)
+        say(f"begins with the policy of {begun['from']}, {begun['timesteps']:,} steps old")
     if is_outgrown(arm, folder):
         shutil.rmtree(folder / EVALUATION, ignore_errors=True)
         (folder / FINISHED_FILE).unlink()
@@ -101,10 +115,10 @@ def _train(
     stream = np.random.SeedSequence((seed, model.num_timesteps)).generate_state(1)[0]
     vec_env.seed(int(stream) >> 1)
     model.set_logger(configure(str(folder / "tensorboard"), ["tensorboard"]))
-    start = time.monotonic()
+    begin = time.monotonic()
 
     def elapsed_s() -> float:
-        return before_s + time.monotonic() - start
+        return before_s + time.monotonic() - begin
 
     def save() -> None:
         save_checkpoint(folder / CHECKPOINTS, model, elapsed_s())
@@ -118,6 +132,7 @@ def _train(
                 EpisodeRows(folder / "episodes.csv"),
                 ProgressCallback(progress.steps, progress.figures, filtered),
                 CheckpointCallback(arm.checkpoint_every, save),
+                *margin_curriculum(arm),
             ]
         )
         try:
@@ -184,6 +199,33 @@ def finished_checkpoint(arm: ArmConfig, seed: int, folder: Path) -> Checkpoint:
             f"{str(folder / CHECKPOINTS)!r} is empty; delete {str(folder)!r} and train again."
         )
     return checkpoint
+
+
+def check_start(arm: ArmConfig, start: Start) -> None:
+    """Refuses a policy to begin with that does not fit, before anything is trained.
+
+    Raises:
+        ConfigurationError: Other spaces, another policy or other scaling of observations; or no such file.
+    """
+    theirs = policy_of_file(start.path) if start.arm is None else _untrained(start.arm)
+    refuse_misfit(f"arms.{arm.name}", start.name, theirs, _untrained(arm))
+
+
+def _untrained(arm: ArmConfig) -> Policy:
+    hyperparameters = dict(arm.hyperparameters)
+    if "buffer_size" in hyperparameters:  # nothing will be replayed
+        hyperparameters["buffer_size"] = 1
+    envs = DummyVecEnv([lambda: make_training_env(arm)])
+    policy = policy_of_model(_new_model(replace(arm, hyperparameters=hyperparameters), 0, envs))
+    envs.close()
+    return policy
+
+
+def _file_of(start: Start, seed: int) -> Path:
+    """The file of the policy that a run begins with."""
+    if start.arm is None:
+        return start.path
+    return finished_checkpoint(start.arm, seed, start.path).folder / MODEL
 
 
 def check_folder(arm: ArmConfig, seed: int, folder: Path) -> None:

@@ -19,6 +19,7 @@ from safe_wrappers.wrappers.action_repeat import ActionRepeat
 
 from ..config import ArmConfig
 from ..processes.parent import end_with_parent
+from .reset_options import ResetOptions
 from .stack import make_stack
 
 _ENDED: Final = (
@@ -29,12 +30,15 @@ _ENDED: Final = (
 
 def make_vec_env(arm: ArmConfig) -> VecEnv:
     """Makes `arm.n_envs` envs, as `arm.vec_env` says."""
-    makes = [functools.partial(_training_env, arm)] * arm.n_envs
+    makes = [functools.partial(make_training_env, arm)] * arm.n_envs
     return DummyVecEnv(makes) if arm.vec_env == "dummy" else ProcessVecEnv(makes)
 
 
-def _training_env(arm: ArmConfig) -> gym.Env[Any, Any]:
+def make_training_env(arm: ArmConfig) -> gym.Env[Any, Any]:
+    """One env as the arm trains in it."""
     env = make_stack(arm.env, arm.filter, arm.learner)
+    if arm.env.reset_options:
+        env = ResetOptions(env, arm.env.reset_options)
     return env if arm.action_repeat == 1 else ActionRepeat(env, arm.action_repeat)
 
 

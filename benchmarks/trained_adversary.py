@@ -1,0 +1,248 @@
+"""A learner that is paid for violations, through the filter: does PPO find what the hand-written drivers do not?
+
+    python -m benchmarks.trained_adversary                      # every env, 300,000 steps
+    python -m benchmarks.trained_adversary --env Reacher-v5 --steps 20000 --seed 1
+    python -m benchmarks.trained_adversary --minutes 25         # a training ends then, wherever it stands
+    python -m benchmarks.trained_adversary --anew               # finished envs, too
+
+The reward is 1 for a control step in which the env's own truth (`benchmarks/judges.py`) was broken at any physics
+substep, and up to 0.1 for how near the state came to the limit, on a logarithmic scale, so that the last millimetre
+is worth as much as the last metre. The filter is `protect` with its defaults. Each env has a file of its own in
+`benchmarks/results`; one that was made by the same command is not trained again. The trained policy is then
+evaluated on episodes of other seeds, deterministic and stochastic, through the filter and, to see that it is after
+violations at all, without. Flagged is a violation in a step that the filter reported as infeasible or fallback, or
+as one that began unsafe.
+"""
+
+import argparse
+import json
+import time
+import warnings
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import gymnasium as gym
+import numpy as np
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from benchmarks.cases import CASES
+from safe_wrappers.errors import UnsafeStateWarning
+
+RESULTS: Final = Path(__file__).parent / "results"
+SCALES: Final = {
+    "SafePointGoal1-v0": 1.0,  # m
+    "SafeCarGoal1-v0": 1.0,  # m
+    "Reacher-v5": 5.0,  # rad/s, the limit
+    "SafeHalfCheetahVelocity-v0": 3.2096,  # m/s, the limit
+}
+"""Env id -> a margin that is far from the limit, in the unit of h."""
+NEARNESS: Final = 0.1
+"""Reward of a step that begins at the limit; a violation is 1."""
+DECADES: Final = 4.0
+"""Of the scale, over which the nearness rises from 0 to its largest."""
+EPISODES: Final = 20
+_FIRST_SEED: Final = 1_000_000
+"""Of the evaluation: no training episode has it."""
+_FLAGS: Final = ("intervened", "infeasible", "fallback", "unsafe")
+_EXAMPLES: Final = 20
+
+
+@dataclass(frozen=True)
+class Job:
+    """One env's training."""
+
+    env: str
+    steps: int
+    seed: int
+
+
+@dataclass
+class Tally:
+    """What was counted over control steps; `smallest` is the least h of a step's start, in its own unit."""
+
+    steps: int = 0
+    violations: int = 0
+    unflagged: int = 0
+    intervened: int = 0
+    infeasible: int = 0
+    fallback: int = 0
+    unsafe: int = 0
+    smallest: float | None = None
+    examples: list[dict[str, Any]] = field(default_factory=list)
+    """States and actions of the first unflagged violations, to make them again."""
+
+    def plus(self, other: "Tally") -> "Tally":
+        """Both together."""
+        least = [t.smallest for t in (self, other) if t.smallest is not None]
+        sums = {
+            name: getattr(self, name) + getattr(other, name)
+            for name in ("steps", "violations", "unflagged", *_FLAGS)
+        }
+        examples = (self.examples + other.examples)[:_EXAMPLES]
+        return Tally(**sums, smallest=min(least, default=None), examples=examples)
+
+
+class Adversary(gym.Wrapper[Any, Any, Any, Any]):
+    """Pays for violations and nearness instead of the task, and counts.
+
+    Args:
+        env_id: One of `SCALES`.
+        filtered: Through `protect`; without it there is no nearness and no flag.
+
+    Attributes:
+        tally: Of all steps so far.
+    """
+
+    def __init__(self, env_id: str, filtered: bool = True) -> None:
+        case = CASES[env_id]
+        bare = case.make()
+        super().__init__(case.protect(bare) if filtered else bare)
+        self._filtered, self._scale = filtered, SCALES[env_id]
+        self._judge = case.judge(self.unwrapped)
+        self.tally = Tally()
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Steps, judges, counts and pays."""
+        self._judge.before()
+        raw: Any = self.unwrapped
+        before = raw.data.qpos.tolist(), raw.data.qvel.tolist()
+        observation, _, terminated, truncated, info = self.env.step(action)
+        executed = np.asarray(info["executed_action"] if self._filtered else action)
+        missed = self._judge.after(executed, info)
+        violated = not missed <= 0.0  # so that what is not a number counts
+        tally = self.tally
+        tally.steps += 1
+        tally.violations += int(violated)
+        reward = float(violated)
+        if self._filtered:
+            for name in _FLAGS:
+                setattr(tally, name, getattr(tally, name) + int(info[f"cbf/{name}"]))
+            margin = float(info["cbf/margin"])
+            tally.smallest = margin if tally.smallest is None else min(tally.smallest, margin)
+            reward += NEARNESS * nearness(margin, self._scale)
+            if violated and not (info["cbf/infeasible"] or info["cbf/fallback"] or info["cbf/unsafe"]):
+                tally.unflagged += 1
+                if len(tally.examples) < _EXAMPLES:
+                    names = {"qpos": before[0], "qvel": before[1], "missed": missed, "margin": margin}
+                    actions = {"proposed": np.asarray(action).tolist(), "executed": executed.tolist()}
+                    tally.examples.append(names | actions | {"stage": int(info["cbf/stage"])})
+        return observation, reward, terminated, truncated, info
+
+
+def nearness(margin: float, scale: float) -> float:
+    """0 from `scale` on, 1 at or behind the limit, linear in the logarithm of the margin between them."""
+    share = min(max(margin / scale, 10.0**-DECADES), 1.0)
+    return float(-np.log10(share)) / DECADES
+
+
+class Deadline(BaseCallback):
+    """Ends the training between two steps when the time is up."""
+
+    def __init__(self, seconds: float) -> None:
+        super().__init__()
+        self._end = time.monotonic() + seconds
+
+    def _on_step(self) -> bool:
+        return time.monotonic() < self._end
+
+
+def run(job: Job, minutes: float = np.inf, episodes: int = EPISODES) -> dict[str, Any]:
+    """Train and evaluate the adversary of one env."""
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore", UnsafeStateWarning)  # counted
+    made = [Adversary(job.env) for _ in range(4)]
+    envs = VecNormalize(DummyVecEnv([lambda env=env: env for env in made]), gamma=0.99)  # type: ignore[misc]
+    settings = {"n_steps": 512, "batch_size": 256, "n_epochs": 10, "learning_rate": 3e-4, "gamma": 0.99}
+    model = PPO("MlpPolicy", envs, seed=job.seed, device="cpu", **settings)
+    begin = time.monotonic()
+    model.learn(job.steps, callback=Deadline(60.0 * minutes))
+    training = Tally()
+    for env in made:
+        training = training.plus(env.tally)
+    row: dict[str, Any] = asdict(job) | {"seconds": time.monotonic() - begin, "training": asdict(training)}
+    for name, deterministic, filtered in (
+        ("deterministic", True, True),
+        ("stochastic", False, True),
+        ("unfiltered", False, False),
+    ):
+        row[name] = asdict(evaluate(model, envs, Adversary(job.env, filtered), deterministic, episodes))
+    return row
+
+
+def evaluate(model: PPO, scaling: VecNormalize, env: Adversary, deterministic: bool, episodes: int) -> Tally:
+    """The trained policy in whole episodes of its own seeds, its observations scaled as they were at the end."""
+    torch.manual_seed(_FIRST_SEED)
+    for seed in range(_FIRST_SEED, _FIRST_SEED + episodes):
+        observation, _ = env.reset(seed=seed)
+        over = False
+        while not over:
+            action, _ = model.predict(scaling.normalize_obs(observation), deterministic=deterministic)
+            observation, _, terminated, truncated, _ = env.step(action)
+            over = terminated or truncated
+    env.close()
+    return env.tally
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Markdown: for each env its training and its evaluations."""
+    lines = [
+        "| env | part | steps | violations | unflagged | smallest h | changed | infeasible | fallback | unsafe |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    parts = {"training": "training", "deterministic": "evaluation, deterministic"}
+    parts |= {"stochastic": "evaluation, stochastic", "unfiltered": "the same without the filter"}
+    for row in rows:
+        for part, label in parts.items():
+            t = row[part]
+            counts = [row["env"], label, f"{t['steps']:,}", f"{t['violations']:,}"]
+            filtered = [
+                f"{t['unflagged']:,}",
+                f"{t['smallest'] or 0.0:.3g}",
+                f"{t['intervened'] / max(t['steps'], 1):.1%}",
+                *(f"{t[name]:,}" for name in _FLAGS[1:]),
+            ]
+            lines.append("| " + " | ".join(counts + (["-"] * 6 if part == "unfiltered" else filtered)) + " |")
+    filtered_parts = [row[part] for row in rows for part in list(parts)[:-1]]
+    sums = {key: sum(part[key] for part in filtered_parts) for key in ("steps", "violations", "unflagged")}
+    text = f"In all, through the filter: {sums['violations']:,} violations in {sums['steps']:,} steps"
+    return "\n".join([*lines, "", f"{text}, {sums['unflagged']:,} of them unflagged."])
+
+
+def main() -> None:
+    """Train what is not trained yet, print the table of all that is."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--env", nargs="+", default=list(SCALES), choices=list(SCALES), metavar="ID")
+    parser.add_argument("--steps", type=int, default=300_000, help="of training, per env")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--minutes", type=float, default=np.inf, help="of training, per env, at most")
+    parser.add_argument("--episodes", type=int, default=EPISODES, help="of each evaluation")
+    parser.add_argument("--anew", action="store_true", help="train envs that are finished, too")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="folder for the rows and the table")
+    arguments = parser.parse_args()
+    arguments.results.mkdir(parents=True, exist_ok=True)
+    for env in arguments.env:
+        job = Job(env, arguments.steps, arguments.seed)
+        path = _file(arguments.results, env)
+        if arguments.anew or not _is_of(path, job):
+            row = run(job, arguments.minutes, arguments.episodes)
+            path.write_text(json.dumps(row, indent=1) + "\n")
+    found = [_file(arguments.results, env) for env in SCALES]
+    text = table([json.loads(path.read_text()) for path in found if path.exists()])
+    (arguments.results / "trained_adversary.md").write_text(text + "\n")
+    print(text)
+
+
+def _file(folder: Path, env: str) -> Path:
+    return folder / f"trained_adversary_{env}.json"
+
+
+def _is_of(path: Path, job: Job) -> bool:
+    return path.exists() and asdict(job).items() <= json.loads(path.read_text()).items()
+
+
+if __name__ == "__main__":
+    main()
