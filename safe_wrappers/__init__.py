@@ -28,6 +28,7 @@ from safe_wrappers.wrappers.chunk_handover import ChunkHandover
 from safe_wrappers.wrappers.contact_monitor import ContactMonitor
 from safe_wrappers.wrappers.cost_function import CostFunction
 from safe_wrappers.wrappers.filter_observation import FilterObservation
+from safe_wrappers.wrappers.learner.stuck_escape import StuckEscape
 from safe_wrappers.wrappers.lease.stopping_budget import StoppingBudget
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
@@ -60,6 +61,7 @@ __all__ = [
     "SafeWrappersError",
     "SlipLimiter",
     "StoppingBudget",
+    "StuckEscape",
     "TeleopChannel",
     "UnsafeStateWarning",
     "VectorCBFActionFilter",

@@ -98,6 +98,12 @@ _NUMBERS: Final = [key for key in KEYS.values() if not key.shape]
 CBF_BOOLS: Final = tuple(key.name for key in _NUMBERS if key.dtype == "bool")
 CBF_FLOATS: Final = tuple(key.name for key in _NUMBERS if key.dtype == "float64")
 
+# StuckEscape, every step ------------------------------------------------------------------------------------
+CBF_STUCK: Final = _key("cbf/stuck", "bool", chunk="any", log="stuck")
+"""For `after_s` the filter has changed most actions, and the rewards have not added up to more than `progress`."""
+CBF_ESCAPING: Final = _key("cbf/escaping", "bool", chunk="any")
+"""A drawn action was proposed in the policy's place."""
+
 # Traction in a filter, SlipLimiter: every step --------------------------------------------------------------------
 SLIP_RATIO: Final = _key("slip/ratio", "float64", shape="(wheels,)", log="slip")
 """Normalised slip of each wheel, in the order of `wheels`, before the step."""
@@ -260,6 +266,7 @@ EPISODE: Final = (
     EpisodeFigure("fallback", "count", (CBF_FALLBACK,), "interventions/fallback"),
     EpisodeFigure("nonfinite", "count", (CBF_NONFINITE,)),
     EpisodeFigure("unsafe", "count", (CBF_UNSAFE,)),
+    EpisodeFigure("stuck", "count", (CBF_STUCK,)),
     EpisodeFigure("lease_expired", "count", (LEASE_EXPIRED,)),
     EpisodeFigure("lease_refused", "count", (LEASE_REFUSED,)),
     EpisodeFigure("lease_braking", "count", (LEASE_BRAKING,)),

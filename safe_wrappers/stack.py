@@ -18,6 +18,7 @@ class Layer(Enum):
     MAP = auto()
     LEASE = auto()
     CHANNEL = auto()
+    ESCAPE = auto()
     OBSERVATION = auto()
     MONITOR = auto()
     ADAPTION = auto()
@@ -29,6 +30,7 @@ class Layer(Enum):
 _PER_CHUNK: Final = {Layer.HANDOVER: "its step is a whole chunk, not a control step"}
 _LAST_WORD: Final = "it changes actions that the filter has checked, and the filter has the last word"
 _AGE: Final = "it hands commands over, and the lease must know how old each one is"
+_AUTHORITY: Final = "the actions that it draws need authority as the policy's do"
 _NETWORK: Final = "it hands commands over, which the channel must do at every control step"
 
 _WRONG_WAY_ROUND: Final = {
@@ -42,7 +44,7 @@ _WRONG_WAY_ROUND: Final = {
     Layer.FILTER: {
         Layer.RECORDER: "it would see no report of the filter, and count no intervention",
         Layer.OBSERVATION: "it shows what the filter inside of it decides by",
-        **dict.fromkeys((Layer.LEASE, Layer.CHANNEL, Layer.HANDOVER, Layer.FAULT), _LAST_WORD),
+        **dict.fromkeys((Layer.LEASE, Layer.CHANNEL, Layer.ESCAPE, Layer.HANDOVER, Layer.FAULT), _LAST_WORD),
     },
     Layer.MAP: {
         Layer.FAULT: "actions are mapped for the state in which they are executed, and it delays them",
@@ -50,12 +52,19 @@ _WRONG_WAY_ROUND: Final = {
     },
     Layer.LEASE: {
         Layer.MAP: "its brake is no policy's action, and would be mapped like one",
+        Layer.ESCAPE: _AUTHORITY,
         Layer.RECORDER: "it would count no lease that expires",
         **dict.fromkeys((Layer.HANDOVER, Layer.FAULT), _AGE),
     },
     Layer.CHANNEL: {
+        Layer.ESCAPE: _AUTHORITY,
         Layer.RECORDER: "it would see no revoked authority",
         **dict.fromkeys((Layer.HANDOVER, Layer.FAULT), _NETWORK),
+    },
+    Layer.ESCAPE: {
+        Layer.RECORDER: "it would count no deadlock",
+        Layer.ADAPTION: "it would take a penalty for an action that the policy has not proposed",
+        **_PER_CHUNK,
     },
     Layer.OBSERVATION: {
         Layer.CHANNEL: "what the filter sees now would stand beside an image that is delayed",
@@ -87,6 +96,7 @@ _NOT_TOGETHER: Final = {
     Layer.ADAPTION: {
         Layer.ADAPTION: "the env has an AdaptionPenalty already, whose penalty would be taken twice"
     },
+    Layer.ESCAPE: {Layer.ESCAPE: "both would act in the policy's place; use one"},
     Layer.OBSERVATION: {Layer.OBSERVATION: "the observation shows what the filter decides by already"},
     Layer.HANDOVER: {Layer.HANDOVER: "this env takes chunks already, and a chunk of chunks has no meaning"},
 }

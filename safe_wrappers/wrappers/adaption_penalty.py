@@ -7,7 +7,7 @@ from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.cbf_action_filter import is_filtered
+from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
 
 
@@ -63,7 +63,7 @@ class AdaptionPenalty(LayerWrapper):
         scale: float = 1.0,
     ) -> None:
         LayerWrapper.__init__(self, env)
-        if not is_filtered(env):
+        if filter_inside(env) is None:
             example = "AdaptionPenalty(sw.protect(env), penalty=...)"
             raise ConfigurationError(f"AdaptionPenalty needs a CBFActionFilter inside: {example}")
         self.penalty = non_negative("penalty", penalty, "the task's reward")

@@ -268,6 +268,6 @@ def _unique(kinds: list[str]) -> list[str]:
     return [k if kinds.count(k) == 1 else f"{k} {place}" for k, place in zip(kinds, places, strict=True)]
 
 
-def is_filtered(env: Env) -> bool:
-    """Whether there is a filter among an env's wrappers."""
-    return any(isinstance(inner, CBFActionFilter) for inner in wrappers_of(env))
+def filter_inside(env: Env) -> CBFActionFilter | None:
+    """The filter among an env's wrappers, or None."""
+    return next((inner for inner in wrappers_of(env) if isinstance(inner, CBFActionFilter)), None)

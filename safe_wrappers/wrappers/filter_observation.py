@@ -10,11 +10,10 @@ from safe_wrappers import info as keys
 from safe_wrappers.checks import whole_number
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Constraint
-from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.serialize import plain_data
 from safe_wrappers.stack import Layer
-from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
+from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter, filter_inside
 from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step
 
 KEY: Final = "filter"
@@ -61,7 +60,7 @@ class FilterObservation(LayerWrapper):
     ) -> None:
         arguments = dict(locals())
         LayerWrapper.__init__(self, env)
-        inside = next((w for w in wrappers_of(env) if isinstance(w, CBFActionFilter)), None)
+        inside = filter_inside(env)
         if inside is None and constraints is None:
             wanted = (
                 "FilterObservation(sw.protect(env)), or constraints=[...] to observe them without a filter"

@@ -98,7 +98,9 @@ def _with_constraints(arm: ArmConfig, experiment: ExperimentConfig) -> ArmConfig
             f"env.{wanted[0]}: there is no filter whose constraints could be used; give an arm or the evaluation one "
             f"(evaluation: {{filter: protect}}){instead}."
         )
-    return replace(arm, env=replace(arm.env, **dict.fromkeys(wanted, replace(chosen, lease=None))))
+    return replace(
+        arm, env=replace(arm.env, **dict.fromkeys(wanted, replace(chosen, lease=None, escape=None)))
+    )
 
 
 def _arm(name: str, own: Mapping[str, Any], common: Mapping[str, Any]) -> ArmConfig:

@@ -15,6 +15,7 @@ from pydantic.dataclasses import dataclass
 
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.protect import protect_options
+from safe_wrappers.wrappers.learner.stuck_escape import StuckEscape
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 
 from .algorithm_settings import HER
@@ -42,6 +43,8 @@ class FilterConfig(Section):
     """Further arguments of the factory."""
     lease: Annotated[Options | None, AfterValidator(check_lease)] = None
     """Arguments of a [LeaseExpiry](wrappers/lease-expiry.md) around the filter."""
+    escape: Annotated[Options | None, with_keys(arguments(StuckEscape))] = None
+    """Arguments of a [StuckEscape](wrappers/stuck-escape.md) around the filter."""
 
     @model_validator(mode="before")
     @classmethod
@@ -55,11 +58,12 @@ class FilterConfig(Section):
     @model_validator(mode="after")
     def _is_one_filter(self) -> FilterConfig:
         both = self.protect is not None and self.factory is not None
-        idle = (self.kwargs and self.factory is None) or (self.lease is not None and self.kind == "none")
+        around = self.lease is not None or self.escape is not None
+        idle = (self.kwargs and self.factory is None) or (around and self.kind == "none")
         if both or idle:
             raise ConfigurationError(
                 "expected none, protect, {protect: {...}} or {factory: 'module:function', kwargs: {...}}, with "
-                f"lease: {{...}} beside it if there is one; got {asdict(self)}."
+                f"lease: {{...}} and escape: {{...}} beside it if there is one; got {asdict(self)}."
             )
         return self
 
@@ -73,7 +77,8 @@ class FilterConfig(Section):
     def plain(self) -> dict[str, Any]:
         """As run folders have it."""
         arguments = self.kwargs if self.protect is None else self.protect
-        return {"kind": self.kind, "kwargs": arguments, "factory": self.factory or "", "lease": self.lease}
+        found = {"kind": self.kind, "kwargs": arguments, "factory": self.factory or "", "lease": self.lease}
+        return found if self.escape is None else {**found, "escape": self.escape}
 
 
 def _of_all_arms(given: Any) -> Any:

@@ -39,6 +39,7 @@ METRICS: Final = {
     "infeasible_per_1000": "Infeasible steps / 1000",
     "fallback": "Fallback steps, total",
     "unsafe": "Steps begun with h < 0, total",
+    "stuck": "Stuck steps, total",
     "lease_braking": "Steps braked by the lease, total",
     "lease_expired": "Leases run out, total",
     "goals_reached": "Goals / episode",

@@ -14,10 +14,11 @@ from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants import MujocoPlant
 from safe_wrappers.wrappers.adaption_penalty import AdaptionPenalty
-from safe_wrappers.wrappers.cbf_action_filter import is_filtered
+from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.cost_function import CostFunction
 from safe_wrappers.wrappers.faults import FAULTS
 from safe_wrappers.wrappers.filter_observation import FilterObservation
+from safe_wrappers.wrappers.learner.stuck_escape import StuckEscape
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
@@ -33,7 +34,7 @@ from .judge import ConstraintJudge
 def make_stack(
     env: EnvConfig, action_filter: FilterConfig, learner: LearnerConfig = NAIVE
 ) -> gym.Env[Any, Any]:
-    """Makes the task; judge, OcclusionPenalty, filter, lease, map, FilterObservation; recorder, faults, Monitor.
+    """Makes the task with all its layers, from the judge to SB3's Monitor.
 
     The recorder counts the task's own reward, whatever the learner sees. Monitor does too, but for OcclusionPenalty,
     which is inside of it.
@@ -68,6 +69,8 @@ def make_stack(
     if learner.maps and action_filter.kind != "none":
         named = ":" in learner.anchor
         task = SafeActionMap(task, _function(learner.anchor, "learner.anchor") if named else learner.anchor)
+    if action_filter.escape is not None:
+        task = StuckEscape(task, **action_filter.escape)
     if observed is not None:
         task = _with_features(task, observed)
     recorded: gym.Env[Any, Any] = RecordInterventions(task)
@@ -100,15 +103,15 @@ def _filtered(task: gym.Env[Any, Any], action_filter: FilterConfig) -> gym.Env[A
 
 def _with_features(task: gym.Env[Any, Any], observed: gym.Env[Any, Any]) -> FilterObservation:
     """The task with what its filter decides by; without one, what a filter around it, which is not stepped, would."""
-    if is_filtered(task):
+    if filter_inside(task) is not None:
         return FilterObservation(task)
-    if not is_filtered(observed):
+    observer = filter_inside(observed)
+    if observer is None:
         raise ConfigurationError(
             "env.observation: the filter has no constraints to observe (a CBFActionFilter has)"
         )
-    plant = observed.get_wrapper_attr("plant")
-    plant = None if isinstance(plant, MujocoPlant) else plant
-    return FilterObservation(task, observed.get_wrapper_attr("constraints"), plant)
+    plant = None if isinstance(observer.plant, MujocoPlant) else observer.plant
+    return FilterObservation(task, observer.constraints, plant)
 
 
 def _leased(task: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> LeaseExpiry:

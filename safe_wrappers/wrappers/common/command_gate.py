@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
 from safe_wrappers.plants.env_checks import check_actions, check_timing
-from safe_wrappers.wrappers.cbf_action_filter import is_filtered
+from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
 from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Step
 from safe_wrappers.wrappers.common.receiver import SAME_STEP, CommandReceiver
@@ -26,7 +26,7 @@ class CommandGate(LayerWrapper, CommandReceiver):
         self._same_s = SAME_STEP * self.control_dt
         self._shape, self._dtype = space.shape, space.dtype
         self._low, self._high = (np.nan_to_num(end).astype(np.float64) for end in (space.low, space.high))
-        self._filtered = is_filtered(env)  # then the filter reports what was executed
+        self._filtered = filter_inside(env) is not None  # then the filter reports what was executed
         self._warned = False
 
     def _start(self, info: dict[str, Any]) -> None:
