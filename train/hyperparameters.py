@@ -84,7 +84,8 @@ def _replay_buffer(arm: ArmConfig, envs: VecEnv) -> tuple[type, dict[str, Any]] 
 
     mode = {"mode": arm.learner.kind}
     if arm.replays_goals:
-        return (HerReplayBuffer, {}) if arm.learner.kind == "naive" else (ExecutedActionHerReplayBuffer, mode)
+        own = arm.learner.stores_executed or arm.learner.penalised
+        return (ExecutedActionHerReplayBuffer, mode) if own else (HerReplayBuffer, {})
     if not arm.learner.stores_executed:
         return None
     has_dict = isinstance(envs.observation_space, spaces.Dict)

@@ -23,6 +23,7 @@ TEXT = {
         "measure every physics substep",
         "contact/*, balance/*",
     ),
+    "SafeActionMap": ("", ON, "maps the policy's box onto what is admitted", "map/*"),
     "LeaseExpiry": (
         "LeaseExpiry  or  TeleopChannel",
         ON,
@@ -58,6 +59,7 @@ def stack() -> list[str]:
     env = sw.OcclusionPenalty(env, [cars], sensor="eye", tolerance=0.5)
     env = sw.protect(env)
     env = sw.LeaseExpiry(env, env.constraints[0], closing_speed=3.0)
+    env = sw.SafeActionMap(env)
     env = sw.AdaptionPenalty(sw.RecordInterventions(sw.ContactMonitor(env)), penalty=0.1)
     env = sw.ChunkHandover(env, 16, 8)
     return names(faults.Outages(env, mean_between_s=2.0, mean_length_s=0.5))
@@ -83,7 +85,7 @@ def draw() -> Figure:
     layers = stack()
     assert set(layers) == set(TEXT)
     assert [n.replace("TeleopChannel", "LeaseExpiry") for n in remote()] == [n for n in layers if n in REMOTE]
-    figure = Figure(figsize=(7.2, 5.6))
+    figure = Figure(figsize=(7.2, 6.0))
     ax = figure.subplots()
     bottom = -len(layers) - 1
     for k, name in enumerate(layers):

@@ -40,8 +40,8 @@ class SafeActionMap(LayerWrapper):
     itself is always asked about. The edge is found to a thousandth of the ray. The box ends where the actuators
     saturate: beyond, actions differ in nothing.
 
-    **What it asks** is what the filter asks, many times in a step (up to 5 + 8 actions, and "centre" up to 13 for
-    each component), which is dear where constraints forecast.
+    **What it asks** is what the filter asks, up to 14 times in a step, and for "centre" up to 13 times more for each
+    component, which is dear where constraints forecast.
 
     Args:
         env: With a `CBFActionFilter` inside, and a bounded action space.
@@ -128,10 +128,8 @@ class SafeActionMap(LayerWrapper):
 
     def _acting(self) -> tuple[Array, Array]:
         """The box of actions between which the force still changes: beyond it a ray would lead nowhere."""
-        acting = self._filter.filter.plant.acting_range
-        if acting is None:
-            return self._low, self._high
-        low, high = np.clip(acting, self._low, self._high)
+        plant = self._filter.filter.plant
+        low, high = np.clip(plant.acting_range or (plant.lower, plant.upper), self._low, self._high)
         return low, high
 
     def _anchor(self, boxed: Array, low: Array, high: Array) -> Array | None:

@@ -102,7 +102,7 @@ def test_trained_killed_continued_and_evaluated(fake_experiment, monkeypatch, al
 
 
 @pytest.mark.parametrize("algorithm", [*ON_POLICY, *OFF_POLICY])
-@pytest.mark.parametrize("kind", ["naive", "adaption_penalty", "safe_action", "both"])
+@pytest.mark.parametrize("kind", ["naive", "adaption_penalty", "safe_action", "both", "safe_set_map"])
 def test_which_algorithm_can_have_which_learner(fake_experiment, algorithm, kind):
     installed(algorithm)
     penalty = ", penalty: 0.1" if kind in ("adaption_penalty", "both") else ""

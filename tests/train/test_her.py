@@ -31,7 +31,9 @@ LEARNERS = {
     "adaption_penalty": "{kind: adaption_penalty, penalty: 7.0}",
     "safe_action": "safe_action",
     "both": "{kind: both, penalty: 7.0}",
+    "safe_set_map": "{kind: safe_set_map, anchor: closest}",
 }
+SB3S_BUFFER = ("naive", "safe_set_map")
 
 
 class Goals(gym.Wrapper):
@@ -87,10 +89,10 @@ def test_trained_killed_continued_and_evaluated(fake_experiment, monkeypatch, re
     folder = run_killed_after(experiment, 1, monkeypatch, arm=0)
     checkpoint = latest_checkpoint(folder / "checkpoints", pytest.fail)
     buffer = checkpoint.load_model("SAC", make_vec_env(arm), "cpu").replay_buffer
-    assert type(buffer) is (HerReplayBuffer if kind == "naive" else ExecutedActionHerReplayBuffer)
-    assert getattr(buffer, "mode", "naive") == kind
+    assert type(buffer) is (HerReplayBuffer if kind in SB3S_BUFFER else ExecutedActionHerReplayBuffer)
+    assert getattr(buffer, "mode", kind) == kind
     assert (buffer.size(), buffer.n_sampled_goal) == (64, 2)
-    assert buffer.sample(9).rewards[3:].min() < -6 or kind in ("naive", "safe_action")
+    assert buffer.sample(9).rewards[3:].min() < -6 or kind in ("safe_action", *SB3S_BUFFER)
     # The episode that the kill cut is whole: there are new ones after it.
     assert (buffer.ep_length[:64] > 0).all() and buffer.timeouts[63, 0] == 1.0
     train_run(arm, 0, folder, Reports().progress)
