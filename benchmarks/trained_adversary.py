@@ -150,7 +150,7 @@ class Deadline(BaseCallback):
         return time.monotonic() < self._end
 
 
-def run(job: Job, minutes: float = np.inf, episodes: int = EPISODES) -> dict[str, Any]:
+def run(job: Job, minutes: float | None = None, episodes: int = EPISODES) -> dict[str, Any]:
     """Train and evaluate the adversary of one env."""
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", UnsafeStateWarning)  # counted
@@ -159,7 +159,7 @@ def run(job: Job, minutes: float = np.inf, episodes: int = EPISODES) -> dict[str
     settings = {"n_steps": 512, "batch_size": 256, "n_epochs": 10, "learning_rate": 3e-4, "gamma": 0.99}
     model = PPO("MlpPolicy", envs, seed=job.seed, device="cpu", **settings)
     begin = time.monotonic()
-    model.learn(job.steps, callback=Deadline(60.0 * minutes))
+    model.learn(job.steps, callback=None if minutes is None else Deadline(60.0 * minutes))
     training = Tally()
     for env in made:
         training = training.plus(env.tally)
@@ -218,7 +218,7 @@ def main() -> None:
     parser.add_argument("--env", nargs="+", default=list(SCALES), choices=list(SCALES), metavar="ID")
     parser.add_argument("--steps", type=int, default=300_000, help="of training, per env")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--minutes", type=float, default=np.inf, help="of training, per env, at most")
+    parser.add_argument("--minutes", type=float, help="of training, per env, at most")
     parser.add_argument("--episodes", type=int, default=EPISODES, help="of each evaluation")
     parser.add_argument("--anew", action="store_true", help="train envs that are finished, too")
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder for the rows and the table")
@@ -227,8 +227,9 @@ def main() -> None:
     for env in arguments.env:
         job = Job(env, arguments.steps, arguments.seed)
         path = _file(arguments.results, env)
-        if arguments.anew or not _is_of(path, job):
-            row = run(job, arguments.minutes, arguments.episodes)
+        limits = {"minutes": arguments.minutes, "episodes": arguments.episodes}
+        if arguments.anew or not _is_of(path, asdict(job) | limits):
+            row = run(job, **limits) | limits
             path.write_text(json.dumps(row, indent=1) + "\n")
     found = [_file(arguments.results, env) for env in SCALES]
     text = table([json.loads(path.read_text()) for path in found if path.exists()])
@@ -240,8 +241,9 @@ def _file(folder: Path, env: str) -> Path:
     return folder / f"trained_adversary_{env}.json"
 
 
-def _is_of(path: Path, job: Job) -> bool:
-    return path.exists() and asdict(job).items() <= json.loads(path.read_text()).items()
+def _is_of(path: Path, settings: dict[str, Any]) -> bool:
+    """Whether the file is of these settings."""
+    return path.exists() and settings.items() <= json.loads(path.read_text()).items()
 
 
 if __name__ == "__main__":

@@ -106,7 +106,7 @@ def test_a_deadline_ends_the_training_where_it_stands():
 def test_a_finished_env_is_not_trained_again(monkeypatch, capsys, tmp_path):
     trained = []
 
-    def counting(job, *_):
+    def counting(job, minutes, episodes):
         trained.append((job.env, job.seed))
         tally = dataclasses.asdict(Tally(steps=1000, intervened=250, smallest=0.0042))
         parts = ("training", "deterministic", "stochastic", "unfiltered")
@@ -123,8 +123,11 @@ def test_a_finished_env_is_not_trained_again(monkeypatch, capsys, tmp_path):
     command("--env", ENV, "--seed", "1")
     command("--env", ENV, "--seed", "1", "--anew")
     assert trained == [(ENV, 0), (ENV, 1), (ENV, 1)]
+    command("--env", ENV, "--seed", "1", "--minutes", "2")
+    command("--env", ENV, "--seed", "1", "--minutes", "2")
+    assert len(trained) == 4  # what a time limit has cut is not what has none
     whole = command("--seed", "1")
-    assert {env for env, _ in trained} == set(trained_adversary.SCALES) and len(trained) == 6
+    assert {env for env, _ in trained} == set(trained_adversary.SCALES) and len(trained) == 8
     head, _, *rows = [line.strip("|").split("|") for line in whole.splitlines() if line.startswith("|")]
     assert len(rows) == 16 and all(len(row) == len(head) for row in rows)
     assert (tmp_path / "trained_adversary.md").read_text() == whole
