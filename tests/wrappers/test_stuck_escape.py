@@ -47,7 +47,7 @@ def test_reporting_alone_changes_nothing():
 
 
 def test_a_drawn_action_is_held_filtered_and_reported_as_a_change_of_the_policys():
-    infos, _, env = pushing(escape_s=0.5)
+    infos, _, _ = pushing(escape_s=0.5)
     escaping = [i[keys.CBF_ESCAPING] for i in infos]
     began = escaping.index(True)
     assert infos[began - 1][keys.CBF_STUCK]

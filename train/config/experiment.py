@@ -10,7 +10,8 @@ from safe_wrappers.errors import ConfigurationError
 
 from .algorithm_settings import HER, check_hyperparameters
 from .algorithms import DETERMINISTIC, DISCRETE, OFF_POLICY, ON_POLICY
-from .models import NAIVE, ArmConfig, ExperimentConfig, default_buffer_size
+from .learner import NAIVE
+from .models import ArmConfig, ExperimentConfig, default_buffer_size
 from .names import check_name
 from .types import validate
 
@@ -98,9 +99,8 @@ def _with_constraints(arm: ArmConfig, experiment: ExperimentConfig) -> ArmConfig
             f"env.{wanted[0]}: there is no filter whose constraints could be used; give an arm or the evaluation one "
             f"(evaluation: {{filter: protect}}){instead}."
         )
-    return replace(
-        arm, env=replace(arm.env, **dict.fromkeys(wanted, replace(chosen, lease=None, escape=None)))
-    )
+    settings: dict[str, Any] = dict.fromkeys(wanted, replace(chosen, lease=None, escape=None))
+    return replace(arm, env=replace(arm.env, **settings))
 
 
 def _arm(name: str, own: Mapping[str, Any], common: Mapping[str, Any]) -> ArmConfig:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from safe_wrappers.errors import RunStateError
-from safe_wrappers.wrappers.action_repeat import ActionRepeat
+from safe_wrappers.wrappers.learner.action_repeat import ActionRepeat
 
 from ..config import ArmConfig
 from ..processes.parent import end_with_parent
@@ -30,7 +30,7 @@ _ENDED: Final = (
 
 def make_vec_env(arm: ArmConfig) -> VecEnv:
     """Makes `arm.n_envs` envs, as `arm.vec_env` says."""
-    makes = [functools.partial(make_training_env, arm)] * arm.n_envs
+    makes: list[Callable[[], gym.Env[Any, Any]]] = [functools.partial(make_training_env, arm)] * arm.n_envs
     return DummyVecEnv(makes) if arm.vec_env == "dummy" else ProcessVecEnv(makes)
 
 

@@ -92,7 +92,8 @@ class Coasting:
 
     def velocity(self) -> Array:
         """Of the body's origin along world x and y, m/s, shape (2,)."""
-        return self._plant.qvel[self._motion[:2]]
+        velocity: Array = self._plant.qvel[self._motion[:2]]
+        return velocity
 
     def speed(self, turning_radius: float) -> float:
         """Present speed of its origin, plus that of a point at this distance as it turns, m/s."""

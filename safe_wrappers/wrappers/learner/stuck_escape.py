@@ -4,23 +4,24 @@ from collections import deque
 from typing import Any, ClassVar
 
 import numpy as np
+from gymnasium.spaces import Box
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
-from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step, WrapperRng
+from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step, WrapperRng
 from safe_wrappers.wrappers.common.receiver import action_array
 
 
 class StuckEscape(LayerWrapper):
     """Proposes an action drawn at random for a while, in the policy's place, where policy and filter are stuck.
 
-    Stuck means: in the last `after_s` the filter changed more than half of the actions, and the rewards of these steps
-    add up to `progress` at most. A deterministic policy that pushes against the filter, or circles an obstacle, does so
-    for ever. The drawn action is held for `escape_s`, and the filter inside checks it like any other: what the filter
-    guarantees stays guaranteed. It is no plan: it ends a deadlock by chance, and may have to act again.
+    Stuck means: in the last `after_s` the filter changed more than half of the actions, and the rewards of these
+    steps add up to `progress` at most. A deterministic policy that pushes against the filter, or circles an obstacle,
+    may do so for ever. The drawn action is held for `escape_s`, and the filter inside checks it like any other, so
+    that its guarantees stay. A deadlock is ended by chance, not by a plan; it may take several draws.
 
     While it acts, `proposed_action`, `cbf/intervened` and `cbf/correction` are about the policy's own action.
 
@@ -44,6 +45,8 @@ class StuckEscape(LayerWrapper):
     """
 
     layer: ClassVar = Layer.ESCAPE
+
+    _drawn: Array
 
     def __init__(self, env: Env, after_s: float = 2.0, progress: float = 0.0, escape_s: float = 1.0) -> None:
         arguments = dict(locals())
@@ -94,8 +97,10 @@ class StuckEscape(LayerWrapper):
         info[keys.CBF_STUCK], info[keys.CBF_ESCAPING] = stuck, escaping
         return observation, reward, terminated, truncated, info
 
-    def _draw(self) -> Any:
+    def _draw(self) -> Array:
         """An action between the plant's bounds, evenly distributed, as the action space has it."""
         plant, space = self._inside.plant, self._inside.action_space
+        assert isinstance(space, Box)  # the filter takes no other
         low, high = np.maximum(plant.lower, space.low), np.minimum(plant.upper, space.high)
-        return self._rng.draw.uniform(low, high).astype(space.dtype)
+        drawn: Array = self._rng.draw.uniform(low, high).astype(space.dtype)
+        return drawn

@@ -95,7 +95,7 @@ class FilterObservation(LayerWrapper):
         ):
             ones = np.ones(count)
             low, high = np.concatenate([space.low, -ones]), np.concatenate([space.high, ones])
-            return spaces.Box(low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype.type)  # type: ignore[arg-type]
+            return spaces.Box(low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype.type)
         return spaces.Dict({"observation": space, KEY: features})
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
