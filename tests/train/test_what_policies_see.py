@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import safe_wrappers as sw
+from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.train.config import EvaluationConfig, FilterConfig, parse_experiment
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluated_steps, evaluation_folder
 from safe_wrappers.train.run import Progress, train_run
@@ -89,3 +90,20 @@ def test_a_run_without_a_repeat_is_known_by_its_old_folder(tmp_path):
 def test_observing_needs_a_filter_with_constraints(tmp_path):
     with pytest.raises(sw.SafeWrappersError, match=r"env\.observation: there is no filter whose constraints"):
         arms(tmp_path, arms={"unfiltered": {"filter": "none"}})
+
+
+def test_an_escape_is_around_the_filter_in_training_and_evaluation(tmp_path):
+    escaping = {"filter": {"protect": {}, "escape": {"progress": 0.1, "escape_s": 0.5}}}
+    _, by_name = arms(tmp_path, arms={"unfiltered": {"filter": "none"}, "filtered": escaping})
+    env = make_stack(by_name["filtered"].env, by_name["filtered"].filter)
+    escape = next(w for w in wrappers_of(env) if isinstance(w, sw.StuckEscape))
+    assert escape.progress == 0.1
+    info = env.reset(seed=0)[1]
+    assert info["cbf/stuck"] is False
+    assert by_name["filtered"].fingerprint()["filter"]["escape"] == {"progress": 0.1, "escape_s": 0.5}
+    assert by_name["unfiltered"].env.observation.escape is None  # observed, not acted on
+
+
+def test_an_escape_needs_a_filter(tmp_path):
+    with pytest.raises(sw.SafeWrappersError, match="escape"):
+        arms(tmp_path, arms={"filtered": {"filter": {"escape": {}}}})
