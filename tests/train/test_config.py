@@ -41,6 +41,10 @@ def test_every_config_of_the_repo_is_valid(path):
         assert kept == without | {f"{name}_penalty": cars for name, cars in without.items()}
         weights = {arm.name: (arm.env.occlusion or {}).get("weight", 0.0) for arm in experiment.arms}
         assert all((weight > 0.0) == name.endswith("_penalty") for name, weight in weights.items())
+    elif path.stem == "pointgoal1_learners":
+        assert set(kinds.values()) == {"protect"}
+        assert [arm.name for arm in experiment.arms if arm.env.observation is None] == ["lidar_alone"]
+        assert [arm.name for arm in experiment.arms if arm.filter.escape is not None] == ["escape"]
     elif path.stem == "pointgoal1_margins":
         assert kinds == {"no_hazards": "none"} | dict.fromkeys(
             ("naive", "wide_first", "fine_tuned"), "protect"
@@ -161,7 +165,7 @@ def test_unknown_names_are_refused_with_the_nearest(settings, message):
         ({"output": 3}, "output: input is not a valid path"),
         (
             {"arms": {"a": {"filter": False}}},
-            "arms.a.filter: expected a mapping of protect, factory, kwargs, lease; got False.",
+            "arms.a.filter: expected a mapping of protect, factory, kwargs, lease, escape; got False.",
         ),
         (
             {"arms": {"a": {"filter": {"factory": "no_colon"}}}},
