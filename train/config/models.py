@@ -209,8 +209,9 @@ class ArmConfig(Section):
             del values["filter"]["lease"]
         if self.action_repeat == 1:
             del values["action_repeat"]
-        if self.env.judge is not None:
-            values["env"]["judge"] = self.env.judge.plain()
+        for key in ("judge", "observation"):
+            if (of := getattr(self.env, key)) is not None:
+                values["env"][key] = of.plain()
         values["env"] = {
             key: value for key, value in values["env"].items() if value or key in ("id", "kwargs")
         }
