@@ -200,6 +200,7 @@ EXAMPLES = {
             },
         ),
     },
+    "StuckEscape": {"sooner": (TASK, lambda: {"after_s": 0.5, "progress": 0.1, "escape_s": 0.2})},
     "TeleopChannel": {
         "plain, any env": (
             "Reacher-v5",
@@ -264,7 +265,7 @@ EXAMPLES = {
 """Wrapper name -> what it shows -> (env id, function of its arguments): plain data or what becomes it."""
 
 INSIDE = dict.fromkeys(
-    ("AdaptionPenalty", "SafeActionMap"), lambda env: sw.CBFActionFilter(env, [_clearance()])
+    ("AdaptionPenalty", "SafeActionMap", "StuckEscape"), lambda env: sw.CBFActionFilter(env, [_clearance()])
 )
 """Wrapper name -> the wrapper that it needs inside."""
 
@@ -404,7 +405,7 @@ def test_spaces_are_the_envs_own(name, case):
         assert env.action_space == gym.spaces.Box(low, high, dtype=own.dtype)
     else:
         assert env.action_space == env.env.action_space
-    if getattr(env, "observe", False) or name == "FilterObservation":  # what was there stays in front
+    if getattr(env, "observe", False) is True or name == "FilterObservation":  # what was there stays in front
         own, box = env.env.observation_space, env.observation_space
         n = own.shape[0]
         assert gym.spaces.Box(box.low[:n], box.high[:n], dtype=box.dtype) == own and box.shape[0] > n

@@ -44,7 +44,6 @@ def test_every_config_of_the_repo_is_valid(path):
     elif path.stem == "pointgoal1_learners":
         assert set(kinds.values()) == {"protect"}
         assert [arm.name for arm in experiment.arms if arm.env.observation is None] == ["lidar_alone"]
-        assert [arm.name for arm in experiment.arms if arm.filter.escape is not None] == ["escape"]
     elif path.stem == "pointgoal1_margins":
         assert kinds == {"no_hazards": "none"} | dict.fromkeys(
             ("naive", "wide_first", "fine_tuned"), "protect"

@@ -100,9 +100,6 @@ class EnvConfig(Section):
     'safe-wrappers[robotics]'`). `module:Id-v0` imports the module first."""
     kwargs: Options = Field(default_factory=dict)
     """Passed to `gymnasium.make`."""
-    reset_options: Options = Field(default_factory=dict)
-    """Options of every reset in training, such as `{layout: {hazards: []}}` of the goal tasks. Evaluation resets
-    without them: every arm is judged on the task itself."""
     faults: Annotated[dict[str, Options], AfterValidator(check_faults)] = Field(default_factory=dict)
     """[Faults](wrappers/faults.md) between policy and robot, in training and evaluation: a wrapper's name and its
     arguments, the innermost first."""
@@ -116,6 +113,9 @@ class EnvConfig(Section):
     observation: Annotated[FilterConfig | None, BeforeValidator(_of_all_arms)] = None
     """`constraints`: policies observe what the filter decides by, in training and evaluation
     ([FilterObservation](wrappers/filter-observation.md)); without a filter, what the evaluation's filter would."""
+    reset_options: Options = Field(default_factory=dict)
+    """Options of every reset in training, such as `{layout: {hazards: []}}` of the goal tasks. Evaluation resets
+    without them: every arm is judged on the task itself."""
 
     @model_validator(mode="after")
     def _has_one_judge(self) -> EnvConfig:
