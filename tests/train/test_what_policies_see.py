@@ -8,6 +8,7 @@ import safe_wrappers as sw
 from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.train.config import EvaluationConfig, FilterConfig, parse_experiment
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluated_steps, evaluation_folder
+from safe_wrappers.train.report.origin import about
 from safe_wrappers.train.run import Progress, train_run
 from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.train.run.training import finished_checkpoint
@@ -78,6 +79,11 @@ def test_training_steps_are_the_policys(tmp_path):
     assert done[0]
     assert infos[0]["interventions"]["length"] == 50
     envs.close()
+
+
+def test_the_report_counts_control_steps(tmp_path):
+    assert ", 64 steps, " in about(arms(tmp_path)[0])
+    assert ", 16 steps, " in about(arms(tmp_path, action_repeat=1)[0])
 
 
 def test_a_run_without_a_repeat_is_known_by_its_old_folder(tmp_path):

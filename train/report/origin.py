@@ -54,7 +54,7 @@ def settings(experiment: ExperimentConfig) -> str:
 def about(experiment: ExperimentConfig) -> str:
     """What was trained on what, for how long, and how it was judged; one sentence."""
     kinds = ", ".join(dict.fromkeys(f"{arm.algorithm} on {arm.env.id}" for arm in experiment.arms))
-    steps = sorted({arm.total_steps for arm in experiment.arms})
+    steps = sorted({arm.total_steps * arm.action_repeat for arm in experiment.arms})
     how_long = f"{steps[0]:,}" if len(steps) == 1 else f"{steps[0]:,} to {steps[-1]:,}"
     seeds = len(experiment.seeds)
     begun = "".join(f" {sentence}" for sentence in _begun(experiment))
