@@ -80,8 +80,9 @@ figures: .venv/installed
 	$(BIN)/python -m benchmarks.admission
 	$(BIN)/python -m benchmarks.leases
 	$(BIN)/python -m benchmarks.seams
-	for config in pointgoal1_300k velocity_experts halfcheetah_velocity_ppo swimmer_velocity_ppo ant_velocity_ppo \
+	for config in pointgoal1_300k pointgoal1_sac pointgoal1_learners velocity_experts halfcheetah_velocity_ppo swimmer_velocity_ppo ant_velocity_ppo \
 		halfcheetah_velocity_sac outages saferover_ppo occluded_crossing_ppo; do $(BIN)/safe-wrappers compare configs/$$config.yaml --report || exit 1; done
+	$(BIN)/python -m benchmarks.stuck_steps --episodes 30
 	$(BIN)/python -m benchmarks.traction
 	$(BIN)/python -m benchmarks.impact
 	$(BIN)/python -m benchmarks.occlusion --steps 40000
