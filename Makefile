@@ -65,7 +65,7 @@ check: lint test
 bench: .venv/bench
 	$(BIN)/python -m benchmarks.bench
 
-# Every long figure of the README and docs/results: about six hours on two cores.
+# Every long figure of the README and docs/results: about nine hours on two cores.
 figures: .venv/installed
 	$(BIN)/python -m benchmarks.adversarial
 	$(BIN)/python -m benchmarks.adversarial --mismatch
