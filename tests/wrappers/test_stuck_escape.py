@@ -63,6 +63,17 @@ def test_a_drawn_action_is_held_filtered_and_reported_as_a_change_of_the_policys
     assert sum(i[keys.CBF_STUCK] for i in infos) < sum(i[keys.CBF_STUCK] for i in alone)
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_policy_that_is_not_finite_while_it_acts_is_counted(bad):
+    _, _, env = pushing(escape_s=2.0, steps=100)
+    info = env.step(np.array([bad, 0.5], dtype=np.float32))[4]
+    assert info[keys.CBF_ESCAPING] and info[keys.CBF_NONFINITE] and info[keys.CBF_INTERVENED]
+    np.testing.assert_array_equal(info[keys.PROPOSED_ACTION], [0.0, 0.5])
+    assert np.isfinite(info[keys.EXECUTED_ACTION]).all()
+    away = np.linalg.norm(info[keys.EXECUTED_ACTION] - [0.0, 0.5])
+    assert info[keys.CBF_CORRECTION] == pytest.approx(away, abs=1e-12)
+
+
 def test_the_same_seed_draws_the_same():
     first, second, third = (
         [i[keys.EXECUTED_ACTION].tolist() for i in pushing(0.5, seed)[0]] for seed in (0, 0, 1)

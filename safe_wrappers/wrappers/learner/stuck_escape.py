@@ -23,7 +23,8 @@ class StuckEscape(LayerWrapper):
     may do so for ever. The drawn action is held for `escape_s`, and the filter inside checks it like any other, so
     that its guarantees stay. A deadlock is ended by chance, not by a plan; it may take several draws.
 
-    While it acts, `proposed_action`, `cbf/intervened` and `cbf/correction` are about the policy's own action.
+    While it acts, `proposed_action`, `cbf/intervened`, `cbf/correction` and `cbf/nonfinite` are about the policy's
+    own action.
 
     Args:
         env: With a `CBFActionFilter` inside.
@@ -82,7 +83,10 @@ class StuckEscape(LayerWrapper):
         observation, reward, terminated, truncated, info = self.env.step(sent)
         if escaping:
             self._left -= 1
-            proposed = np.nan_to_num(action_array(action, self._drawn.shape, np.float64))
+            proposed = action_array(action, self._drawn.shape, np.float64)
+            finite = np.isfinite(proposed)
+            proposed = np.where(finite, proposed, 0.0)
+            info[keys.CBF_NONFINITE] = not finite.all()
             executed = info[keys.EXECUTED_ACTION]
             info[keys.PROPOSED_ACTION] = proposed
             info[keys.CBF_CORRECTION] = float(np.linalg.norm(executed - proposed))
