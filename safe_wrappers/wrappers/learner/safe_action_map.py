@@ -40,7 +40,7 @@ class SafeActionMap(LayerWrapper):
     itself is always asked about. The edge is found to a thousandth of the ray. The box ends where the actuators
     saturate: beyond, actions differ in nothing.
 
-    **What it asks** is what the filter asks, mostly up to 14 times in a step, and for "centre" up to 13 times more for
+    **What it asks** is what the filter asks, mostly up to 14 times in a step, for "centre" up to 13 times more for
     each component, which is dear where constraints forecast.
 
     Args:
