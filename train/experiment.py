@@ -15,7 +15,7 @@ from .evaluation.summary import Summary, summarize, write_summary
 from .hyperparameters import check_task
 from .processes.parallel import Job, run_jobs
 from .processes.stopping import Interrupted
-from .run.margins import check_margins
+from .run.learner_callbacks import check_margins
 from .run.start import Start
 from .run.training import (
     check_finished,

@@ -344,7 +344,7 @@ def test_unknown_names_are_refused(fake_experiment, learner, message):
         (
             "[both]",
             [],
-            r"learner: expected a mapping of kind, penalty, .*, anchor, margin_curriculum; got \['both'\]",
+            r"learner: expected a mapping of kind, penalty, .*, anchor, margin_curriculum, .*; got \['both'\]",
         ),
         ("safe_action", ["arms.a.filter=none"], "without a filter no action is ever changed"),
         ("safe_action", ["hyperparameters.n_steps=3"], "safe_action has one-step returns, .*n_steps is 3"),

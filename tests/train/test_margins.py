@@ -40,8 +40,8 @@ class Margins(BaseCallback):
 @pytest.fixture
 def margins(monkeypatch):
     monkeypatch.setattr(Margins, "seen", {})
-    made = training.margin_curriculum
-    monkeypatch.setattr(training, "margin_curriculum", lambda arm: [*made(arm), Margins()])
+    made = training.learner_callbacks
+    monkeypatch.setattr(training, "learner_callbacks", lambda arm: [*made(arm), Margins()])
     return Margins.seen
 
 

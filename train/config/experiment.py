@@ -10,7 +10,6 @@ from safe_wrappers.errors import ConfigurationError
 
 from .algorithm_settings import HER, check_hyperparameters
 from .algorithms import DETERMINISTIC, DISCRETE, OFF_POLICY, ON_POLICY
-from .learner import NAIVE
 from .models import ArmConfig, ExperimentConfig, default_buffer_size
 from .names import check_name
 from .types import validate
@@ -140,10 +139,16 @@ def _check_actions(arm: ArmConfig, where: str) -> None:
 
 def _check_learner(arm: ArmConfig, where: str) -> None:
     kind = arm.learner.kind
-    if arm.learner != NAIVE and arm.filter.kind == "none":
+    if arm.learner.of_filter and arm.filter.kind == "none":
         raise ConfigurationError(
             f"{where}: without a filter no action is ever changed, and there is no margin; leave `learner` out, or"
             " give the arm a filter."
+        )
+    scaled = arm.normalize.observation or arm.normalize.reward
+    if arm.learner.cost_limit is not None and scaled and arm.algorithm not in ON_POLICY:
+        raise ConfigurationError(
+            f"{where}: with normalize {arm.algorithm} stores the env's own rewards, and cost_limit would change"
+            f" nothing; leave normalize out, or use {' or '.join(ON_POLICY)}."
         )
     if not arm.learner.stores_executed:
         return

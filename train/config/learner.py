@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Annotated, Any, ClassVar, Final, Literal
 
 from pydantic import Field, model_validator
@@ -58,6 +58,11 @@ class LearnerConfig(Section):
     margin_curriculum: MarginCurriculumConfig | None = None
     """A margin that the arm's filter adds in training and that changes; see [its
     keys](concepts/learner.md#a-margin-that-changes). Evaluation has the filter as it is configured."""
+    cost_limit: Annotated[Number, Field(ge=0)] | None = None
+    """Cost per episode above which a [Lagrangian multiplier](sb3.md#a-price-on-cost) puts a price on cost, in
+    training; with PPO this is PPO-Lagrangian. For any algorithm and arm, also without a filter."""
+    multiplier_rate: Annotated[Number, Field(gt=0)] = 1e-3
+    """Of that multiplier: by how much it rises after an episode, for each unit of cost above the limit."""
 
     @model_validator(mode="after")
     def _has_a_penalty_if_it_needs_one(self) -> LearnerConfig:
@@ -72,6 +77,10 @@ class LearnerConfig(Section):
         if self.scale != 1.0 and not self.bounded:
             raise ConfigurationError(
                 f"scale belongs to bounded: {{kind: {self.kind}, bounded: 0.1, scale: 0.5}}."
+            )
+        if self.multiplier_rate != LearnerConfig.multiplier_rate and self.cost_limit is None:
+            raise ConfigurationError(
+                "multiplier_rate belongs to cost_limit: {cost_limit: 25, multiplier_rate: 0.001}."
             )
         if self.anchor != _ANCHOR and not self.maps:
             raise ConfigurationError(f"{self.kind} takes no anchor; safe_set_map does.")
@@ -91,6 +100,11 @@ class LearnerConfig(Section):
     def penalised(self) -> bool:
         """Whether the reward is reduced where the action was changed."""
         return self.kind in self._PENALISED
+
+    @property
+    def of_filter(self) -> bool:
+        """Whether it needs a filter: all but a price on cost does."""
+        return replace(self, cost_limit=None, multiplier_rate=NAIVE.multiplier_rate) != NAIVE
 
     @property
     def maps(self) -> bool:

@@ -37,7 +37,7 @@ from .callbacks import (
     TrainingStopped,
 )
 from .checkpoint import MODEL, Checkpoint, latest_checkpoint, save_checkpoint
-from .margins import margin_curriculum
+from .learner_callbacks import learner_callbacks
 from .start import START_FILE, Policy, Start, begin_with, policy_of_file, policy_of_model, refuse_misfit
 from .vec_envs import make_training_env, make_vec_env
 
@@ -132,7 +132,7 @@ def _train(
                 EpisodeRows(folder / "episodes.csv"),
                 ProgressCallback(progress.steps, progress.figures, filtered),
                 CheckpointCallback(arm.checkpoint_every, save),
-                *margin_curriculum(arm),
+                *learner_callbacks(arm),
             ]
         )
         try:

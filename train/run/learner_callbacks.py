@@ -1,21 +1,26 @@
-"""An arm's curriculum of margins: the callback, and whether the arm's filter can have them."""
+"""What an arm's learner needs beside its algorithm: a margin that changes, a price on cost."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import gymnasium as gym
+from stable_baselines3.common.callbacks import BaseCallback
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.sb3 import MarginCurriculum
+from safe_wrappers.sb3 import LagrangianMultiplier, MarginCurriculum
 
 from ..config import ArmConfig
 
 
-def margin_curriculum(arm: ArmConfig) -> list[MarginCurriculum]:
-    """The callback that changes the filter's margin, if the arm wants one."""
-    given = arm.learner.margin_curriculum
-    return [] if given is None else [MarginCurriculum(given.start, given.end, given.until)]
+def learner_callbacks(arm: ArmConfig) -> list[BaseCallback]:
+    """Those that `arm.learner` wants."""
+    learner, found = arm.learner, list[BaseCallback]()
+    if (margin := learner.margin_curriculum) is not None:
+        found.append(MarginCurriculum(margin.start, margin.end, margin.until))
+    if learner.cost_limit is not None:
+        found.append(LagrangianMultiplier(learner.cost_limit, learner.multiplier_rate))
+    return found
 
 
 def check_margins(arm: ArmConfig, env: gym.Env[Any, Any]) -> None:
