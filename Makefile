@@ -3,7 +3,7 @@ BIN := .venv/bin
 # One BLAS thread: the matrices are tiny and the runs are parallel processes.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test test-library test-slow mutants fuzz lint check bench figures docs clean
+.PHONY: demo test test-library test-slow mutants fuzz lint check bench table figures docs clean
 
 # Tests draw nothing; the demo tries which GL can.
 test test-library test-slow fuzz: export MUJOCO_GL ?= disabled
@@ -65,7 +65,11 @@ check: lint test
 bench: .venv/bench
 	$(BIN)/python -m benchmarks.bench
 
-# Every long figure of the README and docs/results: about nine hours on two cores.
+# What safety costs in return, task by task: days on two cores; goes on where it was stopped.
+table: .venv/installed
+	$(BIN)/python -m benchmarks.table
+
+# Every long figure of the README and docs/results: about nine hours on two cores, but for the table.
 figures: .venv/installed
 	$(BIN)/python -m benchmarks.adversarial
 	$(BIN)/python -m benchmarks.adversarial --mismatch
@@ -80,9 +84,10 @@ figures: .venv/installed
 	$(BIN)/python -m benchmarks.admission
 	$(BIN)/python -m benchmarks.leases
 	$(BIN)/python -m benchmarks.seams
-	for config in pointgoal1_300k pointgoal1_sac pointgoal1_learners velocity_experts halfcheetah_velocity_ppo swimmer_velocity_ppo ant_velocity_ppo \
-		halfcheetah_velocity_sac outages saferover_ppo occluded_crossing_ppo; do $(BIN)/safe-wrappers compare configs/$$config.yaml --report || exit 1; done
-	$(BIN)/python -m benchmarks.stuck_steps --episodes 30
+	for config in pointgoal1_300k pointgoal1_learners velocity_experts halfcheetah_velocity_ppo swimmer_velocity_ppo ant_velocity_ppo \
+		outages saferover_ppo occluded_crossing_ppo; do $(BIN)/safe-wrappers compare configs/$$config.yaml --report || exit 1; done
+	$(BIN)/python -m benchmarks.table --only SafePointGoal1_sac
+	$(BIN)/python -m benchmarks.stuck_steps --episodes 40
 	$(BIN)/python -m benchmarks.traction
 	$(BIN)/python -m benchmarks.impact
 	$(BIN)/python -m benchmarks.occlusion --steps 40000

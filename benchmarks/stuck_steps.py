@@ -1,10 +1,10 @@
 """How often deterministic policies get stuck in the filter, and what StuckEscape makes of it.
 
-    safe-wrappers compare configs/pointgoal1_sac.yaml
+    python -m benchmarks.table --only SafePointGoal1_sac
     python -m benchmarks.stuck_steps
 
 Drives the trained policies of that experiment with the filter on, over the same episodes with `StuckEscape` reporting
-alone and acting.
+alone, drawing actions at random, and choosing among them by the policy's own critic; and with the policy's own noise.
 """
 
 import argparse
@@ -14,24 +14,39 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
+from safe_wrappers.plants.env_checks import wrappers_of
+from safe_wrappers.sb3 import critic_value
 from safe_wrappers.train.config import ArmConfig, FilterConfig, parse_experiment
 from safe_wrappers.train.config.file import read_config
 from safe_wrappers.train.run.policy import TrainedPolicy
 from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.train.run.training import finished_checkpoint
+from safe_wrappers.wrappers.learner.stuck_escape import StuckEscape
 
 ROOT = Path(__file__).parents[1]
 RESULTS = Path(__file__).parent / "results" / "stuck_steps.json"
-CONFIG = ROOT / "configs" / "pointgoal1_sac.yaml"
+CONFIG = ROOT / "configs" / "goal_sac.yaml"
 ESCAPE = {"progress": 0.1}
 """Two seconds with less than 0.1 m gained: standing, or going around in circles."""
 FIRST_SEED = 2_000_000
 
 
-def drive(arm: ArmConfig, used: FilterConfig, policy: TrainedPolicy, episodes: int) -> dict[str, float]:
+MODES = {"reported": 0.0, "random": 1.0, "critic": 2.0, "stochastic policy": 0.0}
+"""How long an escape lasts, s."""
+
+
+def drive(
+    arm: ArmConfig, used: FilterConfig, policy: TrainedPolicy, mode: str, episodes: int
+) -> dict[str, float]:
     """Return per episode, steps, and those that were stuck, escaping and in violation."""
+    policy.deterministic = mode != "stochastic policy"
+    torch.manual_seed(0)
     env = make_stack(arm.env, used)
+    if mode == "critic":
+        escape = next(wrapper for wrapper in wrappers_of(env) if isinstance(wrapper, StuckEscape))
+        escape.value = critic_value(policy.model)
     found: dict[str, Any] = dict.fromkeys(("steps", "stuck", "escaping", "violations"), 0)
     returns = []
     for episode in range(episodes):
@@ -55,7 +70,9 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=50, help="per policy and condition")
     parser.add_argument("--output", default="runs", help="where the experiment lies")
     arguments = parser.parse_args()
-    experiment = parse_experiment(read_config(CONFIG, [f"output={arguments.output}"]))
+    experiment = parse_experiment(
+        read_config(CONFIG, [f"output={arguments.output}", "name=SafePointGoal1_sac", "seeds=[0,1,2,3,4]"])
+    )
     rows = []
     for arm in experiment.arms:
         for seed in experiment.seeds:
@@ -63,24 +80,26 @@ def main() -> None:
             if not (folder / "finished.json").exists():
                 continue
             policy = TrainedPolicy(arm, finished_checkpoint(arm, seed, folder))
-            for escape_s in (0.0, 1.0):
+            for mode, escape_s in MODES.items():
                 used = replace(experiment.evaluation_filter, escape={**ESCAPE, "escape_s": escape_s})
-                row = {"arm": arm.name, "seed": seed, "escape_s": escape_s}
-                rows.append(row | drive(arm, used, policy, arguments.episodes))
+                row = {"arm": arm.name, "seed": seed, "mode": mode}
+                rows.append(row | drive(arm, used, policy, mode, arguments.episodes))
                 print(rows[-1], flush=True)
     RESULTS.write_text(json.dumps(rows, indent=1) + "\n")
     print("| trained | escape | return | lowest | stuck steps | escaping | violations |")
     print("|---|---|---|---|---|---|---|")
     for name in ("unfiltered", "filtered"):
-        for escape_s in (0.0, 1.0):
-            same = [row for row in rows if (row["arm"], row["escape_s"]) == (name, escape_s)]
+        for mode in MODES:
+            same = [row for row in rows if (row["arm"], row["mode"]) == (name, mode)]
+            if not same:
+                continue
             steps = sum(row["steps"] for row in same)
             mean, lowest = np.mean([row["return"] for row in same]), min(row["lowest"] for row in same)
             stuck, escaping = (100 * sum(row[key] for row in same) / steps for key in ("stuck", "escaping"))
             violations = sum(row["violations"] for row in same)
             print(
-                f"| {name} | {'on' if escape_s else 'off'} | {mean:.1f} | {lowest:.1f} | {stuck:.2f} % |"
-                f" {escaping:.2f} % | {violations} of {steps:,} |"
+                f"| {name} | {mode} | {mean:.1f} | {lowest:.1f} | {stuck:.2f} % | {escaping:.2f} % |"
+                f" {violations} of {steps:,} |"
             )
 
 

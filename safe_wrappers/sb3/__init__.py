@@ -6,6 +6,7 @@ except ImportError as missing:
     needs = "safe_wrappers.sb3 needs stable_baselines3 and torch: pip install 'safe-wrappers[train]'"
     raise ImportError(needs) from missing
 
+from safe_wrappers.sb3.critic_value import critic_value
 from safe_wrappers.sb3.executed_action_her_replay_buffer import ExecutedActionHerReplayBuffer
 from safe_wrappers.sb3.executed_action_replay_buffer import (
     ExecutedActionDictReplayBuffer,
@@ -25,4 +26,5 @@ __all__ = [
     "InterventionEvalCallback",
     "LagrangianMultiplier",
     "MarginCurriculum",
+    "critic_value",
 ]

@@ -44,6 +44,9 @@ def test_every_config_of_the_repo_is_valid(path):
     elif path.stem == "pointgoal1_learners":
         assert set(kinds.values()) == {"protect"}
         assert [arm.name for arm in experiment.arms if arm.env.observation is None] == ["lidar_alone"]
+    elif path.stem in ("goal_sac", "velocity_sac"):
+        assert kinds == {"unfiltered": "none", "filtered": "protect", "lagrangian": "none"}
+        assert [arm.learner.cost_limit for arm in experiment.arms] == [None, None, 0.0]
     elif path.stem == "pointgoal1_margins":
         assert kinds == {"no_hazards": "none"} | dict.fromkeys(
             ("naive", "wide_first", "fine_tuned"), "protect"

@@ -81,6 +81,49 @@ def test_the_same_seed_draws_the_same():
     assert first == second != third
 
 
+def to_the_left(observation, actions):
+    """A value function: turn left, backwards."""
+    assert observation.shape == (60,) and actions.dtype == np.float32
+    return actions[:, 1] - actions[:, 0]
+
+
+def test_with_a_value_the_best_admitted_candidate_is_executed_as_it_is():
+    judged = []
+
+    def value(observation, actions):
+        judged.append(actions)
+        return to_the_left(observation, actions)
+
+    infos, _, _ = pushing(escape_s=0.5, value=value)
+    chosen = [i[keys.EXECUTED_ACTION] for i in infos if i[keys.CBF_ESCAPING]]
+    assert len(chosen) == len(judged) > 0
+    for executed, actions in zip(chosen, judged, strict=True):
+        np.testing.assert_array_equal(executed, actions[np.argmax(to_the_left(np.zeros(60), actions))])
+    assert {len(actions) for actions in judged} != {64}  # some were refused
+    assert not any(i["cost_substep"] for i in infos)
+    assert [i[keys.EXECUTED_ACTION].tolist() for i in pushing(0.5, value=to_the_left)[0]] == [
+        i[keys.EXECUTED_ACTION].tolist() for i in infos
+    ]
+
+
+def test_what_has_no_value_is_not_chosen():
+    def only_the_first(_, actions):
+        return [0.0] + [np.nan] * (len(actions) - 1)
+
+    infos, _, _ = pushing(escape_s=0.5, value=only_the_first)
+    escaping = [i for i in infos if i[keys.CBF_ESCAPING]]
+    assert escaping and all(i[keys.CBF_INTERVENED] for i in escaping)
+    infos, _, _ = pushing(escape_s=0.5, value=lambda _, actions: np.full(len(actions), np.nan))
+    alone = pushing(escape_s=0.0)[0]
+    for info, same in zip(infos, alone, strict=True):  # the policy's own action is proposed
+        np.testing.assert_array_equal(info[keys.EXECUTED_ACTION], same[keys.EXECUTED_ACTION])
+
+
+def test_a_value_of_another_shape_is_refused():
+    with pytest.raises(sw.SafeWrappersError, match="value must return a number for each"):
+        pushing(escape_s=0.5, value=lambda _, actions: 1.0)
+
+
 def test_what_it_acted_on_is_counted():
     env = sw.protect(gym.make("SafePointGoal1-v0", max_episode_steps=200), detour=False)
     env = sw.RecordInterventions(sw.StuckEscape(env, after_s=1.0, progress=0.05, escape_s=0.0))

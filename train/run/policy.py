@@ -18,10 +18,16 @@ class TrainedPolicy:
     Args:
         arm: The arm that was trained.
         checkpoint: Its policy.
+
+    Attributes:
+        model: As SB3 loads it.
+        deterministic: False: actions are drawn as in training, from torch's generator.
     """
 
+    deterministic: bool = True
+
     def __init__(self, arm: ArmConfig, checkpoint: Checkpoint) -> None:
-        self._model: BaseAlgorithm = checkpoint.load_model(arm.algorithm, None, arm.device)
+        self.model: BaseAlgorithm = checkpoint.load_model(arm.algorithm, None, arm.device)
         scaled = checkpoint.load_normalize(DummyVecEnv([lambda: make_stack(arm.env, FilterConfig())]))
         self._normalize = scaled if isinstance(scaled, VecNormalize) else None
         scaled.close()
@@ -42,4 +48,4 @@ class TrainedPolicy:
     def _decide(self, observation: Any) -> Any:
         if self._normalize is not None:
             observation = self._normalize.normalize_obs(observation)
-        return self._model.predict(observation, deterministic=True)[0]
+        return self.model.predict(observation, deterministic=self.deterministic)[0]

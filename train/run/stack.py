@@ -69,10 +69,10 @@ def make_stack(
     if learner.maps and action_filter.kind != "none":
         named = ":" in learner.anchor
         task = SafeActionMap(task, _function(learner.anchor, "learner.anchor") if named else learner.anchor)
-    if action_filter.escape is not None:
-        task = StuckEscape(task, **action_filter.escape)
     if observed is not None:
         task = _with_features(task, observed)
+    if action_filter.escape is not None:
+        task = StuckEscape(task, **action_filter.escape)
     recorded: gym.Env[Any, Any] = RecordInterventions(task)
     for name, arguments in env.faults.items():
         try:

@@ -1,10 +1,12 @@
 """StuckEscape: sees where policy and filter block each other, and ends it."""
 
 from collections import deque
-from typing import Any, ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from gymnasium.spaces import Box
+from numpy.typing import ArrayLike
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative, positive
@@ -14,14 +16,19 @@ from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step, WrapperRng
 from safe_wrappers.wrappers.common.receiver import action_array
 
+ValueFunction = Callable[[Any, Array], ArrayLike]
+"""Of an observation and actions, shape (k, m): how good they are, shape (k,)."""
+_CANDIDATES: Final = 64
+
 
 class StuckEscape(LayerWrapper):
-    """Proposes an action drawn at random for a while, in the policy's place, where policy and filter are stuck.
+    """Proposes another action for a while, in the policy's place, where policy and filter are stuck.
 
     Stuck means: in the last `after_s` the filter changed more than half of the actions, and the rewards of these
     steps add up to `progress` at most. A deterministic policy that pushes against the filter, or circles an obstacle,
-    may do so for ever. The drawn action is held for `escape_s`, and the filter inside checks it like any other, so
-    that its guarantees stay. A deadlock is ended by chance, not by a plan; it may take several draws.
+    may do so for ever. For `escape_s` an action that was drawn at random is proposed; or, with a `value`, of 64 that
+    were drawn the best that the filter admits, chosen anew at every step. The filter inside checks it like any other,
+    so that its guarantees stay. A deadlock is ended by chance, not by a plan; it may take several draws.
 
     While it acts, `proposed_action`, `cbf/intervened`, `cbf/correction` and `cbf/nonfinite` are about the policy's
     own action.
@@ -30,12 +37,15 @@ class StuckEscape(LayerWrapper):
         env: With a `CBFActionFilter` inside.
         after_s: The time without progress, s.
         progress: The sum of rewards, in the task's units, up to which there is none.
-        escape_s: For how long the drawn action is proposed, s; 0 reports alone.
+        escape_s: For how long another action is proposed, s; 0 reports alone.
+        value: Chooses among admitted actions: a function of an observation, as this wrapper returns it, and actions,
+            shape (k, m), that returns k numbers, the more the better; `safe_wrappers.sb3.critic_value(model)` is one.
+            An action whose value is NaN is not chosen. The filter is asked 64 times per step of an escape.
 
     Info, at every step: ``cbf/stuck``, ``cbf/escaping`` (bool).
 
     Raises:
-        ConfigurationError: No filter inside, or times that are not.
+        ConfigurationError: No filter inside, or times that are not; in an escape: `value` returns another shape.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
@@ -49,7 +59,14 @@ class StuckEscape(LayerWrapper):
 
     _drawn: Array
 
-    def __init__(self, env: Env, after_s: float = 2.0, progress: float = 0.0, escape_s: float = 1.0) -> None:
+    def __init__(
+        self,
+        env: Env,
+        after_s: float = 2.0,
+        progress: float = 0.0,
+        escape_s: float = 1.0,
+        value: ValueFunction | None = None,
+    ) -> None:
         arguments = dict(locals())
         LayerWrapper.__init__(self, env)
         inside = filter_inside(env)
@@ -64,7 +81,7 @@ class StuckEscape(LayerWrapper):
         self._escape = round(non_negative("escape_s", escape_s, "s") / control_dt)
         self._inside = inside
         self._record(arguments)
-        self.progress = float(progress)
+        self.progress, self.value = float(progress), value
         self._rng = WrapperRng("StuckEscape")
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
@@ -73,17 +90,17 @@ class StuckEscape(LayerWrapper):
         self._rng.reset(self.env, seed)
         self._rewards: deque[float] = deque(maxlen=self._window)
         self._changed: deque[bool] = deque(maxlen=self._window)
-        self._left = 0
+        self._left, self._observation = 0, observation
         return observation, info | {keys.CBF_STUCK: False, keys.CBF_ESCAPING: False}
 
     def step(self, action: Any) -> Step:
         """Step the env with the policy's action, or with the drawn one."""
         escaping = self._left > 0
-        sent = self._drawn if escaping else action
+        sent = self._other(action) if escaping else action
         observation, reward, terminated, truncated, info = self.env.step(sent)
         if escaping:
             self._left -= 1
-            proposed = action_array(action, self._drawn.shape, np.float64)
+            proposed = action_array(action, self._drawn.shape[1:], np.float64)
             finite = np.isfinite(proposed)
             proposed = np.where(finite, proposed, 0.0)
             info[keys.CBF_NONFINITE] = not finite.all()
@@ -91,6 +108,7 @@ class StuckEscape(LayerWrapper):
             info[keys.PROPOSED_ACTION] = proposed
             info[keys.CBF_CORRECTION] = float(np.linalg.norm(executed - proposed))
             info[keys.CBF_INTERVENED] = bool((executed != proposed).any())
+        self._observation = observation
         self._rewards.append(float(reward))
         self._changed.append(info[keys.CBF_INTERVENED])
         full = len(self._rewards) == self._window
@@ -102,9 +120,29 @@ class StuckEscape(LayerWrapper):
         return observation, reward, terminated, truncated, info
 
     def _draw(self) -> Array:
-        """An action between the plant's bounds, evenly distributed, as the action space has it."""
+        """Actions between the plant's bounds, evenly distributed, as the action space has them."""
         plant, space = self._inside.plant, self._inside.action_space
         assert isinstance(space, Box)  # the filter takes no other
         low, high = np.maximum(plant.lower, space.low), np.minimum(plant.upper, space.high)
-        drawn: Array = self._rng.draw.uniform(low, high).astype(space.dtype)
+        count = 1 if self.value is None else _CANDIDATES
+        drawn: Array = self._rng.draw.uniform(low, high, (count, *low.shape)).astype(space.dtype)
         return drawn
+
+    def _other(self, action: Any) -> Any:
+        """The drawn action; with a value function, the best of those that are admitted, else the policy's."""
+        if self.value is None:
+            return self._drawn[0]
+        self._inside.observe()
+        engine = self._inside.filter
+        readable = engine.margin == engine.margin  # else nothing says what is admitted
+        admitted = np.array([u for u in self._drawn if readable and engine.admits(u.astype(np.float64))])
+        if not len(admitted):
+            return action
+        values = np.asarray(self.value(self._observation, admitted), dtype=np.float64)
+        if values.shape != (len(admitted),):
+            raise ConfigurationError(
+                f"StuckEscape: value must return a number for each of {len(admitted)} actions, shape"
+                f" ({len(admitted)},); got shape {values.shape}"
+            )
+        best = np.argmax(np.where(np.isnan(values), -np.inf, values))
+        return action if np.isnan(values[best]) else admitted[best]

@@ -1,0 +1,160 @@
+"""What safety costs in return, task by task: SAC without a filter, through it, with it afterwards, and Lagrangian.
+
+    make table
+    python -m benchmarks.table --only SafeCarGoal1_sac --arms filtered --seeds 0
+    python -m benchmarks.table --collect
+
+Trains and evaluates what is missing: days on two cores; a killed command goes on where it was. Then writes
+`benchmarks/results/table.csv`, a row per run and condition, and `table.md`, which the docs show. `--collect` makes it
+of what is there.
+"""
+
+import argparse
+import csv
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from safe_wrappers.train.config import ExperimentConfig, parse_experiment
+from safe_wrappers.train.config.file import read_config
+from safe_wrappers.train.evaluation.summary import estimate, number, summarize
+from safe_wrappers.train.experiment import evaluate_experiment, train_experiment
+from safe_wrappers.train.tables import write_rows
+
+ROOT = Path(__file__).parents[1]
+RESULTS = Path(__file__).parent / "results" / "table.csv"
+VERSIONS = ("gymnasium", "mujoco", "stable-baselines3", "torch")
+
+
+@dataclass(frozen=True)
+class Task:
+    """An env of the table, its config, how many seeds, overrides of the config, and the end of its folder's name."""
+
+    env_id: str
+    config: str
+    seeds: int
+    overrides: tuple[str, ...] = ()
+    more: str = ""
+
+    @property
+    def name(self) -> str:
+        """Of the experiment."""
+        return f"{self.env_id.removesuffix('-v0')}_sac{self.more}"
+
+
+TASKS = (
+    Task("SafePointGoal1-v0", "goal_sac", 5),
+    Task("SafePointGoal1-v0", "goal_sac", 5, ("total_steps=250000",), "_1m"),
+    Task("SafePointGoal2-v0", "goal_sac", 3),
+    Task("SafeCarGoal1-v0", "goal_sac", 3),
+    Task("SafeCarGoal2-v0", "goal_sac", 3),
+    Task("SafeHalfCheetahVelocity-v0", "velocity_sac", 5),
+    Task("SafeHopperVelocity-v0", "velocity_sac", 3),
+    Task("SafeWalker2dVelocity-v0", "velocity_sac", 3),
+    Task("SafeSwimmerVelocity-v0", "velocity_sac", 3, ("hyperparameters.gamma=0.9999",)),
+    Task("SafeAntVelocity-v0", "velocity_sac", 3),
+    Task("SafeHumanoidVelocity-v0", "velocity_sac", 3),
+)
+METRICS = ("return", "cost", "violations", "stuck", "infeasible", "intervention_rate")
+COLUMNS = ("task", "algorithm", "control_steps", "arm", "seed", "condition", "episodes", "steps", *METRICS)
+
+
+def experiment_of(task: Task, output: str) -> ExperimentConfig:
+    """The task's experiment, all arms and seeds."""
+    seeds = f"seeds={list(range(task.seeds))}"
+    overrides = [f"env.id={task.env_id}", f"name={task.name}", f"output={output}", seeds, *task.overrides]
+    return parse_experiment(read_config(ROOT / "configs" / f"{task.config}.yaml", overrides))
+
+
+def rows_of(task: Task, experiment: ExperimentConfig) -> list[dict[str, Any]]:
+    """What is there: a row per finished and evaluated run and condition."""
+    found = []
+    for row in summarize(experiment).per_seed:
+        arm = next(arm for arm in experiment.arms if arm.name == row["arm"])
+        if not (experiment.run_folder(arm, row["seed"]) / "evaluation" / "evaluation.json").exists():
+            continue
+        steps = arm.total_steps * arm.action_repeat
+        about = {"task": task.env_id, "algorithm": arm.algorithm, "control_steps": steps}
+        found.append(about | {key: row.get(key, "") for key in COLUMNS if key not in about})
+    return found
+
+
+def cell(rows: Iterable[dict[str, Any]], metric: str) -> str:
+    """A metric over seeds; a dash where nothing was judged or counted."""
+    values = [float(row[metric]) for row in rows if row[metric] != ""]
+    if not values:
+        return "-"
+    return str(estimate(values)).removesuffix(" [n/a]")
+
+
+def markdown(rows: list[dict[str, Any]]) -> str:
+    """The table that the docs show."""
+    lines = [
+        "| task | control steps x seeds | trained | training: violations, all seeds | filter off: return; cost "
+        "| filter on: return; cost | stuck | infeasible |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for task, steps in dict.fromkeys((row["task"], row["control_steps"]) for row in rows):
+        of_task = [row for row in rows if (row["task"], row["control_steps"]) == (task, steps)]
+        for arm in dict.fromkeys(row["arm"] for row in of_task):
+            same = [row for row in of_task if row["arm"] == arm]
+            training, off, on = (
+                [row for row in same if row["condition"] == condition]
+                for condition in ("training", "filter_off", "filter_on")
+            )
+            made = sum(int(row["steps"]) for row in on)
+            shares = [
+                f"{100 * sum(float(row[key]) for row in on) / made:.2g} %"
+                if made and all(row[key] != "" for row in on)
+                else "-"
+                for key in ("stuck", "infeasible")
+            ]
+            columns = [
+                task,
+                f"{int(steps):,} x {len(on)}",
+                arm,
+                number(sum(float(row["violations"]) for row in training)),
+                f"{cell(off, 'return')}; {cell(off, 'cost')}",
+                f"{cell(on, 'return')}; {cell(on, 'cost')}",
+                *shares,
+            ]
+            lines.append("| " + " | ".join(columns) + " |")
+    versions = ", ".join(f"{name} {version(name)}" for name in VERSIONS)
+    return "\n".join([*lines, "", f"Made with {versions}.", ""])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    names = [task.name for task in TASKS]
+    parser.add_argument("--only", nargs="+", choices=names, default=names, help="experiments")
+    parser.add_argument("--arms", nargs="+", choices=("unfiltered", "filtered", "lagrangian"))
+    parser.add_argument("--seeds", nargs="+", type=int)
+    parser.add_argument("--workers", type=int, help="runs at a time (default: one per core)")
+    parser.add_argument("--output", default="runs", help="where the experiments lie")
+    parser.add_argument("--collect", action="store_true", help="train nothing")
+    arguments = parser.parse_args()
+    rows = []
+    for task in TASKS:
+        whole = experiment_of(task, arguments.output)
+        if task.name in arguments.only and not arguments.collect:
+            part = replace(
+                whole,
+                arms=tuple(arm for arm in whole.arms if arm.name in (arguments.arms or (arm.name,))),
+                seeds=[seed for seed in whole.seeds if seed in (arguments.seeds or (seed,))],
+                workers=arguments.workers,
+            )
+            train_experiment(part, Console())
+            evaluate_experiment(part, Console())
+        rows += rows_of(task, whole)
+    write_rows(RESULTS, COLUMNS, rows)
+    with RESULTS.open() as file:
+        RESULTS.with_suffix(".md").write_text(table := markdown(list(csv.DictReader(file))))
+    print(table)
+
+
+if __name__ == "__main__":
+    main()
