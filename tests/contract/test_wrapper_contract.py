@@ -18,6 +18,7 @@ from gymnasium.utils.env_checker import check_env
 
 import safe_wrappers as sw
 from safe_wrappers.envs.safe_rover import WHEELS
+from safe_wrappers.errors import UnsupportedEnvError
 
 TASK, CROSSING, STEPS = "SafePointGoal1-v0", "OccludedCrossing-v0", 60
 REFUSING = (TASK, CROSSING)
@@ -339,6 +340,14 @@ def plain(info):
 def test_there_are_wrappers_and_each_has_an_example():
     assert "CBFActionFilter" in EXPORTED and "RecordInterventions" in EXPORTED
     assert set(EXAMPLES) == set(EXPORTED), "every exported wrapper needs an example, and no other has one"
+
+
+@pytest.mark.parametrize("name", EXPORTED)
+def test_a_vector_env_is_refused_with_the_line_to_write(name):
+    envs = gym.make_vec(TASK, num_envs=2, vectorization_mode="sync")
+    arguments = EXAMPLES[name][next(iter(EXAMPLES[name]))][1]()
+    with pytest.raises(UnsupportedEnvError, match=rf"{name} wraps single envs.*make_vec\(.*sw\.{name}\("):
+        getattr(sw, name)(envs, **arguments)
 
 
 # 1, 2: recording ----------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.default import PlantTemplate
 from safe_wrappers.serialize import recorded
 from safe_wrappers.stack import Layer, refuse_order
@@ -26,6 +27,12 @@ class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
     layer: ClassVar[Layer]
 
     def __init__(self, env: Env) -> None:
+        if isinstance(env, gym.vector.VectorEnv):
+            name = type(self).__name__
+            raise UnsupportedEnvError(
+                f"{name} wraps single envs, got {env!r}; wrap each env of it: gym.make_vec(id, num_envs=...,"
+                f" vectorization_mode='sync', wrappers=[sw.protect, lambda env: sw.{name}(env, ...)])"
+            )
         refuse_order(env, self.layer, type(self).__name__)
         gym.Wrapper.__init__(self, env)
 
