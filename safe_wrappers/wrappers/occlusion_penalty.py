@@ -87,10 +87,10 @@ class OcclusionPenalty(LayerWrapper):
         observe: bool = True,
     ) -> None:
         arguments = dict(locals())
+        LayerWrapper.__init__(self, env)
         raw: Any = env.unwrapped
         if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
             raise UnsupportedEnvError(f"OcclusionPenalty needs MuJoCo's .model and .data; {raw} has none")
-        LayerWrapper.__init__(self, env)
         if isinstance(tracks, str | dict) or not isinstance(tracks, Sequence) or not tracks:
             raise ConfigurationError(f"tracks is a list with at least one Track, got {tracks!r}")
         self.tracks = [track_from(t) for t in tracks]

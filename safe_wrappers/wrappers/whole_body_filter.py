@@ -17,7 +17,7 @@ from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.default import own_plant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
-from safe_wrappers.wrappers.common.layer import Env
+from safe_wrappers.wrappers.common.layer import Env, refuse_vector_env
 
 TOLERANCE = 0.01
 """By how much a contact force may miss its cone unless told otherwise, as a share of the robot's weight."""
@@ -83,6 +83,7 @@ class WholeBodyFilter(CBFActionFilter):
         solver: str = "active-set",
     ) -> None:
         arguments = dict(locals())
+        refuse_vector_env(env, type(self).__name__)
         model = getattr(env.unwrapped, "model", None)
         if not isinstance(model, mujoco.MjModel):
             raise UnsupportedEnvError(f"WholeBodyFilter needs MuJoCo's .model and .data; {env} has none")

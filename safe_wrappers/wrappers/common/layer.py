@@ -27,12 +27,7 @@ class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
     layer: ClassVar[Layer]
 
     def __init__(self, env: Env) -> None:
-        if isinstance(env, gym.vector.VectorEnv):
-            name = type(self).__name__
-            raise UnsupportedEnvError(
-                f"{name} wraps single envs, got {env!r}; wrap each env of it: gym.make_vec(id, num_envs=...,"
-                f" vectorization_mode='sync', wrappers=[sw.protect, lambda env: sw.{name}(env, ...)])"
-            )
+        refuse_vector_env(env, type(self).__name__)
         refuse_order(env, self.layer, type(self).__name__)
         gym.Wrapper.__init__(self, env)
 
@@ -41,6 +36,15 @@ class LayerWrapper(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
         if plain.get("plant") is not None:
             plain["plant"] = PlantTemplate(plain["plant"])
         gym.utils.RecordConstructorArgs.__init__(self, **recorded(arguments, **plain))
+
+
+def refuse_vector_env(env: Any, name: str) -> None:
+    """An error that says how to wrap each env of a vector env."""
+    if isinstance(env, gym.vector.VectorEnv):
+        raise UnsupportedEnvError(
+            f"{name} wraps single envs, got {env!r}; wrap each env of it: gym.make_vec(id, num_envs=...,"
+            f" vectorization_mode='sync', wrappers=[sw.protect, lambda env: sw.{name}(env, ...)])"
+        )
 
 
 class WrapperRng:

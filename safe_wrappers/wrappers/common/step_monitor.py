@@ -25,11 +25,11 @@ class StepMonitor(LayerWrapper, ABC):
     """Its info key for steps that could not be replayed."""
 
     def __init__(self, env: Env) -> None:
+        LayerWrapper.__init__(self, env)
         raw: Any = env.unwrapped
         name = type(self).__name__
         if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
             raise UnsupportedEnvError(f"{name} needs an env with MuJoCo's .model and .data; {raw} has none")
-        LayerWrapper.__init__(self, env)
         self._replay = Replay(raw)
         self._warned = False
 
