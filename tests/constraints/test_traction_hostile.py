@@ -92,11 +92,12 @@ def test_wheels_driven_against_each_other_at_random():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("draw", "share"), [(anything, 0.001), (full_or_nothing, 0.002)])
+@pytest.mark.parametrize(("draw", "share"), [(anything, 0.0007), (full_or_nothing, 0.0053)])
 def test_wheels_driven_against_each_other_at_random_for_long(draw, share):
+    """The shares are those of docs/wrappers/slip-limiter.md; nothing kept free: 2.1 % and 6.8 %."""
     slips = overshoots(20_000, draw, seed=1)
     assert (slips > 0.17).mean(axis=0).max() < share
-    assert slips.max() < 0.2
+    assert slips.max() < 0.21
     assert longest_run(slips[:, 0] > 0.17) <= 2
 
 
