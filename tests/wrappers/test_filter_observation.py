@@ -136,6 +136,28 @@ class Pictured(gym.ObservationWrapper):
         self.observation_space, self.observation = space, make
 
 
+def test_of_wheels_the_slip_in_shares_of_the_limit_and_the_ground_as_estimated():
+    env = sw.FilterObservation(sw.protect(gym.make("SafeRover-v0")))
+    observation, _ = env.reset(seed=0)
+    (bound,) = env.env.filter.bound
+    assert features_of(env, observation).shape == (8 + 5,)
+    limited = 0
+    for step in range(60):
+        action = np.append(np.full(4, 1.0 if step % 20 < 12 else -1.0), 0.1).astype(np.float32)
+        observation, _, _, _, info = env.step(action)
+        shown = features_of(env, observation)
+        slip = info["slip"]  # the env's own, at the end of the step
+        clear = np.abs(slip) > 0.01
+        np.testing.assert_array_equal(np.sign(shown[:4])[clear], np.sign(slip)[clear])
+        # The limit in force is max_slip or less, but never below a tenth of it.
+        least = np.minimum(np.abs(slip) / bound.spec.max_slip, 1.0)
+        assert (np.abs(shown[:4]) >= least - 1e-3).all() and (np.abs(shown[:4]) <= 10.0 * least + 1e-2).all()
+        limited += np.abs(shown[:4]).max() > 0.9
+        mu = bound.seen.estimate.mean
+        np.testing.assert_allclose(shown[4:8], mu / (1.0 + mu), atol=1e-7)
+    assert limited > 5
+
+
 @pytest.mark.parametrize("key", ["pixels", None])
 def test_dicts_get_a_key_and_images_become_dicts(key):
     image = gym.spaces.Box(0, 255, (4, 4, 3), np.uint8)
