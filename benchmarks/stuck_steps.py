@@ -16,23 +16,20 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.table import TASKS, experiment_of
 from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.sb3 import critic_value
-from safe_wrappers.train.config import ArmConfig, FilterConfig, parse_experiment
-from safe_wrappers.train.config.file import read_config
+from safe_wrappers.train.config import ArmConfig, FilterConfig
 from safe_wrappers.train.run.policy import TrainedPolicy
 from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.train.run.training import finished_checkpoint
 from safe_wrappers.wrappers.learner.stuck_escape import StuckEscape
 
-ROOT = Path(__file__).parents[1]
-RESULTS = Path(__file__).parent / "results" / "stuck_steps.json"
-CONFIG = ROOT / "configs" / "goal_sac.yaml"
+RESULTS = Path(__file__).parent / "results"
 ESCAPE = {"progress": 0.1}
 """Two seconds with less than 0.1 m gained: standing, or going around in circles."""
 FIRST_SEED = 2_000_000
-
-
+TRAINED = ("unfiltered", "filtered")
 MODES = {"reported": 0.0, "random": 1.0, "critic": 2.0, "stochastic policy": 0.0}
 """How long an escape lasts, s."""
 
@@ -68,13 +65,16 @@ def drive(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--episodes", type=int, default=50, help="per policy and condition")
+    parser.add_argument(
+        "--task", default=TASKS[0].name, choices=[t.name for t in TASKS if t.config == "goal_sac"]
+    )
     parser.add_argument("--output", default="runs", help="where the experiment lies")
     arguments = parser.parse_args()
-    experiment = parse_experiment(
-        read_config(CONFIG, [f"output={arguments.output}", "name=SafePointGoal1_sac", "seeds=[0,1,2,3,4]"])
-    )
+    task = next(task for task in TASKS if task.name == arguments.task)
+    experiment = experiment_of(task, arguments.output)
     rows = []
-    for arm in experiment.arms:
+    arms = [arm for arm in experiment.arms if arm.name in TRAINED]
+    for arm in arms:
         for seed in experiment.seeds:
             folder = experiment.run_folder(arm, seed)
             if not (folder / "finished.json").exists():
@@ -85,10 +85,10 @@ def main() -> None:
                 row = {"arm": arm.name, "seed": seed, "mode": mode}
                 rows.append(row | drive(arm, used, policy, mode, arguments.episodes))
                 print(rows[-1], flush=True)
-    RESULTS.write_text(json.dumps(rows, indent=1) + "\n")
+    (RESULTS / f"stuck_steps_{task.name}.json").write_text(json.dumps(rows, indent=1) + "\n")
     print("| trained | escape | return | lowest | stuck steps | escaping | violations |")
     print("|---|---|---|---|---|---|---|")
-    for name in ("unfiltered", "filtered"):
+    for name in TRAINED:
         for mode in MODES:
             same = [row for row in rows if (row["arm"], row["mode"]) == (name, mode)]
             if not same:
