@@ -114,7 +114,7 @@ def markdown(rows: list[dict[str, Any]]) -> str:
                 for key in ("stuck", "infeasible")
             ]
             columns = [
-                task,
+                task.removesuffix("-v0"),
                 f"{int(steps):,} x {len(on)}",
                 arm,
                 number(sum(float(row["violations"]) for row in training)),
