@@ -68,8 +68,9 @@ bench: .venv/bench
 # What safety costs in return, task by task: days on two cores; goes on where it was stopped.
 table: .venv/installed
 	$(BIN)/python -m benchmarks.table
+	for task in SafePointGoal1 SafeCarGoal1 SafePointGoal2; do $(BIN)/python -m benchmarks.stuck_steps --task $${task}_sac --episodes 40 || exit 1; done
 
-# Every long figure of the README and docs/results: about nine hours on two cores, but for the table.
+# Every long figure of the README and docs/results: about eight hours on two cores, but for the table.
 figures: .venv/installed
 	$(BIN)/python -m benchmarks.adversarial
 	$(BIN)/python -m benchmarks.adversarial --mismatch
@@ -86,8 +87,6 @@ figures: .venv/installed
 	$(BIN)/python -m benchmarks.seams
 	for config in pointgoal1_300k pointgoal1_learners velocity_experts halfcheetah_velocity_ppo swimmer_velocity_ppo ant_velocity_ppo \
 		outages saferover_ppo occluded_crossing_ppo; do $(BIN)/safe-wrappers compare configs/$$config.yaml --report || exit 1; done
-	$(BIN)/python -m benchmarks.table --only SafePointGoal1_sac
-	$(BIN)/python -m benchmarks.stuck_steps --episodes 40
 	$(BIN)/python -m benchmarks.traction
 	$(BIN)/python -m benchmarks.impact
 	$(BIN)/python -m benchmarks.occlusion --steps 40000

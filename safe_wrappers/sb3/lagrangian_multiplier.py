@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative, positive
@@ -31,8 +32,9 @@ class LagrangianMultiplier(BaseCallback):
         initial: The multiplier at the start, reward per cost, at least 0.
 
     Raises:
-        ConfigurationError: Numbers outside these ranges; in training: an env that reports no cost, or an
-            off-policy learner behind a VecNormalize, which stores the env's own rewards.
+        ConfigurationError: Numbers outside these ranges; in training: an env that reports no cost or one that is
+            not finite, hindsight replay, or an off-policy learner behind a VecNormalize: both replay the env's own
+            rewards.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
@@ -59,6 +61,11 @@ class LagrangianMultiplier(BaseCallback):
                 "LagrangianMultiplier: an off-policy learner behind a VecNormalize stores the env's own rewards,"
                 " without a price on cost; leave VecNormalize out, or use an on-policy learner"
             )
+        if isinstance(getattr(self.model, "replay_buffer", None), HerReplayBuffer):
+            raise ConfigurationError(
+                "LagrangianMultiplier: hindsight replay asks the task for rewards anew, without a price on cost; use"
+                " another replay buffer"
+            )
         self._episode_cost = np.zeros(self.training_env.num_envs)
 
     def _on_step(self) -> bool:
@@ -69,6 +76,8 @@ class LagrangianMultiplier(BaseCallback):
                 " sw.CostFunction(env, cost) gives it to any other"
             )
         costs = np.array([info[keys.COST] for info in infos], dtype=np.float64)
+        if not np.isfinite(costs).all():
+            raise ConfigurationError(f"info['cost'] must be finite, got {costs.tolist()}")
         multiplier = self.multiplier
         # SB3 stores this very array after its callbacks.
         rewards = self.locals["rewards"]

@@ -9,6 +9,7 @@ from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.sb3 import LagrangianMultiplier
@@ -36,6 +37,29 @@ class Toll(gym.Env):
         self.made.append((taken, 2.0 * taken))
         info = {"cost": 2.0 * taken} if self.judged else {}
         return np.zeros(1, np.float32), taken, False, self.steps == LENGTH, info
+
+
+class NoNumber(Toll):
+    """Its cost is NaN."""
+
+    def step(self, action):
+        observation, reward, terminated, truncated, _ = super().step(action)
+        return observation, reward, terminated, truncated, {"cost": np.nan}
+
+
+class Goals(Toll):
+    """With goals, as hindsight replay needs them."""
+
+    observation_space = gym.spaces.Dict(
+        {key: Toll.observation_space for key in ("observation", "achieved_goal", "desired_goal")}
+    )
+
+    def reset(self, *, seed=None, options=None):
+        observation, info = super().reset(seed=seed)
+        return dict.fromkeys(self.observation_space, observation), info
+
+    def compute_reward(self, achieved, desired, info):
+        return np.zeros(len(achieved))
 
 
 def expected(made, limit, rate, multiplier=0.0):
@@ -141,6 +165,13 @@ def test_numbers_that_make_no_price_are_refused(wrong, named):
 def test_an_env_without_cost_and_rewards_that_are_stored_elsewhere_are_refused():
     with pytest.raises(ConfigurationError, match="CostFunction"):
         ppo(Toll(judged=False)).learn(20, callback=LagrangianMultiplier(1.0))
+    with pytest.raises(ConfigurationError, match="must be finite"):
+        ppo(NoNumber()).learn(20, callback=LagrangianMultiplier(1.0))
+    goals = SAC(
+        "MultiInputPolicy", Goals(), replay_buffer_class=HerReplayBuffer, buffer_size=100, device="cpu"
+    )
+    with pytest.raises(ConfigurationError, match="hindsight"):
+        goals.learn(20, callback=LagrangianMultiplier(1.0))
     scaled = VecNormalize(DummyVecEnv([Toll]))
     with pytest.raises(ConfigurationError, match="VecNormalize"):
         SAC("MlpPolicy", scaled, device="cpu").learn(20, callback=LagrangianMultiplier(1.0))

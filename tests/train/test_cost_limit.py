@@ -62,6 +62,14 @@ def test_a_limit_needs_no_filter_and_may_stand_beside_one(fake_experiment):
         (["arms.unfiltered.learner={cost_limit: -1}"], "cost_limit"),
         (["arms.unfiltered.learner={multiplier_rate: 0.1}"], "belongs to cost_limit"),
         (["arms.unfiltered={filter: none, algorithm: SAC, learner: {cost_limit: 1}}"], "leave normalize out"),
+        (
+            [
+                "arms.unfiltered={filter: none, algorithm: SAC, normalize: {observation: false},"
+                " learner: {cost_limit: 1}, hyperparameters: {replay_buffer_class: HerReplayBuffer}}"
+            ],
+            "hindsight",
+        ),
+        (["arms.filtered.filter={protect: {}, escape: {value: critic}}"], "value"),
     ],
 )
 def test_a_limit_that_would_change_nothing_is_refused(fake_experiment, given, words):

@@ -10,6 +10,7 @@ from safe_wrappers.train.config import EvaluationConfig, FilterConfig, parse_exp
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluated_steps, evaluation_folder
 from safe_wrappers.train.report.origin import about
 from safe_wrappers.train.run import Progress, train_run
+from safe_wrappers.train.run.policy import TrainedPolicy
 from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.train.run.training import finished_checkpoint
 from safe_wrappers.train.run.vec_envs import make_vec_env
@@ -91,6 +92,18 @@ def test_a_run_without_a_repeat_is_known_by_its_old_folder(tmp_path):
     _, four = arms(tmp_path)
     assert "action_repeat" not in once["filtered"].fingerprint()
     assert four["filtered"].fingerprint()["action_repeat"] == 4
+
+
+def test_a_trained_policy_is_deterministic_unless_told(tmp_path):
+    experiment, by_name = arms(tmp_path, action_repeat=1)
+    arm = by_name["unfiltered"]
+    folder = experiment.run_folder(arm, 0)
+    train_run(arm, 0, folder, SILENT)
+    policy = TrainedPolicy(arm, finished_checkpoint(arm, 0, folder))
+    observation, _ = make_stack(arm.env, arm.filter).reset(seed=0)
+    np.testing.assert_array_equal(policy(observation), policy(observation))
+    policy.deterministic = False
+    assert not np.array_equal(policy(observation), policy(observation))
 
 
 def test_observing_needs_a_filter_with_constraints(tmp_path):

@@ -124,6 +124,22 @@ def test_a_value_of_another_shape_is_refused():
         pushing(escape_s=0.5, value=lambda _, actions: 1.0)
 
 
+def test_where_no_candidate_is_admitted_a_nan_of_the_policy_is_a_change():
+    _, _, env = pushing(escape_s=2.0, steps=100, value=to_the_left)
+    env._drawn = np.empty((0, 2), dtype=np.float32)  # none is left
+    info = env.step(np.array([np.nan, 0.0], dtype=np.float32))[4]
+    assert info[keys.CBF_ESCAPING] and info[keys.CBF_NONFINITE] and info[keys.CBF_INTERVENED]
+    assert info["cbf/fallback"] and np.isfinite(info[keys.EXECUTED_ACTION]).all()
+
+
+def test_an_action_of_another_shape_steps_nothing_while_it_acts():
+    _, _, env = pushing(escape_s=2.0, steps=100)
+    before = env.unwrapped.data.time
+    with pytest.raises(sw.SafeWrappersError, match="expected an action of shape"):
+        env.step(np.zeros(3, dtype=np.float32))
+    assert env.unwrapped.data.time == before and env.step(PUSH)[4][keys.CBF_ESCAPING]
+
+
 def test_what_it_acted_on_is_counted():
     env = sw.protect(gym.make("SafePointGoal1-v0", max_episode_steps=200), detour=False)
     env = sw.RecordInterventions(sw.StuckEscape(env, after_s=1.0, progress=0.05, escape_s=0.0))
@@ -150,7 +166,7 @@ def test_refused():
     with pytest.raises(sw.SafeWrappersError, match="needs a CBFActionFilter inside"):
         sw.StuckEscape(env)
     env = sw.protect(env)
-    for arguments in ({"after_s": 0.0}, {"escape_s": -1.0}, {"progress": np.nan}):
+    for arguments in ({"after_s": 0.0}, {"escape_s": -1.0}, {"progress": np.nan}, {"value": "critic"}):
         with pytest.raises(sw.SafeWrappersError, match=next(iter(arguments))):
             sw.StuckEscape(env, **arguments)
     with pytest.raises(sw.SafeWrappersError, match="use one"):

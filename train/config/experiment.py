@@ -150,6 +150,11 @@ def _check_learner(arm: ArmConfig, where: str) -> None:
             f"{where}: with normalize {arm.algorithm} stores the env's own rewards, and cost_limit would change"
             f" nothing; leave normalize out, or use {' or '.join(ON_POLICY)}."
         )
+    if arm.learner.cost_limit is not None and arm.replays_goals:
+        raise ConfigurationError(
+            f"{where}: hindsight replay asks the task for rewards anew, without the price of cost_limit; leave"
+            " hyperparameters.replay_buffer_class out."
+        )
     if not arm.learner.stores_executed:
         return
     if arm.algorithm in ON_POLICY:

@@ -45,7 +45,8 @@ class StuckEscape(LayerWrapper):
     Info, at every step: ``cbf/stuck``, ``cbf/escaping`` (bool).
 
     Raises:
-        ConfigurationError: No filter inside, or times that are not; in an escape: `value` returns another shape.
+        ConfigurationError: No filter inside, times that are not, or a `value` that is no function; in an escape: it
+            returns another shape.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
@@ -76,6 +77,10 @@ class StuckEscape(LayerWrapper):
             )
         if not np.isfinite(progress):
             raise ConfigurationError(f"progress is a finite sum of rewards, got {progress!r}")
+        if value is not None and not callable(value):
+            raise ConfigurationError(
+                f"value is a function of an observation and actions, such as critic_value(model), got {value!r}"
+            )
         control_dt = inside.plant.control_dt
         self._window = max(1, round(positive("after_s", after_s, "s") / control_dt))
         self._escape = round(non_negative("escape_s", escape_s, "s") / control_dt)
@@ -96,18 +101,20 @@ class StuckEscape(LayerWrapper):
     def step(self, action: Any) -> Step:
         """Step the env with the policy's action, or with the drawn one."""
         escaping = self._left > 0
-        sent = self._other(action) if escaping else action
-        observation, reward, terminated, truncated, info = self.env.step(sent)
+        sent, proposed = action, None
         if escaping:
-            self._left -= 1
             proposed = action_array(action, self._drawn.shape[1:], np.float64)
+            sent = self._other(action)
+        observation, reward, terminated, truncated, info = self.env.step(sent)
+        if proposed is not None:
+            self._left -= 1
             finite = np.isfinite(proposed)
             proposed = np.where(finite, proposed, 0.0)
             info[keys.CBF_NONFINITE] = not finite.all()
             executed = info[keys.EXECUTED_ACTION]
             info[keys.PROPOSED_ACTION] = proposed
             info[keys.CBF_CORRECTION] = float(np.linalg.norm(executed - proposed))
-            info[keys.CBF_INTERVENED] = bool((executed != proposed).any())
+            info[keys.CBF_INTERVENED] = bool((executed != proposed).any() or not finite.all())
         self._observation = observation
         self._rewards.append(float(reward))
         self._changed.append(info[keys.CBF_INTERVENED])
