@@ -125,11 +125,18 @@ def test_a_value_of_another_shape_is_refused():
 
 
 def test_where_no_candidate_is_admitted_a_nan_of_the_policy_is_a_change():
-    _, _, env = pushing(escape_s=2.0, steps=100, value=to_the_left)
+    """Also where the fallback sends what its place is reported with: zeros."""
+    env = sw.protect(gym.make("SafePointGoal1-v0"), detour=False)
+    env = sw.CBFActionFilter(env.env, env.constraints, fallback="zero")
+    env = sw.StuckEscape(env, after_s=1.0, progress=0.05, escape_s=2.0, value=to_the_left)
+    env.reset(seed=0, options={"layout": BEFORE_A_HAZARD})
+    while not env.step(PUSH)[4][keys.CBF_STUCK]:
+        pass
     env._drawn = np.empty((0, 2), dtype=np.float32)  # none is left
-    info = env.step(np.array([np.nan, 0.0], dtype=np.float32))[4]
-    assert info[keys.CBF_ESCAPING] and info[keys.CBF_NONFINITE] and info[keys.CBF_INTERVENED]
-    assert info["cbf/fallback"] and np.isfinite(info[keys.EXECUTED_ACTION]).all()
+    info = env.step(np.full(2, np.nan, dtype=np.float32))[4]
+    assert info[keys.CBF_ESCAPING] and info[keys.CBF_NONFINITE] and info["cbf/fallback"]
+    assert not info[keys.EXECUTED_ACTION].any()
+    assert info[keys.CBF_INTERVENED]
 
 
 def test_an_action_of_another_shape_steps_nothing_while_it_acts():
