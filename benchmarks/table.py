@@ -50,6 +50,7 @@ TASKS = (
     Task("SafePointGoal1-v0", "goal_sac", 5),
     Task("SafePointGoal1-v0", "goal_sac", 5, ("total_steps=250000",), "_1m"),
     Task("SafePointGoal2-v0", "goal_sac", 3),
+    Task("SafePointGoal2-v0", "goal_sac", 3, ("total_steps=250000",), "_1m"),
     Task("SafeCarGoal1-v0", "goal_sac", 3),
     Task("SafeCarGoal2-v0", "goal_sac", 3),
     Task("SafeHalfCheetahVelocity-v0", "velocity_sac", 5),
