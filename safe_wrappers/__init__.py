@@ -17,9 +17,10 @@ from safe_wrappers.errors import SafeWrappersError, UnsafeStateWarning
 from safe_wrappers.filter.batch import project_batch
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces
 from safe_wrappers.filter.projection import project
-from safe_wrappers.plants import AnalyticPlant, MujocoPlant, Plant
+from safe_wrappers.plants import AnalyticPlant, MujocoPlant, Plant, SimulatorPlant
 from safe_wrappers.protect import protect
 from safe_wrappers.wrappers import faults, occlusion, teleop
+from safe_wrappers.wrappers.action_shield import ActionShield
 from safe_wrappers.wrappers.balance_monitor import BalanceMonitor
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.chunk_handover import ChunkHandover
@@ -41,6 +42,7 @@ from safe_wrappers.wrappers.whole_body_filter import WholeBodyFilter
 
 __all__ = [
     "ActionRepeat",
+    "ActionShield",
     "AdaptionPenalty",
     "AnalyticPlant",
     "BalanceMonitor",
@@ -59,6 +61,7 @@ __all__ = [
     "RecordInterventions",
     "SafeActionMap",
     "SafeWrappersError",
+    "SimulatorPlant",
     "SlipLimiter",
     "StoppingBudget",
     "StuckEscape",

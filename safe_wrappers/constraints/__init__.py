@@ -17,6 +17,7 @@ from safe_wrappers.constraints.limits.speed_limit import SpeedLimit
 from safe_wrappers.constraints.limits.upright import Upright
 from safe_wrappers.constraints.limits.workspace import Workspace
 from safe_wrappers.constraints.obstacles import Box, Disc, Discs, Plane, Sphere, TrackedDiscs
+from safe_wrappers.constraints.predictive_shield import PredictiveShield
 from safe_wrappers.constraints.track_permission import TrackPermission
 from safe_wrappers.constraints.traction import Traction
 
@@ -35,6 +36,7 @@ __all__ = [
     "JointPositionLimit",
     "JointSpeedLimit",
     "Plane",
+    "PredictiveShield",
     "SingularityMargin",
     "SpeedLimit",
     "Sphere",

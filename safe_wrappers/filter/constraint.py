@@ -53,6 +53,8 @@ class Constraint(ABC):
     promise: Promise = "best effort"
     measures_approach: ClassVar[bool] = False
     """Whether `BoundConstraint.approach` measures clearance and approach speed."""
+    simulates: ClassVar[bool] = False
+    """Whether it needs a plant that rolls out policies, `SimulatorPlant` by default."""
     margin = 0.0
     """Kept free before the limit, in the constraint's own unit."""
     state_error = 0.0

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -40,6 +40,7 @@ class SafetyFilter:
     """
 
     margin: float
+    search: ClassVar[type[SafeActionSearch]] = SafeActionSearch
 
     def __init__(
         self,
@@ -60,7 +61,7 @@ class SafetyFilter:
                 twice = f"{kind} is in the list {kinds.count(kind)} times"
                 raise ConfigurationError(f"{twice}, and both would write the same info keys; use one")
         falling_back = Fallback(fallback, self.bound)
-        self._search = SafeActionSearch(plant, self.bound, falling_back, solver, low, high, dtype)
+        self._search = self.search(plant, self.bound, falling_back, solver, low, high, dtype)
         self._low, self._high = low, high
         self._narrower = not plant.bounds_are_action_space
         self._all_predict = all(c.predicts for c in self.bound)

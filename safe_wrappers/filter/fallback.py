@@ -35,7 +35,7 @@ class Fallback:
             names = ", ".join(NAMES)
             raise UnknownNameError(f"no fallback {choice!r}; choose {names}, or pass a function of the plant")
         self._choice, self._constraints = choice, constraints
-        self.brakes = choice == "brake"
+        self.brakes, self.custom = choice == "brake", callable(choice)
 
     def __call__(
         self, plant: Plant | None, last: Array, low: Array, high: Array, least: Array | None, readable: bool

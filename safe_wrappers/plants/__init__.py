@@ -4,5 +4,16 @@ from safe_wrappers.plants.analytic import AnalyticPlant
 from safe_wrappers.plants.displacement import DisplacementPlant
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
+from safe_wrappers.plants.rollouts import Rollout, RolloutPlant, View
+from safe_wrappers.plants.simulator.plant import SimulatorPlant
 
-__all__ = ["AnalyticPlant", "DisplacementPlant", "MujocoPlant", "Plant"]
+__all__ = [
+    "AnalyticPlant",
+    "DisplacementPlant",
+    "MujocoPlant",
+    "Plant",
+    "Rollout",
+    "RolloutPlant",
+    "SimulatorPlant",
+    "View",
+]

@@ -1,6 +1,7 @@
 """Which plant describes an env: the user's, one that a spec recorded, or the default."""
 
 import copy
+from collections.abc import Iterable
 from typing import Any
 
 import gymnasium as gym
@@ -10,6 +11,7 @@ from safe_wrappers.plants.displacement import DisplacementPlant
 from safe_wrappers.plants.mujoco.displacement_step import moves_by_displacement
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
+from safe_wrappers.plants.simulator.plant import SimulatorPlant
 
 
 class PlantTemplate:
@@ -29,6 +31,12 @@ def own_plant(plant: Any) -> Plant | None:
     return plant
 
 
-def default_plant(env: gym.Env[Any, Any]) -> MujocoPlant:
-    """A `DisplacementPlant` for envs of the Fetch kind, else a `MujocoPlant`; not bound yet."""
+def default_plant(env: gym.Env[Any, Any], constraints: Iterable[Any] = ()) -> Plant:
+    """Not bound yet.
+
+    A `SimulatorPlant` where a constraint simulates, a `DisplacementPlant` for envs of the Fetch kind, else a
+    `MujocoPlant`.
+    """
+    if any(constraint.simulates for constraint in constraints):
+        return SimulatorPlant()
     return DisplacementPlant() if moves_by_displacement(env.unwrapped) else MujocoPlant()

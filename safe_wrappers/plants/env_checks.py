@@ -81,6 +81,11 @@ def check_actions(env: gym.Env[Any, Any]) -> gym.spaces.Box:
     """The env's action space, refused unless it is a one-dimensional, floating Box."""
     space = env.action_space
     box = gym.spaces.Box
+    if isinstance(space, gym.spaces.Discrete | gym.spaces.MultiDiscrete):
+        raise ConfigurationError(
+            f"expected a continuous Box action space, got {space}: use ActionShield(env, [PredictiveShield(...)]), "
+            "which tries every action"
+        )
     discrete = [s for s in _parts(space) if not (isinstance(s, box) and np.issubdtype(s.dtype, np.floating))]
     if discrete:
         raise ConfigurationError(

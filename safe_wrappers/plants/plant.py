@@ -34,6 +34,8 @@ class Plant(ABC):
     """Whether `lower` and `upper` are the action space's at every state."""
     can_brake: ClassVar[bool] = False
     """Whether it knows which states are velocities, as a braking fallback needs."""
+    simulates: ClassVar[bool] = False
+    """Whether it rolls out actions and policies, as `RolloutPlant` does."""
 
     @property
     @abstractmethod
@@ -67,6 +69,9 @@ class Plant(ABC):
     @abstractmethod
     def observe(self) -> None:
         """Take the env's present state."""
+
+    def received(self, observation: Any, info: dict[str, Any]) -> None:  # noqa: B027 - most plants read the env
+        """Take what the env's reset or step has returned; called before the next `observe`."""
 
     def step(self, env: gym.Env[Any, Any], action: Any) -> Any:
         """Step the env with what may be executed; what `env.step` returns."""
@@ -111,3 +116,11 @@ class Plant(ABC):
         """Refuse a constraint, named by `asker`, whose rows need f and g where there are none."""
         if not self.has_acceleration:
             raise UnsupportedEnvError(f"{asker} needs the acceleration that a control causes")
+
+    def require_simulation(self, asker: str) -> None:
+        """Refuse a constraint, named by `asker`, that needs rollouts of a policy where there are none."""
+        if not self.simulates:
+            raise UnsupportedEnvError(
+                f"{asker} simulates backups, which a {type(self).__name__} cannot: take plant=SimulatorPlant(), and "
+                "put other constraints' requirements into h"
+            )

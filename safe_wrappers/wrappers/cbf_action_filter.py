@@ -49,7 +49,8 @@ class CBFActionFilter(LayerWrapper):
     Args:
         env: With a one-dimensional Box action space.
         constraints: Instances, or the plain dicts that a recorded filter holds. They are copied.
-        plant: None reads the env's MuJoCo model; other envs need an `AnalyticPlant`.
+        plant: None reads the env's MuJoCo model, or simulates the env where a constraint does; else an
+            `AnalyticPlant`.
         fallback: "brake", "hold", "zero", or a function of the plant that returns a control.
         solver: "active-set" (compiled, exact), "daqp" or any installed qpsolvers backend.
         margin: Added to every constraint's own `margin`, in that constraint's unit (m, rad/s, ...).
@@ -90,7 +91,7 @@ class CBFActionFilter(LayerWrapper):
     ) -> None:
         arguments = dict(locals())
         LayerWrapper.__init__(self, env)
-        space = check_actions(env)
+        self._take_action_space(env)
         plant = own_plant(plant)
         if isinstance(constraints, str | dict) or not isinstance(constraints, Sequence) or not constraints:
             raise ConfigurationError(f"constraints is a list with at least one, got {constraints!r}")
@@ -101,15 +102,19 @@ class CBFActionFilter(LayerWrapper):
         self._own = own
         self.constraints: list[Constraint] = self._widened(margin)
         self.constraint_names = _unique([type(c).__name__ for c in self.constraints])
-        self.plant: Plant = plant if plant is not None else default_plant(env)
+        self.plant: Plant = plant if plant is not None else default_plant(env, own)
         self.plant.bind(env)
-        self._low, self._high = np.asarray(space.low, np.float64), np.asarray(space.high, np.float64)
-        self._shape, self._dtype = space.shape, space.dtype
         self._fallback, self._solver = fallback, solver
         self.filter = self._filter()
         self.warned: set[str] = set()
         self._observed = False
         self.filter_seconds, self.filter_calls = 0.0, 0
+
+    def _take_action_space(self, env: Env) -> None:
+        space = check_actions(env)
+        self._low, self._high = np.asarray(space.low, np.float64), np.asarray(space.high, np.float64)
+        self._shape: tuple[int, ...] = space.shape
+        self._dtype: Any = space.dtype
 
     def _widened(self, margin: float) -> list[Constraint]:
         return [c.widened(margin) for c in self._own] if margin else self._own
@@ -145,6 +150,7 @@ class CBFActionFilter(LayerWrapper):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
         """Reset the env and forget the episode: commands in flight, the last action, the warning."""
         observation, info = self.env.reset(seed=seed, options=options)
+        self.plant.received(observation, info)
         return observation, info | self.start_report()
 
     def start_report(self) -> dict[str, Any]:
@@ -170,6 +176,7 @@ class CBFActionFilter(LayerWrapper):
         self.filter_seconds += time.perf_counter() - started
         self.filter_calls += 1
         observation, reward, terminated, truncated, info = self.plant.step(self.env, sent)
+        self.plant.received(observation, info)
         info |= report
         if self.filter.reporting:
             info |= self.filter.info(report[keys.PROPOSED_ACTION], report[keys.EXECUTED_ACTION])

@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorActionWrapper, VectorEnv, VectorWrapper
+from gymnasium.vector.utils import iterate
 from numpy.typing import NDArray
 
 from safe_wrappers import info as keys
@@ -101,6 +102,7 @@ class VectorCBFActionFilter(VectorWrapper[Any, Any, Any, Any, Any]):
         # The vector env takes the mask out of its options.
         observations, infos = self.env.reset(seed=seed, options=options and dict(options))  # type: ignore[arg-type]
         self._ended[mask] = False
+        self._received(observations, infos, mask)
         self._start(infos, mask)
         return observations, infos
 
@@ -117,6 +119,7 @@ class VectorCBFActionFilter(VectorWrapper[Any, Any, Any, Any, Any]):
             single.filter_calls += was_judged
         observations, rewards, terminated, truncated, infos = self._step(sent, judged)
         self._ended = np.asarray(terminated | truncated)
+        self._received(observations, infos, np.ones(self.num_envs, dtype=bool))
         restarted = self._ended if self._same_step else ~judged
         self._report(infos, reports, judged & ~restarted)
         if self._same_step and restarted.any():
@@ -135,6 +138,15 @@ class VectorCBFActionFilter(VectorWrapper[Any, Any, Any, Any, Any]):
         finally:
             for plant in plants:
                 plant.withdraw_rollout()
+
+    def _received(self, observations: Any, infos: dict[str, Any], mask: Mask) -> None:
+        """Tell plants that simulate what their envs have returned."""
+        if not self.filters[0].plant.simulates:
+            return
+        each = list(iterate(self.observation_space, observations))
+        for i in np.flatnonzero(mask).tolist():
+            own = {key: infos[key][i] for key in infos if f"_{key}" in infos and infos[f"_{key}"][i]}
+            self.filters[i].plant.received(copy.deepcopy(each[i]), own)
 
     def _judge(self, given: NDArray[Any], sent: NDArray[Any], judged: Mask) -> dict[str, NDArray[Any]]:
         """Write what to send where it is not what was given; the info keys of all envs, shape (n, ...)."""

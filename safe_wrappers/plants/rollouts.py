@@ -1,0 +1,169 @@
+"""What a plant can do that simulates: rollouts of a control and a policy, judged step by step."""
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple, NoReturn
+
+import gymnasium as gym
+import numpy as np
+
+from safe_wrappers.checks import Array
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.plants.plant import Plant
+
+
+class View(NamedTuple):
+    """What can be seen of a state: the unwrapped env (None of an identified model), observation and info."""
+
+    env: Any
+    observation: Any
+    info: dict[str, Any]
+
+
+Measure = Callable[[View], float]
+Policy = Callable[[View], Any]
+"""Gives an action of the env's action space."""
+
+
+@dataclass
+class Rollout:
+    """What a simulation has seen.
+
+    Attributes:
+        observations: After each step.
+        rewards: Of each step, shape (k,).
+        values: What was measured after each step, shape (k,).
+        ended: The episode terminated or was truncated.
+        reached: The set in which it may stop was reached.
+    """
+
+    observations: list[Any] = field(default_factory=list)
+    rewards: list[float] = field(default_factory=list)
+    values: list[float] = field(default_factory=list)
+    ended: bool = False
+    reached: bool = False
+
+
+class RolloutPlant(Plant):
+    """A plant that predicts by rollouts alone; it has neither f nor g."""
+
+    has_acceleration: ClassVar[bool] = False
+    bounds_are_action_space: ClassVar[bool] = True
+    simulates: ClassVar[bool] = True
+    lower: Array = np.zeros(0)  #: of the control, shape (m,), once bound
+    upper: Array = np.zeros(0)
+    delay_s = 0.0
+    _space: gym.Space[Any]
+    view: View
+    """What was returned last by the env's reset or step."""
+
+    @property
+    def f(self) -> NoReturn:
+        """Raises: nothing is known of it."""
+        self.require_acceleration("f")
+
+    @property
+    def g(self) -> NoReturn:
+        """Raises likewise."""
+        self.require_acceleration("g")
+
+    def require_acceleration(self, asker: str) -> NoReturn:
+        """Raise an error that says what works."""
+        raise UnsupportedEnvError(
+            f"{asker} needs the acceleration that a control causes; a {type(self).__name__} knows only where actions "
+            "lead: use PredictiveShield"
+        )
+
+    def step(self, env: gym.Env[Any, Any], action: Any) -> Any:
+        """Step the env; a discrete action is a control, and becomes what the space has."""
+        return super().step(env, self.action(action) if self.discrete else action)
+
+    def _take_space(self, space: gym.Space[Any]) -> None:
+        """The bounds of controls, which are actions as arrays of float64."""
+        if isinstance(space, gym.spaces.Box) and len(space.shape) == 1:
+            if not space.is_bounded():
+                raise UnsupportedEnvError(
+                    f"expected bounded actions, got {space}; bound the env's action space"
+                )
+            self.lower, self.upper = space.low.astype(float), space.high.astype(float)
+        elif isinstance(space, gym.spaces.Discrete):
+            self.lower = np.array([float(space.start)])
+            self.upper = self.lower + float(space.n - 1)
+        elif isinstance(space, gym.spaces.MultiDiscrete) and space.nvec.ndim == 1:
+            self.lower = space.start.astype(float)
+            self.upper = self.lower + space.nvec - 1.0
+        else:
+            raise UnsupportedEnvError(
+                f"expected a Box of shape (m,), a Discrete or a MultiDiscrete action space, got {space}; give "
+                "the env one of these from gymnasium.spaces.flatten_space, and gymnasium.spaces.unflatten in its step"
+            )
+        self._space = space
+
+    @property
+    def discrete(self) -> bool:
+        """Whether actions are whole numbers."""
+        return not isinstance(self._space, gym.spaces.Box)
+
+    def neighbours(self, control: Array, offsets: Array, more: Sequence[Array] = ()) -> list[Array]:
+        """Other controls, the nearest first: all of discrete ones.
+
+        Args:
+            control: Shape (m,).
+            offsets: In halves of the box, shape (k, m).
+            more: Further ones.
+        """
+        if self.discrete:
+            counts = (self.upper - self.lower + 1.0).astype(int)
+            every = self.lower + np.stack(np.unravel_index(np.arange(counts.prod()), counts), axis=1)
+        else:
+            moved = control + offsets * 0.5 * (self.upper - self.lower)
+            clipped = np.clip(moved, self.lower, self.upper)
+            every = np.array([*more, *clipped.astype(self._space.dtype).astype(np.float64)])
+        distances = np.linalg.norm(every - control, axis=1)
+        return [every[i] for i in np.argsort(distances, kind="stable") if distances[i] > 0.0]
+
+    def action(self, control: Array) -> Any:
+        """The env's action for a control, shape (m,)."""
+        if isinstance(self._space, gym.spaces.Discrete):
+            return int(control[0])
+        return control.astype(self._space.dtype)
+
+    def control(self, action: Any, of: str) -> Array:
+        """The control for an action of the space, clipped to its bounds; `of` says in messages whose it is.
+
+        Raises:
+            ConfigurationError: Another shape, or not finite.
+        """
+        try:
+            control = np.atleast_1d(np.asarray(action, dtype=np.float64))
+        except (TypeError, ValueError):
+            control = np.zeros(0)
+        if control.shape != self.lower.shape or not np.isfinite(control).all():
+            raise ConfigurationError(f"{of} must return a finite action of {self._space}, got {action!r}")
+        return np.clip(control, self.lower, self.upper)
+
+    @abstractmethod
+    def rollout(
+        self,
+        control: Array,
+        horizon: int,
+        policy: Policy | None = None,
+        measure: Measure | None = None,
+        least: float = -np.inf,
+        until: Callable[[View], bool] | None = None,
+    ) -> Rollout:
+        """Simulate a control, then a policy, from the env's present state.
+
+        Args:
+            control: For the first step, shape (m,).
+            horizon: Steps in all, at most; fewer where the episode ends.
+            policy: Takes a `View`, returns an action; None holds the control.
+            measure: Takes a `View`, returns a number.
+            least: A measured number below it, or NaN, ends the rollout.
+            until: Takes a `View`; where it is True the rollout ends.
+        """
+
+    @abstractmethod
+    def margins(self, measure: Measure, horizon: int) -> Array:
+        """By how much a measure may be worse than predicted after each step, shape (horizon,), in its unit."""

@@ -1,0 +1,122 @@
+"""Copies of envs with all their wrappers, in their present state."""
+
+import copy
+from collections.abc import Iterator
+from types import ModuleType
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.plants.env_checks import name_of, wrappers_of
+
+_DRAWING = ("pygame", "glfw", "OpenGL", "moviepy")
+_RECORDING = ("RecordVideo", "HumanRendering", "RenderCollection")
+Memo = dict[int, Any]
+
+
+def envs_of(env: gym.Env[Any, Any]) -> Iterator[gym.Env[Any, Any]]:
+    """The env, what it wraps, and what these hold as attributes, each once."""
+    found: dict[int, Any] = {}
+    left: list[Any] = [env]
+    while left:
+        one = left.pop()
+        if id(one) in found:
+            continue
+        found[id(one)] = one
+        yield one
+        left += [value for value in vars(one).values() if isinstance(value, gym.Env)]
+
+
+def refuse_recorders(env: gym.Env[Any, Any]) -> None:
+    """Refuse wrappers that would draw or write what only a copy has done."""
+    for inner in wrappers_of(env):
+        if type(inner).__name__ in _RECORDING:
+            raise ConfigurationError(
+                f"{type(inner).__name__} inside the filter would also record the steps of the filter's simulations; "
+                "put it outside (filter first, then this wrapper)"
+            )
+
+
+def is_drawn(value: Any) -> bool:
+    """Whether a value is a window, a renderer or a picture, which no copy needs."""
+    kind = type(value)
+    return kind.__module__.partition(".")[0] in _DRAWING or kind.__name__.endswith(("Renderer", "Viewer"))
+
+
+class EnvCopier:
+    """Copies an env again and again; MuJoCo's model is copied once per episode, its data into one place.
+
+    A copy is valid until the next one is made. EzPickle, whose copies are new envs, has no say. Spaces and specs are
+    shared; windows and renderers are left out.
+
+    Args:
+        env: With all the wrappers inside the filter.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        self._env = env
+        self.start()
+
+    def start(self) -> None:
+        """Copy models again: a reset may have changed them."""
+        self._models: dict[int, tuple[Any, Any]] = {}
+        self._data: dict[int, tuple[Any, Any, Any]] = {}
+
+    def copy(self) -> gym.Env[Any, Any]:
+        """The env in its present state.
+
+        Raises:
+            UnsupportedEnvError: An attribute cannot be copied; the message has its name.
+        """
+        memo: Memo = {}
+        envs = list(envs_of(self._env))
+        for one in envs:
+            memo[id(one)] = object.__new__(type(one))
+            for value in vars(one).values():
+                if isinstance(value, gym.Space | gym.envs.registration.EnvSpec | ModuleType):
+                    memo[id(value)] = value
+                elif isinstance(value, mujoco.MjModel):
+                    memo[id(value)] = self._model(value)
+                elif is_drawn(value):
+                    memo[id(value)] = None
+        for one in envs:
+            for value in vars(one).values():
+                if isinstance(value, mujoco.MjData):
+                    memo[id(value)] = self._copy_of_data(value)
+        for one in envs:
+            attributes: dict[str, Any] = memo[id(one)].__dict__
+            for name, value in vars(one).items():
+                known = id(value) in memo  # as None, too, which deepcopy would take for "not copied yet"
+                attributes[name] = memo[id(value)] if known else _copied(one, name, value, memo)
+        raw = memo[id(self._env.unwrapped)]
+        if "render_mode" in vars(raw):
+            raw.render_mode = None
+        copied: gym.Env[Any, Any] = memo[id(self._env)]
+        return copied
+
+    def _model(self, model: mujoco.MjModel) -> mujoco.MjModel:
+        if id(model) not in self._models:
+            self._models[id(model)] = model, copy.copy(model)
+        return self._models[id(model)][1]
+
+    def _copy_of_data(self, data: mujoco.MjData) -> mujoco.MjData:
+        if id(data) not in self._data:
+            model = self._model(data.model)
+            self._data[id(data)] = data, model, mujoco.MjData(model)
+        _, model, own = self._data[id(data)]
+        mujoco.mj_copyData(own, model, data)
+        return own
+
+
+def _copied(owner: Any, name: str, value: Any, memo: Memo) -> Any:
+    try:
+        return copy.deepcopy(value, memo)
+    except Exception as error:
+        raise UnsupportedEnvError(
+            f"{name_of(owner)} cannot be copied: {type(owner).__name__}.{name} is a {type(value).__name__}"
+            f" ({error}). Say how its state is saved and restored, snapshot=(save, restore) with save(env) "
+            "and restore(env, state) of the unwrapped env, or simulate in child processes, "
+            "SimulatorPlant(snapshot='fork'), where the system has them"
+        ) from None

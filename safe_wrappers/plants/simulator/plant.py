@@ -1,0 +1,163 @@
+"""SimulatorPlant: the env's own simulation is the model."""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from safe_wrappers.checks import Array, positive, whole_number
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.env_checks import (
+    check_timing,
+    name_of,
+    read_attribute,
+    refuse_changed_actions,
+    refuse_second_env,
+)
+from safe_wrappers.plants.rollouts import Measure, Policy, Rollout, RolloutPlant, View
+from safe_wrappers.plants.simulator.replay_check import check_replay
+from safe_wrappers.plants.simulator.simulation import (
+    Env,
+    Simulation,
+    Snapshot,
+    fresh_generator,
+    simulation_of,
+)
+
+
+class SimulatorPlant(RolloutPlant):
+    """Rolls out actions in the env itself, from its present state, with all wrappers inside the filter.
+
+    No dynamics are written down. By default the env is copied, MuJoCo's state included; an env with `get_state` and
+    `set_state`, or `clone_state` and `restore_state`, is restored by these. At binding random steps are made in the
+    simulation and in the env: both must agree bit for bit, or the env is refused.
+
+    **It knows what will be drawn**: the random generator of the env belongs to its state, so that a rollout has the
+    noise that the env will have. Only a simulator has this privilege; `same_noise=False` takes it away, and then
+    rollouts are samples, and prove nothing about the env.
+
+    Args:
+        snapshot: `(save, restore)`: functions `save(env)` and `restore(env, state)` of the unwrapped env, which is
+            then itself simulated; or "fork", which simulates in a child process, for envs that cannot be copied, such
+            as Box2D's. None: see above.
+        control_dt: Control interval, s; None takes the env's `dt`. An env without `dt` has none, and wrappers that
+            count in seconds ask for it.
+        same_noise: Whether rollouts draw the random numbers that the env will draw.
+        check_steps: Random steps of the check at binding; 0 checks nothing.
+
+    Raises:
+        UnsupportedEnvError: The env cannot be copied, or its simulation differs from it; the message says where.
+        ConfigurationError: A wrapper inside that records, or changes actions; a wrong control interval.
+
+    Example:
+        >>> import gymnasium as gym, safe_wrappers as sw
+        >>> upright = lambda x: 0.2 - abs(x[2])  # rad, of CartPole's observation
+        >>> plant = sw.SimulatorPlant(control_dt=0.02)
+        >>> env = sw.ActionShield(gym.make("CartPole-v1"), upright, horizon=10, backup=0, plant=plant)
+    """
+
+    def __init__(
+        self,
+        snapshot: Snapshot = None,
+        control_dt: float | None = None,
+        same_noise: bool = True,
+        check_steps: int = 1000,
+    ) -> None:
+        self._snapshot, self.same_noise = snapshot, bool(same_noise)
+        self._given_control_dt = None if control_dt is None else positive("control_dt", control_dt, "s")
+        self.check_steps = whole_number("check_steps", check_steps, 0, "steps")
+        self._simulation: Simulation | None = None
+
+    def bind(self, env: Env) -> None:
+        """Attach to an env, and check that its simulation is the env."""
+        refuse_second_env(None if self._simulation is None else self._simulation.env, env)
+        refuse_changed_actions(env)
+        self._take_space(env.action_space)
+        self._control_dt: float | None = None
+        if self._given_control_dt is not None or env.has_wrapper_attr("dt"):
+            self._control_dt = check_timing(env, self._given_control_dt)
+        self._env = env
+        self._simulation = simulation_of(env, self._snapshot)
+        self.view = View(env.unwrapped, np.zeros(0), {})
+        if self.check_steps:
+            check_replay(self._simulation, self.check_steps)
+
+    @property
+    def control_dt(self) -> float:  # type: ignore[override]
+        """Control interval, s; an error where nothing says it."""
+        if self._control_dt is None:
+            raise ConfigurationError(
+                f"{name_of(self._env)} does not say how long a step lasts (it has no attribute dt): pass "
+                "SimulatorPlant(control_dt=...), in seconds"
+            )
+        return self._control_dt
+
+    @property
+    def simulation(self) -> Simulation:
+        """Of the env that it is bound to."""
+        assert self._simulation is not None
+        return self._simulation
+
+    @property
+    def state(self) -> Array:
+        """The last observation as numbers, shape (n,); empty where it is no array."""
+        observation = self.view.observation
+        if isinstance(observation, np.ndarray) and observation.dtype.kind in "fiub":
+            return observation.astype(np.float64).reshape(-1)
+        return np.zeros(0)
+
+    def observe(self) -> None:
+        """Every rollout starts where the env is."""
+        self.observation_id += 1
+
+    def received(self, observation: Any, info: dict[str, Any]) -> None:
+        """Take what the env's reset or step has returned."""
+        self.view = View(self._env.unwrapped, observation, info)
+
+    def executed(self, control: Array | None) -> None:
+        """A new episode may have changed what copies share."""
+        if control is None:
+            self.simulation.start()
+
+    def attribute(self, name: str) -> Any:
+        """Read a published fact of the env."""
+        return read_attribute(self._env, name)
+
+    def rollout(
+        self,
+        control: Array,
+        horizon: int,
+        policy: Policy | None = None,
+        measure: Measure | None = None,
+        least: float = -np.inf,
+        until: Callable[[View], bool] | None = None,
+    ) -> Rollout:
+        """Simulate a control, then a policy, from the env's present state: see `RolloutPlant.rollout`."""
+
+        def simulated(env: gym.Env[Any, Any]) -> Rollout:
+            if not self.same_noise:
+                env.unwrapped.np_random = fresh_generator(self.observation_id)
+            found, action = Rollout(), self.action(control)
+            for step in range(horizon):
+                observation, reward, terminated, truncated, info = env.step(action)
+                view = View(env.unwrapped, observation, info)
+                found.observations.append(observation)
+                found.rewards.append(float(reward))
+                if measure is not None:
+                    found.values.append(measure(view))
+                    if not found.values[-1] >= least:
+                        break
+                found.ended = bool(terminated or truncated)
+                found.reached = until is not None and until(view)
+                if found.ended or found.reached:
+                    break
+                if policy is not None and step + 1 < horizon:
+                    action = policy(view)
+            return found
+
+        return self.simulation.run(simulated)
+
+    def margins(self, measure: Measure, horizon: int) -> Array:
+        """Zeros: a rollout is what the env does."""
+        return np.zeros(horizon)
