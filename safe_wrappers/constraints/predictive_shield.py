@@ -1,7 +1,8 @@
 """PredictiveShield: an action is admitted if some backup keeps h after it, in a simulation."""
 
+import functools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -12,7 +13,7 @@ from safe_wrappers.checks import non_negative, positive, whole_number
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, Memory
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.rollouts import Policy, RolloutPlant, View
+from safe_wrappers.plants.rollouts import RolloutPlant, View
 
 Value = Callable[[Any, Array], ArrayLike]
 """Of an observation and actions, shape (k, m): how good they are, shape (k,)."""
@@ -83,25 +84,27 @@ class PredictiveShield(Constraint):
         backups = self.backup if isinstance(self.backup, list | tuple) else [self.backup]
         if not backups:
             raise ConfigurationError("backup is a backup, or a list with at least one")
-        self.backups = [_checked(one) for one in backups]
+        self.backup = [_checked(one) for one in backups]
 
     def bind(self, plant: Plant) -> "BoundPredictiveShield":
         return BoundPredictiveShield(self, plant)
 
 
 def _checked(backup: Any) -> Any:
-    """A backup; of a model its `predict`, which is not copied with the constraint."""
+    """A backup; of a model its `predict`, which is not copied with the constraint; of an array a list."""
     if hasattr(backup, "predict"):
         return _PolicyBackup(backup)
     if isinstance(backup, str) and backup not in ("zero", "hold"):
         raise UnknownNameError(
             f"no backup {backup!r}; give zero, hold, an action, a function, a model, or a list of these"
         )
-    if not callable(backup) and not isinstance(backup, str | np.ndarray | int | np.integer):
+    if callable(backup) or isinstance(backup, str):
+        return backup
+    if not isinstance(backup, np.ndarray | list | tuple | int | np.integer):
         raise ConfigurationError(
             f"backup is zero, hold, an array or a whole number, a function, a model, or a list; got {backup!r}"
         )
-    return backup
+    return np.asarray(backup).tolist()
 
 
 class _PolicyBackup:
@@ -135,15 +138,13 @@ class BoundPredictiveShield(BoundConstraint):
         plant.require_simulation("PredictiveShield")
         super().__init__(spec, plant)
         discrete = self.plant.discrete
-        if discrete and "zero" in [one for one in spec.backups if isinstance(one, str)]:
+        if discrete and "zero" in [one for one in spec.backup if isinstance(one, str)]:
             raise ConfigurationError(
                 "a discrete action has no zero: give as backup the action that is safe, or hold, or a function"
             )
-        self._policies: list[Policy | None] = [self._policy(one) for one in spec.backups]
+        self._backups = [self._prepared(one) for one in spec.backup]
         self._needed = spec.margin + self.plant.margins(self._measure, spec.horizon)
-        offsets = np.random.default_rng(0).uniform(-1.0, 1.0, (spec.candidates, self.plant.lower.size))
-        # A quarter of them anywhere, the others nearer and nearer.
-        self._offsets = offsets * np.geomspace(1.0, 0.05, spec.candidates or 1)[: len(offsets), None]
+        self._points = np.random.default_rng(0).random((spec.candidates, self.plant.lower.size))
 
     def start(self) -> Memory:
         return 0, np.clip(np.zeros_like(self.plant.lower), self.plant.lower, self.plant.upper)
@@ -157,8 +158,8 @@ class BoundPredictiveShield(BoundConstraint):
         self._now = math.inf if self._unknown else self._measure(view)
 
     def check(self) -> None:
-        for index in range(len(self._policies)):
-            self._first(index)
+        for backup in self._backups:
+            self._first(backup)
 
     def value(self) -> Array:
         return np.zeros(0) if self._unknown else np.array([self._now])
@@ -182,34 +183,35 @@ class BoundPredictiveShield(BoundConstraint):
         assert self.spec.terminal is not None
         return bool(self.spec.terminal(self._seen(view)))
 
-    def _policy(self, backup: Any) -> Policy | None:
-        """The backup as a function of a view; None holds."""
-        if isinstance(backup, str):
-            zero = self.plant.control(np.zeros(self.plant.lower.shape), "zero") if backup == "zero" else None
-            return None if zero is None else lambda view: self.plant.action(zero)
-        if isinstance(backup, _PolicyBackup):
-            return lambda view: self._action(backup(view.observation), "the backup")
-        if callable(backup):
-            return lambda view: self._action(backup(self._seen(view)), "the backup")
-        constant = self._action(backup, "backup")
-        return lambda view: constant
+    def _prepared(self, backup: Any) -> Any:
+        """A function, a control, shape (m,), or "hold"."""
+        if callable(backup) or (isinstance(backup, str) and backup == "hold"):
+            return backup
+        zero = isinstance(backup, str)
+        return self.plant.control(np.zeros(self.plant.lower.shape) if zero else backup, "the backup")
 
-    def _action(self, given: Any, of: str) -> Any:
-        return self.plant.action(self.plant.control(given, of))
+    def _control(self, backup: Any, view: View) -> Array:
+        """What a backup that does not hold would do, shape (m,)."""
+        if not callable(backup):
+            return np.asarray(backup)
+        seen = view.observation if isinstance(backup, _PolicyBackup) else self._seen(view)
+        return self.plant.control(backup(seen), "the backup")
 
-    def _first(self, index: int) -> Array:
+    def _action(self, backup: Any, view: View) -> Any:
+        return self.plant.action(self._control(backup, view))
+
+    def _first(self, backup: Any) -> Array:
         """What a backup would do now, shape (m,)."""
-        policy = self._policies[index]
-        return self._last if policy is None else self.plant.control(policy(self.plant.view), "the backup")
+        return self._last if isinstance(backup, str) else self._control(backup, self.plant.view)
 
     def plan(self, control: Array) -> Plan:
         """The first backup that keeps h after a control, the survivor of the last step first, else the best."""
         key = control.tobytes()
         if key not in self._known:
-            order = sorted(range(len(self._policies)), key=lambda index: index != self._survivor)
+            order = sorted(range(len(self._backups)), key=lambda index: index != self._survivor)
             best = Plan(-math.inf, order[0])
             for index in order:
-                slack = self._slack(control, self._policies[index])
+                slack = self._after(control, self._backups[index])
                 if slack > best.slack:
                     best = Plan(slack, index)
                 if slack >= 0.0:
@@ -217,8 +219,9 @@ class BoundPredictiveShield(BoundConstraint):
             self._known[key] = best
         return self._known[key]
 
-    def _slack(self, control: Array, policy: Policy | None) -> float:
-        spec = self.spec
+    def _after(self, control: Array, backup: Any) -> float:
+        """The slack of a control with a backup after it."""
+        spec, policy = self.spec, None if isinstance(backup, str) else functools.partial(self._action, backup)
         until = None if spec.terminal is None else self._terminal
         least = float(self._needed.min())
         rollout = self.plant.rollout(control, spec.horizon, policy, self._measure, least, until)
@@ -237,8 +240,8 @@ class BoundPredictiveShield(BoundConstraint):
         return self.plan(control).slack
 
     def candidates(self, control: Array) -> Iterable[Array]:
-        firsts = [self._first(index) for index in range(len(self._policies))]
-        every = self.plant.neighbours(control, self._offsets, firsts)
+        firsts = [self._first(backup) for backup in self._backups]
+        every = self.plant.neighbours(control, self._points, firsts)
         if self.spec.value is None:
             return every
         admitted = np.array([u for u in every if self.admits(u)])
@@ -253,7 +256,7 @@ class BoundPredictiveShield(BoundConstraint):
 
     def backup(self) -> Array | None:
         """What the first backup would do that survives its own action, else what the best one would."""
-        firsts: Sequence[Array] = [self._first(index) for index in range(len(self._policies))]
+        firsts = [self._first(backup) for backup in self._backups]
         return max(firsts, key=lambda first: min(self.slack(first), 0.0))
 
     def executed(self, control: Array) -> Memory:

@@ -105,21 +105,22 @@ class RolloutPlant(Plant):
         """Whether actions are whole numbers."""
         return not isinstance(self._space, gym.spaces.Box)
 
-    def neighbours(self, control: Array, offsets: Array, more: Sequence[Array] = ()) -> list[Array]:
+    def neighbours(self, control: Array, points: Array, more: Sequence[Array] = ()) -> list[Array]:
         """Other controls, the nearest first: all of discrete ones.
 
         Args:
             control: Shape (m,).
-            offsets: In halves of the box, shape (k, m).
+            points: Of the unit cube, shape (k, m): ends of lines from the control through the box, on which the
+                neighbours lie, from the end of the first to 5 % of the last.
             more: Further ones.
         """
         if self.discrete:
             counts = (self.upper - self.lower + 1.0).astype(int)
             every = self.lower + np.stack(np.unravel_index(np.arange(counts.prod()), counts), axis=1)
         else:
-            moved = control + offsets * 0.5 * (self.upper - self.lower)
-            clipped = np.clip(moved, self.lower, self.upper)
-            every = np.array([*more, *clipped.astype(self._space.dtype).astype(np.float64)])
+            shares = np.geomspace(1.0, 0.05, max(1, len(points)))[: len(points), None]
+            between = control + shares * (self.lower + points * (self.upper - self.lower) - control)
+            every = np.array([*more, *between.astype(self._space.dtype).astype(np.float64)])
         distances = np.linalg.norm(every - control, axis=1)
         return [every[i] for i in np.argsort(distances, kind="stable") if distances[i] > 0.0]
 
@@ -130,18 +131,20 @@ class RolloutPlant(Plant):
         return control.astype(self._space.dtype)
 
     def control(self, action: Any, of: str) -> Array:
-        """The control for an action of the space, clipped to its bounds; `of` says in messages whose it is.
+        """The control for an action, clipped to a Box's bounds; `of` says in messages whose it is.
 
         Raises:
-            ConfigurationError: Another shape, or not finite.
+            ConfigurationError: Another shape, not finite, or no action of a discrete space.
         """
         try:
             control = np.atleast_1d(np.asarray(action, dtype=np.float64))
         except (TypeError, ValueError):
             control = np.zeros(0)
-        if control.shape != self.lower.shape or not np.isfinite(control).all():
-            raise ConfigurationError(f"{of} must return a finite action of {self._space}, got {action!r}")
-        return np.clip(control, self.lower, self.upper)
+        fits = control.shape == self.lower.shape and bool(np.isfinite(control).all())
+        clipped = np.clip(control, self.lower, self.upper) if fits else control
+        if not fits or (self.discrete and bool((np.rint(clipped) != control).any())):
+            raise ConfigurationError(f"{of} must be a finite action of {self._space}, got {action!r}")
+        return clipped
 
     @abstractmethod
     def rollout(

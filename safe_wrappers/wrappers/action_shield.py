@@ -84,7 +84,7 @@ class ActionShield(CBFActionFilter):
         counts = np.atleast_1d(space.n if isinstance(space, gym.spaces.Discrete) else space.nvec)
         if counts.prod() > _MOST:
             raise ConfigurationError(
-                f"every action is tried, of which there may be {_MOST}; {space} has more"
+                f"every action is tried, of which there may be {_MOST:,}; {space} has {counts.prod():,}"
             )
         self._counts = counts
         self._low = np.atleast_1d(space.start).astype(np.float64)

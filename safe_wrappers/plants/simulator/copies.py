@@ -64,6 +64,10 @@ class EnvCopier:
         self._models: dict[int, tuple[Any, Any]] = {}
         self._data: dict[int, tuple[Any, Any, Any]] = {}
 
+    def __getstate__(self) -> dict[str, Any]:
+        # What is copied is known by its address, which another process does not have.
+        return vars(self) | {"_models": {}, "_data": {}}
+
     def copy(self) -> gym.Env[Any, Any]:
         """The env in its present state.
 

@@ -37,8 +37,8 @@ def check_replay(simulation: Simulation, steps: int, seed: int = 0) -> None:
             found = difference(simulated, real)
             if found is not None:
                 raise UnsupportedEnvError(
-                    f"the simulation of {name_of(env)} is not the env: {number} steps after its state was restored, "
-                    f"and {made + number} steps in all, {found}. Say how to restore all of its state,"
+                    f"the simulation of {name_of(env)} is not the env: at step {number} after its state was restored "
+                    f"(step {made + number} of the check) {found}. Say how to restore all of its state,"
                     " SimulatorPlant(snapshot=(save, restore)), or simulate in child processes, snapshot='fork'"
                 )
         made += len(behind)

@@ -1,6 +1,7 @@
 """Simulation: runs a task on an env as it would go on from its present state, and leaves the env as it is."""
 
 import copy
+import functools
 import inspect
 import os
 import pickle
@@ -175,11 +176,16 @@ def _own_functions(raw: Any) -> tuple[Save, Restore] | None:
         # Of an Atari env: its random numbers belong to the state.
         takes = inspect.signature(functions[0]).parameters
         options = {"include_rng": True} if "include_rng" in takes else {}
-        return (
-            lambda env, name=save, options=options: copy.deepcopy(getattr(env, name)(**options)),
-            lambda env, state, name=restore: getattr(env, name)(copy.deepcopy(state)),
-        )
+        return functools.partial(_saved, save, options), functools.partial(_put_back, restore)
     return None
+
+
+def _saved(method: str, options: dict[str, Any], env: Any) -> Any:
+    return copy.deepcopy(getattr(env, method)(**options))
+
+
+def _put_back(method: str, env: Any, state: Any) -> None:
+    getattr(env, method)(copy.deepcopy(state))
 
 
 def fresh_generator(seed: int) -> np.random.Generator:

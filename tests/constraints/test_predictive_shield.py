@@ -1,0 +1,286 @@
+"""PredictiveShield against the stopping distance of a cart in closed form, and its promises in closed loop."""
+
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from asking import Asked
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import safe_wrappers as sw
+from safe_wrappers.constraints import PredictiveShield
+from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+
+sys.path.append(str(Path(__file__).parents[1] / "plants" / "simulator"))
+from simulated_worlds import DT, TOP, WALL, Cart, Grid, LockedCart, NoisyCart
+
+
+def brake(observation):
+    """Takes the speed away, in the last step exactly."""
+    return [float(np.clip(-observation[1] / DT, -TOP, TOP))]
+
+
+def at_rest(observation):
+    return abs(observation[1]) < 1e-9 and observation[0] <= WALL
+
+
+def wall(observation):
+    return WALL - observation[0]
+
+
+def shield(**changed):
+    return PredictiveShield(**{"h": wall, "horizon": 60, "backup": brake, "terminal": at_rest} | changed)
+
+
+def asked(constraint, start=(0.0, 0.0), env=None):
+    env = env or Cart(start)
+    plant = sw.SimulatorPlant(check_steps=0)
+    plant.bind(env)
+    plant.received(*env.reset(seed=0))
+    found = Asked(constraint, plant)
+    plant.observe()
+    return found
+
+
+def stopping_distance(v, u):
+    """Of a control held for one step and then `brake`, by whole and last steps in closed form, m."""
+    x, v = v * DT + 0.5 * u * DT * DT, v + u * DT
+    if v <= 0.0:
+        return max(0.0, x)
+    whole = int(v / (TOP * DT) + 1e-12)
+    rest = v - whole * TOP * DT
+    return x + whole * v * DT - 0.5 * TOP * (whole * DT) ** 2 + 0.5 * rest * DT
+
+
+@settings(max_examples=60, deadline=None)
+@given(x=st.floats(-2.0, 4.9), v=st.floats(0.1, 3.0), u=st.floats(-1.0, 1.0))
+def test_it_admits_what_can_stop_before_the_wall(x, v, u):
+    needed, room = stopping_distance(v, u), WALL - x
+    if abs(needed - room) > 1e-9:
+        assert asked(shield(), (x, v)).admits(np.array([u])) == (needed < room)
+
+
+def test_any_backup_of_a_list_admits():
+    room = 0.2  # to the wall, at 1 m/s: too little for the brake
+    go, stop = (lambda o: [0.5]), brake
+    passing = dict(h=lambda o: 1.0 if o[0] < WALL else -1.0, terminal=None, horizon=6)
+    for backup, expected in ((go, False), (stop, False), ([go, stop], False)):
+        found = asked(shield(backup=backup, **passing), (WALL - room, 1.0))
+        assert found.admits(np.array([0.0])) == expected
+    for backup, expected in ((go, False), (stop, True), ([go, stop], True), (["hold", stop], True)):
+        found = asked(shield(backup=backup, **passing), (WALL - 0.65, 1.0))
+        assert found.admits(np.array([0.0])) == expected
+
+
+def test_the_survivor_of_the_last_step_is_asked_first():
+    calls = []
+
+    def named(name, action):
+        return lambda observation: calls.append(name) or [action]
+
+    constraint = shield(backup=[named("go", 1.0), named("stop", -1.0)], terminal=None, horizon=12)
+    found = asked(constraint, (WALL - 0.8, 1.0))
+    assert found.admits(np.zeros(1)) and calls[0] == "go" and calls[-1] == "stop"
+    found.executed(np.zeros(1))
+    found.plant.observe()
+    calls.clear()
+    found.admits(np.array([-1.0]))
+    assert calls[0] == "stop"
+
+
+@pytest.mark.parametrize(
+    ("backup", "expected"),
+    [("zero", 0.0), ("hold", 0.5), (np.array([-0.25]), -0.25), (lambda o: [-0.75], -0.75)],
+)
+def test_what_a_backup_does_after_the_action(backup, expected):
+    seen = []
+
+    def h(observation):
+        seen.append(observation[1])
+        return 1.0
+
+    asked(shield(h=h, backup=backup, terminal=None, horizon=3)).admits(np.array([0.5]))
+    np.testing.assert_allclose(np.diff(seen[-3:]) / DT, expected)
+
+
+def test_a_model_is_a_backup_and_is_not_copied():
+    class Model:
+        def predict(self, observation, deterministic):
+            assert deterministic
+            return np.array([-1.0]), None
+
+        def __deepcopy__(self, memo):
+            raise AssertionError("a model may hold a replay buffer")
+
+    env = sw.CBFActionFilter(Cart((4.4, 1.0)), [shield(backup=Model(), terminal=None, horizon=10)])
+    env.reset(seed=0)
+    assert env.step(np.ones(1))[4]["cbf/intervened"]
+
+
+@pytest.mark.parametrize("driver", ["full speed", "random", "bang-bang"])
+def test_with_a_terminal_set_nothing_is_ever_violated(driver):
+    env = sw.CBFActionFilter(gym.wrappers.TimeLimit(Cart(), 200), [shield(candidates=4)])
+    assert env.constraints[0].promise == "proved"
+    rng, violations, flagged, changed = np.random.default_rng(0), 0.0, 0, 0
+    for seed in range(3):
+        env.reset(seed=seed)
+        for t in range(200):
+            u = {"full speed": 1.0, "random": rng.uniform(-1, 1), "bang-bang": 1.0 if t % 70 < 55 else -1.0}
+            info = env.step(np.array([u[driver]]))[4]
+            violations += info["cost"]
+            flagged += info["cbf/infeasible"] or info["cbf/fallback"]
+            changed += info["cbf/intervened"]
+    assert violations == 0 and flagged == 0 and (changed > 0 or driver == "random")
+
+
+def test_without_one_the_horizon_is_all_that_is_looked_at():
+    assert shield(terminal=None).promise == "best effort"
+    # It can brake from 3 m/s within 4.5 m. Ten steps later nothing is visible yet.
+    far = asked(shield(terminal=None, horizon=10), (0.9, 3.0))
+    assert far.admits(np.ones(1)) and not asked(shield(), (0.9, 3.0)).admits(np.ones(1))
+
+
+def test_a_set_that_is_not_reached_does_not_admit():
+    found = asked(shield(horizon=5), (0.0, 2.0))  # it stops after twenty steps
+    assert not found.admits(np.zeros(1)) and -1e-12 < found.slack(np.zeros(1)) < 0.0
+
+
+def test_an_inactive_shield_passes_the_action_bit_for_bit():
+    class Seen(Cart):
+        def step(self, action):
+            self.action = action
+            return super().step(action)
+
+    env = sw.CBFActionFilter(Seen(), [shield()])
+    env.reset(seed=0)
+    action = np.array([0.1 + 0.2])
+    info = env.step(action)[4]
+    assert env.unwrapped.action is action and not info["cbf/intervened"] and info["cbf/stage"] == 0
+
+
+def test_what_is_executed_in_the_place_of_a_refused_action_is_near_it():
+    env = sw.CBFActionFilter(Cart((WALL - 0.66, 1.0)), [shield(candidates=64)])
+    env.reset(seed=0)
+    # Admitted is, by the closed form, all below this control.
+    edge = max(u for u in np.linspace(-1, 1, 2001) if stopping_distance(1.0, u) <= 0.66)
+    executed = env.step(np.ones(1))[4]["executed_action"][0]
+    assert edge - 0.2 < executed <= edge + 1e-3
+
+
+def test_value_chooses_among_the_admitted():
+    def prefers(observation, actions):
+        return -np.abs(actions[:, 0] + 0.6)
+
+    found = asked(shield(value=prefers, candidates=200), (WALL - 0.66, 1.0))
+    best = next(iter(found.candidates(np.ones(1))))
+    assert abs(best[0] + 0.6) < 0.05 and found.admits(best)
+    wrong = asked(shield(value=lambda o, a: np.zeros(1)), (WALL - 0.66, 1.0))
+    with pytest.raises(ConfigurationError, match=r"value must return a number for each of \d+ actions"):
+        wrong.candidates(np.ones(1))
+
+
+def test_a_start_without_a_way_out_is_flagged():
+    env = sw.CBFActionFilter(Cart((WALL - 0.1, 2.0)), [shield()])
+    env.reset(seed=0)
+    info = env.step(np.ones(1))[4]
+    assert info["cbf/infeasible"] and info["cbf/fallback"] and info["executed_action"][0] == -TOP
+
+
+def test_h_that_is_nan_is_never_admitted():
+    broken = asked(shield(h=lambda o: np.nan if o[1] > 0.0 else 1.0, terminal=None, horizon=3))
+    assert broken.slack(np.ones(1)) == -np.inf and broken.admits(-np.ones(1))
+    env = sw.CBFActionFilter(Cart(), [shield(h=lambda o: np.nan)])
+    with pytest.warns(sw.UnsafeStateWarning):
+        env.reset(seed=0)
+        info = env.step(np.ones(1))[4]
+    assert info["cbf/fallback"] and info["cbf/unsafe"] and info["executed_action"][0] == 0.0
+    with pytest.raises(ConfigurationError, match="h must return one number"):
+        asked(shield(h=lambda o: o)).value()
+
+
+def test_the_envs_own_cost_is_an_h():
+    costly = dict(h="cost", terminal=None, horizon=20)
+    found = asked(shield(**costly), (WALL - 0.66, 1.0))
+    by_hand = asked(shield(terminal=None, horizon=20), (WALL - 0.66, 1.0))
+    for u in np.linspace(-1, 1, 21):
+        assert found.admits(np.array([u])) == by_hand.admits(np.array([u]))
+    np.testing.assert_array_equal(found.value(), [0.0])
+    unknown = asked(shield(**costly | {"h": "danger"}))
+    assert unknown.value().size == 0  # nothing was judged yet
+    with pytest.raises(ConfigurationError, match=r"reports no info\['danger'\]; it has \['cost'\]"):
+        unknown.admits(np.zeros(1))
+
+
+def test_functions_may_see_the_env():
+    seen = asked(
+        shield(
+            sees="env", h=lambda e: WALL - e.x, backup=lambda e: brake((e.x, e.v)), terminal=lambda e: e.v < 1e-9
+        ),
+        (WALL - 0.66, 1.0),
+    )
+    same = asked(shield(), (WALL - 0.66, 1.0))
+    for u in np.linspace(-1, 1, 21):
+        assert seen.slack(np.array([u])) == same.slack(np.array([u]))
+
+
+def test_margin_and_max_decrease():
+    assert asked(shield(margin=0.5), (0.0, 0.0)).slack(np.zeros(1)) == pytest.approx(4.5)
+    env = sw.CBFActionFilter(Cart(), [shield()], margin=0.25)
+    assert env.constraints[0].margin == 0.25
+    counted = []
+    far = asked(shield(h=lambda o: counted.append(o) or wall(o), max_decrease=2.0, terminal=None))
+    assert far.admits(np.ones(1)) and len(counted) == 1
+    near = asked(shield(h=lambda o: counted.append(o) or wall(o), max_decrease=2.0), (3.5, 0.0))
+    assert near.admits(np.zeros(1)) and len(counted) > 2
+
+
+def test_samples_of_unknown_noise_promise_nothing_but_help():
+    def run(plant):
+        env = sw.CBFActionFilter(NoisyCart(), [shield(candidates=4)], plant=plant)
+        env.reset(seed=0)
+        return sum(env.step(np.ones(1))[4]["cost"] for _ in range(150))
+
+    foreseen = run(sw.SimulatorPlant(check_steps=0))
+    sampled = run(sw.SimulatorPlant(check_steps=0, same_noise=False))
+    bare = NoisyCart()
+    bare.reset(seed=0)
+    off = sum(bare.step(np.ones(1))[4]["cost"] for _ in range(150))
+    assert foreseen == 0 and sampled < 0.5 * off
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"h": 3}, "h is a function"),
+        ({"horizon": 0}, "horizon"),
+        ({"backup": "brake"}, "no backup 'brake'"),
+        ({"backup": []}, "at least one"),
+        ({"backup": 0.5}, "backup is zero, hold"),
+        ({"terminal": True}, "terminal is a function"),
+        ({"sees": "state"}, "sees is one of observation, env"),
+        ({"margin": -1.0}, "margin"),
+        ({"max_decrease": 0.0}, "max_decrease"),
+        ({"candidates": -1}, "candidates"),
+    ],
+)
+def test_bad_input_is_refused_at_construction(changed, message):
+    with pytest.raises(ConfigurationError, match=message):
+        shield(**changed)
+
+
+def test_backups_that_do_not_fit_are_refused():
+    with pytest.raises(ConfigurationError, match=r"the backup must be a finite action of Box.*\[0\.5, 0\.5\]"):
+        sw.CBFActionFilter(Cart(), [shield(backup=lambda o: [0.5, 0.5])]).reset(seed=0)
+    with pytest.raises(ConfigurationError, match="the backup must be a finite action"):
+        sw.CBFActionFilter(Cart(), [shield(backup=np.array([np.nan]))])
+    with pytest.raises(ConfigurationError, match="discrete action has no zero"):
+        sw.ActionShield(Grid(), [PredictiveShield("cost", 2)])
+    with pytest.raises(UnsupportedEnvError, match=r"take plant=SimulatorPlant\(\)"):
+        sw.CBFActionFilter(gym.make("Reacher-v5"), [shield()], plant=sw.MujocoPlant())
+    with pytest.raises(UnsupportedEnvError, match="cannot be copied"):
+        sw.CBFActionFilter(LockedCart(), [shield()])
+    with pytest.raises(UnknownNameError):
+        shield(sees="all")

@@ -1,0 +1,261 @@
+"""The simulation of an env: equal to the env bit for bit, without a trace in it, or refused."""
+
+import os
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.wrappers import NormalizeObservation, RecordEpisodeStatistics, RescaleAction, TimeLimit
+from simulated_worlds import (
+    DT,
+    Cart,
+    CloneCart,
+    Grid,
+    LockedCart,
+    NoisyCart,
+    PickyCart,
+    SharedCart,
+    StateCart,
+)
+
+import safe_wrappers as sw
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.plants.simulator.simulation import simulation_of
+
+ENVS = ("Pendulum-v1", "CartPole-v1", "FrozenLake-v1", "HalfCheetah-v5", "SafePointGoal1-v0", "Humanoid-v5")
+ROBOTICS = ("PointMaze_UMaze-v3", "FetchPush-v4")
+
+
+def bound(env, **options):
+    plant = sw.SimulatorPlant(**options)
+    plant.bind(env)
+    return plant
+
+
+def made(env_id):
+    if env_id in ROBOTICS:
+        gym.register_envs(pytest.importorskip("gymnasium_robotics"))
+    return gym.make(env_id)
+
+
+def bits(answer):
+    observation = answer[0]
+    if isinstance(observation, dict):
+        observation = np.concatenate([observation[key] for key in sorted(observation)])
+    return (np.asarray(observation).tobytes(), *answer[1:4])
+
+
+@pytest.mark.parametrize("env_id", [*ENVS, *ROBOTICS])
+def test_a_rollout_is_what_the_env_does_and_leaves_no_trace_in_it(env_id):
+    watched, bare = made(env_id), made(env_id)
+    plant = bound(watched, check_steps=100)
+    for env in (watched, bare):
+        env.action_space.seed(1)
+        env.reset(seed=3)
+    plant.executed(None)
+    for _ in range(12):
+        action = bare.action_space.sample()
+        control = np.atleast_1d(np.asarray(action, dtype=float))
+        ahead = plant.rollout(control, 4)
+        answers = []
+        for step in range(4):
+            theirs = watched.step(action)
+            answers.append(bare.step(action))
+            assert bits(theirs) == bits(answers[-1])
+            assert bits((ahead.observations[step], ahead.rewards[step]))[:2] == bits(answers[-1])[:2]
+            if answers[-1][2] or answers[-1][3]:
+                break
+        assert ahead.ended == (answers[-1][2] or answers[-1][3])
+        assert len(ahead.observations) == len(answers)
+        if ahead.ended:
+            for env in (watched, bare):
+                env.reset()
+            plant.executed(None)
+
+
+def test_a_rollout_goes_through_the_wrappers_inside_and_changes_none_of_them():
+    env = NormalizeObservation(RecordEpisodeStatistics(TimeLimit(Cart(), 5)))
+    plant = bound(env)
+    env.reset(seed=0)
+    before = env.obs_rms.mean.copy(), env.obs_rms.count
+    ahead = plant.rollout(np.ones(1), 9)
+    assert len(ahead.observations) == 5 and ahead.ended  # the time limit ends the episode
+    assert (env.obs_rms.mean == before[0]).all() and env.obs_rms.count == before[1]
+    mine = [env.step(np.ones(1))[0] for _ in range(5)]
+    np.testing.assert_array_equal(np.array(ahead.observations), np.array(mine))
+
+
+def test_a_policy_acts_after_the_control_and_measures_stop_a_rollout():
+    env = Cart(start=(0.0, 1.0))
+    plant = bound(env)
+    env.reset(seed=0)
+    ahead = plant.rollout(np.ones(1), 30, policy=lambda view: -np.sign(view.observation[1:]))
+    speeds = [o[1] for o in ahead.observations]
+    np.testing.assert_allclose(speeds[:3], [1.1, 1.0, 0.9])
+    measured = plant.rollout(np.ones(1), 30, measure=lambda view: 0.15 - view.env.x, least=0.0)
+    assert measured.values[-1] < 0.0 <= measured.values[-2]
+    reached = plant.rollout(np.ones(1), 30, until=lambda view: view.observation[0] > 0.5)
+    assert reached.reached and not reached.ended and len(reached.observations) < 10
+
+
+def test_a_copy_does_not_go_by_ezpickle():
+    env = PickyCart(start=(1.0, 0.0))
+    plant = bound(env)
+    env.reset(seed=0)
+    env.step(np.ones(1))
+    assert plant.simulation.run(lambda other: other.v) == env.v != 0.0
+
+
+def test_a_copy_does_not_draw():
+    class Drawn(Cart):
+        render_mode = "human"
+
+        def __init__(self):
+            super().__init__()
+            self.render_mode = "human"
+
+        def step(self, action):
+            assert self.render_mode is None, "drawn in a simulation"
+            return super().step(action)
+
+    env = Drawn()
+    for snapshot in (None, (lambda raw: (raw.x, raw.v), restore_cart)):
+        plant = bound(env, snapshot=snapshot, check_steps=0)
+        env.reset(seed=0)
+        assert len(plant.rollout(np.ones(1), 3).rewards) == 3
+        assert env.render_mode == "human"
+
+
+def restore_cart(raw, state):
+    raw.x, raw.v = state
+
+
+def test_what_cannot_be_copied_is_refused_by_name_with_ways_out_that_work():
+    with pytest.raises(UnsupportedEnvError, match=r"LockedCart\.lock is a lock.*save, restore.*'fork'"):
+        bound(LockedCart())
+    ways = [(lambda raw: (raw.x, raw.v), restore_cart)]
+    if hasattr(os, "fork"):
+        ways.append("fork")
+    for snapshot in ways:
+        env = LockedCart()
+        plant = bound(env, snapshot=snapshot, check_steps=60)
+        env.reset(seed=0)
+        env.step(np.ones(1))
+        before = env.x, env.v
+        ahead = plant.rollout(np.ones(1), 3)
+        assert (env.x, env.v) == before
+        np.testing.assert_array_equal(ahead.observations[0], env.step(np.ones(1))[0])
+
+
+def test_a_copy_that_drifts_is_refused_with_the_first_difference():
+    with pytest.raises(UnsupportedEnvError, match=r"SharedCart.*step 1 after.*its reward is .* instead of"):
+        bound(SharedCart())
+    forgets = (lambda raw: raw.x, lambda raw, x: setattr(raw, "x", x))  # the speed
+    with pytest.raises(UnsupportedEnvError, match=r"its (reward|observation\[\d\]) is .* instead of"):
+        bound(Cart(), snapshot=forgets)
+    bound(Cart(), snapshot=forgets, check_steps=0)
+
+
+def test_the_envs_own_functions_are_used():
+    StateCart.calls = 0
+    bound(StateCart())
+    assert StateCart.calls > 0
+    bound(CloneCart())
+    assert CloneCart.seen is True
+
+
+def test_wrappers_are_put_back_where_the_env_is_simulated_itself():
+    env = TimeLimit(StateCart(), 5)
+    plant = bound(env)
+    env.reset(seed=0)
+    assert plant.rollout(np.ones(1), 9).ended
+    assert [env.step(np.ones(1))[3] for _ in range(5)] == [False] * 4 + [True]
+
+
+def test_a_check_leaves_the_generator_of_an_env_that_is_simulated_itself():
+    class NoisyState(StateCart):
+        noise = 0.5
+
+    checked, bare = NoisyState(), NoisyState()
+    for env in (checked, bare):
+        env.reset(seed=5)
+    bound(checked)
+    for env in (checked, bare):
+        env.reset()
+    assert checked.step(np.ones(1))[0].tobytes() == bare.step(np.ones(1))[0].tobytes()
+
+
+def test_the_noise_of_the_env_is_foreseen_unless_told():
+    for same_noise in (True, False):
+        env = NoisyCart()
+        plant = bound(env, same_noise=same_noise)
+        env.reset(seed=0)
+        ahead = plant.rollout(np.ones(1), 1).observations[0]
+        again = plant.rollout(np.ones(1), 1).observations[0]
+        assert ahead.tobytes() == again.tobytes()
+        assert (ahead.tobytes() == env.step(np.ones(1))[0].tobytes()) == same_noise
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no child processes here")
+def test_errors_of_a_child_come_back_and_its_end_is_noticed():
+    env = Cart()
+    simulation = simulation_of(env, "fork")
+    env.reset(seed=0)
+    with pytest.raises(ZeroDivisionError):
+        simulation.run(lambda other: 1 / 0)
+    with pytest.raises(UnsupportedEnvError, match="ended the process"):
+        simulation.run(lambda other: os._exit(1))
+    assert simulation.run(lambda other: np.zeros(10**6)).size == 10**6  # more than a pipe holds
+
+
+def test_bad_input_is_refused():
+    with pytest.raises(ConfigurationError, match="snapshot is two functions"):
+        bound(Cart(), snapshot="copy")
+    with pytest.raises(ConfigurationError, match="RescaleAction inside the filter"):
+        bound(RescaleAction(Cart(), -2.0, 2.0))
+    with pytest.raises(ConfigurationError, match="check_steps"):
+        sw.SimulatorPlant(check_steps=-1)
+    plant = bound(Cart())
+    with pytest.raises(ConfigurationError, match="bound to another env"):
+        plant.bind(Cart())
+    with pytest.raises(UnsupportedEnvError, match="needs the acceleration"):
+        _ = plant.g
+
+    class Recorded(gym.Wrapper):
+        pass
+
+    Recorded.__name__ = "RecordVideo"
+    with pytest.raises(ConfigurationError, match="RecordVideo inside the filter would also record"):
+        bound(Recorded(Cart()))
+    endless = Cart()
+    endless.action_space = gym.spaces.Box(-np.inf, np.inf, (1,))
+    with pytest.raises(UnsupportedEnvError, match="bounded"):
+        bound(endless)
+    parts = Cart()
+    parts.action_space = gym.spaces.Dict(a=gym.spaces.Discrete(2))
+    with pytest.raises(UnsupportedEnvError, match="flatten_space"):
+        bound(parts)
+
+
+def test_the_control_interval_is_never_guessed():
+    assert bound(Cart()).control_dt == DT
+    with pytest.raises(ConfigurationError, match="one step of this env lasts"):
+        bound(Cart(), control_dt=0.2)
+    with pytest.raises(ConfigurationError, match=r"Grid.*does not say how long.*SimulatorPlant\(control_dt"):
+        _ = bound(Grid()).control_dt
+    assert bound(Grid(), control_dt=0.5).control_dt == 0.5
+    shield = sw.constraints.PredictiveShield("cost", 2, backup=[0, 1, 2, 3])
+    with pytest.raises(ConfigurationError, match="control_dt"):
+        sw.StuckEscape(sw.ActionShield(Grid(), [shield]))
+
+
+def test_the_check_costs_about_as_many_steps_as_it_makes():
+    class Counted(Cart):
+        made = 0
+
+        def step(self, action):
+            Counted.made += 1
+            return super().step(action)
+
+    bound(Counted(), check_steps=200)
+    assert 400 <= Counted.made <= 440
