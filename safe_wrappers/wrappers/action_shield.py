@@ -12,7 +12,6 @@ from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.filter.discrete import DiscreteFilter
 from safe_wrappers.filter.engine import SafetyFilter
 from safe_wrappers.filter.fallback import FallbackFunction
-from safe_wrappers.plants.default import own_plant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.common.layer import Env, Step
@@ -62,12 +61,10 @@ class ActionShield(CBFActionFilter):
         fallback: str | FallbackFunction = "brake",
         margin: float = 0.0,
     ) -> None:
-        arguments = dict(locals())
         if fallback == "zero":
             raise ConfigurationError("a discrete action has no zero: fallback is brake, hold, or a function")
-        plant = own_plant(plant)
-        self._record(arguments, plant=plant)
         CBFActionFilter.__init__(self, env, constraints, plant=plant, fallback=fallback, margin=margin)
+        del self._saved_kwargs["solver"]  # nothing is projected
 
     def _take_action_space(self, env: Env) -> None:
         space = env.action_space

@@ -217,7 +217,10 @@ def test_the_envs_own_cost_is_an_h():
 def test_functions_may_see_the_env():
     seen = asked(
         shield(
-            sees="env", h=lambda e: WALL - e.x, backup=lambda e: brake((e.x, e.v)), terminal=lambda e: e.v < 1e-9
+            sees="env",
+            h=lambda e: WALL - e.x,
+            backup=lambda e: brake((e.x, e.v)),
+            terminal=lambda e: e.v < 1e-9,
         ),
         (WALL - 0.66, 1.0),
     )
@@ -272,7 +275,9 @@ def test_bad_input_is_refused_at_construction(changed, message):
 
 
 def test_backups_that_do_not_fit_are_refused():
-    with pytest.raises(ConfigurationError, match=r"the backup must be a finite action of Box.*\[0\.5, 0\.5\]"):
+    with pytest.raises(
+        ConfigurationError, match=r"the backup must be a finite action of Box.*\[0\.5, 0\.5\]"
+    ):
         sw.CBFActionFilter(Cart(), [shield(backup=lambda o: [0.5, 0.5])]).reset(seed=0)
     with pytest.raises(ConfigurationError, match="the backup must be a finite action"):
         sw.CBFActionFilter(Cart(), [shield(backup=np.array([np.nan]))])

@@ -13,6 +13,7 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
@@ -21,8 +22,28 @@ from safe_wrappers.envs.safe_rover import WHEELS
 from safe_wrappers.errors import UnsupportedEnvError
 
 TASK, CROSSING, STEPS = "SafePointGoal1-v0", "OccludedCrossing-v0", 60
+DISCRETE = "tests/ThreeTorques-v0"
 REFUSING = (TASK, CROSSING)
 """Tasks that refuse an action that is not finite themselves."""
+
+
+class ThreeTorques(InvertedPendulumEnv):
+    """A pole on a cart that is pushed left, right, or not at all; beyond 0.1 rad it costs."""
+
+    def __init__(self, *arguments, **options):
+        super().__init__(*arguments, **options)
+        self.action_space = gym.spaces.Discrete(3)
+
+    work = 0
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        sum(range(self.work))
+        observation, reward, terminated, truncated, info = super().step(np.array([int(action) - 1.0]))
+        return observation, reward, terminated, truncated, info | {"cost": float(abs(observation[1]) > 0.1)}
+
+
+gym.register(DISCRETE, entry_point=f"{__name__}:ThreeTorques", max_episode_steps=1000)
 
 
 def _clearance():
@@ -37,6 +58,15 @@ def _joint_speed(env):
 
 EXAMPLES = {
     "ActionRepeat": {"four control steps": (TASK, lambda: {"repeat": 4})},
+    "ActionShield": {
+        "the cost of the env": (
+            DISCRETE,
+            lambda: {
+                "constraints": [sw.constraints.PredictiveShield("cost", 6, backup=[0, 1, 2])],
+                "fallback": "hold",
+            },
+        )
+    },
     "AdaptionPenalty": {
         "a constant and a part that grows": (TASK, lambda: {"penalty": 0.5, "per_correction": 0.25}),
         "the square, and one that levels off": (
@@ -318,8 +348,16 @@ def actions(env, steps=STEPS, seed=0):
     """Bang-bang, held for a while: what makes a filter intervene."""
     rng = np.random.default_rng(seed)
     space = env.action_space
+    if isinstance(space, gym.spaces.Discrete):
+        return rng.integers(space.n, size=steps // 5 + 1).repeat(5)[:steps]
     held = rng.choice([0.0, 1.0], (steps // 10 + 1, *space.shape)).repeat(10, axis=0)[:steps]
     return (space.low + held * (space.high - space.low)).astype(space.dtype)
+
+
+def lowest(env):
+    """An action at the edge of the space."""
+    space = env.action_space
+    return 0 if isinstance(space, gym.spaces.Discrete) else space.low
 
 
 def trace(env, seed=0, steps=STEPS):
@@ -472,7 +510,7 @@ def test_it_never_draws_from_the_envs_generator(name, case):
         a, b = env.reset(seed=seed)[0], bare.reset(seed=seed)[0]
         assert a[: b.size].tobytes() == b.tobytes()
         for _ in range(20):
-            env.step(env.action_space.low)
+            env.step(lowest(env))
     assert env.unwrapped.np_random.bit_generator.state == bare.unwrapped.np_random.bit_generator.state
 
 
@@ -516,9 +554,9 @@ def test_info_has_the_same_keys_and_types_at_every_step(name, case):
             for value in (np.nan, 9.0):
                 seen.append(types(env.step(np.full(env.action_space.shape, value))[4]))
             env.set_observation_time(None)
-            seen.append(types(env.step(env.action_space.low)[4]))
+            seen.append(types(env.step(lowest(env))[4]))
     assert all(s == seen[0] for s in seen)
-    added = seen[0].keys() - env.unwrapped.step(env.unwrapped.action_space.low)[4].keys()
+    added = seen[0].keys() - env.unwrapped.step(lowest(env.unwrapped))[4].keys()
     assert added or name in SILENT, "a wrapper of ours reports something"
     assert all("/" in key or key.endswith("_action") or key == "cost" for key in added)
 
@@ -529,7 +567,10 @@ def test_info_holds_no_wall_clock_value(name, case):
     env = build(name, case)
     first = trace(env, steps=20)
     inner = env.env.step
-    env.env.step = lambda action: (sum(i * i for i in range(20_000)), inner(action))[1]
+    if name == "ActionShield":  # whose copies of the env would step this one
+        env.unwrapped.work = 20_000
+    else:
+        env.env.step = lambda action: (sum(i * i for i in range(20_000)), inner(action))[1]
     assert trace(env, steps=20) == first
 
 
@@ -628,6 +669,9 @@ def harmless(name, case):
     if name == "LeaseExpiry":
         far = sw.constraints.JointSpeedLimit(1e9)
         return sw.LeaseExpiry(Witness(gym.make("Reacher-v5")), sw.StoppingBudget(far, closing_speed=1.0))
+    if name == "ActionShield":
+        free = sw.constraints.PredictiveShield(lambda x: 1.0, 1, backup=0)
+        return sw.ActionShield(Witness(gym.make(DISCRETE)), [free], plant=sw.SimulatorPlant(check_steps=0))
     if name == "SlipLimiter":  # a ground that is said to carry any torque
         return sw.SlipLimiter(Witness(gym.make("SafeRover-v0")), list(WHEELS), friction=1e9)
     if name == "WholeBodyFilter":
@@ -644,6 +688,11 @@ def test_inactive_is_bit_identical(name, case):
     env = harmless(name, case)
     env.reset(seed=0)
     rng = np.random.default_rng(0)
+    if name == "ActionShield":
+        for action in (0, np.int64(2), np.array(1)):
+            env.step(action)
+            assert env.env.action == action and env.env.action_space.contains(env.env.action)
+        return
     for dtype in (np.float32, np.float64):
         for _ in range(20):
             action = rng.uniform(-1, 1, env.action_space.shape).astype(dtype)
@@ -664,6 +713,10 @@ def test_a_non_finite_action_does_not_get_through(name, case, bad):
     witness = Witness(gym.make(env_id))
     env = getattr(sw, name)(inside(name, witness), **arguments())
     env.reset(seed=0)
+    if env_id == DISCRETE:  # not an action of the space at all
+        with pytest.raises(sw.SafeWrappersError, match="expected an action of Discrete"):
+            env.step(bad)
+        return
     action = np.full(env.action_space.shape, bad)
     if name in ONLY_LOOKING and env_id not in REFUSING:
         env.step(action)

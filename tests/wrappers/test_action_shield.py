@@ -122,11 +122,13 @@ def test_bad_input_is_refused():
     for space in (gym.spaces.MultiDiscrete([50, 50]), gym.spaces.MultiBinary(3)):
         env = TwoWheels()
         env.action_space = space
-        with pytest.raises(ConfigurationError, match="1,024|expected Discrete"):
+        with pytest.raises(ConfigurationError, match=r"1,024|expected Discrete"):
             sw.ActionShield(env, shield)
     with pytest.raises(ConfigurationError, match="no zero"):
         grid(fallback="zero")
-    with pytest.raises(ConfigurationError, match=r"the backup must be a finite action of Discrete\(4\), got 4"):
+    with pytest.raises(
+        ConfigurationError, match=r"the backup must be a finite action of Discrete\(4\), got 4"
+    ):
         sw.ActionShield(Grid(), [PredictiveShield("cost", 2, backup=4)])
     env = grid()
     env.reset(seed=0)

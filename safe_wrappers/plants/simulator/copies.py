@@ -1,8 +1,9 @@
 """Copies of envs with all their wrappers, in their present state."""
 
 import copy
+import inspect
 from collections.abc import Iterator
-from types import ModuleType
+from types import FunctionType, ModuleType
 from typing import Any
 
 import gymnasium as gym
@@ -115,6 +116,14 @@ class EnvCopier:
 
 
 def _copied(owner: Any, name: str, value: Any, memo: Memo) -> Any:
+    if isinstance(value, FunctionType):
+        held = inspect.getclosurevars(value).nonlocals.values()
+        if any(id(getattr(one, "__self__", one)) in memo for one in held):
+            raise UnsupportedEnvError(
+                f"{name_of(owner)} cannot be copied: the function {type(owner).__name__}.{name} refers to the env "
+                "itself, and in a copy would still act on that; make it a method of a wrapper or a subclass"
+            )
+        return value
     try:
         return copy.deepcopy(value, memo)
     except Exception as error:

@@ -147,6 +147,14 @@ def test_what_cannot_be_copied_is_refused_by_name_with_ways_out_that_work():
         np.testing.assert_array_equal(ahead.observations[0], env.step(np.ones(1))[0])
 
 
+def test_a_function_that_refers_to_the_env_is_refused():
+    env = Cart()
+    step = env.step
+    env.step = lambda action: step(action)
+    with pytest.raises(UnsupportedEnvError, match=r"the function Cart\.step refers to the env itself"):
+        bound(env)
+
+
 def test_a_copy_that_drifts_is_refused_with_the_first_difference():
     with pytest.raises(UnsupportedEnvError, match=r"SharedCart.*step 1 after.*its reward is .* instead of"):
         bound(SharedCart())
