@@ -11,17 +11,21 @@ from safe_wrappers.constraints.limits.joints import JointSpeedLimit
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Constraint
 from safe_wrappers.plants.env_checks import check_actions
+from safe_wrappers.plants.simulator.plant import SimulatorPlant
 from safe_wrappers.recipes import RECIPES
+from safe_wrappers.shelf import PLANTS, SHELF
 from safe_wrappers.stack import refuse_order
+from safe_wrappers.wrappers.action_shield import ActionShield
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 from safe_wrappers.wrappers.vector_cbf_action_filter import VectorCBFActionFilter, single_envs
 
+_EVERY = {**RECIPES, **SHELF}
 VectorEnv = gym.vector.VectorEnv[Any, Any, Any]
 
 
 def protect_options() -> frozenset[str]:
     """Every option that `protect` takes for some env."""
-    of_recipes = [name for recipe in RECIPES.values() for name in _options(recipe)]
+    of_recipes = [name for recipe in _EVERY.values() for name in _options(recipe)]
     return frozenset(of_recipes + _options(CBFActionFilter))
 
 
@@ -57,25 +61,37 @@ def protect(env: gym.Env[Any, Any] | VectorEnv, **options: Any) -> CBFActionFilt
         if len({_env_id(single) for single in envs}) > 1:
             ids = sorted({_env_id(single) for single in envs})
             raise UnsupportedEnvError(f"expected a vector env of one id, got {ids}; protect each env of it")
-        return VectorCBFActionFilter(env, _recommended(envs[0], options), **options)
+        constraints = _recommended(envs[0], options)
+        return VectorCBFActionFilter(env, constraints, **_with_plant(envs[0], options))
     if not isinstance(env, gym.Env):
         raise UnsupportedEnvError(f"expected one env, or a vector env, got {env!r}; {_of_no_env(env)}")
     refuse_order(env, CBFActionFilter.layer, "protect")
-    return CBFActionFilter(env, _recommended(env, options), **options)
+    constraints = _recommended(env, options)
+    discrete = isinstance(env.action_space, gym.spaces.Discrete)
+    return (ActionShield if discrete else CBFActionFilter)(env, constraints, **_with_plant(env, options))
+
+
+def _with_plant(env: gym.Env[Any, Any], options: dict[str, Any]) -> dict[str, Any]:
+    """The options, with the plant that the env needs, if it is not the default one."""
+    of_env = PLANTS.get(_family(env))
+    return options if of_env is None else {"plant": of_env()} | options
 
 
 def _env_id(env: gym.Env[Any, Any]) -> str:
     return env.spec.id if env.spec is not None else ""
 
 
+def _family(env: gym.Env[Any, Any]) -> str:
+    return _env_id(env).rpartition("/")[2].rpartition("-v")[0].removesuffix("Dense")
+
+
 def _recommended(env: gym.Env[Any, Any], options: dict[str, Any]) -> list[Constraint]:
     """The recipe's constraints; takes its options out of all."""
-    env_id = _env_id(env)
-    family = env_id.rpartition("/")[2].rpartition("-v")[0].removesuffix("Dense")
+    env_id, family = _env_id(env), _family(env)
     robot = family.removeprefix("Safe").removesuffix("Velocity") if family.endswith("Velocity") else family
-    recipe = RECIPES.get(robot, RECIPES.get(robot.partition("_")[0]))
+    recipe = _EVERY.get(robot, _EVERY.get(robot.partition("_")[0]))
     if recipe is None:
-        known = f"there are recipes for {', '.join(sorted(RECIPES))}"
+        known = f"there are recipes for {', '.join(sorted(_EVERY))}"
         raise UnsupportedEnvError(f"no recipe for {env_id or env.unwrapped!r}; {known}. {_by_hand(env)}")
     of_recipe, of_filter = _options(recipe), _options(CBFActionFilter)
     for name in options:
@@ -87,22 +103,23 @@ def _recommended(env: gym.Env[Any, Any], options: dict[str, Any]) -> list[Constr
 
 def _by_hand(env: gym.Env[Any, Any]) -> str:
     """The lines that protect an env without a recipe, tried on it, or why there are none."""
+    discrete = isinstance(env.action_space, gym.spaces.Discrete | gym.spaces.MultiDiscrete)
     try:
-        check_actions(env)
+        if not discrete:
+            check_actions(env)
         model = getattr(env.unwrapped, "model", None)
-        if isinstance(model, mujoco.MjModel):
+        if not discrete and isinstance(model, mujoco.MjModel):
             return _limiting_joints(env, model)
+        SimulatorPlant(check_steps=0).bind(env)
     except ConfigurationError as error:
         return f"A filter by hand is refused, too: {error}"
-    say, argument = "", ""
-    if not env.has_wrapper_attr("dt"):
-        say, argument = ", and say with control_dt how long a step lasts, in s", ", control_dt=control_dt"
+    kind = "ActionShield" if discrete else "CBFActionFilter"
     return (
-        "It has no MuJoCo model. Describe it by x' = f(x) + g(x) u with x = state(env), and what must stay positive "
-        f"by h(x){say}; then it is three lines:\n"
+        "It can be simulated. Say by h(observation) what must stay positive, what a backup(observation) does to keep "
+        "it, and for how many steps (horizon) to look; then it is three lines:\n"
         "    import safe_wrappers as sw\n"
-        f"    plant = sw.AnalyticPlant(f, g, state{argument})\n"
-        "    env = sw.CBFActionFilter(env, [sw.constraints.Barrier(h)], plant=plant)"
+        "    shield = sw.constraints.PredictiveShield(h, horizon, backup)\n"
+        f"    env = sw.{kind}(env, [shield])"
     )
 
 

@@ -3,6 +3,7 @@
 import contextlib
 import copy
 import textwrap
+import threading
 import warnings
 from unittest import mock
 
@@ -18,6 +19,7 @@ import safe_wrappers as sw
 from safe_wrappers import info as keys
 from safe_wrappers.envs.velocity.speed_limits import SPEED_LIMITS
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsafeStateWarning, UnsupportedEnvError
+from safe_wrappers.shelf import SHELF
 
 RUNNERS = ["HalfCheetah", "Hopper", "Walker2d", "Swimmer", "Ant", "Humanoid"]
 KNOWN = {
@@ -240,7 +242,7 @@ def test_an_unknown_env_is_refused_with_lines_that_work(lab):
     families = {
         f.removeprefix("Safe").removesuffix("Velocity") if f.endswith("Velocity") else f for f in families
     }
-    assert set(listed) == families | {"SafePointGoal0", "SafeCarGoal0"}
+    assert set(listed) == families | {"SafePointGoal0", "SafeCarGoal0"} | set(SHELF)
     lines = textwrap.dedent("\n".join(message.splitlines()[1:]))
     assert len(lines.splitlines()) == 3
     scope = {"env": env}
@@ -271,48 +273,88 @@ def test_an_env_without_a_spec_is_refused_and_not_a_crash():
         sw.protect(Bare())
 
 
-def test_a_discrete_env_is_refused():
-    with pytest.raises(
-        ConfigurationError, match=r"no recipe for '?CartPole-v1.*got Discrete\(2\).*no closest"
-    ):
-        sw.protect(gym.make("CartPole-v1"))
-
-
 def refusal(env):
     with pytest.raises(ConfigurationError) as caught:
         sw.protect(env)
     return str(caught.value)
 
 
-MACHINES = {
-    "Pendulum-v1": {
-        "f": lambda x: np.array([x[1], 15.0 * np.sin(x[0])]),
-        "g": lambda x: np.array([[0.0], [3.0]]),
-        "h": lambda x: 36.0 - x[1] ** 2,
-    },
-    "MountainCarContinuous-v0": {
-        "f": lambda x: np.array([x[1], -0.0025 * np.cos(3.0 * x[0])]),
-        "g": lambda x: np.array([[0.0], [0.0015]]),
-        "h": lambda x: 0.06 - x[1],
-        "control_dt": 1.0,
-    },
-}
+class Slider(gym.Env):
+    """A point on a line; nobody knows it, and nothing says how long its step lasts."""
+
+    def __init__(self, discrete=False):
+        box = gym.spaces.Box(-1.0, 1.0, (1,))
+        self.action_space = gym.spaces.Discrete(3, start=-1) if discrete else box
+        self.observation_space = gym.spaces.Box(-100.0, 100.0, (2,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state = np.zeros(2)
+        return self.state, {}
+
+    def step(self, action):
+        push = float(np.atleast_1d(action)[0])
+        self.state = self.state + 0.1 * np.array([self.state[1], push])
+        return self.state, 0.0, False, False, {}
 
 
-@pytest.mark.filterwarnings("ignore::safe_wrappers.UnsafeStateWarning")  # its motor is too weak for this h
-@pytest.mark.parametrize("env_id", MACHINES)
-def test_an_env_without_mujoco_gets_lines_for_it(env_id):
-    env = gym.make(env_id)
+@pytest.mark.parametrize("discrete", [False, True])
+def test_an_env_without_mujoco_gets_lines_that_simulate_it(discrete):
+    env = Slider(discrete)
     message = refusal(env)
     assert "JointSpeedLimit" not in message
     lines = textwrap.dedent("\n".join(message.splitlines()[1:]))
-    assert len(lines.splitlines()) == 3 and ("control_dt" in message) == ("control_dt" in MACHINES[env_id])
-    scope = {"env": env, "state": lambda env: env.state, **MACHINES[env_id]}
+    assert len(lines.splitlines()) == 3
+    scope = {"env": env, "h": lambda x: 1.0 - abs(x[1]), "horizon": 2}
+    scope["backup"] = lambda x: -int(np.sign(x[1])) if discrete else [-np.sign(x[1])]
     exec(lines, scope)
     scope["env"].reset(seed=0)
     for _ in range(30):
-        *_, info = scope["env"].step(scope["env"].action_space.sample())
-        assert info["cbf/margin"] >= 0.0 or info["cbf/unsafe"]
+        observation, *_, info = scope["env"].step(1 if discrete else np.ones(1, np.float32))
+        assert abs(observation[1]) <= 1.0 + 1e-9
+    assert info["cbf/intervened"]
+
+
+def test_an_env_that_cannot_be_simulated_is_told_why():
+    env = Slider()
+    env.lock = threading.Lock()
+    assert "A filter by hand is refused, too: " in refusal(env)
+    assert "Slider.lock is a lock" in refusal(env)
+
+
+@pytest.mark.parametrize("env_id", ["Pendulum-v1", "MountainCarContinuous-v0", "CartPole-v1"])
+def test_envs_of_the_shelf_are_protected(env_id):
+    env = sw.protect(gym.make(env_id))
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    kinds = {"CartPole-v1": sw.ActionShield}
+    assert type(env) is kinds.get(env_id, sw.CBFActionFilter)
+    changed = 0
+    worst = env.action_space.n - 1 if env_id == "CartPole-v1" else env.action_space.high
+    for _ in range(150):
+        _, _, terminated, _, info = env.step(worst)
+        assert not terminated and info["cbf/margin"] >= 0.0 and not info["cbf/infeasible"]
+        changed += info["cbf/intervened"]
+    assert changed > 0 or env_id == "MountainCarContinuous-v0"  # whose car rests against its slope
+
+
+BOX2D = {
+    "LunarLander-v3": {"continuous": True},
+    "LunarLanderContinuous-v3": {},
+    "BipedalWalker-v3": {},
+}
+
+
+@pytest.mark.parametrize("env_id", BOX2D)
+def test_box2d_is_protected_by_forks(env_id):
+    pytest.importorskip("Box2D")
+    env = sw.protect(gym.make(env_id, **BOX2D[env_id]), plant=sw.SimulatorPlant("fork", 0.02, check_steps=20))
+    env.reset(seed=0)
+    for _ in range(5):
+        info = env.step(env.action_space.high)[4]
+        assert not info["cbf/infeasible"]
+    with pytest.raises(UnsupportedEnvError, match="cannot be copied"):
+        sw.protect(gym.make(env_id, **BOX2D[env_id]), plant=sw.SimulatorPlant())
 
 
 def test_an_asynchronous_vector_env_is_told_how_to_protect_each_env():

@@ -17,7 +17,7 @@ from safe_wrappers.plants.rollouts import RolloutPlant, View
 
 Value = Callable[[Any, Array], ArrayLike]
 """Of an observation and actions, shape (k, m): how good they are, shape (k,)."""
-SEES = ("observation", "env")
+SEES = ("observation", "env", "view")
 _NOT_REACHED = -math.ulp(0.0)  # the slack of a rollout that keeps h but does not end in the terminal set
 
 
@@ -44,8 +44,8 @@ class PredictiveShield(Constraint):
             a list of these: any that survives admits.
         terminal: A function of what it `sees`: whether the state lies in a set that the backups never leave, with
             h >= margin. None: there is none.
-        sees: Whether `h`, `terminal` and `backup` take the "observation", as the env inside the filter returns it, or
-            the unwrapped "env".
+        sees: Whether `h`, `terminal` and `backup` take the "observation", as the env inside the filter returns it,
+            the unwrapped "env", or a "view" (`safe_wrappers.plants.View`), which has both, and info.
         candidates: How many neighbours of a refused action are tried. With discrete actions all are.
         value: Chooses among those that are admitted, such as `safe_wrappers.sb3.critic_value(model)`. None: the
             nearest is taken, and no more are tried.
@@ -58,7 +58,7 @@ class PredictiveShield(Constraint):
     horizon: int
     backup: Any = "zero"
     terminal: Callable[[Any], bool] | None = None
-    sees: Literal["observation", "env"] = "observation"
+    sees: Literal["observation", "env", "view"] = "observation"
     candidates: int = 16
     value: Value | None = None
     margin: float = 0.0
@@ -177,7 +177,7 @@ class BoundPredictiveShield(BoundConstraint):
         return float(h.reshape(()))
 
     def _seen(self, view: View) -> Any:
-        return view.env if self.spec.sees == "env" else view.observation
+        return view if self.spec.sees == "view" else getattr(view, self.spec.sees)
 
     def _terminal(self, view: View) -> bool:
         assert self.spec.terminal is not None

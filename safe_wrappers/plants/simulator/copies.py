@@ -13,6 +13,11 @@ from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import name_of, wrappers_of
 
 _DRAWING = ("pygame", "glfw", "OpenGL", "moviepy")
+_SHARED = (gym.Space, gym.envs.registration.EnvSpec, ModuleType)
+_WAYS_OUT = (
+    "Say how its state is saved and restored, snapshot=(save, restore) with save(env) and restore(env, state) of the "
+    "unwrapped env, or simulate in child processes, SimulatorPlant(snapshot='fork'), where the system has them"
+)
 _RECORDING = ("RecordVideo", "HumanRendering", "RenderCollection")
 Memo = dict[int, Any]
 
@@ -40,10 +45,35 @@ def refuse_recorders(env: gym.Env[Any, Any]) -> None:
             )
 
 
+def refuse_finalizers(env: gym.Env[Any, Any]) -> None:
+    """Refuse to copy what closes something when it is deleted: copies would close it for the env, too."""
+    seen: set[int] = set()
+    left: list[tuple[str, Any]] = [(type(env).__name__, env)]
+    while left:
+        path, value = left.pop()
+        if id(value) in seen or isinstance(value, (*_SHARED, type, FunctionType)) or is_drawn(value):
+            continue
+        seen.add(id(value))
+        if hasattr(type(value), "__del__") and not isinstance(value, gym.Env):
+            raise UnsupportedEnvError(
+                f"{name_of(env)} cannot be copied: {path} is a {type(value).__name__}, which closes what it holds "
+                f"when a copy of it is deleted. {_WAYS_OUT}"
+            )
+        if isinstance(value, dict):
+            left += [(f"{path}[{key!r}]", one) for key, one in value.items()]
+        elif isinstance(value, list | tuple | set):
+            left += [(f"{path}[{i}]", one) for i, one in enumerate(value)]
+        else:
+            left += [(f"{path}.{name}", one) for name, one in getattr(value, "__dict__", {}).items()]
+
+
 def is_drawn(value: Any) -> bool:
     """Whether a value is a window, a renderer or a picture, which no copy needs."""
     kind = type(value)
-    return kind.__module__.partition(".")[0] in _DRAWING or kind.__name__.endswith(("Renderer", "Viewer"))
+    # SWIG's types have no module.
+    return getattr(kind, "__module__", "").partition(".")[0] in _DRAWING or kind.__name__.endswith(
+        ("Renderer", "Viewer")
+    )
 
 
 class EnvCopier:
@@ -80,7 +110,7 @@ class EnvCopier:
         for one in envs:
             memo[id(one)] = object.__new__(type(one))
             for value in vars(one).values():
-                if isinstance(value, gym.Space | gym.envs.registration.EnvSpec | ModuleType):
+                if isinstance(value, _SHARED):
                     memo[id(value)] = value
                 elif isinstance(value, mujoco.MjModel):
                     memo[id(value)] = self._model(value)
@@ -129,7 +159,5 @@ def _copied(owner: Any, name: str, value: Any, memo: Memo) -> Any:
     except Exception as error:
         raise UnsupportedEnvError(
             f"{name_of(owner)} cannot be copied: {type(owner).__name__}.{name} is a {type(value).__name__}"
-            f" ({error}). Say how its state is saved and restored, snapshot=(save, restore) with save(env) "
-            "and restore(env, state) of the unwrapped env, or simulate in child processes, "
-            "SimulatorPlant(snapshot='fork'), where the system has them"
+            f" ({error}). {_WAYS_OUT}"
         ) from None

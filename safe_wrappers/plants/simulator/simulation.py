@@ -14,7 +14,7 @@ import numpy as np
 
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import name_of, wrappers_of
-from safe_wrappers.plants.simulator.copies import EnvCopier, is_drawn, refuse_recorders
+from safe_wrappers.plants.simulator.copies import EnvCopier, is_drawn, refuse_finalizers, refuse_recorders
 
 T = TypeVar("T")
 Env = gym.Env[Any, Any]
@@ -53,6 +53,7 @@ class CopiedSimulation(Simulation):
 
     def __init__(self, env: Env) -> None:
         super().__init__(env)
+        refuse_finalizers(env)
         self._copier = EnvCopier(env)
         self._copier.copy()
 

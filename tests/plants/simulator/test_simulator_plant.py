@@ -147,6 +147,20 @@ def test_what_cannot_be_copied_is_refused_by_name_with_ways_out_that_work():
         np.testing.assert_array_equal(ahead.observations[0], env.step(np.ones(1))[0])
 
 
+def test_what_closes_a_connection_when_it_is_deleted_is_not_copied():
+    class Client:
+        closed = 0
+
+        def __del__(self):
+            Client.closed += 1
+
+    env = Cart()
+    env.robots = {"left": [Client()]}
+    with pytest.raises(UnsupportedEnvError, match=r"Cart\.robots\['left'\]\[0\] is a Client, which closes"):
+        bound(env)
+    assert Client.closed == 0
+
+
 def test_a_function_that_refers_to_the_env_is_refused():
     env = Cart()
     step = env.step

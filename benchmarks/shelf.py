@@ -1,0 +1,194 @@
+"""Envs of other packages under drivers that look for violations, without the filter and with `protect`.
+
+    python -m benchmarks.shelf
+    python -m benchmarks.shelf --only Pendulum-v1 --steps 20000
+    python -m benchmarks.shelf --collect
+
+Violations are judged on the env after every step, by functions of this file. Needs gymnasium's extra "box2d",
+panda-gym and highway-env for their rows, which are left out where they are not installed. The drivers: "random";
+"greedy", of eight random actions (of all discrete ones) that which earns most when it is held for five steps in a
+simulation; "attacking", that which comes nearest to a violation. Rows go to `benchmarks/results/shelf.csv`, the table
+to `shelf.md`.
+"""
+
+import argparse
+import csv
+import importlib
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+import safe_wrappers as sw
+from safe_wrappers.plants import View
+from safe_wrappers.shelf import PLANTS
+from safe_wrappers.train.tables import write_rows
+
+RESULTS = Path(__file__).parent / "results" / "shelf.csv"
+DRIVERS = ("random", "greedy", "attacking")
+COLUMNS = (
+    "env", "driver", "steps", "violations_off", "violations_on", "unflagged", "changed", "infeasible",
+    "return_off", "return_on", "step_us_off", "step_us_on",
+)  # fmt: skip
+_TRIED, _HELD = 8, 5
+
+
+@dataclass(frozen=True)
+class Case:
+    """An env, how far it is from a violation, how many steps are made, and what it needs."""
+
+    env_id: str
+    h: Callable[[View], float]
+    steps: int = 20_000
+    needs: str = ""
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+def _fallen(view: View, limit: float, angle: float) -> float:
+    return -1.0 if view.env.game_over else limit - abs(angle)
+
+
+def _panda(view: View) -> float:
+    at = np.asarray(view.env.robot.get_ee_position())
+    return float(min(*(at - (-0.2, -0.2, 0.02)), *((0.2, 0.2, 0.3) - at)))
+
+
+CASES = (
+    Case("Pendulum-v1", lambda view: 6.0 - abs(view.env.state[1])),
+    Case("MountainCarContinuous-v0", lambda view: 0.045 - abs(view.env.state[1])),
+    Case(
+        "CartPole-v1", lambda view: min(0.15 - abs(view.env.state[2]), (2.0 - abs(view.env.state[0])) / 13.0)
+    ),
+    Case(
+        "LunarLanderContinuous-v3",
+        lambda view: min(_fallen(view, 0.6, view.env.lander.angle), 1.0 - abs(view.observation[0])),
+        1_500,
+        "Box2D",
+    ),
+    Case("BipedalWalker-v3", lambda view: _fallen(view, 0.8, view.env.hull.angle), 1_500, "Box2D"),
+    Case("PandaReach-v3", _panda, 1_500, "panda_gym"),
+    Case("highway-fast-v0", lambda view: -float(view.env.vehicle.crashed), 400, "highway_env"),
+)
+
+
+def driven(case: Case, driver: str, env: gym.Env[Any, Any], plant: sw.plants.RolloutPlant) -> Any:
+    """The driver's action in the env's present state."""
+    space = env.action_space
+    if driver == "random":
+        return space.sample()
+    discrete = isinstance(space, gym.spaces.Discrete)
+    tried = list(range(space.n)) if discrete else [space.sample() for _ in range(_TRIED)]  # type: ignore[attr-defined]
+    scores = []
+    for action in tried:
+        control = np.atleast_1d(np.asarray(action, dtype=float))
+        rollout = plant.rollout(control, _HELD, measure=case.h)
+        scores.append(sum(rollout.rewards) if driver == "greedy" else -min(rollout.values))
+    return tried[int(np.argmax(scores))]
+
+
+def run(case: Case, driver: str, on: bool, steps: int) -> dict[str, float]:
+    """Drive the env, and judge it after every step."""
+    env = gym.make(case.env_id, **case.options)
+    make_plant = PLANTS.get(case.env_id.rpartition("-v")[0], sw.SimulatorPlant)
+    plant: Any = make_plant()
+    plant.bind(env)
+    stepped: gym.Env[Any, Any] = sw.protect(env) if on else env
+    env.action_space.seed(0)
+    found = dict.fromkeys(("violations", "unflagged", "changed", "infeasible", "return", "seconds"), 0.0)
+    observation, info = stepped.reset(seed=0)
+    plant.executed(None)
+    for _ in range(steps):
+        action = driven(case, driver, stepped, plant)
+        started = time.perf_counter()
+        observation, reward, terminated, truncated, info = stepped.step(action)
+        found["seconds"] += time.perf_counter() - started
+        plant.received(observation, info)
+        violated = case.h(View(env.unwrapped, observation, info)) < 0.0
+        flagged = bool(info.get("cbf/infeasible")) or bool(info.get("cbf/unsafe"))
+        found["violations"] += violated
+        found["unflagged"] += violated and not flagged
+        found["changed"] += bool(info.get("cbf/intervened"))
+        found["infeasible"] += bool(info.get("cbf/infeasible"))
+        found["return"] += float(reward)
+        if terminated or truncated:
+            stepped.reset()
+            plant.executed(None)
+    stepped.close()
+    return found
+
+
+def row(case: Case, driver: str, steps: int) -> dict[str, Any]:
+    """A row of the table."""
+    off, on = (run(case, driver, filtered, steps) for filtered in (False, True))
+    return {
+        "env": case.env_id,
+        "driver": driver,
+        "steps": steps,
+        "violations_off": int(off["violations"]),
+        "violations_on": int(on["violations"]),
+        "unflagged": int(on["unflagged"]),
+        "changed": round(on["changed"] / steps, 4),
+        "infeasible": round(on["infeasible"] / steps, 5),
+        "return_off": round(off["return"] / steps, 4),
+        "return_on": round(on["return"] / steps, 4),
+        "step_us_off": round(1e6 * off["seconds"] / steps, 1),
+        "step_us_on": round(1e6 * on["seconds"] / steps, 1),
+    }
+
+
+def markdown(rows: list[dict[str, Any]]) -> str:
+    """The table that the docs show."""
+    lines = [
+        "| env | driver | steps | violations off | on | of these unflagged | changed | infeasible "
+        "| reward per step off; on | step, ms off; on |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for one in rows:
+        lines.append(
+            f"| {one['env']} | {one['driver']} | {int(one['steps']):,} | {int(one['violations_off']):,} "
+            f"| {int(one['violations_on']):,} | {int(one['unflagged']):,} | {100 * float(one['changed']):.2g} % "
+            f"| {100 * float(one['infeasible']):.2g} % | {float(one['return_off']):.3g}; "
+            f"{float(one['return_on']):.3g} | {float(one['step_us_off']) / 1e3:.2g}; {float(one['step_us_on']) / 1e3:.2g} |"
+        )
+    return "\n".join([*lines, ""])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    names = [case.env_id for case in CASES]
+    parser.add_argument("--only", nargs="+", choices=names, default=names, help="envs")
+    parser.add_argument("--drivers", nargs="+", choices=DRIVERS, default=DRIVERS)
+    parser.add_argument("--steps", type=int, help="of each row (default: as the case has it)")
+    parser.add_argument("--collect", action="store_true", help="measure nothing")
+    arguments = parser.parse_args()
+    warnings.simplefilter("ignore")  # of unsafe states, which are counted
+    known: dict[tuple[str, str], dict[str, Any]] = {}
+    if RESULTS.exists():
+        with RESULTS.open() as file:
+            known = {(one["env"], one["driver"]): dict(one) for one in csv.DictReader(file)}
+    for case in CASES if not arguments.collect else ():
+        if case.env_id not in arguments.only:
+            continue
+        try:
+            importlib.import_module(case.needs or "gymnasium")
+        except ImportError:
+            print(f"{case.env_id}: {case.needs} is not installed")
+            continue
+        for driver in arguments.drivers:
+            known[case.env_id, driver] = row(case, driver, arguments.steps or case.steps)
+            print(known[case.env_id, driver], flush=True)
+            write_rows(
+                RESULTS, COLUMNS, [known[name, d] for name in names for d in DRIVERS if (name, d) in known]
+            )
+    table = markdown([known[name, d] for name in names for d in DRIVERS if (name, d) in known])
+    RESULTS.with_suffix(".md").write_text(table)
+    print(table)
+
+
+if __name__ == "__main__":
+    main()

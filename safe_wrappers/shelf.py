@@ -1,0 +1,139 @@
+"""Recipes for other packages' envs: what their own simulation is to keep, with backups that were measured."""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from safe_wrappers.constraints.predictive_shield import PredictiveShield
+from safe_wrappers.filter.constraint import Constraint
+from safe_wrappers.plants.plant import Plant
+from safe_wrappers.plants.rollouts import View
+from safe_wrappers.plants.simulator.plant import SimulatorPlant
+
+Env = gym.Env[Any, Any]
+BOX2D_DT = 1.0 / 50.0
+CARTPOLE_DT = 0.02
+PANDA_DT = 0.04
+"""Of panda-gym: 20 substeps of 2 ms."""
+
+
+def _pendulum(env: Env, max_speed: float = 6.0) -> list[Constraint]:
+    # Its motor is weaker than gravity, but takes out energy: falling from the top it reaches 4.8 rad/s.
+    return [
+        PredictiveShield(
+            lambda x: max_speed - abs(x[2]), horizon=40, backup=lambda x: [np.clip(-4.0 * x[2], -2.0, 2.0)]
+        )
+    ]
+
+
+def _mountain_car(env: Env, max_speed: float = 0.045) -> list[Constraint]:
+    power = env.unwrapped.power  # type: ignore[attr-defined]
+    return [
+        PredictiveShield(
+            lambda x: max_speed - abs(x[1]),
+            horizon=60,
+            backup=lambda x: [np.clip(-x[1] / power, -1.0, 1.0)],
+        )
+    ]
+
+
+def _cart_pole(env: Env, max_angle: float = 0.15, max_position: float = 2.0) -> list[Constraint]:
+    def h(x: Any) -> float:
+        return float(min(1.0 - abs(x[2]) / max_angle, 1.0 - abs(x[0]) / max_position))
+
+    # The gains are those of the linear quadratic regulator for weights (1, 0.1, 10, 0.1) and 0.01.
+    return [
+        PredictiveShield(
+            h, horizon=60, backup=lambda x: int(0.12 * x[0] + 0.15 * x[1] + x[2] + 0.24 * x[3] > 0.0)
+        )
+    ]
+
+
+def _lunar_lander(env: Env, max_angle: float = 0.6, horizon: int = 150) -> list[Constraint]:
+    from gymnasium.envs.box2d import lunar_lander
+
+    heuristic: Any = lunar_lander.heuristic
+
+    def h(view: View) -> float:
+        if view.env.game_over:
+            return -1.0
+        return float(min(max_angle - abs(view.observation[4]), 1.0 - abs(view.observation[0])))
+
+    return [
+        PredictiveShield(
+            h,
+            horizon=horizon,
+            backup=lambda view: heuristic(view.env, view.observation),
+            sees="view",
+            candidates=6,
+        )
+    ]
+
+
+CROUCH = (
+    ((0.76, 0.49, -0.82, 0.82), 4.68, 0.31),
+    ((0.66, 0.48, 0.30, 1.08), 5.80, 0.65),
+    ((0.42, 1.05, -0.35, 0.53), 5.34, 1.00),
+)
+"""Angles of hips and knees, gains of position and speed, of a walker that stands: the best of 150 at random."""
+
+
+def _bipedal_walker(env: Env, max_tilt: float = 0.8, horizon: int = 60) -> list[Constraint]:
+    def crouch(target: tuple[float, ...], stiffness: float, damping: float) -> Callable[[View], Any]:
+        def act(view: View) -> Any:
+            angles, speeds = view.observation[[4, 6, 9, 11]], view.observation[[5, 7, 10, 12]]
+            return np.clip(stiffness * (np.array(target) - angles) - damping * speeds, -1.0, 1.0)
+
+        return act
+
+    def h(view: View) -> float:
+        return -1.0 if view.env.game_over else float(max_tilt - abs(view.observation[0]))
+
+    backups = [crouch(*posture) for posture in CROUCH]
+    return [PredictiveShield(h, horizon=horizon, backup=backups, sees="view", candidates=6)]
+
+
+def _panda(
+    env: Env,
+    low: tuple[float, ...] = (-0.2, -0.2, 0.02),
+    high: tuple[float, ...] = (0.2, 0.2, 0.3),
+    horizon: int = 4,
+) -> list[Constraint]:
+    def h(raw: Any) -> float:
+        at = np.asarray(raw.robot.get_ee_position())
+        return float(min((at - low).min(), (np.asarray(high) - at).min()))
+
+    return [PredictiveShield(h, horizon=horizon, backup="zero", sees="env", margin=0.002)]
+
+
+def _highway(env: Env, horizon: int = 4) -> list[Constraint]:
+    # SLOWER, the last of its actions; or, with continuous ones, full braking straight on.
+    backup = 4 if isinstance(env.action_space, gym.spaces.Discrete) else np.array([-1.0, 0.0])
+    return [PredictiveShield("crashed", horizon=horizon, backup=[backup, "hold"], candidates=4)]
+
+
+SHELF: dict[str, Callable[..., list[Constraint]]] = {
+    "Pendulum": _pendulum,
+    "MountainCarContinuous": _mountain_car,
+    "CartPole": _cart_pole,
+    "LunarLander": _lunar_lander,
+    "LunarLanderContinuous": _lunar_lander,
+    "BipedalWalker": _bipedal_walker,
+    "BipedalWalkerHardcore": _bipedal_walker,
+    "PandaReach": _panda,
+    "highway": _highway,
+    "highway-fast": _highway,
+}
+"""By the env's id without its version, as in `recipes.RECIPES`."""
+
+PLANTS: dict[str, Callable[[], Plant]] = {
+    "CartPole": lambda: SimulatorPlant(control_dt=CARTPOLE_DT),
+    **dict.fromkeys(
+        ("LunarLander", "LunarLanderContinuous", "BipedalWalker", "BipedalWalkerHardcore"),
+        lambda: SimulatorPlant("fork", control_dt=BOX2D_DT),
+    ),
+    "PandaReach": lambda: SimulatorPlant("fork", control_dt=PANDA_DT),
+}
+"""Likewise, where it is not the default one: Box2D's worlds and PyBullet's server cannot be copied."""
