@@ -153,7 +153,8 @@ def markdown(rows: list[dict[str, Any]]) -> str:
             f"| {one['env']} | {one['driver']} | {int(one['steps']):,} | {int(one['violations_off']):,} "
             f"| {int(one['violations_on']):,} | {int(one['unflagged']):,} | {100 * float(one['changed']):.2g} % "
             f"| {100 * float(one['infeasible']):.2g} % | {float(one['return_off']):.3g}; "
-            f"{float(one['return_on']):.3g} | {float(one['step_us_off']) / 1e3:.2g}; {float(one['step_us_on']) / 1e3:.2g} |"
+            f"{float(one['return_on']):.3g} "
+            f"| {float(one['step_us_off']) / 1e3:.2g}; {float(one['step_us_on']) / 1e3:.2g} |"
         )
     return "\n".join([*lines, ""])
 
