@@ -17,7 +17,7 @@ from safe_wrappers.shelf import PLANTS, SHELF
 from safe_wrappers.stack import refuse_order
 from safe_wrappers.wrappers.action_shield import ActionShield
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
-from safe_wrappers.wrappers.vector_cbf_action_filter import VectorCBFActionFilter, single_envs
+from safe_wrappers.wrappers.vector_cbf_action_filter import VectorCBFActionFilter, by_env, single_envs
 
 _EVERY = {**RECIPES, **SHELF}
 VectorEnv = gym.vector.VectorEnv[Any, Any, Any]
@@ -61,6 +61,10 @@ def protect(env: gym.Env[Any, Any] | VectorEnv, **options: Any) -> CBFActionFilt
         if len({_env_id(single) for single in envs}) > 1:
             ids = sorted({_env_id(single) for single in envs})
             raise UnsupportedEnvError(f"expected a vector env of one id, got {ids}; protect each env of it")
+        if isinstance(env.single_action_space, gym.spaces.Discrete):
+            raise UnsupportedEnvError(
+                f"discrete actions are shielded env by env, got {env!r}; protect each env of it: {by_env(env)}"
+            )
         constraints = _recommended(envs[0], options)
         return VectorCBFActionFilter(env, constraints, **_with_plant(envs[0], options))
     if not isinstance(env, gym.Env):

@@ -368,6 +368,14 @@ def test_an_asynchronous_vector_env_is_told_how_to_protect_each_env():
     protected.close()
 
 
+def test_a_vector_env_of_discrete_actions_is_told_to_protect_each_env():
+    vector = gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="sync")
+    protected = eval(refusal(vector).partition("protect each env of it: ")[2], {"gym": gym, "sw": sw})
+    protected.reset(seed=0)
+    infos = protected.step(np.array([1, 0]))[4]
+    assert infos["cbf/margin"].shape == (2,) and (infos["cbf/margin"] > 0.0).all()
+
+
 def test_a_synchronous_vector_env_gets_one_filter_for_all_and_takes_the_same_options():
     envs = sw.protect(
         gym.make_vec("SafePointGoal1-v0", 2, vectorization_mode="sync"), detour=False, margin=0.1

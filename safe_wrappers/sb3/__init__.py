@@ -15,6 +15,7 @@ from safe_wrappers.sb3.executed_action_replay_buffer import (
 from safe_wrappers.sb3.gymnasium_vec_env import GymnasiumVecEnv
 from safe_wrappers.sb3.intervention_callback import InterventionCallback, InterventionEvalCallback
 from safe_wrappers.sb3.lagrangian_multiplier import LagrangianMultiplier
+from safe_wrappers.sb3.log_probability import log_probability
 from safe_wrappers.sb3.margin_curriculum import MarginCurriculum
 
 __all__ = [
@@ -27,4 +28,5 @@ __all__ = [
     "LagrangianMultiplier",
     "MarginCurriculum",
     "critic_value",
+    "log_probability",
 ]

@@ -12,7 +12,7 @@ from safe_wrappers.errors import ConfigurationError
 
 
 def critic_value(model: BaseAlgorithm) -> Callable[[Any, NDArray[Any]], NDArray[np.float64]]:
-    """What the critic of SAC, TD3, DDPG or TQC expects of actions: for `StuckEscape(value=)`.
+    """What the critic of SAC, TD3, DDPG, TQC or DQN expects: for `StuckEscape(value=)`, `PredictiveShield(value=)`.
 
     The smallest of its networks' answers (of TQC the mean over quantiles of each), as the actor's own loss has it.
 
@@ -26,16 +26,24 @@ def critic_value(model: BaseAlgorithm) -> Callable[[Any, NDArray[Any]], NDArray[
         ConfigurationError: An algorithm whose critic does not judge actions, such as PPO.
     """
     critic: Any = getattr(model, "critic", None)
-    if critic is None:
+    q_net: Any = getattr(model, "q_net", None)
+    if critic is None and q_net is None:
         raise ConfigurationError(
-            f"critic_value needs a critic that judges actions: SAC, TD3, DDPG or TQC; {type(model).__name__} has none"
+            f"critic_value needs a critic that judges actions: SAC, TD3, DDPG, TQC or DQN; {type(model).__name__} has"
+            " none; log_probability says what its policy prefers"
         )
     scaling, policy = model.get_vec_normalize_env(), model.policy
+    start = int(getattr(model.action_space, "start", 0))
 
     def value(observation: Any, actions: NDArray[Any]) -> NDArray[np.float64]:
         if scaling is not None:
             observation = scaling.normalize_obs(observation)
         one, _ = policy.obs_to_tensor(observation)
+        if q_net is not None:
+            with torch.no_grad():
+                of_each = q_net(one)[0].double().cpu().numpy()
+            chosen: NDArray[np.float64] = of_each[np.asarray(actions)[:, 0].astype(int) - start]
+            return chosen
         given: Any
         if isinstance(one, dict):
             given = {key: part.expand(len(actions), *part.shape[1:]) for key, part in one.items()}

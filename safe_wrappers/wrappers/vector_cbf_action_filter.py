@@ -144,8 +144,11 @@ class VectorCBFActionFilter(VectorWrapper[Any, Any, Any, Any, Any]):
         if not self.filters[0].plant.simulates:
             return
         each = list(iterate(self.observation_space, observations))
+        numbers = {
+            key: value for key, value in infos.items() if isinstance(value, np.ndarray) and f"_{key}" in infos
+        }
         for i in np.flatnonzero(mask).tolist():
-            own = {key: infos[key][i] for key in infos if f"_{key}" in infos and infos[f"_{key}"][i]}
+            own = {key: value[i] for key, value in numbers.items() if infos[f"_{key}"][i]}
             self.filters[i].plant.received(copy.deepcopy(each[i]), own)
 
     def _judge(self, given: NDArray[Any], sent: NDArray[Any], judged: Mask) -> dict[str, NDArray[Any]]:
@@ -247,12 +250,12 @@ def single_envs(env: VectorEnv[Any, Any, Any]) -> list[gym.Env[Any, Any]]:
     if not isinstance(inner, SyncVectorEnv):
         raise UnsupportedEnvError(
             f"expected a SyncVectorEnv, whose envs are in this process, got {inner!r}; protect each env of it: "
-            + _by_env(inner)
+            + by_env(inner)
         )
     return list(inner.envs)
 
 
-def _by_env(env: VectorEnv[Any, Any, Any]) -> str:
+def by_env(env: VectorEnv[Any, Any, Any]) -> str:
     """The line that makes the same vector env of protected envs."""
     if env.spec is None:
         envs = f"[lambda: sw.protect(gym.make(...))] * {env.num_envs}"

@@ -86,4 +86,5 @@ def _differing(name: str, one: Any, other: Any) -> str | None:
     if not len(unequal):
         return None  # zeros of another sign
     at = tuple(unequal[0].tolist())
-    return f"its {name}{list(at)} is {np.atleast_1d(a)[at]!r} instead of {np.atleast_1d(b)[at]!r}"
+    one, other = (np.atleast_1d(array)[at].item() for array in (a, b))
+    return f"its {name}{list(at)} is {one!r} instead of {other!r}"
