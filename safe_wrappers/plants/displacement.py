@@ -68,7 +68,7 @@ class DisplacementPlant(MujocoPlant):
                 "displacement counts from where the gripper is when a control interval starts"
             )
 
-    def _check_action_space(self, env: gym.Env[Any, Any]) -> None:
+    def _bind_actions(self, env: gym.Env[Any, Any]) -> None:
         space: Any = env.action_space
         self.lower, self.upper = (np.asarray(end, dtype=np.float64) for end in (space.low, space.high))
 

@@ -31,7 +31,7 @@ def fetch(env_id):
 @pytest.mark.parametrize("limit", LIMITS)
 def test_an_arm_that_is_pulled_by_its_hand_is_not_left_out(limit):
     env = fetch("FetchPickAndPlace-v4")
-    with pytest.raises(ConfigurationError, match=r"Name those that you mean: joints=\[\.\.\.\]") as caught:
+    with pytest.raises(ConfigurationError, match=r"Name those that you mean: joints=\['robot0:") as caught:
         sw.CBFActionFilter(env, [LIMITS[limit]()])
     covered, rest = listed(caught)
     assert sorted(covered) == ["robot0:l_gripper_finger_joint", "robot0:r_gripper_finger_joint"]
@@ -85,6 +85,56 @@ def test_passive_joints_of_a_machine_driven_at_its_joints_need_no_names():
         filtered = sw.CBFActionFilter(gym.make(env_id), [sw.constraints.JointSpeedLimit(3.0)])
         filtered.reset(seed=0)
         assert filtered.filter.bound[0].value().size == driven
+
+
+LINKAGE = """
+<mujoco><compiler autolimits="true"/><worldbody>
+  <body><joint name="crank" axis="0 1 0"/><geom type="capsule" size=".02" fromto="0 0 0 .2 0 0" mass="1"/>
+    <site name="tip" pos=".2 0 0"/>
+    <body pos=".2 0 0"><joint name="rod" axis="0 1 0"/><geom size=".03" mass="1"/><site name="end"/></body></body>
+  <body name="other" pos="0 1 0"><joint name="rocker" axis="0 1 0"/><geom size=".05" mass="1"/>
+    <site name="far" pos=".1 0 0"/></body>
+  <body pos="0 2 0"><joint name="loose" axis="0 1 0"/><geom size=".05" mass="1" pos=".1 0 0"/></body>
+</worldbody>
+<tendon><spatial name="cable" {cable}><site site="tip"/><site site="far"/></spatial>
+  <spatial name="across"  {across}><site site="tip"/><site site="end"/></spatial>
+  <fixed name="one"><joint joint="crank" coef="1"/></fixed><fixed name="two"><joint joint="rod" coef="1"/></fixed>
+</tendon>
+<equality>{equality}</equality>
+<actuator><motor joint="crank" ctrlrange="-1 1"/></actuator></mujoco>
+"""
+TIES = [
+    ('<joint joint1="rocker" joint2="crank"/>', "", ["rocker"]),
+    ('<tendon tendon1="one" tendon2="two"/>', "", ["rod"]),
+    ('<connect site1="end" site2="far"/>', "", ["rod", "rocker"]),
+    ('<weld body1="other"/>', "", []),  # to the world: the drive does not move it
+    ('<joint joint1="rocker"/>', "", []),
+    ('<joint joint1="rocker" joint2="crank" active="false"/>', "", []),
+    ("", 'range="0 2"', ["rocker"]),
+    ("", 'stiffness="10"', ["rocker"]),
+    ("", "", []),
+    ("", "across", []),  # from the driven link to the next one: the drive moves both
+]
+
+
+@pytest.mark.parametrize(("equality", "cable", "rest"), TIES)
+def test_joints_that_are_tied_to_driven_ones_are_not_left_out(tmp_path, equality, cable, rest):
+    path = tmp_path / "linkage.xml"
+    tendons = {"cable": "", "across": 'range="0 2"'} if cable == "across" else {"cable": cable, "across": ""}
+    path.write_text(LINKAGE.format(equality=equality, **tendons))
+    if not rest:
+        assert sw.CBFActionFilter(Leg(path), [sw.constraints.JointSpeedLimit(3.0)])
+        return
+    with pytest.raises(ConfigurationError) as caught:
+        sw.CBFActionFilter(Leg(path), [sw.constraints.JointSpeedLimit(3.0)])
+    assert listed(caught) == [["crank"], rest]
+    assert str(caught.value).endswith("joints=['crank', 'rod', 'rocker', 'loose']")
+
+
+def test_a_hand_s_last_finger_joints_hang_on_tendons():
+    with pytest.raises(ConfigurationError) as caught:
+        sw.CBFActionFilter(fetch("HandReach-v3"), [sw.constraints.JointSpeedLimit(3.0)])
+    assert listed(caught)[1] == [f"robot0:{finger}J0" for finger in ("FF", "MF", "RF", "LF")]
 
 
 LEG = """

@@ -146,7 +146,7 @@ class BoundImpactSpeedLimit(BoundRollout):
         d.qpos[:], d.qvel[:] = qpos, qvel
         self._pushing = control is not None
         if control is not None:
-            d.ctrl[:] = control
+            d.ctrl[:] = self.plant.controls(control)
         mujoco.mj_fwdPosition(m, d)
         mujoco.mj_fwdVelocity(m, d)
         self._moving = self._forces()

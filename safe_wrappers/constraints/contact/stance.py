@@ -20,6 +20,7 @@ from safe_wrappers.control.legged.whole_body import WholeBodySolution, WholeBody
 from safe_wrappers.control.legged.whole_body_problem import WholeBodyProblem
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, Memory
+from safe_wrappers.plants.mujoco.action_map import refuse_mapped
 from safe_wrappers.plants.mujoco.model import fixed_bodies
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
@@ -83,6 +84,7 @@ class BoundStance(BoundConstraint):
         super().__init__(spec, require_mujoco(plant, hint))
         if not plant.has_acceleration:
             raise UnsupportedEnvError(hint)
+        refuse_mapped(self.plant.action_map, "Stance")
         touching_bodies(self.plant, "there is nothing to stand on")
         if self.spec.joint_tolerance is not None:
             refuse_uncovered_stops(self.plant.model)

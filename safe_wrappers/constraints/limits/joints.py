@@ -20,6 +20,7 @@ from safe_wrappers.plants.plant import Plant
 
 HINGE_OR_SLIDE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 _DRIVES = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_LOOPS = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
 
 
 def driven_joints(model: mujoco.MjModel) -> list[int]:
@@ -40,16 +41,62 @@ def _direct(model: mujoco.MjModel) -> list[int]:
     return sorted({int(model.actuator_trnid[a, 0]) for a in range(model.nu) if kinds[a] in _DRIVES})
 
 
+def _tied(model: mujoco.MjModel) -> list[set[int]]:
+    """Joints that are moved together: by an equality, or by a tendon with a limit, a spring or an equality."""
+    groups, tendons = [], (model.tendon_limited != 0) | (model.tendon_stiffness > 0.0)
+    for e in np.flatnonzero(model.eq_active0).tolist():
+        kind, ends = int(model.eq_type[e]), (int(model.eq_obj1id[e]), int(model.eq_obj2id[e]))
+        if kind == int(mujoco.mjtEq.mjEQ_JOINT):
+            groups.append(set(ends))
+        elif kind == int(mujoco.mjtEq.mjEQ_TENDON):
+            groups.append(set().union(*(_of_tendon(model, t) for t in ends if t >= 0)))
+        elif kind in _LOOPS:
+            at_sites = model.eq_objtype[e] == int(mujoco.mjtObj.mjOBJ_SITE)
+            first, second = (
+                set(_chain(model, int(model.site_bodyid[end]) if at_sites else end)) for end in ends
+            )
+            groups.append(first ^ second)
+    return groups + [_of_tendon(model, t) for t in np.flatnonzero(tendons).tolist()]
+
+
+def _of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
+    """The joints that move a tendon; of one through sites, those that do not move all of these."""
+    found: set[int] = set()
+    chains: list[set[int]] = []
+    first = int(model.tendon_adr[tendon])
+    for w in range(first, first + int(model.tendon_num[tendon])):
+        kind, thing = int(model.wrap_type[w]), int(model.wrap_objid[w])
+        if kind == int(mujoco.mjtWrap.mjWRAP_JOINT):
+            found.add(thing)
+        elif kind == int(mujoco.mjtWrap.mjWRAP_SITE):
+            chains.append(set(_chain(model, int(model.site_bodyid[thing]))))
+    return found.union(*chains) - (set.intersection(*chains) if chains else set())
+
+
+def _chain(model: mujoco.MjModel, body: int) -> list[int]:
+    """The joints between a body and the world."""
+    found: list[int] = []
+    while body:
+        first = int(model.body_jntadr[body])
+        found += range(first, first + int(model.body_jntnum[body]))
+        body = int(model.body_parentid[body])
+    return found
+
+
 def refuse_uncovered(model: mujoco.MjModel, joints: Iterable[int], remedy: str, forces: bool = True) -> None:
     """Refuse to take the driven joints for all where an action moves others of these joints (ids) as well.
 
-    It does where actions are displacements, not `forces`, pull at a tendon or a site, or drive a ball joint. The
-    message says which joints would be covered, which not, and the `remedy`.
+    It does where actions are displacements, not `forces`, pull at a tendon or a site, or drive a ball joint, and
+    where a driven joint is tied to another one. What only swings, slides or flexes along is not meant. The message
+    says which joints would be covered, which not, and the `remedy`.
     """
     covered = driven_joints(model)
     only_joints = bool(np.isin(model.actuator_trntype, _DRIVES).all()) and _direct(model) == covered
     rest = [j for j in joints if j not in covered]
-    if rest and not (forces and only_joints):
+    if forces and only_joints:
+        ties = [group for group in _tied(model) if group.intersection(covered)]
+        rest = [j for j in rest if any(j in group for group in ties)]
+    if rest:
         named = [", ".join(model.joint(j).name for j in ids) for ids in (covered, rest)]
         raise ConfigurationError(
             "an action of this machine may move more joints than those that an actuator drives directly. Covered "
@@ -81,7 +128,8 @@ def scalar_joints(plant: MujocoPlant, names: Sequence[str] | None) -> list[int]:
             raise ConfigurationError(f"{wanted}; the model has: {there}")
         # What flies freely is no joint of a machine.
         own = [j for j in range(model.njnt) if model.jnt_type[j] != int(mujoco.mjtJoint.mjJNT_FREE)]
-        refuse_uncovered(model, own, "Name those that you mean: joints=[...]", plant.has_acceleration)
+        every = [model.joint(j).name for j in own if model.jnt_type[j] in HINGE_OR_SLIDE]
+        refuse_uncovered(model, own, f"Name those that you mean: joints={every}", plant.has_acceleration)
         return ids
     ids = [plant.named("joint", name) for name in names]
     for j, name in zip(ids, names, strict=True):

@@ -1,32 +1,95 @@
 """What a `MujocoPlant` needs of an env: a model to copy, the length of a step, actions that are controls."""
 
 import copy
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Final
 
 import gymnasium as gym
 import mujoco
 import numpy as np
 
-from safe_wrappers.checks import Array
+from safe_wrappers.checks import Array, positive
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import name_of
 from safe_wrappers.plants.mujoco.displacement_step import moves_by_displacement
 
+ModelOf = Callable[[Any], mujoco.MjModel]
+"""Takes the unwrapped env; returns its model."""
+DataOf = Callable[[Any], mujoco.MjData]
+"""Takes the unwrapped env; returns its data."""
+
 _LAST_INTEGRATOR = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+PLACEMENTS: Final = ("body_pos", "body_quat", "geom_pos", "geom_quat", "site_pos", "site_quat")
+"""What envs change in their model from one episode to the next: where a door, a target or an obstacle is."""
 
 
-def own_model(raw: Any, given: mujoco.MjModel | None) -> mujoco.MjModel:
-    """A copy of the given model, or of an unwrapped env's, or an error that says why a plant cannot use it."""
-    if not isinstance(getattr(raw, "model", None), mujoco.MjModel) or not hasattr(raw, "data"):
-        raise UnsupportedEnvError(
-            f"{raw} has no MuJoCo .model and .data; describe it with AnalyticPlant(f=..., g=..., state=...) instead"
+class Accessed:
+    """An unwrapped env whose model and data are found by functions of it, here as `.model` and `.data`."""
+
+    def __init__(self, raw: Any, model: ModelOf | None, data: DataOf | None) -> None:
+        self._raw, self._functions = raw, (model, data)
+
+    def on(self, raw: Any) -> "Accessed":
+        """The same functions on another env."""
+        return Accessed(raw, *self._functions)
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The env's model."""
+        return self._found("model", self._functions[0], mujoco.MjModel)
+
+    @property
+    def data(self) -> mujoco.MjData:
+        """The env's data."""
+        return self._found("data", self._functions[1], mujoco.MjData)
+
+    def _found(self, name: str, function: Callable[[Any], Any] | None, kind: type) -> Any:
+        found = getattr(self._raw, name, None) if function is None else function(self._raw)
+        if not isinstance(found, kind):
+            raise ConfigurationError(
+                f"MujocoPlant({name}=...) is a function of the unwrapped env that returns its "
+                f"mujoco.{kind.__name__}; of {self._raw} it returned {type(found).__module__}.{type(found).__name__} "
+                f"(what wraps MuJoCo's own often has it inside: env.physics.{name}.ptr, env.sim.{name}._{name})"
+            )
+        return found
+
+
+def given_and_functions(model: Any, data: Any) -> tuple[Any, tuple[Any, Any]]:
+    """A plant's arguments told apart: its own model, or None, and the functions that find the env's model and data.
+
+    Raises:
+        ConfigurationError: Neither.
+    """
+    own = model if isinstance(model, mujoco.MjModel) else None
+    if own is None and model is not None and not callable(model):
+        raise ConfigurationError(
+            f"model is a mujoco.MjModel or a function of the env that returns one, got {model!r}"
         )
-    model = copy.copy(given if given is not None else raw.model)
-    wanted, sizes = ((m.nq, m.nv, m.nu) for m in (raw.model, model))
+    if data is not None and not callable(data):
+        raise ConfigurationError(
+            f"data is a function of the env that returns its mujoco.MjData, got {data!r}"
+        )
+    return own, (None if own is not None else model, data)
+
+
+def source_of(raw: Any, model: ModelOf | None, data: DataOf | None) -> Any:
+    """What has the unwrapped env's `.model` and `.data`: the env itself, where no function says otherwise."""
+    return raw if model is None and data is None else Accessed(raw, model, data)
+
+
+def own_model(source: Any, given: mujoco.MjModel | None) -> mujoco.MjModel:
+    """A copy of the given model, or of an env's, or an error that says why a plant cannot use it."""
+    if not isinstance(getattr(source, "model", None), mujoco.MjModel) or not hasattr(source, "data"):
+        raise UnsupportedEnvError(
+            f"{source} has no MuJoCo .model and .data; describe it with AnalyticPlant(f=..., g=..., state=...) "
+            "instead, or say where it keeps them: MujocoPlant(model=lambda env: ..., data=lambda env: ...)"
+        )
+    model = copy.copy(given if given is not None else source.model)
+    wanted, sizes = ((m.nq, m.nv, m.nu) for m in (source.model, model))
     if sizes != wanted:
         must = "the plant's model must have the env's joints and actuators"
         raise ConfigurationError(f"{must}: expected (nq, nv, nu) = {wanted}, got {sizes}")
-    expected, timestep = raw.model.opt.timestep, model.opt.timestep
+    expected, timestep = source.model.opt.timestep, model.opt.timestep
     if not np.isclose(timestep, expected, rtol=1e-9):
         must = "the plant's model must take the env's physics steps"
         raise ConfigurationError(f"{must}: expected a timestep of {expected} s, got {timestep} s")
@@ -39,39 +102,95 @@ def own_model(raw: Any, given: mujoco.MjModel | None) -> mujoco.MjModel:
     return model
 
 
+def take_placements(model: mujoco.MjModel, bound: mujoco.MjModel, env_model: mujoco.MjModel) -> bool:
+    """Place what an env has placed anew since its model, `bound`, was copied; whether there is any.
+
+    Raises:
+        UnsupportedEnvError: The env has another model by now, which differs in more than placements.
+    """
+    if env_model is not bound:
+        arrays = [name for name in dir(bound) if isinstance(getattr(bound, name), np.ndarray)]
+        other = [
+            name for name in arrays if not np.array_equal(getattr(bound, name), getattr(env_model, name))
+        ]
+        differ = [name for name in other if name not in PLACEMENTS]
+        if differ:
+            raise UnsupportedEnvError(
+                "the env has made itself another model since the filter was built; the filter's is a copy of the "
+                f"first one, and they differ in {', '.join(differ[:8])}: build the filter anew, or let the env keep "
+                "its model (robosuite: hard_reset=False)"
+            )
+    changed = False
+    for name in PLACEMENTS:
+        mine, its = getattr(model, name), getattr(env_model, name)
+        if not np.array_equal(mine, its):
+            mine[:], changed = its, True
+    return changed
+
+
 def control_interval(raw: Any) -> float:
     """How long an unwrapped MuJoCo env holds one action, s."""
     return physics_steps(raw) * float(raw.model.opt.timestep)
 
 
-def physics_steps(raw: Any) -> int:
-    """How many physics substeps an unwrapped MuJoCo env takes with one action."""
-    env = raw
-    if not hasattr(raw, "frame_skip"):
+def physics_steps(raw: Any, source: Any = None, control_dt: float | None = None) -> int:
+    """How many physics substeps an unwrapped MuJoCo env takes with one action.
+
+    Args:
+        raw: Says it by `frame_skip`, `n_substeps` or `dt` (s), or holds the env that steps its physics and says it.
+            Where functions find its data, by `dt` alone: what else it counts may be other steps.
+        source: Has its `.model` and `.data`; None: the env itself.
+        control_dt: How long it holds an action, s, for an env that does not say so.
+
+    Raises:
+        UnsupportedEnvError: Nobody says it.
+        ConfigurationError: `control_dt` is no whole number of physics steps, or not the env's.
+    """
+    source = raw if source is None else source
+    env, names = raw, ("frame_skip", "n_substeps") if source is raw else ()
+    if names and not hasattr(raw, "frame_skip"):
         # The physics may be stepped by an env that this one holds: a maze holds its robot's.
         held = (e for e in vars(raw).values() if isinstance(e, gym.Env))
         env = next((e for e in held if getattr(e, "data", None) is raw.data), raw)
-    given = getattr(env, "frame_skip", getattr(env, "n_substeps", None))
-    if given is not None:
-        return int(given)
-    if not hasattr(env, "dt"):
-        raise UnsupportedEnvError(
-            f"{raw} does not say how long a step lasts: give it an attribute dt (s) or frame_skip (physics steps)"
+    timestep = float(source.model.opt.timestep)
+    said = next((int(getattr(env, n)) for n in names if getattr(env, n, None) is not None), None)
+    if said is None and getattr(env, "dt", None) is not None:
+        said = round(float(env.dt) / timestep)
+    if control_dt is None:
+        if said is None:
+            raise UnsupportedEnvError(
+                f"{raw} does not say how long a step lasts: give it an attribute dt (s) or frame_skip (physics "
+                "steps), or pass MujocoPlant(control_dt=...), in seconds"
+            )
+        return said
+    steps = positive("control_dt", control_dt, "s") / timestep
+    if round(steps) < 1 or not np.isclose(steps, round(steps), rtol=1e-6):
+        raise ConfigurationError(
+            f"control_dt = {control_dt} s is not a whole number of physics steps of {timestep} s: {steps:g}"
         )
-    return round(float(env.dt) / float(raw.model.opt.timestep))
+    if said not in (None, round(steps)):
+        raise ConfigurationError(
+            f"control_dt = {control_dt} s is {round(steps)} physics steps of {timestep} s, but {raw} takes {said} "
+            "with one action: leave control_dt out"
+        )
+    return round(steps)
 
 
-def check_action_space(env: gym.Env[Any, Any], lower: Array, upper: Array) -> None:
-    """Refuse an env whose action space is not the model's control range, shapes (nu,)."""
-    space = env.action_space
-    assert isinstance(space, gym.spaces.Box)  # the filter has refused every other space
+def actions_are_controls(space: gym.Space[Any], lower: Array, upper: Array) -> bool:
+    """Whether an action space is the model's control range, shapes (nu,), where there is one."""
     limited = np.isfinite(lower)
     rounding = 0.5e-6 * (upper - lower)[limited]
-    if space.shape == lower.shape and (
-        np.allclose(space.low[limited], lower[limited], atol=rounding)
+    return (
+        isinstance(space, gym.spaces.Box)
+        and space.shape == lower.shape
+        and np.allclose(space.low[limited], lower[limited], atol=rounding)
         and np.allclose(space.high[limited], upper[limited], atol=rounding)
-    ):
-        return
+    )
+
+
+def refuse_other_actions(env: gym.Env[Any, Any], lower: Array, upper: Array) -> None:
+    """Refuse an action space that no map of its entries makes the model's control range, shapes (nu,)."""
+    space = env.action_space
     ranges = f"the action space is {space}, the model's control range {lower} to {upper}"
     if space != env.unwrapped.action_space:
         raise UnsupportedEnvError(
@@ -82,7 +201,8 @@ def check_action_space(env: gym.Env[Any, Any], lower: Array, upper: Array) -> No
         raise UnsupportedEnvError(
             f"{name_of(env)} moves its gripper by displacements: take DisplacementPlant(), or leave plant out"
         )
-    raise UnsupportedEnvError(
-        f"{name_of(env)} rescales or limits actions in its own step; filters on such an env are not supported "
-        f"yet, except with an AnalyticPlant(f=..., g=..., state=...) of your own: {ranges}"
-    )
+    if space.shape != lower.shape:
+        raise UnsupportedEnvError(
+            f"{name_of(env)} rescales or limits actions in its own step: it has not one action for each control. Use "
+            f"AnalyticPlant(f=..., g=..., state=...) with your own f and g: {ranges}"
+        )

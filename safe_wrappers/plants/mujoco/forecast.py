@@ -198,14 +198,14 @@ class Recorder(Remade):
         """
         m, data, n = self._model, self._data, self.substeps
         path, published = self._empty(horizon)
-        held = None if first is None else self.held_after(control)
+        held = None if first is None else self.held_after(self.key(control))
         if first is None or held is None:
             self._begin(control)
             whole = self.simulate(0, 1, path, published)
             # Data are large: only plants that forecast have these.
             oldest = self.held.popleft()[1] if len(self.held) == _HELD else mujoco.MjData(m)
             mujoco.mj_copyData(oldest, m, data)
-            self.held.append((control.tobytes(), oldest))
+            self.held.append((self.key(control), oldest))
         else:
             whole = 1
             mujoco.mj_copyData(data, m, held)
@@ -214,9 +214,8 @@ class Recorder(Remade):
             whole = (self._by_euler_steps if euler else self.simulate)(1, horizon, path, published)
         return self._forecast(control, path, published, whole)
 
-    def held_after(self, control: Array) -> mujoco.MjData | None:
+    def held_after(self, key: bytes) -> mujoco.MjData | None:
         """The data at the end of a control interval from the present state, if it is still held."""
-        key = control.tobytes()
         return next((data for known, data in self.held if known == key), None)
 
     def forget(self) -> None:
@@ -277,6 +276,10 @@ class Recorder(Remade):
     def act(self, data: mujoco.MjData, control: Array) -> None:
         """Give the machine a control, as its env does at the start of a control interval."""
         data.ctrl[:] = control
+
+    def key(self, control: Array) -> bytes:
+        """What identifies a control among those whose data are held: the bytes that the env sets."""
+        return control.tobytes()
 
     def braking(self, data: mujoco.MjData) -> Array:
         """Every actuator against its own motion, shape (nu,); read once per control interval, as controllers do."""

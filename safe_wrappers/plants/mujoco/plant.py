@@ -1,51 +1,71 @@
-"""MujocoPlant: f and g of any env whose unwrapped env has `.model` and `.data`, from a copy of the model."""
+"""MujocoPlant: f and g of any env with a MuJoCo model and data, from a copy of the model."""
 
 from collections import deque
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import gymnasium as gym
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import Array, non_negative
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants import env_checks
+from safe_wrappers.plants.mujoco import binding
 from safe_wrappers.plants.mujoco import model as of_model
+from safe_wrappers.plants.mujoco.action_map import ActionMap, MappedRecorder, find_action_map
 from safe_wrappers.plants.mujoco.actuators import AffineActuators, Response, point_motion
-from safe_wrappers.plants.mujoco.binding import check_action_space, control_interval, own_model, physics_steps
 from safe_wrappers.plants.mujoco.contacts import ContactForecast, ContactReader
 from safe_wrappers.plants.mujoco.forecast import Forecast, Poses, Recorder
 from safe_wrappers.plants.mujoco.shared_step import shared_step
 from safe_wrappers.plants.plant import Plant
+from safe_wrappers.plants.snapshot import STATE, Snapshot
 
-_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
-
-class MujocoPlant(Plant):
+class MujocoPlant(Snapshot):
     """`x = (qpos, qvel)`, `x' = f + g u`, through the actuators and the active constraints.
 
-    f and g hold for the present set of active contacts and limits, and are exact for pyramidal friction cones. The
-    env's own model and data are only read.
+    u is the env's action. f and g hold for the present set of active contacts and limits, and are exact for pyramidal
+    friction cones. The env's own model and data are only read; where a reset moves fixed bodies, the copy follows.
 
     Args:
-        model: The filter's model; None copies the env's. Pass another (other masses) to test mismatch.
+        model: None copies the env's `.model`; a function of the unwrapped env returns it where it is elsewhere. A
+            model (other masses) is the filter's in place of the env's, to test mismatch.
         delay_s: Evidence age plus detection plus actuation delay in s, over which this plant's model predicts.
         share_step: Let the rollout of the executed control be the env's step. None: with envs where that was measured
             equal bit for bit; True: with any that keeps `MujocoEnv`'s simulation step and leaves its model alone.
+        data: A function of the unwrapped env that returns its data; None: they are its `.data`.
+        control_dt: How long the env holds an action, s; needed where it has no `dt` or `frame_skip`.
+        action_map: (offset, scale), one number or one per action: the env sets the control `offset + scale * action`.
+            None: an action is a control, or, where the action space is not the control range, this is found by
+            stepping a copy of the env.
+
+    Attributes:
+        action_map: The map, once bound; None where an action is a control.
 
     Raises:
-        UnsupportedEnvError: No MuJoCo model, an actuator that is not affine, or actions that are not controls.
+        UnsupportedEnvError: No MuJoCo model, an actuator that is not affine, or actions that no map makes controls.
     """
 
     bounds_are_action_space: ClassVar[bool] = True
     can_brake: ClassVar[bool] = True
-    lower: Array = np.zeros(0)  #: of the control, shape (nu,), once bound: ctrlrange, or -inf and inf
+    lower: Array = np.zeros(0)  #: of the action, shape (nu,), once bound: ctrlrange, or -inf and inf
     upper: Array = np.zeros(0)
+    action_map: ActionMap | None = None
 
     def __init__(
-        self, model: mujoco.MjModel | None = None, delay_s: float = 0.0, share_step: bool | None = None
+        self,
+        model: mujoco.MjModel | binding.ModelOf | None = None,
+        delay_s: float = 0.0,
+        share_step: bool | None = None,
+        *,
+        data: binding.DataOf | None = None,
+        control_dt: float | None = None,
+        action_map: Sequence[ArrayLike] | None = None,
     ) -> None:
-        self._given, self._share_step = model, share_step
+        self._given, self._functions = binding.given_and_functions(model, data)
+        self._share_step, self._given_dt, self._given_map = share_step, control_dt, action_map
         self.delay_s = non_negative("delay_s", delay_s, "s")
         self._pending: deque[Array] = deque()
         self._factors = (1.0, 1.0)
@@ -55,23 +75,23 @@ class MujocoPlant(Plant):
         """Attach to an env and copy its model."""
         raw: Any = env.unwrapped
         env_checks.refuse_second_env(self._raw, env)
-        self.model = own_model(raw, self._given)
+        self._source = source = binding.source_of(raw, *self._functions)
+        self.model, self._bound_model = binding.own_model(source, self._given), source.model
         self._raw, self._env = raw, env
+        self.substeps = binding.physics_steps(raw, source, self._given_dt)
         self.data = mujoco.MjData(self.model)
         self.actuators = AffineActuators(self.model)
         self._response = Response(self.model, self.data, self.actuators)
         self._clamped = bool(self.model.actuator_forcelimited.any())
         self.lower, self.upper = of_model.control_range(self.model)
         env_checks.refuse_changed_actions(env)
-        self._check_action_space(env)
-        self._idle = np.clip(0.0, self.lower, self.upper)
-        self.substeps = physics_steps(raw)
-        self.control_dt = env_checks.check_timing(env, control_interval(raw))
-        self._nq, self._nv = int(self.model.nq), int(self.model.nv)
+        self._bind_actions(env)
+        self._idle = self.controls(np.clip(0.0, self.lower, self.upper))
+        self.control_dt = env_checks.check_timing(env, self.substeps * float(self.model.opt.timestep))
+        self._new_snapshot()
         self.frames = of_model.Frames(self.model, self.data)
         self._delay_steps = int(np.ceil(self.delay_s / self.model.opt.timestep - 1e-9))
         self._pending = deque(maxlen=max(1, -(-self._delay_steps // self.substeps)))
-        self._snapshot = np.zeros(mujoco.mj_stateSize(self.model, _STATE))
         self._recorder = self._new_recorder()
         self._forget()
         exact = self._given is None and not self.delay_s
@@ -96,10 +116,26 @@ class MujocoPlant(Plant):
             self._shared.withdraw()
 
     def _new_recorder(self) -> Recorder:
-        return Recorder(self.model, self.data, self.substeps)
+        stepped = self.model, self.data, self.substeps
+        return Recorder(*stepped) if self.action_map is None else MappedRecorder(*stepped, self.action_map)
 
-    def _check_action_space(self, env: gym.Env[Any, Any]) -> None:
-        check_action_space(env, self.lower, self.upper)
+    def _bind_actions(self, env: gym.Env[Any, Any]) -> None:
+        """Find the bounds of the action, and the map from it to the control."""
+        self.action_map = None
+        are_controls = binding.actions_are_controls(env.action_space, self.lower, self.upper)
+        if are_controls and np.isfinite(self.lower).all() and self._given_map is None:
+            return
+        binding.refuse_other_actions(env, self.lower, self.upper)
+        found = find_action_map(env, self._source, self.substeps, self._given_map, are_controls)
+        if are_controls and found.is_identity:
+            return
+        self.action_map = found
+        self._clamped |= found.exceeds(self.lower, self.upper)
+        self.lower, self.upper = found.low, found.high
+
+    def controls(self, action: Array) -> Array:
+        """The model's control that the env makes of an action, shapes (nu,)."""
+        return action if self.action_map is None else self.action_map.control(action)
 
     def perturb(self, mass: float = 1.0, damping: float = 1.0) -> None:
         """Scale the masses (and inertias) and joint damping of the plant's own model, now or once it has one."""
@@ -127,7 +163,7 @@ class MujocoPlant(Plant):
 
     def observe(self) -> None:
         """Take the env's present state; everything else is computed on demand."""
-        mujoco.mj_getState(self._raw.model, self._raw.data, self._snapshot, _STATE)
+        mujoco.mj_getState(self._source.model, self._source.data, self._snapshot, STATE)
         self._forget()
         self.observation_id += 1
         # MuJoCo resets a state with a NaN: a prediction would hide it.
@@ -135,9 +171,14 @@ class MujocoPlant(Plant):
             self._predict_over_delay()
 
     def executed(self, control: Array | None) -> None:
-        """Remember a sent command for the delay."""
+        """Remember a sent command for the delay; None begins an episode."""
         if control is None:
             self._pending.clear()
+            if self._given is None and binding.take_placements(
+                self.model, self._bound_model, self._source.model
+            ):
+                self.model_version += 1
+                self._forget()
         elif self._delay_steps:
             self._pending.append(np.array(control))
 
@@ -148,44 +189,9 @@ class MujocoPlant(Plant):
         if early > 0:
             mujoco.mj_step(self.model, self.data, early)
         for i, control in enumerate(self._pending):
-            self.data.ctrl[:] = control
+            self._recorder.act(self.data, control)
             mujoco.mj_step(self.model, self.data, self.substeps + (min(early, 0) if i == 0 else 0))
         self._keep()
-
-    def _keep(self) -> None:
-        """Make the data's state the present one."""
-        mujoco.mj_getState(self.model, self.data, self._snapshot, _STATE)
-        self._loaded = False
-
-    def _load(self) -> None:
-        if not self._loaded:
-            mujoco.mj_setState(self.model, self.data, self._snapshot, _STATE)
-            self._loaded, self._forwarded = True, False
-
-    def _load_to_step(self) -> None:
-        """The data at the present state; the caller may change it."""
-        self._load()
-        self._loaded = False
-
-    @property
-    def time(self) -> float:
-        """Time of the present state, s; under a delay the predicted one."""
-        return float(self._snapshot[0])
-
-    @property
-    def qpos(self) -> Array:
-        """Positions, shape (nq,): m, rad, or quaternions."""
-        return self._snapshot[1 : 1 + self._nq]
-
-    @property
-    def qvel(self) -> Array:
-        """Velocities, shape (nv,): m/s or rad/s."""
-        return self._snapshot[1 + self._nq : 1 + self._nq + self._nv]
-
-    @property
-    def state(self) -> Array:
-        """(qpos, qvel), shape (nq + nv,)."""
-        return self._snapshot[1 : 1 + self._nq + self._nv]
 
     def forward(self) -> mujoco.MjData:
         """The plant's data with every derived quantity up to date at the present state.
@@ -221,6 +227,8 @@ class MujocoPlant(Plant):
         if self._affine is None:
             self.forward()
             self._affine = self._response.drift_and_effect()
+            if self.action_map is not None:
+                self._affine = self.action_map.per_action(*self._affine)
         return self._affine
 
     @property
@@ -235,7 +243,8 @@ class MujocoPlant(Plant):
         if motion is None:
             data = self.forward()
             motion = data.actuator_length, data.actuator_velocity
-        return self.actuators.acting_range(*motion, self.control_dt)
+        ends = self.actuators.acting_range(*motion, self.control_dt)
+        return ends if self.action_map is None else self.action_map.actions_between(*ends)
 
     def inertia_diagonal(self) -> Array:
         """Diagonal of the joint-space inertia, shape (nv,), kg or kg m^2."""
@@ -280,11 +289,6 @@ class MujocoPlant(Plant):
         mujoco.mj_forward(self.model, self.data)
         return self.data
 
-    @property
-    def weight_n(self) -> float:
-        """Weight of everything that moves, N; without gravity its mass in kg."""
-        return of_model.weight_n(self.model)
-
     def braking(self) -> Array:
         """The control by which a forecast brakes, at the present state, shape (nu,)."""
         return self._recorder.braking(self.forward())
@@ -306,7 +310,7 @@ class MujocoPlant(Plant):
 
     def published(self) -> mujoco.MjData | None:
         """The env's own data, whose derived quantities lag; None under a delay, when the state is predicted."""
-        return None if self._delay_steps else self._raw.data
+        return None if self._delay_steps else self._source.data
 
     def path(self, control: Array) -> list[Array]:
         """The states (qpos, qvel) after each physics substep of a held control."""
@@ -328,14 +332,6 @@ class MujocoPlant(Plant):
         response = self.acceleration
         p, jacobian = self.frames.jacobian(kind, name)
         return p.copy(), *point_motion(jacobian, self.frames.jacobian_rate(kind, name), self.qvel, *response)
-
-    def named(self, kind: str, name: str) -> int:
-        """The id of a body, site, geom, joint or actuator; for an unknown name an error that lists all."""
-        return of_model.named(self.model, kind, name)
-
-    def names(self, kind: str, pattern: str = "*") -> list[str]:
-        """All names of a kind that match a shell pattern."""
-        return of_model.names(self.model, kind, pattern)
 
     def attribute(self, name: str) -> Any:
         """Read a published fact of the env."""

@@ -61,7 +61,7 @@ class SharedStep:
         def take_over(ctrl: Array, n_frames: int) -> None:
             del raw._step_mujoco_simulation  # a second simulation within one step is the env's own
             mujoco.mj_getState(raw.model, raw.data, self._state, _STATE)
-            held = rollout.held_after(np.asarray(ctrl, dtype=np.float64))
+            held = rollout.held_after(np.asarray(ctrl, dtype=np.float64).tobytes())
             if (
                 held is None
                 or n_frames != self._substeps

@@ -65,6 +65,7 @@ class Coasting:
         self._pose = self._qpos[self._at : self._at + 7]
         self._motion = self._qvel[self._moving : self._moving + 6]
         self._data = mujoco.MjData(m)
+        self._none = plant.controls(np.zeros(m.nu))
         self._model_version = -1
 
     def _adopt(self) -> None:
@@ -111,7 +112,7 @@ class Coasting:
         now = plant.pose()
         data.qpos[:], data.qvel[:] = now.qpos[self._qpos], now.qvel[self._qvel]
         data.qacc_warmstart[:] = now.qacc_warmstart[self._qvel]
-        data.ctrl[:] = control
+        data.ctrl[:] = plant.controls(control)
         poses, rests = np.empty((horizon * n, 7)), False
         for hold in range(horizon):
             for i in range(hold * n, hold * n + n):
@@ -121,7 +122,7 @@ class Coasting:
             if math.sqrt(vx * vx + vy * vy + vz * vz) + abs(turn) * turning_radius < _REST_SPEED:
                 rests = True
                 break
-            data.ctrl[:] = 0.0
+            data.ctrl[:] = self._none
         return _course(poses[: (hold + 1) * n], rests)
 
 

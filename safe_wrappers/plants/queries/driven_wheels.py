@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from safe_wrappers.checks import Array
 from safe_wrappers.control.vehicle.wheel import Wheel
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.mujoco.action_map import refuse_mapped
 from safe_wrappers.plants.mujoco.model import inertia
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
@@ -40,6 +41,7 @@ class DrivenWheels:
             wanted = f"wheels is a list of joint names, each once, got {names!r}"
             raise ConfigurationError(f"{wanted}; the model has the joints {', '.join(plant.names('joint'))}")
         self.names = list(names)
+        refuse_mapped(plant.action_map, "a slip limit")
         m = plant.model
         self._joints = np.array([plant.named("joint", name) for name in names])
         for joint, name in zip(self._joints, names, strict=True):

@@ -10,6 +10,7 @@ from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.damped_axis import DampedAxis, damped_axis
 from safe_wrappers.control.numerics.rectangles import Rectangle, merged
 from safe_wrappers.errors import UnsupportedEnvError
+from safe_wrappers.plants.mujoco.action_map import refuse_mapped
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
 _ALIGNED = 1e-6
@@ -48,6 +49,7 @@ def planar_point(plant: MujocoPlant, clip: float, body: str | None = None) -> Pl
     Raises:
         UnsupportedEnvError: The model is not such a point; the message says why.
     """
+    refuse_mapped(plant.action_map, "the closed form of a point's motion")
     m = plant.model
     slides = _slides(m, None if body is None else plant.named("body", body))
     data = mujoco.MjData(m)

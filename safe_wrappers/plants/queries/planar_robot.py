@@ -8,6 +8,7 @@ import numpy as np
 from safe_wrappers.checks import Array
 from safe_wrappers.control.backup.heading_drive import HeadingDrive
 from safe_wrappers.errors import UnsupportedEnvError
+from safe_wrappers.plants.mujoco.action_map import refuse_mapped
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 
 _SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
@@ -26,6 +27,7 @@ class PlanarFrame:
     """
 
     def __init__(self, plant: MujocoPlant, body: str) -> None:
+        refuse_mapped(plant.action_map, "the closed form of a planar robot's motion")
         m = plant.model
         b = plant.named("body", body)
         joints = np.flatnonzero(m.jnt_bodyid == b).tolist()

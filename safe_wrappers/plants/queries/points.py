@@ -129,6 +129,8 @@ class Points(Remade):
             numbers = np.empty(18 + plant.lower.size)
             frame = plant.frames.of(kind, name)
             _reach(plant.model._address, data._address, *frame, *self._state, *self._motors, numbers)
+            if plant.action_map is not None:  # a unit of action is `scale` units of control
+                numbers[18:] *= plant.action_map.scale**2
             found.append(numbers)
         return found
 

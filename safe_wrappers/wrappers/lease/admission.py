@@ -3,11 +3,14 @@
 from collections.abc import Callable
 from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
 from safe_wrappers.control.watchdog.reachability import MotionLimits, admits, jerk_limited_time
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
+from safe_wrappers.plants.mujoco.binding import actions_are_controls
+from safe_wrappers.plants.mujoco.model import control_range
 from safe_wrappers.wrappers.common.layer import Array, Env
 
 Measured = Callable[[Env], tuple[ArrayLike, ...]]
@@ -25,6 +28,13 @@ class Admission:
     def __init__(self, env: Env, motion_limits: Any, measured: Measured | None, controls: int) -> None:
         if measured is None and not hasattr(env.unwrapped, "data"):
             raise UnsupportedEnvError(f"no position known: pass measured, {_MEASURED}")
+        model: Any = getattr(env.unwrapped, "model", None)
+        reads_actuators = measured is None and isinstance(model, mujoco.MjModel)
+        if reads_actuators and not actions_are_controls(env.action_space, *control_range(model)):
+            wanted = (
+                "actions are in other units than the lengths of the actuators, so that these are no setpoints"
+            )
+            raise ConfigurationError(f"{wanted}: pass measured, {_MEASURED}")
         try:
             given = dict(motion_limits)
             arrival = given.pop("arrival", "moving")

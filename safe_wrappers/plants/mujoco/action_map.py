@@ -1,0 +1,275 @@
+"""ActionMap: what an env makes of an action before it is the model's control, where that is affine.
+
+An env may count its actions in other units than its model's controls: the hands of gymnasium-robotics take actions in
+[-1, 1] and put them onto the actuators' ranges. The map is found by stepping a copy of the env, and tried there.
+"""
+
+import copy
+from collections.abc import Sequence
+from types import ModuleType
+from typing import Any, Final, NamedTuple
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike
+
+from safe_wrappers.checks import Array
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.plants.env_checks import name_of
+from safe_wrappers.plants.mujoco.binding import Accessed
+from safe_wrappers.plants.mujoco.forecast import Recorder
+from safe_wrappers.plants.mujoco.model import control_range
+
+_TRIALS: Final = 100
+_ROUNDING: Final = 1e-6
+"""Of controls, as a share of the largest one seen, and of states: envs may compute in single precision."""
+_INSTEAD: Final = "Use AnalyticPlant(f=..., g=..., state=...) with your own f and g."
+
+
+class ActionMap:
+    """`control = offset + scale * action`, elementwise.
+
+    Attributes:
+        offset: The model's control at the action zero, shape (nu,).
+        scale: Change of the control per unit of action, shape (nu,).
+        low: Smallest action, shape (nu,).
+        high: Largest action, shape (nu,).
+    """
+
+    def __init__(self, offset: ArrayLike, scale: ArrayLike, low: Array, high: Array) -> None:
+        self.low, self.high = (np.asarray(end, dtype=np.float64) for end in (low, high))
+        self.offset, self.scale = (_entries(name, given, self.low) for name, given in _named(offset, scale))
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether an action is the control."""
+        return not self.offset.any() and bool((self.scale == 1.0).all())
+
+    def control(self, action: Array) -> Array:
+        """The model's control, shape (nu,)."""
+        return self.offset + self.scale * action
+
+    def action(self, control: Array) -> Array:
+        """The action for a control, shape (nu,); the one nearest to zero where actions do nothing."""
+        acts = self.scale != 0.0
+        found = (control - self.offset) / np.where(acts, self.scale, 1.0)
+        return np.where(acts, np.clip(found, self.low, self.high), np.clip(0.0, self.low, self.high))
+
+    def reach(self) -> tuple[Array, Array]:
+        """The least and the largest control that actions have, shapes (nu,)."""
+        ends = _times(self.scale, self.low), _times(self.scale, self.high)
+        return self.offset + np.minimum(*ends), self.offset + np.maximum(*ends)
+
+    def exceeds(self, lower: Array, upper: Array) -> bool:
+        """Whether some action has a control outside of this range, shapes (nu,), by more than rounding."""
+        least, most = self.reach()
+        slack = _ROUNDING * np.abs(self.scale)
+        return bool((least < lower - slack).any() or (most > upper + slack).any())
+
+    def actions_between(self, least: Array, most: Array) -> tuple[Array, Array]:
+        """The actions whose controls are between these, within the action space; shapes (nu,)."""
+        acts = self.scale != 0.0
+        ends = [(end - self.offset) / np.where(acts, self.scale, 1.0) for end in (least, most)]
+        first, last = np.minimum(*ends), np.maximum(*ends)
+        first, last = (np.clip(end, self.low, self.high) for end in (first, last))
+        return np.where(acts, first, self.low), np.where(acts, last, self.high)
+
+    def per_action(self, drift: Array, effect: Array) -> tuple[Array, Array]:
+        """`drift + effect @ control`, shapes (nv,) and (nv, nu), as the same of actions."""
+        return drift + effect @ self.offset, effect * self.scale
+
+
+def refuse_mapped(action_map: ActionMap | None, asker: str) -> None:
+    """Refuse what reads controls off the model itself, named by `asker`, where an action is not the control."""
+    if action_map is not None:
+        raise UnsupportedEnvError(
+            f"{asker} needs actions that are the model's controls; this env makes its controls of them by control = "
+            "offset + scale * action. Constraints that forecast take that into account (SpeedLimit, JointSpeedLimit, "
+            "JointPositionLimit, Workspace, Upright), as do Clearance, Barrier and ImpactSpeedLimit"
+        )
+
+
+def _times(scale: Array, end: Array) -> Array:
+    """Their product, zero where the scale is, though the end may be infinite."""
+    return np.where(scale == 0.0, 0.0, scale) * np.where(scale == 0.0, 0.0, end)
+
+
+def _named(offset: ArrayLike, scale: ArrayLike) -> tuple[tuple[str, ArrayLike], tuple[str, ArrayLike]]:
+    return ("offset", offset), ("scale", scale)
+
+
+def _entries(name: str, given: ArrayLike, like: Array) -> Array:
+    try:
+        found = np.broadcast_to(np.asarray(given, dtype=np.float64), like.shape).copy()
+    except (TypeError, ValueError):
+        found = np.array(np.nan)
+    if not np.isfinite(found).all():
+        raise ConfigurationError(
+            f"action_map is (offset, scale), each one number or {like.size}; got {name} = {given!r}"
+        )
+    return found
+
+
+class MappedRecorder(Recorder):
+    """Forecasts of actions that the env maps to controls; the arguments are those of `Recorder`, and the map."""
+
+    def __init__(
+        self, model: mujoco.MjModel, data: mujoco.MjData, substeps: int, action_map: ActionMap
+    ) -> None:
+        super().__init__(model, data, substeps)
+        self._map = action_map
+        # Brakes are as strong as actions can make them.
+        low, high = (np.clip(end, *control_range(model)) for end in action_map.reach())
+        self._law = self._law._replace(low=low, high=high)
+
+    def act(self, data: mujoco.MjData, control: Array) -> None:
+        """Give the machine an action, shape (nu,), as its env does at the start of a control interval."""
+        data.ctrl[:] = self._map.control(control)
+
+    def key(self, control: Array) -> bytes:
+        """What identifies an action: the bytes of the control that its env sets."""
+        return self._map.control(control).tobytes()
+
+    def braking(self, data: mujoco.MjData) -> Array:
+        """The action that brakes, shape (nu,)."""
+        return self._map.action(super().braking(data))
+
+
+class _Tried(NamedTuple):
+    """What a copy of an env did in so many steps, k."""
+
+    actions: Array  # shape (k, nu)
+    controls: Array  # that the env left in the data, shape (k, nu)
+    departure: float  # largest difference of its states from those of this control, held
+
+
+def find_action_map(
+    env: gym.Env[Any, Any], source: Any, substeps: int, given: Sequence[ArrayLike] | None, ranges_agree: bool
+) -> ActionMap:
+    """The map by which an env makes controls of actions, found on a copy of it, or the given one, if that is right.
+
+    Args:
+        env: Its action space has one action per control. It and its random generator stay as they are.
+        source: Has the unwrapped env's `.model` and `.data`.
+        substeps: Physics steps of one step of the env.
+        given: (offset, scale); where no copy of the env can be stepped, they are taken as they are.
+        ranges_agree: The action space is the control range, as far as there is one: then actions are controls where
+            no copy can be stepped.
+
+    Raises:
+        ConfigurationError: The given pair is none, or not what the env does.
+        UnsupportedEnvError: No copy can be stepped, or the env does something else with its actions.
+    """
+    space, name = env.action_space, name_of(env)
+    assert isinstance(space, gym.spaces.Box)  # the filter has refused every other space
+    box = space.low.astype(np.float64), space.high.astype(np.float64)
+    if given is not None and (not isinstance(given, Sequence) or len(given) != 2):
+        raise ConfigurationError(
+            f"action_map is (offset, scale): control = offset + scale * action; got {given!r}"
+        )
+    wanted = None if given is None else ActionMap(given[0], given[1], *box)
+    likely = wanted or (ActionMap(0.0, 1.0, *box) if ranges_agree else None)
+    try:
+        tried = _tried(env.unwrapped, source, space, substeps)
+    except Exception as error:
+        if likely is not None:
+            return likely
+        raise UnsupportedEnvError(
+            f"{name} rescales or limits actions in its own step, and no copy of it can be stepped to find out how "
+            f"({type(error).__name__}: {error}); say what it does by MujocoPlant(action_map=(offset, scale)), where "
+            "control = offset + scale * action"
+        ) from error
+    guesses = [wanted] if wanted is not None else [_ends_to_ends(source.model, box), _through_two(tried, box)]
+    errors = [np.abs(tried.controls - np.array([g.control(a) for a in tried.actions])) for g in guesses]
+    best = int(np.argmin([np.nan_to_num(error, nan=np.inf).max() for error in errors]))
+    worst, allowed = errors[best].max(axis=0), _ROUNDING * np.abs(tried.controls).max(axis=0)
+    if not (worst <= allowed).all():
+        i = int(np.nanargmax(worst - allowed))
+        seen = tried.controls[:, i]
+        says = (
+            f"in {_TRIALS} steps of random actions its controls were up to {worst[i]:.3g} away from that, at "
+            f"actuator {source.model.actuator(i).name or i!r}, which had {seen.min():.3g} to {seen.max():.3g}"
+        )
+        if wanted is not None:
+            raise ConfigurationError(f"action_map is not what {name} does with its actions: {says}")
+        raise UnsupportedEnvError(
+            f"{name} rescales or limits actions in its own step, and not by control = offset + scale * action: "
+            f"{says}. The map may depend on its state. {_INSTEAD}"
+        )
+    if not tried.departure <= _ROUNDING:
+        raise UnsupportedEnvError(
+            f"{name} does not hold one control for {substeps} physics steps: its state was up to "
+            f"{tried.departure:.3g} away from that of the control that it leaves in its data (it may change the "
+            f"control, or the state, between or after its physics steps). {_INSTEAD}"
+        )
+    return guesses[best]
+
+
+def _ends_to_ends(model: mujoco.MjModel, box: tuple[Array, Array]) -> ActionMap:
+    """The usual map: the middle and the ends of the action space to those of the control range."""
+    low, high = model.actuator_ctrlrange.T
+    with np.errstate(all="ignore"):
+        scale = (high - low) / (box[1] - box[0])
+        offset = (low + high) / 2.0 - scale * ((box[0] + box[1]) / 2.0)
+    known = np.isfinite(scale) & np.isfinite(offset)
+    return ActionMap(np.where(known, offset, 0.0), np.where(known, scale, 1.0), *box)
+
+
+def _through_two(tried: _Tried, box: tuple[Array, Array]) -> ActionMap:
+    """The map through the first two actions that were tried; see `_tried`."""
+    (first, second, *_), (at_first, at_second, *_) = tried.actions, tried.controls
+    with np.errstate(all="ignore"):
+        scale = np.nan_to_num((at_second - at_first) / (second - first), posinf=0.0, neginf=0.0)
+    return ActionMap(np.nan_to_num(at_first - scale * first), scale, *box)
+
+
+def _tried(raw: Any, source: Any, space: gym.spaces.Box, substeps: int) -> _Tried:
+    """Step a copy of an unwrapped env: by the middle of its actions, their upper end, and random ones."""
+    twin = duplicate(raw)
+    at = source.on(twin) if isinstance(source, Accessed) else twin
+    for one in _envs_of(twin):
+        if getattr(one, "render_mode", None) is not None:
+            one.render_mode = None
+    space = copy.deepcopy(space)
+    space.seed(0)
+    low, high = (
+        np.where(np.isfinite(space.low), space.low, -1.0),
+        np.where(np.isfinite(space.high), space.high, 1.0),
+    )
+    actions = [(low + high) / 2.0, high, *(space.sample() for _ in range(_TRIALS))]
+    twin.reset(seed=0)
+    probe, controls, departure = mujoco.MjData(at.model), [], 0.0
+    for action in actions:
+        mujoco.mj_copyData(probe, at.model, at.data)
+        twin.step(np.array(action, dtype=space.dtype))
+        controls.append(at.data.ctrl.copy())
+        probe.ctrl[:] = at.data.ctrl
+        mujoco.mj_step(at.model, probe, nstep=substeps)
+        for held, found in ((probe.qpos, at.data.qpos), (probe.qvel, at.data.qvel)):
+            missed = np.abs(held - found) / (1.0 + np.abs(found))
+            departure = max(departure, float(np.nan_to_num(missed, nan=np.inf).max(initial=0.0)))
+    return _Tried(np.array(actions, dtype=space.dtype).astype(np.float64), np.array(controls), departure)
+
+
+def _envs_of(raw: Any) -> list[Any]:
+    """An env and all that it holds, directly or not."""
+    held = [e for e in vars(raw).values() if isinstance(e, gym.Env)]
+    return [raw, *(inner for e in held for inner in _envs_of(e))]
+
+
+def duplicate(raw: Any) -> Any:
+    """A copy of an unwrapped env at its present state, without its renderers.
+
+    `copy.deepcopy` would make many envs anew from the arguments of their constructors, as `EzPickle` tells it to.
+    """
+    memo: dict[int, Any] = {}
+    envs = _envs_of(raw)
+    for one in envs:
+        memo[id(one)] = object.__new__(type(one))
+    for one in envs:
+        for name, value in vars(one).items():
+            rendered = name == "mujoco_renderer"
+            kept = value if isinstance(value, ModuleType) else copy.deepcopy(value, memo)
+            memo[id(one)].__dict__[name] = None if rendered else kept
+    return memo[id(raw)]

@@ -1,0 +1,215 @@
+"""Envs that keep model and data elsewhere than in `.model` and `.data`: functions say where.
+
+The oracle is the env's own step.
+"""
+
+from types import SimpleNamespace
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+
+import safe_wrappers as sw
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+
+PENDULUM = """
+<mujoco><compiler autolimits="true"/><option timestep="0.005"/><worldbody>
+  <body><joint name="swing" axis="0 1 0" damping="0.1"/>
+    <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.5" mass="1"/></body></worldbody>
+  <actuator><motor joint="swing" ctrlrange="-2 2"/></actuator></mujoco>
+"""
+
+
+class Nested(gym.Env):
+    """A pendulum whose model and data are two levels down, and which does not say how long a step lasts."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+
+    def __init__(self, most=2.0, scale=1.0):
+        model = mujoco.MjModel.from_xml_string(PENDULUM)
+        self.sim = SimpleNamespace(
+            model=SimpleNamespace(_model=model), data=SimpleNamespace(_data=mujoco.MjData(model))
+        )
+        self.action_space, self.scale = gym.spaces.Box(-most, most, (1,), np.float64), scale
+
+    def observed(self):
+        return np.concatenate([self.sim.data._data.qpos, self.sim.data._data.qvel])
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        mujoco.mj_resetData(self.sim.model._model, self.sim.data._data)
+        self.sim.data._data.qpos[0] = self.np_random.uniform(-0.5, 0.5)
+        return self.observed(), {}
+
+    def step(self, action):
+        self.sim.data._data.ctrl[:] = self.scale * action
+        mujoco.mj_step(self.sim.model._model, self.sim.data._data, 4)
+        return self.observed(), 0.0, False, False, {}
+
+
+def nested_plant(**changed):
+    known = {
+        "model": lambda env: env.sim.model._model,
+        "data": lambda env: env.sim.data._data,
+        "control_dt": 0.02,
+    }
+    return sw.MujocoPlant(**known | changed)
+
+
+@pytest.mark.parametrize("env", [Nested(), Nested(1.0, 2.0)], ids=["control", "mapped"])
+def test_a_filter_keeps_a_limit_of_a_machine_two_levels_down(env):
+    limit = sw.constraints.JointSpeedLimit(limit=2.0, margin=0.01)
+    plant = nested_plant()
+    filtered = sw.CBFActionFilter(env, [limit], plant=plant)
+    assert plant.substeps == 4 and plant.control_dt == pytest.approx(0.02)
+    assert (plant.action_map is None) == (env.scale == 1.0)
+    filtered.reset(seed=0)
+    rng, fastest, changed = np.random.default_rng(0), 0.0, 0
+    for k in range(200):
+        action = rng.uniform(-1.0, 1.0, 1) if k < 20 else env.action_space.high
+        *_, info = filtered.step(action)
+        fastest, changed = max(fastest, abs(env.sim.data._data.qvel[0])), changed + info["cbf/intervened"]
+        assert np.array_equal(plant.forecast(info["executed_action"]).path[-1], env.observed())
+        assert not info["cbf/infeasible"]
+    assert 1.9 < fastest <= 2.0 and changed
+
+
+def test_how_long_a_step_lasts_is_not_guessed():
+    with pytest.raises(UnsupportedEnvError, match=r"how long a step lasts.*MujocoPlant\(control_dt=\.\.\.\)"):
+        nested_plant(control_dt=None).bind(Nested())
+    env = Nested()
+    env.frame_skip = 7  # may be a count of somebody else's steps
+    with pytest.raises(UnsupportedEnvError, match="how long a step lasts"):
+        nested_plant(control_dt=None).bind(env)
+    env.dt = 0.02
+    plant = nested_plant(control_dt=None)
+    plant.bind(env)
+    assert plant.substeps == 4
+    with pytest.raises(
+        ConfigurationError, match=r"is 8 physics steps of 0\.005 s, but .* takes 4 with one action"
+    ):
+        nested_plant(control_dt=0.04).bind(env)
+    with pytest.raises(ConfigurationError, match=r"not a whole number of physics steps of 0\.005 s: 4\.2"):
+        nested_plant(control_dt=0.021).bind(Nested())
+    with pytest.raises(ConfigurationError, match="control_dt"):
+        nested_plant(control_dt=-0.02).bind(Nested())
+    with pytest.raises(ConfigurationError, match="takes 2 with one action: leave control_dt out"):
+        sw.MujocoPlant(control_dt=0.5).bind(gym.make("Reacher-v5"))
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        (
+            {"model": lambda env: env.sim.model},
+            r"returns its mujoco\.MjModel; of .* it returned types.SimpleNamespace",
+        ),
+        ({"data": lambda env: None}, r"returns its mujoco\.MjData; of .* it returned builtins\.NoneType"),
+        ({"model": None}, r"MujocoPlant\(model=\.\.\.\) is a function"),
+        ({"data": None}, r"MujocoPlant\(data=\.\.\.\) is a function"),
+        ({"model": 3}, "model is a mujoco.MjModel or a function"),
+        ({"data": mujoco.MjData(mujoco.MjModel.from_xml_string(PENDULUM))}, "data is a function of the env"),
+    ],
+)
+def test_functions_that_do_not_find_them(changed, says):
+    with pytest.raises(ConfigurationError, match=says):
+        nested_plant(**changed).bind(Nested())
+
+
+def test_an_env_without_a_model_is_told_of_the_functions():
+    with pytest.raises(UnsupportedEnvError, match=r"say where it keeps them: MujocoPlant\(model=lambda env"):
+        sw.MujocoPlant().bind(Nested())
+
+
+def test_a_model_of_the_filter_s_own_goes_with_a_function_for_the_data():
+    env = gym.make("Reacher-v5")
+    heavy = mujoco.MjModel.from_xml_string(PENDULUM)
+    with pytest.raises(ConfigurationError, match="the env's joints and actuators"):
+        sw.MujocoPlant(heavy, data=lambda raw: raw.data, control_dt=0.02).bind(env)
+    plant = sw.MujocoPlant(env.unwrapped.model, data=lambda raw: raw.data)
+    plant.bind(env)
+    env.reset(seed=0)
+    plant.observe()
+    assert np.array_equal(plant.qpos, env.unwrapped.data.qpos) and plant.substeps == 2
+
+
+class FromDmControl(gym.Env):
+    """A user's own env around one of dm_control's."""
+
+    def __init__(self, task, scale=1.0):
+        suite = pytest.importorskip("dm_control.suite")
+        self.inner, self.scale = suite.load(*task, task_kwargs={"random": 0}), scale
+        self.physics, spec = self.inner.physics, self.inner.action_spec()
+        self.action_space = gym.spaces.Box(spec.minimum / scale, spec.maximum / scale, spec.shape, np.float64)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (self.physics.get_state().size,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.inner.reset()
+        return self.physics.get_state(), {}
+
+    def step(self, action):
+        self.inner.step(self.scale * action)
+        return self.physics.get_state(), 0.0, False, False, {}
+
+
+TASKS = [
+    ("cartpole", "balance"),
+    ("reacher", "easy"),
+    ("walker", "walk"),
+    ("finger", "spin"),
+    ("humanoid", "run"),
+]
+
+
+def dm_plant(env, inner):
+    plant = sw.MujocoPlant(
+        model=lambda raw: inner(raw).physics.model.ptr,
+        data=lambda raw: inner(raw).physics.data.ptr,
+        control_dt=inner(env).control_timestep(),
+    )
+    plant.bind(env)
+    return plant
+
+
+def missed(env, plant, data, episodes=2, steps=100):
+    """The largest difference between forecasts and steps."""
+    rng, worst = np.random.default_rng(0), 0.0
+    for episode in range(episodes):
+        env.reset(seed=episode)
+        plant.executed(None)
+        for _ in range(steps):
+            plant.observe()
+            action = rng.uniform(env.action_space.low, env.action_space.high)
+            end = plant.forecast(action).path[-1]
+            env.step(action)
+            worst = max(worst, float(np.abs(end - np.concatenate([data.qpos, data.qvel])).max()))
+    return worst
+
+
+@pytest.mark.parametrize("task", TASKS, ids="-".join)
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_a_step_of_a_dm_control_task_is_its_forecast(task, scale):
+    env = FromDmControl(task, scale)
+    plant = dm_plant(env, lambda raw: raw.inner)
+    assert (plant.action_map is None) == (scale == 1.0)
+    assert missed(env, plant, env.physics.data.ptr) <= 1e-9  # 0.0 with dm_control 1.0.44 and MuJoCo 3.11
+
+
+def test_a_dm_control_task_through_shimmy():
+    suite = pytest.importorskip("dm_control.suite")
+    shimmy = pytest.importorskip("shimmy.dm_control_compatibility")
+    env = shimmy.DmControlCompatibilityV0(suite.load("reacher", "easy", task_kwargs={"random": 0}))
+    assert missed(env, dm_plant(env, lambda raw: raw._env), env._env.physics.data.ptr) <= 1e-9
+    limit = sw.constraints.JointSpeedLimit(limit=4.0, margin=0.05)
+    plant = sw.MujocoPlant(
+        model=lambda raw: raw._env.physics.model.ptr, data=lambda raw: raw._env.physics.data.ptr
+    )
+    filtered = sw.CBFActionFilter(env, [limit], plant=plant)
+    filtered.reset(seed=0)
+    fastest = 0.0
+    for _ in range(200):
+        filtered.step(env.action_space.high)
+        fastest = max(fastest, float(np.abs(env._env.physics.data.qvel).max()))
+    assert 3.5 < fastest <= 4.0
