@@ -12,7 +12,6 @@ from safe_wrappers.plants.env_checks import (
     check_timing,
     name_of,
     read_attribute,
-    refuse_changed_actions,
     refuse_second_env,
 )
 from safe_wrappers.plants.rollouts import Measure, Policy, Rollout, RolloutPlant, View
@@ -40,7 +39,8 @@ class SimulatorPlant(RolloutPlant):
     Args:
         snapshot: `(save, restore)`: functions `save(env)` and `restore(env, state)` of the unwrapped env, which is
             then itself simulated; or "fork", which simulates in a child process, for envs that cannot be copied, such
-            as Box2D's. None: see above.
+            as Box2D's (a model as backup then computes in the child, where torch must have one thread). None: see
+            above.
         control_dt: Control interval, s; None takes the env's `dt`. An env without `dt` has none, and wrappers that
             count in seconds ask for it.
         same_noise: Whether rollouts draw the random numbers that the env will draw.
@@ -48,7 +48,7 @@ class SimulatorPlant(RolloutPlant):
 
     Raises:
         UnsupportedEnvError: The env cannot be copied, or its simulation differs from it; the message says where.
-        ConfigurationError: A wrapper inside that records, or changes actions; a wrong control interval.
+        ConfigurationError: A wrapper inside that records; a wrong control interval.
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
@@ -72,7 +72,6 @@ class SimulatorPlant(RolloutPlant):
     def bind(self, env: Env) -> None:
         """Attach to an env, and check that its simulation is the env."""
         refuse_second_env(None if self._simulation is None else self._simulation.env, env)
-        refuse_changed_actions(env)
         self._take_space(env.action_space)
         self._control_dt: float | None = None
         if self._given_control_dt is not None or env.has_wrapper_attr("dt"):
