@@ -3,7 +3,7 @@ BIN := .venv/bin
 # One BLAS thread: the matrices are tiny and the runs are parallel processes.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test test-library test-slow mutants fuzz lint check bench table figures docs clean
+.PHONY: demo test test-library test-slow mutants fuzz lint check bench table shelf figures docs clean
 
 # Tests draw nothing; the demo tries which GL can.
 test test-library test-slow fuzz: export MUJOCO_GL ?= disabled
@@ -64,6 +64,16 @@ check: lint test
 # One table, six minutes: beside bare envs, other packages, and the version before.
 bench: .venv/bench
 	$(BIN)/python -m benchmarks.bench
+
+.venv/shelf: .venv/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[shelf]'
+	@touch $@
+
+# Other packages' envs, simulated: about three hours on two cores.
+shelf: .venv/shelf
+	$(BIN)/python -m benchmarks.shelf
+	$(BIN)/python -m benchmarks.shielded --only FrozenLake8x8-v1 --seeds 0 1 2
+	$(BIN)/python -m benchmarks.shielded --only LunarLander-v3 --steps 15000
 
 # What safety costs in return, task by task: days on two cores; goes on where it was stopped.
 table: .venv/installed

@@ -3,6 +3,7 @@
 from benchmarks.mutants.of_backups import COASTING, ESCAPE, HEADING_DRIVE, WALL, WAYS
 from benchmarks.mutants.of_projection import ACTIVE_SET, PROJECTION
 from benchmarks.mutants.of_search import ROLLOUT, SEARCH
+from benchmarks.mutants.of_simulation import DISCRETE, SHIELD, SIMULATION
 from benchmarks.mutants.of_wrappers import CHUNK_HANDOVER, COMMAND_GATE, HANDOVER, LEASE, LEASE_EXPIRY
 from benchmarks.mutants.target import Target
 
@@ -16,6 +17,9 @@ TARGETS: dict[str, Target] = {
     "escape": ESCAPE,
     "ways": WAYS,
     "wall": WALL,
+    "shield": SHIELD,
+    "simulation": SIMULATION,
+    "discrete": DISCRETE,
     "lease": LEASE,
     "lease expiry": LEASE_EXPIRY,
     "command gate": COMMAND_GATE,

@@ -1,5 +1,6 @@
 """PredictiveShield: an action is admitted if some backup keeps h after it, in a simulation."""
 
+import contextlib
 import functools
 import math
 from collections.abc import Callable, Iterable
@@ -13,7 +14,7 @@ from safe_wrappers.checks import non_negative, positive, whole_number
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, Memory
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.plants.rollouts import RolloutPlant, View
+from safe_wrappers.plants.rollouts import NotFiniteError, RolloutPlant, View
 
 Value = Callable[[Any, Array], ArrayLike]
 """Of an observation and actions, shape (k, m): how good they are, shape (k,)."""
@@ -158,8 +159,9 @@ class BoundPredictiveShield(BoundConstraint):
         self._now = math.inf if self._unknown else self._measure(view)
 
     def check(self) -> None:
-        for backup in self._backups:
-            self._first(backup)
+        if np.isfinite(self.plant.state).all():
+            for backup in self._backups:
+                self._first(backup)
 
     def value(self) -> Array:
         return np.zeros(0) if self._unknown else np.array([self._now])
@@ -204,6 +206,14 @@ class BoundPredictiveShield(BoundConstraint):
         """What a backup would do now, shape (m,)."""
         return self._last if isinstance(backup, str) else self._control(backup, self.plant.view)
 
+    def _firsts(self) -> list[Array]:
+        """What the backups would do now that have an answer."""
+        found = []
+        for backup in self._backups:
+            with contextlib.suppress(NotFiniteError):
+                found.append(self._first(backup))
+        return found
+
     def plan(self, control: Array) -> Plan:
         """The first backup that keeps h after a control, the survivor of the last step first, else the best."""
         key = control.tobytes()
@@ -224,7 +234,10 @@ class BoundPredictiveShield(BoundConstraint):
         spec, policy = self.spec, None if isinstance(backup, str) else functools.partial(self._action, backup)
         until = None if spec.terminal is None else self._terminal
         least = float(self._needed.min())
-        rollout = self.plant.rollout(control, spec.horizon, policy, self._measure, least, until)
+        try:
+            rollout = self.plant.rollout(control, spec.horizon, policy, self._measure, least, until)
+        except NotFiniteError:
+            return -math.inf  # the backup has no answer
         values = np.array(rollout.values)
         slack = float((values - self._needed[: len(values)]).min())
         if math.isnan(slack):
@@ -240,8 +253,7 @@ class BoundPredictiveShield(BoundConstraint):
         return self.plan(control).slack
 
     def candidates(self, control: Array) -> Iterable[Array]:
-        firsts = [self._first(backup) for backup in self._backups]
-        every = self.plant.neighbours(control, self._points, firsts)
+        every = self.plant.neighbours(control, self._points, self._firsts())
         if self.spec.value is None:
             return every
         admitted = np.array([u for u in every if self.admits(u)])
@@ -256,8 +268,7 @@ class BoundPredictiveShield(BoundConstraint):
 
     def backup(self) -> Array | None:
         """What the first backup would do that survives its own action, else what the best one would."""
-        firsts = [self._first(backup) for backup in self._backups]
-        return max(firsts, key=lambda first: min(self.slack(first), 0.0))
+        return max(self._firsts(), key=lambda first: min(self.slack(first), 0.0), default=None)
 
     def executed(self, control: Array) -> Memory:
         known = self._known.get(control.tobytes())

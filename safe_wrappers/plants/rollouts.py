@@ -21,6 +21,10 @@ class View(NamedTuple):
     info: dict[str, Any]
 
 
+class NotFiniteError(ConfigurationError):
+    """A backup or a policy has given an action that is not finite."""
+
+
 Measure = Callable[[View], float]
 Policy = Callable[[View], Any]
 """Gives an action of the env's action space."""
@@ -134,16 +138,21 @@ class RolloutPlant(Plant):
         """The control for an action, clipped to a Box's bounds; `of` says in messages whose it is.
 
         Raises:
-            ConfigurationError: Another shape, not finite, or no action of a discrete space.
+            NotFiniteError: Not finite.
+            ConfigurationError: Another shape, or no action of a discrete space.
         """
         try:
             control = np.atleast_1d(np.asarray(action, dtype=np.float64))
         except (TypeError, ValueError):
             control = np.zeros(0)
-        fits = control.shape == self.lower.shape and bool(np.isfinite(control).all())
-        clipped = np.clip(control, self.lower, self.upper) if fits else control
-        if not fits or (self.discrete and bool((np.rint(clipped) != control).any())):
-            raise ConfigurationError(f"{of} must be a finite action of {self._space}, got {action!r}")
+        wanted = f"{of} must be a finite action of {self._space}, got {action!r}"
+        if control.shape != self.lower.shape:
+            raise ConfigurationError(wanted)
+        if not np.isfinite(control).all():
+            raise NotFiniteError(wanted)
+        clipped = np.clip(control, self.lower, self.upper)
+        if self.discrete and bool((np.rint(clipped) != control).any()):
+            raise ConfigurationError(wanted)
         return clipped
 
     @abstractmethod

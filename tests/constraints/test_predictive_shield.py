@@ -201,6 +201,37 @@ def test_h_that_is_nan_is_never_admitted():
         asked(shield(h=lambda o: o)).value()
 
 
+def test_a_backup_without_an_answer_admits_nothing_and_ends_nothing():
+    lost = asked(
+        shield(backup=lambda o: [np.nan] if o[1] > 1.0 else brake(o), terminal=None, horizon=4), (0.0, 1.0)
+    )
+    assert not lost.admits(np.ones(1)) and lost.admits(np.zeros(1))
+    env = sw.CBFActionFilter(
+        Cart((0.0, 0.0)), [shield(backup=lambda o: [np.nan] if o[1] > 0.05 else [0.0], terminal=None)]
+    )
+    env.reset(seed=0)
+    env.unwrapped.v = 2.0
+    env.step(np.zeros(1))
+    info = env.step(np.ones(1))[4]
+    assert info["cbf/infeasible"] and np.isfinite(info["executed_action"]).all()
+    with pytest.raises(ConfigurationError, match="must be a finite action"):
+        sw.CBFActionFilter(Cart(), [shield(backup=lambda o: [np.nan])]).reset(seed=0)
+
+
+def test_an_observation_that_is_not_a_number_at_a_reset_is_no_error():
+    class Blind(Cart):
+        def reset(self, *, seed=None, options=None):
+            observation, info = super().reset(seed=seed)
+            return observation * np.nan, info
+
+    env = sw.CBFActionFilter(Blind(), [shield(backup=[brake, "hold"])])
+    with pytest.warns(sw.UnsafeStateWarning):
+        env.reset(seed=0)
+        info = env.step(np.ones(1))[4]
+    assert info["cbf/fallback"] and info["executed_action"][0] == 0.0
+    assert not env.step(np.ones(1))[4]["cbf/fallback"]
+
+
 def test_the_envs_own_cost_is_an_h():
     costly = dict(h="cost", terminal=None, horizon=20)
     found = asked(shield(**costly), (WALL - 0.66, 1.0))
