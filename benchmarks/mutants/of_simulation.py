@@ -9,7 +9,6 @@ SHIELD = Target(
         Mutant("                if slack >= 0.0:\n                    break\n", ""),
         Mutant("key=lambda index: index != self._survivor", "key=lambda index: index"),
         Mutant("if slack > best.slack:", "if slack < best.slack:"),
-        Mutant("        if math.isnan(slack):\n            return -math.inf\n", ""),
         Mutant("not (rollout.reached or rollout.ended)", "not rollout.reached"),
         Mutant("return min(slack, _NOT_REACHED)", "return slack"),
         Mutant("(values - self._needed[: len(values)]).min()", "values.min()"),

@@ -230,7 +230,7 @@ class BoundPredictiveShield(BoundConstraint):
         return self._known[key]
 
     def _after(self, control: Array, backup: Any) -> float:
-        """The slack of a control with a backup after it."""
+        """The slack of a control with a backup after it; NaN where an h is."""
         spec, policy = self.spec, None if isinstance(backup, str) else functools.partial(self._action, backup)
         until = None if spec.terminal is None else self._terminal
         least = float(self._needed.min())
@@ -240,8 +240,6 @@ class BoundPredictiveShield(BoundConstraint):
             return -math.inf  # the backup has no answer
         values = np.array(rollout.values)
         slack = float((values - self._needed[: len(values)]).min())
-        if math.isnan(slack):
-            return -math.inf
         if until is not None and not (rollout.reached or rollout.ended):
             return min(slack, _NOT_REACHED)
         return slack

@@ -148,6 +148,13 @@ def test_a_set_that_is_not_reached_does_not_admit():
     assert not found.admits(np.zeros(1)) and -1e-12 < found.slack(np.zeros(1)) < 0.0
 
 
+def test_an_episode_that_ends_has_survived():
+    short = gym.wrappers.TimeLimit(Cart((0.0, 2.0)), 4)
+    assert asked(shield(horizon=5), env=short).admits(np.zeros(1))  # it does not come to rest in four steps
+    hits = gym.wrappers.TimeLimit(Cart((WALL - 0.5, 2.0)), 4)
+    assert not asked(shield(horizon=5), env=hits).admits(np.zeros(1))
+
+
 def test_an_inactive_shield_passes_the_action_bit_for_bit():
     class Seen(Cart):
         def step(self, action):
@@ -275,13 +282,13 @@ def test_samples_of_unknown_noise_promise_nothing_but_help():
     def run(plant):
         env = sw.CBFActionFilter(NoisyCart(), [shield(candidates=4)], plant=plant)
         env.reset(seed=0)
-        return sum(env.step(np.ones(1))[4]["cost"] for _ in range(150))
+        return sum(env.step(np.ones(1))[4]["cost"] for _ in range(80))
 
     foreseen = run(sw.SimulatorPlant(check_steps=0))
     sampled = run(sw.SimulatorPlant(check_steps=0, same_noise=False))
     bare = NoisyCart()
     bare.reset(seed=0)
-    off = sum(bare.step(np.ones(1))[4]["cost"] for _ in range(150))
+    off = sum(bare.step(np.ones(1))[4]["cost"] for _ in range(80))
     assert foreseen == 0 and sampled < 0.5 * off
 
 
