@@ -106,6 +106,13 @@ def test_what_a_backup_does_after_the_action(backup, expected):
     np.testing.assert_allclose(np.diff(seen[-3:]) / DT, expected)
 
 
+def test_to_hold_is_to_do_again_what_was_executed():
+    found = asked(shield(h=lambda o: 1.0, backup="hold", terminal=None))
+    found.executed(np.array([0.4]))
+    found.plant.observe()
+    np.testing.assert_array_equal(found.backup(), [0.4])
+
+
 def test_a_model_is_a_backup_and_is_not_copied():
     class Model:
         def predict(self, observation, deterministic):

@@ -218,7 +218,7 @@ def test_an_integer_or_two_dimensional_box_is_refused():
     with pytest.raises(ConfigurationError, match="continuous Box"):
         cart([wall(1.0)], env=env)
     env.action_space = gym.spaces.Box(-1, 1, (2, 1), np.float32)
-    with pytest.raises(ConfigurationError, match=r"actions of shape \(m,\)"):
+    with pytest.raises(ConfigurationError, match=r"of shape \(m,\).*one flat Box"):
         cart([wall(1.0)], env=env)
 
 
