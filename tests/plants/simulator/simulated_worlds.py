@@ -65,6 +65,15 @@ class SharedCart(Cart):
         return observation, reward + self.steps[0], terminated, truncated, info
 
 
+class SharedSight(SharedCart):
+    """Only what is seen drifts."""
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = Cart.step(self, action)
+        self.steps[0] += 1
+        return observation + np.array([self.steps[0], 0.0]), reward, terminated, truncated, info
+
+
 class StateCart(LockedCart):
     """Saves and restores itself."""
 

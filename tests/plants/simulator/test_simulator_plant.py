@@ -5,6 +5,7 @@ import os
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
 from gymnasium.wrappers import NormalizeObservation, RecordEpisodeStatistics, RescaleAction, TimeLimit
 from simulated_worlds import (
     DT,
@@ -15,6 +16,7 @@ from simulated_worlds import (
     NoisyCart,
     PickyCart,
     SharedCart,
+    SharedSight,
     StateCart,
 )
 
@@ -103,6 +105,16 @@ def test_a_policy_acts_after_the_control_and_measures_stop_a_rollout():
     np.testing.assert_allclose(speeds[:3], [1.1, 1.0, 0.9])
     measured = plant.rollout(np.ones(1), 30, measure=lambda view: 0.15 - view.env.x, least=0.0)
     assert measured.values[-1] < 0.0 <= measured.values[-2]
+    unknown = plant.rollout(np.ones(1), 30, measure=lambda view: np.nan if view.env.x > 0.15 else 1.0)
+    assert len(unknown.values) == 2 and np.isnan(unknown.values[-1])
+    damped = plant.rollout(np.ones(1), 6, policy=lambda view: -view.observation[1:]).observations
+    real, action = [], np.ones(1)
+    other = Cart(start=(0.0, 1.0))
+    other.reset(seed=0)
+    for _ in range(6):
+        real.append(other.step(action)[0])
+        action = -real[-1][1:]
+    np.testing.assert_array_equal(damped, real)
     reached = plant.rollout(np.ones(1), 30, until=lambda view: view.observation[0] > 0.5)
     assert reached.reached and not reached.ended and len(reached.observations) < 10
 
@@ -181,6 +193,8 @@ def test_a_function_that_refers_to_the_env_is_refused():
 def test_a_copy_that_drifts_is_refused_with_the_first_difference():
     with pytest.raises(UnsupportedEnvError, match=r"SharedCart.*step 1 after.*its reward is .* instead of"):
         bound(SharedCart())
+    with pytest.raises(UnsupportedEnvError, match=r"its observation\[0\] is .* instead of"):
+        bound(SharedSight())
     forgets = (lambda raw: raw.x, lambda raw, x: setattr(raw, "x", x))  # the speed
     with pytest.raises(UnsupportedEnvError, match=r"its (reward|observation\[\d\]) is .* instead of"):
         bound(Cart(), snapshot=forgets)
@@ -276,6 +290,34 @@ def test_the_control_interval_is_never_guessed():
     shield = sw.constraints.PredictiveShield("cost", 2, backup=[0, 1, 2, 3])
     with pytest.raises(ConfigurationError, match="control_dt"):
         sw.StuckEscape(sw.ActionShield(Grid(), [shield]))
+
+
+def test_a_reset_that_changes_the_model_is_followed():
+    class Heavier(HalfCheetahEnv):
+        def reset_model(self):
+            self.model.body_mass[1] = self.np_random.uniform(2.0, 20.0)
+            return super().reset_model()
+
+    env = gym.wrappers.TimeLimit(Heavier(), 100)
+    plant = bound(env, check_steps=20)
+    for seed in range(3):
+        env.reset(seed=seed)
+        plant.executed(None)
+        ahead = plant.rollout(np.ones(6), 3).observations
+        mine = [env.step(np.ones(6, np.float32))[0] for _ in range(3)]
+        np.testing.assert_array_equal(ahead, mine)
+
+
+def test_the_check_goes_on_in_a_new_episode_where_one_is_truncated():
+    class Counted(Cart):
+        resets = 0
+
+        def reset(self, *, seed=None, options=None):
+            Counted.resets += 1
+            return super().reset(seed=seed)
+
+    bound(TimeLimit(Counted(), 5), check_steps=50)
+    assert Counted.resets >= 10
 
 
 def test_the_check_costs_about_as_many_steps_as_it_makes():
