@@ -70,7 +70,8 @@ def _of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
             found.add(thing)
         elif kind == int(mujoco.mjtWrap.mjWRAP_SITE):
             chains.append(set(_chain(model, int(model.site_bodyid[thing]))))
-    return found.union(*chains) - (set.intersection(*chains) if chains else set())
+    common = set.intersection(*chains) if chains else set[int]()
+    return found.union(*chains) - common
 
 
 def _chain(model: mujoco.MjModel, body: int) -> list[int]:
