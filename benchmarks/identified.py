@@ -33,6 +33,8 @@ RESULTS = Path(__file__).parent / "results" / "identified.csv"
 MISS_RATE = 0.1
 FRESH = 100  # episodes per seed
 CLOSED = 10
+AGAIN = 0.5  # of the episodes, through the filter
+KINDS = ("without a filter", "through that filter")
 BAND = 0.99
 
 
@@ -127,7 +129,6 @@ CASES = (
         push=lambda x: np.array([1.0, -1.0 if x[4] > 0.0 else 1.0]),
         model="linear",
         episodes=200,
-        again=True,
         calm=0.6,
         needs="Box2D",
     ),
@@ -231,9 +232,10 @@ def measure_seed(case: Case, seed: int) -> Iterator[dict[str, Any]]:
     """A row for the plant of logs without a filter, and one for that of logs through the first one's filter."""
     numbers = iter(np.random.SeedSequence(seed).generate_state(12).tolist())
     env = case.make()
-    for logged in ("without a filter", "through that filter")[: 1 + case.again]:
-        logs = drive(env, case, case.episodes, next(numbers))
-        fresh = drive(env, case, FRESH, next(numbers))
+    for logged in KINDS[: 1 + case.again]:
+        share = 1.0 if logged == KINDS[0] else AGAIN
+        logs = drive(env, case, round(share * case.episodes), next(numbers))
+        fresh = drive(env, case, round(share * FRESH), next(numbers))
         plant, misses, margin = identify(case, logs, fresh, seed)
         row = {"env": case.name, "logged": logged, "seed": seed, "held_out": len(plant.held_out_episodes)}
         row |= {"windows": len(fresh), "misses": misses, "margin": margin}
@@ -300,6 +302,15 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def write(rows: list[dict[str, Any]], path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    path.with_suffix(".md").write_text(table(rows) + "\n")
+
+
 def main() -> None:
     """Measure, print the table, keep the rows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -319,17 +330,11 @@ def main() -> None:
             continue
         for seed in range(arguments.seeds):
             rows += measure_seed(case, seed)
+            write(rows, arguments.results)
             print(case.name, seed, flush=True)
     if not rows:
         parser.error(f"nothing to measure; the envs are: {', '.join(case.name for case in CASES)}")
-    arguments.results.parent.mkdir(parents=True, exist_ok=True)
-    with arguments.results.open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
-    text = table(rows)
-    arguments.results.with_suffix(".md").write_text(text + "\n")
-    print(text)
+    print(table(rows))
 
 
 if __name__ == "__main__":

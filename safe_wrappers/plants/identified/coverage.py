@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import betaln, logsumexp
+from scipy.special import betaln
 
 from safe_wrappers.checks import Array
 from safe_wrappers.plants.identified.conformal import allowed_misses
@@ -65,4 +65,4 @@ class Coverage:
         kept = np.asarray(judged, dtype=np.float64) - missed
         larger = missed[..., None] * np.log(self._larger) + kept[..., None] * np.log1p(-self._larger)
         declared = betaln(self._misses + missed, self._others + kept) - betaln(self._misses, self._others)
-        return np.asarray(logsumexp(larger, axis=-1) - np.log(_ALTERNATIVES) - declared)
+        return np.asarray(np.logaddexp.reduce(larger, axis=-1) - np.log(_ALTERNATIVES) - declared)
