@@ -17,7 +17,7 @@ from safe_wrappers.errors import SafeWrappersError, UnsafeStateWarning
 from safe_wrappers.filter.batch import project_batch
 from safe_wrappers.filter.constraint import BoundConstraint, Constraint, HalfSpaces
 from safe_wrappers.filter.projection import project
-from safe_wrappers.plants import AnalyticPlant, MujocoPlant, Plant, SimulatorPlant
+from safe_wrappers.plants import AnalyticPlant, IdentifiedPlant, MujocoPlant, Plant, SimulatorPlant
 from safe_wrappers.protect import protect
 from safe_wrappers.wrappers import faults, occlusion, teleop
 from safe_wrappers.wrappers.action_shield import ActionShield
@@ -54,6 +54,7 @@ __all__ = [
     "CostFunction",
     "FilterObservation",
     "HalfSpaces",
+    "IdentifiedPlant",
     "LeaseExpiry",
     "MujocoPlant",
     "OcclusionPenalty",

@@ -4,6 +4,7 @@ Every wrapper writes its keys at every step with the dtype given here. No key ho
 compares two runs exactly.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
@@ -56,6 +57,25 @@ class EpisodeFigure:
     running: str = ""
 
 
+class _NotJudged(np.float64):
+    """A NaN that equals every NaN: Gymnasium's `check_env` compares the infos of two equal runs by `==`."""
+
+    def __eq__(self, other: Any) -> bool:
+        return isinstance(other, float) and math.isnan(other)
+
+    def __ne__(self, other: Any) -> bool:
+        return not self == other
+
+    def __hash__(self) -> int:
+        return hash(type(self))
+
+    def __reduce__(self) -> str:
+        return "NOT_JUDGED"  # the one below, in a copy and in another process too
+
+
+NOT_JUDGED: Final = _NotJudged("nan")
+"""float64 NaN, written in info for a number that nobody reported; test for it with `math.isnan`."""
+
 KEYS: Final[dict[str, InfoKey]] = {}
 """By name."""
 
@@ -103,6 +123,14 @@ CBF_STUCK: Final = _key("cbf/stuck", "bool", chunk="any", log="stuck")
 """For `after_s` the filter has changed most actions, and the rewards have not added up to more than `progress`."""
 CBF_ESCAPING: Final = _key("cbf/escaping", "bool", chunk="any")
 """A drawn action was proposed in the policy's place."""
+
+# PredictiveShield on an IdentifiedPlant, every step: of the predictions of h by one step ---------------------------
+PLANT_COVERAGE: Final = _key("plant/coverage", "float64")
+"""Share of the episode's steps so far after which h was at least its prediction less the margin; NaN before the first
+one."""
+PLANT_COVERAGE_LOST: Final = _key("plant/coverage_lost", "bool", chunk="any", log="coverage_lost")
+"""In this episode h has been below that more often than the plant's `miss_rate` explains (a false alarm in at most
+0.1 % of the episodes that are like the logged ones)."""
 
 # Traction in a filter, SlipLimiter: every step --------------------------------------------------------------------
 SLIP_RATIO: Final = _key("slip/ratio", "float64", shape="(wheels,)", log="slip")

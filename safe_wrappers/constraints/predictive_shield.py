@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from safe_wrappers.checks import non_negative, positive, whole_number
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, Memory
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.rollouts import NotFiniteError, RolloutPlant, View
@@ -138,6 +138,12 @@ class BoundPredictiveShield(BoundConstraint):
     def __init__(self, spec: PredictiveShield, plant: Plant) -> None:
         plant.require_simulation("PredictiveShield")
         super().__init__(spec, plant)
+        self.info_keys = self.plant.info_keys
+        if not self.plant.simulates_env and (spec.sees == "env" or isinstance(spec.h, str)):
+            raise UnsupportedEnvError(
+                f"the rollouts of an {type(plant).__name__} have observations alone, and neither an env nor its "
+                'info: take sees="observation", and as h a function of it'
+            )
         discrete = self.plant.discrete
         if discrete and "zero" in [one for one in spec.backup if isinstance(one, str)]:
             raise ConfigurationError(
@@ -271,3 +277,7 @@ class BoundPredictiveShield(BoundConstraint):
     def executed(self, control: Array) -> Memory:
         known = self._known.get(control.tobytes())
         return self._survivor if known is None else known.backup, control
+
+    def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
+        """The plant's own info keys."""
+        return self.plant.info()

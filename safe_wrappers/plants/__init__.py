@@ -2,6 +2,8 @@
 
 from safe_wrappers.plants.analytic import AnalyticPlant
 from safe_wrappers.plants.displacement import DisplacementPlant
+from safe_wrappers.plants.identified.logs import log_steps
+from safe_wrappers.plants.identified.plant import IdentifiedPlant
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.rollouts import Rollout, RolloutPlant, View
@@ -10,10 +12,12 @@ from safe_wrappers.plants.simulator.plant import SimulatorPlant
 __all__ = [
     "AnalyticPlant",
     "DisplacementPlant",
+    "IdentifiedPlant",
     "MujocoPlant",
     "Plant",
     "Rollout",
     "RolloutPlant",
     "SimulatorPlant",
     "View",
+    "log_steps",
 ]

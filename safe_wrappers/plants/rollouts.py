@@ -36,7 +36,7 @@ class Rollout:
 
     Attributes:
         observations: After each step.
-        rewards: Of each step, shape (k,).
+        rewards: Of each step, shape (k,); NaN where the plant does not know them.
         values: What was measured after each step, shape (k,).
         ended: The episode terminated or was truncated.
         reached: The set in which it may stop was reached.
@@ -55,6 +55,10 @@ class RolloutPlant(Plant):
     has_acceleration: ClassVar[bool] = False
     bounds_are_action_space: ClassVar[bool] = True
     simulates: ClassVar[bool] = True
+    simulates_env: ClassVar[bool] = True
+    """Whether a `View` of a rollout has the env and its info; else only the observation."""
+    info_keys: ClassVar[tuple[str, ...]] = ()
+    """The keys that `info` writes."""
     lower: Array = np.zeros(0)  #: of the control, shape (m,), once bound
     upper: Array = np.zeros(0)
     delay_s = 0.0
@@ -179,3 +183,7 @@ class RolloutPlant(Plant):
     @abstractmethod
     def margins(self, measure: Measure, horizon: int) -> Array:
         """By how much a measure may be worse than predicted after each step, shape (horizon,), in its unit."""
+
+    def info(self) -> dict[str, Any]:
+        """The info keys of its own, always the same, after what was received last."""
+        return {}

@@ -18,26 +18,6 @@ COLUMNS: Final = ("length", "return", *(figure.name for figure in keys.EPISODE))
 """The CSV file's columns. Cells stay empty where the task or the stack does not report what they hold."""
 
 
-class _NotJudged(np.float64):
-    """A NaN that equals every NaN: Gymnasium's `check_env` compares the infos of two equal runs by `==`."""
-
-    def __eq__(self, other: Any) -> bool:
-        return isinstance(other, float) and math.isnan(other)
-
-    def __ne__(self, other: Any) -> bool:
-        return not self == other
-
-    def __hash__(self) -> int:
-        return hash(type(self))
-
-    def __reduce__(self) -> str:
-        return "NOT_JUDGED"  # the one below, in a copy and in another process too
-
-
-NOT_JUDGED: Final = _NotJudged("nan")
-"""float64 NaN, written in info for a number that nobody reported; test for it with `math.isnan`."""
-
-
 class _Tally:
     """A figure of the episode so far."""
 
@@ -149,7 +129,7 @@ class RecordInterventions(LayerWrapper):
         for tally in self._tallies:
             tally.reset(info)
             if tally.figure.running:
-                info[tally.figure.running] = 0.0 if tally.figure.of[0] in info else NOT_JUDGED
+                info[tally.figure.running] = 0.0 if tally.figure.of[0] in info else keys.NOT_JUDGED
         return observation, info
 
     def step(self, action: Any) -> Step:
@@ -162,7 +142,7 @@ class RecordInterventions(LayerWrapper):
             tally.add(info)
             if tally.figure.running:
                 value = tally.value(self._steps)
-                info[tally.figure.running] = NOT_JUDGED if value is None else float(value)
+                info[tally.figure.running] = keys.NOT_JUDGED if value is None else float(value)
         if terminated or truncated:
             figures = {tally.figure.name: tally.value(self._steps) for tally in self._tallies}
             summary = {"length": self._steps, "return": self._return}

@@ -119,11 +119,14 @@ class VectorCBFActionFilter(VectorWrapper[Any, Any, Any, Any, Any]):
             single.filter_calls += was_judged
         observations, rewards, terminated, truncated, infos = self._step(sent, judged)
         self._ended = np.asarray(terminated | truncated)
-        self._received(observations, infos, np.ones(self.num_envs, dtype=bool))
         restarted = self._ended if self._same_step else ~judged
+        if self._same_step and restarted.any():
+            self._received(infos["final_obs"], infos["final_info"], restarted)
+        self._received(observations, infos, ~restarted)
         self._report(infos, reports, judged & ~restarted)
         if self._same_step and restarted.any():
             self._report(infos["final_info"], reports, restarted)
+        self._received(observations, infos, restarted)
         self._start(infos, restarted)
         return observations, rewards, terminated, truncated, infos
 
@@ -143,7 +146,9 @@ class VectorCBFActionFilter(VectorWrapper[Any, Any, Any, Any, Any]):
         """Tell plants that simulate what their envs have returned."""
         if not self.filters[0].plant.simulates:
             return
-        each = list(iterate(self.observation_space, observations))
+        # Last observations of episodes are in an array of objects, which needs no space to be taken apart.
+        final = isinstance(observations, np.ndarray) and observations.dtype == object
+        each = observations if final else list(iterate(self.observation_space, observations))
         numbers = {
             key: value for key, value in infos.items() if isinstance(value, np.ndarray) and f"_{key}" in infos
         }

@@ -12,7 +12,6 @@ from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.record_interventions import (
     COLUMNS,
-    NOT_JUDGED,
     RecordInterventions,
     read_episodes,
 )
@@ -204,10 +203,10 @@ def test_monitor_s_file_says_nan_for_what_is_not_judged(tmp_path):
 
 def test_what_is_not_judged_equals_itself_also_in_another_process():
     # check_env compares the infos of two equal runs by ==.
-    again = pickle.loads(pickle.dumps(copy.deepcopy(NOT_JUDGED)))
-    assert again is NOT_JUDGED and again == NOT_JUDGED and float("nan") == NOT_JUDGED
-    assert NOT_JUDGED != 0.0 and NOT_JUDGED != "nan" and np.isnan(NOT_JUDGED)
-    assert len({NOT_JUDGED, again}) == 1
+    again = pickle.loads(pickle.dumps(copy.deepcopy(keys.NOT_JUDGED)))
+    assert again is keys.NOT_JUDGED and again == keys.NOT_JUDGED and float("nan") == keys.NOT_JUDGED
+    assert keys.NOT_JUDGED != 0.0 and keys.NOT_JUDGED != "nan" and np.isnan(keys.NOT_JUDGED)
+    assert len({keys.NOT_JUDGED, again}) == 1
 
 
 def test_filter_time_is_an_attribute_and_never_in_info():

@@ -1,0 +1,68 @@
+"""Whether bounds that should miss rarely do so in closed loop."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import betaln
+
+from safe_wrappers.checks import Array
+from safe_wrappers.plants.identified.conformal import allowed_misses
+
+_ALTERNATIVES = 20
+_ALARM = np.log(1000.0)
+
+
+class Coverage:
+    """Counts an episode's misses, and says when they are too many for a conformal bound.
+
+    A test martingale: the likelihood of the misses under larger miss rates, over that under exchangeability with the
+    scores that the bound came from. It passes 1,000 with a probability of at most 0.1 % in an episode whose steps are
+    exchangeable with these, however long it is and however often one looks (Ville's inequality). A quantile of the
+    binomial distribution would be right for one look alone, and for a bound from infinitely many scores.
+
+    The steps of one episode are often alike, however: a gust lasts. So the alarm is also above what n known episodes
+    have reached, which another one like them passes with a probability of 1 / (n + 1), whatever binds their steps.
+
+    Args:
+        scores: From how many scores the bound came.
+        miss_rate: For which it was made.
+
+    Attributes:
+        judged: Steps judged so far.
+        missed: Those of them in which the bound did not hold.
+        lost: The misses were too many, now or earlier in the episode.
+    """
+
+    def __init__(self, scores: int, miss_rate: float) -> None:
+        allowed = allowed_misses(scores, miss_rate)
+        # Given the scores, the miss rate is drawn from Beta(allowed, scores + 1 - allowed).
+        self._misses, self._others = allowed, scores + 1 - allowed
+        steps = (np.arange(_ALTERNATIVES) + 0.5) / _ALTERNATIVES
+        self._larger = miss_rate + (1.0 - miss_rate) * steps
+        self.set_alarm([])
+        self.start()
+
+    def set_alarm(self, known: Sequence[NDArray[np.bool_]]) -> None:
+        """Above what known episodes have reached: of each, whether the bound held after each step."""
+        reached = [self.evidence(np.cumsum(~held), np.arange(1, len(held) + 1)).max() for held in known]
+        self._alarm = max([_ALARM, *reached])
+
+    def start(self) -> None:
+        """A new episode."""
+        self.judged = self.missed = 0
+        self.lost = False
+
+    def judge(self, held: bool) -> None:
+        """Count a step."""
+        self.judged += 1
+        self.missed += not held
+        self.lost |= bool(self.evidence(self.missed, self.judged) > self._alarm)
+
+    def evidence(self, missed: ArrayLike, judged: ArrayLike) -> Array:
+        """The logarithm of the martingale after so many steps, shape of the arguments."""
+        missed = np.asarray(missed, dtype=np.float64)
+        kept = np.asarray(judged, dtype=np.float64) - missed
+        larger = missed[..., None] * np.log(self._larger) + kept[..., None] * np.log1p(-self._larger)
+        declared = betaln(self._misses + missed, self._others + kept) - betaln(self._misses, self._others)
+        return np.asarray(np.logaddexp.reduce(larger, axis=-1) - np.log(_ALTERNATIVES) - declared)

@@ -1,0 +1,115 @@
+"""Logged episodes: what log_steps writes, and what is refused."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import safe_wrappers as sw
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.identified.logs import checked_episodes
+
+
+def test_a_log_can_be_replayed():
+    env = gym.make("Pendulum-v1", max_episode_steps=30)
+    logs = sw.plants.log_steps(env, episodes=3, seed=5)
+    assert [(o.shape, a.shape) for o, a in logs] == [((31, 3), (30, 1))] * 3
+    other = gym.make("Pendulum-v1", max_episode_steps=30)
+    for index, (observations, actions) in enumerate(logs):
+        first, _ = other.reset(seed=5 if index == 0 else None)
+        np.testing.assert_array_equal(first, observations[0])
+        for action, observation in zip(actions, observations[1:], strict=True):
+            np.testing.assert_array_equal(other.step(action.astype(np.float32))[0], observation)
+    assert not np.array_equal(logs[0].observations, logs[1].observations)
+
+
+def test_the_same_seed_logs_the_same_and_leaves_the_envs_own_draws_alone():
+    env = gym.make("Pendulum-v1")
+    env.action_space.seed(3)
+    first, second = (sw.plants.log_steps(env, episodes=2, seed=1, max_steps=5) for _ in range(2))
+    for one, other in zip(first, second, strict=True):
+        np.testing.assert_array_equal(one.actions, other.actions)
+        np.testing.assert_array_equal(one.observations, other.observations)
+    drawn = env.action_space.sample()
+    env.action_space.seed(3)
+    np.testing.assert_array_equal(drawn, env.action_space.sample())
+
+
+def test_a_policy_sees_observations_and_ended_episodes_are_shorter():
+    seen = []
+
+    def push_right(observation):
+        seen.append(observation.copy())
+        return 1
+
+    (one,) = sw.plants.log_steps(gym.make("CartPole-v1"), push_right, episodes=1)
+    assert one.actions.shape == (len(seen), 1) and (one.actions == 1.0).all() and len(seen) < 15
+    np.testing.assert_array_equal(np.float32(one.observations[:-1]), seen)
+
+
+def test_what_a_filter_inside_has_executed_is_logged():
+    env = gym.make("InvertedPendulum-v5")
+    wall = sw.constraints.Clearance(
+        [sw.constraints.Plane([0.9], [-1])], bodies=["cart"], braking=8.0, margin=0.8
+    )
+    filtered = sw.CBFActionFilter(env, [wall])
+    (one,) = sw.plants.log_steps(filtered, lambda x: np.array([3.0], np.float32), episodes=1)
+    assert (one.actions < 3.0).any()
+
+
+class SameArray(gym.Env):
+    """Returns one array again and again, as some simulators do."""
+
+    observation_space = gym.spaces.Box(-10.0, 10.0, (1,))
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = np.zeros(1)
+        return self.x, {}
+
+    def step(self, action):
+        self.x += 1.0
+        return self.x, 0.0, False, self.x[0] >= 4.0, {}
+
+
+def test_an_array_that_changes_afterwards_is_copied():
+    (one,) = sw.plants.log_steps(SameArray(), episodes=1)
+    np.testing.assert_array_equal(one.observations[1:, 0], [1.0, 2.0, 3.0, 4.0])
+    assert one.observations[0, 0] == 0.0
+
+
+GOOD = (np.zeros((4, 2)), np.zeros((3, 1)))
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ([], "list of"),
+        ("logs", "list of"),
+        (np.zeros((3, 2)), "list of"),
+        ([GOOD, 3], "episode 1 is no pair"),
+        ([GOOD, (np.zeros((3, 2)), np.zeros((3, 1)))], r"episode 1: expected .* got \(3, 2\) and \(3, 1\)"),
+        ([(np.zeros((1, 2)), np.zeros((0, 1)))], "T of at least 1"),
+        ([(np.zeros(4), np.zeros((3, 1)))], "episode 0: expected"),
+        ([GOOD, (np.zeros((4, 3)), np.zeros((3, 1)))], "episode 1 has observations of 3 numbers, episode 0 of 2"),
+        ([GOOD, (np.zeros((4, 2)), np.zeros((3, 2)))], "episode 1 has actions of 2 numbers, episode 0 of 1"),
+        ([GOOD, (np.array([[0, 0], [0, np.nan], [0, 0], [0, 0]]), GOOD[1])], "episode 1 are not finite at step 1"),
+        ([(GOOD[0], np.array([[0.0], [0.0], [np.inf]]))], "actions of episode 0 are not finite at step 2"),
+        ([({"a": 1}, GOOD[1])], "observations of episode 0 is a number or an array"),
+    ],
+)  # fmt: skip
+def test_other_logs_are_refused(given, says):
+    with pytest.raises(ConfigurationError, match=says):
+        checked_episodes(given)
+
+
+def test_one_number_per_action_needs_no_second_axis():
+    (one,) = checked_episodes([(np.zeros((4, 2)), [0, 1, 2])])
+    assert one.actions.shape == (3, 1) and one.actions.dtype == np.float64
+
+
+def test_wrong_counts_are_refused():
+    env = gym.make("Pendulum-v1")
+    for wrong in ({"episodes": 0}, {"episodes": 1.5}, {"max_steps": 0}):
+        with pytest.raises(ConfigurationError):
+            sw.plants.log_steps(env, **wrong)
