@@ -47,6 +47,8 @@ FORBIDDEN = {
     "sb3": set(),
     "train": set(),
 }
+IN_A_FUNCTION = {"ensemble.py": {"torch"}}
+"""What a module imports only where it is asked to fit; the test of the top says that importing us does not."""
 
 
 def modules(layer):
@@ -99,7 +101,7 @@ def test_no_arrow_points_back_up(layer):
 def test_heavy_libraries_stay_in_their_layers(layer):
     for path in modules(layer):
         roots = {name.split(".")[0] for name in imports(path, dotted(layer, path))}
-        wrong = roots & FORBIDDEN[layer]
+        wrong = roots & FORBIDDEN[layer] - IN_A_FUNCTION.get(path.name, set())
         assert not wrong, f"{path.relative_to(ROOT)} imports {sorted(wrong)}"
 
 

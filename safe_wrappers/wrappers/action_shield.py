@@ -46,7 +46,7 @@ class ActionShield(CBFActionFilter):
 
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
-        >>> upright = sw.constraints.PredictiveShield(lambda x: 0.15 - abs(x[2]), horizon=10, backup=[0, 1])
+        >>> upright = sw.constraints.PredictiveShield(lambda x: 0.2 - abs(x[2]), horizon=4, backup=[0, 1])
         >>> env = sw.ActionShield(gym.make("CartPole-v1"), [upright])
         >>> _ = env.reset(seed=0)
         >>> env.action_masks()

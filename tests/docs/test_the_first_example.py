@@ -1,4 +1,4 @@
-"""README's example for any env: what it promises holds in closed loop, against drivers that want it broken."""
+"""The examples for envs without MuJoCo: what they promise holds in closed loop, against hostile drivers."""
 
 import doctest
 import runpy
@@ -34,7 +34,6 @@ def of_docstring():
 
 
 SOURCES = {
-    "README": lambda: of_page("../README.md"),
     "quickstart": lambda: of_page("quickstart.md"),
     "AnalyticPlant": of_docstring,
 }
@@ -56,7 +55,7 @@ def drive(env, driver, seed):
 
 @pytest.mark.parametrize("driver", DRIVERS)
 def test_the_limit_holds(driver):
-    filtered = SOURCES["README"]()["env"]
+    filtered = SOURCES["quickstart"]()["env"]
     free = gym.make(filtered.unwrapped.spec.id, **filtered.unwrapped.spec.kwargs)
     violated = 0
     for seed in range(5):
@@ -68,18 +67,29 @@ def test_the_limit_holds(driver):
 
 @pytest.mark.parametrize("source", SOURCES)
 def test_it_is_the_same_example_everywhere(source):
-    shown, readme = SOURCES[source](), SOURCES["README"]()
-    assert shown["env"].unwrapped.spec.kwargs == readme["env"].unwrapped.spec.kwargs
+    shown, first = SOURCES[source](), SOURCES["quickstart"]()
+    assert shown["env"].unwrapped.spec.kwargs == first["env"].unwrapped.spec.kwargs
     rng = np.random.default_rng(0)
     for x in rng.uniform(-3.0, 3.0, (20, 2)):
-        assert shown["slow"].h(x) == readme["slow"].h(x)
-        np.testing.assert_array_equal(shown["plant"].drift(x), readme["plant"].drift(x))
-        np.testing.assert_array_equal(shown["plant"].effect(x), readme["plant"].effect(x))
+        assert shown["slow"].h(x) == first["slow"].h(x)
+        np.testing.assert_array_equal(shown["plant"].drift(x), first["plant"].drift(x))
+        np.testing.assert_array_equal(shown["plant"].effect(x), first["plant"].effect(x))
         # And it is this pendulum's: its env makes the step that the plant predicts.
-        env = readme["env"].unwrapped
+        env = first["env"].unwrapped
         env.reset(seed=0)
         env.state, u = x.copy(), rng.uniform(-2.0, 2.0, 1)
         env.step(u)
         assert env.state[1] == pytest.approx(
-            x[1] + 0.05 * (readme["plant"].drift(x)[1] + 3.0 * u[0]), abs=1e-9
+            x[1] + 0.05 * (first["plant"].drift(x)[1] + 3.0 * u[0]), abs=1e-9
         )
+
+
+@pytest.mark.parametrize("driver", ["bang-bang", "faster"])
+def test_the_readmes_limit_holds_by_simulation(driver):
+    filtered = PAGES["run"]("../README.md", until="slow")["env"]
+    free, violated = gym.make("Pendulum-v1"), 0
+    for seed in range(2):
+        speeds, flagged = drive(filtered, driver, seed)
+        assert (speeds.max(), flagged) <= (6.0, 0) and len(speeds) == 200
+        violated += (drive(free, driver, seed)[0] > 6.0).sum()
+    assert violated > 20

@@ -53,8 +53,9 @@ class SimulatorPlant(RolloutPlant):
     Example:
         >>> import gymnasium as gym, safe_wrappers as sw
         >>> upright = lambda x: 0.2 - abs(x[2])  # rad, of CartPole's observation
+        >>> shield = sw.constraints.PredictiveShield(upright, horizon=10, backup=[0, 1])
         >>> plant = sw.SimulatorPlant(control_dt=0.02)
-        >>> env = sw.ActionShield(gym.make("CartPole-v1"), upright, horizon=10, backup=0, plant=plant)
+        >>> env = sw.ActionShield(gym.make("CartPole-v1"), [shield], plant=plant)
     """
 
     def __init__(
