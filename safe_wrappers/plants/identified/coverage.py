@@ -22,7 +22,8 @@ class Coverage:
     binomial distribution would be right for one look alone, and for a bound from infinitely many scores.
 
     The steps of one episode are often alike, however: a gust lasts. So the alarm is also above what n known episodes
-    have reached, which another one like them passes with a probability of about 1 / (n + 1), whatever binds their steps.
+    have reached, which another one like them passes with a probability of about 1 / (n + 1), whatever binds their
+    steps.
 
     Args:
         scores: From how many scores the bound came.
