@@ -144,6 +144,8 @@ class BoundPredictiveShield(BoundConstraint):
                 f"the rollouts of an {type(plant).__name__} have observations alone, and neither an env nor its "
                 'info: take sees="observation", and as h a function of it'
             )
+        if not self.plant.exact:
+            spec.promise = "best effort"  # of an unchecked, noisy or fitted model a set proves nothing
         discrete = self.plant.discrete
         if discrete and "zero" in [one for one in spec.backup if isinstance(one, str)]:
             raise ConfigurationError(

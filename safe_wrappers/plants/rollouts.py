@@ -57,6 +57,8 @@ class RolloutPlant(Plant):
     simulates: ClassVar[bool] = True
     simulates_env: ClassVar[bool] = True
     """Whether a `View` of a rollout has the env and its info; else only the observation."""
+    exact: bool = False
+    """Whether rollouts were checked to be what the env does, its noise included."""
     info_keys: ClassVar[tuple[str, ...]] = ()
     """The keys that `info` writes."""
     lower: Array = np.zeros(0)  #: of the control, shape (m,), once bound

@@ -144,6 +144,19 @@ def test_with_a_terminal_set_nothing_is_ever_violated(driver):
     assert violations == 0 and flagged == 0 and (changed > 0 or driver == "random")
 
 
+def test_nothing_is_proved_on_a_plant_that_was_not_checked_or_has_other_noise():
+    for options, promise in (
+        ({}, "proved"),
+        ({"check_steps": 0}, "best effort"),
+        ({"same_noise": False}, "best effort"),
+    ):
+        env = sw.CBFActionFilter(Cart(), [shield()], plant=sw.SimulatorPlant(**options))
+        assert env.constraints[0].promise == promise
+    logs = sw.plants.log_steps(Cart(), episodes=20, max_steps=20)
+    env = sw.CBFActionFilter(Cart(), [shield(horizon=5)], plant=sw.IdentifiedPlant(logs))
+    assert env.constraints[0].promise == "best effort"
+
+
 def test_without_one_the_horizon_is_all_that_is_looked_at():
     assert shield(terminal=None).promise == "best effort"
     # It can brake from 3 m/s within 4.5 m. Ten steps later nothing is visible yet.
@@ -273,6 +286,21 @@ def test_functions_may_see_the_env():
     same = asked(shield(), (WALL - 0.66, 1.0))
     for u in np.linspace(-1, 1, 21):
         assert seen.slack(np.array([u])) == same.slack(np.array([u]))
+
+
+def test_functions_may_see_a_view():
+    found = asked(
+        shield(
+            sees="view",
+            h=lambda view: WALL - view.env.x - view.info["cost"],
+            backup=lambda view: brake(view.observation),
+            terminal=lambda view: at_rest(view.observation),
+        ),
+        (WALL - 0.66, 1.0),
+    )
+    same = asked(shield(), (WALL - 0.66, 1.0))
+    for u in np.linspace(-1, 1, 21):
+        assert found.admits(np.array([u])) == same.admits(np.array([u]))
 
 
 def test_margin_and_max_decrease():

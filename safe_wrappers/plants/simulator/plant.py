@@ -68,6 +68,7 @@ class SimulatorPlant(RolloutPlant):
         self._snapshot, self.same_noise = snapshot, bool(same_noise)
         self._given_control_dt = None if control_dt is None else positive("control_dt", control_dt, "s")
         self.check_steps = whole_number("check_steps", check_steps, 0, "steps")
+        self.exact = self.same_noise and self.check_steps > 0
         self._simulation: Simulation | None = None
 
     def bind(self, env: Env) -> None:
