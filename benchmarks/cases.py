@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 
 import safe_wrappers as sw
 from benchmarks import judges, patrol_drivers, tracked
@@ -17,6 +18,7 @@ from benchmarks.fetch_judge import FetchJudge
 from benchmarks.judges import Judge, Replay, Reported, Worst
 from benchmarks.mujoco_drivers import Maker
 from safe_wrappers.envs.teleop_contact import CLAMP_Y, TOOL_RADIUS
+from safe_wrappers.recipes import SHADOW_HAND_TIED
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ class Case:
 
     def make(self) -> gym.Env[Any, Any]:
         """The env without the filter."""
-        if "Maze" in self.env_id or self.env_id.startswith("Fetch"):
+        if any(word in self.env_id for word in ("Maze", "Fetch", "Hand")):
             import gymnasium_robotics
 
             gym.register_envs(gymnasium_robotics)
@@ -220,6 +222,14 @@ def _fallen(env_id: str) -> Case:
     return Case(env_id, _rail, _RAIL, note="on after the fall", past_termination=True, max_episode_steps=500)
 
 
+def _hand(env_id: str, limit: float, slides: float = np.inf, also: tuple[str, ...] = ()) -> Case:
+    def judge(env: Any) -> Judge:
+        truth = judges.joints_too_fast(env.model, limit, slides, also)
+        return Replay(env, truth, control=judges.onto_ranges(env.model))
+
+    return Case(env_id, judge, _SPEED if env_id.startswith("Adroit") else _BLIND)
+
+
 def _by_name(*cases: Case) -> dict[str, Case]:
     return {case.name: case for case in cases}
 
@@ -246,6 +256,9 @@ PROTECTED: dict[str, Case] = _by_name(
     _patrolled_maze(),
     _ant_maze("UMaze"),
     *(_fetch(task) for task in ("Reach", "Push", "Slide", "PickAndPlace")),
+    _hand("HandReach-v3", 3.0, also=tuple(SHADOW_HAND_TIED)),
+    *(_hand(f"AdroitHand{task}-v1", 10.0) for task in ("Pen", "Hammer")),
+    *(_hand(f"AdroitHand{task}-v1", 10.0, slides=1.0) for task in ("Door", "Relocate")),
 )
 """Every env that `protect` knows, by the name of its row."""
 

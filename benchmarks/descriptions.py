@@ -2,12 +2,14 @@
 
 from typing import Any
 
+import mujoco
+
 import safe_wrappers as sw
 
 
 def constrained(env: sw.CBFActionFilter) -> str:
     """What the filter keeps, one phrase per constraint."""
-    return "; ".join(_phrase(c) for c in env.constraints)
+    return "; ".join(_phrase(c, env) for c in env.constraints)
 
 
 def promised(env: sw.CBFActionFilter) -> str:
@@ -18,13 +20,18 @@ def promised(env: sw.CBFActionFilter) -> str:
 
 def reserve(env: sw.CBFActionFilter) -> str:
     """The constraints' margins, each in its unit."""
-    return ", ".join(_margin(c) for c in env.constraints)
+    return ", ".join(_margin(c, env) for c in env.constraints)
 
 
-def _phrase(constraint: Any) -> str:
+def _phrase(constraint: Any, env: sw.CBFActionFilter) -> str:
     match constraint:
         case sw.constraints.JointSpeedLimit():
-            return f"joint speeds below {constraint.limit:g} rad/s"
+            which = (
+                "joint speeds"
+                if constraint.joints is None
+                else f"speeds of {len(constraint.joints)} joint(s)"
+            )
+            return f"{which} below {constraint.limit:g} {_unit(constraint, env)}"
         case sw.constraints.JointPositionLimit():
             where = ", ".join(constraint.joints or ["driven joints"])
             return f"{where} between {constraint.lower} and {constraint.upper}"
@@ -64,16 +71,24 @@ def _phrase(constraint: Any) -> str:
     return type(constraint).__name__
 
 
-def _margin(constraint: Any) -> str:
+def _margin(constraint: Any, env: sw.CBFActionFilter) -> str:
     margin = float(getattr(constraint, "margin", 0.0))
     match constraint:
         case sw.constraints.JointSpeedLimit():
-            return f"{margin:g} rad/s"
+            return f"{margin:g} {_unit(constraint, env)}"
         case sw.constraints.SpeedLimit():
             return f"{margin:g} m/s"
         case sw.constraints.Traction():
             return f"{margin:g}"
     return f"{1e3 * margin:g} mm"
+
+
+def _unit(limit: sw.constraints.JointSpeedLimit, env: sw.CBFActionFilter) -> str:
+    """Of joints, which all turn or all slide."""
+    model = env.unwrapped.model  # type: ignore[attr-defined]
+    slide = int(mujoco.mjtJoint.mjJNT_SLIDE)
+    kinds = {int(model.joint(name).type[0]) == slide for name in limit.joints or ()}
+    return "m/s" if kinds == {True} else "rad/s"
 
 
 def _points(constraint: Any) -> str:

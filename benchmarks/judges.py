@@ -36,19 +36,23 @@ class Replay:
         env: Unwrapped.
         truth: Evaluated on the states.
         prepare: What the env does to its data at the start of a step, before it sets the control.
+        control: The control that the env makes of an action; None: the action itself.
 
     Raises:
         RuntimeError: The replay does not end in the env's own state, bit for bit.
     """
 
     def __init__(
-        self, env: Any, truth: Truth, prepare: Callable[[mujoco.MjModel, mujoco.MjData], None] | None = None
+        self,
+        env: Any,
+        truth: Truth,
+        prepare: Callable[[mujoco.MjModel, mujoco.MjData], None] | None = None,
+        control: Callable[[np.ndarray], np.ndarray] | None = None,
     ) -> None:
-        self._env, self._truth, self._prepare = env, truth, prepare
+        self._env, self._truth, self._prepare, self._control = env, truth, prepare, control
         self._model: mujoco.MjModel = env.model
         self._data = mujoco.MjData(self._model)
         self._state = np.zeros(mujoco.mj_stateSize(self._model, _STATE))
-        self._substeps = stepped(env).frame_skip
 
     def start(self) -> float:
         """The truth of the env's present state."""
@@ -66,12 +70,12 @@ class Replay:
         mujoco.mj_setState(model, data, self._state, _STATE)
         if self._prepare is not None:
             self._prepare(model, data)
-        data.ctrl[:] = executed
+        there = self._env.data
+        data.ctrl[:] = executed if self._control is None else self._control(executed)
         missed = []
-        for _ in range(self._substeps):
+        for _ in range(round((there.time - data.time) / model.opt.timestep)):
             mujoco.mj_step(model, data)
             missed.append(self._present())
-        there = self._env.data
         if not (np.array_equal(data.qpos, there.qpos) and np.array_equal(data.qvel, there.qvel)):
             raise RuntimeError(
                 "the replayed step does not end where the env's did: this judge would be wrong"
@@ -111,6 +115,12 @@ def stepped(env: Any) -> Any:
     return next(e for e in (env, *vars(env).values()) if hasattr(e, "frame_skip"))
 
 
+def onto_ranges(model: mujoco.MjModel) -> Callable[[np.ndarray], np.ndarray]:
+    """Actions in [-1, 1] put onto the actuators' ranges, as the hands do."""
+    low, high = model.actuator_ctrlrange.T
+    return lambda action: (low + high) / 2.0 + action * ((high - low) / 2.0)
+
+
 def any_of(*truths: Truth) -> Truth:
     """Several requirements at once: the worst of them."""
     return lambda data: max(truth(data) for truth in truths)
@@ -128,10 +138,15 @@ def joint_above(model: mujoco.MjModel, joint: str, limit: float) -> Truth:
     return lambda data: float(data.qpos[address]) - limit
 
 
-def joints_too_fast(model: mujoco.MjModel, limit: float) -> Truth:
-    """A joint with a motor faster than `limit`, rad/s."""
-    driven = model.jnt_dofadr[model.actuator_trnid[:, 0]]
-    return lambda data: float(np.abs(data.qvel[driven]).max()) - limit
+def joints_too_fast(
+    model: mujoco.MjModel, limit: float, slides: float = np.inf, also: tuple[str, ...] = ()
+) -> Truth:
+    """A joint with a motor, or one of those named, faster than `limit`, rad/s; a slide than `slides`, m/s."""
+    motors = np.isin(model.actuator_trntype, int(mujoco.mjtTrn.mjTRN_JOINT))
+    joints = [*model.actuator_trnid[motors, 0], *(model.joint(name).id for name in also)]
+    dofs = model.jnt_dofadr[joints]
+    limits = np.where(model.jnt_type[joints] == int(mujoco.mjtJoint.mjJNT_SLIDE), slides, limit)
+    return lambda data: float((np.abs(data.qvel[dofs]) - limits).max())
 
 
 def inside_disc(model: mujoco.MjModel, body: str, center: tuple[float, float], radius: float) -> Truth:

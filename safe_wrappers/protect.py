@@ -86,7 +86,7 @@ def _env_id(env: gym.Env[Any, Any]) -> str:
 
 
 def _family(env: gym.Env[Any, Any]) -> str:
-    return _env_id(env).rpartition("/")[2].rpartition("-v")[0].removesuffix("Dense")
+    return _env_id(env).rpartition("/")[2].rpartition("-v")[0].removesuffix("Dense").removesuffix("Sparse")
 
 
 def _recommended(env: gym.Env[Any, Any], options: dict[str, Any]) -> list[Constraint]:

@@ -24,6 +24,7 @@ from safe_wrappers.constraints import (
     WallClearance,
     Workspace,
 )
+from safe_wrappers.constraints.limits.joints import driven_joints
 from safe_wrappers.control.numerics.rectangles import merged
 from safe_wrappers.envs.goal.car import CAR
 from safe_wrappers.envs.teleop_contact import CLAMP_Y, TELEOP_BRAKING, TOOL_RADIUS
@@ -168,6 +169,29 @@ def _fetch(
     return [grip, clear]
 
 
+SHADOW_HAND_TIED: Final = [f"robot0:{finger}J0" for finger in ("FF", "MF", "RF", "LF")]
+"""Joints at the fingertips of gymnasium-robotics' hand, which a tendon moves together with the next ones."""
+
+
+def _joint_speeds(
+    hinges: float, margin: float, horizon: int, slides: float = 0.0, tied: Sequence[str] = ()
+) -> Callable[..., Recommended]:
+    """Speed limits of the driven joints, and of those that tendons move with them, rad/s and m/s."""
+
+    def recipe(env: Env) -> Recommended:
+        model: mujoco.MjModel = env.unwrapped.model  # type: ignore[attr-defined]
+        hinge = int(mujoco.mjtJoint.mjJNT_HINGE)
+        driven = {model.joint(j).name: int(model.jnt_type[j]) == hinge for j in driven_joints(model)}
+        turning = [*(name for name, turns in driven.items() if turns), *tied]
+        sliding = [name for name, turns in driven.items() if not turns]
+        limits = [JointSpeedLimit(hinges, turning, margin=margin, horizon=horizon)]
+        if sliding:
+            limits.append(JointSpeedLimit(slides, sliding, margin=0.02, horizon=horizon))
+        return list(limits)
+
+    return recipe
+
+
 LOOK_AHEAD_BELOW: Final = {"HalfCheetah": 0.8, "Hopper": 0.7, "Walker2d": 0.7, "Ant": 0.8, "Humanoid": 0.7}
 """Shares of the speed limit. Controls that left more after their own step were never refused by the look-ahead
 (`benchmarks/look_ahead.py`); Swimmer's were, whatever they left."""
@@ -212,6 +236,12 @@ RECIPES: dict[str, Callable[..., Recommended]] = {
     "PatrolledPointMaze": _patrolled_maze,
     "AntMaze": _ant_maze,
     **{f"Fetch{task}": _fetch for task in ("Reach", "Push", "Slide", "PickAndPlace")},
+    # Targets of position servos. With a horizon of three a wrist on slides had no way out in 2 of 400 steps.
+    "HandReach": _joint_speeds(3.0, margin=0.05, horizon=1, tied=SHADOW_HAND_TIED),
+    "AdroitHandPen": _joint_speeds(10.0, margin=0.1, horizon=2),
+    "AdroitHandHammer": _joint_speeds(10.0, margin=0.2, horizon=2),
+    "AdroitHandDoor": _joint_speeds(10.0, margin=0.1, horizon=4, slides=1.0),
+    "AdroitHandRelocate": _joint_speeds(10.0, margin=0.1, horizon=4, slides=1.0),
     # With a horizon of three a trained policy found states with no way out (1 violation in 1000 steps).
     "HalfCheetah": _velocity("HalfCheetah", horizon=5),
     "Swimmer": _velocity("Swimmer", margin=0.005),
