@@ -5,7 +5,8 @@
     python -m benchmarks.shelf --collect
 
 Violations are judged on the env after every step, by functions of this file. Needs gymnasium's extra "box2d",
-panda-gym and highway-env for their rows, which are left out where they are not installed. The drivers: "random";
+gymnasium-robotics, panda-gym, highway-env and shimmy with dm_control for their rows, which are left out where they
+are not installed. The drivers: "random";
 "greedy", of eight random actions (of all discrete ones) that which earns most when it is held for five steps in a
 simulation; "attacking", that which comes nearest to a violation. Rows go to `benchmarks/results/shelf.csv`, the table
 to `shelf.md`.
@@ -58,6 +59,10 @@ def _panda(view: View) -> float:
     return float(min(*(at - (-0.2, -0.2, 0.02)), *((0.2, 0.2, 0.3) - at)))
 
 
+def _physics(view: View) -> Any:
+    return view.env._env.physics
+
+
 CASES = (
     Case("Pendulum-v1", lambda view: 6.0 - abs(view.env.state[1])),
     Case("MountainCarContinuous-v0", lambda view: 0.045 - abs(view.env.state[1])),
@@ -73,6 +78,22 @@ CASES = (
     Case("BipedalWalker-v3", lambda view: _fallen(view, 0.8, view.env.hull.angle), 1_500, "Box2D"),
     Case("PandaReach-v3", _panda, 1_500, "panda_gym"),
     Case("highway-fast-v0", lambda view: -float(view.env.vehicle.crashed), 400, "highway_env"),
+    Case(
+        "FrankaKitchen-v1",
+        lambda view: 1.0 - float(np.abs(view.env.robot_env.data.qvel[:7]).max()),
+        2_000,
+        "gymnasium_robotics",
+    ),
+    Case(
+        "dm_control/cartpole-swingup-v0",
+        lambda view: 1.0 - abs(float(_physics(view).data.qpos[0])),
+        needs="shimmy",
+    ),
+    Case(
+        "dm_control/walker-run-v0",
+        lambda view: 1.0 - float(_physics(view).named.data.sensordata["torso_subtreelinvel"][0]),
+        needs="shimmy",
+    ),
 )
 
 
@@ -93,9 +114,10 @@ def driven(case: Case, driver: str, env: gym.Env[Any, Any], plant: sw.plants.Rol
 
 def run(case: Case, driver: str, on: bool, steps: int) -> dict[str, float]:
     """Drive the env, and judge it after every step."""
+    gym.register_envs(importlib.import_module(case.needs or "gymnasium"))
     env = gym.make(case.env_id, **case.options)
-    make_plant = PLANTS.get(case.env_id.rpartition("-v")[0], sw.SimulatorPlant)
-    plant: Any = make_plant()
+    make_plant = PLANTS.get(case.env_id.rpartition("-v")[0], lambda env: sw.SimulatorPlant())
+    plant: Any = make_plant(env)
     plant.bind(env)
     stepped: gym.Env[Any, Any] = sw.protect(env) if on else env
     env.action_space.seed(0)

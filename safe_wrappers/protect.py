@@ -78,7 +78,7 @@ def protect(env: gym.Env[Any, Any] | VectorEnv, **options: Any) -> CBFActionFilt
 def _with_plant(env: gym.Env[Any, Any], options: dict[str, Any]) -> dict[str, Any]:
     """The options, with the plant that the env needs, if it is not the default one."""
     of_env = PLANTS.get(_family(env))
-    return options if of_env is None else {"plant": of_env()} | options
+    return options if of_env is None else {"plant": of_env(env)} | options
 
 
 def _env_id(env: gym.Env[Any, Any]) -> str:
@@ -86,7 +86,10 @@ def _env_id(env: gym.Env[Any, Any]) -> str:
 
 
 def _family(env: gym.Env[Any, Any]) -> str:
-    return _env_id(env).rpartition("/")[2].rpartition("-v")[0].removesuffix("Dense").removesuffix("Sparse")
+    namespace, _, name = _env_id(env).rpartition("/")
+    if namespace == "dm_control":
+        return f"{namespace}/{name.partition('-')[0]}"
+    return name.rpartition("-v")[0].removesuffix("Dense").removesuffix("Sparse")
 
 
 def _recommended(env: gym.Env[Any, Any], options: dict[str, Any]) -> list[Constraint]:

@@ -6,8 +6,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from safe_wrappers.constraints.clearance import Clearance
+from safe_wrappers.constraints.limits.speed_limit import SpeedLimit
+from safe_wrappers.constraints.obstacles import Plane
 from safe_wrappers.constraints.predictive_shield import PredictiveShield
 from safe_wrappers.filter.constraint import Constraint
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
 from safe_wrappers.plants.rollouts import View
 from safe_wrappers.plants.simulator.plant import SimulatorPlant
@@ -17,6 +21,8 @@ BOX2D_DT = 1.0 / 50.0
 CARTPOLE_DT = 0.02
 PANDA_DT = 0.04
 """Of panda-gym: 20 substeps of 2 ms."""
+KITCHEN_DT = 0.08
+"""Of FrankaKitchen: 40 substeps of 2 ms."""
 
 
 def _pendulum(env: Env, max_speed: float = 6.0) -> list[Constraint]:
@@ -114,6 +120,31 @@ def _highway(env: Env, horizon: int = 4) -> list[Constraint]:
     return [PredictiveShield("crashed", horizon=horizon, backup=[backup, "hold"], candidates=4)]
 
 
+def _kitchen(env: Env, max_speed: float = 1.0) -> list[Constraint]:
+    # Its targets are clipped ahead of noisy measurements: no MujocoPlant forecasts that, a copy with the noise does.
+    def h(raw: Any) -> float:
+        return float(max_speed - np.abs(raw.data.qvel[:7]).max())
+
+    return [PredictiveShield(h, horizon=3, backup="zero", sees="env", margin=0.05)]
+
+
+def _dm_cartpole(env: Env, max_position: float = 1.0) -> list[Constraint]:
+    rail = [Plane([side * max_position], [-side]) for side in (-1.0, 1.0)]
+    # 10 N on 1.1 kg of cart and pole is 9 m/s^2; the swinging pole takes up to a third of it.
+    return [Clearance(obstacles=rail, bodies=["cart"], braking=6.0, margin=0.01)]
+
+
+def _dm_walker(env: Env, max_speed: float = 1.0) -> list[Constraint]:
+    return [SpeedLimit(max_speed, None, "+x", margin=0.1, horizon=10, average="substep")]
+
+
+def _of_physics(env: Env) -> Plant:
+    """The model and the data of dm_control's physics, in an env of shimmy's."""
+    return MujocoPlant(
+        model=lambda raw: raw._env.physics.model.ptr, data=lambda raw: raw._env.physics.data.ptr
+    )
+
+
 SHELF: dict[str, Callable[..., list[Constraint]]] = {
     "Pendulum": _pendulum,
     "MountainCarContinuous": _mountain_car,
@@ -125,15 +156,20 @@ SHELF: dict[str, Callable[..., list[Constraint]]] = {
     "PandaReach": _panda,
     "highway": _highway,
     "highway-fast": _highway,
+    "FrankaKitchen": _kitchen,
+    "dm_control/cartpole": _dm_cartpole,
+    "dm_control/walker": _dm_walker,
 }
-"""By the env's id without its version, as in `recipes.RECIPES`."""
+"""By the env's id without its version, as in `recipes.RECIPES`; dm_control's by the domain, without the task."""
 
-PLANTS: dict[str, Callable[[], Plant]] = {
-    "CartPole": lambda: SimulatorPlant(control_dt=CARTPOLE_DT),
+PLANTS: dict[str, Callable[[Env], Plant]] = {
+    "CartPole": lambda env: SimulatorPlant(control_dt=CARTPOLE_DT),
     **dict.fromkeys(
         ("LunarLander", "LunarLanderContinuous", "BipedalWalker", "BipedalWalkerHardcore"),
-        lambda: SimulatorPlant("fork", control_dt=BOX2D_DT),
+        lambda env: SimulatorPlant("fork", control_dt=BOX2D_DT),
     ),
-    "PandaReach": lambda: SimulatorPlant("fork", control_dt=PANDA_DT),
+    "PandaReach": lambda env: SimulatorPlant("fork", control_dt=PANDA_DT),
+    "FrankaKitchen": lambda env: SimulatorPlant(control_dt=KITCHEN_DT),
+    **dict.fromkeys(("dm_control/cartpole", "dm_control/walker"), _of_physics),
 }
 """Likewise, where it is not the default one: Box2D's worlds and PyBullet's server cannot be copied."""

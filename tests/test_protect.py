@@ -43,6 +43,9 @@ KNOWN = {
         f"Fetch{task}-v4": [sw.constraints.Workspace, sw.constraints.Workspace]
         for task in ("Reach", "Push", "Slide", "PickAndPlaceDense")
     },
+    "HandReach-v3": [sw.constraints.JointSpeedLimit],
+    **{f"AdroitHand{task}-v1": [sw.constraints.JointSpeedLimit] for task in ("Pen", "Hammer")},
+    **{f"AdroitHand{task}-v1": [sw.constraints.JointSpeedLimit] * 2 for task in ("Door", "Relocate")},
     **{f"{robot}-{version}": [sw.constraints.SpeedLimit] for robot in RUNNERS for version in ("v4", "v5")},
     **{f"Safe{robot}Velocity-v0": [sw.constraints.SpeedLimit] for robot in RUNNERS},
 }
@@ -52,7 +55,7 @@ known = pytest.mark.parametrize("env_id", KNOWN)
 
 
 def make(env_id, **options):
-    if "Maze" in env_id or env_id.startswith("Fetch"):
+    if any(word in env_id for word in ("Maze", "Fetch", "Hand")):
         gym.register_envs(pytest.importorskip("gymnasium_robotics"))
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*is out of date")
@@ -338,6 +341,64 @@ def test_envs_of_the_shelf_are_protected(env_id):
     assert changed > 0 or env_id == "MountainCarContinuous-v0"  # whose car rests against its slope
 
 
+def test_the_kitchen_is_protected_by_its_own_simulation():
+    gym.register_envs(pytest.importorskip("gymnasium_robotics"))
+    env = sw.protect(gym.make("FrankaKitchen-v1"), plant=sw.SimulatorPlant(control_dt=0.08, check_steps=20))
+    env.reset(seed=0)
+    changed, fastest = 0, 0.0
+    for step in range(12):
+        info = env.step(env.action_space.high if step < 6 else env.action_space.low)[4]
+        changed += info["cbf/intervened"]
+        fastest = max(fastest, np.abs(env.unwrapped.robot_env.data.qvel[:7]).max())
+        assert not info["cbf/infeasible"]
+    assert changed and 0.8 < fastest <= 1.0
+
+
+@pytest.mark.parametrize("task", ["cartpole-swingup", "walker-run"])
+def test_dm_control_tasks_are_protected_through_shimmy(task):
+    gym.register_envs(pytest.importorskip("shimmy"))
+    pytest.importorskip("dm_control")
+    env = sw.protect(gym.make(f"dm_control/{task}-v0"))
+    physics = env.unwrapped._env.physics
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    changed = 0
+    for step in range(150):
+        if step % 15 == 0:
+            action = np.sign(env.action_space.sample())
+        info = env.step(action if task == "walker-run" else env.action_space.high)[4]
+        changed += info["cbf/intervened"]
+        if task == "walker-run":
+            assert physics.named.data.sensordata["torso_subtreelinvel"][0] <= 1.0 or info["cbf/infeasible"]
+        else:
+            assert abs(physics.data.qpos[0]) <= 1.0 and not info["cbf/infeasible"]
+    assert changed
+
+
+@pytest.mark.parametrize(("env_id", "joints"), [
+    ("HandReachDense-v3", 24), ("AdroitHandPen-v1", 24), ("AdroitHandHammer-v1", 26),
+    ("AdroitHandDoorSparse-v1", 28), ("AdroitHandRelocate-v1", 30),
+])  # fmt: skip
+def test_hands_are_protected_in_all_of_their_joints(env_id, joints):
+    gym.register_envs(pytest.importorskip("gymnasium_robotics"))
+    env = sw.protect(gym.make(env_id))
+    model, data = env.unwrapped.model, env.unwrapped.data
+    limited = {name: limit.limit for limit in env.constraints for name in limit.joints}
+    assert len(limited) == joints
+    slides = {name for name in limited if model.joint(name).type[0] == int(mujoco.mjtJoint.mjJNT_SLIDE)}
+    assert slides == {name for name, limit in limited.items() if limit == 1.0}
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    changed = 0
+    for step in range(25):
+        info = env.step(env.action_space.high if step % 2 else env.action_space.low)[4]
+        speeds = {name: abs(float(data.joint(name).qvel[0])) for name in limited}
+        over = {name: speed for name, speed in speeds.items() if speed > limited[name]}
+        assert not over or info["cbf/infeasible"], over
+        changed += info["cbf/intervened"]
+    assert changed
+
+
 BOX2D = {
     "LunarLander-v3": {"continuous": True},
     "LunarLanderContinuous-v3": {},
@@ -413,13 +474,9 @@ def test_an_env_whose_own_step_limits_actions_is_named_and_not_blamed_on_wrapper
     says = (
         r"FrankaKitchen-v1 rescales or limits actions in its own step, and not by control = offset \+ scale"
     )
-    for refused in (
-        lambda: sw.protect(env),
-        lambda: sw.CBFActionFilter(env, [sw.constraints.SpeedLimit(1.0)]),
-    ):
-        with pytest.raises(UnsupportedEnvError, match=says) as caught:
-            refused()
-        assert "wrapper" not in str(caught.value)
+    with pytest.raises(UnsupportedEnvError, match=says) as caught:
+        sw.CBFActionFilter(env, [sw.constraints.SpeedLimit(1.0)])
+    assert "wrapper" not in str(caught.value) and "PredictiveShield" in str(caught.value)
     effect = np.ones((1, *env.action_space.shape))
     control_dt = None if env.has_wrapper_attr("dt") else 0.1
     plant = sw.AnalyticPlant(np.zeros_like, lambda x: effect, lambda env: np.zeros(1), control_dt=control_dt)

@@ -24,7 +24,10 @@ from safe_wrappers.plants.mujoco.model import control_range
 _TRIALS: Final = 100
 _ROUNDING: Final = 1e-6
 """Of controls, as a share of the largest one seen, and of states: envs may compute in single precision."""
-_INSTEAD: Final = "Use AnalyticPlant(f=..., g=..., state=...) with your own f and g."
+_INSTEAD: Final = (
+    "Simulate the env itself: PredictiveShield with SimulatorPlant(); or use AnalyticPlant(f=..., g=..., state=...) "
+    "with your own f and g."
+)
 
 
 class ActionMap:
