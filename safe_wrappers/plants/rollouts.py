@@ -8,8 +8,9 @@ from typing import Any, ClassVar, NamedTuple, NoReturn
 import gymnasium as gym
 import numpy as np
 
-from safe_wrappers.checks import Array
+from safe_wrappers.checks import Array, positive
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.plants.env_checks import check_timing, name_of, read_attribute, refuse_second_env
 from safe_wrappers.plants.plant import Plant
 
 
@@ -65,8 +66,31 @@ class RolloutPlant(Plant):
     upper: Array = np.zeros(0)
     delay_s = 0.0
     _space: gym.Space[Any]
+    _env: gym.Env[Any, Any] | None = None
+    _control_dt: float | None = None
     view: View
     """What was returned last by the env's reset or step."""
+
+    def __init__(self, control_dt: float | None) -> None:
+        self._given_control_dt = None if control_dt is None else positive("control_dt", control_dt, "s")
+
+    def _attach(self, env: gym.Env[Any, Any]) -> None:
+        """Be an env's from now on."""
+        refuse_second_env(self._env, env)
+        if self._given_control_dt is not None or env.has_wrapper_attr("dt"):
+            self._control_dt = check_timing(env, self._given_control_dt)
+        self._env = env
+
+    @property
+    def control_dt(self) -> float:  # type: ignore[override]
+        """Control interval, s; an error where nothing says it."""
+        if self._control_dt is None:
+            assert self._env is not None
+            raise ConfigurationError(
+                f"{name_of(self._env)} does not say how long a step lasts (it has no attribute dt): pass "
+                f"{type(self).__name__}(control_dt=...), in seconds"
+            )
+        return self._control_dt
 
     @property
     def f(self) -> NoReturn:
@@ -77,6 +101,11 @@ class RolloutPlant(Plant):
     def g(self) -> NoReturn:
         """Raises likewise."""
         self.require_acceleration("g")
+
+    def attribute(self, name: str) -> Any:
+        """Read a published fact of the env."""
+        assert self._env is not None
+        return read_attribute(self._env, name)
 
     def require_acceleration(self, asker: str) -> NoReturn:
         """Raise an error that says what works."""

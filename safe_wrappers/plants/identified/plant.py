@@ -13,11 +13,8 @@ from safe_wrappers import info as keys
 from safe_wrappers.checks import Array, positive, whole_number
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import (
-    check_timing,
     name_of,
-    read_attribute,
     refuse_changed_actions,
-    refuse_second_env,
 )
 from safe_wrappers.plants.identified.conformal import scores_needed, upper_bound
 from safe_wrappers.plants.identified.coverage import Coverage
@@ -92,7 +89,7 @@ class IdentifiedPlant(RolloutPlant):
             raise UnknownNameError(f"model is one of {', '.join(MODELS)}; got {model!r}")
         self.miss_rate = _share("miss_rate", miss_rate)
         held_out, seed = _share("held_out", held_out), whole_number("seed", seed, 0)
-        self._given_control_dt = None if control_dt is None else positive("control_dt", control_dt, "s")
+        super().__init__(control_dt)
         every = checked_episodes(episodes)
         calibrating = round(held_out * len(every))
         needed = scores_needed(self.miss_rate)
@@ -125,14 +122,12 @@ class IdentifiedPlant(RolloutPlant):
             if model == "linear"
             else EnsembleModel(states, controls, changes, seed)
         )
-        self._env: gym.Env[Any, Any] | None = None
         self._watched: Measure | None = None
         self.coverage = Coverage(calibrating, self.miss_rate)
         self._least: float | None = None  # of the watched measure after the step under way
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
         """Attach to an env whose observations and actions are those of the episodes."""
-        refuse_second_env(self._env, env)
         refuse_changed_actions(env)
         self._take_space(env.action_space)
         first = self.fit_episodes[0]
@@ -145,22 +140,8 @@ class IdentifiedPlant(RolloutPlant):
                     f"the model was fitted to {name} of shape {have}, {name_of(env)} has {space}; log episodes "
                     "of this env, with the wrappers that are inside the filter (such as FlattenObservation)"
                 )
-        self._control_dt: float | None = None
-        if self._given_control_dt is not None or env.has_wrapper_attr("dt"):
-            self._control_dt = check_timing(env, self._given_control_dt)
-        self._env = env
+        self._attach(env)
         self.view = View(None, np.zeros(first.observations.shape[1]), {})
-
-    @property
-    def control_dt(self) -> float:  # type: ignore[override]
-        """Control interval, s; an error where nothing says it."""
-        if self._control_dt is None:
-            assert self._env is not None
-            raise ConfigurationError(
-                f"{name_of(self._env)} does not say how long a step lasts (it has no attribute dt): pass "
-                "IdentifiedPlant(control_dt=...), in seconds"
-            )
-        return self._control_dt
 
     @property
     def state(self) -> Array:
@@ -187,10 +168,6 @@ class IdentifiedPlant(RolloutPlant):
         elif self._watched is not None and np.isfinite(self.state).all():
             predicted = self.model(self.state[None], control[None])[0]
             self._least = measured(self._watched, predicted) - self._one_step
-
-    def attribute(self, name: str) -> Any:
-        """Read a published fact of the env."""
-        return read_attribute(self._env, name)  # type: ignore[arg-type]
 
     def rollout(
         self,

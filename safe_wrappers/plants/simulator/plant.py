@@ -6,14 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from safe_wrappers.checks import Array, positive, whole_number
-from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.env_checks import (
-    check_timing,
-    name_of,
-    read_attribute,
-    refuse_second_env,
-)
+from safe_wrappers.checks import Array, whole_number
 from safe_wrappers.plants.rollouts import Measure, Policy, Rollout, RolloutPlant, View
 from safe_wrappers.plants.simulator.replay_check import check_replay
 from safe_wrappers.plants.simulator.simulation import (
@@ -66,33 +59,19 @@ class SimulatorPlant(RolloutPlant):
         check_steps: int = 1000,
     ) -> None:
         self._snapshot, self.same_noise = snapshot, bool(same_noise)
-        self._given_control_dt = None if control_dt is None else positive("control_dt", control_dt, "s")
+        super().__init__(control_dt)
         self.check_steps = whole_number("check_steps", check_steps, 0, "steps")
         self.exact = self.same_noise and self.check_steps > 0
         self._simulation: Simulation | None = None
 
     def bind(self, env: Env) -> None:
         """Attach to an env, and check that its simulation is the env."""
-        refuse_second_env(None if self._simulation is None else self._simulation.env, env)
         self._take_space(env.action_space)
-        self._control_dt: float | None = None
-        if self._given_control_dt is not None or env.has_wrapper_attr("dt"):
-            self._control_dt = check_timing(env, self._given_control_dt)
-        self._env = env
+        self._attach(env)
         self._simulation = simulation_of(env, self._snapshot)
         self.view = View(env.unwrapped, np.zeros(0), {})
         if self.check_steps:
             check_replay(self._simulation, self.check_steps)
-
-    @property
-    def control_dt(self) -> float:  # type: ignore[override]
-        """Control interval, s; an error where nothing says it."""
-        if self._control_dt is None:
-            raise ConfigurationError(
-                f"{name_of(self._env)} does not say how long a step lasts (it has no attribute dt): pass "
-                "SimulatorPlant(control_dt=...), in seconds"
-            )
-        return self._control_dt
 
     @property
     def simulation(self) -> Simulation:
@@ -114,16 +93,12 @@ class SimulatorPlant(RolloutPlant):
 
     def received(self, observation: Any, info: dict[str, Any]) -> None:
         """Take what the env's reset or step has returned."""
-        self.view = View(self._env.unwrapped, observation, info)
+        self.view = View(self.simulation.env.unwrapped, observation, info)
 
     def executed(self, control: Array | None) -> None:
         """A new episode may have changed what copies share."""
         if control is None:
             self.simulation.start()
-
-    def attribute(self, name: str) -> Any:
-        """Read a published fact of the env."""
-        return read_attribute(self._env, name)
 
     def rollout(
         self,
