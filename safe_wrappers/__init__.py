@@ -12,6 +12,7 @@ import warnings as _warnings
 from typing import Any as _Any
 
 from safe_wrappers import constraints, plants
+from safe_wrappers.diagnosis import diagnose
 from safe_wrappers.envs import register_envs as _register_envs
 from safe_wrappers.errors import SafeWrappersError, UnsafeStateWarning
 from safe_wrappers.filter.batch import project_batch
@@ -71,6 +72,7 @@ __all__ = [
     "VectorCBFActionFilter",
     "WholeBodyFilter",
     "constraints",
+    "diagnose",
     "faults",
     "occlusion",
     "plants",

@@ -1,4 +1,4 @@
-"""The one-way arrows: control <- plants <- filter <- constraints <- wrappers <- sb3, train; envs beside them."""
+"""The one-way arrows: control <- plants <- filter <- constraints <- wrappers <- sb3, diagnosis, train; envs aside."""
 
 import ast
 import subprocess
@@ -18,6 +18,7 @@ LAYERS = {
     "constraints": ROOT / "safe_wrappers" / "constraints",
     "wrappers": ROOT / "safe_wrappers" / "wrappers",
     "sb3": ROOT / "safe_wrappers" / "sb3",
+    "diagnosis": ROOT / "safe_wrappers" / "diagnosis",
     "envs": ROOT / "envs",
     "train": ROOT / "train",
 }
@@ -32,6 +33,7 @@ MAY_USE = {
     "constraints": {"control", "plants", "filter", "constraints", *COMMON},
     "wrappers": {"wrappers", *BELOW_WRAPPERS},
     "sb3": {"wrappers", "sb3", *BELOW_WRAPPERS},
+    "diagnosis": {"wrappers", "diagnosis", "protect", "", *BELOW_WRAPPERS},
     "envs": {"appendix", "control", "constraints", "envs", *COMMON},
     "train": {"wrappers", "sb3", "envs", "train", "protect", "", *BELOW_WRAPPERS},
 }
@@ -43,6 +45,7 @@ FORBIDDEN = {
     "plants": LEARNERS,
     "constraints": LEARNERS,
     "wrappers": LEARNERS,
+    "diagnosis": LEARNERS,
     "envs": LEARNERS,
     "sb3": set(),
     "train": set(),

@@ -1,0 +1,55 @@
+"""A symptom: how it is measured, and which lines treat it."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from safe_wrappers.checks import Array
+from safe_wrappers.diagnosis.finding import Evidence
+from safe_wrappers.diagnosis.recording import Env, Recording
+
+Recordings = Mapping[str, Recording]
+"""By the driver's name."""
+
+
+class NotMeasuredError(Exception):
+    """Why a symptom cannot be measured in an env; never leaves this package."""
+
+
+@dataclass
+class Measured:
+    """A symptom's figure for one driver.
+
+    Attributes:
+        figure: In the symptom's unit.
+        steps: The same of every control step, for a plot, shape (k,).
+        evidence: Further numbers.
+    """
+
+    figure: float
+    steps: Array
+    evidence: Sequence[Evidence] = field(default_factory=tuple)
+
+
+class Symptom(NamedTuple):
+    """One row of the table of symptoms.
+
+    Attributes:
+        title: In words.
+        section: Of the appendix.
+        threshold: From which on it is a symptom, in `unit`.
+        unit: Of the figure; "share" is one of control steps.
+        plotted: What a plot shows, and its unit.
+        measure: Of an env and what one driver did in it; raises `NotMeasuredError`.
+        lines: For an env and the driver's recording: lines that put a wrapper around `env`, and advice.
+        policies_only: Random and attacking drivers have this symptom of themselves.
+    """
+
+    title: str
+    section: str
+    threshold: float
+    unit: str
+    plotted: tuple[str, str]
+    measure: Callable[[Env, Recording], Measured]
+    lines: Callable[[Env, Recording], tuple[str, str]]
+    policies_only: bool = False
