@@ -27,3 +27,7 @@ class RunStateError(SafeWrappersError):
 
 class UnsafeStateWarning(UserWarning):
     """The state was already outside the safe set when the filter was asked to act; said once per episode."""
+
+
+class PhaseMarginWarning(UserWarning):
+    """Hold and delays leave a declared control loop less phase margin than it asks for; said once per plant."""

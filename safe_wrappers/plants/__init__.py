@@ -1,6 +1,7 @@
 """Models of machines for the filter, read from an env at every step."""
 
 from safe_wrappers.plants.analytic import AnalyticPlant
+from safe_wrappers.plants.control_loop import ControlLoop
 from safe_wrappers.plants.displacement import DisplacementPlant
 from safe_wrappers.plants.identified.logs import log_steps
 from safe_wrappers.plants.identified.plant import IdentifiedPlant
@@ -11,6 +12,7 @@ from safe_wrappers.plants.simulator.plant import SimulatorPlant
 
 __all__ = [
     "AnalyticPlant",
+    "ControlLoop",
     "DisplacementPlant",
     "IdentifiedPlant",
     "MujocoPlant",

@@ -7,7 +7,8 @@ import gymnasium as gym
 
 from safe_wrappers.checks import Array
 from safe_wrappers.deprecation import deprecated_attribute
-from safe_wrappers.errors import UnsupportedEnvError
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+from safe_wrappers.plants.control_loop import ControlLoop
 
 
 class Plant(ABC):
@@ -19,12 +20,14 @@ class Plant(ABC):
             predicted over it with the commands in flight.
         observation_id: Number of observations so far.
         model_version: Number of changes of the model, after which a constraint reads its constants again.
+        loop: The loop that a controller closes through this machine, if one was declared.
     """
 
     control_dt: float
     delay_s: float
     observation_id: int = 0
     model_version: int = 0
+    loop: ControlLoop | None = None
     hold_s = deprecated_attribute("hold_s", "control_dt")
     stamp = deprecated_attribute("stamp", "observation_id")
     revision = deprecated_attribute("revision", "model_version")
@@ -36,6 +39,22 @@ class Plant(ABC):
     """Whether it knows which states are velocities, as a braking fallback needs."""
     simulates: ClassVar[bool] = False
     """Whether it rolls out actions and policies, as `RolloutPlant` does."""
+
+    @property
+    def margin_left_deg(self) -> float | None:
+        """What this plant's hold and delay leave of the declared loop's phase margin, degrees; None without a loop.
+
+        Raises:
+            ConfigurationError: The hold is not known yet.
+        """
+        if self.loop is None:
+            return None
+        if not hasattr(self, "control_dt"):
+            raise ConfigurationError(
+                "this plant does not know its control_dt yet: it reads it from the env; call plant.bind(env), or put "
+                "it into a CBFActionFilter first"
+            )
+        return self.loop.margin_left_deg(self.control_dt, self.delay_s)
 
     @property
     @abstractmethod
@@ -69,6 +88,11 @@ class Plant(ABC):
     @abstractmethod
     def observe(self) -> None:
         """Take the env's present state."""
+
+    def _check_loop(self, bound_before: bool) -> None:
+        """Called by `bind` once the hold is known: warns of a loop with too little margin, at the first env alone."""
+        if self.loop is not None and not bound_before:
+            self.loop.warn_if_short(self.control_dt, self.delay_s)
 
     def received(self, observation: Any, info: dict[str, Any]) -> None:  # noqa: B027 - most plants read the env
         """Take what the env's reset or step has returned; called before the next `observe`."""

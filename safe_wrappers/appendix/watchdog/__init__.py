@@ -1,1 +1,1 @@
-"""Reachability, and the phase that sampling and delay cost."""
+"""Reachability, and the delays of a lease."""

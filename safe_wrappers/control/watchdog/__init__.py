@@ -1,1 +1,1 @@
-"""How long a command may be executed: leases, round-trip ceilings, reachability in time."""
+"""How long a command may be executed, and what late ones cost: leases, ceilings, reachability, sampling."""

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from safe_wrappers.checks import Array, non_negative
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants import env_checks
+from safe_wrappers.plants.control_loop import ControlLoop, checked_loop
 from safe_wrappers.plants.mujoco import binding
 from safe_wrappers.plants.mujoco import model as of_model
 from safe_wrappers.plants.mujoco.action_map import ActionMap, MappedRecorder, find_action_map
@@ -40,6 +41,7 @@ class MujocoPlant(Snapshot):
         action_map: (offset, scale), one number or one per action: the env sets the control `offset + scale * action`.
             None: an action is a control, or, where the action space is not the control range, this is found by
             stepping a copy of the env.
+        loop: The `plants.ControlLoop` that your controller closes; `margin_left_deg` is what is left of its margin.
 
     Attributes:
         action_map: The map, once bound; None where an action is a control.
@@ -63,12 +65,13 @@ class MujocoPlant(Snapshot):
         data: binding.DataOf | None = None,
         control_dt: float | None = None,
         action_map: Sequence[ArrayLike] | None = None,
+        loop: ControlLoop | None = None,
     ) -> None:
         self._given, self._functions = binding.given_and_functions(model, data)
         self._share_step, self._given_dt, self._given_map = share_step, control_dt, action_map
         self.delay_s = non_negative("delay_s", delay_s, "s")
         self._pending: deque[Array] = deque()
-        self._factors = (1.0, 1.0)
+        self._factors, self.loop = (1.0, 1.0), checked_loop(loop)
         self._raw: Any = None
 
     def bind(self, env: gym.Env[Any, Any]) -> None:
@@ -77,7 +80,7 @@ class MujocoPlant(Snapshot):
         env_checks.refuse_second_env(self._raw, env)
         self._source = source = binding.source_of(raw, *self._functions)
         self.model, self._bound_model = binding.own_model(source, self._given), source.model
-        self._raw, self._env = raw, env
+        bound_before, self._raw, self._env = self._raw is not None, raw, env
         self.substeps = binding.physics_steps(raw, source, self._given_dt)
         self.data = mujoco.MjData(self.model)
         self.actuators = AffineActuators(self.model)
@@ -88,6 +91,7 @@ class MujocoPlant(Snapshot):
         self._bind_actions(env)
         self._idle = self.controls(np.clip(0.0, self.lower, self.upper))
         self.control_dt = env_checks.check_timing(env, self.substeps * float(self.model.opt.timestep))
+        self._check_loop(bound_before)
         self._new_snapshot()
         self.frames = of_model.Frames(self.model, self.data)
         self._delay_steps = int(np.ceil(self.delay_s / self.model.opt.timestep - 1e-9))

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safe_wrappers.appendix.watchdog.sampling import hold_lag_s, margin_left, phase_lag
+from safe_wrappers.control.watchdog.sampling import hold_lag_s, margin_left, phase_lag
 from safe_wrappers.errors import ConfigurationError
 
 

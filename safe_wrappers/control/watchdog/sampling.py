@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.plant import Plant
 
 Array = NDArray[np.float64]
 
@@ -94,31 +93,3 @@ def margin_left(
     if not np.isfinite(margin).all():
         raise ConfigurationError(f"phase_margin must be finite (rad), got {margin}")
     return np.asarray(margin - phase_lag(crossover, control_dt, compute_s, bus_s))
-
-
-def phase_margin_left(plant: Plant, phase_margin: float, crossover: float) -> float:
-    """Phase margin in rad that a loop through this plant keeps of its continuous, delay-free design.
-
-    The plant's `delay_s` (evidence, detection and actuation together) and half its `control_dt` are what the loop is
-    late by. That holds well below the sampling frequency.
-
-    Args:
-        plant: Any plant that knows its hold; a `MujocoPlant` learns it from the env when it is bound.
-        phase_margin: Margin of the controller's design, rad.
-        crossover: Crossover frequency of its open loop, rad/s, below the Nyquist frequency.
-
-    Returns:
-        What is left, rad; zero or less means that the stated reserve is used up.
-
-    Raises:
-        ConfigurationError: For a plant without a hold yet, a crossover that is not positive or not below the
-            Nyquist frequency, or a margin that is not finite.
-    """
-    try:
-        control_dt = plant.control_dt
-    except AttributeError:
-        raise ConfigurationError(
-            "this plant does not know its control_dt yet: it reads it from the env; call plant.bind(env), or put it "
-            "into a CBFActionFilter first"
-        ) from None
-    return float(margin_left(phase_margin, crossover, control_dt, plant.delay_s))
