@@ -2,7 +2,7 @@
 
 Boundary values have any shape (...) that broadcasts, the duration (s, > 0) among them. Times of evaluation are common
 to the whole batch, and their axes come last. Positions in any unit q, velocities in q/s, and so on. Neither keeps
-limits between its ends (`safe_wrappers.appendix.handover.splines`).
+limits between its ends (`interior`).
 
 Source: appendix "Smooth Trajectories and Bumpless Transfer".
 """
