@@ -12,6 +12,7 @@ import warnings as _warnings
 from typing import Any as _Any
 
 from safe_wrappers import constraints, plants
+from safe_wrappers.control.handover.seam_limits import SeamLimits
 from safe_wrappers.diagnosis import diagnose
 from safe_wrappers.envs import register_envs as _register_envs
 from safe_wrappers.errors import SafeWrappersError, UnsafeStateWarning
@@ -63,6 +64,7 @@ __all__ = [
     "RecordInterventions",
     "SafeActionMap",
     "SafeWrappersError",
+    "SeamLimits",
     "SimulatorPlant",
     "SlipLimiter",
     "StoppingBudget",

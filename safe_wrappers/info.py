@@ -194,8 +194,11 @@ HANDOVER_STARVED: Final = _key("handover/starved", "int64", log="starved")
 """Control steps of this step at which the queue was empty and the fallback gave the command."""
 HANDOVER_LIMITED: Final = _key("handover/limited", "int64", log="limited")
 """Control steps of this step at which `rate_limit` changed a command, beyond the blend."""
+HANDOVER_STRETCHED: Final = _key("handover/stretched", "int64")
+"""Blends that began in this step and are longer than without `limits`."""
 HANDOVER_REFUSED: Final = _key("handover/refused", "bool")
-"""A chunk was refused: not finite, not newer than the one in force, too late, or out of reach."""
+"""A chunk was refused: not finite, not newer than the one in force, too late, out of reach, or without a blend that
+keeps `limits`."""
 HANDOVER_LATENCY: Final = _key("handover/latency", "int64")
 """Control steps from the observation to the takeover of the last chunk that took over in this step; -1 without."""
 HANDOVER_STEPS: Final = _key("handover/steps", "int64")

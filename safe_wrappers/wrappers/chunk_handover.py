@@ -2,22 +2,25 @@
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 
 from safe_wrappers import info as keys
-from safe_wrappers.checks import non_negative
+from safe_wrappers.checks import non_negative, settings_from
+from safe_wrappers.control.handover.seam_limits import SeamCheck, SeamLimits
 from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ActionError, UnknownNameError
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.plants.default import own_plant
 from safe_wrappers.plants.env_checks import check_actions, check_timing
+from safe_wrappers.plants.mujoco.inverse_dynamics import InverseDynamics
+from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
-from safe_wrappers.serialize import plain_numbers
+from safe_wrappers.serialize import plain_data, plain_numbers
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
 from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step, WrapperRng
@@ -56,10 +59,12 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         decay: The ensemble's weights are exp(-decay i), i = 0 the oldest.
         steps_per_entry: Control steps from one entry of a chunk to the next, with a cubic Hermite spline between.
         clock_error_s: Observation times that are ahead of `now_s` by no more count as now, s; others are refused.
+        limits: Of the machine, which every blend keeps between its ends, too: it is stretched until it does, or its
+            chunk is refused.
 
     Info, at every step (see `safe_wrappers.info`): ``handover/seam_jump``, ``handover/peak_jerk``,
-    ``handover/blend_time``, ``handover/starved``, ``handover/limited``, ``handover/refused``, ``handover/latency``,
-    ``handover/steps``. The inner layers' info is merged over the control steps.
+    ``handover/blend_time``, ``handover/starved``, ``handover/limited``, ``handover/stretched``, ``handover/refused``,
+    ``handover/latency``, ``handover/steps``. The inner layers' info is merged over the control steps.
 
     Raises:
         ConfigurationError: Sizes that do not fit together, a time or limit that is not positive, nothing to blend
@@ -94,6 +99,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         decay: float = 0.01,
         steps_per_entry: int = 1,
         clock_error_s: float = 0.0,
+        limits: SeamLimits | Mapping[str, Any] | None = None,
     ) -> None:
         arguments = dict(locals())
         LayerWrapper.__init__(self, env)  # first: with a handover inside the actions are no vector either
@@ -103,6 +109,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         if blend not in (*BLENDS, *BASELINES):
             raise UnknownNameError(f"no blend {blend!r}; choose {', '.join((*BLENDS, *BASELINES))}")
         decay = non_negative("decay", decay, "a number")
+        limits = None if limits is None else settings_from(SeamLimits, limits, "limits")
         blend_time, rate_limit, control_dt = map(plain_numbers, (blend_time, rate_limit, control_dt))
         self._record(
             arguments,
@@ -115,6 +122,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             control_dt=control_dt,
             decay=decay,
             steps_per_entry=sizes.steps_per_entry,
+            limits=plain_data(limits),
         )
         self.chunk_size, self.execution_horizon, self.blend = sizes.entries, sizes.horizon, blend
         self.control_dt = check_timing(env, control_dt)
@@ -125,8 +133,10 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         low, high = (np.repeat(end[None], sizes.entries, axis=0) for end in (space.low, space.high))
         self.action_space = gym.spaces.Box(low, high, dtype=space.dtype)
         self._fallback = FallbackController(env, fallback, plant)
-        fewest, rate_limits = blend_bounds(sizes, space, self.control_dt, blend, blend_time, rate_limit)
-        self._queue = ChunkQueue(space, self.control_dt, blend, fewest, rate_limits, decay)
+        bounds = blend_time, rate_limit, limits
+        fewest, rate_limits = blend_bounds(sizes, space, self.control_dt, blend, *bounds)
+        self._check = None if limits is None else self._bound_check(limits)
+        self._queue = ChunkQueue(space, self.control_dt, blend, fewest, rate_limits, decay, self._check)
         self._inside = receiver_inside(env)
         self._random = WrapperRng(type(self).__name__)
         self._warned = False
@@ -180,6 +190,16 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         """Name the source of the chunks from now on; the change is blended, from the last command."""
         self._queue.switch(source)
 
+    def _bound_check(self, limits: SeamLimits) -> SeamCheck:
+        if not limits.needs_dynamics:
+            return SeamCheck(limits, self._controls, self.control_dt)
+        plant = self._fallback.plant
+        if not isinstance(plant, MujocoPlant):
+            plant = MujocoPlant()
+            plant.bind(self.env)
+        dynamics = InverseDynamics(plant)
+        return SeamCheck(limits, self._controls, self.control_dt, dynamics.torques, dynamics.inertia)
+
     def _checked(self, action: Any) -> Array:
         expected = f"expected a chunk of shape {self.action_space.shape}"
         try:
@@ -206,6 +226,8 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         if self.now_s < observed_s <= self.now_s + self._clock_error_s + SAME_STEP * self.control_dt:
             observed_s = self.now_s
         observed = math.floor(observed_s / self.control_dt + SAME_STEP)
+        if self._check is not None and not self._upsampling.bears_knots(chunk, self._check, self.control_dt):
+            return False
         return self._queue.submit(self._upsampling.commands(chunk), observed, self._queue.now + delay)
 
     def _start(self) -> None:
@@ -242,6 +264,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             keys.HANDOVER_BLEND_TIME: (max(blends) + 1) * self.control_dt if blends else 0.0,
             keys.HANDOVER_STARVED: sum(c.starved for c in commands),
             keys.HANDOVER_LIMITED: limited,
+            keys.HANDOVER_STRETCHED: sum(c.stretched for c in commands),
             keys.HANDOVER_STEPS: len(commands),
             keys.HANDOVER_REFUSED: refused,
             keys.HANDOVER_LATENCY: latency,

@@ -11,12 +11,14 @@ from safe_wrappers.appendix.handover import splines as appendix_splines
 from safe_wrappers.appendix.handover.splines import (
     evaluate,
     hermite,
-    interior_extrema,
-    knot_acceleration_step,
-    knot_torque_step,
     peak_torque,
     quintic_reduced_system,
     quintic_system,
+)
+from safe_wrappers.control.handover.interior import (
+    interior_extrema,
+    knot_acceleration_step,
+    knot_torque_step,
 )
 from safe_wrappers.control.handover.splines import hermite_series, quintic_coefficients
 from safe_wrappers.errors import ConfigurationError

@@ -28,6 +28,7 @@ TYPES = {
     "handover/blend_time": "float",
     "handover/starved": "int",
     "handover/limited": "int",
+    "handover/stretched": "int",
     "handover/refused": "bool",
     "handover/latency": "int",
     "handover/steps": "int",

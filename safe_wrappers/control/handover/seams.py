@@ -6,6 +6,7 @@ A stream is a policy's commands for the next control steps, shape (n, m): one pe
 Source: appendix "Smooth Trajectories and Bumpless Transfer", whose bounds are for continuous commands.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, Literal
@@ -33,11 +34,13 @@ class Seam:
         plan: The commands from the seam on, shape (n, m): the blend, then the new stream bit for bit.
         steps: Control steps of the blend: the first `steps` commands are mixed.
         limited: Which commands were rate-limited in addition to the blend, shape (n,).
+        stretched: A shorter blend keeps the rate limit and was not accepted.
     """
 
     plan: Array
     steps: int
     limited: NDArray[np.bool_]
+    stretched: bool = False
 
 
 def join(
@@ -51,7 +54,8 @@ def join(
     rate_limit: Array | float = np.inf,
     low: Array | float = -np.inf,
     high: Array | float = np.inf,
-) -> Seam:
+    accepts: Callable[[int], bool] | None = None,
+) -> Seam | None:
     """The shortest blend from what was sent into a new stream that keeps the rate limit.
 
     "smoothstep" mixes the two streams, the prior one held at the last command unless it lasts for the whole blend.
@@ -69,27 +73,36 @@ def join(
         rate_limit: Largest ``|du/dt|``, action units per second: of every component, or of each, shape (m,).
         low: Action box, for the bridges, shape (m,) or a number.
         high: Likewise.
+        accepts: Whether a blend of so many steps will do, 0 for none, asked from the shortest on of those that keep
+            the rate limit and that the box does not cut. If none will do, the result is None.
     """
     step = np.asarray(rate_limit * control_dt)
     if not len(sent):
         plan, limited = limit_rate(new, None, step)
         return Seam(plan, 0, limited)
     fewest = min(fewest, len(new) - 1)
-    if fewest == 0 and (np.abs(new[0] - sent[-1]) <= step).all():
+    uncut = np.ones(len(new), dtype=bool)
+    if accepts is None and fewest == 0 and (np.abs(new[0] - sent[-1]) <= step).all():
         candidates, first = new[None, :], 0
     else:
-        first = max(fewest, 1) if len(new) > 1 else 0
+        first = max(fewest, 1) if accepts is None and len(new) > 1 else fewest
         if blend == "smoothstep":
             candidates = _mixed(sent, prior, new, first)
         else:
-            candidates = np.clip(_bridged(sent, new, blend, first), low, high)
+            bridges = _bridged(sent, new, blend, first)
+            candidates = np.clip(bridges, low, high)
+            uncut = np.isclose(bridges, candidates, rtol=1e-9, atol=1e-12).all(axis=(1, 2))
     peaks = _peaks(candidates, sent[-1], first, step)
     kept = np.flatnonzero(peaks <= 1.0)
-    chosen = int(kept[0]) if kept.size else int(np.argmin(peaks))
+    chosen: int | None = int(kept[0]) if kept.size else int(np.argmin(peaks))
+    if accepts is not None:
+        chosen = next((int(c) for c in kept if uncut[c] and accepts(first + int(c))), None)
+    if chosen is None:
+        return None
     steps = first + chosen
     plan = np.concatenate([candidates[chosen, :steps], new[steps:]])
     plan, limited = limit_rate(plan, sent[-1], step)
-    return Seam(plan, steps, limited)
+    return Seam(plan, steps, limited, stretched=bool(kept.size and chosen > kept[0]))
 
 
 def limit_rate(commands: Array, before: Array | None, step: Array | float) -> tuple[Array, NDArray[np.bool_]]:
@@ -162,10 +175,7 @@ def _bridged(sent: Array, new: Array, blend: Blend, first: int) -> Array:
     n = len(new)
     ends = np.arange(first, n)
     order = 2 if blend == "hermite" else 3
-    at_start = _derivatives(sent, order)
-    at_end = [new, np.gradient(new, axis=0) if n > 1 else np.zeros_like(new), np.zeros_like(new)]
-    if n > 2:
-        at_end[2][1:-1] = np.diff(new, n=2, axis=0)
+    at_start, at_end = backward_differences(sent, order), stream_derivatives(new)
     lasts = (ends + 1.0)[:, None]
     given = [np.broadcast_to(d, (len(ends), d.size)) * lasts**k for k, d in enumerate(at_start)]
     given += [d[ends] * lasts**k for k, d in enumerate(at_end[:order])]
@@ -173,9 +183,20 @@ def _bridged(sent: Array, new: Array, blend: Blend, first: int) -> Array:
     return np.asarray(np.where((np.arange(n) < ends[:, None])[:, :, None], bridged, new))
 
 
-def _derivatives(sent: Array, order: int) -> list[Array]:
-    """The last command and its backward differences, per control step; 0 where too little was sent."""
+def backward_differences(sent: Array, order: int) -> list[Array]:
+    """The last command and its first backward differences, `order` in all, each of shape (m,), per control step.
+
+    Zero where too little was sent.
+    """
     return [
         np.diff(sent[-k - 1 :], n=k, axis=0)[0] if len(sent) > k else np.zeros_like(sent[-1])
         for k in range(order)
     ]
+
+
+def stream_derivatives(new: Array) -> list[Array]:
+    """A stream, shape (n, m), with its first and second central differences, per control step."""
+    second = np.zeros_like(new)
+    if len(new) > 2:
+        second[1:-1] = np.diff(new, n=2, axis=0)
+    return [new, np.gradient(new, axis=0) if len(new) > 1 else np.zeros_like(new), second]

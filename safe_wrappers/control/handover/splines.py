@@ -2,7 +2,7 @@
 
 Boundary values have any shape (...) that broadcasts, the duration (s, > 0) among them. Times of evaluation are common
 to the whole batch, and their axes come last. Positions in any unit q, velocities in q/s, and so on. Neither keeps
-limits between its ends (`safe_wrappers.appendix.handover.splines`).
+limits between its ends (`interior`).
 
 Source: appendix "Smooth Trajectories and Bumpless Transfer".
 """
@@ -67,6 +67,21 @@ def quintic_coefficients(
     c4 = (-15.0 * way + (8.0 * v0 + 7.0 * v1) * span + (3.0 * a0 - 2.0 * a1) * half) / span**4
     c5 = (6.0 * way - 3.0 * (v0 + v1) * span - (a0 - a1) * half) / span**5
     return np.stack([q0, v0, 0.5 * a0, c3, c4, c5], axis=-1)
+
+
+def hermite_coefficients(
+    q0: ArrayLike, v0: ArrayLike, q1: ArrayLike, v1: ArrayLike, duration: ArrayLike
+) -> Array:
+    """Coefficients (..., 4), lowest power of t first, of the cubic through two positions with two velocities.
+
+    Arguments and errors as `quintic_coefficients`.
+    """
+    span = positive_duration(duration)
+    span, q0, v0, q1, v1 = finite_arrays(duration=span, q0=q0, v0=v0, q1=q1, v1=v1)
+    way = q1 - q0
+    c2 = (3.0 * way - (2.0 * v0 + v1) * span) / span**2
+    c3 = (-2.0 * way + (v0 + v1) * span) / span**3
+    return np.stack([q0, v0, c2, c3], axis=-1)
 
 
 _HERMITE = np.array([[1, 0, -3, 2], [0, 1, -2, 1], [0, 0, 3, -2], [0, 0, -1, 1]], dtype=np.float64)

@@ -1,13 +1,15 @@
 """ChunkQueue: which command a robot executes while chunks arrive late, broken or not at all."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Final, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES, join
+from safe_wrappers.control.handover.seam_limits import SeamCheck
+from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES, Seam, join
 from safe_wrappers.control.handover.smoothstep import shortest_latched_blend, smoothstep
 from safe_wrappers.wrappers.common.layer import Array
 from safe_wrappers.wrappers.common.receiver import whole_steps
@@ -29,6 +31,7 @@ class Command(NamedTuple):
     refused: bool  # a chunk that has arrived was refused
     seam: bool  # there is a seam before it: another chunk, another source, or the fallback began
     blend_steps: int  # control steps of the blend that begins with this command; 0 if none does
+    stretched: bool  # that blend is longer than without the machine's limits
 
 
 class Chunk(NamedTuple):
@@ -52,6 +55,7 @@ class ChunkQueue:
         fewest: A blend takes at least so many control steps.
         rate_limit: Largest |du/dt| of every component, shape (m,), action units per second; infinite for none.
         decay: Ensembling weighs the i-th oldest chunk by exp(-decay i).
+        check: Of the machine's limits; None accepts all blends.
     """
 
     def __init__(
@@ -62,9 +66,10 @@ class ChunkQueue:
         fewest: int,
         rate_limit: Array,
         decay: float,
+        check: SeamCheck | None = None,
     ) -> None:
         self._control_dt, self._blend, self._fewest, self._decay = control_dt, blend, fewest, decay
-        self._rate_limit = rate_limit
+        self._rate_limit, self._check = rate_limit, check
         step = np.asarray(rate_limit * control_dt)
         # The difference of two commands, divided by the interval again, must not come out above the limit.
         self._step = np.where(step / control_dt > rate_limit, np.nextafter(step, 0.0), step)
@@ -119,7 +124,11 @@ class ChunkQueue:
         admitted, refused = self._admitted(admits)
         newest = self._observed
         self._coming = [c for c in self._coming if c.due > self.now]
-        seam, blend_steps = self._take_over(admitted) if admitted else (False, 0)
+        seam, blend_steps, stretched = False, 0, False
+        if admitted:
+            joined = self._take_over(admitted)
+            refused |= joined is None
+            seam, blend_steps, stretched = joined or (False, 0, False)
         control, limited = self._planned()
         starved = control is None
         if control is None:
@@ -136,7 +145,8 @@ class ChunkQueue:
         self._sent = np.concatenate([self._sent[-DIFFERENCES + 1 :], sent[None].astype(np.float64)])
         self.now += 1
         took_over = self._observed > newest
-        return Command(sent, self._observed, starved, limited or held, took_over, refused, seam, blend_steps)
+        held |= limited
+        return Command(sent, self._observed, starved, held, took_over, refused, seam, blend_steps, stretched)
 
     def _admitted(self, admits: Callable[[Array, int], bool]) -> tuple[list[Chunk], bool]:
         """The chunks that may take over now, the newest observation first; and whether one was refused."""
@@ -152,25 +162,37 @@ class ChunkQueue:
                 break
         return admitted, refused
 
-    def _take_over(self, admitted: list[Chunk]) -> tuple[bool, int]:
-        """Let the newest of these take over, or all in an ensemble: whether it is a seam, and its blend's steps."""
+    def _take_over(self, admitted: list[Chunk]) -> tuple[bool, int, bool] | None:
+        """Let the newest of these take over, or all in an ensemble; None if no blend keeps the machine's limits.
+
+        Returns whether it is a seam, its blend's steps, and whether these limits stretched it.
+        """
         newest = admitted[0]
+        fresh = newest.commands[self.now - newest.observed :]
+        joined: Seam | None = None
+        if self._blend in BLENDS and len(newest.commands) > 1:
+            joined = self._joined(fresh)
+            if joined is None:
+                return None
         self._coming = [c for c in self._coming if c.observed > newest.observed]
         self._observed, self._in_force = newest.observed, self._source
         if self._blend == ENSEMBLE:
             self._averaged += reversed(admitted)
-            return len(self._sent) > 0, 0
-        fresh = newest.commands[self.now - newest.observed :]
-        if self._blend == REPLACE or len(newest.commands) == 1:
+            return len(self._sent) > 0, 0, False
+        if joined is None:
             self._plan, self._limited = fresh, np.zeros(len(fresh), dtype=bool)
-            return self._blend == REPLACE and len(self._sent) > 0, 0
-        blend: Any = self._blend  # checked by the wrapper
-        bounds: dict[str, Any] = {"rate_limit": self._rate_limit, "low": self._low, "high": self._high}
-        motion = self._sent, self._plan, fresh
-        joined = join(*motion, self._control_dt, blend=blend, fewest=self._fewest, **bounds)
+            return self._blend == REPLACE and len(self._sent) > 0, 0, False
         self._plan, self._limited = joined.plan, joined.limited
         self._fade = None
-        return len(self._sent) > 0, joined.steps
+        return len(self._sent) > 0, joined.steps, joined.stretched
+
+    def _joined(self, fresh: Array) -> Seam | None:
+        """The blend into a chunk's rest, shape (n, m); None if none keeps the machine's limits."""
+        motion: Any = self._blend, self._sent, self._plan, fresh  # the blend's name is checked by the wrapper
+        check = None if self._check is None else partial(self._check.accepts, *motion)
+        bounds: dict[str, Any] = {"rate_limit": self._rate_limit, "low": self._low, "high": self._high}
+        blend: dict[str, Any] = {"blend": motion[0], "fewest": self._fewest, "accepts": check}
+        return join(*motion[1:], self._control_dt, **blend, **bounds)
 
     def _planned(self) -> tuple[Array | None, bool]:
         if self._blend == ENSEMBLE:
@@ -193,6 +215,9 @@ class ChunkQueue:
         if bounded.any():
             change = np.abs(target - self._sent[-1])[bounded]
             shortest = float(shortest_latched_blend(change, self._rate_limit[bounded]).max())
+            steps = max(steps, whole_steps(shortest, self._control_dt) - 1)
+        if self._check is not None:
+            shortest = self._check.shortest_fade(np.abs(target - self._sent[-1]))
             steps = max(steps, whole_steps(shortest, self._control_dt) - 1)
         return steps
 

@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 
 from safe_wrappers.checks import positive, whole_number
+from safe_wrappers.control.handover.seam_limits import SeamCheck, SeamLimits
 from safe_wrappers.control.handover.seams import BLENDS
 from safe_wrappers.control.handover.splines import hermite_series
 from safe_wrappers.errors import ConfigurationError
@@ -61,15 +62,18 @@ def blend_bounds(
     blend: str,
     blend_time: float | None,
     rate_limit: float | Sequence[float] | None,
+    limits: SeamLimits | None = None,
 ) -> tuple[int, Array]:
     """The fewest steps of a blend, and the rate limit of every component, shape (m,), infinite for none."""
-    fewest, limits = 0, np.full(space.shape, np.inf)
+    fewest, rate_limits = 0, np.full(space.shape, np.inf)
+    given = {"blend_time": blend_time, "rate_limit": rate_limit, "limits": limits}
+    named = [name for name, one in given.items() if one is not None]
     if blend in BASELINES:
-        if blend_time is not None or rate_limit is not None:
+        if named:
             bounded = ", ".join(BLENDS)
             baseline = f"blend={blend!r} is a baseline that bounds nothing"
-            raise ConfigurationError(f"{baseline}: blend_time and rate_limit are for {bounded}")
-        return fewest, limits
+            raise ConfigurationError(f"{baseline}: blend_time, rate_limit and limits are for {bounded}")
+        return fewest, rate_limits
     if blend_time is not None:
         fewest = max(whole_steps(positive("blend_time", blend_time, "s"), control_dt) - 1, 1)
         available = sizes.chunk - sizes.delay[1]
@@ -78,17 +82,17 @@ def blend_bounds(
             longer = f"blend_time = {blend_time} s is longer than a chunk's rest, {left}"
             raise ConfigurationError(f"{longer}: choose a longer chunk_size or a shorter blend_time")
     if rate_limit is not None:
-        limits = _rate_limits(rate_limit, limits.size)
+        rate_limits = _rate_limits(rate_limit, rate_limits.size)
         resolution = _rounding(space)
-        if (limits * control_dt <= resolution).any():
+        if (rate_limits * control_dt <= resolution).any():
             least = f"what {space.dtype} resolves in {control_dt} s, {resolution / control_dt:.3g} per second"
             raise ConfigurationError(f"rate_limit = {rate_limit} is not above {least}: choose a larger one")
-    if blend_time is None and rate_limit is None:
+    if not named:
         fewest = sizes.chunk - sizes.horizon - sizes.delay[1]  # the least left-over
         if fewest == 0:
-            given = f"chunk_size {sizes.chunk}, execution_horizon {sizes.horizon}, inference_delay {sizes.delay[1]}"
-            raise ConfigurationError(f"{given}: no left-over to blend with: pass rate_limit or blend_time")
-    return fewest, limits
+            has = f"chunk_size {sizes.chunk}, execution_horizon {sizes.horizon}, inference_delay {sizes.delay[1]}"
+            raise ConfigurationError(f"{has}: no left-over to blend with: pass rate_limit or blend_time")
+    return fewest, rate_limits
 
 
 def _size(entries: int, apart: int, letter: str) -> str:
@@ -138,6 +142,10 @@ class Upsampling:
             rates = np.asarray(np.gradient(unit, axis=1)) / steps
             # The spline is linear in the entries: one matrix for all chunks.
             self._weights = hermite_series(times, unit, rates, np.arange((entries - 1) * steps + 1)).T
+
+    def bears_knots(self, chunk: Array, check: SeamCheck, control_dt: float) -> bool:
+        """Whether the torque steps where the spline's pieces meet keep the machine's limits."""
+        return self._steps == 1 or check.bears_knots(chunk, self._steps * control_dt)
 
     def commands(self, chunk: Array) -> Array:
         """The commands of a chunk (H, m), shape ((H - 1) steps + 1, m); at the entries these bit for bit."""
