@@ -28,7 +28,7 @@ from scipy.integrate import solve_ivp
 
 import safe_wrappers as sw
 from benchmarks.arm_and_wall import REACH_M, SUBSTEPS, TIP_M, ArmAndWall, arm_model, normal_force, springy
-from safe_wrappers.appendix.contact.impact import effective_mass, peak_force
+from safe_wrappers.control.contact.impact import effective_mass, peak_force
 
 RESULTS = Path(__file__).parent / "results"
 MASSES = (0.5, 2.0, 10.0, 40.0)

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from _style import FORBIDDEN, OFF, ON, OTHER, panels
-from safe_wrappers.appendix.contact.impact import attenuation_after_delay, time_to_peak
+from safe_wrappers.control.contact.impact import attenuation_after_delay, time_to_peak
 
 MASS, STIFFNESS, SPEED = 6.0, 25e3, 0.7
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from safe_wrappers.appendix.contact.impact import reduced_mass, speed_limit
 from safe_wrappers.control.contact.body_regions import BODY_REGIONS, body_region
+from safe_wrappers.control.contact.impact import reduced_mass, speed_limit
 from safe_wrappers.errors import UnknownNameError
 
 

@@ -10,9 +10,9 @@ from scipy.optimize import nnls
 
 from safe_wrappers.appendix.contact.contact_lcp import contact_step, delassus_matrix
 from safe_wrappers.appendix.contact.forces import plane_gap, sphere_gap, unilateral_force
-from safe_wrappers.appendix.contact.impact import effective_mass, normal_impulse, restitution_velocity
 from safe_wrappers.appendix.contact.lemke import LcpStatus
 from safe_wrappers.control.contact.contact import complementarity_residuals
+from safe_wrappers.control.contact.impact import effective_mass, normal_impulse, restitution_velocity
 from safe_wrappers.errors import ConfigurationError
 
 G = 9.81

@@ -7,7 +7,7 @@ import pytest
 from dropped_ball import DroppedBall
 from scipy.spatial.transform import Rotation
 
-from safe_wrappers.appendix.contact.impact import peak_force
+from safe_wrappers.control.contact.impact import peak_force
 from safe_wrappers.plants.mujoco.contacts import Contacts
 from safe_wrappers.plants.mujoco.replay import Replay, rotation_vector_rate
 

@@ -1,17 +1,19 @@
 """ImpactSpeedLimit: bound the peak force of contacts by the approach speed."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from dataclasses import dataclass, field
+from typing import ClassVar, NamedTuple
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from safe_wrappers.checks import check_fields, name_list, positive
 from safe_wrappers.constraints.contact.geom_gaps import GeomGaps
 from safe_wrappers.constraints.rollout import BoundRollout, RolloutConstraint
 from safe_wrappers.control.contact.body_regions import body_region
 from safe_wrappers.control.contact.contact import series_stiffness
+from safe_wrappers.control.contact.impact import braked_peak_force, reduced_mass, speed_limit
 from safe_wrappers.deprecation import deprecated_parameters
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array
@@ -32,7 +34,7 @@ class ImpactSpeedLimit(RolloutConstraint):
     Best effort: along the held step of an executed control that is not flagged every first touch keeps the limit, for
     a plant that is right, a contact that is a linear spring of the declared stiffness, and one pair of geoms at a
     time. Not counted are friction, other contacts, joint stops, and the obstacles' own way during the forecast. The
-    physics step should be at most a tenth of `appendix.contact.impact.time_to_peak`.
+    physics step should be at most a tenth of `control.contact.impact.time_to_peak`.
 
     Args:
         bodies: Names of the machine's bodies (all their geoms that can collide, or all if none can) or geoms.
@@ -97,27 +99,30 @@ class ImpactSpeedLimit(RolloutConstraint):
         return BoundImpactSpeedLimit(self, plant)
 
 
-@dataclass(frozen=True, slots=True)
-class Contact:
-    """A contact, now or at the present speed."""
+class Contact(NamedTuple):
+    """Contacts, now or at the present speed, each field a number or shape (...)."""
 
-    gap: float  # m, negative inside
-    speed: float  # of the approach, m/s, >= 0
-    inertia: float  # mass times stiffness, N^2 s^2 / m^2
-    push: float  # what presses on besides the motion, N, >= 0
-    pressed: float  # force by the present deflection, N
+    gap: float | Array  # m, negative inside
+    speed: float | Array  # of the approach, m/s, >= 0
+    mass: float | Array  # effective, kg
+    stiffness: float | Array  # N/m
+    push: float | Array  # what presses on besides the motion, N, >= 0
+    deflection: float | Array  # m, >= 0
 
     @property
-    def peak(self) -> float:
-        """From `m v^2 / 2 + k x^2 / 2 + F_p (x_max - x) = k x_max^2 / 2`, N."""
-        return self.push + float(np.hypot(self.pressed - self.push, np.sqrt(self.inertia) * self.speed))
+    def peak(self) -> Array:
+        """Force by the deepest deflection, under a push that goes on, N."""
+        pushed = -self.push / self.mass
+        return braked_peak_force(self.speed, self.mass, self.stiffness, pushed, deflection=self.deflection)
 
-    def left(self, limit: float) -> float:
+    def left(self, limit: float) -> Array:
         """What is left of a limit, N, to first order; in squares, nearly linear in the control."""
+        pressed = self.stiffness * self.deflection
         # Beyond the limit the push would change its sign with that of the first factor.
-        push = self.push if self.pressed <= limit else -self.push
-        square = (limit - self.pressed) * (limit + self.pressed - 2.0 * push)
-        return (square - self.inertia * self.speed**2) / (2.0 * limit)
+        push = np.where(pressed <= limit, self.push, -self.push)
+        share = self.speed / speed_limit(limit, self.mass, self.stiffness)
+        square = (limit - pressed) * (limit + pressed - 2.0 * push)
+        return np.asarray(square / (2.0 * limit) - 0.5 * limit * share**2)
 
 
 class BoundImpactSpeedLimit(BoundRollout):
@@ -175,8 +180,9 @@ class BoundImpactSpeedLimit(BoundRollout):
         given = self._mobile[0].copy()
         mobility = float(row @ given)
         speed = float(row @ self._speeds)
+        stiffness = self.spec._stiffness
         if mobility < _FIXED:
-            return Contact(gap, 0.0, 0.0, 0.0, 0.0)
+            return Contact(gap, 0.0, 1.0 / _FIXED, stiffness, 0.0, 0.0)
         mass = 1.0 / mobility if self.spec.effective_mass is None else self.spec.effective_mass
         moving = float(given @ self._moving)
         if self._curving:
@@ -184,10 +190,9 @@ class BoundImpactSpeedLimit(BoundRollout):
             mujoco.mj_jacDot(m, d, second_dot, None, points[3:], m.geom_bodyid[other])
             moving += float(normal @ (first_dot - second_dot) @ self._speeds)
         if not self._gaps.moves[pair]:
-            mass = 1.0 / (1.0 / mass + 1.0 / self.spec._other_mass)
+            mass = float(reduced_mass(mass, self.spec._other_mass))
         push = mass * max(moving, self._at_rest(given), 0.0)
-        stiffness = self.spec._stiffness
-        return Contact(gap, max(speed, 0.0), mass * stiffness, push, stiffness * max(-gap, 0.0))
+        return Contact(gap, max(speed, 0.0), mass, stiffness, push, max(-gap, 0.0))
 
     def _at_rest(self, given: Array) -> float:
         """Acceleration along the normal once the motion has stopped, when damping no longer holds it back, m/s^2."""
@@ -213,23 +218,19 @@ class BoundImpactSpeedLimit(BoundRollout):
         mujoco.mj_getState(m, data, self._integration, what)
         mujoco.mj_setState(m, d, self._integration, what)
         self.place(self.plant.qpos, self.plant.qvel, None)
-        contacts = [self.contact(pair) for pair in range(len(self._gaps.pairs))]
-        touching = [c.gap <= touch for c, touch in zip(contacts, self._gaps.touch, strict=True)]
+        contacts = _together([self.contact(pair) for pair in range(len(self._gaps.pairs))])
+        there = contacts.gap <= self._gaps.touch
         # Only a contact that is there counts; before it, how it will be is the forecast's to say.
-        lost, value = [], []
-        for c, there in zip(contacts, touching, strict=True):
-            left = self.spec._force - (c if there else self._braked(c)).peak
-            value.append(left if there or self.spec.braking is not None else max(left, 0.0))
-            lost.append(min(c.left(self._limit), 0.0) if there else 0.0)
-        self._lost = np.array(lost)
-        return np.array(value)
+        left = self.spec._force - self._braked(contacts, there).peak
+        self._lost = np.where(there, np.minimum(contacts.left(self._limit), 0.0), 0.0)
+        return left if self.spec.braking is not None else np.where(there, left, np.maximum(left, 0.0))
 
-    def _braked(self, contact: Contact) -> Contact:
-        """A contact to come, at the speed that the declared braking leaves of it."""
+    def _braked(self, contacts: Contact, there: NDArray[np.bool_]) -> Contact:
+        """Contacts to come at the speed that the declared braking leaves of them."""
         if self.spec.braking is None:
-            return contact
-        square = max(contact.speed**2 - 2.0 * self.spec.braking * contact.gap, 0.0)
-        return replace(contact, speed=square**0.5)
+            return contacts
+        square = np.maximum(contacts.speed**2 - 2.0 * self.spec.braking * contacts.gap, 0.0)
+        return contacts._replace(speed=np.where(there, contacts.speed, np.sqrt(square)))
 
     def _violation(self, value: Array) -> Array:
         return self._lost
@@ -247,12 +248,22 @@ class BoundImpactSpeedLimit(BoundRollout):
             touched[soon] = list(range(pairs))
         # Without contact as much is left as in the gentlest one.
         room = np.full((k, pairs), 0.5 * self._limit)
+        judged: list[tuple[int, int]] = []
+        contacts: list[Contact] = []
         for instant, those in touched.items():
             # At the end of the held step another control takes over.
             control = forecast.control if instant < soon or instant == 0 else None
             self.place(forecast.qpos[instant], forecast.qvel[instant], control)
             for pair in those:
-                contact = self.contact(pair)
-                there = contact.gap <= self._gaps.touch[pair]
-                room[instant, pair] = (contact if there else self._braked(contact)).left(self._limit)
+                judged.append((instant, pair))
+                contacts.append(self.contact(pair))
+        if judged:
+            together, (instants, those) = _together(contacts), np.transpose(judged)
+            there = together.gap <= self._gaps.touch[those]
+            room[instants, those] = self._braked(together, there).left(self._limit)
         return room + self.spec.margin
+
+
+def _together(contacts: Sequence[Contact]) -> Contact:
+    """One of arrays, shape (contacts,)."""
+    return Contact(*np.array(contacts, dtype=np.float64).T)

@@ -7,7 +7,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from safe_wrappers.appendix.contact.impact import (
+from safe_wrappers.control.contact.contact import series_stiffness
+from safe_wrappers.control.contact.impact import (
     attenuation_after_delay,
     braked_deflection,
     braked_peak_force,
@@ -20,7 +21,6 @@ from safe_wrappers.appendix.contact.impact import (
     speed_limit,
     time_to_peak,
 )
-from safe_wrappers.control.contact.contact import series_stiffness
 from safe_wrappers.errors import ConfigurationError
 
 speeds, masses = st.floats(0.01, 10.0), st.floats(0.05, 100.0)
@@ -28,14 +28,14 @@ stiffnesses, brakes = st.floats(100.0, 1e6), st.floats(0.0, 300.0)
 MACHINE = (0.8, 12.0, 25_000.0)
 
 
-def integrated(v, m, k, a=0.0, latency=0.0):
+def integrated(v, m, k, a=0.0, latency=0.0, start=0.0):
     """Time and depth of the first peak, from the equation of motion; the brake comes on at `latency`."""
 
     def peak(t, x):
         return x[1]
 
     peak.terminal, peak.direction = True, -1
-    now, state = 0.0, [0.0, v]
+    now, state = 0.0, [start, v]
     period = 2.0 * np.pi * np.sqrt(m / k)
     for braking, until in ((0.0, latency), (a, latency + 10.0 * period)):
         if until <= now:
@@ -85,6 +85,26 @@ def test_a_push_that_goes_on_is_a_brake_below_zero(v, m, k, a, share):
     latency = share * time_to_peak(m, k)
     _, depth = integrated(v, m, k, a, latency)
     assert braked_deflection(v, m, k, a, latency) == pytest.approx(depth, rel=1e-6)
+
+
+@settings(max_examples=60, deadline=None)
+@given(speeds, masses, stiffnesses, st.floats(-100.0, 300.0), st.floats(0.0, 3.0), st.floats(0.0, 1.6))
+def test_a_contact_that_is_deflected_already_goes_on_from_there(v, m, k, a, depth, share):
+    unbraked = v * np.sqrt(m / k)
+    start = depth * unbraked
+    quarter = np.arctan2(1.0, depth) * np.sqrt(m / k)  # till its own peak
+    latency = share * quarter
+    assume(abs(share - 1.0) > 1e-3)
+    _, deep = integrated(v, m, k, a, latency, start)
+    assert braked_deflection(v, m, k, a, latency, start) == pytest.approx(deep, rel=1e-6)
+    assert braked_peak_force(v, m, k, a, latency, start) == pytest.approx(k * deep, rel=1e-6)
+
+
+def test_a_spring_that_holds_a_push_stays_where_it_is():
+    push, k, m = 50.0, 1e4, 2.0
+    assert braked_peak_force(0.0, m, k, -push / m, deflection=push / k) == pytest.approx(push, rel=1e-12)
+    # Let go from half of it, it swings to as far beyond.
+    assert braked_peak_force(0.0, m, k, -push / m, deflection=0.5 * push / k) == pytest.approx(1.5 * push)
 
 
 @settings(max_examples=50, deadline=None)
@@ -296,6 +316,8 @@ def test_a_drop_in_mujoco_bounces_as_its_restitution_says(damping):
         (lambda: braked_deflection(*MACHINE, np.inf), "braking must be finite"),
         (lambda: braked_deflection(*MACHINE, 1.0, -0.1), "latency must be 0 s or more"),
         (lambda: braked_deflection(*MACHINE, 1.0, np.nan), "latency must be 0 s or more"),
+        (lambda: braked_deflection(*MACHINE, 1.0, 0.0, -1e-3), "deflection must be finite and 0 m or more"),
+        (lambda: braked_deflection(*MACHINE, 1.0, 0.0, np.inf), "deflection must be finite"),
         (lambda: braked_deflection(1.0, np.inf, 1.0, 1.0), "mass must be finite for a brake"),
         (lambda: braked_peak_force(1.0, 1.0, np.inf, 1.0), "stiffness must be finite"),
         (lambda: series_stiffness(), "at least one"),

@@ -59,7 +59,7 @@ def normal_impulse(mass: ArrayLike, velocity: ArrayLike, restitution: ArrayLike)
 def effective_mass(inertia: ArrayLike, jacobian: ArrayLike) -> Array:
     """Effective mass of a machine at one point along one direction, `1 / (J M^-1 J')`, kg.
 
-    Each direction separately: simultaneous contacts share the inertia (`contact_lcp.delassus_matrix`).
+    Each direction separately: simultaneous contacts share the inertia (`appendix.contact.contact_lcp`).
 
     Args:
         inertia: Joint-space inertia M, symmetric and positive definite, shape (..., n, n).
@@ -144,48 +144,66 @@ def time_to_peak(mass: ArrayLike, stiffness: ArrayLike) -> Array:
 
 
 def braked_deflection(
-    speed: ArrayLike, mass: ArrayLike, stiffness: ArrayLike, braking: ArrayLike, latency: ArrayLike = 0.0
+    speed: ArrayLike,
+    mass: ArrayLike,
+    stiffness: ArrayLike,
+    braking: ArrayLike,
+    latency: ArrayLike = 0.0,
+    deflection: ArrayLike = 0.0,
 ) -> Array:
     """The first peak of the deflection when a brake works against it, shape (...), m.
 
     The brake's work `m a (x_max - x_latency)` is taken off the energy, where x_latency is how deep the contact
-    already is when the brake comes on: with b = m a / k and the unbraked peak p,
+    already is when the brake comes on: with b = m a / k, p = v / w, the deflection x at the start and the unbraked
+    peak `sqrt(p^2 + x^2)`,
 
-        x_max = sqrt(b^2 + p^2 + 2 b x_latency) - b,    x_latency = p sin(w latency).
+        x_max = sqrt(b^2 + p^2 + x^2 + 2 b x_latency) - b,    x_latency = p sin(w latency) + x cos(w latency).
 
-    From the `time_to_peak` on it is the unbraked peak.
+    From the unbraked peak on, at the `time_to_peak` where x is 0, a brake changes nothing.
 
     Args:
-        speed: v at the first touch, m/s.
+        speed: v at the start, m/s.
         mass: m, kg, finite where there is braking.
         stiffness: k, N/m.
         braking: Constant deceleration a, m/s^2, of brakes alone, without the contact's own. Below zero it is a
             push that goes on.
-        latency: From the first touch to the brake's action, at least 0, s.
+        latency: From the start to the brake's action, at least 0, s.
+        deflection: x, how deep the contact is at the start, at least 0, m; 0 at the first touch.
     """
     v, m, k = _checked(speed, mass, stiffness)
     (a,), late = finite_arrays(braking=braking), float_array("latency", latency)
+    x = float_array("deflection", deflection)
     if not (late >= 0.0).all():
         raise ConfigurationError(f"latency must be 0 s or more, got {late}")
+    if not (np.isfinite(x) & (x >= 0.0)).all():
+        raise ConfigurationError(f"deflection must be finite and 0 m or more, got {x}")
     root = np.sqrt(m / k)
-    unbraked = _times(v, root)
+    to_come = _times(v, root)
+    unbraked = np.hypot(to_come, x)
     if not a.any():
         return np.asarray(np.broadcast_arrays(unbraked, a, late)[0].copy())
     if np.isinf(m).any():
         raise ConfigurationError("mass must be finite for a brake to act on it")
     b = a * root**2
-    in_time = late < np.pi / 2.0 * root
+    quarter = np.where(x > 0.0, np.arctan2(to_come, x), np.pi / 2.0)
+    in_time = (late == 0.0) | (late < quarter * root)
     phase = np.where(in_time, late, 0.0) / np.where(root > 0.0, root, 1.0)
-    deep = unbraked * np.sin(phase)
+    deep = to_come * np.sin(phase) + x * np.cos(phase)
+    # From where the brake comes on it swings about -b.
+    whole = np.hypot(deep + b, to_come * np.cos(phase) - x * np.sin(phase))
     # (x_max + b)^2 - b^2, divided rather than subtracted: for a strong brake the difference cancels.
     gained = unbraked**2 + 2.0 * b * deep
-    whole = np.sqrt(np.maximum(b**2 + gained, 0.0))
     braked = np.where(b > 0.0, gained / np.where(b > 0.0, whole + b, 1.0), whole - b)
     return np.asarray(np.where(in_time, braked, unbraked))
 
 
 def braked_peak_force(
-    speed: ArrayLike, mass: ArrayLike, stiffness: ArrayLike, braking: ArrayLike, latency: ArrayLike = 0.0
+    speed: ArrayLike,
+    mass: ArrayLike,
+    stiffness: ArrayLike,
+    braking: ArrayLike,
+    latency: ArrayLike = 0.0,
+    deflection: ArrayLike = 0.0,
 ) -> Array:
     """The contact's force at that peak, `k x_max`, shape (...), N.
 
@@ -195,9 +213,10 @@ def braked_peak_force(
         stiffness: k, N/m, finite.
         braking: See `braked_deflection`.
         latency: See `braked_deflection`.
+        deflection: See `braked_deflection`.
     """
     k = finite_array("stiffness", stiffness)
-    return np.asarray(k * braked_deflection(speed, mass, k, braking, latency))
+    return np.asarray(k * braked_deflection(speed, mass, k, braking, latency, deflection))
 
 
 def attenuation_after_delay(
