@@ -3,8 +3,8 @@
 import mujoco
 import numpy as np
 
-from safe_wrappers.appendix.watchdog.sampling import phase_lag
 from safe_wrappers.checks import Array
+from safe_wrappers.control.watchdog.sampling import phase_lag
 from safe_wrappers.diagnosis.finding import Evidence
 from safe_wrappers.diagnosis.late_commands import ages
 from safe_wrappers.diagnosis.recording import Env, Recording, physics
