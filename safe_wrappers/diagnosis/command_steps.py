@@ -4,7 +4,7 @@ import numpy as np
 
 from safe_wrappers.checks import Array
 from safe_wrappers.diagnosis.finding import Evidence
-from safe_wrappers.diagnosis.recording import Env, Recording, box, physics
+from safe_wrappers.diagnosis.recording import Env, Recording, box
 from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom
 
 RATE = 0.05
@@ -12,18 +12,10 @@ RATE = 0.05
 
 
 def _relative(env: Env, recording: Recording) -> Array:
-    """Commands as shares of their range, shape (k, m): the model's controls, or else actions."""
-    found = physics(env)
-    if found is not None and recording.commands.size:
-        commands = recording.commands
-        low, high = found[0].actuator_ctrlrange.T
-        limited = found[0].actuator_ctrllimited.astype(bool)
-        low = np.where(limited, low, commands.min(axis=0))
-        high = np.where(limited, high, commands.max(axis=0))
-    else:
-        commands, (low, high) = recording.actions, box(env)
+    """What the env was given, as shares of its range, shape (k, m)."""
+    low, high = box(env.unwrapped)
     span = high - low
-    return np.asarray(commands / np.where(span > 0.0, span, 1.0))
+    return np.asarray(recording.executed / np.where(span > 0.0, span, 1.0))
 
 
 def _differences(commands: Array, first: np.ndarray, order: int) -> Array:

@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from safe_wrappers.checks import Array
@@ -165,8 +165,3 @@ def _amount(value: float, unit: str) -> str:
     if math.isnan(value):
         return "not measured"
     return f"{100.0 * value:.3g} %" if unit == "share" else f"{value:.3g} {unit}".strip()
-
-
-def treated(finding: Finding, after: float) -> Finding:
-    """The same finding, after the second run."""
-    return replace(finding, after=after)

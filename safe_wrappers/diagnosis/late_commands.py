@@ -4,7 +4,7 @@ import numpy as np
 
 from safe_wrappers.checks import Array
 from safe_wrappers.diagnosis.finding import Evidence
-from safe_wrappers.diagnosis.recording import Env, Recording, physics
+from safe_wrappers.diagnosis.recording import Env, Recording
 from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom
 
 OLDEST = 100
@@ -17,23 +17,18 @@ _EVERY = 0.5
 
 def ages(env: Env, recording: Recording) -> Array:
     """Control steps between the proposal of each command and its execution, shape (k,); NaN where none was found."""
-    found = physics(env)
-    if found is None or not recording.commands.size:
-        raise NotMeasuredError("the env has no MuJoCo model whose control could be read")
-    model, commands, actions = found[0], recording.commands, recording.actions
-    if commands.shape != actions.shape:
+    proposed, executed = recording.actions, recording.executed
+    if executed.shape != proposed.shape:
         raise NotMeasuredError(
-            f"an action has {actions.shape[1]} numbers, the model {commands.shape[1]} controls"
+            f"a proposal has {proposed.shape[1]} numbers, the env's action {executed.shape[1]}"
         )
-    low, high = model.actuator_ctrlrange.T
-    proposed = np.where(model.actuator_ctrllimited, np.clip(actions, low, high), actions)
     same = _SAME * np.maximum(1.0, np.abs(proposed).max())
-    age = np.full(len(commands), np.nan)
+    age = np.full(len(executed), np.nan)
     start = 0
-    for k in range(len(commands)):
+    for k in range(len(executed)):
         start = k if recording.first[k] else start
         back = proposed[max(start, k - OLDEST) : k + 1][::-1]
-        hit = np.flatnonzero((np.abs(back - commands[k]) <= same).all(axis=1))
+        hit = np.flatnonzero((np.abs(back - executed[k]) <= same).all(axis=1))
         age[k] = hit[0] if hit.size else np.nan
     if np.isfinite(age).mean() < _EVERY:
         raise NotMeasuredError(

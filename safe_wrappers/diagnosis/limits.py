@@ -7,17 +7,16 @@ from numpy.typing import NDArray
 from safe_wrappers.checks import Array
 from safe_wrappers.constraints.limits.joints import JointPositionLimit, driven_joints
 from safe_wrappers.diagnosis.finding import Evidence
-from safe_wrappers.diagnosis.recording import Env, Recording, physics
+from safe_wrappers.diagnosis.recording import Env, Recording, braking_horizon, physics
 from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.model import fixed_bodies
 from safe_wrappers.protect import protect
 from safe_wrappers.wrappers.cbf_action_filter import CBFActionFilter
 
-PRESSED = 0.05
+PRESSED = 0.02
 """Share of a joint's range by which it is beyond its stop."""
 _GROUND = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
-HORIZON = 5
 
 
 def _costs(recording: Recording) -> NDArray[np.bool_]:
@@ -95,9 +94,10 @@ def lines(env: Env, recording: Recording) -> tuple[str, str]:
         names = [
             found[0].joint(j).name for j, worst in zip(joints, beyond.max(axis=0), strict=True) if worst > 0.0
         ]
-        limit = f"sw.constraints.JointPositionLimit(joints={names}, margin=0.0, horizon={HORIZON})"
+        horizon = braking_horizon(recording)
+        limit = f"sw.constraints.JointPositionLimit(joints={names}, margin=0.0, horizon={horizon})"
         try:
-            CBFActionFilter(env, [JointPositionLimit(joints=names, horizon=HORIZON)])
+            CBFActionFilter(env, [JointPositionLimit(joints=names, horizon=horizon)])
             return f"limit = {limit}\nenv = sw.CBFActionFilter(env, [limit])", ""
         except ConfigurationError as error:
             return "", f"JointPositionLimit is refused: {error}"
@@ -112,5 +112,5 @@ def lines(env: Env, recording: Recording) -> tuple[str, str]:
 
 SYMPTOM = Symptom(
     "unsafe actions near obstacles or limits", "section 1.2, barriers and kinetic stopping insets",
-    0.01, "share", ("steps with a cost, a pressed stop or a hit", ""), measure, lines,
+    0.02, "share", ("steps with a cost, a pressed stop or a hit", ""), measure, lines,
 )  # fmt: skip

@@ -14,6 +14,8 @@ LINEAR = 0.9
 """Share of the variance of a command that a linear function of the state must explain."""
 _SATURATED = 0.98  # of the end of the range
 _FREQUENCIES = 4000
+_NUDGE = 1e-5
+_UNSTABLE = 100.0
 
 
 def _gains(recording: Recording, low: Array, high: Array) -> tuple[Array, Array]:
@@ -37,15 +39,19 @@ def _gains(recording: Recording, low: Array, high: Array) -> tuple[Array, Array]
 
 
 def _held_step(model: mujoco.MjModel, mean: Array, steps: int) -> tuple[Array, Array]:
-    """The control step as x+ = A x + B u at a state, by MuJoCo's differences."""
-    data, n = mujoco.MjData(model), 2 * model.nv + model.na
-    data.qpos[:], data.qvel[:] = mean[: model.nq], mean[model.nq :]
-    a, b = np.zeros((n, n)), np.zeros((n, model.nu))
-    mujoco.mjd_transitionFD(model, data, 1e-6, True, a, b, None, None)
-    total, power = np.zeros_like(b), np.eye(n)
-    for _ in range(steps):
-        total, power = total + power @ b, a @ power
-    return power, total
+    """The control step as x+ = A x + B u at a state, by differences; A (2 nv, 2 nv), B (2 nv, nu)."""
+    data, n = mujoco.MjData(model), len(mean)
+
+    def after(change: Array) -> Array:
+        mujoco.mj_resetData(model, data)
+        state = mean + change[:n]
+        data.qpos[:], data.qvel[:], data.ctrl[:] = state[: model.nq], state[model.nq :], change[n:]
+        mujoco.mj_step(model, data, steps)
+        return np.concatenate([data.qpos, data.qvel])
+
+    nudges = _NUDGE * np.eye(n + model.nu)
+    slopes = np.array([(after(nudge) - after(-nudge)) / (2.0 * _NUDGE) for nudge in nudges]).T
+    return slopes[:, :n], slopes[:, n:]
 
 
 def loop(a: Array, b: Array, gains: Array, delay: int, broken: int, dt: float) -> tuple[float, float]:
@@ -85,34 +91,42 @@ def loop(a: Array, b: Array, gains: Array, delay: int, broken: int, dt: float) -
 
 
 def measure(env: Env, recording: Recording) -> Measured:
-    """The share of the phase margin that hold and delay take, of the worst actuator's loop."""
+    """The phase that hold and delay take, as a multiple of what is left, in the worst actuator's loop."""
     found = physics(env)
     if found is None:
         raise NotMeasuredError("the env has no MuJoCo model that could be linearised")
     model, dt = found[0], recording.control_dt
-    if model.nq != model.nv or recording.actions.shape[1] != model.nu:
+    if model.nq != model.nv or model.na or recording.actions.shape[1] != model.nu:
         raise NotMeasuredError(
-            "only machines of hinges and slides, whose actions are controls, are linearised"
+            "only machines of hinges and slides, whose actions are controls without activation, are linearised"
         )
     low, high = np.where(
         model.actuator_ctrllimited.astype(bool)[:, None], model.actuator_ctrlrange, [-1e9, 1e9]
     ).T
+    if not recording.repeats:
+        raise NotMeasuredError(
+            "the policy gives other actions for the same observation: it is no feedback alone"
+        )
+    if not np.allclose(recording.controls, recording.executed, rtol=1e-5, atol=1e-6):
+        raise NotMeasuredError("the env makes other controls of its actions")
     gains, mean = _gains(recording, low, high)
     age = ages(env, recording)
     delay = int(np.nanmedian(age))
     a, b = _held_step(model, mean, round(dt / model.opt.timestep))
-    full = np.hstack([gains, np.zeros((model.nu, a.shape[0] - gains.shape[1]))])
     worst, evidence = 0.0, [Evidence("delay of commands", delay * dt, "s"), Evidence("hold", dt, "s")]
     for i in range(model.nu):
-        margin, crossover = loop(a, b, full, delay, i, dt)
+        margin, crossover = loop(a, b, gains, delay, i, dt)
         if np.isinf(margin):
             continue
         if margin == 0.0:
-            return Measured(
-                1.0, np.nan_to_num(age) * dt, [*evidence, Evidence("phase margin left", 0.0, "deg")]
-            )
+            if not recording.terminated.any():
+                raise NotMeasuredError(
+                    "linearised at its mean state the loop is unstable, which the machine is not"
+                )
+            evidence.append(Evidence("phase margin left", 0.0, "deg"))
+            return Measured(_UNSTABLE, np.nan_to_num(age) * dt, evidence)
         lag = float(phase_lag(crossover, dt, delay * dt)) if crossover * dt < np.pi else np.pi
-        taken = lag / (lag + margin)
+        taken = min(lag / margin, _UNSTABLE)
         if taken > worst:
             worst = taken
             name = model.actuator(i).name or f"actuator {i}"
@@ -135,5 +149,5 @@ def lines(env: Env, recording: Recording) -> tuple[str, str]:
 
 SYMPTOM = Symptom(
     "sampling and latency that use up the loop's phase margin", "section 1.3.5, zero-order hold and delay",
-    0.5, "share", ("age of commands", "s"), measure, lines, policies_only=True,
+    1.0, "times what is left", ("age of commands", "s"), measure, lines, policies_only=True,
 )  # fmt: skip

@@ -1,7 +1,8 @@
 """Recordings: what an env did under a driver, step by step."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
-from safe_wrappers.plants.env_checks import check_timing
+from safe_wrappers.plants.env_checks import check_timing, wrappers_of
 from safe_wrappers.wrappers.balance_monitor import BalanceMonitor
 from safe_wrappers.wrappers.contact_monitor import ContactMonitor
 
@@ -20,6 +21,9 @@ Driver = Callable[[Any], Any]
 """Gives an action for an observation."""
 PULSE_STEPS = 15
 """For which the attacking driver holds a corner of the action space."""
+
+LONGEST_HORIZON = 60
+"""Control steps of a proposed horizon at most: each costs a forecast of as many."""
 
 
 class Predicts(Protocol):
@@ -80,26 +84,39 @@ class Recording:
         infos: Of each step, with those of a contact and a balance monitor, where the env allows them.
         first: The first steps of episodes, shape (k,).
         terminated: Shape (k,).
-        commands: The model's control that each step left, shape (k, nu); empty without MuJoCo.
+        executed: That the unwrapped env was given, shape (k, m).
+        controls: The model's control that each step left, shape (k, nu); empty without MuJoCo.
         qpos: After each step, shape (k, nq); likewise.
         qvel: Shape (k, nv); likewise.
         contacts: After each step, pairs of geoms that touch, ids; likewise.
+        struck: Names of the two bodies with the largest force of each step; None where there was none.
         control_dt: Control interval, s; NaN where nothing says it.
+        repeats: Asked twice with the first observation, the driver has given the same action.
     """
 
     actions: Array
     infos: list[dict[str, Any]]
     first: np.ndarray
     terminated: np.ndarray
-    commands: Array
+    executed: Array
+    controls: Array
     qpos: Array
     qvel: Array
     contacts: list[set[tuple[int, int]]]
+    struck: list[tuple[str, str] | None]
     control_dt: float
+    repeats: bool
 
     def of_info(self, key: str) -> Array:
         """A number of each step's info, shape (k,); NaN where a step does not report it."""
         return np.array([float(info.get(key, np.nan)) for info in self.infos])
+
+
+def braking_horizon(recording: Recording) -> int:
+    """Control steps in which the speeds that were seen are braked, by the changes of speed that were usual."""
+    change = np.abs(np.diff(recording.qvel, axis=0)).max(axis=1)[~recording.first[1:]]
+    usual = float(np.median(change)) if change.size else 0.0
+    return int(np.clip(np.ceil(np.abs(recording.qvel).max() / max(usual, 1e-9)), 5, LONGEST_HORIZON))
 
 
 def physics(env: Env) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
@@ -126,39 +143,64 @@ def _declared_dt(env: Env) -> float:
         return math.nan
 
 
+@contextmanager
+def _spied(env: Env) -> Iterator[list[Array]]:
+    """The actions that the unwrapped env is given, as long as this lasts."""
+    raw: Any = env.unwrapped
+    step, given = raw.step, list[Array]()
+
+    def spy(action: Any) -> Any:
+        given.append(np.array(action, dtype=float))
+        return step(action)
+
+    raw.step = spy
+    try:
+        yield given
+    finally:
+        del raw.step
+
+
 def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
     """Drive the env for so many control steps, episode after episode."""
-    env, found = monitored(env), physics(env)
-    taken: dict[str, list[Any]] = {name: [] for name in ("actions", "infos", "first", "terminated")}
-    seen: dict[str, list[Any]] = {name: [] for name in ("commands", "qpos", "qvel", "contacts")}
-    observation, over, episode, control_dt = None, True, 0, _declared_dt(env)
-    for _ in range(steps):
-        if over:
-            observation, _ = env.reset(seed=seed + episode)
-            episode += 1
-        action = driver(observation)
-        before_s = found[1].time if found is not None else 0.0
-        observation, _, terminated, truncated, info = env.step(action)
-        for name, value in (
-            ("actions", np.array(action, dtype=float)), ("infos", info), ("first", over), ("terminated", terminated)
-        ):  # fmt: skip
-            taken[name].append(value)
-        over = bool(terminated or truncated)
-        if found is not None:
-            data = found[1]
-            control_dt = data.time - before_s
-            seen["commands"].append(data.ctrl.copy())
-            seen["qpos"].append(data.qpos.copy())
-            seen["qvel"].append(data.qvel.copy())
-            touching = data.contact.geom[: data.ncon][data.contact.dist[: data.ncon] <= 0.0]
-            seen["contacts"].append({(int(a), int(b)) for a, b in touching})
-    arrays = {name: np.array(values) for name, values in seen.items() if name != "contacts"}
+    found, env = physics(env), monitored(env)
+    monitor = next((one for one in wrappers_of(env) if isinstance(one, ContactMonitor)), None)
+    rows: list[tuple[Any, ...]] = []
+    states: list[tuple[Any, ...]] = []
+    contacts: list[set[tuple[int, int]]] = []
+    observation, over, episode, control_dt, repeats = None, True, 0, _declared_dt(env), False
+    with _spied(env) as given:
+        for _ in range(steps):
+            first = over
+            if first:
+                observation, _ = env.reset(seed=seed + episode)
+                episode += 1
+            if not rows:
+                repeats = np.array_equal(driver(observation), driver(observation))
+            action = np.asarray(driver(observation))
+            before_s = found[1].time if found is not None else 0.0
+            observation, _, terminated, truncated, info = env.step(action)
+            struck = None if monitor is None else monitor.peak_bodies
+            rows.append((action.astype(float), info, first, terminated, given[-1], struck))
+            over = bool(terminated or truncated)
+            if found is not None:
+                data = found[1]
+                control_dt = data.time - before_s
+                states.append((data.ctrl.copy(), data.qpos.copy(), data.qvel.copy()))
+                touching = data.contact.geom[: data.ncon][data.contact.dist[: data.ncon] <= 0.0]
+                contacts.append({(int(a), int(b)) for a, b in touching})
+    actions, infos, starts, terminated, executed, pairs = zip(*rows, strict=True)
+    controls, qpos, qvel = zip(*states, strict=True) if states else ((), (), ())
     return Recording(
-        np.array(taken["actions"]),
-        taken["infos"],
-        np.array(taken["first"]),
-        np.array(taken["terminated"]),
-        contacts=seen["contacts"],
-        control_dt=control_dt,
-        **arrays,
+        np.array(actions),
+        list(infos),
+        np.array(starts),
+        np.array(terminated),
+        np.array(executed),
+        np.array(controls),
+        np.array(qpos),
+        np.array(qvel),
+        contacts,
+        list(pairs),
+        control_dt,
+        repeats,
     )

@@ -1,7 +1,7 @@
 """diagnose: measure an env's symptoms, rank them, and try what treats them."""
 
-import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import gymnasium as gym
@@ -18,7 +18,7 @@ from safe_wrappers.diagnosis import (
     singular_poses,
     wheel_slip,
 )
-from safe_wrappers.diagnosis.finding import Diagnosis, Finding, Series, treated
+from safe_wrappers.diagnosis.finding import Diagnosis, Finding, Series
 from safe_wrappers.diagnosis.recording import (
     Driver,
     Env,
@@ -94,7 +94,7 @@ def diagnose(
     for name in chosen:
         finding = _found(env, name, recordings)
         if finding.present and finding.code:
-            finding = treated(finding, _again(env, name, finding, drivers, steps, seed))
+            finding = _treated(env, finding, drivers, steps, seed)
         findings.append(finding)
     return Diagnosis(name_of(env), steps, list(drivers), findings)
 
@@ -153,8 +153,8 @@ def _found(env: Env, name: str, recordings: Recordings) -> Finding:
     )  # fmt: skip
 
 
-def _again(env: Env, name: str, finding: Finding, drivers: dict[str, Driver], steps: int, seed: int) -> float:
-    """The figure with the finding's lines around the env; NaN where they, or the measurement, are refused."""
+def _treated(env: Env, finding: Finding, drivers: dict[str, Driver], steps: int, seed: int) -> Finding:
+    """The finding with the figure that its lines leave; lines that are refused are taken out, and it is told why."""
     import safe_wrappers
 
     scope: dict[str, Any] = {"env": env, "sw": safe_wrappers}
@@ -165,6 +165,7 @@ def _again(env: Env, name: str, finding: Finding, drivers: dict[str, Driver], st
         exec(finding.code, scope)  # the very lines that the user is told
         fresh = makers[driver](env, seed) if driver in makers else drivers[driver]
         recording = record(scope["env"], fresh, steps, seed)
-        return SYMPTOMS[name].measure(scope["env"], recording).figure
-    except (SafeWrappersError, NotMeasuredError):
-        return math.nan
+        return replace(finding, after=SYMPTOMS[finding.symptom].measure(scope["env"], recording).figure)
+    except (SafeWrappersError, NotMeasuredError) as error:
+        tool = f"{finding.advice} {finding.code.partition('(')[0].rpartition('sw.')[2]} was refused: {error}"
+        return replace(finding, code="", advice=tool.strip())

@@ -1,0 +1,288 @@
+"""Does `diagnose` find what was planted? Envs and policies with one fault each, and healthy ones.
+
+    python -m benchmarks.diagnose
+    python -m benchmarks.diagnose --only "icy ground" --steps 2000
+
+A planted symptom should rank first, the proposed lines should halve its figure in the second run, and a healthy env
+should have no symptom. The table goes to `benchmarks/results/diagnose.md`.
+"""
+
+import argparse
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import gymnasium_robotics
+import mujoco
+import numpy as np
+from scipy.linalg import solve_discrete_are
+
+import safe_wrappers as sw
+from safe_wrappers.diagnosis import Diagnosis, diagnose
+
+RESULTS = Path(__file__).parent / "results" / "diagnose.md"
+Policy = Callable[[Any], Any]
+Made = tuple[gym.Env[Any, Any], Policy | None]
+gym.register_envs(gymnasium_robotics)
+
+
+class Late(gym.Wrapper[Any, Any, Any, Any]):
+    """Executes every action so many steps late."""
+
+    def __init__(self, env: gym.Env[Any, Any], steps: int) -> None:
+        super().__init__(env)
+        self.late = steps
+
+    def reset(self, **options: Any) -> Any:
+        self.queue = [np.zeros(self.action_space.shape, self.action_space.dtype)] * self.late
+        return self.env.reset(**options)
+
+    def step(self, action: Any) -> Any:
+        self.queue.append(np.asarray(action))
+        return self.env.step(self.queue.pop(0))
+
+
+def waving(env: gym.Env[Any, Any], share: float = 0.3, period: float = 60.0, seam: int = 0) -> Policy:
+    """Slow sines; with a `seam` another phase every so many steps, as chunks have that do not fit together."""
+    high, state = env.action_space.high.astype(float), {"k": 0, "phase": 0.0}  # type: ignore[attr-defined]
+    rng = np.random.default_rng(0)
+
+    def act(observation: Any) -> Any:
+        if seam and state["k"] % seam == 0:
+            state["phase"] = rng.uniform(0.0, 2.0 * np.pi)
+        state["k"] += 1
+        angle = 2.0 * np.pi * state["k"] / period + state["phase"] + np.arange(high.size)
+        return (share * high * np.sin(angle)).astype(env.action_space.dtype)
+
+    return act
+
+
+def still(env: gym.Env[Any, Any]) -> Policy:
+    """Nothing."""
+    return lambda observation: np.zeros(env.action_space.shape, env.action_space.dtype)  # type: ignore[arg-type]
+
+
+def balancing(env: gym.Env[Any, Any]) -> Policy:
+    """A linear quadratic regulator of InvertedPendulum, from differences of one control step."""
+    raw: Any = env.unwrapped
+    model, data, n = raw.model, mujoco.MjData(raw.model), raw.model.nv
+
+    def after(x: np.ndarray) -> np.ndarray:
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = x[:n], x[n : 2 * n], x[2 * n :]
+        mujoco.mj_step(model, data, raw.frame_skip)
+        return np.concatenate([data.qpos, data.qvel])
+
+    nudges = 1e-5 * np.eye(2 * n + model.nu)
+    slopes = np.array([(after(nudge) - after(-nudge)) / 2e-5 for nudge in nudges]).T
+    a, b = slopes[:, : 2 * n], slopes[:, 2 * n :]
+    value = solve_discrete_are(a, b, np.eye(2 * n), 0.1 * np.eye(1))
+    gain = np.linalg.solve(0.1 * np.eye(1) + b.T @ value @ b, b.T @ value @ a)
+    return lambda x: np.clip(-gain @ x, -3.0, 3.0).astype(np.float32)
+
+
+ARM = """
+<mujoco><compiler autolimits="true"/><option timestep="0.002" gravity="0 0 0"/><worldbody>
+  <body name="upper"><joint name="shoulder" axis="0 0 1" damping="0.05"/>
+    <geom type="capsule" size=".02" fromto="0 0 0 .3 0 0" mass="1" contype="0" conaffinity="0"/>
+    <body name="lower" pos=".3 0 0"><joint name="elbow" axis="0 0 1" damping="0.05"/>
+      <geom type="capsule" size=".02" fromto="0 0 0 .3 0 0" mass=".5" contype="0" conaffinity="0"/>
+      <body name="tip" pos=".3 0 0"><geom size=".01" mass=".05" contype="0" conaffinity="0"/></body></body></body>
+  </worldbody><actuator><velocity joint="shoulder" kv="5" ctrlrange="-30 30"/>
+  <velocity joint="elbow" kv="5" ctrlrange="-30 30"/></actuator></mujoco>
+"""
+CART = """
+<mujoco><compiler autolimits="true"/><option timestep="0.002"/><worldbody>
+  <geom type="box" name="wall" pos="1.05 0 0" size=".05 .3 .3" solref="-{stiffness} -20"/>
+  <body name="cart"><joint name="slide" type="slide" axis="1 0 0"/>
+    <geom size=".05" mass="1" solref="-{stiffness} -20"/></body>
+  </worldbody><actuator><motor joint="slide" ctrlrange="-20 20"/></actuator></mujoco>
+"""
+STOPPED = """
+<mujoco><compiler autolimits="true"/><option timestep="0.002" gravity="0 0 0"/><worldbody>
+  <body><joint name="swing" axis="0 0 1" range="-60 60" damping=".01"/>
+    <geom type="capsule" size=".02" fromto="0 0 0 .3 0 0" mass="1"/></body>
+  </worldbody><actuator><motor joint="swing" ctrlrange="-4 4"/></actuator></mujoco>
+"""
+
+
+class Bench(gym.Env[Any, Any]):
+    """A machine of a few parts; the observation is its state."""
+
+    frame_skip = 5
+
+    def __init__(self, xml: str, start: Any = None) -> None:
+        self.model = mujoco.MjModel.from_xml_string(xml)
+        self.data = mujoco.MjData(self.model)
+        self.start = np.zeros(self.model.nq) if start is None else np.array(start)
+        self.dt = self.frame_skip * self.model.opt.timestep
+        low, high = self.model.actuator_ctrlrange.T
+        self.action_space = gym.spaces.Box(low, high, dtype=np.float64)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (self.model.nq + self.model.nv,), np.float64)
+        self.steps = 0
+
+    def _state(self) -> Any:
+        return np.concatenate([self.data.qpos, self.data.qvel])
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:] = self.start + self.np_random.uniform(-0.01, 0.01, self.model.nq)
+        mujoco.mj_forward(self.model, self.data)
+        self.steps = 0
+        return self._state(), {}
+
+    def step(self, action: Any) -> Any:
+        self.data.ctrl[:] = action
+        mujoco.mj_step(self.model, self.data, self.frame_skip)
+        self.steps += 1
+        return self._state(), 0.0, False, self.steps >= 400, {}
+
+
+def tracing(env: Bench, center: float, width: float) -> Policy:
+    """Moves the tip to and fro along x at 0.3 m/s by resolved rates, around `center`."""
+    model, data = env.model, mujoco.MjData(env.model)
+    jacobian = np.zeros((3, model.nv))
+    state = {"k": 0}
+
+    def act(observation: Any) -> Any:
+        data.qpos[:] = observation[: model.nq]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_jacBody(model, data, jacobian, None, model.body("tip").id)
+        state["k"] += 1
+        target = np.array([center + width * np.sin(0.3 / width * state["k"] * env.dt), 0.0])
+        error = target - data.body("tip").xpos[:2]
+        return np.clip(np.linalg.pinv(jacobian[:2], rcond=1e-3) @ (5.0 * error), -30.0, 30.0)
+
+    return act
+
+
+def holding(env: Bench, at: float) -> Policy:
+    """A gentle spring and damper to a position."""
+    return lambda x: np.clip(2.0 * (at - x[:1]) - 3.0 * x[1:], -3.0, 3.0)
+
+
+def _with(env: gym.Env[Any, Any], policy: Callable[[Any], Policy] | None = None) -> Made:
+    return env, None if policy is None else policy(env)
+
+
+def _lease(env: gym.Env[Any, Any]) -> Made:
+    policy = waving(env)
+    return sw.faults.Outages(env, mean_length_s=0.3, mean_between_s=1.0), policy
+
+
+PLANTED: dict[str, tuple[str, Callable[[], Made]]] = {
+    "chunks that do not fit together": (
+        "command_steps",
+        lambda: _with(gym.make("Swimmer-v5"), lambda env: waving(env, seam=10)),
+    ),
+    "chunks on a position-controlled arm": (
+        "command_steps",
+        lambda: _with(gym.make("FetchReach-v4"), lambda env: waving(env, 0.5, seam=8)),
+    ),
+    "commands three steps late": (
+        "loop_margin",
+        lambda: (Late(base := gym.make("InvertedPendulum-v5"), 3), balancing(base)),
+    ),
+    "commands two steps late": (
+        "loop_margin",
+        lambda: (Late(base := gym.make("InvertedPendulum-v5"), 2), balancing(base)),
+    ),
+    "a link that falls silent": ("late_commands", lambda: _lease(gym.make("Swimmer-v5"))),
+    "icy ground": ("wheel_slip", lambda: _with(gym.make("SafeRover-v0"))),
+    "a path through a singular pose": (
+        "singular_poses",
+        lambda: _with(env := Bench(ARM, [0.8, -1.6]), lambda _: tracing(env, 0.45, 0.165)),
+    ),
+    "a stiff wall": (
+        "contact_forces",
+        lambda: _with(Bench(CART.format(stiffness=40_000)), lambda env: waving(env, 0.5, 200.0)),
+    ),
+    "a stop that is run into": ("limits", lambda: _with(Bench(STOPPED), lambda env: waving(env, 0.5, 100.0))),
+    "hazards": ("limits", lambda: _with(gym.make("SafePointGoal1-v0"))),
+    "a speed limit": (
+        "limits",
+        lambda: _with(gym.make("SafeSwimmerVelocity-v0"), lambda env: waving(env, 1.0, 25.0)),
+    ),
+    "a maze with stiff walls": ("contact_forces", lambda: _with(gym.make("PointMaze_UMaze-v3"))),
+}
+HEALTHY: dict[str, Callable[[], Made]] = {
+    "InvertedPendulum, balanced": lambda: _with(gym.make("InvertedPendulum-v5"), balancing),
+    "Swimmer, waving": lambda: _with(gym.make("Swimmer-v5"), waving),
+    "FetchReach, waving slowly": lambda: _with(gym.make("FetchReach-v4"), lambda env: waving(env, 0.2)),
+    "SafeRover, slowly": lambda: _with(
+        sw.protect(gym.make("SafeRover-v0")), lambda env: waving(env, 0.2, 200.0)
+    ),
+    "arm, away from singular poses": lambda: _with(
+        env := Bench(ARM, [0.8, -1.6]), lambda _: tracing(env, 0.3, 0.08)
+    ),
+    "cart, held": lambda: _with(Bench(CART.format(stiffness=20_000)), lambda env: holding(env, 0.5)),
+    "swing, waving": lambda: _with(Bench(STOPPED), lambda env: waving(env, 0.02, 60.0)),
+    "SafePointGoal0": lambda: _with(gym.make("SafePointGoal0-v0")),
+    "SafePointGoal1, protected": lambda: _with(sw.protect(gym.make("SafePointGoal1-v0"))),
+    "PointMaze, protected": lambda: _with(sw.protect(gym.make("PointMaze_UMaze-v3"))),
+    "Reacher, waving": lambda: _with(gym.make("Reacher-v5"), lambda env: waving(env, 0.05)),
+    "Pusher, still": lambda: _with(gym.make("Pusher-v5"), still),
+}
+
+
+def lines(planted: bool, name: str, symptom: str, found: Diagnosis) -> str:
+    """A row of the table."""
+    first = found.present[0] if found.present else None
+    cells = [name, "planted" if planted else "healthy", symptom or "-"]
+    cells.append(", ".join(f"{one.symptom} ({one.severity:.2g})" for one in found.present) or "nothing")
+    if planted and first is not None and first.symptom == symptom:
+        cells.append(f"{first.figure:.3g} {first.unit}")
+        cells.append(f"{first.after:.3g}" if first.code else "told, no wrapper")
+    else:
+        cells += ["-", "-"]
+    return "| " + " | ".join(cells) + " |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--only", nargs="+", choices=[*PLANTED, *HEALTHY])
+    parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--words", action="store_true", help="print each diagnosis")
+    arguments = parser.parse_args()
+    warnings.simplefilter("ignore")
+    table = [
+        "| env and policy | is | planted | found (in thresholds) | figure | with the proposed lines |",
+        "|---|---|---|---|---|---|",
+    ]
+    ranked = halved = treatable = clean = 0
+    for name, (symptom, make) in PLANTED.items():
+        if arguments.only and name not in arguments.only:
+            continue
+        env, policy = make()
+        found = diagnose(env, policy, arguments.steps)
+        first = found.present[0] if found.present else None
+        if first is not None and first.symptom == symptom:
+            ranked += 1
+            treatable += bool(first.code)
+            halved += bool(first.code) and first.after <= 0.5 * first.figure
+        table.append(lines(True, name, symptom, found))
+        print(found if arguments.words else table[-1], flush=True)
+    for name, healthy in HEALTHY.items():
+        if arguments.only and name not in arguments.only:
+            continue
+        found = diagnose(*healthy(), arguments.steps)
+        clean += not found.present
+        table.append(lines(False, name, "", found))
+        print(found if arguments.words else table[-1], flush=True)
+    if arguments.only:
+        return
+    table.append("")
+    table.append(
+        f"Ranked first: {ranked} of {len(PLANTED)}. Halved by the proposed lines: {halved} of {treatable} that have "
+        f"lines. No symptom: {clean} of {len(HEALTHY)} healthy ones. {arguments.steps:,} steps per driver."
+    )
+    RESULTS.write_text("\n".join(table) + "\n")
+    print("\n".join(table))
+
+
+if __name__ == "__main__":
+    main()
