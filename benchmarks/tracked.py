@@ -41,6 +41,23 @@ PATROLLED: dict[str, Any] = {
 """Of PatrolledPointMaze on the U maze."""
 
 
+PATROLS_AT_ONCE: dict[str, Any] = PATROLLED | {
+    # The same spread of speeds in the long run, 2 * 0.2725 / 2 = q * 0.25 / 2 m^2/s^2; it may turn about at any time.
+    "tracks": [PATROLLED["tracks"][0] | {"acceleration_noise": [2.18, 0], "reversion_s": 0.25}]
+}
+"""Of PatrolledPointMaze, told that a patrol turns about within a quarter of a second."""
+
+PATROLS_TURNING: dict[str, Any] = PATROLLED | {
+    "tracks": [PATROLLED["tracks"][0] | {"turn_noise": 1.0, "start_turn_std": 0.5}]
+}
+"""Of PatrolledPointMaze, told that a patrol turns as a car does. No turn rate leads it back on its own line."""
+
+PATROLS_TURNING_AT_ONCE: dict[str, Any] = PATROLLED | {
+    "tracks": [PATROLS_AT_ONCE["tracks"][0] | {"turn_noise": 1.0, "start_turn_std": 0.5}]
+}
+"""Both."""
+
+
 def crossing(env: gym.Env[Any, Any], **changes: Any) -> sw.OcclusionPenalty:
     """OccludedCrossing with its cars tracked."""
     return sw.OcclusionPenalty(env, **(CROSSING | changes))

@@ -12,7 +12,8 @@ from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative, positive
 from safe_wrappers.control.estimation.covariance import blind_time
 from safe_wrappers.control.estimation.observability import unobservable_directions
-from safe_wrappers.control.estimation.tracks import Tracks, largest_deviation
+from safe_wrappers.control.estimation.tracks import largest_deviation
+from safe_wrappers.control.estimation.turning_tracks import TurningTracks, tracks_of
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import read_attribute
 from safe_wrappers.plants.mujoco.binding import control_interval
@@ -54,7 +55,7 @@ class OcclusionPenalty(LayerWrapper):
         track_names: One per track: the body's name, or the attribute's with an index.
         last_seen_positions: Where each was measured to be last, shape (n, d), m; before that, the initial fix.
         permitted: Tracks that may be relied on, bool (n,).
-        unobservable: Track name -> directions of its state ("x", "vy") that the sensor cannot resolve even in sight.
+        unobservable: Track name -> directions of its state that the sensor cannot resolve even in sight.
 
     Raises:
         UnsupportedEnvError: No MuJoCo model, or with `observe` neither a flat Box nor a Dict observation.
@@ -114,13 +115,9 @@ class OcclusionPenalty(LayerWrapper):
         self._look_at(raw.model)
         owners = [thing.track for thing in self._things]
         self.track_names = [thing.name for thing in self._things]
-        self.tracking = Tracks([track.motion(self._d) for track in owners])
-        self._start_std = [np.stack(stds) for stds in zip(*(t.start(self._d) for t in owners), strict=True)]
-        names = [*axes, *(f"v{axis}" for axis in axes)]
-        self.unobservable = {
-            name: list(unobservable_directions(motion.matrices()[0], self._matrix, names))
-            for name, motion in zip(self.track_names, self.tracking.motions, strict=True)
-        }
+        self.tracking = tracks_of([track.motion(self._d) for track in owners])
+        self._start_std = np.stack([track.start(self._d, self.tracking.size) for track in owners])
+        self._state_names = [*axes, *(f"v{axis}" for axis in axes)]
         self.last_seen_positions = np.zeros((len(self.track_names), self._d))
         self.permitted = np.zeros(len(self.track_names), dtype=bool)
         self.observe = bool(observe)
@@ -195,8 +192,28 @@ class OcclusionPenalty(LayerWrapper):
             reward = float(reward) - penalty
         return self._observed(observation), reward, terminated, truncated, info
 
+    @property
+    def unobservable(self) -> dict[str, list[str]]:
+        """Track name -> directions of its state ("x", "vy", "turn rate") that the sensor cannot resolve in sight.
+
+        Of a track that turns they depend on its state, and are those at the present estimate: the rank of the
+        differentials of its outputs' Lie derivatives.
+        """
+        return {name: self._unobservable(i) for i, name in enumerate(self.track_names)}
+
+    def _unobservable(self, track: int) -> list[str]:
+        motion = self.tracking.motions[track]
+        if motion.turn_noise is not None and isinstance(self.tracking, TurningTracks):
+            return list(self.tracking.unobservable(track, self._matrix, self._state_names))
+        return list(unobservable_directions(motion.matrices()[0], self._matrix, self._state_names))
+
     def permissions(self, horizon_s: float = 60.0) -> Array:
-        """How long each track may be relied on if nothing is seen from now on, s, (n,); inf beyond the horizon."""
+        """How long each track may be relied on if nothing is seen from now on, s, (n,); inf beyond the horizon.
+
+        Where a track turns, in whole control steps, the last one before the bound crosses the tolerance.
+        """
+        if isinstance(self.tracking, TurningTracks):
+            return self.tracking.blind_times(self.tolerance / self.sigmas, horizon_s, self._control_dt)
         direction = np.eye(self._d, 2 * self._d)
         times = []
         for i, motion in enumerate(self.tracking.motions):
@@ -218,15 +235,11 @@ class OcclusionPenalty(LayerWrapper):
     def _start(self) -> None:
         """The initial fix: truth plus noise of the declared size, and the declared mean velocity."""
         d, n = self._d, len(self.track_names)
-        position_std, velocity_std = self._start_std
         truth, _ = self._truth()
-        mean = np.zeros((n, 2 * d))
-        mean[:, :d] = truth[:, :d] + position_std * self._random.draw.standard_normal((n, d))
-        mean[:, d:] = np.stack([motion.mean_velocity for motion in self.tracking.motions])
-        covariance = np.zeros((n, 2 * d, 2 * d))
-        diagonal = np.concatenate([position_std, velocity_std], axis=1) ** 2
-        covariance[:, np.arange(2 * d), np.arange(2 * d)] = diagonal
-        self.tracking.start(mean, covariance)
+        mean = np.zeros((n, self.tracking.size))
+        mean[:, :d] = truth[:, :d] + self._start_std[:, :d] * self._random.draw.standard_normal((n, d))
+        mean[:, d : 2 * d] = np.stack([motion.mean_velocity for motion in self.tracking.motions])
+        self.tracking.start(mean, self._start_std[:, :, None] ** 2 * np.eye(self.tracking.size))
         self.last_seen_positions = mean[:, :d].copy()
 
     def _look(self) -> dict[str, Any]:

@@ -12,10 +12,10 @@ from scipy.linalg import subspace_angles
 
 from safe_wrappers.appendix.estimation.observability import (
     linear_observability,
-    nonlinear_observability,
     observability_matrix,
     pbh_test,
 )
+from safe_wrappers.control.estimation.lie_derivatives import nonlinear_observability
 from safe_wrappers.control.estimation.observability import (
     described,
     described_subspace,

@@ -24,8 +24,11 @@ def test_a_number_holds_for_every_coordinate_a_list_is_one_each_a_matrix_is_itse
 
 def test_the_start_is_a_number_or_one_per_coordinate():
     track = Track("a", acceleration_noise=0, start_position_std=[0.1, 0.0], start_velocity_std=0.7)
-    position, velocity = track.start(2)
-    assert position.tolist() == [0.1, 0.0] and velocity.tolist() == [0.7, 0.7]
+    assert track.start(2, 4).tolist() == [0.1, 0.0, 0.7, 0.7]
+    assert track.start(2, 5).tolist() == [0.1, 0.0, 0.7, 0.7, 0.0]  # beside one that turns
+    turning = Track("a", acceleration_noise=0, turn_noise=0.1, start_turn_std=0.2)
+    assert turning.start(2, 5).tolist() == [0.1, 0.1, 0.5, 0.5, 0.2]
+    assert turning.motion(2).turn_noise == 0.1 and track.motion(2).turn_noise is None
 
 
 @pytest.mark.parametrize(
@@ -85,7 +88,7 @@ def test_what_does_not_fit_the_coordinates_is_refused_by_name(given, words):
     track = Track("car*", **given)
     with pytest.raises(ConfigurationError, match=words):
         track.motion(2)
-        track.start(2)
+        track.start(2, 4)
 
 
 def test_a_name_alone_says_what_is_missing_and_an_unknown_key_what_there_is():

@@ -30,11 +30,14 @@ class Motion(NamedTuple):
         intensity: Of the acceleration noise, q, shape (d, d), m^2/s^3.
         reversion_s: Time constant with which the velocity reverts to its mean, s; inf for none.
         mean_velocity: Shape (d,), m/s.
+        turn_noise: Of a velocity that turns at a rate of its own, intensity of the white noise in that rate's
+            derivative, rad^2/s^3; None for one that does not turn. See `turning_tracks`.
     """
 
     intensity: Array
     reversion_s: float
     mean_velocity: Array
+    turn_noise: float | None = None
 
     def matrices(self) -> tuple[Array, Array, Array]:
         """A (2d, 2d), the constant drift b (2d,) and the noise intensity Q (2d, 2d) of `x' = A x + b + w`."""
@@ -61,6 +64,7 @@ class Tracks:
         motions: One per track, all of the same number of coordinates.
 
     Attributes:
+        size: Of a state: 2d.
         mean: Positions and velocities, shape (n, 2d), m and m/s.
         covariance: Shape (n, 2d, 2d).
     """
@@ -68,9 +72,9 @@ class Tracks:
     def __init__(self, motions: Sequence[Motion]) -> None:
         self.motions = list(motions)
         self.coordinates = self.motions[0].mean_velocity.size
-        size = 2 * self.coordinates
-        self.mean = np.zeros((len(self.motions), size))
-        self.covariance = np.zeros((len(self.motions), size, size))
+        self.size = 2 * self.coordinates
+        self.mean = np.zeros((len(self.motions), self.size))
+        self.covariance = np.zeros((len(self.motions), self.size, self.size))
         self._single: dict[float, _Over] = {}
         self._stacked: dict[tuple[float, ...], _Over] = {}
 
@@ -82,7 +86,7 @@ class Tracks:
     @property
     def velocities(self) -> Array:
         """Estimated velocities, shape (n, d), m/s."""
-        return self.mean[:, self.coordinates :]
+        return self.mean[:, self.coordinates : 2 * self.coordinates]
 
     @property
     def position_covariances(self) -> Array:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from safe_wrappers.appendix.estimation.taylor import output_series
+from safe_wrappers.control.estimation.taylor import output_series
 from safe_wrappers.errors import ConfigurationError
 
 ORDER = 8

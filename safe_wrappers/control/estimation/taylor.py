@@ -64,7 +64,7 @@ def _run(name: str, function: Function, states: Array) -> Array:
     except (TypeError, AttributeError) as error:
         raise ConfigurationError(
             f"{name} is run on Taylor series, and this failed: {error}. It may use arithmetic and NumPy's elementary "
-            "functions (see safe_wrappers.appendix.estimation.taylor), not `math`, must build its result by "
+            "functions (see safe_wrappers.control.estimation.taylor), not `math`, must build its result by "
             "`np.array([...])` and give hypot and arctan2 a first argument that varies (2 + 0 * x for 2)"
         ) from error
     if not np.isfinite(found).all():
