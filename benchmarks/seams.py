@@ -51,8 +51,9 @@ Array = NDArray[np.float64]
 
 DELAYS = (0, 2, 5)
 """Control steps."""
-RATE, TIME, RATE_AND_TIME = "rate", "time", "rate + time"
-"""What bounds a blend; `TIME` bounds no rate, and shows what the rate's bound costs."""
+RATE, TIME, RATE_AND_TIME, FLEXIBLE = "rate", "time", "rate + time", "flexible"
+"""What bounds a blend; `TIME` bounds no rate, and shows what the rate's bound costs. `FLEXIBLE` finds its bounds by
+itself, from the model, where springs ring."""
 
 
 @dataclass(frozen=True)

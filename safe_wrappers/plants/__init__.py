@@ -7,6 +7,7 @@ from safe_wrappers.plants.identified.logs import log_steps
 from safe_wrappers.plants.identified.plant import IdentifiedPlant
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
+from safe_wrappers.plants.queries.rigid_model import RigidModelCheck, rigid_model_check
 from safe_wrappers.plants.rollouts import Rollout, RolloutPlant, View
 from safe_wrappers.plants.simulator.plant import SimulatorPlant
 
@@ -17,9 +18,11 @@ __all__ = [
     "IdentifiedPlant",
     "MujocoPlant",
     "Plant",
+    "RigidModelCheck",
     "Rollout",
     "RolloutPlant",
     "SimulatorPlant",
     "View",
     "log_steps",
+    "rigid_model_check",
 ]

@@ -20,13 +20,14 @@ from safe_wrappers.plants.env_checks import check_actions, check_timing
 from safe_wrappers.plants.mujoco.inverse_dynamics import InverseDynamics
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
 from safe_wrappers.plants.plant import Plant
+from safe_wrappers.plants.queries.rigid_model import RigidModelCheck, rigid_model_check
 from safe_wrappers.serialize import plain_data, plain_numbers
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.fallback_controller import FallbackController
 from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step, WrapperRng
 from safe_wrappers.wrappers.common.receiver import SAME_STEP, CommandReceiver, receiver_inside
 from safe_wrappers.wrappers.handover.queue import BASELINES, ChunkQueue, Command
-from safe_wrappers.wrappers.handover.sizes import ChunkSizes, Upsampling, blend_bounds
+from safe_wrappers.wrappers.handover.sizes import ChunkSizes, Upsampling, blend_bounds, bounds_for_springs
 
 
 @deprecated_parameters(renamed={"jerk_limit": "rate_limit", "hold_s": "control_dt"})
@@ -61,6 +62,11 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         clock_error_s: Observation times that are ahead of `now_s` by no more count as now, s; others are refused.
         limits: Of the machine, which every blend keeps between its ends, too: it is stretched until it does, or its
             chunk is refused.
+        flexible: A `plants.rigid_model_check`, or "auto", which makes one now: where it finds that springs ring on,
+            `blend_time` and `rate_limit` are at least as strict as `vibration_share` asks, and smoothsteps that the
+            next seam comes before the end of fade out beside the next one.
+        vibration_share: Of the energy that a step of torque leaves in the springs, what a blend over the whole action
+            range may leave.
 
     Info, at every step (see `safe_wrappers.info`): ``handover/seam_jump``, ``handover/peak_jerk``,
     ``handover/blend_time``, ``handover/starved``, ``handover/limited``, ``handover/stretched``, ``handover/refused``,
@@ -100,6 +106,8 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         steps_per_entry: int = 1,
         clock_error_s: float = 0.0,
         limits: SeamLimits | Mapping[str, Any] | None = None,
+        flexible: RigidModelCheck | Mapping[str, Any] | str | None = None,
+        vibration_share: float = 0.01,
     ) -> None:
         arguments = dict(locals())
         LayerWrapper.__init__(self, env)  # first: with a handover inside the actions are no vector either
@@ -123,6 +131,7 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             decay=decay,
             steps_per_entry=sizes.steps_per_entry,
             limits=plain_data(limits),
+            flexible=plain_data(flexible),
         )
         self.chunk_size, self.execution_horizon, self.blend = sizes.entries, sizes.horizon, blend
         self.control_dt = check_timing(env, control_dt)
@@ -133,10 +142,16 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
         low, high = (np.repeat(end[None], sizes.entries, axis=0) for end in (space.low, space.high))
         self.action_space = gym.spaces.Box(low, high, dtype=space.dtype)
         self._fallback = FallbackController(env, fallback, plant)
+        springs = self._springs(flexible)
+        if springs is not None:
+            blend_time, rate_limit = bounds_for_springs(
+                springs, vibration_share, space, blend_time, rate_limit
+            )
         bounds = blend_time, rate_limit, limits
         fewest, rate_limits = blend_bounds(sizes, space, self.control_dt, blend, *bounds)
         self._check = None if limits is None else self._bound_check(limits)
-        self._queue = ChunkQueue(space, self.control_dt, blend, fewest, rate_limits, decay, self._check)
+        queue = space, self.control_dt, blend, fewest, rate_limits, decay, self._check
+        self._queue = ChunkQueue(*queue, overlap=springs is not None)
         self._inside = receiver_inside(env)
         self._random = WrapperRng(type(self).__name__)
         self._warned = False
@@ -189,6 +204,16 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
     def switch(self, source: str) -> None:
         """Name the source of the chunks from now on; the change is blended, from the last command."""
         self._queue.switch(source)
+
+    def _springs(self, flexible: Any) -> RigidModelCheck | None:
+        """What the user or the env's model says about springs that ring on; None where there are none."""
+        if flexible is None:
+            return None
+        if isinstance(flexible, str) and flexible == "auto":
+            plant = self._fallback.plant
+            flexible = rigid_model_check(self.env, plant if isinstance(plant, MujocoPlant) else None)
+        check = settings_from(RigidModelCheck, flexible, "flexible", ', or "auto"')
+        return None if check.rigid_is_good_enough else check
 
     def _bound_check(self, limits: SeamLimits) -> SeamCheck:
         if not limits.needs_dynamics:

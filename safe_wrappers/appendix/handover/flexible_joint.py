@@ -28,6 +28,7 @@ broadcast with those of M. Anything else raises `ConfigurationError`.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from safe_wrappers.control.handover.vibration import ramp_share, smoothstep_share
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -184,9 +185,6 @@ def ramp_energy(
 ) -> Array:
     """The most that the same change injects as a ramp, if it stops at its end or anywhere before, shape (...,), J.
 
-    A change s(t) from 0 to 1 excites a resonance w as a step does, times |integral of s'(t) exp(-i w t)|. For a
-    ramp that is |sin(w T / 2)| / (w T / 2) at its end: at most 2 / (w T), and never more than 1.
-
     Args:
         torque_step: Whole change, shape (..., n), N m.
         duration: T, s, positive.
@@ -195,8 +193,7 @@ def ramp_energy(
         link_inertia: See the module.
     """
     energies, omega = _step_energies(torque_step, stiffness, rotor_inertia, link_inertia)
-    share = np.minimum(1.0, 2.0 / (omega * _positive("duration", duration)))
-    return np.asarray((energies * share**2).sum(axis=-1))
+    return np.asarray((energies * ramp_share(omega * _positive("duration", duration))).sum(axis=-1))
 
 
 def smoothstep_energy(
@@ -210,10 +207,6 @@ def smoothstep_energy(
 ) -> Array:
     """The most that the same change injects as a smoothstep s = 10 x^3 - 15 x^4 + 6 x^5, x = t / T, shape (...,), J.
 
-    At its end (see `ramp_energy`) the integral is 15 j2(k) / k^2 with k = w T / 2 and the spherical Bessel function
-    j2, which stays below sqrt(1 + 3/k^2 + 9/k^4) / k. Stopped on its way, a change whose rate rises once and falls
-    once leaves at most 2 max(s') / w, by parts: 3.75 / (w T) here.
-
     Args:
         torque_step: Whole change, shape (..., n), N m.
         duration: T, s, positive.
@@ -223,9 +216,8 @@ def smoothstep_energy(
         cut_short: Bound it for a blend that may stop anywhere on its way, where its rate is not zero.
     """
     energies, omega = _step_energies(torque_step, stiffness, rotor_inertia, link_inertia)
-    k = omega * _positive("duration", duration) / 2.0
-    share = 1.875 / k if cut_short else 15.0 / k**3 * np.sqrt(1.0 + 3.0 / k**2 + 9.0 / k**4)
-    return np.asarray((energies * np.minimum(1.0, share) ** 2).sum(axis=-1))
+    share = smoothstep_share(omega * _positive("duration", duration), cut_short)
+    return np.asarray((energies * share).sum(axis=-1))
 
 
 def torque_slew_limit(

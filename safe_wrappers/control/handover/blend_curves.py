@@ -78,9 +78,9 @@ class BlendCurve(NamedTuple):
         return np.asarray(most)
 
     def motion(self) -> Motion:
-        """At both ends of every control step, and where an acceleration is largest or smallest inside of a piece."""
+        """At every quarter of a control step, and where an acceleration is largest or smallest inside of a piece."""
         extreme = interior_extrema(self.pieces, self.span, 2)
-        grid = np.arange(0.0, self.span + 0.5 * self.control_dt, self.control_dt)
+        grid = np.linspace(0.0, self.span, 4 * round(self.span / self.control_dt) + 1)
         seen = [(0.0, *self.before)]
         for i, piece in enumerate(self.pieces):
             for t in np.unique(np.concatenate([grid, extreme.minimum_at[i], extreme.maximum_at[i]])):

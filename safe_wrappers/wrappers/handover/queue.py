@@ -56,6 +56,8 @@ class ChunkQueue:
         rate_limit: Largest |du/dt| of every component, shape (m,), action units per second; infinite for none.
         decay: Ensembling weighs the i-th oldest chunk by exp(-decay i).
         check: Of the machine's limits; None accepts all blends.
+        overlap: A smoothstep that the next seam comes before the end of is not cut short: what is left of it fades
+            out beside the next one. A blend longer than the left-over holds the left-over's end.
     """
 
     def __init__(
@@ -67,9 +69,11 @@ class ChunkQueue:
         rate_limit: Array,
         decay: float,
         check: SeamCheck | None = None,
+        overlap: bool = False,
     ) -> None:
         self._control_dt, self._blend, self._fewest, self._decay = control_dt, blend, fewest, decay
         self._rate_limit, self._check = rate_limit, check
+        self._overlap = overlap and blend == "smoothstep"
         step = np.asarray(rate_limit * control_dt)
         # The difference of two commands, divided by the interval again, must not come out above the limit.
         self._step = np.where(step / control_dt > rate_limit, np.nextafter(step, 0.0), step)
@@ -88,6 +92,7 @@ class ChunkQueue:
         self._observed = -1
         self._sent = self._none
         self._plan, self._limited = self._none, np.zeros(0, dtype=bool)
+        self._asked = self._none  # the chunk in force as it came; it ends with the plan
         self._coming: list[Chunk] = []
         self._averaged: list[Chunk] = []
         self._in_force = self._source
@@ -182,13 +187,20 @@ class ChunkQueue:
         if joined is None:
             self._plan, self._limited = fresh, np.zeros(len(fresh), dtype=bool)
             return self._blend == REPLACE and len(self._sent) > 0, 0, False
-        self._plan, self._limited = joined.plan, joined.limited
+        self._plan, self._limited, self._asked = joined.plan, joined.limited, fresh
         self._fade = None
         return len(self._sent) > 0, joined.steps, joined.stretched
 
     def _joined(self, fresh: Array) -> Seam | None:
         """The blend into a chunk's rest, shape (n, m); None if none keeps the machine's limits."""
-        motion: Any = self._blend, self._sent, self._plan, fresh  # the blend's name is checked by the wrapper
+        prior = self._plan
+        if self._overlap and len(prior):
+            left, fresh = len(prior), fresh.copy()
+            fading = (prior - self._asked[-left:])[: len(fresh)]
+            fresh[: len(fading)] += fading
+            fresh = np.clip(fresh, self._low, self._high)
+            prior = np.concatenate([prior, np.repeat(prior[-1:], max(len(fresh) - left, 0), axis=0)])
+        motion: Any = self._blend, self._sent, prior, fresh  # the blend's name is checked by the wrapper
         check = None if self._check is None else partial(self._check.accepts, *motion)
         bounds: dict[str, Any] = {"rate_limit": self._rate_limit, "low": self._low, "high": self._high}
         blend: dict[str, Any] = {"blend": motion[0], "fewest": self._fewest, "accepts": check}

@@ -10,7 +10,9 @@ from safe_wrappers.checks import positive, whole_number
 from safe_wrappers.control.handover.seam_limits import SeamCheck, SeamLimits
 from safe_wrappers.control.handover.seams import BLENDS
 from safe_wrappers.control.handover.splines import hermite_series
+from safe_wrappers.control.handover.vibration import fastest_ramp, shortest_smoothstep
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.queries.rigid_model import RigidModelCheck
 from safe_wrappers.wrappers.common.layer import Array
 from safe_wrappers.wrappers.common.receiver import whole_steps
 from safe_wrappers.wrappers.handover.queue import BASELINES
@@ -93,6 +95,25 @@ def blend_bounds(
             has = f"chunk_size {sizes.chunk}, execution_horizon {sizes.horizon}, inference_delay {sizes.delay[1]}"
             raise ConfigurationError(f"{has}: no left-over to blend with: pass rate_limit or blend_time")
     return fewest, rate_limits
+
+
+def bounds_for_springs(
+    check: RigidModelCheck,
+    share: float,
+    space: gym.spaces.Box,
+    blend_time: float | None,
+    rate_limit: float | Sequence[float] | None,
+) -> tuple[float, Sequence[float] | float | None]:
+    """Blend time, s, and rate limit that leave at most a share of a step's energy in the springs, or the user's own.
+
+    A blend is so long that its smoothstep does. The rate is that of the fastest ramp over the whole action range that
+    does; a component without a range has no such rate. Each is the stricter of this and what the user gave.
+    """
+    slowest = check.resonances[0]
+    least = max(shortest_smoothstep(share, slowest), blend_time or 0.0)
+    own = np.full(space.shape, np.inf) if rate_limit is None else _rate_limits(rate_limit, space.shape[0])
+    rates = np.minimum((space.high - space.low) * fastest_ramp(share, slowest), own)
+    return least, rates.tolist() if np.isfinite(rates).all() else rate_limit
 
 
 def _size(entries: int, apart: int, letter: str) -> str:

@@ -1,0 +1,89 @@
+"""Resonances of springs in a machine, and what share of a step's energy a gradual change of torque leaves in them.
+
+A change s(t) of the torque from 0 to 1 excites a resonance w as a step does, times |integral of s'(t) exp(-i w t)|;
+the energy that is left goes with the square, the **share**. The phase is w T, over the change's duration T.
+
+Source: appendix "Flexible joint dynamics and singular perturbations"; the energies themselves are in
+`safe_wrappers.appendix.handover.flexible_joint`.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from safe_wrappers.errors import ConfigurationError
+
+Array = NDArray[np.float64]
+
+
+class Modes(NamedTuple):
+    """Vibrations of a machine, the slowest first; rigid motions have a resonance of 0."""
+
+    resonances: Array  # shape (n,), rad/s
+    damping_ratios: Array  # shape (n,), to first order in the damping; 0 for rigid motions
+    shapes: Array  # columns v with v . M v = 1, shape (n, n)
+
+
+def modes(inertia: Array, stiffness: Array, damping: Array) -> Modes:
+    """Vibrations of M x'' + D x' + K x = 0: a frame in which M is 1, and the eigenvectors of K there.
+
+    Args:
+        inertia: M, symmetric and positive definite, shape (n, n).
+        stiffness: K, symmetric and positive semidefinite, shape (n, n).
+        damping: D, shape (n, n).
+    """
+    root = np.linalg.inv(np.linalg.cholesky(inertia))
+    squares, turned = np.linalg.eigh(root @ stiffness @ root.T)
+    rigid = squares <= 1e-9 * squares.max(initial=0.0)
+    omega = np.sqrt(np.where(rigid, 0.0, squares))
+    shapes = root.T @ turned
+    own = np.einsum("ji,jk,ki->i", shapes, damping, shapes)
+    ratios = np.divide(own, 2.0 * omega, out=np.zeros_like(own), where=~rigid)
+    return Modes(omega, ratios, shapes)
+
+
+def ramp_share(phase: ArrayLike) -> Array:
+    """Most that a ramp leaves, stopped at its end or anywhere before: |sin(w T / 2) / (w T / 2)|^2 is below it."""
+    return np.asarray(np.minimum(1.0, 2.0 / np.asarray(phase, dtype=np.float64)) ** 2)
+
+
+def smoothstep_share(phase: ArrayLike, cut_short: bool = False) -> Array:
+    """Most that a smoothstep leaves, s = 10 x^3 - 15 x^4 + 6 x^5, x = t / T.
+
+    At its end the integral is 15 j2(k) / k^2 with k = w T / 2 and the spherical Bessel function j2, which stays below
+    sqrt(1 + 3/k^2 + 9/k^4) / k. Stopped on its way, a change whose rate rises once and falls once leaves at most
+    2 max(s') / w, by parts: 3.75 / (w T) here.
+
+    Args:
+        phase: w T, rad.
+        cut_short: Bound it for a change that may stop anywhere on its way, where its rate is not zero.
+    """
+    k = np.asarray(phase, dtype=np.float64) / 2.0
+    share = 1.875 / k if cut_short else 15.0 / k**3 * np.sqrt(1.0 + 3.0 / k**2 + 9.0 / k**4)
+    return np.asarray(np.minimum(1.0, share) ** 2)
+
+
+def shortest_smoothstep(share: float, resonance: float) -> float:
+    """Duration, s, from which on a smoothstep leaves at most a share in a resonance (rad/s) and any faster one."""
+    _check_share(share)
+    low, high = 0.0, 4.0 * (15.0 / math.sqrt(share)) ** (1.0 / 3.0) + 8.0  # the bound falls all along
+    for _ in range(100):
+        phase = 0.5 * (low + high)
+        if smoothstep_share(phase) > share:
+            low = phase
+        else:
+            high = phase
+    return high / resonance
+
+
+def fastest_ramp(share: float, resonance: float) -> float:
+    """Rate per change, 1/s, of the fastest ramp that leaves at most a share, in this resonance and any faster one."""
+    _check_share(share)
+    return resonance * math.sqrt(share) / 2.0
+
+
+def _check_share(share: float) -> None:
+    if not 0.0 < share < 1.0:
+        raise ConfigurationError(f"a share of a step's energy is above 0 and below 1, got {share!r}")

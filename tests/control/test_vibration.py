@@ -1,0 +1,76 @@
+"""Shares of a step's energy against integration of an oscillator, and modes against scipy's eigenvalues."""
+
+import numpy as np
+import pytest
+import scipy.linalg
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+
+from safe_wrappers.control.handover.vibration import (
+    fastest_ramp,
+    modes,
+    ramp_share,
+    shortest_smoothstep,
+    smoothstep_share,
+)
+from safe_wrappers.errors import ConfigurationError
+
+
+def left(rate, resonance, duration):
+    """|integral of s'(t) exp(-i w t)|^2 by quadrature."""
+    parts = [
+        quad(lambda t, f=f: rate(t) * f(resonance * t), 0.0, duration, limit=200, epsabs=1e-12)[0]
+        for f in (np.cos, np.sin)
+    ]
+    return parts[0] ** 2 + parts[1] ** 2
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(0.002, 0.9), st.floats(5.0, 200.0), st.floats(1.0, 4.0))
+def test_the_shortest_smoothstep_leaves_no_more_in_its_resonance_and_in_faster_ones(share, resonance, faster):
+    span = shortest_smoothstep(share, resonance)
+    assert smoothstep_share(resonance * span) == pytest.approx(share)
+    found = left(lambda t: 30 * (t / span * (1 - t / span)) ** 2 / span, faster * resonance, span)
+    assert found <= share + 1e-9
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(0.002, 0.9), st.floats(5.0, 200.0), st.floats(1.0, 4.0), st.floats(0.1, 1.0))
+def test_the_fastest_ramp_leaves_no_more_wherever_it_stops(share, resonance, faster, stopped):
+    rate = fastest_ramp(share, resonance)
+    assert ramp_share(resonance / rate) == pytest.approx(share)
+    assert left(lambda t: rate, faster * resonance, stopped / rate) <= share + 1e-9
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_modes_are_scipys_and_light_damping_moves_its_eigenvalues_as_they_say(seed):
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(2, 5))
+    roots = rng.normal(size=(3, n, n))
+    inertia = roots[0] @ roots[0].T + 0.3 * np.eye(n)
+    stiffness = roots[1] @ np.diag(np.r_[0.0, rng.uniform(50, 900, n - 1)]) @ roots[1].T  # one rigid motion
+    damping = 1e-4 * roots[2] @ roots[2].T
+    found = modes(inertia, stiffness, damping)
+    squares = np.sort(scipy.linalg.eigh(stiffness, inertia, eigvals_only=True))
+    np.testing.assert_allclose(found.resonances**2, squares, rtol=1e-6, atol=1e-6 * squares[-1])
+    assert found.resonances[0] == found.damping_ratios[0] == 0.0
+    np.testing.assert_allclose(found.shapes.T @ inertia @ found.shapes, np.eye(n), atol=1e-7)
+    system = np.block(
+        [[np.zeros((n, n)), np.eye(n)], [-np.linalg.solve(inertia, np.hstack([stiffness, damping]))]]
+    )
+    values = np.linalg.eigvals(system)
+    ringing = values[values.imag > 1e-3]
+    ringing = ringing[np.argsort(np.abs(ringing))]
+    np.testing.assert_allclose(found.resonances[1:], np.abs(ringing), rtol=1e-4)
+    np.testing.assert_allclose(
+        found.damping_ratios[1:], -ringing.real / np.abs(ringing), rtol=1e-2, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0, -0.1, float("nan")])
+def test_a_share_is_between_none_and_all(share):
+    for function in (shortest_smoothstep, fastest_ramp):
+        with pytest.raises(ConfigurationError, match="share"):
+            function(share, 60.0)

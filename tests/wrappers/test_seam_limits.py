@@ -1,0 +1,268 @@
+"""Machines' limits: no executed blend breaks them between its ends; what cannot be blended is refused."""
+
+import copy
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from chunk_worlds import Line
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.interpolate import BPoly, CubicHermiteSpline
+
+import safe_wrappers as sw
+from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
+
+HOLD = 0.1
+
+
+def driven(chunks, blend="quintic", horizon=4, delay=0, **more):
+    """The infos of some chunks on a line, and what it was sent."""
+    line = Line(chunks[0].shape[1], dtype=np.float64)
+    env = sw.ChunkHandover(line, len(chunks[0]), horizon, delay, blend=blend, fallback="hold", **more)
+    env.reset(seed=0)
+    return [env.step(chunk)[4] for chunk in chunks], np.array(line.given)
+
+
+def flat(*levels, entries=12):
+    return [np.full((entries, 1), level) for level in levels]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.floats(1.0, 40.0),
+    st.floats(10.0, 400.0),
+    st.floats(50.0, 8000.0),
+    st.sampled_from(["quintic", "hermite"]),
+)
+def test_no_executed_bridge_breaks_a_limit_anywhere(seed, velocity, acceleration, jerk, blend):
+    rng = np.random.default_rng(seed)
+    chunks = [np.linspace(*rng.uniform(-1, 1, (2, 2)), 12) for _ in range(8)]
+    limits = sw.SeamLimits(velocity=velocity, acceleration=[acceleration, None], jerk=jerk)
+    infos, sent = driven(chunks, blend, horizon=12, limits=limits)
+    for k in range(1, len(chunks)):
+        steps = round(infos[k]["handover/blend_time"] / HOLD) - 1
+        begins = 12 * k
+        if infos[k]["handover/refused"] or steps < 1 or begins < 3 or infos[k]["handover/starved"]:
+            continue
+        last = sent[begins - 3 : begins]
+        slope, bend = chunks[k][1] - chunks[k][0], np.zeros(2)
+        starts = [last[-1], (last[-1] - last[-2]) / HOLD, np.diff(last, n=2, axis=0)[0] / HOLD**2]
+        ends = [chunks[k][steps], slope / HOLD, bend]
+        kept = 3 if blend == "quintic" else 2
+        curve = BPoly.from_derivatives([0.0, (steps + 1) * HOLD], [starts[:kept], ends[:kept]])
+        t = np.linspace(0.0, (steps + 1) * HOLD, 5000)
+        np.testing.assert_allclose(
+            curve(HOLD * np.arange(1, steps + 1)), sent[begins : begins + steps], atol=1e-9
+        )
+        assert (np.abs(curve(t, 1)) <= velocity * 1.0001).all()
+        assert (np.abs(curve(t, 2))[:, 0] <= acceleration * 1.0001).all()
+        assert (np.abs(curve(t, 3)) <= jerk * 1.0001).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "order", "peak"), [("velocity", 1, 1.875), ("acceleration", 2, 5.7735026919)]
+)
+def test_a_blend_is_as_long_as_its_limit_asks_and_no_longer(name, order, peak):
+    for steps in (3, 5, 8):
+        limit = peak * 1.0 / ((steps + 1) * HOLD) ** order * 1.0001
+        infos, _ = driven(flat(-0.5, 0.5), "smoothstep", limits={name: limit})
+        assert infos[1]["handover/blend_time"] == pytest.approx((steps + 1) * HOLD)
+        assert infos[1]["handover/stretched"] == 1
+    infos, _ = driven(flat(-0.5, 0.5), "smoothstep", limits={name: 1e9})
+    assert infos[1]["handover/stretched"] == 0
+
+
+def test_without_a_blend_that_will_do_the_chunk_is_refused_and_the_old_one_goes_on():
+    chunks = flat(-0.5, 0.5, 0.5)
+    infos, sent = driven(chunks, limits={"acceleration": 0.5})
+    assert [info["handover/refused"] for info in infos] == [False, True, True]
+    assert (sent == -0.5).all()
+    assert [info["handover/latency"] for info in infos] == [0, -1, -1]
+    assert infos[2]["handover/stretched"] == 0 and not any(info["handover/starved"] for info in infos)
+    # The same within a time that would do, and beyond it.
+    enough = 5.7735026919 / 1.0**2 * 1.0001  # a second
+    for longest, refused in ((1.0, False), (0.9, True)):
+        limits = {"acceleration": enough, "max_blend_time": longest}
+        infos, _ = driven(flat(-0.5, 0.5), limits=limits)
+        assert infos[1]["handover/refused"] is refused
+
+
+def test_a_bridge_that_the_box_would_cut_is_not_taken():
+    rising, top = np.linspace(-0.8, 1.0, 12)[:, None], np.full((12, 1), 1.0)
+    limits = {"velocity": 1e6}
+    for limited, refused in ((None, False), (limits, True)):
+        bounds = {"blend_time": 0.5} if limited is None else {"limits": limited, "blend_time": 0.5}
+        infos, sent = driven([rising, top], horizon=12, **bounds)
+        assert infos[1]["handover/refused"] is refused
+        assert (
+            sent[12:15] == 1.0
+        ).any() or refused  # it was cut: the bridge goes on with the rate that it had
+
+
+def test_torque_commands_are_limited_themselves_and_by_their_slew():
+    slow = {"torque_slew": 1.875 / 0.6 * 1.0001, "command": "torque"}
+    infos, _ = driven(flat(-0.5, 0.5), limits=slow)
+    assert infos[1]["handover/blend_time"] == pytest.approx(0.6)
+    infos, _ = driven(flat(-0.5, 0.5), limits={"torque": 0.49, "command": "torque"})
+    assert infos[1]["handover/refused"]
+
+
+def test_a_change_of_source_is_faded_within_the_limits():
+    line = Line(1, dtype=np.float64)
+    limits = {"acceleration": 5.7735026919 / 0.7**2 * 1.0001}
+    env = sw.ChunkHandover(line, 1, 1, fallback="hold", limits=limits)
+    env.reset(seed=0)
+    env.switch("policy")
+    env.step(np.array([-0.5]))
+    env.switch("human")
+    info = env.step(np.array([0.5]))[4]
+    assert info["handover/blend_time"] == pytest.approx(0.7)
+
+
+def test_generous_limits_change_no_command_of_a_blend_time():
+    rng = np.random.default_rng(0)
+    chunks = [rng.uniform(-0.2, 0.2, (12, 2)) for _ in range(6)]
+    for blend in ("smoothstep", "quintic", "hermite"):
+        _, without = driven(chunks, blend, blend_time=0.4)
+        _, sent = driven(chunks, blend, blend_time=0.4, limits={"jerk": 1e12})
+        assert np.array_equal(without, sent)
+
+
+# Torques of position commands -----------------------------------------------------------------------------------
+
+PENDULUM = """<mujoco><option timestep="0.01"/><worldbody><body><joint name="j" type="hinge" axis="0 1 0"
+damping="{d}" armature="0.02"/><geom type="sphere" size="0.05" pos="0.5 0 0" mass="1.5"/></body></worldbody>
+<actuator>{a}</actuator>
+</mujoco>"""
+SERVO = '<position name="servo" joint="j" kp="50" ctrlrange="-2 2"/>'
+
+
+class Pendulum(gym.Env):
+    def __init__(self, actuator=SERVO, damping=0.3):
+        self.model = mujoco.MjModel.from_xml_string(PENDULUM.format(d=damping, a=actuator))
+        self.data, self.frame_skip, self.dt = mujoco.MjData(self.model), 2, 0.02
+        self.action_space = gym.spaces.Box(-2.0, 2.0, (1,), np.float64)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,))
+
+    def seen(self):
+        return np.concatenate([self.data.qpos, self.data.qvel]).astype(np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        return self.seen(), {}
+
+    def step(self, action):
+        self.data.ctrl[:] = action
+        mujoco.mj_step(self.model, self.data, 2)
+        return self.seen(), 0.0, False, False, {}
+
+
+def torque_by_hand(q, v, a):
+    """Of the pendulum: m g l cos q about y, axes turned; positive q turns it down."""
+    inertia = 0.02 + 1.5 * 0.5**2 + 0.4 * 1.5 * 0.05**2
+    return inertia * a - 1.5 * 9.81 * 0.5 * np.cos(q) + 0.3 * v
+
+
+def held_pendulum(limits, levels, entries=20, dt=0.02):
+    env = sw.ChunkHandover(Pendulum(), entries, 8, blend="quintic", fallback="zero", limits=limits)
+    env.reset(seed=0)
+    return [env.step(np.full((entries, 1), level))[4] for level in levels]
+
+
+def quintic_peak_torque(low, high, steps):
+    span = (steps + 1) * 0.02
+    curve = BPoly.from_derivatives([0.0, span], [[low, 0, 0], [high, 0, 0]])
+    t = np.linspace(0, span, 20001)
+    torque = torque_by_hand(curve(t), curve(t, 1), curve(t, 2))
+    return np.abs(torque).max(), np.abs(np.diff(torque)).max() / (t[1] - t[0])
+
+
+def test_a_position_commands_torque_is_that_of_the_equations_of_motion():
+    peak = np.array([quintic_peak_torque(0.2, 0.6, n) for n in range(20)])
+    for column, name in ((0, "torque"), (1, "torque_slew")):
+        for limit in (12.0, 20.0) if name == "torque" else (200.0, 900.0):
+            infos = held_pendulum({name: limit}, (0.2, 0.6))
+            steps = round(infos[1]["handover/blend_time"] / 0.02) - 1
+            # Slews are taken between quarters of a control step: a little below the steepest one.
+            assert peak[steps, column] <= limit * (1.0 if column == 0 else 1.15)
+            assert peak[steps - 1, column] > limit
+
+
+def test_a_slow_chunks_knots_are_refused_by_the_torque_steps_there():
+    rng = np.random.default_rng(1)
+    chunk = 0.3 * rng.uniform(-1, 1, (6, 1))
+    spacing = 4 * 0.02
+    rates = np.gradient(chunk, spacing, axis=0)
+    bend = CubicHermiteSpline(np.arange(6) * spacing, chunk, rates).derivative(2)
+    at = np.arange(1, 5) * spacing
+    inertia = 0.02 + 1.5 * 0.5**2 + 0.4 * 1.5 * 0.05**2
+    largest = np.abs(bend(at + 1e-9) - bend(at - 1e-9)).max() * inertia / 0.02
+    for factor, refused in ((1.001, False), (0.999, True)):
+        limits = {"torque_slew": factor * largest}
+        env = sw.ChunkHandover(
+            Pendulum(), 6, 8, steps_per_entry=4, blend="hermite", fallback="zero", limits=limits
+        )
+        env.reset(seed=0)
+        assert env.step(chunk)[4]["handover/refused"] is refused
+
+
+@pytest.mark.parametrize(
+    "actuator",
+    [
+        '<motor joint="j" ctrlrange="-2 2"/>',
+        '<position joint="j" kp="50" ctrlrange="-2 2"/><velocity joint="j" kv="1" ctrlrange="-2 2"/>',
+    ],
+)
+def test_what_is_no_position_servo_tells_no_torque(actuator):
+    env = Pendulum(actuator)
+    env.action_space = gym.spaces.Box(-2.0, 2.0, (env.model.nu,), np.float64)
+    with pytest.raises(UnsupportedEnvError, match="no position servo"):
+        sw.ChunkHandover(env, 8, 4, limits={"torque": 3.0})
+
+
+# Bad input --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("limits", "says"),
+    [
+        ({}, "limits has none; it takes velocity"),
+        ({"velocity": 0.0}, "limits.velocity must be a finite number > 0"),
+        ({"jerk": [1.0, -2.0]}, "limits.jerk"),
+        ({"velocity": [1.0, 2.0]}, "limits.velocity has 2 entries, a command 1"),
+        ({"velocity": 1.0, "command": "torque"}, "limit its torque_slew"),
+        ({"torque": 1.0, "command": "force"}, '"position" or "torque"'),
+        ({"velocity": 1.0, "max_blend_time": 0.0}, "max_blend_time"),
+        ({"speed": 1.0}, "limits has no 'speed'; it has velocity"),
+        (3.0, "limits is a SeamLimits"),
+    ],
+)
+def test_bad_limits_are_refused(limits, says):
+    with pytest.raises(ConfigurationError, match=says):
+        sw.ChunkHandover(Line(1), 8, 4, fallback="hold", limits=limits)
+
+
+def test_a_baseline_takes_no_limits():
+    with pytest.raises(ConfigurationError, match="a baseline that bounds nothing"):
+        sw.ChunkHandover(Line(1), 8, 4, blend="replace", fallback="hold", limits={"velocity": 1.0})
+
+
+def test_they_are_recorded_as_plain_data():
+    limits = sw.SeamLimits(velocity=[1.0], jerk=5.0)
+    env = sw.ChunkHandover(gym.make("InvertedPendulum-v5"), 8, 4, limits=limits)
+    recorded = env.spec.additional_wrappers[-1].kwargs["limits"]
+    assert recorded == {
+        "velocity": (1.0,),
+        "acceleration": None,
+        "jerk": 5.0,
+        "torque": None,
+        "torque_slew": None,
+        "command": "position",
+        "max_blend_time": None,
+    }
+    again = gym.make(copy.deepcopy(env.spec))
+    assert again.get_wrapper_attr("action_space") == env.action_space
