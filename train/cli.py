@@ -30,7 +30,10 @@ COMMANDS = {
     "evaluate": "evaluate the trained policies on the same episodes, with the filter off and on",
     "compare": "train, evaluate, and print the comparison",
     "report": "write the comparison as one HTML page, from what is already there; of several, also an overview",
+    "diagnose": "run an env, and a policy: what is wrong, and which wrapper treats it; takes ENV for CONFIG.yaml",
 }
+
+DIAGNOSED_STEPS = 2000
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -60,6 +63,13 @@ def _main(arguments: Sequence[str] | None) -> int:
 
 
 def _run(options: argparse.Namespace, console: Console) -> None:
+    if options.command == "diagnose":
+        from .diagnosis import diagnose_command
+
+        output = options.output or Path("diagnosis.html")
+        words = ["safe-wrappers", *(sys.argv[1:] if options.given is None else options.given)]
+        diagnose_command(options.words[0], options.policy, options.steps, output, shlex.join(words), console)
+        return
     from .config import parse_experiment, read_config
 
     settings = [read_config(config, options.overrides) for config in options.configs]
@@ -116,6 +126,14 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = make_parser()
     # Subparsers would take no words behind an option: `compare a.yaml --report seeds=[0]`.
     options = parser.parse_intermixed_args(arguments)
+    options.given = arguments
+    if options.command != "diagnose" and (options.policy or options.steps != DIAGNOSED_STEPS):
+        parser.error(f"{options.command} takes no --policy and no --steps; diagnose does")
+    if options.command == "diagnose":
+        if len(options.words) > 1 or options.report:
+            parser.error("diagnose takes one ENV, --policy, --steps and --output")
+        options.configs = []
+        return options
     options.configs = [Path(word) for word in options.words if "=" not in word]
     options.overrides = [word for word in options.words if "=" in word]
     if not options.configs:
@@ -148,7 +166,20 @@ def make_parser() -> argparse.ArgumentParser:
         "--output",
         type=Path,
         metavar="PAGE.html",
-        help="of report: where to (default: report.html beside the runs; of several, overview.html)",
+        help="of report: where to (default: report.html beside the runs; of several, overview.html); of diagnose "
+        "(default: diagnosis.html; the same as JSON beside it)",
+    )
+    parser.add_argument(
+        "--policy",
+        type=Path,
+        metavar="RUN",
+        help="of diagnose: a run's folder, runs/NAME/ARM/seed_N, or a model.zip of Stable-Baselines3",
+    )
+    parser.add_argument(
+        "--steps",
+        type=int,
+        default=DIAGNOSED_STEPS,
+        help="of diagnose: control steps of each driver (default: %(default)s)",
     )
     parser.add_argument("--version", action="version", version=version("safe-wrappers"))
     return parser

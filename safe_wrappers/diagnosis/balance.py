@@ -3,13 +3,17 @@
 import numpy as np
 
 from safe_wrappers.diagnosis.finding import Evidence
-from safe_wrappers.diagnosis.recording import Env, Recording
+from safe_wrappers.diagnosis.recording import Env, Recording, physics
 from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom
+from safe_wrappers.diagnosis.wheel_slip import wheels
 from safe_wrappers.plants.env_checks import name_of
 
 
 def measure(env: Env, recording: Recording) -> Measured:
     """The share of steps with a foot at the edge of its friction cone, or outside of the support polygon."""
+    found = physics(env)
+    if found is not None and wheels(found[0]):
+        raise NotMeasuredError("it rolls: its wheels are judged by their slip")
     friction, zmp = recording.of_info("balance/friction_used"), recording.of_info("balance/zmp_margin")
     if np.isnan(friction).all():
         raise NotMeasuredError(

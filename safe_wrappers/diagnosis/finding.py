@@ -144,7 +144,7 @@ class Diagnosis:
             lines.append(f"  {_verdict(finding):9} {finding.symptom:16} {_words(finding)}")
             if finding.present and finding.code:
                 lines += [f"      {line}" for line in finding.code.splitlines()]
-                lines.append(f"      with these lines: {_amount(finding.after, finding.unit)}")
+                lines.append(f"      with these lines: {amount(finding.after, finding.unit)}")
             if finding.present and finding.advice:
                 lines.append(f"      {finding.advice}")
         return "\n".join(lines)
@@ -157,11 +157,12 @@ def _verdict(finding: Finding) -> str:
 def _words(finding: Finding) -> str:
     if finding.missing:
         return finding.missing
-    limit = _amount(finding.threshold, finding.unit)
-    return f"{finding.title}: {_amount(finding.figure, finding.unit)} (from {limit} on; {finding.section})"
+    limit = amount(finding.threshold, finding.unit)
+    return f"{finding.title}: {amount(finding.figure, finding.unit)} (from {limit} on; {finding.section})"
 
 
-def _amount(value: float, unit: str) -> str:
+def amount(value: float, unit: str) -> str:
+    """A number with its unit, for people."""
     if math.isnan(value):
         return "not measured"
     return f"{100.0 * value:.3g} %" if unit == "share" else f"{value:.3g} {unit}".strip()

@@ -188,13 +188,13 @@ def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
                 states.append((data.ctrl.copy(), data.qpos.copy(), data.qvel.copy()))
                 touching = data.contact.geom[: data.ncon][data.contact.dist[: data.ncon] <= 0.0]
                 contacts.append({(int(a), int(b)) for a, b in touching})
-    actions, infos, starts, terminated, executed, pairs = zip(*rows, strict=True)
+    actions, infos, starts, ends, executed, pairs = zip(*rows, strict=True)
     controls, qpos, qvel = zip(*states, strict=True) if states else ((), (), ())
     return Recording(
         np.array(actions),
         list(infos),
         np.array(starts),
-        np.array(terminated),
+        np.array(ends),
         np.array(executed),
         np.array(controls),
         np.array(qpos),

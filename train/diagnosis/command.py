@@ -1,0 +1,44 @@
+"""The command: makes the env, loads the policy, diagnoses, prints, and writes page and JSON."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+from rich.console import Console
+
+from safe_wrappers.diagnosis import Diagnosis, diagnose
+
+from ..config.env_ids import check_env_id
+from .page import diagnosis_page
+from .trained import of_file, of_run
+
+
+def diagnose_command(
+    env_id: str, policy: Path | None, steps: int, output: Path, command: str, console: Console
+) -> Diagnosis:
+    """Diagnose an env by its id, and write the page, and the same as JSON beside it.
+
+    Args:
+        env_id: As `gym.make` takes it.
+        policy: A run's folder, or a model.zip; None: random and attacking drivers alone.
+        steps: Control steps of each driver.
+        output: The page.
+        command: For the page.
+        console: Where the table goes.
+    """
+    acts: Any = None
+    if policy is not None and policy.suffix != ".zip":
+        env, acts = of_run(policy, env_id)
+    else:
+        env = gym.make(check_env_id(env_id))
+        acts = acts if policy is None else of_file(policy)
+    found = diagnose(env, acts, steps)
+    env.close()
+    output.parent.mkdir(parents=True, exist_ok=True)
+    output.with_suffix(".json").write_text(found.as_json())
+    output.write_text(diagnosis_page(found, command))
+    console.print(str(found), highlight=False, markup=False, soft_wrap=True)
+    console.print(f"Page: {output}", highlight=False, soft_wrap=True)
+    return found
