@@ -6,7 +6,7 @@ import pytest
 
 from safe_wrappers.errors import UnsupportedEnvError
 from safe_wrappers.plants.mujoco.contacts import Contacts
-from safe_wrappers.plants.queries.next_impact import NextImpact
+from safe_wrappers.plants.queries.next_impact import NextImpact, _velocities
 
 ARM = """<mujoco><option timestep="0.005" gravity="0 0 0"/><worldbody>
 <geom name="floor" type="plane" pos="0 0 -.6" euler="5 0 0" size="3 3 .1"/>
@@ -89,6 +89,26 @@ def test_it_is_the_soonest_of_all_pairs_by_differences_of_their_distances():
         assert impact.mass == pytest.approx(mass, rel=1e-4)
         hit.add(impact.bodies)
     assert len(hit) >= 4
+
+
+def test_the_pairs_are_those_that_mujoco_lets_collide():
+    near = finder(mujoco.MjModel.from_xml_string(ARM))
+    found = [tuple(sorted(pair)) for pair in zip(near._first.tolist(), near._second.tolist(), strict=True)]
+    assert set(found) == pairs_of_mujoco() and len(found) == len(set(found))
+
+
+def test_no_pair_is_left_out_that_would_be_the_first():
+    model, skipped = mujoco.MjModel.from_xml_string(ARM), 0
+    near, all_of_them = finder(model), finder(model)
+    whole = all_of_them._in_order
+    all_of_them._in_order = lambda *motion: [(pair, 0.0) for pair, _ in whole(*motion)]
+    for data in states(model, 300):
+        data.qvel[[0, 1, 2, 6, 7, 8, 12, 13, 14]] *= 50.0  # it spins more than it moves
+        impact = near.of(data)
+        assert impact == all_of_them.of(data) or impact.time_s == np.inf
+        order = near._in_order(*_velocities(model, near._data))
+        skipped += sum(least_s > impact.time_s for _, least_s in order)
+    assert skipped > 100
 
 
 def test_only_watched_pairs_count_and_the_state_is_only_read():
