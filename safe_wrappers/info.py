@@ -246,6 +246,21 @@ CONTACT_PENETRATION: Final = _key("contact/penetration", "float64", unit="m", ch
 """The largest penetration depth."""
 CONTACT_RESIDUAL: Final = _key("contact/residual", "float64", unit="N m", chunk="max")
 """The largest ``|gap * force|`` of a contact: the violation of complementarity."""
+CONTACT_JUDGED: Final = _key("contact/judged", "int64", chunk="sum")
+"""How many contacts the figures are of; one counts at every evaluation of the physics that has it."""
+CONTACT_PULL: Final = _key("contact/pull", "float64", unit="N", chunk="max", where="contact/judged")
+"""The largest normal force that pulls, 0 where all push; NaN where no contact was judged."""
+CONTACT_OPEN_FORCE: Final = _key(
+    "contact/open_force", "float64", unit="N", chunk="max", where="contact/judged"
+)
+"""The largest normal force, of either sign, across an open gap, 0 without one; NaN where no contact was judged."""
+CONTACT_NEXT_TIME: Final = _key("contact/next_time", "float64", unit="s")
+"""With `restitution`: until the next watched pair of geoms touches, at the speeds after the step; inf where none
+approaches, NaN of a state that is not finite."""
+CONTACT_NEXT_IMPULSE: Final = _key("contact/next_impulse", "float64", unit="N s")
+"""With `restitution`: the impulse of that impact, `m (1 + e) v` along its normal; NaN without one."""
+CONTACT_NEXT_FORCE: Final = _key("contact/next_force", "float64", unit="N")
+"""With `restitution`: the peak force of that impact, `v sqrt(k m)`; NaN without one or without `stiffness`."""
 CONTACT_PARTIAL: Final = _key("contact/partial", "bool", chunk="any")
 """Not every substep was seen; the other keys describe only the last substep."""
 

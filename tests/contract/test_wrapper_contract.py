@@ -131,6 +131,7 @@ EXAMPLES = {
             "HalfCheetah-v5",
             lambda: {"bodies": ["bfoot", "ffoot"], "against": ["world"]},
         ),
+        "impacts to come": ("Ant-v5", lambda: {"restitution": 0.2, "stiffness": 1e4}),
     },
     "CostFunction": {
         "a function": ("Reacher-v5", lambda: {"fn": _joint_speed}),
@@ -530,9 +531,14 @@ def test_it_forwards_no_attributes(name, case):
 # 7, 8: info ---------------------------------------------------------------------------------------------------
 
 
+def kind(value):
+    # A number that nobody judged is a float of its own kind.
+    return "float" if isinstance(value, float) else type(value).__name__
+
+
 def types(info):
     return {
-        k: (v.dtype.str, v.shape) if isinstance(v, np.ndarray) else type(v).__name__
+        k: (v.dtype.str, v.shape) if isinstance(v, np.ndarray) else kind(v)
         for k, v in info.items()
         if k not in ("interventions", "episode")  # at an episode's end only, by design
     }

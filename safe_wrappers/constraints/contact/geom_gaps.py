@@ -9,15 +9,7 @@ from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.mujoco.plant import MujocoPlant
-
-_FAR = 1e6  # largest distance that is measured, m
-# Offsets at which a distance is measured again, m.
-_BESIDE = 1e-7 * np.array(
-    [[0.0, 0.0, 0.0], [1.0, 0.3, 0.2], [-0.3, 1.0, -0.5], [0.4, -0.6, 1.0], [-1.0, -0.7, -0.4]]
-)
-_ROUND = int(mujoco.mjtGeom.mjGEOM_CAPSULE)  # up to it: planes, height fields, spheres, capsules
-_NUDGE = 1e-6  # width of the differences that give a normal, m
-_NORMAL = 1e-9  # distance below which the nearest points give no normal, m
+from safe_wrappers.plants.queries.geom_distance import geom_distance, nearest
 
 
 class GeomGaps:
@@ -56,30 +48,10 @@ class GeomGaps:
         self.pairs = [(a, b) for a in dict.fromkeys(own) for b in dict.fromkeys(others)]
         self.touch = np.array([max(m.geom_margin[a], m.geom_margin[b], 0.0) for a, b in self.pairs])
         self.moves = np.array([tree[b] >= 0 for _, b in self.pairs])
-        self._segment = np.zeros(6)
 
     def nearest(self, model: mujoco.MjModel, data: mujoco.MjData, pair: int) -> tuple[float, Array, Array]:
         """Distance (m), the unit normal from the machine to the world, and the nearest points of both, shape (6,)."""
-        a, b = self.pairs[pair]
-        gap = _distance(model, data, a, b, self._segment)
-        between = self._segment[3:] - self._segment[:3]
-        length = float(np.linalg.norm(between))
-        points = self._segment.copy()
-        if length < _NORMAL:
-            return gap, self._steepest(model, data, a, b), points
-        return gap, np.asarray(between * (np.sign(gap) / length)), points
-
-    def _steepest(self, model: mujoco.MjModel, data: mujoco.MjData, a: int, b: int) -> Array:
-        """The direction in which moving the machine's geom shortens the distance most: a normal, by differences."""
-        place, steepest = data.geom_xpos[a].copy(), np.zeros(3)
-        for axis, nudge in enumerate(_NUDGE * np.eye(3)):
-            ends = []
-            for moved in (place - nudge, place + nudge):
-                data.geom_xpos[a] = moved
-                ends.append(_distance(model, data, a, b, None))
-            steepest[axis] = ends[0] - ends[1]
-        data.geom_xpos[a] = place
-        return np.asarray(steepest / max(float(np.linalg.norm(steepest)), _NUDGE**2))
+        return nearest(model, data, *self.pairs[pair])
 
     def touched(
         self, plant: MujocoPlant, forecast: Forecast, data: mujoco.MjData, pair: int
@@ -99,7 +71,7 @@ class GeomGaps:
         while instant < k:
             data.geom_xpos[a], data.geom_xmat[a] = centres[instant], axes[instant].ravel()
             data.geom_xpos[b], data.geom_xmat[b] = other[instant], others[instant].ravel()
-            gap = _distance(m, data, a, b, None)
+            gap = geom_distance(m, data, a, b)
             if gap <= touch:
                 ends = (instant + 1) % plant.substeps == 0
                 if before == np.inf or ends or (back and gap < before):
@@ -109,26 +81,6 @@ class GeomGaps:
             else:
                 before, back = np.inf, False
                 instant = max(instant + 1, int(np.searchsorted(way, way[instant] + gap - touch)))
-
-
-def _distance(model: mujoco.MjModel, data: mujoco.MjData, a: int, b: int, segment: Array | None) -> float:
-    """MuJoCo's distance of two geoms, m, and the nearest points into `segment`."""
-    # For about one in thirty pairs of boxes that are apart MuJoCo 3.11 returns 0, or the wrong sign: they are
-    # measured again at small offsets, and the median of the results other than 0 counts. Round geoms do not need it.
-    gap = mujoco.mj_geomDistance(model, data, a, b, _FAR, segment)
-    if gap > 0.0 or model.geom_type[a] <= _ROUND or model.geom_type[b] <= _ROUND:
-        return float(gap)
-    place, answers = data.geom_xpos[a].copy(), []
-    for beside in _BESIDE:
-        data.geom_xpos[a] = place + beside
-        answers.append((float(mujoco.mj_geomDistance(model, data, a, b, _FAR, None)), beside))
-    there = sorted((a for a in answers if a[0] != 0.0), key=lambda a: a[0]) or answers
-    gap, beside = there[len(there) // 2]
-    if segment is not None:
-        data.geom_xpos[a] = place + beside
-        mujoco.mj_geomDistance(model, data, a, b, _FAR, segment)
-    data.geom_xpos[a] = place
-    return gap
 
 
 def _geoms(plant: MujocoPlant, name: str) -> list[int]:

@@ -31,6 +31,9 @@ class NormalContact(NamedTuple):
 class Contacts:
     """Reads the contacts between the named bodies of a model and those they touch; None is all of them.
 
+    Attributes:
+        watched: Which two bodies count, shape (nbody + 1, nbody + 1); the last stands for flexible parts.
+
     Raises:
         UnknownNameError: No body has that name; the message lists all names.
     """
@@ -40,7 +43,8 @@ class Contacts:
     ) -> None:
         self.model = model
         one, other = _chosen(model, "bodies", bodies), _chosen(model, "against", against)
-        self._watched = (one[:, None] & other | other[:, None] & one).tolist()
+        self.watched = one[:, None] & other | other[:, None] & one
+        self._watched = self.watched.tolist()
         # The last entry is for geom -1, of something flexible.
         self._body_of_geom: list[int] = [*model.geom_bodyid.tolist(), model.nbody]
         # A pyramidal cone's edges share the normal force; an elliptic cone's first row has it.
