@@ -64,7 +64,7 @@ class Job:
         env: Its id.
         task: Its table's name.
         blend: As `ChunkHandover` takes it.
-        bounds: `RATE`, `TIME`, `RATE_AND_TIME`, or "-" for a baseline.
+        bounds: `RATE`, `TIME`, `RATE_AND_TIME`, `FLEXIBLE`, or "-" for a baseline.
         delay: Control steps.
     """
 
@@ -80,7 +80,8 @@ class Job:
 def jobs(task: Task, episodes: int, seed: int) -> list[Job]:
     """The rows of an env's table."""
     ways = [("replace", "-"), ("ensemble", "-")]
-    ways += [(blend, bounds) for bounds in (RATE, TIME, RATE_AND_TIME) for blend in BLENDS]
+    springs = (FLEXIBLE,) if "Flex" in task.env else ()
+    ways += [(blend, bounds) for bounds in (RATE, TIME, RATE_AND_TIME, *springs) for blend in BLENDS]
     return [
         Job(task.env, task.name, blend, bounds, delay, episodes, seed)
         for delay in DELAYS
@@ -230,6 +231,7 @@ def run(job: Job, task: Task, act: Policy) -> dict[str, Any]:
         RATE: {"rate_limit": bounds.rate_limit},
         TIME: {"blend_time": bounds.blend_time},
         RATE_AND_TIME: {"rate_limit": bounds.rate_limit, "blend_time": bounds.blend_time},
+        FLEXIBLE: {"flexible": "auto"},
     }[job.bounds]
     env = sw.ChunkHandover(recorder, task.chunk, task.horizon, job.delay, blend=job.blend, **given)
     seeds = range(1000 * job.seed, 1000 * job.seed + job.episodes)
@@ -261,13 +263,16 @@ def run(job: Job, task: Task, act: Policy) -> dict[str, Any]:
     }
 
 
-def measured(tasks: tuple[Task, ...], episodes: int, seed: int, runs: Path) -> Iterator[dict[str, Any]]:
-    """Train what is not there, then all rows."""
+def measured(
+    tasks: tuple[Task, ...], episodes: int, seed: int, runs: Path, bounds: list[str] | None = None
+) -> Iterator[dict[str, Any]]:
+    """Train what is not there, then all rows, or those with some bounds."""
     torch.set_num_threads(1)
     for task in tasks:
         act = policy(task, runs)
         for job in jobs(task, episodes, seed):
-            yield run(job, task, act)
+            if bounds is None or job.bounds in bounds:
+                yield run(job, task, act)
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -275,7 +280,8 @@ def table(rows: list[dict[str, Any]]) -> str:
     blended = [r for r in rows if r["bounds"] in (RATE, RATE_AND_TIME)]
     within, seams = (sum(r[key] for r in blended) for key in ("within", "seams"))
     parts = [
-        _part(name, [r for r in rows if r["task"] == name]) for name in dict.fromkeys(r["task"] for r in rows)
+        _part(name, sorted((r for r in rows if r["task"] == name), key=lambda r: r["delay"]))
+        for name in dict.fromkeys(r["task"] for r in rows)
     ]
     return "\n\n".join(
         [
@@ -321,7 +327,7 @@ def _part(name: str, rows: list[dict[str, Any]]) -> str:
             *jumps,
             f"{r['rate_peak']:.2f}",
             f"{r['within'] / r['seams']:.1%}",
-            f"{r['limited']:.1%}" if r["bounds"] in (RATE, RATE_AND_TIME) else "-",
+            f"{r['limited']:.1%}" if r["bounds"] in (RATE, RATE_AND_TIME, FLEXIBLE) else "-",
             "-" if r["bounds"] == "-" else f"{1e3 * r['blend_time_mean_s']:.0f}, {r['cut_short']:.0%}",
             energies,
             lower,
@@ -351,6 +357,9 @@ def main() -> None:
         nargs="+",
         help="words; a task whose name has one of them is run, and its rows take their place in the tables",
     )
+    parser.add_argument(
+        "--bounds", nargs="+", help="only rows with these bounds; the others stay as they are"
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--runs", type=Path, default=RUNS, help="folder of the trained policies")
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder for the rows and the tables")
@@ -363,9 +372,13 @@ def main() -> None:
     arguments.results.mkdir(parents=True, exist_ok=True)
     names = [task.name for task in tasks]
     kept = arguments.results / "seams.json"
-    others = json.loads(kept.read_text()) if kept.exists() and arguments.envs else []
-    rows: list[dict[str, Any]] = [row for row in others if row["task"] not in names]
-    for row in measured(tasks, arguments.episodes, arguments.seed, arguments.runs):
+    some = arguments.envs or arguments.bounds
+    others = json.loads(kept.read_text()) if kept.exists() and some else []
+    again = [
+        row["task"] in names and row["bounds"] in (arguments.bounds or [row["bounds"]]) for row in others
+    ]
+    rows: list[dict[str, Any]] = [row for row, fresh in zip(others, again, strict=True) if not fresh]
+    for row in measured(tasks, arguments.episodes, arguments.seed, arguments.runs, arguments.bounds):
         rows.append(row)
         kept.write_text(json.dumps(rows, indent=1) + "\n")
         (arguments.results / "seams.md").write_text(table(rows) + "\n")

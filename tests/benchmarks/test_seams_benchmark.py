@@ -187,7 +187,7 @@ def test_a_tiny_run_trains_once_and_writes_every_row(tmp_path, monkeypatch, caps
     monkeypatch.setattr(chunk_policy, "train", counted)
     seams.main()
     rows = json.loads((tmp_path / "seams.json").read_text())
-    assert len(rows) == sum(len(jobs(task, 2, 0)) for task in TINY) == 44
+    assert len(rows) == sum(len(jobs(task, 2, 0)) for task in TINY) == 50
     for row in rows:
         with_rate = row["bounds"] in ("rate", "rate + time")
         assert row["within"] == row["seams"] or not with_rate
@@ -199,7 +199,7 @@ def test_a_tiny_run_trains_once_and_writes_every_row(tmp_path, monkeypatch, caps
         assert row["tracking_error_mean_m"] > 0.0 > row["return_mean"]
     printed = capsys.readouterr().out
     assert (tmp_path / "seams.md").read_text() in printed
-    assert printed.count("\n| ") == 44 + 2
+    assert printed.count("\n| ") == 50 + 2
 
     assert trained == ["FlexJointReach-v0", "Reacher-v5"]
     before = (tmp_path / "seams.json").read_text()
@@ -212,6 +212,13 @@ def test_a_tiny_run_trains_once_and_writes_every_row(tmp_path, monkeypatch, caps
     seams.main()  # the other task's rows stay, these are made anew
     again = json.loads((tmp_path / "seams.json").read_text())
     assert sorted(again, key=str) == sorted(rows, key=str) and again != rows
+
+    monkeypatch.setattr(sys, "argv", [*arguments, "--bounds", "flexible"])
+    seams.main()  # only six rows are made anew, and stand in their places in the table
+    partly = json.loads((tmp_path / "seams.json").read_text())
+    assert sorted(partly, key=str) == sorted(rows, key=str)
+    assert [row["bounds"] for row in partly[-6:]] == ["flexible"] * 6
+    assert table(again) == (tmp_path / "seams.md").read_text().rstrip("\n")
 
 
 @pytest.mark.slow

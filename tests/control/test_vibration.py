@@ -7,13 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from safe_wrappers.control.handover.vibration import (
-    fastest_ramp,
-    modes,
-    ramp_share,
-    shortest_smoothstep,
-    smoothstep_share,
-)
+from safe_wrappers.control.handover.vibration import modes, shortest_smoothstep, smoothstep_share
 from safe_wrappers.errors import ConfigurationError
 
 
@@ -33,14 +27,6 @@ def test_the_shortest_smoothstep_leaves_no_more_in_its_resonance_and_in_faster_o
     assert smoothstep_share(resonance * span) == pytest.approx(share)
     found = left(lambda t: 30 * (t / span * (1 - t / span)) ** 2 / span, faster * resonance, span)
     assert found <= share + 1e-9
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.floats(0.002, 0.9), st.floats(5.0, 200.0), st.floats(1.0, 4.0), st.floats(0.1, 1.0))
-def test_the_fastest_ramp_leaves_no_more_wherever_it_stops(share, resonance, faster, stopped):
-    rate = fastest_ramp(share, resonance)
-    assert ramp_share(resonance / rate) == pytest.approx(share)
-    assert left(lambda t: rate, faster * resonance, stopped / rate) <= share + 1e-9
 
 
 @settings(max_examples=40, deadline=None)
@@ -71,6 +57,5 @@ def test_modes_are_scipys_and_light_damping_moves_its_eigenvalues_as_they_say(se
 
 @pytest.mark.parametrize("share", [0.0, 1.0, -0.1, float("nan")])
 def test_a_share_is_between_none_and_all(share):
-    for function in (shortest_smoothstep, fastest_ramp):
-        with pytest.raises(ConfigurationError, match="share"):
-            function(share, 60.0)
+    with pytest.raises(ConfigurationError, match="share"):
+        shortest_smoothstep(share, 60.0)

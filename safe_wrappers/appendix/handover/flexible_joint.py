@@ -28,7 +28,7 @@ broadcast with those of M. Anything else raises `ConfigurationError`.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from safe_wrappers.control.handover.vibration import ramp_share, smoothstep_share
+from safe_wrappers.control.handover.vibration import smoothstep_share
 from safe_wrappers.errors import ConfigurationError
 
 Array = NDArray[np.float64]
@@ -185,6 +185,9 @@ def ramp_energy(
 ) -> Array:
     """The most that the same change injects as a ramp, if it stops at its end or anywhere before, shape (...,), J.
 
+    At its end it leaves the share |sin(w T / 2) / (w T / 2)|^2 (see `safe_wrappers.control.handover.vibration`): at
+    most (2 / (w T))^2, and never more than 1.
+
     Args:
         torque_step: Whole change, shape (..., n), N m.
         duration: T, s, positive.
@@ -193,7 +196,8 @@ def ramp_energy(
         link_inertia: See the module.
     """
     energies, omega = _step_energies(torque_step, stiffness, rotor_inertia, link_inertia)
-    return np.asarray((energies * ramp_share(omega * _positive("duration", duration))).sum(axis=-1))
+    share = np.minimum(1.0, 2.0 / (omega * _positive("duration", duration)))
+    return np.asarray((energies * share**2).sum(axis=-1))
 
 
 def smoothstep_energy(

@@ -57,10 +57,12 @@ class BlendCurve(NamedTuple):
             pieces = _mixed(sent, prior, new, steps) / control_dt ** np.arange(9.0)
             return cls(pieces, control_dt, before, after, control_dt)
         span = (steps + 1) * control_dt
+        q0, v0, a0 = before
+        q1, v1, a1 = after
         if blend == "quintic":
-            bridge = quintic_coefficients(*before, *after, span)
+            bridge = quintic_coefficients(q0, v0, a0, q1, v1, a1, span)
         else:
-            bridge = hermite_coefficients(*before[:2], *after[:2], span)
+            bridge = hermite_coefficients(q0, v0, q1, v1, span)
         return cls(bridge[None], span, before, after, control_dt)
 
     def peak(self, derivative: int) -> Array:

@@ -55,6 +55,7 @@ def join(
     low: Array | float = -np.inf,
     high: Array | float = np.inf,
     accepts: Callable[[int], bool] | None = None,
+    hold_back: bool = True,
 ) -> Seam | None:
     """The shortest blend from what was sent into a new stream that keeps the rate limit.
 
@@ -75,13 +76,15 @@ def join(
         high: Likewise.
         accepts: Whether a blend of so many steps will do, 0 for none, asked from the shortest on of those that keep
             the rate limit and that the box does not cut. If none will do, the result is None.
+        hold_back: False leaves it to the caller to limit the rate of what no blend can.
     """
     step = np.asarray(rate_limit * control_dt)
+    held = step if hold_back else np.inf
     if not len(sent):
-        plan, limited = limit_rate(new, None, step)
+        plan, limited = limit_rate(new, None, held)
         return Seam(plan, 0, limited)
     fewest = min(fewest, len(new) - 1)
-    uncut = np.ones(len(new), dtype=bool)
+    uncut: NDArray[np.bool_] = np.ones(len(new), dtype=bool)
     if accepts is None and fewest == 0 and (np.abs(new[0] - sent[-1]) <= step).all():
         candidates, first = new[None, :], 0
     else:
@@ -91,7 +94,7 @@ def join(
         else:
             bridges = _bridged(sent, new, blend, first)
             candidates = np.clip(bridges, low, high)
-            uncut = np.isclose(bridges, candidates, rtol=1e-9, atol=1e-12).all(axis=(1, 2))
+            uncut = np.asarray(np.isclose(bridges, candidates, rtol=1e-9, atol=1e-12).all(axis=(1, 2)))
     peaks = _peaks(candidates, sent[-1], first, step)
     kept = np.flatnonzero(peaks <= 1.0)
     chosen: int | None = int(kept[0]) if kept.size else int(np.argmin(peaks))
@@ -101,7 +104,7 @@ def join(
         return None
     steps = first + chosen
     plan = np.concatenate([candidates[chosen, :steps], new[steps:]])
-    plan, limited = limit_rate(plan, sent[-1], step)
+    plan, limited = limit_rate(plan, sent[-1], held)
     return Seam(plan, steps, limited, stretched=bool(kept.size and chosen > kept[0]))
 
 
@@ -122,6 +125,16 @@ def limit_rate(commands: Array, before: Array | None, step: Array | float) -> tu
         limited[i] = (held != kept[i]).any()
         kept[i] = last = held
     return kept, limited
+
+
+def drawn_out(stream: Array, size: int) -> Array:
+    """A stream, shape (n, m), that goes on to `size` commands at a rate that falls evenly to zero."""
+    more = size - len(stream)
+    if more <= 0:
+        return stream
+    rate = backward_differences(stream, 2)[1]
+    i = np.arange(1.0, more + 1.0)[:, None]
+    return np.concatenate([stream, stream[-1] + rate * (i - i * (i + 1.0) / (2.0 * (more + 1.0)))])
 
 
 def _peaks(candidates: Array, before: Array, first: int, step: Array) -> Array:

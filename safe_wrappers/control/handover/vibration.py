@@ -44,11 +44,6 @@ def modes(inertia: Array, stiffness: Array, damping: Array) -> Modes:
     return Modes(omega, ratios, shapes)
 
 
-def ramp_share(phase: ArrayLike) -> Array:
-    """Most that a ramp leaves, stopped at its end or anywhere before: |sin(w T / 2) / (w T / 2)|^2 is below it."""
-    return np.asarray(np.minimum(1.0, 2.0 / np.asarray(phase, dtype=np.float64)) ** 2)
-
-
 def smoothstep_share(phase: ArrayLike, cut_short: bool = False) -> Array:
     """Most that a smoothstep leaves, s = 10 x^3 - 15 x^4 + 6 x^5, x = t / T.
 
@@ -67,7 +62,8 @@ def smoothstep_share(phase: ArrayLike, cut_short: bool = False) -> Array:
 
 def shortest_smoothstep(share: float, resonance: float) -> float:
     """Duration, s, from which on a smoothstep leaves at most a share in a resonance (rad/s) and any faster one."""
-    _check_share(share)
+    if not 0.0 < share < 1.0:
+        raise ConfigurationError(f"a share of a step's energy is above 0 and below 1, got {share!r}")
     low, high = 0.0, 4.0 * (15.0 / math.sqrt(share)) ** (1.0 / 3.0) + 8.0  # the bound falls all along
     for _ in range(100):
         phase = 0.5 * (low + high)
@@ -75,15 +71,4 @@ def shortest_smoothstep(share: float, resonance: float) -> float:
             low = phase
         else:
             high = phase
-    return high / resonance
-
-
-def fastest_ramp(share: float, resonance: float) -> float:
-    """Rate per change, 1/s, of the fastest ramp that leaves at most a share, in this resonance and any faster one."""
-    _check_share(share)
-    return resonance * math.sqrt(share) / 2.0
-
-
-def _check_share(share: float) -> None:
-    if not 0.0 < share < 1.0:
-        raise ConfigurationError(f"a share of a step's energy is above 0 and below 1, got {share!r}")
+    return float(high / resonance)

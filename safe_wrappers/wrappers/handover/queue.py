@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.control.handover.seam_limits import SeamCheck
-from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES, Seam, join
+from safe_wrappers.control.handover.seams import BLENDS, DIFFERENCES, Seam, drawn_out, join
 from safe_wrappers.control.handover.smoothstep import shortest_latched_blend, smoothstep
 from safe_wrappers.wrappers.common.layer import Array
 from safe_wrappers.wrappers.common.receiver import whole_steps
@@ -57,7 +57,8 @@ class ChunkQueue:
         decay: Ensembling weighs the i-th oldest chunk by exp(-decay i).
         check: Of the machine's limits; None accepts all blends.
         overlap: A smoothstep that the next seam comes before the end of is not cut short: what is left of it fades
-            out beside the next one. A blend longer than the left-over holds the left-over's end.
+            out beside the next one. A left-over that is shorter than a blend is drawn out. What keeps the rate limit
+            is then the sending alone.
     """
 
     def __init__(
@@ -195,16 +196,24 @@ class ChunkQueue:
         """The blend into a chunk's rest, shape (n, m); None if none keeps the machine's limits."""
         prior = self._plan
         if self._overlap and len(prior):
-            left, fresh = len(prior), fresh.copy()
-            fading = (prior - self._asked[-left:])[: len(fresh)]
+            fading = (prior - self._asked[-len(prior) :])[: len(fresh)]
+            fresh = fresh.copy()
             fresh[: len(fading)] += fading
             fresh = np.clip(fresh, self._low, self._high)
-            prior = np.concatenate([prior, np.repeat(prior[-1:], max(len(fresh) - left, 0), axis=0)])
-        motion: Any = self._blend, self._sent, prior, fresh  # the blend's name is checked by the wrapper
-        check = None if self._check is None else partial(self._check.accepts, *motion)
-        bounds: dict[str, Any] = {"rate_limit": self._rate_limit, "low": self._low, "high": self._high}
-        blend: dict[str, Any] = {"blend": motion[0], "fewest": self._fewest, "accepts": check}
-        return join(*motion[1:], self._control_dt, **blend, **bounds)
+            prior = np.clip(drawn_out(prior, len(fresh)), self._low, self._high)
+        blend: Any = self._blend  # checked by the wrapper
+        motion = self._sent, prior, fresh
+        return join(
+            *motion,
+            self._control_dt,
+            blend=blend,
+            fewest=self._fewest,
+            rate_limit=self._rate_limit,
+            low=self._low,
+            high=self._high,
+            accepts=None if self._check is None else partial(self._check.accepts, blend, *motion),
+            hold_back=not self._overlap,
+        )
 
     def _planned(self) -> tuple[Array | None, bool]:
         if self._blend == ENSEMBLE:

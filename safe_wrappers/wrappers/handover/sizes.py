@@ -9,8 +9,9 @@ import numpy as np
 from safe_wrappers.checks import positive, whole_number
 from safe_wrappers.control.handover.seam_limits import SeamCheck, SeamLimits
 from safe_wrappers.control.handover.seams import BLENDS
+from safe_wrappers.control.handover.smoothstep import SMOOTHSTEP_PEAK_RATE
 from safe_wrappers.control.handover.splines import hermite_series
-from safe_wrappers.control.handover.vibration import fastest_ramp, shortest_smoothstep
+from safe_wrappers.control.handover.vibration import shortest_smoothstep
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.queries.rigid_model import RigidModelCheck
 from safe_wrappers.wrappers.common.layer import Array
@@ -74,7 +75,9 @@ def blend_bounds(
         if named:
             bounded = ", ".join(BLENDS)
             baseline = f"blend={blend!r} is a baseline that bounds nothing"
-            raise ConfigurationError(f"{baseline}: blend_time, rate_limit and limits are for {bounded}")
+            raise ConfigurationError(
+                f"{baseline}: blend_time, rate_limit, limits and flexible are for {bounded}"
+            )
         return fewest, rate_limits
     if blend_time is not None:
         fewest = max(whole_steps(positive("blend_time", blend_time, "s"), control_dt) - 1, 1)
@@ -104,16 +107,15 @@ def bounds_for_springs(
     blend_time: float | None,
     rate_limit: float | Sequence[float] | None,
 ) -> tuple[float, Sequence[float] | float | None]:
-    """Blend time, s, and rate limit that leave at most a share of a step's energy in the springs, or the user's own.
+    """Blend time, s, and rate limit, each the stricter of the user's and of what springs ask.
 
-    A blend is so long that its smoothstep does. The rate is that of the fastest ramp over the whole action range that
-    does; a component without a range has no such rate. Each is the stricter of this and what the user gave.
+    These ask for the time from which on a smoothstep leaves at most a share of a step's energy in them, and for the
+    steepest rate of such a blend over the whole action range, if every component has one.
     """
-    slowest = check.resonances[0]
-    least = max(shortest_smoothstep(share, slowest), blend_time or 0.0)
+    shortest = shortest_smoothstep(share, check.resonances[0])
     own = np.full(space.shape, np.inf) if rate_limit is None else _rate_limits(rate_limit, space.shape[0])
-    rates = np.minimum((space.high - space.low) * fastest_ramp(share, slowest), own)
-    return least, rates.tolist() if np.isfinite(rates).all() else rate_limit
+    rates = np.minimum(SMOOTHSTEP_PEAK_RATE * (space.high - space.low).astype(np.float64) / shortest, own)
+    return max(shortest, blend_time or 0.0), rates.tolist() if np.isfinite(rates).all() else rate_limit
 
 
 def _size(entries: int, apart: int, letter: str) -> str:
