@@ -20,6 +20,7 @@ from safe_wrappers.plants.mujoco.binding import control_interval
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.common.layer import Array, Env, LayerWrapper, Reset, Step, WrapperRng
+from safe_wrappers.wrappers.occlusion.imu import EgoMotion, Imu
 from safe_wrappers.wrappers.occlusion.sensor import Sensor, sensor_from
 from safe_wrappers.wrappers.occlusion.track import Track, track_from, tracked_things
 
@@ -53,6 +54,8 @@ class OcclusionPenalty(LayerWrapper):
     Attributes:
         tracking: The `control.estimation.tracks.Tracks`: positions, velocities, covariances, and those ahead.
         track_names: One per track: the body's name, or the attribute's with an index.
+        ego_motion: Where the sensor's body is taken to be (`position`, m, and `velocity`, m/s), if the sensor has an
+            `Imu`; else None.
         last_seen_positions: Where each was measured to be last, shape (n, d), m; before that, the initial fix.
         permitted: Tracks that may be relied on, bool (n,).
         unobservable: Track name -> directions of its state that the sensor cannot resolve even in sight.
@@ -129,6 +132,8 @@ class OcclusionPenalty(LayerWrapper):
         s = self.sensor
         range_m = math.inf if s.range_m is None else s.range_m
         self._sight = LineOfSight(model, s.camera, s.site, s.view_deg, range_m, s.occluder_groups)
+        imu = s.imu
+        self.ego_motion = EgoMotion(imu, self._sight) if isinstance(imu, Imu) else None
         self._things = tracked_things(model, self.tracks, self._published)
         self._bodies = np.array([thing.body for thing in self._things], dtype=np.intp)
         self._in_model = self._bodies >= 0
@@ -174,6 +179,8 @@ class OcclusionPenalty(LayerWrapper):
                 raise ConfigurationError(f"the env has another model, with other things: {tracked}")
         self._time = float(self._raw.data.time)
         self._sight.read(self._raw.data)
+        if self.ego_motion is not None:
+            self.ego_motion.fix()
         self._start()
         info.update(self._look())
         info[keys.OCCLUSION_PENALTY] = info[keys.OCCLUSION_TASK_REWARD] = 0.0
@@ -182,8 +189,11 @@ class OcclusionPenalty(LayerWrapper):
     def step(self, action: Any) -> Step:
         """Step the env with the action as it is, and look."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self.tracking.advance(self._elapsed())
+        elapsed = self._elapsed()
+        self.tracking.advance(elapsed)
         self._sight.read(self._raw.data)
+        if self.ego_motion is not None:
+            self.ego_motion.advance(elapsed, self._random.draw.standard_normal(9))
         info.update(self._look())
         penalty = self.weight * self._uncertainty() if self.weight else 0.0
         info[keys.OCCLUSION_TASK_REWARD] = float(reward)
@@ -254,7 +264,7 @@ class OcclusionPenalty(LayerWrapper):
         which = np.flatnonzero(seen)
         if which.size:
             among = None if velocities is None else velocities[which]
-            measurements = self.sensor.measured(self._sight, d, truth[which], among)
+            measurements = self.sensor.measured(self._sight, d, truth[which], among, self.ego_motion)
             measurements += noise[which]
             self.tracking.see(which, measurements, self._matrix, self._noise)
             if self.sensor.position_std is not None:
@@ -280,7 +290,8 @@ class OcclusionPenalty(LayerWrapper):
     def _observed(self, observation: Any) -> Any:
         if not self.observe:
             return observation
-        body = self._sight.data.xpos[self._sight.body, : self._d]
+        ego = self.ego_motion
+        body = (self._sight.data.xpos[self._sight.body] if ego is None else ego.position)[: self._d]
         tracking = self.tracking
         deviations = np.sqrt(np.diagonal(tracking.position_covariances, axis1=1, axis2=2))
         flat = np.concatenate([tracking.positions - body, tracking.velocities, deviations], axis=1).ravel()

@@ -9,13 +9,15 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from safe_wrappers.appendix.estimation.lever_arm import (
-    centre_acceleration,
     centre_acceleration_from_imu,
     centre_velocity,
     imu_specific_force,
+    sensor_pose,
+)
+from safe_wrappers.control.estimation.lever_arm import (
+    centre_acceleration,
     lever_arm_acceleration,
     rigid_transform,
-    sensor_pose,
 )
 from safe_wrappers.control.numerics.spatial import from_sensor, lever_arm_velocity, to_sensor
 from safe_wrappers.errors import ConfigurationError

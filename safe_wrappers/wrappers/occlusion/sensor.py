@@ -14,6 +14,7 @@ from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.queries.line_of_sight import LineOfSight
 from safe_wrappers.serialize import plain_numbers
 from safe_wrappers.wrappers.common.layer import Array
+from safe_wrappers.wrappers.occlusion.imu import EgoMotion, Imu
 
 
 @dataclass
@@ -33,6 +34,8 @@ class Sensor:
         velocity_std: Likewise of a measured velocity, m/s and m^2/s^2. None: it does not measure velocities.
         dropout: Probability that a measurement of what is in sight is lost, for each track and step, below 1.
         lever_arm: Whether the estimator knows where on its body the sensor sits; False takes the body's origin.
+        imu: An `Imu` on the same body, from which the estimator reckons where that body is, or the dict of one; None:
+            it knows.
 
     Raises:
         ConfigurationError: Both or neither of camera and site, nothing measured, or a number outside its range.
@@ -47,6 +50,7 @@ class Sensor:
     velocity_std: Any = None
     dropout: float = 0.0
     lever_arm: bool = True
+    imu: Imu | dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
         if (self.camera is None) == (self.site is None):
@@ -67,6 +71,8 @@ class Sensor:
         if not isinstance(self.lever_arm, bool | np.bool_):
             raise ConfigurationError(f"lever_arm is True or False, got {self.lever_arm!r}")
         self.lever_arm = bool(self.lever_arm)
+        if self.imu is not None:
+            self.imu = settings_from(Imu, self.imu, "imu")
         for name in ("position_std", "velocity_std"):
             setattr(self, name, plain_numbers(getattr(self, name)))
 
@@ -81,18 +87,32 @@ class Sensor:
             noise[block, block] = _noise(name, getattr(self, name), coordinates)
         return np.concatenate(list(measured.values())), noise
 
-    def measured(self, sight: LineOfSight, d: int, truth: Array, velocities: Array | None) -> Array:
-        """Positions (k, 3), m, and velocities (k, d), m/s, as they are measured, noise aside, shape (k, m)."""
+    def measured(
+        self, sight: LineOfSight, d: int, truth: Array, velocities: Array | None, ego: EgoMotion | None = None
+    ) -> Array:
+        """Positions (k, 3), m, and velocities (k, d), m/s, as they are measured, noise aside, shape (k, m).
+
+        Where the sensor's body is taken to be is the ego-motion's, if there is one, else the model's.
+        """
         body = np.array(sight.data.xpos[sight.body])
         eye, axes = sight.position, sight.rotation
-        believed = eye if self.lever_arm else body
+        if ego is None:
+            turned, believed = np.eye(3), eye if self.lever_arm else body
+        else:
+            # From the world's axes to where the body's believed orientation puts what is seen along them.
+            turned = ego.rotation @ np.array(sight.data.xmat[sight.body]).reshape(3, 3).T
+            believed = ego.position + (turned @ (eye - body) if self.lever_arm else 0.0)
         parts = []
         if self.position_std is not None:
-            parts.append(from_sensor(to_sensor(truth, axes, eye), axes, believed)[:, :d])
+            parts.append(from_sensor(to_sensor(truth, axes, eye), turned @ axes, believed)[:, :d])
         if velocities is not None:
             linear, angular = sight.velocity(sight.body)
             apparent = velocities - lever_arm_velocity(linear, angular, eye - body)[:d]
-            parts.append(apparent + lever_arm_velocity(linear, angular, believed - body)[:d])
+            own = (
+                (linear, angular, body) if ego is None else (ego.velocity, ego.angular_velocity, ego.position)
+            )
+            own_velocity = lever_arm_velocity(own[0], own[1], believed - own[2])[:d]
+            parts.append(apparent @ turned[:d, :d].T + own_velocity)
         return np.concatenate(parts, axis=1)
 
     def data(self) -> dict[str, Any]:
