@@ -35,7 +35,7 @@ MAY_USE = {
     "sb3": {"wrappers", "sb3", *BELOW_WRAPPERS},
     "diagnosis": {"wrappers", "diagnosis", "protect", "", *BELOW_WRAPPERS},
     "envs": {"appendix", "control", "constraints", "envs", *COMMON},
-    "train": {"wrappers", "sb3", "envs", "train", "protect", "", *BELOW_WRAPPERS},
+    "train": {"wrappers", "sb3", "envs", "train", "diagnosis", "protect", "", *BELOW_WRAPPERS},
 }
 LEARNERS = {"torch", "stable_baselines3"}
 FORBIDDEN = {

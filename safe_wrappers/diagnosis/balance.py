@@ -3,7 +3,7 @@
 import numpy as np
 
 from safe_wrappers.diagnosis.finding import Evidence
-from safe_wrappers.diagnosis.recording import Env, Recording, physics
+from safe_wrappers.diagnosis.recording import NOT_REPLAYED, Env, Recording, physics
 from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom
 from safe_wrappers.diagnosis.wheel_slip import wheels
 from safe_wrappers.plants.env_checks import name_of
@@ -19,6 +19,8 @@ def measure(env: Env, recording: Recording) -> Measured:
         raise NotMeasuredError(
             "no BalanceMonitor goes around this env: nothing stands on fixed ground by friction"
         )
+    if recording.of_info("balance/partial").mean() > 0.5:
+        raise NotMeasuredError(NOT_REPLAYED)
     if np.nanmax(recording.of_info("balance/airborne")) == 0.0 and not recording.terminated.any():
         raise NotMeasuredError(f"{name_of(env)} never left the ground: it does not balance")
     sliding, tipping = friction >= 1.0, zmp < 0.0

@@ -4,7 +4,7 @@ import numpy as np
 
 from safe_wrappers.diagnosis.finding import Evidence
 from safe_wrappers.diagnosis.limits import touches_fixed
-from safe_wrappers.diagnosis.recording import Env, Recording, braking_horizon, physics
+from safe_wrappers.diagnosis.recording import NOT_REPLAYED, Env, Recording, braking_horizon, physics
 from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.model import fixed_bodies, weight_n
@@ -18,6 +18,8 @@ def measure(env: Env, recording: Recording) -> Measured:
         raise NotMeasuredError("the env has no MuJoCo model whose contacts could be read")
     if np.isnan(forces).all():
         raise NotMeasuredError("no ContactMonitor goes around this env: a step of its outer wrapper is many")
+    if recording.of_info("contact/partial").mean() > 0.5:
+        raise NotMeasuredError(NOT_REPLAYED)
     if not np.isfinite(np.concatenate([recording.qpos.ravel(), forces])).all():
         return Measured(np.inf, forces, [Evidence("steps with numbers that are not finite", 1.0, "")])
     weight = weight_n(found[0])

@@ -1,6 +1,7 @@
 """Recordings: what an env did under a driver, step by step."""
 
 import math
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from safe_wrappers.wrappers.contact_monitor import ContactMonitor
 Env = gym.Env[Any, Any]
 Driver = Callable[[Any], Any]
 """Gives an action for an observation."""
+NOT_REPLAYED = "most control steps, made once more, end elsewhere: the env changes its state between substeps"
 PULSE_STEPS = 15
 """For which the attacking driver holds a corner of the action space."""
 
@@ -168,7 +170,8 @@ def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
     states: list[tuple[Any, ...]] = []
     contacts: list[set[tuple[int, int]]] = []
     observation, over, episode, control_dt, repeats = None, True, 0, _declared_dt(env), False
-    with _spied(env) as given:
+    with _spied(env) as given, warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of what the figures count
         for _ in range(steps):
             first = over
             if first:

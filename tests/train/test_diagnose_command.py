@@ -17,13 +17,13 @@ name: tiny
 total_steps: 64
 seeds: [0]
 workers: 1
+env: SafePointGoal1-v0
+algorithm: PPO
+action_repeat: 2
+hyperparameters: {n_steps: 32, batch_size: 32, n_epochs: 1}
+normalize: {observation: true}
 arms:
-  plain:
-    env: SafePointGoal1-v0
-    algorithm: PPO
-    action_repeat: 2
-    hyperparameters: {n_steps: 32, batch_size: 32, n_epochs: 1}
-    normalize: {observation: true}
+  plain: {filter: none}
 """
 
 
