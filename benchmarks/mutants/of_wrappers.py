@@ -177,7 +177,7 @@ HANDOVER = Target(
             "        return len(self._sent) > 0, joined.steps",
         ),
         Mutant("whole_steps(shortest, self._control_dt) - 1)", "whole_steps(shortest, self._control_dt))"),
-        Mutant("starved, limited or held, took_over", "starved, limited, took_over"),
+        Mutant("        held |= limited\n", ""),
         Mutant("if acting != self._acting and len(self._sent):", "if False:"),
         Mutant("weights @ votes / weights.sum()", "weights @ votes / len(votes)"),
         Mutant("np.where(step / control_dt > rate_limit, np.nextafter(step, 0.0), step)", "step"),

@@ -200,7 +200,7 @@ class ChunkQueue:
             fresh = fresh.copy()
             fresh[: len(fading)] += fading
             fresh = np.clip(fresh, self._low, self._high)
-            prior = np.clip(drawn_out(prior, len(fresh)), self._low, self._high)
+            prior = drawn_out(prior, len(fresh))
         blend: Any = self._blend  # checked by the wrapper
         motion = self._sent, prior, fresh
         return join(
@@ -230,17 +230,14 @@ class ChunkQueue:
         return control, limited
 
     def _fade_steps(self, target: Array) -> int:
-        """Control steps between the latched command and the new one that keep the limit, were both at rest."""
-        steps = self._fewest
+        """Control steps between the latched command and the new one that keep the limits, were both at rest."""
+        change = np.abs(target - self._sent[-1])
+        shortest = 0.0 if self._check is None else self._check.shortest_fade(change)
         bounded = np.isfinite(self._rate_limit)
         if bounded.any():
-            change = np.abs(target - self._sent[-1])[bounded]
-            shortest = float(shortest_latched_blend(change, self._rate_limit[bounded]).max())
-            steps = max(steps, whole_steps(shortest, self._control_dt) - 1)
-        if self._check is not None:
-            shortest = self._check.shortest_fade(np.abs(target - self._sent[-1]))
-            steps = max(steps, whole_steps(shortest, self._control_dt) - 1)
-        return steps
+            shortest_by_rate = shortest_latched_blend(change[bounded], self._rate_limit[bounded])
+            shortest = max(shortest, float(shortest_by_rate.max()))
+        return max(self._fewest, whole_steps(shortest, self._control_dt) - 1)
 
     def _faded(self, control: Array) -> Array:
         if self._fade is None:
