@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from safe_wrappers.appendix.contact import contact_lcp, forces, impact, lemke
+from safe_wrappers.appendix.contact import contact_lcp, forces, lemke
 from safe_wrappers.appendix.estimation import consistency, sigma_coverage
 from safe_wrappers.appendix.estimation import covariance as appendix_covariance
 from safe_wrappers.appendix.estimation import observability as appendix_observability
@@ -18,7 +18,7 @@ from safe_wrappers.appendix.vehicle import slip as appendix_slip
 from safe_wrappers.appendix.watchdog import lease_delays, sampling
 from safe_wrappers.appendix.watchdog import reachability as appendix_reachability
 from safe_wrappers.control.backup import stopping
-from safe_wrappers.control.contact import contact, friction_cone
+from safe_wrappers.control.contact import contact, friction_cone, impact
 from safe_wrappers.control.estimation import covariance, kalman, observability
 from safe_wrappers.control.filtering import cbf, manipulability
 from safe_wrappers.control.handover import smoothstep, splines
@@ -71,7 +71,7 @@ CALLS = {
     "peak_force": (impact.peak_force, [2, 4, 100]),
     "speed_limit": (impact.speed_limit, [2, 4, 100]),
     "time_to_peak": (impact.time_to_peak, [4, 100]),
-    "braked_deflection": (impact.braked_deflection, [2, 4, 100, 3, 1]),
+    "braked_deflection": (impact.braked_deflection, [2, 4, 100, 3, 1, 1]),
     "braked_peak_force": (impact.braked_peak_force, [2, 4, 100, 3, 1]),
     "predict": (kalman.predict, [[1, 2], EYE, CHAIN, EYE]),
     "update": (kalman.update, [[1, 2], EYE, [1], [[1, 0]], [[1]]]),
@@ -80,6 +80,8 @@ CALLS = {
     "stopping_distance": (appendix_reachability.stopping_distance, [2, 1]),
     "longest_lease": (leases.longest_lease, [1, 1, 1, 0]),
     "longest_lease, all": (leases.longest_lease, [9, 2, 1, 1, 1, 1, 1, 4]),
+    "longest_lease, jerk": (leases.longest_lease, [9, 2, 1, 1, 1, 1, 1, 4, 3]),
+    "jerk_limited_stop": (leases.jerk_limited_stop, [2, 1, 1, 3, 4]),
     "longest_lease_of_room": (leases.longest_lease_of_room, [9, 2, 1]),
     "round_trip_ceiling": (leases.round_trip_ceiling, [9, 1, 1, 0, 1, 1]),
     "solve_lcp": (lambda m, q: lemke.solve_lcp(m, q)[:2], [EYE, [-1, 2]]),
