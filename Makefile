@@ -100,6 +100,9 @@ figures: .venv/installed
 	$(BIN)/python -m benchmarks.traction
 	$(BIN)/python -m benchmarks.impact
 	$(BIN)/python -m benchmarks.occlusion --steps 40000
+	$(BIN)/python -m benchmarks.patrols
+	$(BIN)/python -m benchmarks.turns
+	$(BIN)/python -m benchmarks.ego_motion
 	$(BIN)/python -m benchmarks.singularity
 	$(BIN)/python -m benchmarks.fetch
 	$(BIN)/python -m benchmarks.friction_cones

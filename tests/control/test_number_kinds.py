@@ -15,7 +15,7 @@ from safe_wrappers.appendix.handover import splines as appendix_splines
 from safe_wrappers.appendix.legged import balance
 from safe_wrappers.appendix.teleop import energy_ledger, passivity_controller, waves
 from safe_wrappers.appendix.vehicle import slip as appendix_slip
-from safe_wrappers.appendix.watchdog import lease_delays, sampling
+from safe_wrappers.appendix.watchdog import lease_delays
 from safe_wrappers.appendix.watchdog import reachability as appendix_reachability
 from safe_wrappers.control.backup import stopping
 from safe_wrappers.control.contact import contact, friction_cone, impact
@@ -25,7 +25,7 @@ from safe_wrappers.control.handover import smoothstep, splines
 from safe_wrappers.control.legged import predicted_positions, support
 from safe_wrappers.control.teleop import passivity
 from safe_wrappers.control.vehicle import slip
-from safe_wrappers.control.watchdog import leases
+from safe_wrappers.control.watchdog import leases, sampling
 from safe_wrappers.filter import projection
 
 EYE = [[1, 0], [0, 1]]
