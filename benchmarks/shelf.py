@@ -81,18 +81,20 @@ CASES = (
     Case(
         "FrankaKitchen-v1",
         lambda view: 1.0 - float(np.abs(view.env.robot_env.data.qvel[:7]).max()),
-        2_000,
+        1_000,
         "gymnasium_robotics",
     ),
     Case(
         "dm_control/cartpole-swingup-v0",
         lambda view: 1.0 - abs(float(_physics(view).data.qpos[0])),
-        needs="shimmy",
+        2_000,
+        "shimmy",
     ),
     Case(
         "dm_control/walker-run-v0",
         lambda view: 1.0 - float(_physics(view).named.data.sensordata["torso_subtreelinvel"][0]),
-        needs="shimmy",
+        2_000,
+        "shimmy",
     ),
 )
 

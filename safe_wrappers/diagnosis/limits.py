@@ -57,15 +57,15 @@ def touches_fixed(env: Env, recording: Recording) -> NDArray[np.bool_]:
 
 def measure(env: Env, recording: Recording) -> Measured:
     """The share of steps with a cost, a pressed stop, or a hit."""
-    beyond = _beyond(env, recording)
+    beyond, judged = _beyond(env, recording), not np.isnan(recording.of_info("cost")).all()
     costs, pressed, hits = _costs(recording), (beyond > PRESSED).any(axis=1), touches_fixed(env, recording)
-    if np.isnan(recording.of_info("cost")).all() and physics(env) is None:
+    if not judged and physics(env) is None:
         raise NotMeasuredError(
             "the env reports no cost in info, and has no MuJoCo model whose limits could be read"
         )
     bad = (costs | pressed | hits).astype(float)
     evidence = [
-        Evidence("steps with a cost", float(costs.mean()), "share"),
+        Evidence("steps with a cost", float(costs.mean()) if judged else np.nan, "share"),
         Evidence("steps with a driven joint pressed beyond its stop", float(pressed.mean()), "share"),
         Evidence("steps in contact with something fixed, not the ground", float(hits.mean()), "share"),
     ]

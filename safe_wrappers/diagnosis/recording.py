@@ -149,7 +149,7 @@ def _declared_dt(env: Env) -> float:
 def _spied(env: Env) -> Iterator[list[Array]]:
     """The actions that the unwrapped env is given, as long as this lasts."""
     raw: Any = env.unwrapped
-    step, given = raw.step, list[Array]()
+    step, own, given = raw.step, vars(raw).get("step"), list[Array]()
 
     def spy(action: Any) -> Any:
         given.append(np.array(action, dtype=float))
@@ -160,6 +160,8 @@ def _spied(env: Env) -> Iterator[list[Array]]:
         yield given
     finally:
         del raw.step
+        if own is not None:
+            raw.step = own
 
 
 def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
