@@ -107,6 +107,14 @@ STOPPED = """
   </worldbody><actuator><motor joint="swing" ctrlrange="-4 4"/></actuator></mujoco>
 """
 
+TURNTABLE = """
+<mujoco><compiler autolimits="true"/><option timestep="0.002" gravity="0 0 0"/><worldbody>
+  <body><joint name="turn" axis="0 0 1" damping=".1"/><geom type="cylinder" size=".3 .02" mass="2"/>
+    <site name="imu" pos="{arm} 0 0"/></body></worldbody>
+  <actuator><motor joint="turn" ctrlrange="-1 1"/></actuator>
+  <sensor><accelerometer site="imu"/><gyro site="imu"/></sensor></mujoco>
+"""
+
 
 class Bench(gym.Env[Any, Any]):
     """A machine of a few parts; the observation is its state."""
@@ -192,6 +200,10 @@ PLANTED: dict[str, tuple[str, Callable[[], Made]]] = {
         lambda: (Late(base := gym.make("InvertedPendulum-v5"), 2), balancing(base)),
     ),
     "a link that falls silent": ("late_commands", lambda: _lease(gym.make("Swimmer-v5"))),
+    "an IMU off the turning axis": (
+        "lever_arms",
+        lambda: _with(Bench(TURNTABLE.format(arm=0.25)), lambda env: waving(env, 0.5, 100.0)),
+    ),
     "icy ground": ("wheel_slip", lambda: _with(gym.make("SafeRover-v0"))),
     "a path through a singular pose": (
         "singular_poses",
@@ -221,6 +233,9 @@ HEALTHY: dict[str, Callable[[], Made]] = {
     ),
     "cart, held": lambda: _with(Bench(CART.format(stiffness=20_000)), lambda env: holding(env, 0.5)),
     "swing, waving": lambda: _with(Bench(STOPPED), lambda env: waving(env, 0.02, 60.0)),
+    "an IMU on the turning axis": lambda: _with(
+        Bench(TURNTABLE.format(arm=0.0)), lambda env: waving(env, 0.5, 100.0)
+    ),
     "SafePointGoal0": lambda: _with(gym.make("SafePointGoal0-v0")),
     "SafePointGoal1, protected": lambda: _with(sw.protect(gym.make("SafePointGoal1-v0"))),
     "PointMaze, protected": lambda: _with(sw.protect(gym.make("PointMaze_UMaze-v3"))),

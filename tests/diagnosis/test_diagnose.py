@@ -27,6 +27,7 @@ QUICK = {
     "a link that falls silent": 300,
     "a stop that is run into": 300,
     "a stiff wall": 300,
+    "an IMU off the turning axis": 200,
     "a path through a singular pose": 800,
 }
 
@@ -49,7 +50,14 @@ def test_every_planted_fault_ranks_first(name):
 
 
 @pytest.mark.parametrize(
-    "name", ["InvertedPendulum, balanced", "swing, waving", "cart, held", "Swimmer, waving"]
+    "name",
+    [
+        "InvertedPendulum, balanced",
+        "swing, waving",
+        "cart, held",
+        "an IMU on the turning axis",
+        "Swimmer, waving",
+    ],
 )
 def test_a_healthy_env_has_no_symptom(name):
     assert not diagnose(*HEALTHY[name](), steps=200).present

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 pytest.importorskip("gymnasium_robotics")
-from benchmarks.diagnose import ARM, Bench
-from safe_wrappers.diagnosis import command_steps, late_commands, wheel_slip
+from benchmarks.diagnose import ARM, TURNTABLE, Bench, waving
+from safe_wrappers.diagnosis import command_steps, late_commands, lever_arms, wheel_slip
 from safe_wrappers.diagnosis.loop_margin import loop
 from safe_wrappers.diagnosis.recording import attacking_driver, braking_horizon, random_driver, record
 from safe_wrappers.diagnosis.singular_poses import _arm, _manipulability
@@ -54,6 +54,21 @@ def test_manipulability_of_a_two_link_arm():
     found, directions = _manipulability(env.model, tip, dofs, poses)
     assert directions == "xy"
     assert found == pytest.approx(np.abs(0.3 * 0.3 * np.sin(poses[:, 1])), abs=1e-12)
+
+
+def test_what_turning_adds_is_what_an_accelerometer_reads():
+    env = Bench(TURNTABLE.format(arm=0.25))
+    policy, read = waving(env, 0.5, 100.0), []
+
+    def act(observation):
+        read.append(np.linalg.norm(env.data.sensordata[:3]))
+        return policy(observation)
+
+    measured = lever_arms.measure(env, record(env, act, 200, 0))
+    # Asked three times at first; a reading before an action is that of the step before it.
+    seen = np.array(read[3:])
+    assert np.abs(measured.steps[1:-1] - seen[1:]).max() < 0.02 * seen.max()
+    assert measured.evidence[0].value == pytest.approx(0.25)
 
 
 ROVER = """
