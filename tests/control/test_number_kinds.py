@@ -10,7 +10,6 @@ from safe_wrappers.appendix.estimation import observability as appendix_observab
 from safe_wrappers.appendix.filtering import barriers
 from safe_wrappers.appendix.filtering import manipulability as appendix_manipulability
 from safe_wrappers.appendix.handover import blends, flexible_joint
-from safe_wrappers.appendix.handover import polynomials as appendix_polynomials
 from safe_wrappers.appendix.handover import splines as appendix_splines
 from safe_wrappers.appendix.legged import balance
 from safe_wrappers.appendix.teleop import energy_ledger, passivity_controller, waves
@@ -21,7 +20,7 @@ from safe_wrappers.control.backup import stopping
 from safe_wrappers.control.contact import contact, friction_cone, impact
 from safe_wrappers.control.estimation import covariance, kalman, observability
 from safe_wrappers.control.filtering import cbf, manipulability
-from safe_wrappers.control.handover import smoothstep, splines
+from safe_wrappers.control.handover import polynomials, smoothstep, splines
 from safe_wrappers.control.legged import predicted_positions, support
 from safe_wrappers.control.teleop import passivity
 from safe_wrappers.control.vehicle import slip
@@ -108,7 +107,7 @@ CALLS = {
     "ChannelLedger": (lambda *a: filled(passivity.ChannelLedger(a[0]), a[1:]), [1, 2, 3, 1, 4, 1, 2]),
     "PassivityObserver": (lambda *a: observed(*a), [1, 2, 3, 1]),
     "differentiate": (splines.differentiate, [[1, 2, 3]]),
-    "extrema": (appendix_polynomials.extrema, [[0, 3, -1], 2]),
+    "extrema": (polynomials.extrema, [[0, 3, -1], 2]),
     "largest_acceleration": (predicted_positions.largest_acceleration, [2, 1, 1]),
     "project, one row": (lambda *a: projection.project(*a)[0], [[1, 1], [[1, 1]], [1], -1, 1]),
     "project, rows": (lambda *a: projection.project(*a)[0], [[1, 1], [[2, 1], [1, 2]], [1, 1], -1, 1]),
