@@ -237,8 +237,8 @@ class ChunkHandover(LayerWrapper, CommandReceiver):
             raise ActionError(f"{expected} (chunk_size, controls), got {chunk.shape}")
         return chunk
 
-    def _admits(self, end: Array, steps: int) -> bool:
-        return self._inside is None or self._inside.admits(end, steps)
+    def _admits(self, commands: Array) -> bool:
+        return self._inside is None or self._inside.admits_chunk(commands)
 
     def _submit(self, chunk: Array) -> bool:
         """Send the chunk on its way; False if one came and was refused."""

@@ -60,7 +60,10 @@ class LeaseExpiry(CommandGate):
         brake_blend_time: s, of the way to the fallback; it counts in the budget. 0: at once.
         clock_error_s: Bound on how wrong the times of observations may be, s; it counts in the budget.
         motion_limits: For actions that are position setpoints: {"max_acceleration": ..., "max_speed": ...,
-            "max_jerk": ..., "arrival": "moving" or "rest"}; chunks whose end is out of reach are refused.
+            "max_jerk": ..., "arrival": "moving" or "rest", "stopping": True or False}; chunks whose end is out of
+            reach are refused. With "stopping" a chunk's lease ends with the last of its points up to which a
+            jerk-limited stop from each would stay within the clearance, in whatever direction; a chunk without such a
+            point is refused.
         measured: For `motion_limits`: a function of the env that returns positions, velocities and, for an arrival at
             rest with limited jerk, accelerations; None reads the lengths of the MuJoCo actuators.
         fallback: "brake", "hold", "zero", or a function of the plant.
@@ -143,6 +146,9 @@ class LeaseExpiry(CommandGate):
         self._admission: Admission | None = None
         if motion_limits is not None:
             self._admission = Admission(env, motion_limits, measured, self._low.size)
+            if self._admission.stops and not budget.measures_approach:
+                raise ConfigurationError("stopping needs a clearance in the setpoints' unit of length")
+        self._late_s = self._delays_s + budget.act_s
         self._start({})
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
@@ -162,6 +168,7 @@ class LeaseExpiry(CommandGate):
         self._executed = None
         self._braking = self._chunk_refused = False
         self._blend = None
+        self._chunk_s = math.inf
 
     def step(self, action: Any) -> Step:
         """Execute the action under its lease, the command in force under its own, or the fallback."""
@@ -170,6 +177,7 @@ class LeaseExpiry(CommandGate):
         arrived, fresh, refused = self._accept(given, now)
         if fresh:
             refused |= not self._grant(now)
+        self._chunk_s = math.inf
         covered = now + self.control_dt <= self._until_s + self._same_s
         expired = not covered and self._until_s > -math.inf
         if covered:
@@ -199,6 +207,18 @@ class LeaseExpiry(CommandGate):
         self._chunk_refused |= not admitted
         return admitted
 
+    def admits_chunk(self, commands: Array) -> bool:
+        """Whether the end is within `motion_limits`; with "stopping" the lease is cut to the points that can stop."""
+        if not self.admits(commands[-1], len(commands)):
+            return False
+        if self._admission is None or not self._admission.stops:
+            return True
+        self._budget.measure()
+        points = self._admission.stoppable(commands, self.control_dt, self._budget.room, self._late_s)
+        self._chunk_s = min(self._chunk_s, points * self.control_dt)
+        self._chunk_refused |= points == 0
+        return points > 0
+
     def _accept(self, command: NDArray[Any], now: float) -> tuple[bool, bool, bool]:
         """Whether there is a command that may be executed, whether it is a fresh one, whether one was refused."""
         observed_s, refused, newest_s = self._observed_s, self._chunk_refused, self._newest_s
@@ -218,7 +238,7 @@ class LeaseExpiry(CommandGate):
         """A new lease for the fresh command; False, and none at all, where it would not last."""
         self._budget.measure()
         longest_s = self._budget.longest_time(self._delays_s + max(now - self._newest_s, 0.0))
-        lease = max(min(longest_s, self._max_lease_s), self._min_lease_s)
+        lease = max(min(longest_s, self._max_lease_s, self._chunk_s), self._min_lease_s)
         # NaN gives no lease at all: a filter inside reads the same state.
         granted = not math.isnan(longest_s) and lease + self._same_s >= self.control_dt
         self._until_s = now + lease if granted else -math.inf

@@ -36,7 +36,7 @@ def never():
     raise AssertionError("the fallback was asked, though commands are planned")
 
 
-def tick(queue, stand_in=fallback, admit=lambda end, steps: True):
+def tick(queue, stand_in=fallback, admit=lambda commands: True):
     """One command."""
     return queue.next(admit, stand_in)
 
@@ -150,7 +150,7 @@ def test_an_older_chunk_steps_in_for_a_newer_one_that_is_refused():
     run(q, 1)
     q.submit(numbered(2, 9), 1, 2)
     run(q, 1)
-    command = tick(q, never, lambda end, steps: end[0] < 200)
+    command = tick(q, never, lambda commands: commands[-1, 0] < 200)
     assert (
         float(command.control[0]) == 102 and command.refused and command.took_over and command.observed == 0
     )
@@ -159,7 +159,8 @@ def test_an_older_chunk_steps_in_for_a_newer_one_that_is_refused():
 def test_admission_is_asked_with_the_end_and_the_time_to_it():
     asked = []
 
-    def admit(end, steps):
+    def admit(commands):
+        end, steps = commands[-1], len(commands)
         asked.append((end.tolist(), steps))
         return end[0] < 150
 
@@ -176,9 +177,9 @@ def test_admission_is_asked_with_the_end_and_the_time_to_it():
 def test_a_refused_chunk_may_be_asked_for_again():
     q = queue()
     q.submit(numbered(1, 5), 0, 0)
-    assert run(q, 1, admit=lambda end, steps: False)[0].refused
+    assert run(q, 1, admit=lambda commands: False)[0].refused
     q.submit(numbered(2, 5), 0, 1)
-    assert controls(run(q, 1, admit=lambda end, steps: True)) == [201]
+    assert controls(run(q, 1, admit=lambda commands: True)) == [201]
 
 
 @settings(max_examples=100, deadline=None)

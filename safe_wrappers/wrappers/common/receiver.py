@@ -56,6 +56,10 @@ class CommandReceiver:
         """Whether a chunk may be executed that ends with this command, shape (m,), so many control steps from now."""
         return True
 
+    def admits_chunk(self, commands: NDArray[np.float64]) -> bool:
+        """Whether a chunk may be executed, shape (h, m): the commands of the next h control steps."""
+        return self.admits(commands[-1], len(commands))
+
     deliver = deprecated_method("deliver", "set_observation_time")
 
 

@@ -89,6 +89,9 @@ class Fault(LayerWrapper, CommandReceiver, ABC):
     def admits(self, end: NDArray[np.float64], steps: int) -> bool:
         return self._inside is None or self._inside.admits(end, steps)
 
+    def admits_chunk(self, commands: NDArray[np.float64]) -> bool:
+        return self._inside is None or self._inside.admits_chunk(commands)
+
     def begin(self) -> None:
         """A new episode; `random` is ready."""
 

@@ -119,12 +119,12 @@ class ChunkQueue:
         """Chunks that take over from now on are somebody else's; the change is blended, from the last command."""
         self._source = source
 
-    def next(self, admits: Callable[[Array, int], bool], fallback: Callable[[], Array]) -> Command:
+    def next(self, admits: Callable[[Array], bool], fallback: Callable[[], Array]) -> Command:
         """The command of this control step.
 
         Args:
-            admits: Whether a chunk that has arrived may take over, by its last command, shape (m,), and the control
-                steps until the end of that command.
+            admits: Whether a chunk that has arrived may take over, by its commands from this control step on, shape
+                (h, m).
             fallback: Called when nothing is planned; returns a finite control of shape (m,).
         """
         admitted, refused = self._admitted(admits)
@@ -154,13 +154,13 @@ class ChunkQueue:
         held |= limited
         return Command(sent, self._observed, starved, held, took_over, refused, seam, blend_steps, stretched)
 
-    def _admitted(self, admits: Callable[[Array, int], bool]) -> tuple[list[Chunk], bool]:
+    def _admitted(self, admits: Callable[[Array], bool]) -> tuple[list[Chunk], bool]:
         """The chunks that may take over now, the newest observation first; and whether one was refused."""
         admitted: list[Chunk] = []
         refused = False
         for chunk in reversed([c for c in self._coming if c.due <= self.now]):
             left = chunk.commands[self.now - chunk.observed :]
-            if not (len(left) and admits(left[-1], len(left))):  # it came too late, or must not
+            if not (len(left) and admits(left)):  # it came too late, or must not
                 refused = True
                 continue
             admitted.append(chunk)

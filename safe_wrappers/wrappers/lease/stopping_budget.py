@@ -170,6 +170,13 @@ class BoundBudget:
         """Whether all that was measured is finite."""
         return bool(np.isfinite(self.clearance).all() and np.isfinite(self.speed).all())
 
+    @property
+    def room(self) -> float:
+        """The least measured clearance less its reserves, m; -inf where it is not finite, inf without obstacles."""
+        if not self.readable:
+            return -math.inf
+        return float(self.clearance.min(initial=math.inf)) - sum(self._reserves.values())
+
     def longest_time(self, delays_s: float = 0.0) -> float:
         """The longest time that the worst command may go on from the measured state, s; zero or less: stop now.
 
