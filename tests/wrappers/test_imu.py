@@ -117,6 +117,26 @@ def test_velocities_are_put_right_by_the_reckoned_motion():
     assert ends[True] < 0.02 and ends[False] > 0.2
 
 
+def test_what_moves_is_seen_to_move_in_the_reckoned_axes():
+    imu = sw.occlusion.Imu("eye", accelerometer_std=1.0, gyro_std=0.5)
+    sensor = sw.occlusion.Sensor(site="eye", position_std=None, velocity_std=0.01, imu=imu)
+    world = Turning(((0, 1, 0, -1, 0), (1.0, 0, 0.4, 0, 0)))
+    env = sw.OcclusionPenalty(world, [straight("thing")], sensor, tolerance=0.5)
+    env.reset(seed=0)
+    for _ in range(40):
+        env.step(PUSH)
+    ego, data = env.ego_motion, world.data
+    mujoco.mj_kinematics(world.model, data)
+    turned = ego.rotation @ data.body("robot").xmat.reshape(3, 3).T
+    arm = data.site("eye").xpos - data.body("robot").xpos
+    apparent = np.array([0.0, 0.4, 0.0]) - np.cross([0, 0, data.qvel[0]], arm)
+    own = ego.velocity + np.cross(ego.angular_velocity, turned @ arm)
+    seen = env.sensor.measured(env._sight, 2, np.zeros((1, 3)), np.array([[0.0, 0.4]]), ego)[0]
+    # in the plane, as the velocities are: what noise tilts the axes by is left out
+    np.testing.assert_allclose(seen, turned[:2, :2] @ apparent[:2] + own[:2], atol=1e-9)
+    assert np.abs(turned - np.eye(3)).max() > 0.01
+
+
 def test_its_noise_is_the_seeds_and_another_one_s_is_not_touched():
     def run(**options):
         env = tracked(**options)
