@@ -47,7 +47,7 @@ LEASE = Target(
             ),
         ),
         Mutant("        if self.longest_time() >= duration_s:\n            return True\n", ""),
-        Mutant("and self._budget.act_s == 0.0 and self.readable", "and self.readable"),
+        Mutant("and at_once and self.readable", "and self.readable"),
         Mutant("        if not self.readable:\n            return math.nan\n", ""),
         Mutant(
             "top_speed = math.inf if budget.top_speed is None else budget.top_speed", "top_speed = math.inf"
@@ -60,6 +60,14 @@ LEASE = Target(
         Mutant(
             '{"braking": braking, "margin": margin, "state_error": localisation}',
             '{"braking": braking}',
+        ),
+        Mutant(
+            'self._stop["jerk"] = budget.jerk', "pass", tests=("tests/wrappers/test_jerk_limited_stop.py",)
+        ),
+        Mutant(
+            "late_s * fastest",
+            "late_s * np.linalg.norm(v)",
+            tests=("tests/wrappers/test_jerk_limited_stop.py",),
         ),
     ),
 )
@@ -106,10 +114,12 @@ LEASE_EXPIRY = Target(
         ),
         Mutant("self._delays_s + max(now - self._newest_s, 0.0)", "self._delays_s"),
         Mutant(
-            "max(min(longest_s, self._max_lease_s), self._min_lease_s)", "max(longest_s, self._min_lease_s)"
+            "max(min(longest_s, self._max_lease_s, self._chunk_s), self._min_lease_s)",
+            "max(min(longest_s, self._chunk_s), self._min_lease_s)",
         ),
         Mutant(
-            "max(min(longest_s, self._max_lease_s), self._min_lease_s)", "min(longest_s, self._max_lease_s)"
+            "max(min(longest_s, self._max_lease_s, self._chunk_s), self._min_lease_s)",
+            "min(longest_s, self._max_lease_s, self._chunk_s)",
         ),
         Mutant(
             "granted = not math.isnan(longest_s) and lease",
