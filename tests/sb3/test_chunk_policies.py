@@ -13,6 +13,7 @@ from stable_baselines3.common.monitor import Monitor  # noqa: E402
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv  # noqa: E402
 
 import safe_wrappers as sw  # noqa: E402
+from safe_wrappers.info import KEYS  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore:a command was held back:UserWarning")
 LIMIT = 8.0
