@@ -104,6 +104,15 @@ def test_a_servo_holds_the_motor_and_what_swings_on_the_servo_is_not_the_spring(
     assert check.resonances == pytest.approx([np.sqrt(200.0 / INERTIA)], rel=1e-4)  # the link alone
 
 
+def test_a_servos_own_damping_counts():
+    env = TwoMasses(actuator='<position joint="motor" kp="300" kv="0.4"/>')
+    check = rigid_model_check(env)
+    mujoco.mj_forward(env.model, env.data)
+    frequencies, ratios = ringing_of_finite_differences(env)
+    assert check.resonances == pytest.approx([frequencies[1]], rel=1e-2)
+    assert check.damping_ratios == pytest.approx([ratios[1]], rel=0.1) and ratios[1] > 0.01
+
+
 def test_a_spring_without_a_motor_before_it_does_not_count():
     other = '<body pos="1 0 0"><joint name="alone" stiffness="30"/><geom size="0.1" mass="1"/></body>'
     assert rigid_model_check(TwoMasses(other=other)).springs == ("spring",)

@@ -167,8 +167,8 @@ def torque_by_hand(q, v, a):
     return inertia * a - 1.5 * 9.81 * 0.5 * np.cos(q) + 0.3 * v
 
 
-def held_pendulum(limits, levels, entries=20, dt=0.02):
-    env = sw.ChunkHandover(Pendulum(), entries, 8, blend="quintic", fallback="zero", limits=limits)
+def held_pendulum(limits, levels, entries=20, **pendulum):
+    env = sw.ChunkHandover(Pendulum(**pendulum), entries, 8, blend="quintic", fallback="zero", limits=limits)
     env.reset(seed=0)
     return [env.step(np.full((entries, 1), level))[4] for level in levels]
 
@@ -190,6 +190,14 @@ def test_a_position_commands_torque_is_that_of_the_equations_of_motion():
             # Slews are taken between quarters of a control step: a little below the steepest one.
             assert peak[steps, column] <= limit * (1.0 if column == 0 else 1.15)
             assert peak[steps - 1, column] > limit
+
+
+def test_a_gear_turns_the_joint_by_less_and_a_stop_of_the_joint_is_no_torque():
+    geared = SERVO.replace("kp=", 'gear="2" kp=')
+    stopped = SERVO + "</actuator><default><joint limited='true' range='-0.1 0.1'/></default><actuator>"
+    plain = held_pendulum({"torque": 12.0}, (0.2, 0.6))[1]["handover/blend_time"]
+    assert held_pendulum({"torque": 12.0}, (0.4, 1.2), actuator=geared)[1]["handover/blend_time"] == plain
+    assert held_pendulum({"torque": 12.0}, (0.2, 0.6), actuator=stopped)[1]["handover/blend_time"] == plain
 
 
 def test_a_slow_chunks_knots_are_refused_by_the_torque_steps_there():
