@@ -189,13 +189,14 @@ def _stop(v: float, a: float, b: float, jerk: float, top: float) -> float:
     else:
         # The top speed is reached before the acceleration is gone.
         gain = top - v
-        rising = 2.0 * gain / (a + math.sqrt(max(a * a - 2.0 * jerk * gain, 0.0)))
+        rising = 2.0 * (gain / a) / (1.0 + math.sqrt(max(1.0 - 2.0 * (jerk / a) * (gain / a), 0.0)))
         way = rising * (v + rising * (0.5 * a - jerk * rising / 6.0)) + top * (winding - rising)
         highest = top
     if highest <= 0.0:
         return 0.0
     time = 2.0 * math.sqrt(highest / jerk) if jerk * highest <= b * b else highest / b + b / jerk
-    return way + 0.5 * highest * time
+    total = way + 0.5 * highest * time
+    return math.inf if math.isnan(total) else total  # numbers that overflowed
 
 
 def round_trip_ceiling(
