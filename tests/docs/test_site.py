@@ -118,7 +118,8 @@ def test_every_constraint_and_wrapper_has_a_page_with_a_picture(folder):
         where = getattr(thing, "__module__", "")
         if not where.startswith(f"safe_wrappers.{folder}."):
             continue
-        module = where.split(".")[2 if folder == "wrappers" else -1]
+        parts = where.removeprefix("safe_wrappers.wrappers.learner.").split(".")
+        module = parts[2 if folder == "wrappers" and len(parts) > 2 else -1]
         if module in told_elsewhere:
             continue
         if folder == "constraints" or (isinstance(thing, type) and issubclass(thing, gym.Wrapper)):
