@@ -81,7 +81,7 @@ CASES = (
     Case(
         "FrankaKitchen-v1",
         lambda view: 1.0 - float(np.abs(view.env.robot_env.data.qvel[:7]).max()),
-        1_000,
+        400,
         "gymnasium_robotics",
     ),
     Case(
@@ -93,7 +93,7 @@ CASES = (
     Case(
         "dm_control/walker-run-v0",
         lambda view: 1.0 - float(_physics(view).named.data.sensordata["torso_subtreelinvel"][0]),
-        2_000,
+        600,
         "shimmy",
     ),
 )
