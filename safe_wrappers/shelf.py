@@ -21,6 +21,8 @@ BOX2D_DT = 1.0 / 50.0
 CARTPOLE_DT = 0.02
 PANDA_DT = 0.04
 """Of panda-gym: 20 substeps of 2 ms."""
+KITCHEN_SPEED = 1.0
+"""Of FrankaKitchen's arm joints, rad/s."""
 KITCHEN_DT = 0.08
 """Of FrankaKitchen: 40 substeps of 2 ms."""
 
@@ -120,24 +122,24 @@ def _highway(env: Env, horizon: int = 4) -> list[Constraint]:
     return [PredictiveShield("crashed", horizon=horizon, backup=[backup, "hold"], candidates=4)]
 
 
-def _kitchen(env: Env, max_speed: float = 1.0) -> list[Constraint]:
+def _kitchen(env: Env) -> list[Constraint]:
     # Its targets are clipped ahead of noisy measurements: no MujocoPlant forecasts that, a copy with the noise does.
     def h(raw: Any) -> float:
-        return float(max_speed - np.abs(raw.data.qvel[:7]).max())
+        return float(KITCHEN_SPEED - np.abs(raw.data.qvel[:7]).max())
 
     return [PredictiveShield(h, horizon=3, backup="zero", sees="env", margin=0.05)]
 
 
-def _dm_cartpole(env: Env, max_position: float = 1.0) -> list[Constraint]:
-    rail = [Plane([side * max_position], [-side]) for side in (-1.0, 1.0)]
+def _dm_cartpole(env: Env) -> list[Constraint]:
+    rail = [Plane([side], [-side]) for side in (-1.0, 1.0)]
     # 10 N on 1.1 kg of cart and pole is 9 m/s^2; the swinging pole takes up to a third of it.
     return [Clearance(obstacles=rail, bodies=["cart"], braking=6.0, margin=0.01)]
 
 
-def _dm_walker(env: Env, max_speed: float = 1.0) -> list[Constraint]:
+def _dm_walker(env: Env) -> list[Constraint]:
     # What dm_control reports is the velocity at the end of a step. Over a physics substep the centre of mass moves by
     # up to 0.18 m/s less (measured), since legs that turn at 50 rad/s bend its way.
-    return [SpeedLimit(max_speed, None, "+x", margin=0.3, horizon=10, average="substep")]
+    return [SpeedLimit(1.0, None, "+x", margin=0.3, horizon=10, average="substep")]
 
 
 def _of_physics(env: Env) -> Plant:

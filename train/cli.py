@@ -67,8 +67,9 @@ def _run(options: argparse.Namespace, console: Console) -> None:
         from .diagnosis import diagnose_command
 
         output = options.output or Path("diagnosis.html")
+        steps = DIAGNOSED_STEPS if options.steps is None else options.steps
         words = ["safe-wrappers", *(sys.argv[1:] if options.given is None else options.given)]
-        diagnose_command(options.words[0], options.policy, options.steps, output, shlex.join(words), console)
+        diagnose_command(options.words[0], options.policy, steps, output, shlex.join(words), console)
         return
     from .config import parse_experiment, read_config
 
@@ -127,7 +128,7 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     # Subparsers would take no words behind an option: `compare a.yaml --report seeds=[0]`.
     options = parser.parse_intermixed_args(arguments)
     options.given = arguments
-    if options.command != "diagnose" and (options.policy or options.steps != DIAGNOSED_STEPS):
+    if options.command != "diagnose" and (options.policy or options.steps is not None):
         parser.error(f"{options.command} takes no --policy and no --steps; diagnose does")
     if options.command == "diagnose":
         if len(options.words) > 1 or options.report:
@@ -178,8 +179,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--steps",
         type=int,
-        default=DIAGNOSED_STEPS,
-        help="of diagnose: control steps of each driver (default: %(default)s)",
+        help=f"of diagnose: control steps of each driver (default: {DIAGNOSED_STEPS:,})",
     )
     parser.add_argument("--version", action="version", version=version("safe-wrappers"))
     return parser

@@ -18,10 +18,15 @@ def measure(env: Env, recording: Recording) -> Measured:
         raise NotMeasuredError("the env has no MuJoCo model whose contacts could be read")
     if np.isnan(forces).all():
         raise NotMeasuredError("no ContactMonitor goes around this env: a step of its outer wrapper is many")
+    bad = recording.diverged | ~np.isfinite(np.column_stack([recording.qpos, recording.qvel])).all(axis=1)
+    if bad.any():
+        return Measured(
+            np.inf,
+            bad.astype(float),
+            [Evidence("steps in which the simulation diverged", float(bad.sum()), "")],
+        )
     if recording.of_info("contact/partial").mean() > 0.5:
         raise NotMeasuredError(NOT_REPLAYED)
-    if not np.isfinite(np.concatenate([recording.qpos.ravel(), forces])).all():
-        return Measured(np.inf, forces, [Evidence("steps with numbers that are not finite", 1.0, "")])
     weight = weight_n(found[0])
     deepest = float(np.nanmax(recording.of_info("contact/penetration")))
     # What presses all the time, maybe where it cannot move, is no impact.
@@ -39,6 +44,8 @@ def lines(env: Env, recording: Recording) -> tuple[str, str]:
     """`protect`, where it keeps the machine off what is fixed; else a limit of the pair that hit hardest."""
     found = physics(env)
     assert found is not None
+    if recording.diverged.any():
+        return "", "The simulation diverged: a shorter timestep, softer contacts, or weaker actuators."
     if touches_fixed(env, recording).any():
         try:
             protect(env)

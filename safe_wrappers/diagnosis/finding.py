@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from safe_wrappers.checks import Array
+from safe_wrappers.errors import UnknownNameError
 
 
 class Evidence(NamedTuple):
@@ -122,7 +123,10 @@ class Diagnosis:
 
     def finding(self, symptom: str) -> Finding:
         """That of one symptom."""
-        return next(finding for finding in self.findings if finding.symptom == symptom)
+        found = {finding.symptom: finding for finding in self.findings}
+        if symptom not in found:
+            raise UnknownNameError(f"no symptom {symptom!r} was looked for; there are {', '.join(found)}")
+        return found[symptom]
 
     def as_dict(self) -> dict[str, Any]:
         """All of it, for JSON."""

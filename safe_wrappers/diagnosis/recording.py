@@ -21,6 +21,11 @@ Env = gym.Env[Any, Any]
 Driver = Callable[[Any], Any]
 """Gives an action for an observation."""
 NOT_REPLAYED = "most control steps, made once more, end elsewhere: the env changes its state between substeps"
+_DIVERGED = (
+    mujoco.mjtWarning.mjWARN_BADQPOS,
+    mujoco.mjtWarning.mjWARN_BADQVEL,
+    mujoco.mjtWarning.mjWARN_BADQACC,
+)
 PULSE_STEPS = 15
 """For which the attacking driver holds a corner of the action space."""
 
@@ -93,6 +98,7 @@ class Recording:
         contacts: After each step, pairs of geoms that touch, ids; likewise.
         struck: Names of the two bodies with the largest force of each step; None where there was none.
         control_dt: Control interval, s; NaN where nothing says it.
+        diverged: Whether MuJoCo has found numbers in a step that are not finite, and has reset its data, shape (k,).
         repeats: Asked twice with the first observation, the driver has given the same action.
     """
 
@@ -107,6 +113,7 @@ class Recording:
     contacts: list[set[tuple[int, int]]]
     struck: list[tuple[str, str] | None]
     control_dt: float
+    diverged: np.ndarray
     repeats: bool
 
     def of_info(self, key: str) -> Array:
@@ -164,13 +171,22 @@ def _spied(env: Env) -> Iterator[list[Array]]:
             raw.step = own
 
 
+def _warnings(data: mujoco.MjData) -> int:
+    return int(sum(data.warning[kind].number for kind in _DIVERGED))
+
+
 def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
-    """Drive the env for so many control steps, episode after episode."""
+    """Drive the env for so many control steps, episode after episode.
+
+    Raises:
+        ConfigurationError: The driver gave an action that is not finite; the env never gets it.
+    """
     found, env = physics(env), monitored(env)
     monitor = next((one for one in wrappers_of(env) if isinstance(one, ContactMonitor)), None)
     rows: list[tuple[Any, ...]] = []
     states: list[tuple[Any, ...]] = []
     contacts: list[set[tuple[int, int]]] = []
+    diverged: list[bool] = []
     observation, over, episode, control_dt, repeats = None, True, 0, _declared_dt(env), False
     with _spied(env) as given, warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of what the figures count
@@ -182,14 +198,21 @@ def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
             if not rows:
                 repeats = np.array_equal(driver(observation), driver(observation))
             action = np.asarray(driver(observation))
-            before_s = found[1].time if found is not None else 0.0
+            if not np.isfinite(action).all():
+                raise ConfigurationError(
+                    f"the policy's action in control step {len(rows)} is not finite: {action}; the env was not "
+                    "given it"
+                )
+            before = (found[1].time, _warnings(found[1])) if found is not None else (0.0, 0)
             observation, _, terminated, truncated, info = env.step(action)
             struck = None if monitor is None else monitor.peak_bodies
             rows.append((action.astype(float), info, first, terminated, given[-1], struck))
             over = bool(terminated or truncated)
             if found is not None:
                 data = found[1]
-                control_dt = data.time - before_s
+                new = _warnings(data) > before[1]
+                diverged.append(new)
+                control_dt = control_dt if new else data.time - before[0]
                 states.append((data.ctrl.copy(), data.qpos.copy(), data.qvel.copy()))
                 touching = data.contact.geom[: data.ncon][data.contact.dist[: data.ncon] <= 0.0]
                 contacts.append({(int(a), int(b)) for a, b in touching})
@@ -207,5 +230,6 @@ def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
         contacts,
         list(pairs),
         control_dt,
+        np.array(diverged),
         repeats,
     )

@@ -152,6 +152,32 @@ def test_bad_input_is_refused_by_name():
         diagnose(env, steps=1)
 
 
+def test_an_action_that_is_not_finite_never_reaches_the_env():
+    env, calls = gym.make("Swimmer-v5"), []
+    seen = env.unwrapped.step
+    env.unwrapped.step = lambda action: calls.append(np.isfinite(action).all()) or seen(action)
+    answers = iter([np.zeros(2, np.float32)] * 6)
+    with pytest.raises(
+        ConfigurationError, match=r"control step \d+ is not finite: \[nan nan\]; the env was not given"
+    ):
+        diagnose(env, lambda observation: next(answers, np.full(2, np.nan, np.float32)), steps=20)
+    assert calls and all(calls)
+
+
+def test_a_simulation_that_diverges_is_found_though_mujoco_resets_it():
+    xml = CART.format(stiffness=20_000).replace('timestep="0.002"', 'timestep="0.002" integrator="Euler"')
+    wild = xml.replace('type="slide" axis', 'type="slide" stiffness="1e9" axis')
+    env = Bench(wild)
+    finding = diagnose(env, steps=60, symptoms=["contact_forces"]).findings[0]
+    assert finding.present and finding.figure == math.inf and not finding.code
+    assert finding.evidence[0].value >= 1.0 and "timestep" in finding.advice
+    assert json.loads(Diagnosis("x", 60, [], [finding]).as_json())["findings"][0]["present"] is True
+    with pytest.raises(
+        UnknownNameError, match="no symptom 'limits' was looked for; there are contact_forces"
+    ):
+        Diagnosis("x", 60, [], [finding]).finding("limits")
+
+
 class Model:
     """A policy as Stable-Baselines3 has it."""
 

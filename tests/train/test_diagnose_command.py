@@ -86,7 +86,7 @@ def test_what_is_no_policy_is_refused(run, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("words", [
-    ["train", "a.yaml", "--policy", "runs/a"], ["compare", "a.yaml", "--steps", "3"],
+    ["train", "a.yaml", "--policy", "runs/a"], ["compare", "a.yaml", "--steps", "2000"],
     ["diagnose", "Swimmer-v5", "Reacher-v5"], ["diagnose", "Swimmer-v5", "--report"],
 ])  # fmt: skip
 def test_options_of_other_commands_are_refused(words, capsys):
