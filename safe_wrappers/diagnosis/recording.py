@@ -21,11 +21,7 @@ Env = gym.Env[Any, Any]
 Driver = Callable[[Any], Any]
 """Gives an action for an observation."""
 NOT_REPLAYED = "most control steps, made once more, end elsewhere: the env changes its state between substeps"
-_DIVERGED = (
-    mujoco.mjtWarning.mjWARN_BADQPOS,
-    mujoco.mjtWarning.mjWARN_BADQVEL,
-    mujoco.mjtWarning.mjWARN_BADQACC,
-)
+_DIVERGED = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC")]
 PULSE_STEPS = 15
 """For which the attacking driver holds a corner of the action space."""
 
