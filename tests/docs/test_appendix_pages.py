@@ -20,6 +20,8 @@ WORKED = {
         "relative degree 2",
         "relative degree 1",
         r"$(a_{\mathrm{brake}}/v)(\gamma h_k - v)$",
+        r"$\dot h \ge 0$",
+        "closed form",
         "clamped afterwards",
     ],
     "trajectories": [
@@ -40,6 +42,8 @@ WORKED = {
     "springs-and-sampling": [r"$\zeta < 0.05$", "$T_s/2$", "28.65°"],
     "reachability": [
         r"$\det(J J^\top) = 0$",
+        r"$n \ge 6$",
+        "tangential and centripetal",
         r"$d_{\mathrm{crit}} = v_{\max}^2 / a_{\max}$",
         r"$\tfrac14 a_{\max} \tau^2$",
         r"$v_{\max}(\tau - v_{\max}/a_{\max})$",
