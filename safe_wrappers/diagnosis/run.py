@@ -8,17 +8,6 @@ import gymnasium as gym
 import numpy as np
 
 from safe_wrappers.checks import whole_number
-from safe_wrappers.diagnosis import (
-    balance,
-    command_steps,
-    contact_forces,
-    late_commands,
-    lever_arms,
-    limits,
-    loop_margin,
-    singular_poses,
-    wheel_slip,
-)
 from safe_wrappers.diagnosis.finding import Diagnosis, Finding, Series
 from safe_wrappers.diagnosis.recording import (
     Driver,
@@ -30,6 +19,17 @@ from safe_wrappers.diagnosis.recording import (
     record,
 )
 from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Recordings, Symptom
+from safe_wrappers.diagnosis.symptoms import (
+    balance,
+    command_steps,
+    contact_forces,
+    late_commands,
+    lever_arms,
+    limits,
+    loop_margin,
+    singular_poses,
+    wheel_slip,
+)
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import name_of
 
