@@ -21,11 +21,39 @@ from scipy.linalg import solve_discrete_are
 
 import safe_wrappers as sw
 from safe_wrappers.diagnosis import Diagnosis, diagnose
+from safe_wrappers.envs.teleop_operator import TeleopOperator
 
 RESULTS = Path(__file__).parent / "results" / "diagnose.md"
 Policy = Callable[[Any], Any]
 Made = tuple[gym.Env[Any, Any], Policy | None]
 gym.register_envs(gymnasium_robotics)
+
+
+class LateBothWays(gym.Wrapper[Any, Any, Any, Any]):
+    """A plain link: actions go up and observations come down, each so many steps late."""
+
+    def __init__(self, env: gym.Env[Any, Any], steps: int) -> None:
+        super().__init__(env)
+        self.late = steps
+
+    def reset(self, **options: Any) -> Any:
+        observation, info = self.env.reset(**options)
+        self.up = [np.zeros(self.action_space.shape, self.action_space.dtype)] * self.late
+        self.down = [observation] * self.late
+        return observation, info
+
+    def step(self, action: Any) -> Any:
+        self.up.append(np.array(action))
+        observation, *rest = self.env.step(self.up.pop(0))
+        self.down.append(observation)
+        return self.down.pop(0), *rest
+
+
+class Operating(TeleopOperator):
+    """The scripted operator as a policy."""
+
+    def __call__(self, observation: Any) -> Any:
+        return self.act(observation)
 
 
 class Late(gym.Wrapper[Any, Any, Any, Any]):
@@ -219,8 +247,18 @@ PLANTED: dict[str, tuple[str, Callable[[], Made]]] = {
         "limits",
         lambda: _with(gym.make("SafeSwimmerVelocity-v0"), lambda env: waving(env, 1.0, 25.0)),
     ),
+    "a plain channel, 0.1 s each way": (
+        "port_energy",
+        lambda: (sw.TeleopChannel(gym.make("TeleopContact-v0"), 0.1, 0.1), Operating()),
+    ),
+    "a plain link of one's own, 0.06 s each way": (
+        "port_energy",
+        lambda: (LateBothWays(gym.make("TeleopContact-v0"), 60), Operating()),
+    ),
     "a maze with stiff walls": ("contact_forces", lambda: _with(gym.make("PointMaze_UMaze-v3"))),
 }
+LONGER = {"a plain channel, 0.1 s each way": 4, "a plain link of one's own, 0.06 s each way": 4}
+"""How many times the steps: a control step of these takes a millisecond."""
 HEALTHY: dict[str, Callable[[], Made]] = {
     "InvertedPendulum, balanced": lambda: _with(gym.make("InvertedPendulum-v5"), balancing),
     "Swimmer, waving": lambda: _with(gym.make("Swimmer-v5"), waving),
@@ -273,7 +311,7 @@ def main() -> None:
         if arguments.only and name not in arguments.only:
             continue
         env, policy = make()
-        found = diagnose(env, policy, arguments.steps)
+        found = diagnose(env, policy, arguments.steps * LONGER.get(name, 1))
         first = found.present[0] if found.present else None
         if first is not None and first.symptom == symptom:
             ranked += 1

@@ -27,6 +27,7 @@ from safe_wrappers.diagnosis.symptoms import (
     lever_arms,
     limits,
     loop_margin,
+    port_energy,
     singular_poses,
     wheel_slip,
 )
@@ -43,6 +44,7 @@ SYMPTOMS: Final[dict[str, Symptom]] = {
     "contact_forces": contact_forces.SYMPTOM,
     "wheel_slip": wheel_slip.SYMPTOM,
     "balance": balance.SYMPTOM,
+    "port_energy": port_energy.SYMPTOM,
 }
 """By name."""
 POLICY: Final = "policy"
