@@ -201,6 +201,15 @@ def holding(env: Bench, at: float) -> Policy:
     return lambda x: np.clip(2.0 * (at - x[:1]) - 3.0 * x[1:], -3.0, 3.0)
 
 
+def stiffened(env: gym.Env[Any, Any], times: float) -> gym.Env[Any, Any]:
+    """The same joints, with so much stiffer and more damped springs."""
+    raw: Any = env.unwrapped
+    springs = raw.model.jnt_stiffness > 0.0
+    raw.model.jnt_stiffness[springs] *= times
+    raw.model.dof_damping[raw.model.jnt_dofadr[springs]] *= times
+    return env
+
+
 def _with(env: gym.Env[Any, Any], policy: Callable[[Any], Policy] | None = None) -> Made:
     return env, None if policy is None else policy(env)
 
@@ -255,6 +264,10 @@ PLANTED: dict[str, tuple[str, Callable[[], Made]]] = {
         "port_energy",
         lambda: (LateBothWays(gym.make("TeleopContact-v0"), 60), Operating()),
     ),
+    "chunks on joints that ring": (
+        "soft_joints",
+        lambda: _with(gym.make("FlexJointReach-v0"), lambda env: waving(env, 0.15, 200.0, seam=24)),
+    ),
     "a maze with stiff walls": ("contact_forces", lambda: _with(gym.make("PointMaze_UMaze-v3"))),
 }
 LONGER = {"a plain channel, 0.1 s each way": 4, "a plain link of one's own, 0.06 s each way": 4}
@@ -278,6 +291,16 @@ HEALTHY: dict[str, Callable[[], Made]] = {
     "SafePointGoal1, protected": lambda: _with(sw.protect(gym.make("SafePointGoal1-v0"))),
     "PointMaze, protected": lambda: _with(sw.protect(gym.make("PointMaze_UMaze-v3"))),
     "Reacher, waving": lambda: _with(gym.make("Reacher-v5"), lambda env: waving(env, 0.05)),
+    "FlexJointReach, waving": lambda: _with(
+        gym.make("FlexJointReach-v0"), lambda env: waving(env, 0.15, 200.0)
+    ),
+    "chunks on stiff joints": lambda: _with(
+        stiffened(gym.make("FlexJointReach-v0"), 100.0), lambda env: waving(env, 0.15, 200.0, seam=24)
+    ),
+    "TeleopContact through waves, in the air": lambda: _with(
+        sw.TeleopChannel(gym.make("TeleopContact-v0"), 0.1, 0.1, coding="wave", impedance=40.0),
+        lambda env: waving(env, 0.02, 500.0),
+    ),
     "Pusher, still": lambda: _with(gym.make("Pusher-v5"), still),
 }
 

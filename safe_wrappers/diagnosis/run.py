@@ -29,6 +29,7 @@ from safe_wrappers.diagnosis.symptoms import (
     loop_margin,
     port_energy,
     singular_poses,
+    soft_joints,
     wheel_slip,
 )
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnknownNameError, UnsupportedEnvError
@@ -45,6 +46,7 @@ SYMPTOMS: Final[dict[str, Symptom]] = {
     "wheel_slip": wheel_slip.SYMPTOM,
     "balance": balance.SYMPTOM,
     "port_energy": port_energy.SYMPTOM,
+    "soft_joints": soft_joints.SYMPTOM,
 }
 """By name."""
 POLICY: Final = "policy"
