@@ -87,6 +87,19 @@ def waving(env: gym.Env[Any, Any], share: float = 0.3, period: float = 60.0, sea
     return act
 
 
+def without_speeds(env: gym.Env[Any, Any]) -> Policy:
+    """`balancing`, with speeds from the last two positions."""
+    feedback, state = balancing(env), {"before": np.zeros(2)}
+    dt = env.unwrapped.dt  # type: ignore[attr-defined]
+
+    def act(seen: Any) -> Any:
+        speeds = (seen - state["before"]) / dt
+        state["before"] = np.array(seen)
+        return feedback(np.concatenate([seen, np.clip(speeds, -1.0, 1.0)]))
+
+    return act
+
+
 def still(env: gym.Env[Any, Any]) -> Policy:
     """Nothing."""
     return lambda observation: np.zeros(env.action_space.shape, env.action_space.dtype)  # type: ignore[arg-type]
@@ -144,6 +157,17 @@ TURNTABLE = """
 """
 
 
+HIDDEN = """
+<mujoco><compiler autolimits="true"/><option timestep="0.002" gravity="0 0 0"/><worldbody>
+  <geom name="pillar" type="box" pos="0 1 0" size=".2 .05 .3"/>
+  <body name="cart"><joint name="slide" type="slide" axis="1 0 0" range="-1 1" damping="2"/>
+    <geom size=".1" mass="1"/><camera name="eye" pos="0 .12 0" xyaxes="1 0 0 0 0 1" fovy="110"/></body>
+  <body name="ball" pos="0 2 0"><joint name="ball" type="slide" axis="1 0 0" stiffness="1"/>
+    <geom size=".1" mass="1"/></body>
+  </worldbody><actuator><motor joint="slide" ctrlrange="-2 2"/></actuator></mujoco>
+"""
+
+
 class Bench(gym.Env[Any, Any]):
     """A machine of a few parts; the observation is its state."""
 
@@ -159,7 +183,7 @@ class Bench(gym.Env[Any, Any]):
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (self.model.nq + self.model.nv,), np.float64)
         self.steps = 0
 
-    def _state(self) -> Any:
+    def _get_obs(self) -> Any:
         return np.concatenate([self.data.qpos, self.data.qvel])
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
@@ -168,13 +192,21 @@ class Bench(gym.Env[Any, Any]):
         self.data.qpos[:] = self.start + self.np_random.uniform(-0.01, 0.01, self.model.nq)
         mujoco.mj_forward(self.model, self.data)
         self.steps = 0
-        return self._state(), {}
+        return self._get_obs(), {}
 
     def step(self, action: Any) -> Any:
         self.data.ctrl[:] = action
         mujoco.mj_step(self.model, self.data, self.frame_skip)
         self.steps += 1
-        return self._state(), 0.0, False, self.steps >= 400, {}
+        return self._get_obs(), 0.0, False, self.steps >= 400, {}
+
+
+def partly(env: gym.Env[Any, Any], left_out: list[int]) -> gym.Env[Any, Any]:
+    """The env without some entries of its observation."""
+    low, high = (np.delete(end, left_out) for end in (env.observation_space.low, env.observation_space.high))  # type: ignore[attr-defined]
+    return gym.wrappers.TransformObservation(
+        env, lambda seen: np.delete(seen, left_out), gym.spaces.Box(low, high, dtype=np.float64)
+    )
 
 
 def tracing(env: Bench, center: float, width: float) -> Policy:
@@ -268,6 +300,18 @@ PLANTED: dict[str, tuple[str, Callable[[], Made]]] = {
         "soft_joints",
         lambda: _with(gym.make("FlexJointReach-v0"), lambda env: waving(env, 0.15, 200.0, seam=24)),
     ),
+    "a ball behind a pillar": (
+        "unobserved_states",
+        lambda: _with(partly(Bench(HIDDEN, [0.0, 1.0]), [1, 3]), lambda env: waving(env, 0.2, 200.0)),
+    ),
+    "cars that are not observed": (
+        "unobserved_states",
+        lambda: _with(gym.make("OccludedCrossing-v0"), still),
+    ),
+    "a target that is not observed": (
+        "unobserved_states",
+        lambda: _with(partly(gym.make("Reacher-v5"), [4, 5, 8, 9]), lambda env: waving(env, 0.05)),
+    ),
     "a maze with stiff walls": ("contact_forces", lambda: _with(gym.make("PointMaze_UMaze-v3"))),
 }
 LONGER = {"a plain channel, 0.1 s each way": 4, "a plain link of one's own, 0.06 s each way": 4}
@@ -300,6 +344,10 @@ HEALTHY: dict[str, Callable[[], Made]] = {
     "TeleopContact through waves, in the air": lambda: _with(
         sw.TeleopChannel(gym.make("TeleopContact-v0"), 0.1, 0.1, coding="wave", impedance=40.0),
         lambda env: waving(env, 0.02, 500.0),
+    ),
+    "InvertedPendulum, balanced without seeing speeds": lambda: (
+        partly(base := gym.make("InvertedPendulum-v5"), [2, 3]),
+        without_speeds(base),
     ),
     "Pusher, still": lambda: _with(gym.make("Pusher-v5"), still),
 }

@@ -84,6 +84,7 @@ class Recording:
 
     Attributes:
         actions: That were proposed, shape (k, m).
+        rewards: Of each step, shape (k,).
         infos: Of each step, with those of a contact and a balance monitor, where the env allows them.
         first: The first steps of episodes, shape (k,).
         terminated: Shape (k,).
@@ -102,6 +103,7 @@ class Recording:
     """
 
     actions: Array
+    rewards: Array
     infos: list[dict[str, Any]]
     first: np.ndarray
     terminated: np.ndarray
@@ -217,10 +219,19 @@ def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
                     "given it"
                 )
             before = (found[1].time, _warnings(found[1])) if found is not None else (0.0, 0)
-            observation, _, terminated, truncated, info = env.step(action)
+            observation, reward, terminated, truncated, info = env.step(action)
             struck = None if monitor is None else monitor.peak_bodies
             rows.append(
-                (action.astype(float), info, first, terminated, *given[-1], struck, _kept(observation))
+                (
+                    action.astype(float),
+                    float(reward),
+                    info,
+                    first,
+                    terminated,
+                    *given[-1],
+                    struck,
+                    _kept(observation),
+                )
             )
             if publishes:
                 efforts.append(np.array(env.get_wrapper_attr("port_effort_acted"), dtype=float))
@@ -233,10 +244,11 @@ def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
                 states.append((data.ctrl.copy(), data.qpos.copy(), data.qvel.copy()))
                 touching = data.contact.geom[: data.ncon][data.contact.dist[: data.ncon] <= 0.0]
                 contacts.append({(int(a), int(b)) for a, b in touching})
-    actions, infos, starts, ends, executed, answered, pairs, shown = zip(*rows, strict=True)
+    actions, rewards, infos, starts, ends, executed, answered, pairs, shown = zip(*rows, strict=True)
     controls, qpos, qvel = zip(*states, strict=True) if states else ((), (), ())
     return Recording(
         np.array(actions),
+        np.array(rewards),
         list(infos),
         np.array(starts),
         np.array(ends),

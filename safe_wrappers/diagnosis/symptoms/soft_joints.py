@@ -23,7 +23,7 @@ def _checked(env: Env) -> tuple[mujoco.MjModel, RigidModelCheck]:
     try:
         check = rigid_model_check(env.unwrapped)
     except SafeWrappersError as error:
-        raise NotMeasuredError(str(error)) from error
+        raise NotMeasuredError(f"the springs of this machine cannot be read: {error}") from error
     if not check.springs:
         raise NotMeasuredError("no spring lies behind a motor")
     return found[0], check
