@@ -56,7 +56,15 @@ def observation_reader(env: Env) -> Callable[[], Array]:
     def seen() -> Array:
         return _flat(functools.reduce(lambda given, function: function(given), functions, read()))
 
-    if not np.array_equal(seen(), seen(), equal_nan=True):
+    try:
+        steady = np.array_equal(seen(), seen(), equal_nan=True)
+    except NotMeasuredError:
+        raise
+    except Exception as error:
+        raise NotMeasuredError(
+            f"the env's observation raised {type(error).__name__} when it was asked for between two steps: {error}"
+        ) from error
+    if not steady:
         raise NotMeasuredError("the env gives two observations of one state: it adds noise")
     return seen
 
