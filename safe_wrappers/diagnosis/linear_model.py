@@ -174,6 +174,12 @@ class Linearised:
                 np.array([self._nudged(step, by * direction, function) for direction in directions.T])
                 for by in (NUDGE, -NUDGE)
             )
+        except NotMeasuredError:
+            raise
+        except Exception as error:
+            raise NotMeasuredError(
+                f"the env raised {type(error).__name__} in a state next to one of the run: {error}"
+            ) from error
         finally:
             mujoco.mj_setState(self._model, self._data, self._kept, STATE)
             mujoco.mj_forward(self._model, self._data)

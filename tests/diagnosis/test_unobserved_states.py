@@ -220,6 +220,19 @@ def test_what_cannot_be_measured_is_said():
     env.steps = 20
     with pytest.raises(NotMeasuredError, match=r"raised ValueError.*no map"):
         unobserved_states.measure(env, recording)
+
+    class Stops(Bench):
+        def step(self, action):
+            if self.steps > 20:
+                raise RuntimeError("reset me")
+            return super().step(action)
+
+    env = partly(Stops(HIDDEN, [0.0, 1.0]), [1, 3])
+    recording = record(env, waving(env), 20, 0)
+    env.unwrapped.steps, before = 99, env.unwrapped.data.qpos.copy()
+    with pytest.raises(NotMeasuredError, match=r"RuntimeError in a state next to.*reset me"):
+        unobserved_states.measure(env, recording)
+    assert np.array_equal(env.unwrapped.data.qpos, before)
     resting = Bench(ROLLING)
     recording = record(resting, still(resting), 5, 0)
     recording.qpos[:], recording.qvel[:] = recording.qpos[0], 0.0
