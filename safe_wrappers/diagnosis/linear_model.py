@@ -71,8 +71,8 @@ def observation_reader(env: Env) -> Callable[[], Array]:
 
 def _own_reader(raw: Any) -> Callable[[], Any]:
     for name in ("observe", "_get_obs"):
-        function = getattr(raw, name, None)
-        if callable(function) and not inspect.signature(function).parameters:
+        function: Callable[[], Any] | None = getattr(raw, name, None)
+        if function is not None and not inspect.signature(function).parameters:
             return function
     for name in ("point_env", "ant_env"):  # gymnasium-robotics' mazes
         if hasattr(raw, name):

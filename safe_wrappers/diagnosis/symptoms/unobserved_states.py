@@ -72,7 +72,7 @@ def unseen(a: Array, c: Array) -> Array:
 def _relative(c: Array) -> Array:
     """Rows of length one, but for those of nothing."""
     lengths = np.linalg.norm(c, axis=1, keepdims=True)
-    return np.divide(c, lengths, out=np.zeros_like(c), where=lengths > 0.0)
+    return np.asarray(np.divide(c, lengths, out=np.zeros_like(c), where=lengths > 0.0))
 
 
 class Hidden(NamedTuple):
