@@ -21,11 +21,39 @@ from scipy.linalg import solve_discrete_are
 
 import safe_wrappers as sw
 from safe_wrappers.diagnosis import Diagnosis, diagnose
+from safe_wrappers.envs.teleop_operator import TeleopOperator
 
 RESULTS = Path(__file__).parent / "results" / "diagnose.md"
 Policy = Callable[[Any], Any]
 Made = tuple[gym.Env[Any, Any], Policy | None]
 gym.register_envs(gymnasium_robotics)
+
+
+class LateBothWays(gym.Wrapper[Any, Any, Any, Any]):
+    """A plain link: actions go up and observations come down, each so many steps late."""
+
+    def __init__(self, env: gym.Env[Any, Any], steps: int) -> None:
+        super().__init__(env)
+        self.late = steps
+
+    def reset(self, **options: Any) -> Any:
+        observation, info = self.env.reset(**options)
+        self.up = [np.zeros(self.action_space.shape, self.action_space.dtype)] * self.late
+        self.down = [observation] * self.late
+        return observation, info
+
+    def step(self, action: Any) -> Any:
+        self.up.append(np.array(action))
+        observation, *rest = self.env.step(self.up.pop(0))
+        self.down.append(observation)
+        return self.down.pop(0), *rest
+
+
+class Operating(TeleopOperator):
+    """The scripted operator as a policy."""
+
+    def __call__(self, observation: Any) -> Any:
+        return self.act(observation)
 
 
 class Late(gym.Wrapper[Any, Any, Any, Any]):
@@ -55,6 +83,19 @@ def waving(env: gym.Env[Any, Any], share: float = 0.3, period: float = 60.0, sea
         state["k"] += 1
         angle = 2.0 * np.pi * state["k"] / period + state["phase"] + np.arange(high.size)
         return (share * high * np.sin(angle)).astype(env.action_space.dtype)
+
+    return act
+
+
+def without_speeds(env: gym.Env[Any, Any]) -> Policy:
+    """`balancing`, with speeds from the last two positions."""
+    feedback, state = balancing(env), {"before": np.zeros(2)}
+    dt = env.unwrapped.dt  # type: ignore[attr-defined]
+
+    def act(seen: Any) -> Any:
+        speeds = (seen - state["before"]) / dt
+        state["before"] = np.array(seen)
+        return feedback(np.concatenate([seen, np.clip(speeds, -1.0, 1.0)]))
 
     return act
 
@@ -116,6 +157,17 @@ TURNTABLE = """
 """
 
 
+HIDDEN = """
+<mujoco><compiler autolimits="true"/><option timestep="0.002" gravity="0 0 0"/><worldbody>
+  <geom name="pillar" type="box" pos="0 1 0" size=".2 .05 .3"/>
+  <body name="cart"><joint name="slide" type="slide" axis="1 0 0" range="-1 1" damping="2"/>
+    <geom size=".1" mass="1"/><camera name="eye" pos="0 .12 0" xyaxes="1 0 0 0 0 1" fovy="110"/></body>
+  <body name="ball" pos="0 2 0"><joint name="ball" type="slide" axis="1 0 0" stiffness="1"/>
+    <geom size=".1" mass="1"/></body>
+  </worldbody><actuator><motor joint="slide" ctrlrange="-2 2"/></actuator></mujoco>
+"""
+
+
 class Bench(gym.Env[Any, Any]):
     """A machine of a few parts; the observation is its state."""
 
@@ -131,7 +183,7 @@ class Bench(gym.Env[Any, Any]):
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (self.model.nq + self.model.nv,), np.float64)
         self.steps = 0
 
-    def _state(self) -> Any:
+    def _get_obs(self) -> Any:
         return np.concatenate([self.data.qpos, self.data.qvel])
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
@@ -140,13 +192,21 @@ class Bench(gym.Env[Any, Any]):
         self.data.qpos[:] = self.start + self.np_random.uniform(-0.01, 0.01, self.model.nq)
         mujoco.mj_forward(self.model, self.data)
         self.steps = 0
-        return self._state(), {}
+        return self._get_obs(), {}
 
     def step(self, action: Any) -> Any:
         self.data.ctrl[:] = action
         mujoco.mj_step(self.model, self.data, self.frame_skip)
         self.steps += 1
-        return self._state(), 0.0, False, self.steps >= 400, {}
+        return self._get_obs(), 0.0, False, self.steps >= 400, {}
+
+
+def partly(env: gym.Env[Any, Any], left_out: list[int]) -> gym.Env[Any, Any]:
+    """The env without some entries of its observation."""
+    low, high = (np.delete(end, left_out) for end in (env.observation_space.low, env.observation_space.high))  # type: ignore[attr-defined]
+    return gym.wrappers.TransformObservation(
+        env, lambda seen: np.delete(seen, left_out), gym.spaces.Box(low, high, dtype=np.float64)
+    )
 
 
 def tracing(env: Bench, center: float, width: float) -> Policy:
@@ -171,6 +231,15 @@ def tracing(env: Bench, center: float, width: float) -> Policy:
 def holding(env: Bench, at: float) -> Policy:
     """A gentle spring and damper to a position."""
     return lambda x: np.clip(2.0 * (at - x[:1]) - 3.0 * x[1:], -3.0, 3.0)
+
+
+def stiffened(env: gym.Env[Any, Any], times: float) -> gym.Env[Any, Any]:
+    """The same joints, with so much stiffer and more damped springs."""
+    raw: Any = env.unwrapped
+    springs = raw.model.jnt_stiffness > 0.0
+    raw.model.jnt_stiffness[springs] *= times
+    raw.model.dof_damping[raw.model.jnt_dofadr[springs]] *= times
+    return env
 
 
 def _with(env: gym.Env[Any, Any], policy: Callable[[Any], Policy] | None = None) -> Made:
@@ -219,8 +288,34 @@ PLANTED: dict[str, tuple[str, Callable[[], Made]]] = {
         "limits",
         lambda: _with(gym.make("SafeSwimmerVelocity-v0"), lambda env: waving(env, 1.0, 25.0)),
     ),
+    "a plain channel, 0.1 s each way": (
+        "port_energy",
+        lambda: (sw.TeleopChannel(gym.make("TeleopContact-v0"), 0.1, 0.1), Operating()),
+    ),
+    "a plain link of one's own, 0.06 s each way": (
+        "port_energy",
+        lambda: (LateBothWays(gym.make("TeleopContact-v0"), 60), Operating()),
+    ),
+    "chunks on joints that ring": (
+        "soft_joints",
+        lambda: _with(gym.make("FlexJointReach-v0"), lambda env: waving(env, 0.15, 200.0, seam=24)),
+    ),
+    "a ball behind a pillar": (
+        "unobserved_states",
+        lambda: _with(partly(Bench(HIDDEN, [0.0, 1.0]), [1, 3]), lambda env: waving(env, 0.2, 200.0)),
+    ),
+    "cars that are not observed": (
+        "unobserved_states",
+        lambda: _with(gym.make("OccludedCrossing-v0"), still),
+    ),
+    "a target that is not observed": (
+        "unobserved_states",
+        lambda: _with(partly(gym.make("Reacher-v5"), [4, 5, 8, 9]), lambda env: waving(env, 0.05)),
+    ),
     "a maze with stiff walls": ("contact_forces", lambda: _with(gym.make("PointMaze_UMaze-v3"))),
 }
+LONGER = {"a plain channel, 0.1 s each way": 4, "a plain link of one's own, 0.06 s each way": 4}
+"""How many times the steps: a control step of these takes a millisecond."""
 HEALTHY: dict[str, Callable[[], Made]] = {
     "InvertedPendulum, balanced": lambda: _with(gym.make("InvertedPendulum-v5"), balancing),
     "Swimmer, waving": lambda: _with(gym.make("Swimmer-v5"), waving),
@@ -240,6 +335,20 @@ HEALTHY: dict[str, Callable[[], Made]] = {
     "SafePointGoal1, protected": lambda: _with(sw.protect(gym.make("SafePointGoal1-v0"))),
     "PointMaze, protected": lambda: _with(sw.protect(gym.make("PointMaze_UMaze-v3"))),
     "Reacher, waving": lambda: _with(gym.make("Reacher-v5"), lambda env: waving(env, 0.05)),
+    "FlexJointReach, waving": lambda: _with(
+        gym.make("FlexJointReach-v0"), lambda env: waving(env, 0.15, 200.0)
+    ),
+    "chunks on stiff joints": lambda: _with(
+        stiffened(gym.make("FlexJointReach-v0"), 100.0), lambda env: waving(env, 0.15, 200.0, seam=24)
+    ),
+    "TeleopContact through waves, in the air": lambda: _with(
+        sw.TeleopChannel(gym.make("TeleopContact-v0"), 0.1, 0.1, coding="wave", impedance=40.0),
+        lambda env: waving(env, 0.02, 500.0),
+    ),
+    "InvertedPendulum, balanced without seeing speeds": lambda: (
+        partly(base := gym.make("InvertedPendulum-v5"), [2, 3]),
+        without_speeds(base),
+    ),
     "Pusher, still": lambda: _with(gym.make("Pusher-v5"), still),
 }
 
@@ -273,7 +382,7 @@ def main() -> None:
         if arguments.only and name not in arguments.only:
             continue
         env, policy = make()
-        found = diagnose(env, policy, arguments.steps)
+        found = diagnose(env, policy, arguments.steps * LONGER.get(name, 1))
         first = found.present[0] if found.present else None
         if first is not None and first.symptom == symptom:
             ranked += 1

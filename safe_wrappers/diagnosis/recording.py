@@ -19,7 +19,7 @@ from safe_wrappers.wrappers.contact_monitor import ContactMonitor
 
 Env = gym.Env[Any, Any]
 Driver = Callable[[Any], Any]
-"""Gives an action for an observation."""
+"""Gives an action for an observation; one that has `reset()` is told so that an episode begins."""
 NOT_REPLAYED = "most control steps, made once more, end elsewhere: the env changes its state between substeps"
 _DIVERGED = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC")]
 PULSE_STEPS = 15
@@ -84,6 +84,7 @@ class Recording:
 
     Attributes:
         actions: That were proposed, shape (k, m).
+        rewards: Of each step, shape (k,).
         infos: Of each step, with those of a contact and a balance monitor, where the env allows them.
         first: The first steps of episodes, shape (k,).
         terminated: Shape (k,).
@@ -93,12 +94,16 @@ class Recording:
         qvel: Shape (k, nv); likewise.
         contacts: After each step, pairs of geoms that touch, ids; likewise.
         struck: Names of the two bodies with the largest force of each step; None where there was none.
+        shown: The observation after each step, as the driver got it; None where it is no flat array.
+        answered: As the unwrapped env gave it; likewise.
+        port_efforts: That acted at the env's port in each step, as it publishes them, shape (k, p), N; else empty.
         control_dt: Control interval, s; NaN where nothing says it.
         diverged: Whether MuJoCo has found numbers in a step that are not finite, and has reset its data, shape (k,).
         repeats: Asked twice with the first observation, the driver has given the same action.
     """
 
     actions: Array
+    rewards: Array
     infos: list[dict[str, Any]]
     first: np.ndarray
     terminated: np.ndarray
@@ -108,6 +113,9 @@ class Recording:
     qvel: Array
     contacts: list[set[tuple[int, int]]]
     struck: list[tuple[str, str] | None]
+    shown: list[Array | None]
+    answered: list[Array | None]
+    port_efforts: Array
     control_dt: float
     diverged: np.ndarray
     repeats: bool
@@ -149,14 +157,16 @@ def _declared_dt(env: Env) -> float:
 
 
 @contextmanager
-def _spied(env: Env) -> Iterator[list[Array]]:
-    """The actions that the unwrapped env is given, as long as this lasts."""
+def _spied(env: Env) -> Iterator[list[tuple[Array, Array | None]]]:
+    """The actions that the unwrapped env is given, and its observations, as long as this lasts."""
     raw: Any = env.unwrapped
-    step, own, given = raw.step, vars(raw).get("step"), list[Array]()
+    step, own, given = raw.step, vars(raw).get("step"), list[tuple[Array, Array | None]]()
 
     def spy(action: Any) -> Any:
-        given.append(np.array(action, dtype=float))
-        return step(action)
+        taken = np.array(action, dtype=float)
+        answer = step(action)
+        given.append((taken, _kept(answer[0])))
+        return answer
 
     raw.step = spy
     try:
@@ -165,6 +175,12 @@ def _spied(env: Env) -> Iterator[list[Array]]:
         del raw.step
         if own is not None:
             raw.step = own
+
+
+def _kept(observation: Any) -> Array | None:
+    """A copy, since an env may reuse its arrays."""
+    flat = isinstance(observation, np.ndarray) and observation.ndim == 1
+    return observation.astype(np.float64) if flat else None
 
 
 def _warnings(data: mujoco.MjData) -> int:
@@ -183,6 +199,8 @@ def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
     states: list[tuple[Any, ...]] = []
     contacts: list[set[tuple[int, int]]] = []
     diverged: list[bool] = []
+    efforts: list[Array] = []
+    publishes = env.has_wrapper_attr("port_effort_acted")
     observation, over, episode, control_dt, repeats = None, True, 0, _declared_dt(env), False
     with _spied(env) as given, warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of what the figures count
@@ -190,6 +208,7 @@ def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
             first = over
             if first:
                 observation, _ = env.reset(seed=seed + episode)
+                getattr(driver, "reset", lambda: None)()
                 episode += 1
             if not rows:
                 repeats = np.array_equal(driver(observation), driver(observation))
@@ -200,9 +219,22 @@ def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
                     "given it"
                 )
             before = (found[1].time, _warnings(found[1])) if found is not None else (0.0, 0)
-            observation, _, terminated, truncated, info = env.step(action)
+            observation, reward, terminated, truncated, info = env.step(action)
             struck = None if monitor is None else monitor.peak_bodies
-            rows.append((action.astype(float), info, first, terminated, given[-1], struck))
+            rows.append(
+                (
+                    action.astype(float),
+                    float(reward),
+                    info,
+                    first,
+                    terminated,
+                    *given[-1],
+                    struck,
+                    _kept(observation),
+                )
+            )
+            if publishes:
+                efforts.append(np.array(env.get_wrapper_attr("port_effort_acted"), dtype=float))
             over = bool(terminated or truncated)
             if found is not None:
                 data = found[1]
@@ -212,10 +244,11 @@ def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
                 states.append((data.ctrl.copy(), data.qpos.copy(), data.qvel.copy()))
                 touching = data.contact.geom[: data.ncon][data.contact.dist[: data.ncon] <= 0.0]
                 contacts.append({(int(a), int(b)) for a, b in touching})
-    actions, infos, starts, ends, executed, pairs = zip(*rows, strict=True)
+    actions, rewards, infos, starts, ends, executed, answered, pairs, shown = zip(*rows, strict=True)
     controls, qpos, qvel = zip(*states, strict=True) if states else ((), (), ())
     return Recording(
         np.array(actions),
+        np.array(rewards),
         list(infos),
         np.array(starts),
         np.array(ends),
@@ -225,6 +258,9 @@ def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
         np.array(qvel),
         contacts,
         list(pairs),
+        list(shown),
+        list(answered),
+        np.array(efforts),
         control_dt,
         np.array(diverged),
         repeats,

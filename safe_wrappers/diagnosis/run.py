@@ -8,17 +8,6 @@ import gymnasium as gym
 import numpy as np
 
 from safe_wrappers.checks import whole_number
-from safe_wrappers.diagnosis import (
-    balance,
-    command_steps,
-    contact_forces,
-    late_commands,
-    lever_arms,
-    limits,
-    loop_margin,
-    singular_poses,
-    wheel_slip,
-)
 from safe_wrappers.diagnosis.finding import Diagnosis, Finding, Series
 from safe_wrappers.diagnosis.recording import (
     Driver,
@@ -30,6 +19,20 @@ from safe_wrappers.diagnosis.recording import (
     record,
 )
 from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Recordings, Symptom
+from safe_wrappers.diagnosis.symptoms import (
+    balance,
+    command_steps,
+    contact_forces,
+    late_commands,
+    lever_arms,
+    limits,
+    loop_margin,
+    port_energy,
+    singular_poses,
+    soft_joints,
+    unobserved_states,
+    wheel_slip,
+)
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError, UnknownNameError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import name_of
 
@@ -43,6 +46,9 @@ SYMPTOMS: Final[dict[str, Symptom]] = {
     "contact_forces": contact_forces.SYMPTOM,
     "wheel_slip": wheel_slip.SYMPTOM,
     "balance": balance.SYMPTOM,
+    "port_energy": port_energy.SYMPTOM,
+    "soft_joints": soft_joints.SYMPTOM,
+    "unobserved_states": unobserved_states.SYMPTOM,
 }
 """By name."""
 POLICY: Final = "policy"
@@ -155,6 +161,16 @@ def _found(env: Env, name: str, recordings: Recordings) -> Finding:
     )  # fmt: skip
 
 
+def _as_before(tried: Env, env: Env) -> Env:
+    """What a policy of the env alone can be asked in: a flat observation that has grown loses what is new."""
+    new, old = tried.observation_space, env.observation_space
+    if not isinstance(new, gym.spaces.Box) or not isinstance(old, gym.spaces.Box) or len(new.shape) != 1:
+        return tried
+    if new.shape[0] <= old.shape[0]:
+        return tried
+    return gym.wrappers.TransformObservation(tried, lambda seen: seen[: old.shape[0]], old)
+
+
 def _treated(env: Env, finding: Finding, drivers: dict[str, Driver], steps: int, seed: int) -> Finding:
     """The finding with the figure that its lines leave; lines that are refused are taken out, and it is told why."""
     import safe_wrappers
@@ -166,7 +182,7 @@ def _treated(env: Env, finding: Finding, drivers: dict[str, Driver], steps: int,
     try:
         exec(finding.code, scope)  # the very lines that the user is told
         fresh = makers[driver](env, seed) if driver in makers else drivers[driver]
-        recording = record(scope["env"], fresh, steps, seed)
+        recording = record(_as_before(scope["env"], env), fresh, steps, seed)
         return replace(finding, after=SYMPTOMS[finding.symptom].measure(scope["env"], recording).figure)
     except (SafeWrappersError, NotMeasuredError) as error:
         tool = f"{finding.advice} {finding.code.partition('(')[0].rpartition('sw.')[2]} was refused: {error}"

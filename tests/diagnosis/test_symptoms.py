@@ -8,10 +8,10 @@ import pytest
 
 pytest.importorskip("gymnasium_robotics")
 from benchmarks.diagnose import ARM, TURNTABLE, Bench, waving
-from safe_wrappers.diagnosis import command_steps, late_commands, lever_arms, wheel_slip
-from safe_wrappers.diagnosis.loop_margin import loop
 from safe_wrappers.diagnosis.recording import attacking_driver, braking_horizon, random_driver, record
-from safe_wrappers.diagnosis.singular_poses import _arm, _manipulability
+from safe_wrappers.diagnosis.symptoms import command_steps, late_commands, lever_arms, wheel_slip
+from safe_wrappers.diagnosis.symptoms.loop_margin import loop
+from safe_wrappers.diagnosis.symptoms.singular_poses import _arm, _manipulability
 
 
 @pytest.mark.parametrize("delay", [0, 1, 3])

@@ -3,9 +3,9 @@
 import numpy as np
 
 from safe_wrappers.diagnosis.finding import Evidence
-from safe_wrappers.diagnosis.limits import touches_fixed
 from safe_wrappers.diagnosis.recording import NOT_REPLAYED, Env, Recording, braking_horizon, physics
 from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom
+from safe_wrappers.diagnosis.symptoms.limits import touches_fixed
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.mujoco.model import fixed_bodies, weight_n
 from safe_wrappers.protect import protect

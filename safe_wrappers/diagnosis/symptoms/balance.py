@@ -5,7 +5,7 @@ import numpy as np
 from safe_wrappers.diagnosis.finding import Evidence
 from safe_wrappers.diagnosis.recording import NOT_REPLAYED, Env, Recording, physics
 from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom
-from safe_wrappers.diagnosis.wheel_slip import wheels
+from safe_wrappers.diagnosis.symptoms.wheel_slip import wheels
 from safe_wrappers.plants.env_checks import name_of
 
 

@@ -6,9 +6,9 @@ import numpy as np
 from safe_wrappers.checks import Array
 from safe_wrappers.control.watchdog.sampling import phase_lag
 from safe_wrappers.diagnosis.finding import Evidence
-from safe_wrappers.diagnosis.late_commands import ages
 from safe_wrappers.diagnosis.recording import Env, Recording, physics
 from safe_wrappers.diagnosis.symptom import Measured, NotMeasuredError, Symptom
+from safe_wrappers.diagnosis.symptoms.late_commands import ages
 
 LINEAR = 0.9
 """Share of the variance of a command that a linear function of the state must explain."""

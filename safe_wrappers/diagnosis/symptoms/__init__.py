@@ -1,0 +1,1 @@
+"""The symptoms, one a module: how each is measured, and which lines treat it."""
