@@ -35,8 +35,8 @@ class Finding:
         symptom: Its name, a key of `SYMPTOMS`.
         title: In words.
         section: Of the appendix.
-        figure: What was measured, in `unit`: with the policy, or without one the worse of the other drivers; NaN
-            where it could not be measured.
+        figure: What was measured, in `unit`: with the policy, or without one the worse of the other drivers (the
+            milder for `Symptom.least`); NaN where it could not be measured.
         threshold: From which on it is a symptom.
         unit: Of both.
         by_driver: The figure of each driver.

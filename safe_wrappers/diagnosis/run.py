@@ -139,9 +139,10 @@ def _measured(env: Env, symptom: Symptom, recordings: Recordings) -> tuple[dict[
     return found, missing
 
 
-def _judged(found: dict[str, Measured]) -> str:
-    """The driver whose figure counts: the policy, or else the worse of the others."""
-    return POLICY if POLICY in found else max(found, key=lambda driver: found[driver].figure)
+def _judged(found: dict[str, Measured], least: bool) -> str:
+    """The driver whose figure counts: the policy, or else the worse of the others, or the milder."""
+    choose = min if least else max
+    return POLICY if POLICY in found else choose(found, key=lambda driver: found[driver].figure)
 
 
 def _found(env: Env, name: str, recordings: Recordings) -> Finding:
@@ -149,7 +150,7 @@ def _found(env: Env, name: str, recordings: Recordings) -> Finding:
     found, missing = _measured(env, symptom, recordings)
     if not found:
         return Finding(name, symptom.title, symptom.section, missing=missing)
-    driver = _judged(found)
+    driver = _judged(found, symptom.least)
     measured = found[driver]
     code = advice = ""
     if measured.figure >= symptom.threshold:

@@ -43,6 +43,8 @@ class Symptom(NamedTuple):
         measure: Of an env and what one driver did in it; raises `NotMeasuredError`.
         lines: For an env and the driver's recording: lines that put a wrapper around `env`, and advice.
         policies_only: Random and attacking drivers have this symptom of themselves.
+        least: Without a policy the milder of the other drivers counts: what only one of them meets says nothing of
+            the env.
     """
 
     title: str
@@ -53,3 +55,4 @@ class Symptom(NamedTuple):
     measure: Callable[[Env, Recording], Measured]
     lines: Callable[[Env, Recording], tuple[str, str]]
     policies_only: bool = False
+    least: bool = False

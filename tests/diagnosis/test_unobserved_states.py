@@ -140,6 +140,11 @@ def test_the_lines_track_what_is_not_shown_and_a_policy_keeps_its_observation():
     assert unobserved_states.lines(scope["env"], recording)[0] == ""  # it is tracked already
 
 
+def test_where_only_an_attacker_leaves_a_sensors_range_the_env_is_not_blamed():
+    found = diagnose(gym.make("SafePointGoal0-v0"), steps=700, symptoms=["unobserved_states"]).findings[0]
+    assert found.by_driver["attacking"] > 0.0 == found.by_driver["random"] == found.figure
+
+
 def test_speeds_that_wander_are_recovered():
     rng, dt, memory_s, noise = np.random.default_rng(0), 0.05, 2.0, 0.03
     off = np.zeros((40_000, 1, 2))

@@ -235,5 +235,5 @@ def _sensor(model: mujoco.MjModel) -> str:
 
 SYMPTOM = Symptom(
     "states that count and are never shown: occluded, or left out", "section 1.6, covariance and observability",
-    1.0, "directions", ("directions not shown", "directions"), measure, lines,
+    1.0, "directions", ("directions not shown", "directions"), measure, lines, least=True,
 )  # fmt: skip
