@@ -1,0 +1,39 @@
+"""Marks in MuJoCo's own scene: what Gymnasium's renderer draws beside the model, in frames and in the window."""
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import gymnasium as gym
+import mujoco
+
+from safe_wrappers.drawing.marks import COLOURS, Mark
+
+MOST_MARKS: Final = 500
+"""Of one frame. Gymnasium's scene has room for 1000 shapes, the model's own among them."""
+
+
+def find_renderer(env: gym.Env[Any, Any]) -> Any | None:
+    """The `MujocoRenderer` of an env, or of the robot's env that it holds, as a maze does; None: it has none."""
+    raw: Any = env.unwrapped
+    held = [raw, *(inner for inner in vars(raw).values() if isinstance(inner, gym.Env))]
+    found = (getattr(one, "mujoco_renderer", None) for one in held)
+    return next((renderer for renderer in found if renderer is not None), None)
+
+
+def put(marks: Sequence[Mark], renderer: Any, render_mode: str) -> None:
+    """Have the next frame show marks; model and data stay bit for bit as they are.
+
+    Args:
+        marks: The first `MOST_MARKS` of them are drawn.
+        renderer: Found by `find_renderer`.
+        render_mode: "rgb_array" or "human".
+    """
+    viewer = renderer._get_viewer(render_mode)
+    for mark in marks[:MOST_MARKS]:
+        viewer.add_marker(
+            type=getattr(mujoco.mjtGeom, f"mjGEOM_{mark.shape.upper()}"),
+            pos=mark.position,
+            size=mark.size,
+            mat=mark.axes.ravel(),
+            rgba=COLOURS[mark.role],
+        )
