@@ -6,7 +6,7 @@ from typing import Any, Final
 import numpy as np
 
 from safe_wrappers.constraints.obstacles import Box, Disc, Discs, Plane, Sphere, TrackedDiscs
-from safe_wrappers.drawing.marks import Mark, ball, block, disc, ellipsoid, pad, spatial
+from safe_wrappers.drawing.marks import Mark, ball, block, ellipsoid, pad, ring, spatial
 from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.plant import Plant
 
@@ -23,8 +23,10 @@ def obstacle_marks(obstacles: Sequence[Any], plant: Plant, inset: float, point: 
     for obstacle in obstacles:
         if isinstance(obstacle, Disc | Discs | Sphere):
             centers, radius = obstacle.centers(plant), obstacle.radius + inset
-            shape = disc if centers.shape[1] == 2 else ball
-            found += [shape("keep out", center, radius) for center in centers]
+            if centers.shape[1] == 2:
+                found += [mark for center in centers for mark in ring("limit", center, radius)]
+            else:
+                found += [ball("keep out", center, radius) for center in centers]
         elif isinstance(obstacle, Box):
             found.append(block("keep out", obstacle.center, np.array(obstacle.half_size) + inset))
         elif isinstance(obstacle, Plane):

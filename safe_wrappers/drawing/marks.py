@@ -9,13 +9,16 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 Role = Literal["keep out", "limit", "way", "estimate", "proposed", "executed"]
-Shape = Literal["sphere", "ellipsoid", "cylinder", "capsule", "box", "arrow"]
+Shape = Literal["sphere", "ellipsoid", "capsule", "box", "arrow"]
 
+_CORNERS: Final = 20
+THIN: Final = 0.012
+"""m: half the width of a line."""
 FLOOR: Final = 0.02
 """m: the height at which what has no height is drawn, just above a floor at 0."""
 COLOURS: Final[dict[Role, tuple[float, float, float, float]]] = {
-    "keep out": (0.85, 0.12, 0.2, 0.3),
-    "limit": (0.85, 0.12, 0.2, 0.8),
+    "keep out": (0.95, 0.15, 0.1, 0.4),
+    "limit": (0.95, 0.15, 0.1, 0.9),
     "way": (1.0, 0.72, 0.05, 0.95),
     "estimate": (0.55, 0.3, 0.8, 0.35),
     "proposed": (0.95, 0.42, 0.1, 1.0),
@@ -66,9 +69,11 @@ def ball(role: Role, center: ArrayLike, radius: float) -> Mark:
     return _mark("sphere", role, spatial(center), [radius, 0.0, 0.0])
 
 
-def disc(role: Role, center: ArrayLike, radius: float, height: float = FLOOR) -> Mark:
-    """An upright cylinder on the floor, m."""
-    return _mark("cylinder", role, spatial(center)[:2].tolist() + [height / 2.0], [radius, height / 2.0, 0.0])
+def ring(role: Role, center: ArrayLike, radius: float) -> list[Mark]:
+    """A circle on the floor, m, as a polygon."""
+    angles = np.linspace(0.0, 2.0 * np.pi, _CORNERS, endpoint=False)
+    around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return line(role, spatial(center)[:2] + radius * around, THIN, closed=True)
 
 
 def block(role: Role, center: ArrayLike, half_size: ArrayLike) -> Mark:

@@ -5,11 +5,15 @@ from typing import Any, Final
 
 import gymnasium as gym
 import mujoco
+import numpy as np
 
 from safe_wrappers.drawing.marks import COLOURS, Mark
 
 MOST_MARKS: Final = 500
 """Of one frame. Gymnasium's scene has room for 1000 shapes, the model's own among them."""
+
+_SIZES: Final = {"arrow": np.array([1.0, 1.0, 2.0])}
+"""MuJoCo draws an arrow half as long as its size says."""
 
 
 def find_renderer(env: gym.Env[Any, Any]) -> Any | None:
@@ -33,7 +37,7 @@ def put(marks: Sequence[Mark], renderer: Any, render_mode: str) -> None:
         viewer.add_marker(
             type=getattr(mujoco.mjtGeom, f"mjGEOM_{mark.shape.upper()}"),
             pos=mark.position,
-            size=mark.size,
+            size=mark.size * _SIZES.get(mark.shape, 1.0),
             mat=mark.axes.ravel(),
             rgba=COLOURS[mark.role],
         )

@@ -118,7 +118,7 @@ class Strip:
 
     def _write(self, draw: ImageDraw.ImageDraw, left: int, top: int, tall: int, right: int) -> None:
         """The state with its colour, then the numbers, as far as there is room."""
-        font = ImageFont.load_default(size=max(9, round(0.75 * tall)))
+        font = ImageFont.load_default(size=max(9, round(0.6 * tall)))
         state, *rest = self.words
         middle, x = top + tall / 2, left + tall // 4
         draw.ellipse((x, middle - tall / 4, x + tall / 2, middle + tall / 4), fill=STATES[state])
@@ -128,7 +128,7 @@ class Strip:
             if x + room > right:
                 break
             draw.text((x, middle), text, fill=_WHITE, font=font, anchor="lm")
-            x += round(room + 0.8 * tall)
+            x += round(room + 0.6 * tall)
 
     def _chart(self, draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int]) -> None:
         """A column per step, the last one at the right: as high as the margin, in the colour of the state."""

@@ -17,7 +17,7 @@ from safe_wrappers.constraints.rollout import RENAMED
 from safe_wrappers.control.numerics.nearest_discs import nearest_discs
 from safe_wrappers.control.numerics.outlines import clearances_on_a_course, convex_outline
 from safe_wrappers.deprecation import deprecated_parameters
-from safe_wrappers.drawing.marks import Mark, disc, line
+from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, Constraint
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
@@ -255,7 +255,7 @@ class BoundCoastingClearance(BoundDetourClearance):
         found = obstacle_marks(obstacles, self.plant, self.spec.margin, self._here)
         course = self.coasting.run(self._still, self.spec.horizon, self._radius)
         way = [self._here, *course.places[:: self.plant.substeps], course.places[-1]]
-        return [*found, *line("way", way, 0.012), disc("way", way[-1], 0.03, 0.05)]
+        return [*found, *line("way", way, THIN), ball("way", way[-1], 3.0 * THIN)]
 
 
 class _Outcome(NamedTuple):

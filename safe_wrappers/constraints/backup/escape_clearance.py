@@ -13,7 +13,7 @@ from safe_wrappers.constraints.obstacle_marks import obstacle_marks
 from safe_wrappers.constraints.obstacles import Disc, Discs, Plane, TrackedDiscs, distances, obstacles_from
 from safe_wrappers.control.backup.evasive_maneuvers import EvasiveManeuvers, Maneuver
 from safe_wrappers.control.backup.way_clearances import Around, least_left, way_clearances
-from safe_wrappers.drawing.marks import Mark, disc, line
+from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, Memory
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
@@ -240,7 +240,7 @@ class BoundEscapeClearance(BoundBackupClearance):
         found = obstacle_marks(spec.obstacles, self.plant, spec.radius + spec.margin, self._position)
         x, y = self._escapes.paths(self._position[None], self._velocity[None], which)
         way = np.stack([x[0, 0], y[0, 0]], axis=1)
-        return [*found, *line("way", way, 0.012), disc("way", way[-1], 0.03, 0.05)]
+        return [*found, *line("way", way, THIN), ball("way", way[-1], 3.0 * THIN)]
 
     def _firsts(self) -> Array:
         """First controls of the manoeuvres: braking, and each direction; shape (5, 2)."""

@@ -14,7 +14,7 @@ from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.backup import drive_decision as among
 from safe_wrappers.control.backup.heading_drive import Motion, path_corners, stopping_path
 from safe_wrappers.control.numerics.nearest_discs import nearest_discs
-from safe_wrappers.drawing.marks import Mark, disc, line
+from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, Constraint, HalfSpaces
 from safe_wrappers.filter.constraint_batch import ConstraintBatch
@@ -157,7 +157,7 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         path = stopping_path(self.drive, motion, self.spec.brake)
         corners = path_corners(path)
         found = obstacle_marks(self.spec.obstacles, self.plant, self.reserve, corners[0])
-        return [*found, *line("way", corners, 0.012, closed=True), disc("way", corners[2], 0.03, 0.05)]
+        return [*found, *line("way", corners, THIN, closed=True), ball("way", corners[2], 3.0 * THIN)]
 
     @classmethod
     def batch(

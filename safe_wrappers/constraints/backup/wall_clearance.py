@@ -9,7 +9,7 @@ from safe_wrappers.checks import check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundBackupClearance
 from safe_wrappers.control.backup import point_scene
 from safe_wrappers.control.backup.damped_axis import braking
-from safe_wrappers.drawing.marks import Mark, disc, line
+from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.filter.constraint import Array, Constraint, HalfSpaces
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
@@ -111,10 +111,10 @@ class BoundWallClearance(BoundBackupClearance):
         ways = braking(self._point.axes[0], x, vx), braking(self._point.axes[1], y, vy)
         longest = max(len(way) for way in ways)
         way = np.stack([np.pad(way, (0, longest - len(way)), mode="edge") for way in ways], axis=1)
-        found = [*line("way", way, 0.012), disc("way", way[-1], 0.03, 0.05)]
+        found = [*line("way", way, THIN), ball("way", way[-1], 3.0 * THIN)]
         for left, right, low, high in self._scene.walls + self._room * np.array([-1.0, 1.0, -1.0, 1.0]):
             corners = [[left, low], [right, low], [right, high], [left, high]]
-            found += line("limit", corners, 0.012, closed=True)
+            found += line("limit", corners, THIN, closed=True)
         return found
 
     def rows(self) -> HalfSpaces:

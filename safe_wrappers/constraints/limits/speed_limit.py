@@ -14,7 +14,7 @@ from safe_wrappers.filter.constraint import Array, Memory
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 
-_DRAWN = 0.3  # share of the model's extent that is drawn for the limit
+_DRAWN, _LIFTED = 0.2, 0.05  # shares of the model's extent: how long the limit is drawn, and how high over the body
 DIRECTIONS = ("+x", "-x", "x", "+y", "-y", "y", "+z", "-z", "z", "xy", "xyz")
 
 
@@ -135,7 +135,7 @@ class BoundSpeedLimit(BoundRollout):
         return np.asarray(self.spec.limit - np.sqrt((velocity * velocity).sum(axis=-1)))
 
     def draw(self) -> list[Mark]:
-        """The velocity as an arrow, and the limit as a ball on its way: reached, where the tip is in it."""
+        """The velocity as an arrow over the machine, and the limit as a ball on its way: reached, where the tip is in it."""
         if self._before is None:
             return []
         moved = np.zeros(3)
@@ -145,7 +145,8 @@ class BoundSpeedLimit(BoundRollout):
             return []
         pose = self.plant.pose()
         at = self._shares @ pose.xipos if self._body is None else pose.xpos[self._body]
-        reach = _DRAWN * float(self.plant.model.stat.extent) * moved / length
+        extent = float(self.plant.model.stat.extent)
+        at, reach = at + [0.0, 0.0, _LIFTED * extent], _DRAWN * extent * moved / length
         share = length / (self.plant.control_dt * self.spec.limit)
         radius = 0.02 * float(np.linalg.norm(reach))
         return [arrow("way", at, share * reach, 2.0 * radius), ball("limit", at + reach, 3.0 * radius)]
