@@ -64,9 +64,20 @@ def _tracked(env: Env) -> Env:
 
 
 def _leased(env: Env) -> Env:
-    rail = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
-    clearance = sw.constraints.Clearance(rail, bodies=["cart"], braking=8.0)
-    return sw.LeaseExpiry(sw.CBFActionFilter(env, [clearance]), sw.StoppingBudget(clearance, acceleration=30.0))
+    """A lease, and a link that falls silent."""
+    env = sw.protect(env)
+    lease = sw.LeaseExpiry(env, sw.StoppingBudget(env.constraints[0], closing_speed=4.0))  # type: ignore[attr-defined]
+    return sw.faults.Outages(lease, mean_between_s=0.3, mean_length_s=1.0)
+
+
+def _full(driver: Callable[[Any, np.random.Generator], Driver]) -> Callable[[Any, np.random.Generator], Driver]:
+    """The same driver with the whole of the action space: the car's motors saturate far inside of it."""
+
+    def made(env: Any, rng: np.random.Generator) -> Driver:
+        act = driver(env, rng)
+        return lambda: 50.0 * act()
+
+    return made
 
 
 def _held(*action: float) -> Callable[[Any, np.random.Generator], Driver]:
@@ -86,7 +97,7 @@ SCENES = {
     "car": Scene(
         "SafeCarGoal1-v0",
         sw.protect,
-        car_drivers.hazard_seeking,
+        _full(car_drivers.hazard_seeking),
         _changed,
         camera=_ABOVE | {"lookat": np.array([0.0, 0.0, 0.0])},
         after=60,
@@ -111,13 +122,14 @@ SCENES = {
         lambda env: sw.SlipLimiter(env, wheels=list(WHEELS)),
         _held(1.0, 1.0, 1.0, 1.0, 0.3),
         _changed,
-        camera={"distance": 5.0},
+        camera={"distance": 8.0},
     ),
     "ant": Scene(
         "Ant-v5",
         lambda env: sw.WholeBodyFilter(env, friction_share=0.7, zmp_inset=0.02),
-        mujoco_drivers.random,
-        _changed,
+        lambda env, rng: lambda: 0.5 * rng.uniform(-1.0, 1.0, 8),
+        lambda info: info["whole_body/contacts"] > 3,
+        after=30,
     ),
     "teleop": Scene(
         "TeleopContact-v0",
@@ -126,7 +138,15 @@ SCENES = {
         _changed,
         after=60,
     ),
-    "lease": Scene("InvertedPendulum-v5", _leased, _held(0.8), lambda info: True, after=30),
+    "lease": Scene(
+        "SafePointGoal1-v0",
+        _leased,
+        drivers.hazard_seeking,
+        lambda info: bool(info["lease/braking"]),
+        camera=_ABOVE,
+        after=60,
+        seed=1,
+    ),
     "pendulum": Scene("Pendulum-v1", sw.protect, _held(2.0), _changed, after=70),
 }
 

@@ -38,15 +38,16 @@ def arrows(plant: Plant, specs: Iterable[Any], proposed: Array, executed: Array)
         at, ways = _pushes(plant, plant.named("body", body))
     else:
         return []
-    # The longest push of a corner of the box has the full length.
-    reach = float(np.linalg.norm(np.abs(ways) @ np.maximum(np.abs(plant.lower), np.abs(plant.upper))))
+    # The longest push of a corner of the box has the full length; beyond `acting_range` nothing pushes harder.
+    low, high = plant.acting_range if plant.has_acceleration else (plant.lower, plant.upper)
+    reach = float(np.linalg.norm(np.abs(ways) @ np.maximum(np.abs(low), np.abs(high))))
     size = float(plant.model.geom_rbound[plant.model.geom_bodyid == plant.named("body", body)].max(initial=0.0))
     if not (0.0 < reach < np.inf and size > 0.0):
         return []
     found = []
     roles: tuple[tuple[Role, Array], ...] = ("proposed", proposed), ("executed", executed)
     for i, (role, action) in enumerate(roles):
-        vector = ways @ np.clip(action, plant.lower, plant.upper) * (_LENGTH * size / reach)
+        vector = ways @ np.clip(action, low, high) * (_LENGTH * size / reach)
         if float(np.linalg.norm(vector)) > _THICKNESS * size:  # a shorter one is all head
             over = at + np.array([0.0, 0.0, (1.0 + 0.7 * i) * size])
             found.append(arrow(role, over, vector, _THICKNESS * size))

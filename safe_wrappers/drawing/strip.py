@@ -52,7 +52,7 @@ def state_of(info: dict[str, Any]) -> str:
 def words_of(info: dict[str, Any]) -> list[str]:
     """What is said beside the state: the numbers that info has."""
     found = []
-    if keys.CBF_MARGIN in info:
+    if info.get(keys.CBF_MARGIN, 0.0) != 0.0:  # 0 is written where there is no h at all
         found.append(f"margin {info[keys.CBF_MARGIN]:.3g}")
     if keys.LEASE_REMAINING_S in info:
         found.append(f"lease {info[keys.LEASE_REMAINING_S]:.2f} s")
