@@ -322,7 +322,6 @@ ONLY_LOOKING = (
     "FilterObservation",
     "OcclusionPenalty",
     "RecordInterventions",
-    "SafetyOverlay",
 )
 """Wrappers that look on and pass every action as it is."""
 SILENT = ("ActionRepeat", "FilterObservation", "SafetyOverlay")
