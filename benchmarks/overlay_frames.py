@@ -112,7 +112,11 @@ SCENES = {
     ),
     "patrols": Scene("PatrolledPointMaze-v0", sw.protect, patrol_drivers.patrol_seeking, _changed, after=60),
     "cheetah": Scene(
-        "SafeHalfCheetahVelocity-v0", sw.protect, mujoco_drivers.speed_seeking, _changed, after=20
+        "HalfCheetah-v5",
+        lambda env: sw.CBFActionFilter(env, [sw.constraints.SpeedLimit(1.5, body="torso", direction="x")]),
+        mujoco_drivers.speed_seeking,
+        _changed,
+        after=30,
     ),
     "crossing": Scene(
         "OccludedCrossing-v0", _tracked, crossing_drivers.goal_seeking, _changed, after=30

@@ -22,6 +22,7 @@ MOST_BARS: Final = 12
 """Of more actions only the first are shown."""
 _SHARE: Final = 0.14  # of the frame's height
 _LEAST_WIDTH: Final = 240  # px; a narrower frame has no room for words
+_LEAST: Final = 60  # px; a smaller frame stays as it is
 _DARKNESS: Final = 0.25  # share of the frame's light that is left under the strip
 _GREY: Final[Colour] = (150, 158, 168)
 _WHITE: Final[Colour] = (240, 242, 245)
@@ -93,8 +94,10 @@ class Strip:
         return [state_of(self._info), *words_of(self._info)]
 
     def on(self, frame: Pixels) -> Pixels:
-        """A copy of a frame, shape (height, width, 3), with the strip over its lower edge."""
+        """A copy of a frame, shape (height, width, 3), with the strip over its lower edge, where it is large enough."""
         height, width = frame.shape[:2]
+        if min(height, width) < _LEAST:
+            return frame
         tall = max(12, round(_SHARE * height))
         whole = np.array(frame[..., :3], dtype=np.uint8)
         whole[height - tall :] = (_DARKNESS * whole[height - tall :]).astype(np.uint8)

@@ -11,6 +11,7 @@ import pytest
 from gymnasium.spaces import Box
 
 import safe_wrappers as sw
+from benchmarks import car_drivers, drivers
 from safe_wrappers import info as keys
 from safe_wrappers.drawing.arrows import arrows
 from safe_wrappers.drawing.scene import MOST_MARKS, find_renderer, put
@@ -121,21 +122,28 @@ def crossing(env):
 STACKS = {
     TASK: sw.protect,
     "SafeCarGoal1-v0": sw.protect,
-    "SafeHalfCheetahVelocity-v0": sw.protect,
+    "HalfCheetah-v5": lambda env: sw.CBFActionFilter(env, [sw.constraints.SpeedLimit(0.5, horizon=2)]),
     "SafeRover-v0": lambda env: sw.SlipLimiter(env, wheels=list(WHEELS)),
     "OccludedCrossing-v0": crossing,
     "Ant-v5": lambda env: sw.WholeBodyFilter(env, zmp_inset=0.02),
     "FetchReach-v4": sw.protect,
     "PatrolledPointMaze-v0": sw.protect,
 }
+DRIVERS = {TASK: drivers.hazard_seeking, "SafeCarGoal1-v0": car_drivers.hazard_seeking}
+"""Who meets the filter sooner than corners of the action space do."""
 
 
-def episode(env, looking, steps=60):
+def episode(env, looking):
+    task = env.spec.id
+    act = DRIVERS[task](env.unwrapped, np.random.default_rng(0)) if task in DRIVERS else None
     rng = np.random.default_rng(0)
-    seen = [env.reset(seed=0)]
+    around = {"agent": [0, 0, 0], "hazards": [[0.6, 0.0], [-0.6, 0.0], [0.0, 0.6], [0.0, -0.6]]}
+    seen = [env.reset(seed=0, options={"layout": around} if act else None)]
     space = env.action_space
-    for step in range(steps):
-        if step % 10 == 0:
+    for step in range(90 if act else 60):
+        if act:
+            action = act()
+        elif step % 10 == 0:
             action = np.where(rng.random(space.shape) < 0.5, space.low, space.high)
         if looking and step % 3:
             env.marks()
@@ -251,7 +259,9 @@ def test_a_drive_points_along_the_heading_and_a_turn_alone_nowhere():
     found = drawn_arrows(env, [0.0, 1.0], [1.0, 0.0])
     assert set(found) == {"executed"}
     np.testing.assert_allclose(found["executed"].axes[:, 2], heading, atol=1e-6)
-    back = drawn_arrows(env, [-0.5, 0.0], [-1.0, 0.0])
+    low = env.plant.acting_range[0][0]  # no control pushes harder
+    back = drawn_arrows(env, [0.5 * low, 0.0], [low, 0.0])
+    assert drawn_arrows(env, [0.5 * low, 0.0], [3.0 * low, 0.0])["executed"].size[2] == back["executed"].size[2]
     np.testing.assert_allclose(back["executed"].axes[:, 2], -heading, atol=1e-6)
     assert back["executed"].size[2] == pytest.approx(2.0 * back["proposed"].size[2])
 
