@@ -18,7 +18,7 @@ from PIL import Image
 
 import safe_wrappers as sw
 from benchmarks import car_drivers, crossing_drivers, drivers, mujoco_drivers, patrol_drivers
-from safe_wrappers.drawing.scene import find_renderer
+from safe_wrappers.drawing.scene import find_renderer, set_size
 from safe_wrappers.envs.safe_rover import WHEELS
 from safe_wrappers.envs.traffic import CAR_ACCELERATION_NOISE, CAR_TIME_CONSTANT_S
 
@@ -161,7 +161,10 @@ def shot(scene: Scene, steps: int = 1500) -> np.ndarray[Any, Any]:
 
     gym.register_envs(gymnasium_robotics)
     env = gym.make(scene.task, render_mode="rgb_array", max_episode_steps=steps + 1)
-    _stage(env.unwrapped, scene.camera)
+    set_size(env, WIDTH, HEIGHT)
+    renderer = find_renderer(env)
+    if renderer is not None:
+        renderer.default_cam_config = {**(renderer.default_cam_config or {}), **scene.camera}
     env = sw.SafetyOverlay(scene.wrap(env))
     env.reset(seed=scene.seed, options=scene.options)
     act = scene.driver(env.unwrapped, np.random.default_rng(scene.seed))
@@ -175,16 +178,6 @@ def shot(scene: Scene, steps: int = 1500) -> np.ndarray[Any, Any]:
     frame = np.asarray(env.render())
     env.close()
     return frame
-
-
-def _stage(task: Any, camera: dict[str, Any]) -> None:
-    """A wide frame and a camera of its own, where MuJoCo draws."""
-    renderer = find_renderer(task)
-    if renderer is not None:
-        model = task.model
-        renderer.width, renderer.height = WIDTH, HEIGHT
-        model.vis.global_.offwidth, model.vis.global_.offheight = WIDTH, HEIGHT
-        renderer.default_cam_config = {**(renderer.default_cam_config or {}), **camera}
 
 
 def main() -> None:

@@ -24,6 +24,15 @@ def find_renderer(env: gym.Env[Any, Any]) -> Any | None:
     return next((renderer for renderer in found if renderer is not None), None)
 
 
+def set_size(env: gym.Env[Any, Any], width: int, height: int) -> None:
+    """Have an env of which no frame has been asked yet draw frames of this size, px; others stay as they are."""
+    renderer = find_renderer(env)
+    if renderer is not None:
+        renderer.width, renderer.height = width, height
+        drawn = renderer.model.vis.global_
+        drawn.offwidth, drawn.offheight = width, height
+
+
 def put(marks: Sequence[Mark], renderer: Any, render_mode: str) -> None:
     """Have the next frame show marks; model and data stay bit for bit as they are.
 

@@ -54,7 +54,7 @@ def test_the_playing_time_is_what_the_speed_says():
 def test_the_strip_shows_when_the_filter_acted_and_where_it_is_now():
     made = shot(100, changed=range(40, 60), violated=[80])
     frames, _ = played(encode(made, fps=10, speed=1.0))
-    width = 320
+    width = 640
     assert frames[0].shape == (HEIGHT + STRIP, width, 3)
 
     def strip(frame, step):

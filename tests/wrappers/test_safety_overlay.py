@@ -140,7 +140,7 @@ def episode(env, looking):
     around = {"agent": [0, 0, 0], "hazards": [[0.6, 0.0], [-0.6, 0.0], [0.0, 0.6], [0.0, -0.6]]}
     seen = [env.reset(seed=0, options={"layout": around} if act else None)]
     space = env.action_space
-    for step in range(90 if act else 60):
+    for step in range(150 if act else 60):
         if act:
             action = act()
         elif step % 10 == 0:

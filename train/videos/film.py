@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-HEIGHT: Final = 240
-"""Pixels of the picture; the strip is below it."""
-STRIP: Final = 10
+WIDTH: Final = 640
+HEIGHT: Final = 480
+"""Pixels of the picture, whose width an env that MuJoCo does not draw may decide; the strip is below it."""
+STRIP: Final = 16
 MOST_FRAMES: Final = 120
-MOST_BYTES: Final = 1_500_000
+MOST_BYTES: Final = 2_000_000
 _LONGEST_S: Final = 10.0
 _SHORTEST_S: Final = 4.0
 _QUALITY: Final = 55
