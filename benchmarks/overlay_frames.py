@@ -70,7 +70,9 @@ def _leased(env: Env) -> Env:
     return sw.faults.Outages(lease, mean_between_s=0.3, mean_length_s=1.0)
 
 
-def _full(driver: Callable[[Any, np.random.Generator], Driver]) -> Callable[[Any, np.random.Generator], Driver]:
+def _full(
+    driver: Callable[[Any, np.random.Generator], Driver],
+) -> Callable[[Any, np.random.Generator], Driver]:
     """The same driver with the whole of the action space: the car's motors saturate far inside of it."""
 
     def made(env: Any, rng: np.random.Generator) -> Driver:
@@ -118,9 +120,7 @@ SCENES = {
         _changed,
         after=30,
     ),
-    "crossing": Scene(
-        "OccludedCrossing-v0", _tracked, crossing_drivers.goal_seeking, _changed, after=30
-    ),
+    "crossing": Scene("OccludedCrossing-v0", _tracked, crossing_drivers.goal_seeking, _changed, after=30),
     "rover": Scene(
         "SafeRover-v0",
         lambda env: sw.SlipLimiter(env, wheels=list(WHEELS)),

@@ -31,7 +31,9 @@ def arrows(plant: Plant, specs: Iterable[Any], proposed: Array, executed: Array)
         body, ways = plant.gripper, np.eye(3, plant.lower.size)
         at, _ = plant.motion("body", body)
     elif isinstance(plant, MujocoPlant) and plant.has_acceleration and plant.lower.size <= _MOST_ACTUATORS:
-        named = (getattr(spec, "body", None) or next(iter(getattr(spec, "bodies", ())), None) for spec in specs)
+        named = (
+            getattr(spec, "body", None) or next(iter(getattr(spec, "bodies", ())), None) for spec in specs
+        )
         body = next((name for name in named if name), _only_body(plant))
         if body is None:
             return []
@@ -41,7 +43,9 @@ def arrows(plant: Plant, specs: Iterable[Any], proposed: Array, executed: Array)
     # The longest push of a corner of the box has the full length; beyond `acting_range` nothing pushes harder.
     low, high = plant.acting_range if plant.has_acceleration else (plant.lower, plant.upper)
     reach = float(np.linalg.norm(np.abs(ways) @ np.maximum(np.abs(low), np.abs(high))))
-    size = float(plant.model.geom_rbound[plant.model.geom_bodyid == plant.named("body", body)].max(initial=0.0))
+    size = float(
+        plant.model.geom_rbound[plant.model.geom_bodyid == plant.named("body", body)].max(initial=0.0)
+    )
     if not (0.0 < reach < np.inf and size > 0.0):
         return []
     found = []

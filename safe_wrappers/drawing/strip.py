@@ -94,7 +94,7 @@ class Strip:
         return [state_of(self._info), *words_of(self._info)]
 
     def on(self, frame: Pixels) -> Pixels:
-        """A copy of a frame, shape (height, width, 3), with the strip over its lower edge, where it is large enough."""
+        """A copy of a frame, shape (height, width, 3), with the strip over its lower edge; too small a one as it is."""
         height, width = frame.shape[:2]
         if min(height, width) < _LEAST:
             return frame
@@ -146,7 +146,9 @@ class Strip:
             x = right - (age + 1) * wide
             draw.rectangle((x, high, max(x, x + wide - 1.0), bottom), fill=STATES[state])
 
-    def _bars(self, draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int], low: Array, high: Array) -> None:
+    def _bars(
+        self, draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int], low: Array, high: Array
+    ) -> None:
         """For every action a column from its smallest to its largest value: proposed and executed as two marks."""
         left, top, right, bottom = box
         span = np.where(high > low, high - low, 1.0)

@@ -23,10 +23,10 @@ class SafetyOverlay(LayerWrapper):
     """Draws what the filter inside knows and does into the env's own frames.
 
     In MuJoCo's scene, in frames and in the window: what every constraint keeps free, and the way that its backup
-    would take from here (`BoundConstraint.draw`); the proposed action as an orange arrow and the executed one as a blue
-    one, where it is known which way an action pushes. Over the lower edge of a frame a strip: what was done to the last
-    action, margin, lease and slip as far as they are in info, a column per step as high as the margin, and the actions
-    as bars. Envs that are not MuJoCo's get the strip alone; so does an env without a filter.
+    would take from here (`BoundConstraint.draw`); the proposed action as an orange arrow and the executed one as a
+    blue one, where it is known which way an action pushes. Over the lower edge of a frame a strip: what was done to
+    the last action, margin, lease and slip as far as they are in info, a column per step as high as the margin, and
+    the actions as bars. Envs that are not MuJoCo's get the strip alone; so does an env without a filter.
 
     It only looks: actions, observations, rewards, infos and random numbers are bit for bit those without it.
 

@@ -19,7 +19,9 @@ def of(marks, role, shape=None):
 
 def rods(marks):
     """Both ends of every rod."""
-    return np.array([[m.position - m.size[1] * m.axes[:, 2], m.position + m.size[1] * m.axes[:, 2]] for m in marks])
+    return np.array(
+        [[m.position - m.size[1] * m.axes[:, 2], m.position + m.size[1] * m.axes[:, 2]] for m in marks]
+    )
 
 
 def test_a_constraint_draws_nothing_unless_it_says_so():
@@ -82,7 +84,7 @@ def test_walls_are_framed_where_the_ball_touches_and_braking_ends_where_it_is_dr
         env.step(np.array([1.0, 0.2], np.float32))
     (marks,) = looked(env)
     edges = rods(of(marks, "limit"))[..., :2]
-    # The wall in the middle ends 0.5 m off its centre; the ball has 0.1 m, and MuJoCo reports contacts before a touch.
+    # The wall in the middle ends 0.5 m off its centre; the ball has 0.1 m, and MuJoCo reports earlier touches.
     inner = edges[(np.abs(edges) < 1.3).all(axis=(1, 2))]
     reported = 2.0 * env.unwrapped.model.geom_margin.max()
     np.testing.assert_allclose(np.abs(inner[..., 1]).max(), 0.5 + 0.1 + 0.02 + reported)
@@ -107,7 +109,7 @@ def test_an_escape_begins_where_the_ball_is_and_the_patrols_have_their_bounds():
     np.testing.assert_allclose(rods(of(marks, "way", "capsule"))[0, 0, :2], task.agent_position, atol=1e-9)
     bounds = of(marks, "estimate")
     np.testing.assert_allclose([m.position[:2] for m in bounds], task.patrol_positions)
-    np.testing.assert_allclose([m.size for m in bounds], 0.1 + 0.15 + 0.03)  # known exactly: both radii and the margin
+    np.testing.assert_allclose([m.size for m in bounds], 0.1 + 0.15 + 0.03)  # known exactly: radii, margin
 
 
 def test_tracked_discs_are_ellipsoids_of_the_estimates():
@@ -232,7 +234,7 @@ def test_in_the_air_there_is_nothing_to_draw_of_contacts():
         gym.make("Ant-v5"), [sw.constraints.ContactFeasibility(), sw.constraints.SupportMargin(inset=0.01)]
     )
     env.reset(seed=0)
-    env.unwrapped.set_state(env.unwrapped.init_qpos + [0, 0, 5.0, *np.zeros(12)], env.unwrapped.init_qvel)
+    up = env.unwrapped.init_qpos.copy()
+    up[2] = 5.0
+    env.unwrapped.set_state(up, env.unwrapped.init_qvel)
     assert looked(env) == [[], []]
-
-

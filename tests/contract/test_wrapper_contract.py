@@ -301,7 +301,8 @@ EXAMPLES = {
 """Wrapper name -> what it shows -> (env id, function of its arguments): plain data or what becomes it."""
 
 INSIDE = dict.fromkeys(
-    ("AdaptionPenalty", "SafeActionMap", "SafetyOverlay", "StuckEscape"), lambda env: sw.CBFActionFilter(env, [_clearance()])
+    ("AdaptionPenalty", "SafeActionMap", "SafetyOverlay", "StuckEscape"),
+    lambda env: sw.CBFActionFilter(env, [_clearance()]),
 )
 """Wrapper name -> the wrapper that it needs inside."""
 

@@ -83,6 +83,7 @@ def test_a_film_that_is_too_large_loses_every_other_frame(monkeypatch):
     for _ in range(16):
         made.add_frame(rng.integers(0, 255, (240, 320, 3), dtype=np.uint8))
         made.add_step(False, False)
+    monkeypatch.setattr(film, "MOST_BYTES", 100_000_000)
     whole = encode(made, fps=10, speed=1.0)
     monkeypatch.setattr(film, "MOST_BYTES", int(0.3 * len(whole)))
     small = encode(made, fps=10, speed=1.0)

@@ -165,5 +165,7 @@ def test_what_a_filter_knows_is_drawn_into_its_film_and_into_no_other(evaluated,
             video = load_video(video_path(experiment, arm, condition))
             frames = Image.open(io.BytesIO(video.animation))
             frames.seek(19)
-            lower[condition] = np.asarray(frames.convert("RGB"))[HEIGHT - 20 : HEIGHT - 5, 300:350].mean()
+            lower[condition] = np.asarray(frames.convert("RGB"))[
+                390:430, 300:350
+            ].mean()  # of the lowest fifth
         assert lower["filter_on"] < 0.5 * lower["filter_off"]

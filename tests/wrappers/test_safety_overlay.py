@@ -76,7 +76,9 @@ class Renderer:
 
 
 def test_an_env_without_frames_is_refused_with_the_line_to_write():
-    with pytest.raises(ConfigurationError, match=r"render_mode is None: .*gym.make\(\.\.\., render_mode='rgb_array'"):
+    with pytest.raises(
+        ConfigurationError, match=r"render_mode is None: .*gym.make\(\.\.\., render_mode='rgb_array'"
+    ):
         sw.SafetyOverlay(sw.protect(gym.make(TASK)))
     with pytest.raises(ConfigurationError, match="'depth_array'"):
         sw.SafetyOverlay(sw.protect(gym.make(TASK, render_mode="depth_array")))
@@ -94,7 +96,9 @@ def test_windows_of_other_envs_and_nothing_to_draw_are_refused():
     [
         sw.protect,
         lambda env: sw.CostFunction(env, lambda task: 0.0),
-        lambda env: sw.LeaseExpiry(env, sw.StoppingBudget(sw.constraints.JointSpeedLimit(9.0), closing_speed=1.0)),
+        lambda env: sw.LeaseExpiry(
+            env, sw.StoppingBudget(sw.constraints.JointSpeedLimit(9.0), closing_speed=1.0)
+        ),
         lambda env: sw.TeleopChannel(env, 0.0, 0.0),
     ],
 )
@@ -261,7 +265,9 @@ def test_a_drive_points_along_the_heading_and_a_turn_alone_nowhere():
     np.testing.assert_allclose(found["executed"].axes[:, 2], heading, atol=1e-6)
     low = env.plant.acting_range[0][0]  # no control pushes harder
     back = drawn_arrows(env, [0.5 * low, 0.0], [low, 0.0])
-    assert drawn_arrows(env, [0.5 * low, 0.0], [3.0 * low, 0.0])["executed"].size[2] == back["executed"].size[2]
+    assert (
+        drawn_arrows(env, [0.5 * low, 0.0], [3.0 * low, 0.0])["executed"].size[2] == back["executed"].size[2]
+    )
     np.testing.assert_allclose(back["executed"].axes[:, 2], -heading, atol=1e-6)
     assert back["executed"].size[2] == pytest.approx(2.0 * back["proposed"].size[2])
 

@@ -248,7 +248,6 @@ class BoundCoastingClearance(BoundDetourClearance):
         outer_is_first = self._first_turns_left == (side * drive > 0.0)
         return list(pairs if outer_is_first else pairs[:, ::-1])
 
-
     def draw(self) -> list[Mark]:
         """The discs with what is kept free before them, and the way of the origin until rest without control."""
         obstacles = [*self.spec.keep_out, *self.spec.untouched]

@@ -14,7 +14,10 @@ from safe_wrappers.filter.constraint import Array, Memory
 from safe_wrappers.plants.mujoco.forecast import Forecast
 from safe_wrappers.plants.plant import Plant
 
-_DRAWN, _LIFTED = 0.2, 0.05  # shares of the model's extent: how long the limit is drawn, and how high over the body
+_DRAWN, _LIFTED = (
+    0.2,
+    0.05,
+)  # shares of the model's extent: how long the limit is drawn, and how high over the body
 DIRECTIONS = ("+x", "-x", "x", "+y", "-y", "y", "+z", "-z", "z", "xy", "xyz")
 
 
@@ -135,7 +138,7 @@ class BoundSpeedLimit(BoundRollout):
         return np.asarray(self.spec.limit - np.sqrt((velocity * velocity).sum(axis=-1)))
 
     def draw(self) -> list[Mark]:
-        """The velocity as an arrow over the machine, and the limit as a ball on its way: reached, where the tip is in it."""
+        """The velocity as an arrow over the machine, and on its way a ball, which the tip reaches at the limit."""
         if self._before is None:
             return []
         moved = np.zeros(3)
@@ -146,7 +149,8 @@ class BoundSpeedLimit(BoundRollout):
         pose = self.plant.pose()
         at = self._shares @ pose.xipos if self._body is None else pose.xpos[self._body]
         extent = float(self.plant.model.stat.extent)
-        at, reach = at + [0.0, 0.0, _LIFTED * extent], _DRAWN * extent * moved / length
+        at = at + np.array([0.0, 0.0, _LIFTED * extent])
+        reach = _DRAWN * extent * moved / length
         share = length / (self.plant.control_dt * self.spec.limit)
         radius = 0.02 * float(np.linalg.norm(reach))
         return [arrow("way", at, share * reach, 2.0 * radius), ball("limit", at + reach, 3.0 * radius)]

@@ -118,7 +118,6 @@ class BoundWorkspace(BoundRollout):
         poses = forecast.poses()
         return self._left(self._points(poses.frames, poses.axes))
 
-
     def draw(self) -> list[Mark]:
         """The points; the edges of the box in which they stay, or what is near of its planes; the obstacles."""
         spec, pose = self.spec, self.plant.pose()

@@ -102,7 +102,7 @@ def path_corners(path: StoppingPath) -> Array:
     """
     along, aside = (path.forward, path.forward, 0.0), (path.crossing, path.sideways, path.sideways)
     count = 3 if path.spread else 2
-    corners = np.zeros((count + 1, 2)) + (path.x, path.y)
+    corners = np.tile(np.array([path.x, path.y]), (count + 1, 1))
     corners[1:] += np.outer(along[:count], (path.ex, path.ey)) + np.outer(aside[:count], (path.sx, path.sy))
     return corners
 
