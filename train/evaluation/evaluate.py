@@ -124,7 +124,7 @@ class _Evaluation:
 
     def _episode(self, policy: TrainedPolicy, episode_seed: int) -> tuple[dict[str, Any], Scene | None]:
         observation, _ = self._env.reset(seed=episode_seed)
-        policy.begin()
+        policy.begin(self._env)
         self.steps.begin(episode_seed)
         scene = SceneRecorder(self._env)
         done = False

@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import CallbackList
@@ -298,10 +297,9 @@ def _new_model(arm: ArmConfig, seed: int, envs: VecEnv) -> BaseAlgorithm:
             norm_reward=arm.normalize.reward,
             gamma=arm.hyperparameters.get("gamma", 0.99),
         )
-    has_dict = isinstance(envs.observation_space, gym.spaces.Dict)
-    policy = "MultiInputPolicy" if has_dict else "MlpPolicy"
-    settings = {"policy": policy, **constructor_arguments(arm, envs)}
-    model: BaseAlgorithm = ALGORITHMS[arm.algorithm](env=envs, seed=seed, device=arm.device, **settings)
+    model: BaseAlgorithm = ALGORITHMS[arm.algorithm](
+        env=envs, seed=seed, device=arm.device, **constructor_arguments(arm, envs)
+    )
     return model
 
 

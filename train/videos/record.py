@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -147,15 +147,14 @@ def record_video(
     """
     checkpoint = finished_checkpoint(arm, shown.seed, run_folder)
     policy = TrainedPolicy(arm, checkpoint)
-    filmed = replace(arm.env, kwargs={**arm.env.kwargs, "render_mode": "rgb_array"})
-    env = make_stack(filmed, used, arm.learner.in_evaluation)
+    env = make_stack(arm.env, used, arm.learner.in_evaluation, "rgb_array")
     # One speed for all conditions, also where one of them ends early.
     longest = env.spec.max_episode_steps if env.spec is not None else None
     judged = False
     film = Film(stride=stride_of(longest or 1))
     try:
         observation, _ = env.reset(seed=shown.episode_seed)
-        policy.begin()
+        policy.begin(env)
         done = False
         while not done:
             if film.wants_frame:
