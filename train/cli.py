@@ -96,13 +96,20 @@ def _enjoy(options: argparse.Namespace, console: Console) -> None:
 
     episodes = options.episodes or ENJOYED_EPISODES
     enjoy_command(
-        Path(options.words[0]),
+        options.words[0],
         episodes,
         options.filter or FILTERS[0],
         options.render,
         options.output,
         console,
     )
+
+
+def _push(options: argparse.Namespace, console: Console) -> None:
+    from .policies.hub import upload
+
+    names = upload(Path(options.words[0]), options.words[1])
+    console.print(f"Uploaded: {', '.join(names)}", highlight=False, soft_wrap=True)
 
 
 def _list(options: argparse.Namespace, console: Console) -> None:
@@ -117,7 +124,13 @@ def _init(options: argparse.Namespace, console: Console) -> None:
     init_command(next(iter(options.configs), None), options.overrides, console)
 
 
-_WITHOUT_EXPERIMENT: Final = {"diagnose": _diagnose, "enjoy": _enjoy, "list": _list, "init": _init}
+_WITHOUT_EXPERIMENT: Final = {
+    "diagnose": _diagnose,
+    "enjoy": _enjoy,
+    "push": _push,
+    "list": _list,
+    "init": _init,
+}
 
 
 def _report(options: argparse.Namespace, experiments: list[ExperimentConfig], console: Console) -> None:

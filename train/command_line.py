@@ -14,6 +14,7 @@ COMMANDS: Final = {
     "compare": "train, evaluate, and print the comparison",
     "report": "write the comparison as one HTML page, from what is already there; of several, also an overview",
     "enjoy": "let a trained policy act, in a window or on film if asked; takes RUN for CONFIG.yaml",
+    "push": "upload a run's policy to the Hugging Face hub; takes RUN and owner/name for CONFIG.yaml",
     "diagnose": "run an env, and a policy: what is wrong, and which wrapper treats it; takes ENV for CONFIG.yaml",
     "list": "print the names of envs, recipes, wrappers, algorithms and configs, or of those kinds that are named",
     "init": "write a commented config to begin with; takes env=ID and algorithm=NAME",
@@ -58,6 +59,10 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
             parser.error(f"--episodes: expected at least 1, got {options.episodes}")
         if options.render and options.output:
             parser.error("enjoy takes --render or --output, a window or a film")
+        options.configs = []
+    elif command == "push":
+        if len(options.words) != 2:
+            parser.error(f"push takes a RUN and owner/name, got {' '.join(options.words) or 'none'}")
         options.configs = []
     elif command == "list":
         options.configs = []

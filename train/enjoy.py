@@ -21,12 +21,12 @@ FilterName = Literal["trained", "none", "protect"]
 
 
 def enjoy_command(
-    run: Path, episodes: int, action_filter: FilterName, window: bool, film: Path | None, console: Console
+    run: str, episodes: int, action_filter: FilterName, window: bool, film: Path | None, console: Console
 ) -> None:
     """Lets a run's policy act, and prints a line per episode.
 
     Args:
-        run: The run's folder.
+        run: As `load_policy` takes it.
         episodes: How many; their env seeds are 0, 1, 2, ...
         action_filter: The filter that it was trained with, or another.
         window: The task draws itself in a window.
@@ -36,7 +36,7 @@ def enjoy_command(
     Raises:
         ConfigurationError: No such run, or the task cannot be drawn in this way.
     """
-    trained = load_policy(run)
+    trained = load_policy(run, other_filter=action_filter != "trained")
     env = _drawn(trained, action_filter, "human" if window else "rgb_array" if film is not None else None)
     try:
         for seed in range(episodes):

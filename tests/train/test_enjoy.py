@@ -60,7 +60,7 @@ def test_a_window_is_the_task_s_own(run, monkeypatch):
     monkeypatch.setattr(gym, "make", making)
     from rich.console import Console
 
-    enjoy_command(run, 1, "trained", True, None, Console())
+    enjoy_command(str(run), 1, "trained", True, None, Console())
     assert asked == [None, "human"]
 
 

@@ -37,6 +37,7 @@ from .callbacks import (
 )
 from .checkpoint import MODEL, Checkpoint, latest_checkpoint, save_checkpoint
 from .learner_callbacks import learner_callbacks
+from .portable import POLICY, write_policy
 from .start import START_FILE, Policy, Start, begin_with, policy_of_file, policy_of_model, refuse_misfit
 from .vec_envs import make_training_env, make_vec_env
 
@@ -105,7 +106,8 @@ def _train(
         write_json(folder / START_FILE, begun)
         say(f"begins with the policy of {begun['from']}, {begun['timesteps']:,} steps old")
     if is_outgrown(arm, folder):
-        shutil.rmtree(folder / EVALUATION, ignore_errors=True)
+        for outdated in (EVALUATION, POLICY):
+            shutil.rmtree(folder / outdated, ignore_errors=True)
         (folder / FINISHED_FILE).unlink()
     before_s = 0.0 if checkpoint is None else checkpoint.elapsed_s
     # SB3 seeds env i with seed + i, so that seeds 0 and 1 would share all but one of their envs' episodes.
@@ -149,6 +151,7 @@ def _train(
         finally:
             model.logger.close()
         save_checkpoint(folder / CHECKPOINTS, model, elapsed_s(), final=True)
+        write_policy(arm, seed, folder, model)
         write_json(folder / FINISHED_FILE, _facts(model, elapsed_s(), envs))
 
 
