@@ -18,6 +18,7 @@ from .processes.parallel import Job, run_jobs
 from .processes.stopping import Interrupted
 from .run.learner_callbacks import check_margins
 from .run.start import Start
+from .run.trackers import check_trackers
 from .run.training import (
     check_finished,
     check_folder,
@@ -46,6 +47,7 @@ def train_experiment(experiment: ExperimentConfig, console: Console) -> None:
         if arm.env.reset_options:
             env.reset()  # the task alone knows its options
         check_margins(arm, env)
+        check_trackers(arm)
         env.close()
         start = _start(experiment, arm, experiment.seeds[0])
         if start is not None:

@@ -188,6 +188,8 @@ class ArmConfig(Section):
     """Steps between two checkpoints, saved between two rollouts. May be changed later."""
     device: Literal["cpu", "cuda", "auto"] = "cpu"
     """Torch's. May be changed later."""
+    trackers: list[Literal["wandb", "mlflow"]] = Field(default_factory=list)
+    """[Where curves and films go](cli.md#trackers) beside TensorBoard. May be changed later."""
 
     @property
     def replays_goals(self) -> bool:
@@ -197,7 +199,7 @@ class ArmConfig(Section):
     def fingerprint(self) -> dict[str, Any]:
         """What a run folder must agree on to be continued: all that changes what is learned."""
         values = asdict(self) | {"filter": self.filter.plain()}
-        for harmless in ("name", "checkpoint_every", "device", "vec_env"):
+        for harmless in ("name", "checkpoint_every", "device", "vec_env", "trackers"):
             del values[harmless]
         without_default_buffer_size(values)
         # As in the folders of runs that were made before there was a choice.

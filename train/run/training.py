@@ -13,7 +13,6 @@ from typing import Any, Final
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import CallbackList
-from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
@@ -39,6 +38,7 @@ from .checkpoint import MODEL, Checkpoint, latest_checkpoint, save_checkpoint
 from .learner_callbacks import learner_callbacks
 from .portable import POLICY, write_policy
 from .start import START_FILE, Policy, Start, begin_with, policy_of_file, policy_of_model, refuse_misfit
+from .trackers import run_logger
 from .vec_envs import make_training_env, make_vec_env
 
 RUN_FILE: Final = "run.json"
@@ -115,7 +115,7 @@ def _train(
     assert vec_env is not None
     stream = np.random.SeedSequence((seed, model.num_timesteps)).generate_state(1)[0]
     vec_env.seed(int(stream) >> 1)
-    model.set_logger(configure(str(folder / "tensorboard"), ["tensorboard"]))
+    model.set_logger(run_logger(arm, seed, folder))
     begin = time.monotonic()
 
     def elapsed_s() -> float:

@@ -20,6 +20,7 @@ from ..evaluation.step_log import is_violation
 from ..processes.parallel import Job, Progress, RunsFailedError, environment, run_jobs
 from ..run.policy import TrainedPolicy
 from ..run.stack import make_stack
+from ..run.trackers import track_film
 from ..run.training import finished_checkpoint
 from .film import Film, encode, speed_of, stride_of
 from .rendering import find_rendering
@@ -129,6 +130,10 @@ def _record_arms(
             run_jobs(jobs, experiment.workers, console, "Videos")
     except RunsFailedError as error:
         return f"filming {env.id} failed: {str(error).strip().splitlines()[-1]}"
+    for job in jobs:
+        arm, _, folder, _, path = job.arguments
+        steps = finished_checkpoint(arm, shown.seed, folder).timesteps
+        track_film(arm, shown.seed, folder, path.stem.removeprefix(f"{arm.name}_"), path, steps)
     return ""
 
 
