@@ -18,7 +18,7 @@ from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.sb3 import ExecutedActionReplayBuffer
-from safe_wrappers.train.config import EvaluationConfig
+from safe_wrappers.train.config import EvaluationConfig, FilterConfig
 from safe_wrappers.train.config.algorithms import ALGORITHMS, DISCRETE, MASKED, OFF_POLICY, ON_POLICY
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
 from safe_wrappers.train.hyperparameters import check_task, constructor_arguments
@@ -239,6 +239,24 @@ def test_a_policy_s_memory_is_carried_through_an_episode_and_emptied_after_it(fa
     assert np.array_equal(first, second) == (algorithm == "PPO")
     policy.begin()
     assert np.array_equal(policy(observation), first) and np.array_equal(policy(observation), second)
+
+
+def test_a_policy_of_masks_asks_the_env_for_them(fake_experiment):
+    installed("MaskablePPO")
+    (arm,) = one_arm(
+        fake_experiment, "MaskablePPO", "filter: {factory: 'test_algorithms:masks'}", "total_steps=32"
+    ).arms
+    folder = fake_experiment().output / "masked"
+    train_run(arm, 0, folder, Reports().progress)
+    policy, observation = load_policy(folder), np.zeros(2)
+    liked = int(policy(observation))
+    env = Masked(discrete())
+    for allowed in range(3):
+        env.action_masks = lambda allowed=allowed: np.arange(3) == allowed
+        policy.begin(env)
+        assert policy(observation) == allowed
+    policy.begin(make_stack(arm.env, FilterConfig()))  # nobody has masks there
+    assert policy(observation) == liked
 
 
 def test_the_policy_fits_the_observations(fake_experiment):

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from test_run import Reports
 
-from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.errors import ConfigurationError, RunStateError, UnknownNameError
 from safe_wrappers.train import experiment as experiment_module
 from safe_wrappers.train.config import EvaluationConfig
 from safe_wrappers.train.evaluation.evaluate import evaluate_run
@@ -156,6 +156,29 @@ def test_a_run_may_be_tracked_later_and_is_the_same_run(fake_experiment, fakes, 
     assert not (folder / "trackers.json").exists() and not fakes["wandb"].inits
     train_run(tracked(fake_experiment, "wandb", steps=256), 0, folder, Reports().progress)
     assert len(fakes["wandb"].inits) == 1 and fakes["wandb"].logged[-1]["timesteps"] == 256
+
+
+def test_a_tracker_that_refuses_is_told_and_one_that_is_lost_stops_no_training(
+    fake_experiment, fakes, tmp_path
+):
+    arm, folder = tracked(fake_experiment, "wandb", "mlflow"), tmp_path / "fake" / "filtered" / "seed_0"
+
+    def fail(*_, **__):
+        raise OSError("no network")
+
+    fakes["mlflow"].log_batch = fail
+    with pytest.warns(UserWarning, match="Mlflow: what follows is not tracked: no network") as said:
+        train_run(arm, 0, folder, Reports().progress)
+    assert sum("Mlflow" in str(each.message) for each in said) == 1
+    assert (folder / "finished.json").exists() and fakes["wandb"].logged
+    fakes["wandb"].Video = fail
+    with pytest.warns(UserWarning, match="Wandb: what follows is not tracked"):
+        track_film(replace(arm, trackers=["wandb"]), 0, folder, "a", film(tmp_path / "a.webp"), 1)
+    fakes["wandb"].init = fail
+    with pytest.raises(
+        RunStateError, match=r"Wandb does not take the run: no network\. .*WANDB_MODE=offline"
+    ):
+        run_logger(arm, 0, folder)
 
 
 def test_what_is_not_installed_or_does_not_exist_is_refused(fake_experiment, monkeypatch):

@@ -12,8 +12,9 @@ import math
 import tempfile
 import time
 import uuid
+import warnings
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,7 +22,7 @@ import numpy as np
 from PIL import Image
 from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
 
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import ConfigurationError, RunStateError
 
 from ..atomic import write_json
 from ..config import ArmConfig
@@ -38,13 +39,22 @@ class Tracker(KVWriter):
         arm: The run's arm; its settings are the tracker's.
         seed: Its seed.
         folder: The run's folder, `EXPERIMENT/ARM/seed_N`.
+
+    Raises:
+        RunStateError: The tracker refuses it. What fails later is told in a warning, and training goes on.
     """
 
     def __init__(self, arm: ArmConfig, seed: int, folder: Path) -> None:
-        path, kind = folder / IDS_FILE, type(self).__name__
+        path, kind, self._lost = folder / IDS_FILE, type(self).__name__, False
         ids = json.loads(path.read_text()) if path.exists() else {}
         known = ids.get(kind)
-        found = self._open(folder.resolve().parents[1].name, arm, seed, folder, known)
+        try:
+            found = self._open(folder.resolve().parents[1].name, arm, seed, folder, known)
+        except Exception as error:
+            raise RunStateError(
+                f"{kind} does not take the run: {error}. Log in there, or work offline (WANDB_MODE=offline,"
+                " MLFLOW_TRACKING_URI=sqlite:///mlflow.db), or leave it out of `trackers`."
+            ) from error
         if found != known:
             write_json(path, {**ids, kind: found})
 
@@ -57,8 +67,12 @@ class Tracker(KVWriter):
         """Takes numbers by their names."""
 
     @abstractmethod
-    def film(self, name: str, path: Path, step: int) -> None:
-        """Takes a film (animated WebP) of the policy at this step."""
+    def _film(self, name: str, path: Path, step: int) -> None:
+        """Takes a film."""
+
+    @abstractmethod
+    def _close(self) -> None:
+        """Ends the run."""
 
     def write(
         self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0
@@ -72,7 +86,24 @@ class Tracker(KVWriter):
             and math.isfinite(value)
         }
         if numbers:
-            self._log(numbers, step)
+            self._unless_lost(self._log, numbers, step)
+
+    def film(self, name: str, path: Path, step: int) -> None:
+        """Takes a film (animated WebP) of the policy at this step."""
+        self._unless_lost(self._film, name, path, step)
+
+    def close(self) -> None:
+        """Ends the run there, until it goes on."""
+        self._unless_lost(self._close)
+
+    def _unless_lost(self, call: Callable[..., None], *arguments: Any) -> None:
+        if self._lost:
+            return
+        try:
+            call(*arguments)
+        except Exception as error:  # whatever a network does: the training is worth more than its curve
+            self._lost = True
+            warnings.warn(f"{type(self).__name__}: what follows is not tracked: {error}", stacklevel=3)
 
 
 class Wandb(Tracker):
@@ -98,15 +129,14 @@ class Wandb(Tracker):
     def _log(self, numbers: Mapping[str, float], step: int) -> None:
         self._run.log({**numbers, "timesteps": step})
 
-    def film(self, name: str, path: Path, step: int) -> None:
-        """As a GIF, which it shows; it takes no WebP."""
+    def _film(self, name: str, path: Path, step: int) -> None:
+        # As a GIF: it shows no WebP.
         with tempfile.TemporaryDirectory() as folder, Image.open(path) as animation:
             picture = Path(folder) / f"{name}.gif"
             animation.save(picture, save_all=True)
             self._run.log({f"films/{name}": self._wandb.Video(str(picture), format="gif"), "timesteps": step})
 
-    def close(self) -> None:
-        """Ends the run there, until it goes on."""
+    def _close(self) -> None:
         self._run.finish()
 
 
@@ -133,12 +163,10 @@ class Mlflow(Tracker):
         found = [metric(name, value, now_ms, step) for name, value in numbers.items()]
         self._client.log_batch(self._id, metrics=found)
 
-    def film(self, name: str, path: Path, step: int) -> None:
-        """As it is, among the run's artifacts."""
+    def _film(self, name: str, path: Path, step: int) -> None:
         self._client.log_artifact(self._id, str(path), "films")
 
-    def close(self) -> None:
-        """Ends the run there, until it goes on."""
+    def _close(self) -> None:
         self._client.set_terminated(self._id)
 
 
