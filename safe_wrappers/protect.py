@@ -29,6 +29,18 @@ def protect_options() -> frozenset[str]:
     return frozenset(of_recipes + _options(CBFActionFilter))
 
 
+def recipe_of(env_id: str) -> str | None:
+    """The name of the recipe that `protect` has for an id, or None."""
+    family = _family(env_id)
+    robot = family.removeprefix("Safe").removesuffix("Velocity") if family.endswith("Velocity") else family
+    return next((known for known in (robot, robot.partition("_")[0]) if known in _EVERY), None)
+
+
+def recipe_names() -> list[str]:
+    """Every recipe that `protect` has, by the env's id without its version."""
+    return sorted(_EVERY)
+
+
 def _options(takes: Callable[..., Any]) -> list[str]:
     return [name for name in inspect.signature(takes).parameters if name not in ("env", "constraints")]
 
@@ -77,7 +89,7 @@ def protect(env: gym.Env[Any, Any] | VectorEnv, **options: Any) -> CBFActionFilt
 
 def _with_plant(env: gym.Env[Any, Any], options: dict[str, Any]) -> dict[str, Any]:
     """The options, with the plant that the env needs, if it is not the default one."""
-    of_env = PLANTS.get(_family(env))
+    of_env = PLANTS.get(_family(_env_id(env)))
     return options if of_env is None else {"plant": of_env(env)} | options
 
 
@@ -85,8 +97,8 @@ def _env_id(env: gym.Env[Any, Any]) -> str:
     return env.spec.id if env.spec is not None else ""
 
 
-def _family(env: gym.Env[Any, Any]) -> str:
-    namespace, _, name = _env_id(env).rpartition("/")
+def _family(env_id: str) -> str:
+    namespace, _, name = env_id.rpartition("/")
     if namespace == "dm_control":
         return f"{namespace}/{name.partition('-')[0]}"
     return name.rpartition("-v")[0].removesuffix("Dense").removesuffix("Sparse")
@@ -94,17 +106,17 @@ def _family(env: gym.Env[Any, Any]) -> str:
 
 def _recommended(env: gym.Env[Any, Any], options: dict[str, Any]) -> list[Constraint]:
     """The recipe's constraints; takes its options out of all."""
-    env_id, family = _env_id(env), _family(env)
-    robot = family.removeprefix("Safe").removesuffix("Velocity") if family.endswith("Velocity") else family
-    recipe = _EVERY.get(robot, _EVERY.get(robot.partition("_")[0]))
-    if recipe is None:
-        known = f"there are recipes for {', '.join(sorted(_EVERY))}"
+    env_id = _env_id(env)
+    name = recipe_of(env_id)
+    if name is None:
+        known = f"there are recipes for {', '.join(recipe_names())}"
         raise UnsupportedEnvError(f"no recipe for {env_id or env.unwrapped!r}; {known}. {_by_hand(env)}")
+    recipe = _EVERY[name]
     of_recipe, of_filter = _options(recipe), _options(CBFActionFilter)
     for name in options:
         if name not in of_recipe + of_filter:
             known = ", ".join(of_filter + of_recipe)
-            raise UnknownNameError(f"protect has no option {name!r} for {family}; it has {known}")
+            raise UnknownNameError(f"protect has no option {name!r} for {_family(env_id)}; it has {known}")
     return recipe(env, **{n: options.pop(n) for n in of_recipe if n in options})
 
 

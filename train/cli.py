@@ -10,12 +10,12 @@ import argparse
 import shlex
 import sys
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from safe_wrappers.errors import ConfigurationError, SafeWrappersError
 
+from .command_line import DIAGNOSED_STEPS, ENJOYED_EPISODES, FILTERS, parse
 from .local_imports import importable
 from .processes.output import lasting_output
 from .processes.stopping import Interrupted
@@ -25,16 +25,6 @@ if TYPE_CHECKING:
 
     from .config import ExperimentConfig
 
-COMMANDS = {
-    "train": "train every arm with every seed; a killed run goes on where it was, a finished one is left",
-    "evaluate": "evaluate the trained policies on the same episodes, with the filter off and on",
-    "compare": "train, evaluate, and print the comparison",
-    "report": "write the comparison as one HTML page, from what is already there; of several, also an overview",
-    "diagnose": "run an env, and a policy: what is wrong, and which wrapper treats it; takes ENV for CONFIG.yaml",
-}
-
-DIAGNOSED_STEPS = 2000
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit status. Output that nobody reads any more does not stop it."""
@@ -43,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(arguments: Sequence[str] | None) -> int:
-    options = _options(arguments)
+    options = parse(arguments)
     from rich.console import Console
 
     try:
@@ -63,13 +53,8 @@ def _main(arguments: Sequence[str] | None) -> int:
 
 
 def _run(options: argparse.Namespace, console: Console) -> None:
-    if options.command == "diagnose":
-        from .diagnosis import diagnose_command
-
-        output = options.output or Path("diagnosis.html")
-        steps = DIAGNOSED_STEPS if options.steps is None else options.steps
-        words = ["safe-wrappers", *(sys.argv[1:] if options.given is None else options.given)]
-        diagnose_command(options.words[0], options.policy, steps, output, shlex.join(words), console)
+    if options.command in _WITHOUT_EXPERIMENT:
+        _WITHOUT_EXPERIMENT[options.command](options, console)
         return
     from .config import parse_experiment, read_config
 
@@ -97,6 +82,57 @@ def _run(options: argparse.Namespace, console: Console) -> None:
     console.print(f"Files: {experiment.folder}", soft_wrap=True, highlight=False)
 
 
+def _diagnose(options: argparse.Namespace, console: Console) -> None:
+    from .diagnosis import diagnose_command
+
+    output = options.output or Path("diagnosis.html")
+    steps = DIAGNOSED_STEPS if options.steps is None else options.steps
+    words = ["safe-wrappers", *(sys.argv[1:] if options.given is None else options.given)]
+    diagnose_command(options.words[0], options.policy, steps, output, shlex.join(words), console)
+
+
+def _enjoy(options: argparse.Namespace, console: Console) -> None:
+    from .enjoy import enjoy_command
+
+    episodes = options.episodes or ENJOYED_EPISODES
+    enjoy_command(
+        options.words[0],
+        episodes,
+        options.filter or FILTERS[0],
+        options.render,
+        options.output,
+        console,
+    )
+
+
+def _push(options: argparse.Namespace, console: Console) -> None:
+    from .policies.hub import upload
+
+    names = upload(Path(options.words[0]), options.words[1])
+    console.print(f"Uploaded: {', '.join(names)}", highlight=False, soft_wrap=True)
+
+
+def _list(options: argparse.Namespace, console: Console) -> None:
+    from .listing import list_command
+
+    list_command(options.words, console)
+
+
+def _init(options: argparse.Namespace, console: Console) -> None:
+    from .first_config import init_command
+
+    init_command(next(iter(options.configs), None), options.overrides, console)
+
+
+_WITHOUT_EXPERIMENT: Final = {
+    "diagnose": _diagnose,
+    "enjoy": _enjoy,
+    "push": _push,
+    "list": _list,
+    "init": _init,
+}
+
+
 def _report(options: argparse.Namespace, experiments: list[ExperimentConfig], console: Console) -> None:
     """Of one config its page; of several a page each, and one that puts them side by side."""
     from .experiment import summarize_experiment
@@ -121,68 +157,6 @@ def _report(options: argparse.Namespace, experiments: list[ExperimentConfig], co
 
 def _compare_command(config: Path, overrides: Sequence[str]) -> str:
     return shlex.join(["safe-wrappers", "compare", str(config), *overrides, "--report"])
-
-
-def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = make_parser()
-    # Subparsers would take no words behind an option: `compare a.yaml --report seeds=[0]`.
-    options = parser.parse_intermixed_args(arguments)
-    options.given = arguments
-    if options.command != "diagnose" and (options.policy or options.steps is not None):
-        parser.error(f"{options.command} takes no --policy and no --steps; diagnose does")
-    if options.command == "diagnose":
-        if len(options.words) > 1 or options.report:
-            parser.error("diagnose takes one ENV, --policy, --steps and --output")
-        options.configs = []
-        return options
-    options.configs = [Path(word) for word in options.words if "=" not in word]
-    options.overrides = [word for word in options.words if "=" in word]
-    if not options.configs:
-        parser.error("the following arguments are required: CONFIG.yaml")
-    if options.command != "report" and (options.output or len(options.configs) > 1):
-        parser.error(f"{options.command} takes one CONFIG.yaml and no --output; report does")
-    if options.command != "compare" and options.report:
-        parser.error(f"{options.command} takes no --report; compare does")
-    return options
-
-
-def make_parser() -> argparse.ArgumentParser:
-    """The command's words and options."""
-    parser = argparse.ArgumentParser(
-        prog="safe-wrappers",
-        description="Train with and without a safety filter, and compare.",
-        usage="%(prog)s COMMAND CONFIG.yaml [key=value ...] [option ...]",
-        epilog="commands:\n" + "\n".join(f"  {name:10}{text}" for name, text in COMMANDS.items()),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("command", choices=COMMANDS, metavar="COMMAND", help="one of those below")
-    parser.add_argument(
-        "words",
-        nargs="+",
-        metavar="CONFIG.yaml, key=value",
-        help="the experiment, and overrides such as total_steps=1000 or arms.filtered.filter=protect",
-    )
-    parser.add_argument("--report", action="store_true", help="of compare: also write the HTML report")
-    parser.add_argument(
-        "--output",
-        type=Path,
-        metavar="PAGE.html",
-        help="of report: where to (default: report.html beside the runs; of several, overview.html); of diagnose "
-        "(default: diagnosis.html; the same as JSON beside it)",
-    )
-    parser.add_argument(
-        "--policy",
-        type=Path,
-        metavar="RUN",
-        help="of diagnose: a run's folder, runs/NAME/ARM/seed_N, or a model.zip of Stable-Baselines3",
-    )
-    parser.add_argument(
-        "--steps",
-        type=int,
-        help=f"of diagnose: control steps of each driver (default: {DIAGNOSED_STEPS:,})",
-    )
-    parser.add_argument("--version", action="version", version=version("safe-wrappers"))
-    return parser
 
 
 if __name__ == "__main__":

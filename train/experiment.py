@@ -13,10 +13,12 @@ from .config import ArmConfig, ExperimentConfig
 from .evaluation.evaluate import evaluate_run
 from .evaluation.summary import Summary, summarize, write_summary
 from .hyperparameters import check_task
+from .policies.card import write_card
 from .processes.parallel import Job, run_jobs
 from .processes.stopping import Interrupted
 from .run.learner_callbacks import check_margins
 from .run.start import Start
+from .run.trackers import check_trackers
 from .run.training import (
     check_finished,
     check_folder,
@@ -45,6 +47,7 @@ def train_experiment(experiment: ExperimentConfig, console: Console) -> None:
         if arm.env.reset_options:
             env.reset()  # the task alone knows its options
         check_margins(arm, env)
+        check_trackers(arm)
         env.close()
         start = _start(experiment, arm, experiment.seeds[0])
         if start is not None:
@@ -68,6 +71,7 @@ def train_experiment(experiment: ExperimentConfig, console: Console) -> None:
             for arm in experiment.arms
         ]
         raise
+    _write_cards(experiment)
 
 
 def evaluate_experiment(experiment: ExperimentConfig, console: Console) -> None:
@@ -84,6 +88,7 @@ def evaluate_experiment(experiment: ExperimentConfig, console: Console) -> None:
     arguments = (experiment.evaluation, experiment.evaluation_filter)
     every, evaluation = experiment.arms, lambda *_: evaluate_run
     _run(experiment, every, console, "Evaluation", lambda _: episodes, "episodes", evaluation, arguments)
+    _write_cards(experiment)
     record_videos(experiment, console)
 
 
@@ -92,6 +97,12 @@ def summarize_experiment(experiment: ExperimentConfig) -> Summary:
     summary = summarize(experiment)
     write_summary(summary, experiment.folder)
     return summary
+
+
+def _write_cards(experiment: ExperimentConfig) -> None:
+    for arm in experiment.arms:
+        for seed in experiment.seeds:
+            write_card(arm, seed, experiment.run_folder(arm, seed), experiment.evaluation_filter)
 
 
 def _start(experiment: ExperimentConfig, arm: ArmConfig, seed: int) -> Start | None:

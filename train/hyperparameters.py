@@ -8,7 +8,7 @@ from __future__ import annotations
 import inspect
 from copy import deepcopy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import gymnasium as gym
 import numpy as np
@@ -17,13 +17,16 @@ from gymnasium import spaces
 from safe_wrappers.errors import ConfigurationError
 
 from .config.algorithm_settings import HER, LINEAR, SCHEDULED
-from .config.algorithms import ALGORITHMS, DISCRETE, OFF_POLICY, ON_POLICY
+from .config.algorithms import ALGORITHMS, DISCRETE, MASKED, OFF_POLICY, ON_POLICY, RECURRENT
 
 if TYPE_CHECKING:
     from stable_baselines3.common.noise import ActionNoise
     from stable_baselines3.common.vec_env import VecEnv
 
     from .config import ArmConfig
+
+
+_ANY_ACTIONS: Final = tuple(name for name in ON_POLICY if name not in MASKED)
 
 
 @dataclass(frozen=True)
@@ -42,9 +45,11 @@ class LinearFall:
 
 
 def constructor_arguments(arm: ArmConfig, envs: VecEnv) -> dict[str, Any]:
-    """What the arm's algorithm is made with: its hyperparameters, and the replay buffer that its learner needs."""
+    """What the arm's algorithm is made with: hyperparameters, a policy for its observations, its replay buffer."""
+    has_dict = isinstance(envs.observation_space, spaces.Dict)
+    policy = f"{'MultiInput' if has_dict else 'Mlp'}{'Lstm' if arm.algorithm in RECURRENT else ''}Policy"
     # A copy: SB3 writes into policy_kwargs, and a run folder is known again by its settings.
-    settings = deepcopy(arm.hyperparameters)
+    settings = {"policy": policy, **deepcopy(arm.hyperparameters)}
     for key in SCHEDULED:
         if isinstance(settings.get(key), str):
             settings[key] = LinearFall(float(settings[key].removeprefix(LINEAR)))
@@ -105,16 +110,22 @@ def check_task(arm: ArmConfig, env: gym.Env[Any, Any]) -> None:
         ConfigurationError: Actions of the wrong kind; or, for HER, no goals, or training before an episode ends.
     """
     where = f"arms.{arm.name}"
-    for names, kind, wanted in (
-        (OFF_POLICY, spaces.Box, "continuous"),
-        (DISCRETE, spaces.Discrete, "discrete"),
+    for names, kinds, wanted, instead in (
+        (OFF_POLICY, (spaces.Box,), "continuous", (*ON_POLICY, *DISCRETE)),
+        (DISCRETE, (spaces.Discrete,), "discrete", (*_ANY_ACTIONS, *OFF_POLICY)),
+        (MASKED, (spaces.Discrete, spaces.MultiDiscrete), "discrete", (*_ANY_ACTIONS, *OFF_POLICY)),
     ):
-        if arm.algorithm in names and not isinstance(env.action_space, kind):
-            others = ", ".join(name for name in (*ON_POLICY, *OFF_POLICY, *DISCRETE) if name not in names)
+        if arm.algorithm in names and not isinstance(env.action_space, kinds):
+            boxes = " or ".join(kind.__name__ for kind in kinds)
             raise ConfigurationError(
-                f"{where}: {arm.algorithm} needs {wanted} actions (a {kind.__name__}), and {arm.env.id} has"
-                f" {env.action_space}. Other algorithms: {others}."
+                f"{where}: {arm.algorithm} needs {wanted} actions (a {boxes}), and {arm.env.id} has"
+                f" {env.action_space}. Other algorithms: {', '.join(instead)}."
             )
+    if arm.algorithm in MASKED and not env.has_wrapper_attr("action_masks"):
+        raise ConfigurationError(
+            f"{where}: {arm.algorithm} asks the env at every step which actions are allowed, and neither {arm.env.id}"
+            " nor the arm's filter has action_masks. Give the arm a filter (an ActionShield has them), or use PPO."
+        )
     if not arm.replays_goals:
         return
     goals = {"observation", "achieved_goal", "desired_goal"}

@@ -7,17 +7,24 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.spaces import Discrete
+from fake_task import HAZARD, FakeFilter
+from gymnasium.spaces import Box, Dict, Discrete
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv
 from test_run import Reports, run_killed_after
 
+from safe_wrappers import ActionShield
+from safe_wrappers import info as keys
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.sb3 import ExecutedActionReplayBuffer
-from safe_wrappers.train.config import EvaluationConfig
-from safe_wrappers.train.config.algorithms import ALGORITHMS, DISCRETE, OFF_POLICY, ON_POLICY
+from safe_wrappers.train.config import EvaluationConfig, FilterConfig
+from safe_wrappers.train.config.algorithms import ALGORITHMS, DISCRETE, MASKED, OFF_POLICY, ON_POLICY
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
 from safe_wrappers.train.hyperparameters import check_task, constructor_arguments
+from safe_wrappers.train.policies import load_policy
 from safe_wrappers.train.run.checkpoint import latest_checkpoint
+from safe_wrappers.train.run.policy import SpacesEnv
 from safe_wrappers.train.run.stack import make_stack
 from safe_wrappers.train.run.training import train_run
 from safe_wrappers.train.run.vec_envs import make_vec_env
@@ -29,6 +36,8 @@ SETTINGS = {
     "PPO": f"n_steps: 32, batch_size: 32, n_epochs: 1, {SMALL}",
     "A2C": f"n_steps: 8, {SMALL}",
     "TRPO": f"n_steps: 32, batch_size: 32, n_critic_updates: 1, {SMALL}",
+    "RecurrentPPO": "n_steps: 32, batch_size: 32, n_epochs: 1, policy_kwargs: {net_arch: [8], lstm_hidden_size: 8}",
+    "MaskablePPO": f"n_steps: 32, batch_size: 32, n_epochs: 1, {SMALL}",
     "TD3": f"{REPLAY}, action_noise: {{normal: 0.1}}",
     "DDPG": f"{REPLAY}, action_noise: {{ornstein_uhlenbeck: 0.1}}",
 } | dict.fromkeys(("SAC", "TQC", "CrossQ", "DQN", "QRDQN"), REPLAY)
@@ -55,8 +64,42 @@ def discrete():
 gym.register("DiscreteGoal-v0", discrete)
 
 
+class Masked(FakeFilter):
+    """The fake filter for those three actions, which also says beforehand what it would refuse."""
+
+    asked = 0
+
+    def _refused(self, action):
+        at = self.unwrapped.agent_position + 0.1 * np.array([float(action) - 1.0, 0.0])
+        return np.linalg.norm(at - HAZARD) - self.unwrapped.hazard_radius < self.margin
+
+    def action_masks(self):
+        Masked.asked += 1
+        return np.array([not self._refused(action) for action in range(3)])
+
+    def step(self, action):
+        refused = self._refused(action)
+        assert not refused or not self.masked, "the mask forbade it"
+        *result, info = self.env.step(1 if refused else action)
+        info.update(dict.fromkeys(keys.CBF_BOOLS, False) | dict.fromkeys(keys.CBF_FLOATS, 0.0))
+        info[keys.CBF_INTERVENED] = refused
+        return *result, info
+
+    masked = True
+
+
+def masks(env):
+    return Masked(env)
+
+
+def shielded(env):
+    env = Masked(env)
+    env.masked = False
+    return env
+
+
 def one_arm(fake_experiment, algorithm, arm, *overrides):
-    discrete = ["env=test_algorithms:DiscreteGoal-v0"] if algorithm in DISCRETE else []
+    discrete = ["env=test_algorithms:DiscreteGoal-v0"] if algorithm in (*DISCRETE, *MASKED) else []
     return fake_experiment(
         f"algorithm={algorithm}",
         f"hyperparameters={{{SETTINGS[algorithm]}}}",
@@ -71,7 +114,7 @@ def one_arm(fake_experiment, algorithm, arm, *overrides):
 
 
 def installed(algorithm):
-    if algorithm in ("TQC", "CrossQ", "TRPO", "QRDQN"):
+    if algorithm not in ("PPO", "A2C", "SAC", "TD3", "DDPG", "DQN"):
         pytest.importorskip("sb3_contrib")
     return algorithm
 
@@ -79,7 +122,9 @@ def installed(algorithm):
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_trained_killed_continued_and_evaluated(fake_experiment, monkeypatch, algorithm):
     installed(algorithm)
-    arm = FILTERED if algorithm not in DISCRETE else "filter: none"
+    of_three = "masks" if algorithm in MASKED else "shielded"
+    discrete = algorithm in (*DISCRETE, *MASKED)
+    arm = FILTERED if not discrete else f"filter: {{factory: 'test_algorithms:{of_three}'}}"
     arm += f", {TWO}" if algorithm in OFF_POLICY else ""
     experiment = one_arm(fake_experiment, algorithm, arm)
     (arm,) = experiment.arms
@@ -95,13 +140,14 @@ def test_trained_killed_continued_and_evaluated(fake_experiment, monkeypatch, al
     assert json.loads((folder / "finished.json").read_text())["timesteps"] == 192
     rows = read_rows(folder / "episodes.csv")
     assert len(rows) == 64 // 20 + 128 // 20
-    assert (sum(row.get("intervention_rate", 0.0) for row in rows) > 0) == (algorithm not in DISCRETE)
+    # An action that is masked is never proposed; QRDQN and DQN begin with random ones, which are changed.
+    assert (sum(row["intervention_rate"] for row in rows) > 0) == (algorithm not in MASKED)
     evaluate_run(arm, 0, folder, EvaluationConfig(2, 7), experiment.evaluation_filter, Reports().progress)
-    for condition in ("filter_off", *(("filter_on",) if algorithm not in DISCRETE else ())):
+    for condition in ("filter_off", "filter_on"):
         assert len(read_rows(evaluation_folder(folder) / f"{condition}.csv")) == 2
 
 
-@pytest.mark.parametrize("algorithm", [*ON_POLICY, *OFF_POLICY])
+@pytest.mark.parametrize("algorithm", [name for name in (*ON_POLICY, *OFF_POLICY) if name not in MASKED])
 @pytest.mark.parametrize("kind", ["naive", "adaption_penalty", "safe_action", "both", "safe_set_map"])
 def test_which_algorithm_can_have_which_learner(fake_experiment, algorithm, kind):
     installed(algorithm)
@@ -127,7 +173,7 @@ def test_names_are_classes_of_the_two_packages():
         assert (
             ALGORITHMS[name].__name__ == name and "policy" in inspect.signature(ALGORITHMS[name]).parameters
         )
-    assert set(ALGORITHMS) == {*ON_POLICY, *OFF_POLICY, *DISCRETE} == set(SETTINGS) and len(ALGORITHMS) == 10
+    assert set(ALGORITHMS) == {*ON_POLICY, *OFF_POLICY, *DISCRETE} == set(SETTINGS) and len(ALGORITHMS) == 12
 
 
 def test_a_missing_package_is_named_with_the_line_that_installs_it(fake_experiment, monkeypatch):
@@ -138,7 +184,7 @@ def test_a_missing_package_is_named_with_the_line_that_installs_it(fake_experime
         one_arm(fake_experiment, "TQC", FILTERED)
 
 
-@pytest.mark.parametrize("name", ["ARS", "RecurrentPPO", "MaskablePPO"])
+@pytest.mark.parametrize("name", ["ARS"])
 def test_what_does_not_work_with_a_run_is_refused_with_the_reason(fake_experiment, name):
     with pytest.raises(
         ConfigurationError, match=rf"arms.a.algorithm: {name} is not offered: .*Valid names: A2C"
@@ -148,19 +194,83 @@ def test_what_does_not_work_with_a_run_is_refused_with_the_reason(fake_experimen
         fake_experiment("arms={a: {filter: none}}", "arms.a.algorithm=TD33")
 
 
-def test_discrete_actions_have_no_filter(fake_experiment):
-    with pytest.raises(
-        ConfigurationError, match=r"arms.a.filter: DQN has discrete actions.*leave `filter` out"
-    ):
-        one_arm(fake_experiment, "DQN", FILTERED)
-    with pytest.raises(
-        ConfigurationError, match=r"evaluation would put a filter on.*evaluation.filter to none"
-    ):
-        one_arm(fake_experiment, "DQN", "filter: none", "evaluation.filter=protect")
+@pytest.mark.parametrize("algorithm", [*DISCRETE, *MASKED])
+def test_learners_of_continuous_actions_are_refused_for_discrete_ones(fake_experiment, algorithm):
+    installed(algorithm)
+    for kind in ("safe_action", "safe_set_map", "{kind: both, penalty: 1.0}"):
+        with pytest.raises(
+            ConfigurationError, match=rf"is for continuous actions, and {algorithm} has discrete"
+        ):
+            one_arm(fake_experiment, algorithm, f"{FILTERED}, learner: {kind}")
     with pytest.raises(ConfigurationError, match="without a filter no action is ever changed"):
-        one_arm(fake_experiment, "DQN", "learner: safe_action")
-    arms = [f"arms.b={{{FILTERED}, algorithm: PPO}}", "evaluation.filter=none"]
-    assert len(one_arm(fake_experiment, "DQN", "filter: none", *arms).arms) == 2
+        one_arm(fake_experiment, algorithm, "learner: safe_action")
+
+
+def test_masks_need_somebody_who_has_them(fake_experiment):
+    pytest.importorskip("sb3_contrib")
+    (arm,) = one_arm(fake_experiment, "MaskablePPO", "filter: none").arms
+    with pytest.raises(
+        ConfigurationError, match="neither test_algorithms:DiscreteGoal-v0 nor the arm's filter"
+    ):
+        check_task(arm, make_stack(arm.env, arm.filter))
+
+
+def test_dqn_learns_cart_pole_through_its_shield(fake_experiment):
+    """protect's filter for discrete actions is an ActionShield."""
+    (arm,) = one_arm(
+        fake_experiment, "DQN", "filter: {protect: {}}", "env=CartPole-v1", "total_steps=64"
+    ).arms
+    env = make_stack(arm.env, arm.filter)
+    check_task(arm, env)
+    assert any(isinstance(inner, ActionShield) for inner in wrappers_of(env))
+    folder = fake_experiment().output / "dqn"
+    train_run(arm, 0, folder, Reports().progress)
+    assert json.loads((folder / "finished.json").read_text())["timesteps"] == 64
+
+
+@pytest.mark.parametrize("algorithm", ["RecurrentPPO", "PPO"])
+def test_a_policy_s_memory_is_carried_through_an_episode_and_emptied_after_it(fake_experiment, algorithm):
+    installed(algorithm)
+    (arm,) = one_arm(fake_experiment, algorithm, FILTERED, "total_steps=32").arms
+    folder = fake_experiment().output / algorithm
+    train_run(arm, 0, folder, Reports().progress)
+    policy, observation = load_policy(folder), np.zeros(2)
+    first, second = policy(observation), policy(observation)
+    assert np.array_equal(first, second) == (algorithm == "PPO")
+    policy.begin()
+    assert np.array_equal(policy(observation), first) and np.array_equal(policy(observation), second)
+
+
+def test_a_policy_of_masks_asks_the_env_for_them(fake_experiment):
+    installed("MaskablePPO")
+    (arm,) = one_arm(
+        fake_experiment, "MaskablePPO", "filter: {factory: 'test_algorithms:masks'}", "total_steps=32"
+    ).arms
+    folder = fake_experiment().output / "masked"
+    train_run(arm, 0, folder, Reports().progress)
+    policy, observation = load_policy(folder), np.zeros(2)
+    liked = int(policy(observation))
+    env = Masked(discrete())
+    for allowed in range(3):
+        env.action_masks = lambda allowed=allowed: np.arange(3) == allowed
+        policy.begin(env)
+        assert policy(observation) == allowed
+    policy.begin(make_stack(arm.env, FilterConfig()))  # nobody has masks there
+    assert policy(observation) == liked
+
+
+def test_the_policy_fits_the_observations(fake_experiment):
+    pytest.importorskip("sb3_contrib")
+    for algorithm, space, name in (
+        ("PPO", Box(-1, 1, (2,)), "MlpPolicy"), ("PPO", Dict(a=Box(-1, 1, (2,))), "MultiInputPolicy"),
+        ("RecurrentPPO", Box(-1, 1, (2,)), "MlpLstmPolicy"),
+        ("RecurrentPPO", Dict(a=Box(-1, 1, (2,))), "MultiInputLstmPolicy"),
+    ):  # fmt: skip
+        (arm,) = one_arm(fake_experiment, algorithm, FILTERED).arms
+        spaces = DummyVecEnv([lambda space=space: SpacesEnv(space, Discrete(2))])
+        assert constructor_arguments(arm, spaces)["policy"] == name
+        (arm,) = one_arm(fake_experiment, algorithm, FILTERED, "hyperparameters.policy=CnnPolicy").arms
+        assert constructor_arguments(arm, spaces)["policy"] == "CnnPolicy"
 
 
 @pytest.mark.parametrize(

@@ -72,6 +72,18 @@ def test_a_model_file_is_loaded_as_what_it_is(algorithm, tmp_path):
     )
 
 
+@pytest.mark.parametrize(
+    ("name", "policy"),
+    [("RecurrentPPO", "MlpLstmPolicy"), ("MaskablePPO", "MlpPolicy"), ("TRPO", "MlpPolicy")],
+)
+def test_a_model_file_of_sb3_contrib_is_loaded_as_what_it_is(name, policy, tmp_path):
+    algorithm = getattr(pytest.importorskip("sb3_contrib"), name)
+    algorithm(policy, gym.make("CartPole-v1"), device="cpu", n_steps=8, batch_size=8).save(
+        tmp_path / "model.zip"
+    )
+    assert type(of_file(tmp_path / "model.zip")) is algorithm
+
+
 def test_what_is_no_policy_is_refused(run, tmp_path, capsys):
     with pytest.raises(ConfigurationError, match=r"is no run's folder \(it has no run\.json\)"):
         of_run(tmp_path, "SafePointGoal1-v0")

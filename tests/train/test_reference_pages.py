@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from safe_wrappers.train import cli
+from safe_wrappers.train import command_line as cli
 from safe_wrappers.train.config import models, parse_experiment
 from safe_wrappers.wrappers.faults import FAULTS
 

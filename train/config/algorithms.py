@@ -16,21 +16,23 @@ if TYPE_CHECKING:
 _CONTRIB: Final = "sb3_contrib"
 _MODULES: Final = {
     **dict.fromkeys(("PPO", "A2C", "SAC", "TD3", "DDPG", "DQN"), "stable_baselines3"),
-    **dict.fromkeys(("TQC", "CrossQ", "TRPO", "QRDQN"), _CONTRIB),
+    **dict.fromkeys(("TQC", "CrossQ", "TRPO", "QRDQN", "RecurrentPPO", "MaskablePPO"), _CONTRIB),
 }
-ON_POLICY: Final = ("PPO", "A2C", "TRPO")
+ON_POLICY: Final = ("PPO", "A2C", "TRPO", "RecurrentPPO", "MaskablePPO")
 """They learn from what they have just done, continuous actions or discrete ones."""
 OFF_POLICY: Final = ("SAC", "TD3", "DDPG", "TQC", "CrossQ")
 """They learn from a replay buffer, continuous actions."""
 DISCRETE: Final = ("DQN", "QRDQN")
-"""They learn from a replay buffer, discrete actions; no filter of this library takes those."""
+"""They learn from a replay buffer, discrete actions; their filter is an ActionShield."""
+MASKED: Final = ("MaskablePPO",)
+"""Discrete actions; at every step they ask the env which of them are allowed (`action_masks`)."""
+RECURRENT: Final = ("RecurrentPPO",)
+"""Their policies have a memory, which is carried from step to step of an episode."""
 DETERMINISTIC: Final = ("TD3", "DDPG")
 """Of `OFF_POLICY` those whose policy tries nothing out by itself."""
 
 _NOT_OFFERED: Final = {
     "ARS": "it shows no steps to callbacks, and the episodes and interventions of a run are counted there",
-    "RecurrentPPO": "its policy has a memory, which evaluation does not carry from step to step",
-    "MaskablePPO": "it needs a mask of discrete actions at every step, which evaluation does not ask the env for",
 }
 """Algorithms of sb3-contrib that do not work with the rest of a run, and why."""
 

@@ -9,7 +9,7 @@ from typing import Any, Final
 from safe_wrappers.errors import ConfigurationError
 
 from .algorithm_settings import HER, check_hyperparameters
-from .algorithms import DETERMINISTIC, DISCRETE, OFF_POLICY, ON_POLICY
+from .algorithms import DETERMINISTIC, DISCRETE, MASKED, OFF_POLICY, ON_POLICY
 from .models import ArmConfig, ExperimentConfig, default_buffer_size
 from .names import check_name
 from .types import validate
@@ -46,13 +46,6 @@ def parse_experiment(settings: Mapping[str, Any]) -> ExperimentConfig:
     experiment: ExperimentConfig = validate(ExperimentConfig, own, "")
     if len(set(experiment.seeds)) < len(experiment.seeds):
         raise ConfigurationError(f"seeds: each may be given once, got {experiment.seeds}.")
-    for arm in experiment.arms:
-        if arm.algorithm in DISCRETE and experiment.evaluation_filter.kind != "none":
-            raise ConfigurationError(
-                f"arms.{arm.name}: {arm.algorithm} has discrete actions, and no filter of this library takes those,"
-                " but evaluation would put a filter on (evaluation.filter, or that of another arm). Give the arm an"
-                " experiment of its own, or set evaluation.filter to none."
-            )
     for arm in experiment.arms:
         _check_start(arm, experiment)
     return replace(experiment, arms=tuple(_with_constraints(arm, experiment) for arm in experiment.arms))
@@ -123,11 +116,6 @@ def _arm(name: str, own: Mapping[str, Any], common: Mapping[str, Any]) -> ArmCon
 
 
 def _check_actions(arm: ArmConfig, where: str) -> None:
-    if arm.algorithm in DISCRETE and arm.filter.kind != "none":
-        raise ConfigurationError(
-            f"{where}.filter: {arm.algorithm} has discrete actions, and no filter of this library takes those: leave"
-            f" `filter` out. Algorithms that train through a filter: {', '.join(ON_POLICY + OFF_POLICY)}."
-        )
     if arm.algorithm in DETERMINISTIC and "action_noise" not in arm.hyperparameters:
         raise ConfigurationError(
             f"{where}: the policy of {arm.algorithm} is deterministic and tries nothing out by itself. Give"
@@ -154,6 +142,11 @@ def _check_learner(arm: ArmConfig, where: str) -> None:
         raise ConfigurationError(
             f"{where}: hindsight replay asks the task for rewards anew, without the price of cost_limit; leave"
             " hyperparameters.replay_buffer_class out."
+        )
+    if arm.algorithm in (*DISCRETE, *MASKED) and (arm.learner.stores_executed or arm.learner.maps):
+        raise ConfigurationError(
+            f"{where}: {kind} is for continuous actions, and {arm.algorithm} has discrete ones. Use naive or"
+            " adaption_penalty."
         )
     if not arm.learner.stores_executed:
         return

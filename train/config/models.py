@@ -156,13 +156,15 @@ class ArmConfig(Section):
     """The env: an id, or the keys of [`env`](#env)."""
     algorithm: Annotated[str, AfterValidator(check_algorithm)]
     """`PPO`, `A2C`, `SAC`, `TD3`, `DDPG`, `DQN`; with `pip install 'sb3-contrib>=2.6,<3'` also `TQC`, `CrossQ`,
-    `TRPO`, `QRDQN`. `DQN` and `QRDQN` are for discrete actions, and for arms without a filter."""
+    `TRPO`, `RecurrentPPO`, `QRDQN`, `MaskablePPO`. The last two and `DQN` are for discrete actions; filtered, those
+    have an [ActionShield](wrappers/action-shield.md), and `MaskablePPO` learns from its masks."""
     total_steps: Count
     """Steps of all envs together; whole rollouts, so PPO may make a few more. May be [raised
     later](cli.md#training-for-longer)."""
     hyperparameters: Options = Field(default_factory=dict)
     """Arguments of the algorithm's class, by SB3's names. An arm's are added to those at the top, if the algorithm
-    is the same. `policy` is `MlpPolicy`, or `MultiInputPolicy` where observations are dicts, if it is not given.
+    is the same. `policy` is `MlpPolicy`, or `MultiInputPolicy` where observations are dicts, if it is not given (of
+    RecurrentPPO `MlpLstmPolicy` and `MultiInputLstmPolicy`).
     `buffer_size` is `total_steps`, at most a million. What the run decides itself (`env`, `seed`, `device`,
     `verbose`, `tensorboard_log`, `stats_window_size`) is refused."""
     filter: FilterConfig = FilterConfig()
@@ -186,6 +188,8 @@ class ArmConfig(Section):
     """Steps between two checkpoints, saved between two rollouts. May be changed later."""
     device: Literal["cpu", "cuda", "auto"] = "cpu"
     """Torch's. May be changed later."""
+    trackers: list[Literal["wandb", "mlflow"]] = Field(default_factory=list)
+    """[Where curves and films go](cli.md#trackers) beside TensorBoard. May be changed later."""
 
     @property
     def replays_goals(self) -> bool:
@@ -195,7 +199,7 @@ class ArmConfig(Section):
     def fingerprint(self) -> dict[str, Any]:
         """What a run folder must agree on to be continued: all that changes what is learned."""
         values = asdict(self) | {"filter": self.filter.plain()}
-        for harmless in ("name", "checkpoint_every", "device", "vec_env"):
+        for harmless in ("name", "checkpoint_every", "device", "vec_env", "trackers"):
             del values[harmless]
         without_default_buffer_size(values)
         # As in the folders of runs that were made before there was a choice.

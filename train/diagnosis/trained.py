@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import gymnasium as gym
 from stable_baselines3.common.monitor import Monitor
@@ -15,14 +14,11 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
 
-from ..config import ArmConfig, EnvConfig, FilterConfig
 from ..config.algorithms import ALGORITHMS
-from ..run.checkpoint import latest_checkpoint
-from ..run.policy import TrainedPolicy
-from ..run.stack import make_stack
-from ..run.training import RUN_FILE
+from ..policies import load_policy
 
 Policy = Callable[[Any], Any]
+_OF_PACKAGE: Final = {"recurrent": "RecurrentPPO", "maskable": "MaskablePPO"}
 
 
 def of_run(folder: Path, env_id: str) -> tuple[gym.Env[Any, Any], Policy]:
@@ -31,41 +27,15 @@ def of_run(folder: Path, env_id: str) -> tuple[gym.Env[Any, Any], Policy]:
     Raises:
         ConfigurationError: The folder holds no run, no checkpoint, or the policy of another env.
     """
-    file = folder / RUN_FILE
-    if not file.is_file():
+    trained = load_policy(folder)
+    if trained.arm.env.id != env_id:
         raise ConfigurationError(
-            f"--policy: {str(folder)!r} is no run's folder (it has no {RUN_FILE}): give runs/NAME/ARM/seed_N, or a "
-            "model.zip"
+            f"--policy: {str(folder)!r} was trained on {trained.arm.env.id}, not on {env_id}: diagnose that env"
         )
-    arm = _arm(json.loads(file.read_text())["config"])
-    if arm.env.id != env_id:
-        raise ConfigurationError(
-            f"--policy: {str(folder)!r} was trained on {arm.env.id}, not on {env_id}: diagnose that env"
-        )
-    checkpoint = latest_checkpoint(folder / "checkpoints", print)
-    if checkpoint is None:
-        raise ConfigurationError(f"--policy: {str(folder)!r} has no checkpoint yet")
-    env = make_stack(arm.env, FilterConfig())
+    env = trained.make_env("none")
     while isinstance(env, Monitor | RecordInterventions):  # they belong outside of filters that are tried
         env = env.env
-    return env, TrainedPolicy(arm, checkpoint)
-
-
-def _arm(config: dict[str, Any]) -> ArmConfig:
-    """What a policy needs to act, from the settings in a run's file."""
-    settings = {key: value for key, value in config["env"].items() if key not in ("observation", "judge")}
-    seen = config["env"].get("observation") or {}
-    if seen.get("kind", "none") != "none":
-        by_name = {"protect": seen["kwargs"]} if seen["kind"] == "protect" else {}
-        settings["observation"] = FilterConfig(
-            **(by_name or {"factory": seen["factory"], "kwargs": seen["kwargs"]})
-        )
-    names = ("algorithm", "action_repeat", "total_steps")
-    return ArmConfig(
-        name="diagnosed",
-        env=EnvConfig(**settings),
-        **{name: config[name] for name in names if name in config},
-    )
+    return env, trained
 
 
 def of_file(path: Path) -> Any:
@@ -88,6 +58,8 @@ def of_file(path: Path) -> Any:
 def _algorithm(data: dict[str, Any]) -> str:
     """Whose model it is: the file names the policy's class alone."""
     package = data["policy_class"].__module__.split(".")[-2]
+    if package in _OF_PACKAGE:
+        return _OF_PACKAGE[package]
     if package == "common":  # PPO's, A2C's and TRPO's policies have one class
         return "PPO" if "clip_range" in data else "TRPO" if "cg_max_steps" in data else "A2C"
     found = [name for name in ALGORITHMS if name.lower() == package]

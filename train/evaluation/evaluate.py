@@ -7,8 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from stable_baselines3.common.logger import configure
-
 from safe_wrappers import info as keys
 from safe_wrappers.wrappers.record_interventions import COLUMNS
 
@@ -17,6 +15,7 @@ from ..config import ArmConfig, EvaluationConfig, FilterConfig
 from ..processes.parallel import Progress
 from ..run.policy import TrainedPolicy
 from ..run.stack import make_stack
+from ..run.trackers import run_logger
 from ..run.training import EVALUATION, finished_checkpoint
 from ..tables import write_rows
 from .scene import Scene, SceneRecorder, save_scenes
@@ -85,7 +84,7 @@ def evaluate_run(
         return
     (out / STATE_FILE).unlink(missing_ok=True)  # from here on the rows may be of two settings
     policy = TrainedPolicy(arm, checkpoint)
-    logger = configure(str(folder / "tensorboard"), ["tensorboard"])
+    logger = run_logger(arm, seed, folder)
     for at, (condition, used) in enumerate(filters.items()):
         evaluation = _Evaluation(arm, used)
         rows: list[dict[str, Any]] = []
@@ -124,7 +123,7 @@ class _Evaluation:
 
     def _episode(self, policy: TrainedPolicy, episode_seed: int) -> tuple[dict[str, Any], Scene | None]:
         observation, _ = self._env.reset(seed=episode_seed)
-        policy.begin()
+        policy.begin(self._env)
         self.steps.begin(episode_seed)
         scene = SceneRecorder(self._env)
         done = False

@@ -199,14 +199,14 @@ def summarize(experiment: ExperimentConfig) -> Summary:
             metrics = [metric for metric in METRICS if metric not in (*left_out, *unjudged)]
             rows = []
             for seed in experiment.seeds:
-                episodes = read_rows(_episode_file(experiment.run_folder(arm, seed), condition))
+                episodes = read_rows(episode_file(experiment.run_folder(arm, seed), condition))
                 if episodes:
                     rows.append(
                         {
                             "arm": arm.name,
                             "seed": seed,
                             "condition": condition,
-                            **_seed_row(episodes, metrics),
+                            **seed_row(episodes, metrics),
                         }
                     )
             per_seed += rows
@@ -260,13 +260,15 @@ def number(value: float) -> str:
     return f"{value:.3g}"
 
 
-def _episode_file(run_folder: Path, condition: str) -> Path:
+def episode_file(run_folder: Path, condition: str) -> Path:
+    """The table of a run's episodes under a condition."""
     if condition == "training":
         return run_folder / "episodes.csv"
     return evaluation_folder(run_folder) / f"{condition}.csv"
 
 
-def _seed_row(episodes: Sequence[Mapping[str, float]], metrics: Sequence[str]) -> dict[str, Any]:
+def seed_row(episodes: Sequence[Mapping[str, float]], metrics: Sequence[str]) -> dict[str, Any]:
+    """What a run's episodes come to: `episodes`, `steps`, and those metrics that all of them report."""
     steps = sum(episode["length"] for episode in episodes)
     row: dict[str, Any] = {"episodes": len(episodes), "steps": int(steps)}
     for metric in metrics:

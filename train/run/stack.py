@@ -32,7 +32,10 @@ from .judge import ConstraintJudge
 
 
 def make_stack(
-    env: EnvConfig, action_filter: FilterConfig, learner: LearnerConfig = NAIVE
+    env: EnvConfig,
+    action_filter: FilterConfig,
+    learner: LearnerConfig = NAIVE,
+    render_mode: str | None = None,
 ) -> gym.Env[Any, Any]:
     """Makes the task with all its layers, from the judge to SB3's Monitor.
 
@@ -44,15 +47,17 @@ def make_stack(
         action_filter: The filter around it.
         learner: In training the arm's; in evaluation its `in_evaluation`, so that no return ever holds a penalty.
             Without a filter there is nothing to map onto, and no map.
+        render_mode: As `gymnasium.make` takes it; None: as the config has it.
 
     Raises:
         ConfigurationError: The task or the filter refuses its settings.
     """
+    kwargs = env.kwargs if render_mode is None else {**env.kwargs, "render_mode": render_mode}
     check_env_id(env.id)  # a spawned process has not yet registered what the first one did
     try:
-        task: gym.Env[Any, Any] = gym.make(env.id, **env.kwargs)
+        task: gym.Env[Any, Any] = gym.make(env.id, **kwargs)
     except (TypeError, gym.error.Error, ImportError) as error:
-        raise ConfigurationError(f"env: {env.id} with kwargs {env.kwargs} cannot be made: {error}") from error
+        raise ConfigurationError(f"env: {env.id} with kwargs {kwargs} cannot be made: {error}") from error
     if env.cost is not None:
         task = CostFunction(task, _function(env.cost, "env.cost"))
     if env.judge is not None:

@@ -10,11 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import CallbackList
-from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
@@ -38,7 +36,9 @@ from .callbacks import (
 )
 from .checkpoint import MODEL, Checkpoint, latest_checkpoint, save_checkpoint
 from .learner_callbacks import learner_callbacks
+from .portable import POLICY, write_policy
 from .start import START_FILE, Policy, Start, begin_with, policy_of_file, policy_of_model, refuse_misfit
+from .trackers import run_logger
 from .vec_envs import make_training_env, make_vec_env
 
 RUN_FILE: Final = "run.json"
@@ -106,7 +106,8 @@ def _train(
         write_json(folder / START_FILE, begun)
         say(f"begins with the policy of {begun['from']}, {begun['timesteps']:,} steps old")
     if is_outgrown(arm, folder):
-        shutil.rmtree(folder / EVALUATION, ignore_errors=True)
+        for outdated in (EVALUATION, POLICY):
+            shutil.rmtree(folder / outdated, ignore_errors=True)
         (folder / FINISHED_FILE).unlink()
     before_s = 0.0 if checkpoint is None else checkpoint.elapsed_s
     # SB3 seeds env i with seed + i, so that seeds 0 and 1 would share all but one of their envs' episodes.
@@ -114,7 +115,7 @@ def _train(
     assert vec_env is not None
     stream = np.random.SeedSequence((seed, model.num_timesteps)).generate_state(1)[0]
     vec_env.seed(int(stream) >> 1)
-    model.set_logger(configure(str(folder / "tensorboard"), ["tensorboard"]))
+    model.set_logger(run_logger(arm, seed, folder))
     begin = time.monotonic()
 
     def elapsed_s() -> float:
@@ -150,6 +151,7 @@ def _train(
         finally:
             model.logger.close()
         save_checkpoint(folder / CHECKPOINTS, model, elapsed_s(), final=True)
+        write_policy(arm, seed, folder, model)
         write_json(folder / FINISHED_FILE, _facts(model, elapsed_s(), envs))
 
 
@@ -298,10 +300,9 @@ def _new_model(arm: ArmConfig, seed: int, envs: VecEnv) -> BaseAlgorithm:
             norm_reward=arm.normalize.reward,
             gamma=arm.hyperparameters.get("gamma", 0.99),
         )
-    has_dict = isinstance(envs.observation_space, gym.spaces.Dict)
-    policy = "MultiInputPolicy" if has_dict else "MlpPolicy"
-    settings = {"policy": policy, **constructor_arguments(arm, envs)}
-    model: BaseAlgorithm = ALGORITHMS[arm.algorithm](env=envs, seed=seed, device=arm.device, **settings)
+    model: BaseAlgorithm = ALGORITHMS[arm.algorithm](
+        env=envs, seed=seed, device=arm.device, **constructor_arguments(arm, envs)
+    )
     return model
 
 

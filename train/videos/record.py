@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,6 +23,7 @@ from ..evaluation.step_log import is_violation
 from ..processes.parallel import Job, Progress, RunsFailedError, environment, run_jobs
 from ..run.policy import TrainedPolicy
 from ..run.stack import make_stack
+from ..run.trackers import track_film
 from ..run.training import finished_checkpoint
 from .film import HEIGHT, WIDTH, Film, encode, speed_of, stride_of
 from .rendering import find_rendering
@@ -132,6 +133,10 @@ def _record_arms(
             run_jobs(jobs, experiment.workers, console, "Videos")
     except RunsFailedError as error:
         return f"filming {env.id} failed: {str(error).strip().splitlines()[-1]}"
+    for job in jobs:
+        arm, _, folder, _, path = job.arguments
+        steps = finished_checkpoint(arm, shown.seed, folder).timesteps
+        track_film(arm, shown.seed, folder, path.stem.removeprefix(f"{arm.name}_"), path, steps)
     return ""
 
 
@@ -150,8 +155,7 @@ def record_video(
     """
     checkpoint = finished_checkpoint(arm, shown.seed, run_folder)
     policy = TrainedPolicy(arm, checkpoint)
-    filmed = replace(arm.env, kwargs={**arm.env.kwargs, "render_mode": "rgb_array"})
-    env = make_stack(filmed, used, arm.learner.in_evaluation)
+    env = make_stack(arm.env, used, arm.learner.in_evaluation, "rgb_array")
     set_size(env, WIDTH, HEIGHT)
     if filter_inside(env) is not None:
         env = SafetyOverlay(env)
@@ -161,7 +165,7 @@ def record_video(
     film = Film(stride=stride_of(longest or 1))
     try:
         observation, _ = env.reset(seed=shown.episode_seed)
-        policy.begin()
+        policy.begin(env)
         done = False
         while not done:
             if film.wants_frame:

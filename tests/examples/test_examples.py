@@ -1,0 +1,82 @@
+"""Every script of `examples/` runs in a few seconds with few steps, and prints what it is there to show."""
+
+import re
+import runpy
+import sys
+from pathlib import Path
+from unittest import mock
+
+import gymnasium as gym
+import pytest
+
+import safe_wrappers  # noqa: F401  (its ids must outlast the first script)
+
+pytest.importorskip("stable_baselines3")
+torch = pytest.importorskip("torch")
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+STEPS_AND_WORDS = {
+    "protect_ppo": (64, r"return -?[\d.]+, steps in violation 0\n\d+% of the actions changed"),
+    "sac_executed_actions": (40, r"^40 steps; the filter changed \d+% of the actions"),
+    "her_fetch": (102, r"^[0-5] of 5 goals reached; the smallest margin was 0\.\d+ m"),
+    "chunk_policy": (16, r"fastest change of a command: [\d.]+ per second, limit 25\.0"),
+    "lease_outages": (
+        400,
+        r"no lease: (\d+) silent steps, 0 braked, [1-9]\d* .*\nlease: \1 .*, [1-9]\d* braked, 0 ",
+    ),
+    "slip_rover": (
+        150,
+        r"as it is: [\d.]+ m, largest slip 0\.[6-9]\d\nlimited: [\d.]+ m, largest slip 0\.1\d",
+    ),
+    "occlusion": (40, r"cars in sight \d+% of the time, penalty [\d.]+, [1-9]\d* of 40 actions changed"),
+    "own_env": (100, r"^Ferry: over the weir\nCBFActionFilter: holds at 0\.00 m"),
+    "vector_env": (512, r"^\d+ actions changed, cost 0, last rewards"),
+}
+
+
+def run(name, words, capsys, monkeypatch):
+    """What the script prints, run as a person would."""
+    torch.set_num_threads(1)
+    monkeypatch.setattr(sys, "argv", [f"{name}.py", *map(str, words)])
+    with mock.patch.dict(gym.registry):
+        runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
+    return capsys.readouterr().out
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", STEPS_AND_WORDS)
+def test_it_runs_and_shows_what_it_says(name, tmp_path, capsys, monkeypatch):
+    if name == "her_fetch":
+        pytest.importorskip("gymnasium_robotics")
+    monkeypatch.chdir(tmp_path)
+    steps, words = STEPS_AND_WORDS[name]
+    out = run(name, ["--steps", steps], capsys, monkeypatch)
+    assert re.search(words, out), out
+    assert not list(tmp_path.iterdir()), "it leaves nothing behind"
+
+
+def scripts():
+    return sorted(path for path in EXAMPLES.glob("*.py"))
+
+
+def test_there_are_ten_short_ones_and_a_table_of_all():
+    assert {path.stem for path in scripts()} == STEPS_AND_WORDS.keys() | {"enjoy"}
+    table = (EXAMPLES / "README.md").read_text(encoding="utf-8")
+    for path in scripts():
+        assert f"[`{path.name}`]({path.name})" in table, path.name
+        lines = path.read_text(encoding="utf-8").splitlines()
+        assert len(lines) <= 50, path.name
+        assert f"python examples/{path.name}" in "\n".join(lines[:6]), path.name
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_trained_policy_acts_again(tmp_path, capsys, monkeypatch):
+    from safe_wrappers.train.config import parse_experiment
+    from safe_wrappers.train.run import Progress, train_run
+
+    settings = {"name": "a", "env": "Reacher-v5", "algorithm": "PPO", "total_steps": 64, "seeds": [0]}
+    arms = {"filtered": {"filter": "protect", "hyperparameters": {"n_steps": 64}}}
+    (arm,) = parse_experiment({**settings, "arms": arms}).arms
+    train_run(arm, 0, tmp_path / "seed_0", Progress(lambda steps: None, print))
+    out = run("enjoy", [tmp_path / "seed_0", "--episodes", 2], capsys, monkeypatch)
+    assert re.fullmatch(r"(seed [01]: return -[\d.]+, \d+% changed\n){2}", out), out

@@ -1,0 +1,84 @@
+"""safe-wrappers enjoy: a trained policy acts, in its filter or in another, and is filmed."""
+
+import io
+import re
+
+import gymnasium as gym
+import pytest
+from PIL import Image
+from test_run import Reports
+
+from safe_wrappers.train.cli import main
+from safe_wrappers.train.enjoy import enjoy_command
+from safe_wrappers.train.run.training import train_run
+
+LINE = r"episode (\d): return -?[\d.]+, 20 steps, (\d+) in violation"
+
+
+@pytest.fixture
+def run(fake_experiment, tmp_path):
+    """The folder of a run on the filmed task."""
+    arm = fake_experiment("total_steps=128", "env=fake_task:FilmedGoal-v0").arms[1]
+    train_run(arm, 0, tmp_path / "seed_0", Reports().progress)
+    return tmp_path / "seed_0"
+
+
+def test_it_prints_a_line_per_episode(run, capsys):
+    assert main(["enjoy", str(run)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [re.fullmatch(LINE + r", [\d.]+ % changed", line)[1] for line in lines] == ["0", "1", "2"]
+    assert main(["enjoy", str(run), "--episodes", "1", "--filter", "none"]) == 0
+    (line,) = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(LINE, line), "without a filter nothing is changed, and nothing is said of it"
+
+
+def test_it_films_the_first_episode(run, tmp_path, capsys):
+    film = tmp_path / "deep" / "film.webp"
+    assert main(["enjoy", str(run), "--episodes", "2", "--output", str(film)]) == 0
+    assert f"Film: {film}" in capsys.readouterr().out
+    picture = Image.open(io.BytesIO(film.read_bytes()))
+    assert picture.n_frames == 20 and picture.size[1] == 250
+
+
+def test_what_cannot_be_drawn_is_refused(run, tmp_path, capsys):
+    assert main(["enjoy", str(run), "--render"]) == 1
+    assert "draws no window (its render modes: rgb_array); try --output FILM.webp" in capsys.readouterr().err
+    assert main(["enjoy", str(tmp_path)]) == 1
+    assert "is no run's folder" in capsys.readouterr().err
+
+
+def test_a_window_is_the_task_s_own(run, monkeypatch):
+    asked = []
+    make = gym.make
+
+    def making(env_id, **kwargs):
+        asked.append(kwargs.pop("render_mode", None))
+        env = make(env_id, **kwargs)
+        env.unwrapped.metadata = {**env.unwrapped.metadata, "render_modes": ["human"]}
+        return env
+
+    monkeypatch.setattr(gym, "make", making)
+    from rich.console import Console
+
+    enjoy_command(str(run), 1, "trained", True, None, Console())
+    assert asked == [None, "human"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["enjoy"], "enjoy takes one RUN, got none"),
+        (["enjoy", "a", "b"], "enjoy takes one RUN, got a b"),
+        (["enjoy", "a", "--report"], "enjoy takes no --report; compare does"),
+        (["enjoy", "a", "--episodes", "0"], "--episodes: expected at least 1, got 0"),
+        (["enjoy", "a", "--render", "--output", "b"], "enjoy takes --render or --output, a window or a film"),
+        (["enjoy", "a", "--filter", "nun"], "invalid choice: 'nun'"),
+        (["train", "a.yaml", "--output", "b"], "train takes no --output; report and diagnose and enjoy do"),
+        (["report", "a.yaml", "--render"], "report takes no --render; enjoy does"),
+        (["train", "a.yaml", "b.yaml"], "train takes one CONFIG.yaml; report takes several"),
+    ],
+)
+def test_what_it_does_not_take_is_refused(words, message, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(words)
+    assert stop.value.code == 2 and message in capsys.readouterr().err
