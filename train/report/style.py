@@ -75,6 +75,15 @@ b.bad, .value.bad { color: var(--bad); }
 .key .disc { width: 11px; height: 11px; border-radius: 6px; background: var(--mark-color); }
 .key .line, .key .dot { width: 20px; height: 0; border-top-width: 3px; }
 .key .dot { border-top-style: dotted; }
+a.csv { font-size: 13px; white-space: nowrap; }
+a.number { color: inherit; text-decoration: underline dotted; text-underline-offset: 3px; }
+a.number:hover { color: var(--arm1); }
+.numbers { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 420px), 1fr)); gap: 4px 28px; margin: 0; }
+.numbers > div { padding: 6px 8px; margin: 0 -8px; border-radius: 6px; scroll-margin-top: 12px; }
+.numbers > div:target { background: color-mix(in srgb, var(--mark) 18%, transparent); }
+.numbers dt { font-size: 15px; font-weight: 600; }
+.numbers dd { margin: 0; font-size: 14px; color: var(--soft); }
+.numbers code { font-size: 12px; color: var(--soft); font-weight: 400; overflow-wrap: anywhere; }
 .wide { overflow-x: auto; }
 table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; font-size: 15px; }
 th, td { text-align: right; padding: 6px 10px; border-bottom: 1px solid var(--line); white-space: nowrap; }
