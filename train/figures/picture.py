@@ -1,4 +1,4 @@
-"""What a picture is on the page: a title, the drawing, its marks, a sentence that reads it, and what it is drawn from."""
+"""What a picture is on the page: a title, the drawing, its marks, a sentence that reads it, and its numbers."""
 
 from __future__ import annotations
 

@@ -78,7 +78,9 @@ b.bad, .value.bad { color: var(--bad); }
 a.csv { font-size: 13px; white-space: nowrap; }
 a.number { color: inherit; text-decoration: underline dotted; text-underline-offset: 3px; }
 a.number:hover { color: var(--arm1); }
-.numbers { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 420px), 1fr)); gap: 4px 28px; margin: 0; }
+.numbers {
+  display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 420px), 1fr)); gap: 4px 28px; margin: 0;
+}
 .numbers > div { padding: 6px 8px; margin: 0 -8px; border-radius: 6px; scroll-margin-top: 12px; }
 .numbers > div:target { background: color-mix(in srgb, var(--mark) 18%, transparent); }
 .numbers dt { font-size: 15px; font-weight: 600; }
