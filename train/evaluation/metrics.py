@@ -16,7 +16,7 @@ class Metric:
         label: Its heading.
         counts: What it counts, in whole sentences.
         unit: "" for a plain count.
-        absent: When there is none; "" takes it from the info keys that the number is made from.
+        absent: When there is none, where no info key that it is made from says so.
     """
 
     label: str
@@ -25,14 +25,11 @@ class Metric:
     absent: str = ""
 
 
-_NEVER: Final = "Never, once an episode is finished."
 _TOTAL: Final = "Over all episodes of the condition."
 _MEAN: Final = "Mean over the condition's episodes."
 _OF_CONDITION: Final = {
-    "return": Metric(
-        "Return / episode", f"The task's own reward summed over an episode. {_MEAN}", "reward", _NEVER
-    ),
-    "length": Metric("Steps / episode", f"Control steps of an episode. {_MEAN}", "steps", _NEVER),
+    "return": Metric("Return / episode", f"The task's own reward summed over an episode. {_MEAN}", "reward"),
+    "length": Metric("Steps / episode", f"Control steps of an episode. {_MEAN}", "steps"),
     "cost": Metric(
         "Cost / episode",
         f"The task's cost at the ends of control steps, summed over an episode. {_MEAN}",
@@ -120,20 +117,17 @@ _OF_CONDITION: Final = {
     "expiries": Metric(
         "Permissions to rely on a track run out, total",
         f"Times that a track's uncertainty grew beyond its tolerance. {_TOTAL}",
-        "",
     ),
     "expiries_per_1000": Metric(
         "Permissions run out / 1000 steps", "Permissions run out per 1000 control steps.", "per 1000 steps"
     ),
 }
 _OF_A_RUN: Final = {
-    "arm": Metric("Arm", "The arm's name in the config.", "", "Never."),
-    "seed": Metric("Seed", "The seed of the training run.", "", "Never."),
-    "condition": Metric("Condition", "Training, or evaluation with the filter off or on.", "", "Never."),
-    "episodes": Metric("Episodes", "Episodes that were finished.", "episodes", "Never."),
-    "steps": Metric(
-        "Steps", "Control steps of the finished episodes; one that was cut off is not in.", "steps", "Never."
-    ),
+    "arm": Metric("Arm", "The arm's name in the config."),
+    "seed": Metric("Seed", "The seed of the training run."),
+    "condition": Metric("Condition", "Training, or evaluation with the filter off or on."),
+    "episodes": Metric("Episodes", "Episodes that were finished."),
+    "steps": Metric("Steps", "Control steps of the finished episodes; one that was cut off is not in."),
     "elapsed_s": Metric(
         "Training time",
         "Wall clock of the training of one run, all its parts if it was stopped in between, on the machine that"
@@ -144,13 +138,12 @@ _OF_A_RUN: Final = {
     "steps_per_s": Metric(
         "Steps/s",
         "The policy's steps per second of training time; with an action repeat each is several control steps.",
-        "steps/s",
-        "The run is not finished.",
+        absent="The run is not finished.",
     ),
     "filter_time_us": Metric(
-        "Filter call",
+        "Filter call in µs",
         "Mean time of a filter call in training, on the machine that ran it.",
-        "µs",
+        "microseconds",
         "No filter is on, or the run is not finished.",
     ),
 }
@@ -192,8 +185,8 @@ NOT_JUDGED: Final = "not judged"
 
 
 def absent(metric: str) -> str:
-    """When there is no such number, and what stands in its place, as a sentence."""
-    if REGISTRY[metric].absent:
+    """When there is no such number, as a sentence; "" for one that is always there."""
+    if not sources(metric):
         return REGISTRY[metric].absent
     keys = " or ".join(f"`{key}`" for key in sources(metric))
     if metric in OF_THE_JUDGE:

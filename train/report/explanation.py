@@ -22,10 +22,13 @@ def explanations(names: Iterable[str]) -> str:
 
 def _entry(name: str) -> str:
     metric = REGISTRY[name]
-    unit = f" <small>{text(metric.unit)}</small>" if metric.unit else ""
+    facts = [f"<i>Unit:</i> {text(metric.unit)}."] if metric.unit else []
+    if absent(name):
+        facts.append(f"<i>Absent:</i> {_with_code(absent(name))}")
+    more = f"<dd>{' '.join(facts)}</dd>" if facts else ""
     return (
-        f'<div id="{number_id(name)}"><dt>{text(metric.label)}{unit} <code>{text(name)}</code></dt>'
-        f"<dd>{text(metric.counts)}</dd><dd><i>Absent:</i> {_with_code(absent(name))}</dd></div>"
+        f'<div id="{number_id(name)}"><dt>{text(metric.label)} <code>{text(name)}</code></dt>'
+        f"<dd>{text(metric.counts)}</dd>{more}</div>"
     )
 
 

@@ -100,7 +100,8 @@ def explained(name: str, label: str = "") -> str:
         name: In the registry of numbers.
         label: What is written; its label in the registry if not given.
     """
-    return f'<a class="number" href="#{number_id(name)}">{text(label or REGISTRY[name].label)}</a>'
+    words = text(label or REGISTRY[name].label).replace(" / ", "\N{NO-BREAK SPACE}/ ")
+    return f'<a class="number" href="#{number_id(name)}">{words}</a>'
 
 
 def number_id(name: str) -> str:

@@ -90,7 +90,7 @@ def runs_table(experiment: ExperimentConfig, summary: Summary) -> str:
             body.append(f'<tr><th scope="row">{text(arm.name)}</th><td>{seed}</td>{cells}</tr>')
     head = "".join(f'<th scope="col">{explained(name, SHORT.get(name, ""))}</th>' for name in RUN_NUMBERS)
     return (
-        f'<div class="wide"><table class="short"><thead><tr>{head}</tr></thead>'
+        f'<div class="wide"><table class="short runs"><thead><tr>{head}</tr></thead>'
         f"<tbody>{''.join(body)}</tbody></table></div>"
     )
 
