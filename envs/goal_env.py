@@ -41,7 +41,9 @@ _HAZARD_Z: Final = 0.02
 _PARKED: Final = 1000.0  # m: objects outside the scenario, farther than a robot gets in an episode
 _SLEEP_TOLERANCE: Final = 1e-7  # m/s: a thousandth of the speed that costs
 _ASSETS: Final = Path(__file__).parent / "assets"
-_CAMERA: Final = {"distance": 5.5, "elevation": -55.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.2, 0.0])}
+_CAMERA: Final = {"elevation": -65.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.25, 0.0])}
+_CAMERA_DISTANCE: Final = 2.8
+"""Of the camera, in half extents of the field."""
 
 
 class SafeGoalEnv(MujocoEnv, EzPickle):
@@ -93,7 +95,8 @@ class SafeGoalEnv(MujocoEnv, EzPickle):
             raise ConfigurationError(f"level must be one of 0, 1, 2; got {level!r}")
         self.robot = robot
         self.level = LEVELS[level]
-        kwargs.setdefault("default_camera_config", _CAMERA)
+        seen = {**_CAMERA, "distance": _CAMERA_DISTANCE * self.level.half_extent}
+        kwargs.setdefault("default_camera_config", seen)
         kinds = 1 + (self.level.hazards > 0) + (self.level.vases > 0)
         low = np.concatenate([np.full(robot.n_sensors, -np.inf), np.zeros(kinds * LIDAR_BINS)])
         high = np.concatenate([np.full(robot.n_sensors, np.inf), np.ones(kinds * LIDAR_BINS)])

@@ -40,6 +40,7 @@ START_GAP: Final = 0.3
 _CONTACT: Final = BALL_RADIUS + PATROL_RADIUS
 _HEIGHT: Final = 0.1  # m: half of a patrol's, drawn about the ball's own height
 _COLOUR: Final = (1.0, 0.5, 0.0, 1.0)
+_CAMERA: Final = {"elevation": -75.0}  # from lower the walls would hide the patrols
 _SHORTEST: Final = 2.0  # m: on a shorter way the ball may leave no place to start at
 _TRIES: Final = 1000
 U_MAZE_PATROLS: Final = (((1, 1), (1, 3)), ((3, 1), (3, 3)))
@@ -118,7 +119,9 @@ class PatrolledPointMazeEnv(PointMazeEnv):  # type: ignore[misc]
         ]
         self._tracks = Tracks(motions)
         self._touching = np.zeros(len(ways), dtype=bool)
-        self.point_env.mujoco_renderer = MarkingRenderer(self.point_env.mujoco_renderer, self._markers)
+        renderer = self.point_env.mujoco_renderer
+        renderer.default_cam_config = {**renderer.default_cam_config, **_CAMERA}
+        self.point_env.mujoco_renderer = MarkingRenderer(renderer, self._markers)
 
     def _markers(self) -> list[dict[str, Any]]:
         """The patrols, as a renderer draws them."""

@@ -37,6 +37,7 @@ from safe_wrappers.wrappers.lease.stopping_budget import StoppingBudget
 from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 from safe_wrappers.wrappers.occlusion_penalty import OcclusionPenalty
 from safe_wrappers.wrappers.record_interventions import RecordInterventions
+from safe_wrappers.wrappers.safety_overlay import SafetyOverlay
 from safe_wrappers.wrappers.slip_limiter import SlipLimiter
 from safe_wrappers.wrappers.teleop_channel import TeleopChannel
 from safe_wrappers.wrappers.vector_cbf_action_filter import VectorCBFActionFilter
@@ -64,6 +65,7 @@ __all__ = [
     "RecordInterventions",
     "SafeActionMap",
     "SafeWrappersError",
+    "SafetyOverlay",
     "SeamLimits",
     "SimulatorPlant",
     "SlipLimiter",

@@ -22,11 +22,13 @@ class Layer(Enum):
     OBSERVATION = auto()
     MONITOR = auto()
     ADAPTION = auto()
+    OVERLAY = auto()
     RECORDER = auto()
     HANDOVER = auto()
     FAULT = auto()
 
 
+_UNSEEN: Final = "it would draw nothing of what is outside of it"
 _PER_CHUNK: Final = {Layer.HANDOVER: "its step is a whole chunk, not a control step"}
 _LAST_WORD: Final = "it changes actions that the filter has checked, and the filter has the last word"
 _AGE: Final = "it hands commands over, and the lease must know how old each one is"
@@ -34,15 +36,17 @@ _AUTHORITY: Final = "the actions that it draws need authority as the policy's do
 _NETWORK: Final = "it hands commands over, which the channel must do at every control step"
 
 _WRONG_WAY_ROUND: Final = {
-    Layer.COST: {Layer.RECORDER: "it would count no cost", **_PER_CHUNK},
+    Layer.COST: {Layer.RECORDER: "it would count no cost", Layer.OVERLAY: _UNSEEN, **_PER_CHUNK},
     Layer.OCCLUSION: {
         Layer.FILTER: "the filter reads the estimates, so they must be there before it decides",
         Layer.CHANNEL: "estimates of now would stand beside an image that is delayed",
         Layer.RECORDER: "it would not count what is seen",
+        Layer.OVERLAY: _UNSEEN,
         **_PER_CHUNK,
     },
     Layer.FILTER: {
         Layer.RECORDER: "it would see no report of the filter, and count no intervention",
+        Layer.OVERLAY: _UNSEEN,
         Layer.OBSERVATION: "it shows what the filter inside of it decides by",
         **dict.fromkeys((Layer.LEASE, Layer.CHANNEL, Layer.ESCAPE, Layer.HANDOVER, Layer.FAULT), _LAST_WORD),
     },
@@ -54,11 +58,13 @@ _WRONG_WAY_ROUND: Final = {
         Layer.MAP: "its brake is no policy's action, and would be mapped like one",
         Layer.ESCAPE: _AUTHORITY,
         Layer.RECORDER: "it would count no lease that expires",
+        Layer.OVERLAY: _UNSEEN,
         **dict.fromkeys((Layer.HANDOVER, Layer.FAULT), _AGE),
     },
     Layer.CHANNEL: {
         Layer.ESCAPE: _AUTHORITY,
         Layer.RECORDER: "it would see no revoked authority",
+        Layer.OVERLAY: _UNSEEN,
         **dict.fromkeys((Layer.HANDOVER, Layer.FAULT), _NETWORK),
     },
     Layer.ESCAPE: {
@@ -70,7 +76,7 @@ _WRONG_WAY_ROUND: Final = {
         Layer.CHANNEL: "what the filter sees now would stand beside an image that is delayed",
         **_PER_CHUNK,
     },
-    **dict.fromkeys((Layer.MONITOR, Layer.ADAPTION, Layer.RECORDER), _PER_CHUNK),
+    **dict.fromkeys((Layer.MONITOR, Layer.ADAPTION, Layer.OVERLAY, Layer.RECORDER), _PER_CHUNK),
 }
 """By the outer layer, then the inner one: why this order is wrong. The reverse is right."""
 
@@ -96,6 +102,7 @@ _NOT_TOGETHER: Final = {
     Layer.ADAPTION: {
         Layer.ADAPTION: "the env has an AdaptionPenalty already, whose penalty would be taken twice"
     },
+    Layer.OVERLAY: {Layer.OVERLAY: "the frames have an overlay already"},
     Layer.ESCAPE: {Layer.ESCAPE: "both would act in the policy's place; use one"},
     Layer.OBSERVATION: {Layer.OBSERVATION: "the observation shows what the filter decides by already"},
     Layer.HANDOVER: {Layer.HANDOVER: "this env takes chunks already, and a chunk of chunks has no meaning"},

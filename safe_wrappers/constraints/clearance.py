@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from safe_wrappers.checks import check_fields, name_list, non_negative, positive
+from safe_wrappers.constraints.obstacle_marks import obstacle_marks
 from safe_wrappers.constraints.obstacles import Nearest, Plain, obstacles_from, refuse_more_dimensions
 from safe_wrappers.control.backup.approach_rows import (
     approach_rows,
@@ -15,6 +16,7 @@ from safe_wrappers.control.backup.approach_rows import (
     out_of_reach,
 )
 from safe_wrappers.control.numerics.nearest_discs import squashed
+from safe_wrappers.drawing.marks import Mark, segment
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, HalfSpaces, Memory
 from safe_wrappers.plants.plant import Plant
@@ -168,6 +170,16 @@ class BoundClearance(BoundConstraint):
         for row, i in zip(seen, order.tolist(), strict=False):
             row[:-2], row[-2:] = normals[i], (squashed(clearances[i], 1.0), squashed(speeds[i], 1.0))
         return np.concatenate([super().features(neighbours), seen.ravel()])
+
+    def draw(self) -> list[Mark]:
+        """The obstacles with what is kept free before them, and every point's way until rest along its motion."""
+        spec, found = self.spec, []
+        inset = spec.radius + spec.margin + spec.state_error
+        for p, v in self._points.motions():
+            way = 0.5 * float(np.linalg.norm(v)) / spec.braking * v
+            found.append(segment("way", p, p + way, max(spec.radius, 0.01)))
+            found += obstacle_marks(spec.obstacles, self.plant, inset, p)
+        return found
 
     def rows(self) -> HalfSpaces:
         """One row per point and surface whose limit the actuators could exceed."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.control.numerics.nearest_discs import squashed
+from safe_wrappers.drawing.marks import Mark
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.plants.plant import Plant
 
@@ -199,6 +200,10 @@ class BoundConstraint:
     def executed(self, control: Array) -> Memory:
         """The memory after a control was executed in the observed state."""
         return None
+
+    def draw(self) -> Sequence[Mark]:
+        """What a picture of the observed state shows of the constraint (`SafetyOverlay`), in world coordinates."""
+        return ()
 
     def info(self, proposed: Array | None, executed: Array | None) -> dict[str, Any]:
         """The info keys of its own, always the same; None: nothing was judged yet, or the state is not a number."""

@@ -13,7 +13,7 @@ import numpy as np
 from safe_wrappers import info as keys
 from safe_wrappers.checks import non_negative
 from safe_wrappers.errors import ConfigurationError, UnsafeStateWarning
-from safe_wrappers.filter.constraint import Constraint
+from safe_wrappers.filter.constraint import BoundConstraint, Constraint
 from safe_wrappers.filter.engine import SafetyFilter
 from safe_wrappers.filter.fallback import FallbackFunction
 from safe_wrappers.filter.projection import check_solver
@@ -189,6 +189,16 @@ class CBFActionFilter(LayerWrapper):
         """
         self.filter.observe()
         self._observed = True
+
+    def look(self) -> Sequence[BoundConstraint]:
+        """The constraints in the env's present state, for who looks on; none where that is not a number.
+
+        `step` observes anew, and decides and reports what it would have.
+        """
+        count = self.plant.observation_id
+        self.filter.observe()
+        self.plant.observation_id = count
+        return self.filter.bound if self.filter.margin == self.filter.margin else ()
 
     def judge(self, action: Any) -> tuple[Any, dict[str, Any]]:
         """What to send for a proposed action in the env's present state, and the step's info keys.

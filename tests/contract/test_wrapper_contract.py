@@ -217,6 +217,10 @@ EXAMPLES = {
         "from the backup": (TASK, dict),
         "from the filter's answer": (TASK, lambda: {"anchor": "closest"}),
     },
+    "SafetyOverlay": {
+        "everything, of a filter": (TASK, dict),
+        "the strip alone": (TASK, lambda: {"scene": False}),
+    },
     "SlipLimiter": {
         "all wheels": ("SafeRover-v0", lambda: {"wheels": list(WHEELS)}),
         "the rear ones, with options": (
@@ -297,9 +301,13 @@ EXAMPLES = {
 """Wrapper name -> what it shows -> (env id, function of its arguments): plain data or what becomes it."""
 
 INSIDE = dict.fromkeys(
-    ("AdaptionPenalty", "SafeActionMap", "StuckEscape"), lambda env: sw.CBFActionFilter(env, [_clearance()])
+    ("AdaptionPenalty", "SafeActionMap", "SafetyOverlay", "StuckEscape"),
+    lambda env: sw.CBFActionFilter(env, [_clearance()]),
 )
 """Wrapper name -> the wrapper that it needs inside."""
+
+MADE_WITH = {"SafetyOverlay": {"render_mode": "rgb_array"}}
+"""Wrapper name -> arguments of `gym.make` that it needs."""
 
 CHUNKED = ("ChunkHandover",)
 """Wrappers whose action is a chunk, shape (chunk_size, controls), executed over several control steps."""
@@ -317,7 +325,7 @@ ONLY_LOOKING = (
     "RecordInterventions",
 )
 """Wrappers that look on and pass every action as it is."""
-SILENT = ("ActionRepeat", "FilterObservation")
+SILENT = ("ActionRepeat", "FilterObservation", "SafetyOverlay")
 """They add nothing to info."""
 
 EXPORTED = sorted(
@@ -335,6 +343,11 @@ def example(name, case):
     return EXAMPLES[name][case]
 
 
+def made(name, env_id):
+    """The task as the wrapper needs it."""
+    return gym.make(env_id, **MADE_WITH.get(name, {}))
+
+
 def inside(name, env):
     """The env as the wrapper needs it."""
     return INSIDE.get(name, lambda env: env)(env)
@@ -342,7 +355,7 @@ def inside(name, env):
 
 def build(name, case):
     env_id, arguments = example(name, case)
-    return getattr(sw, name)(inside(name, gym.make(env_id)), **arguments())
+    return getattr(sw, name)(inside(name, made(name, env_id)), **arguments())
 
 
 def actions(env, steps=STEPS, seed=0):
@@ -481,7 +494,7 @@ class Witness(gym.Wrapper):
 @every_wrapper
 def test_reset_passes_seed_and_options_on_and_changes_neither(name, case):
     env_id, arguments = example(name, case)
-    env = getattr(sw, name)(Witness(inside(name, gym.make(env_id))), **arguments())
+    env = getattr(sw, name)(Witness(inside(name, made(name, env_id))), **arguments())
     options = {"note": [1, 2, {"deep": 3}]}
     if env_id == TASK:
         options = {"layout": {"goal": [1.0, 1.0], "hazards": [[0.0, -1.0]]}}
@@ -686,7 +699,7 @@ def harmless(name, case):
     env_id, arguments = example(name, case)
     if name == "TeleopChannel":
         return sw.TeleopChannel(Witness(gym.make("Reacher-v5")), 0.0, 0.0)
-    return getattr(sw, name)(Witness(inside(name, gym.make(env_id))), **arguments())
+    return getattr(sw, name)(Witness(inside(name, made(name, env_id))), **arguments())
 
 
 @every_wrapper
@@ -716,7 +729,7 @@ def test_inactive_is_bit_identical(name, case):
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_non_finite_action_does_not_get_through(name, case, bad):
     env_id, arguments = example(name, case)
-    witness = Witness(gym.make(env_id))
+    witness = Witness(made(name, env_id))
     env = getattr(sw, name)(inside(name, witness), **arguments())
     env.reset(seed=0)
     if env_id == DISCRETE:  # not an action of the space at all

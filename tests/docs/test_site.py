@@ -127,7 +127,7 @@ def test_every_constraint_and_wrapper_has_a_page_with_a_picture(folder):
             if folder == "constraints" and isinstance(thing, type):  # joints.py has two
                 module = re.sub(r"(?<!^)(?=[A-Z])", "_", thing.__name__).lower()
             page = DOCS / folder / (module.replace("_", "-") + ".md")
-            assert "```{drawn}" in page.read_text(encoding="utf-8"), page
+            assert re.search("```{(drawn|image)}", page.read_text(encoding="utf-8")), page
 
 
 def test_whoever_reads_of_the_appendix_can_follow_to_the_book(pages):

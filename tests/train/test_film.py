@@ -54,7 +54,7 @@ def test_the_playing_time_is_what_the_speed_says():
 def test_the_strip_shows_when_the_filter_acted_and_where_it_is_now():
     made = shot(100, changed=range(40, 60), violated=[80])
     frames, _ = played(encode(made, fps=10, speed=1.0))
-    width = 320
+    width = 640
     assert frames[0].shape == (HEIGHT + STRIP, width, 3)
 
     def strip(frame, step):
@@ -83,6 +83,7 @@ def test_a_film_that_is_too_large_loses_every_other_frame(monkeypatch):
     for _ in range(16):
         made.add_frame(rng.integers(0, 255, (240, 320, 3), dtype=np.uint8))
         made.add_step(False, False)
+    monkeypatch.setattr(film, "MOST_BYTES", 100_000_000)
     whole = encode(made, fps=10, speed=1.0)
     monkeypatch.setattr(film, "MOST_BYTES", int(0.3 * len(whole)))
     small = encode(made, fps=10, speed=1.0)

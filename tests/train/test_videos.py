@@ -6,6 +6,7 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
+from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.train.evaluation.episode_selection import shown_episode
 from safe_wrappers.train.evaluation.evaluate import evaluate_run, evaluation_folder
 from safe_wrappers.train.evaluation.scene import load_scenes
@@ -77,11 +78,11 @@ def test_every_arm_is_filmed_in_the_same_episode_with_the_filter_off_and_on(eval
             frames = Image.open(io.BytesIO(video.animation))
             assert frames.n_frames == 20
             scenes = load_scenes(evaluation_folder(experiment.run_folder(arm, 0)) / f"{condition}.npz")
-            start = (scenes[shown.episode_seed].agent[0] * (20, 15) + (40, 30)).astype(int) * 4 + 2
+            start = (scenes[shown.episode_seed].agent[0] * (20, 15) + (40, 30)).astype(int) * 8 + 4
             red, green, _ = np.moveaxis(np.asarray(frames.convert("RGB"), dtype=int)[:HEIGHT], -1, 0)
             dot = np.argwhere(red - green > 100).mean(axis=0)[::-1]
             # Where this episode starts, to half a pixel of the task's.
-            assert dot == pytest.approx(start, abs=2)
+            assert dot == pytest.approx(start, abs=4)
             frames.seek(19)
             background = np.asarray(frames.convert("RGB"))[10, 10]
             assert background == pytest.approx([5 * 19] * 3, abs=6)
@@ -149,3 +150,22 @@ def test_in_processes_of_its_own_with_the_variables_of_the_rendering(evaluated, 
     pixel = np.asarray(Image.open(io.BytesIO(video.animation)).convert("RGB"))[10, 10]
     assert pixel[2] > 200 > 50 > pixel[0]  # black, but for the blue that the variable asks for
     assert "FILMED_BLUE" not in os.environ
+
+
+def test_what_a_filter_knows_is_drawn_into_its_film_and_into_no_other(evaluated, inline, monkeypatch):
+    def fake_filter(env):
+        return next((inner for inner in wrappers_of(env) if type(inner).__name__ == "FakeFilter"), None)
+
+    monkeypatch.setattr(videos, "filter_inside", fake_filter)
+    experiment = evaluated()
+    said(experiment)
+    for arm in experiment.arms:
+        lower = {}
+        for condition in ("filter_off", "filter_on"):
+            video = load_video(video_path(experiment, arm, condition))
+            frames = Image.open(io.BytesIO(video.animation))
+            frames.seek(19)
+            lower[condition] = np.asarray(frames.convert("RGB"))[
+                390:430, 300:350
+            ].mean()  # of the lowest fifth
+        assert lower["filter_on"] < 0.5 * lower["filter_off"]

@@ -10,14 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-HEIGHT: Final = 240
-"""Pixels of the picture; the strip is below it."""
-STRIP: Final = 10
+WIDTH: Final = 640
+HEIGHT: Final = 480
+"""Pixels of the picture, whose width an env that MuJoCo does not draw may decide; the strip is below it."""
+STRIP: Final = 16
 MOST_FRAMES: Final = 120
-MOST_BYTES: Final = 1_500_000
+MOST_BYTES: Final = 2_000_000
 _LONGEST_S: Final = 10.0
 _SHORTEST_S: Final = 4.0
 _QUALITY: Final = 55
+_WIDE: Final = 3  # px: half of what marks one step in the strip
 _COLORS: Final = {
     "bare": (120, 128, 138),
     "changed": (240, 178, 20),
@@ -118,13 +120,13 @@ def _with_strip(film: Film, at: int) -> Image.Image:
     steps = len(film.changed)
     columns = np.arange(picture.width) * steps // picture.width
     row = np.tile(np.array(_COLORS["bare"], dtype=np.uint8), (picture.width, 1))
-    # One step that hurt must not be lost between two columns, nor in the coding: it is three columns wide.
+    # One step that hurt must not be lost between two columns, nor in the coding: it is several columns wide.
     for flags, color in ((film.changed, "changed"), (film.violated, "violated")):
-        hits = np.flatnonzero(flags)[:, None] * picture.width // steps + (-1, 0, 1)
+        hits = np.flatnonzero(flags)[:, None] * picture.width // steps + np.arange(-_WIDE, _WIDE + 1)
         row[np.clip(hits, 0, picture.width - 1)] = _COLORS[color]
         row[np.asarray(flags, dtype=bool)[columns]] = _COLORS[color]
     now = min(picture.width - 1, at * film.stride * picture.width // steps)
-    row[max(0, now - 1) : now + 2] = _COLORS["now"]
+    row[max(0, now - _WIDE) : now + _WIDE + 1] = _COLORS["now"]
     whole = Image.new("RGB", (picture.width, HEIGHT + STRIP))
     whole.paste(picture, (0, 0))
     whole.paste(Image.fromarray(np.tile(row[None], (STRIP, 1, 1))), (0, HEIGHT))

@@ -10,7 +10,10 @@ from typing import Any, Final
 from rich.console import Console
 
 from safe_wrappers import info as keys
+from safe_wrappers.drawing.scene import set_size
 from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.wrappers.cbf_action_filter import filter_inside
+from safe_wrappers.wrappers.safety_overlay import SafetyOverlay
 
 from ..atomic import write_bytes, write_json
 from ..config import ArmConfig, EnvConfig, ExperimentConfig, FilterConfig
@@ -21,7 +24,7 @@ from ..processes.parallel import Job, Progress, RunsFailedError, environment, ru
 from ..run.policy import TrainedPolicy
 from ..run.stack import make_stack
 from ..run.training import finished_checkpoint
-from .film import Film, encode, speed_of, stride_of
+from .film import HEIGHT, WIDTH, Film, encode, speed_of, stride_of
 from .rendering import find_rendering
 
 _PROBLEM: Final = "problem.json"
@@ -135,7 +138,7 @@ def _record_arms(
 def record_video(
     arm: ArmConfig, shown: ShownEpisode, run_folder: Path, used: FilterConfig, path: Path, progress: Progress
 ) -> None:
-    """Runs one episode and writes its film and its facts.
+    """Runs one episode and writes its film, with what a filter knows drawn into it, and its facts.
 
     Args:
         arm: Whose policy.
@@ -149,6 +152,9 @@ def record_video(
     policy = TrainedPolicy(arm, checkpoint)
     filmed = replace(arm.env, kwargs={**arm.env.kwargs, "render_mode": "rgb_array"})
     env = make_stack(filmed, used, arm.learner.in_evaluation)
+    set_size(env, WIDTH, HEIGHT)
+    if filter_inside(env) is not None:
+        env = SafetyOverlay(env)
     # One speed for all conditions, also where one of them ends early.
     longest = env.spec.max_episode_steps if env.spec is not None else None
     judged = False

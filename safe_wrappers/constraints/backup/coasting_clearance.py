@@ -11,11 +11,13 @@ import numpy as np
 
 from safe_wrappers.checks import check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundDetourClearance, Detour
+from safe_wrappers.constraints.obstacle_marks import obstacle_marks
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.constraints.rollout import RENAMED
 from safe_wrappers.control.numerics.nearest_discs import nearest_discs
 from safe_wrappers.control.numerics.outlines import clearances_on_a_course, convex_outline
 from safe_wrappers.deprecation import deprecated_parameters
+from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, Constraint
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
@@ -245,6 +247,14 @@ class BoundCoastingClearance(BoundDetourClearance):
         pairs = np.array(_AROUND) * drive
         outer_is_first = self._first_turns_left == (side * drive > 0.0)
         return list(pairs if outer_is_first else pairs[:, ::-1])
+
+    def draw(self) -> list[Mark]:
+        """The discs with what is kept free before them, and the way of the origin until rest without control."""
+        obstacles = [*self.spec.keep_out, *self.spec.untouched]
+        found = obstacle_marks(obstacles, self.plant, self.spec.margin, self._here)
+        course = self.coasting.run(self._still, self.spec.horizon, self._radius)
+        way = [self._here, *course.places[:: self.plant.substeps], course.places[-1]]
+        return [*found, *line("way", way, THIN), ball("way", way[-1], 3.0 * THIN)]
 
 
 class _Outcome(NamedTuple):

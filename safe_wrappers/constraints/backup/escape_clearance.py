@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 
 from safe_wrappers.checks import check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundBackupClearance
+from safe_wrappers.constraints.obstacle_marks import obstacle_marks
 from safe_wrappers.constraints.obstacles import Disc, Discs, Plane, TrackedDiscs, distances, obstacles_from
 from safe_wrappers.control.backup.evasive_maneuvers import EvasiveManeuvers, Maneuver
 from safe_wrappers.control.backup.way_clearances import Around, least_left, way_clearances
+from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, BoundConstraint, Constraint, Memory
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
@@ -231,6 +233,14 @@ class BoundEscapeClearance(BoundBackupClearance):
         left = self._slacks(firsts).max(axis=1)
         best = firsts[0 if left[0] >= 0.0 else int(left.argmax())]
         return self._point.control(np.zeros(self.plant.model.nu), best)
+
+    def draw(self) -> list[Mark]:
+        """The obstacles with what is kept free before them, and the way of the manoeuvre that is open."""
+        spec, which = self.spec, np.array([self._memory or 0])
+        found = obstacle_marks(spec.obstacles, self.plant, spec.radius + spec.margin, self._position)
+        x, y = self._escapes.paths(self._position[None], self._velocity[None], which)
+        way = np.stack([x[0, 0], y[0, 0]], axis=1)
+        return [*found, *line("way", way, THIN), ball("way", way[-1], 3.0 * THIN)]
 
     def _firsts(self) -> Array:
         """First controls of the manoeuvres: braking, and each direction; shape (5, 2)."""

@@ -9,9 +9,12 @@ import numpy as np
 from safe_wrappers.checks import check_fields, non_negative
 from safe_wrappers.constraints.backup.base import BoundDetourClearance
 from safe_wrappers.constraints.backup.heading_drive_batch import HeadingDriveBatch
+from safe_wrappers.constraints.obstacle_marks import obstacle_marks
 from safe_wrappers.constraints.obstacles import Disc, Discs, obstacles_from
 from safe_wrappers.control.backup import drive_decision as among
+from safe_wrappers.control.backup.heading_drive import Motion, path_corners, stopping_path
 from safe_wrappers.control.numerics.nearest_discs import nearest_discs
+from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, Constraint, HalfSpaces
 from safe_wrappers.filter.constraint_batch import ConstraintBatch
@@ -147,6 +150,14 @@ class BoundHeadingDriveClearance(BoundDetourClearance):
         From inside a disc it drives out, whichever way is better.
         """
         return self._pair(np.array([among.manoeuvre_drive(*self._scene), 0.0]))
+
+    def draw(self) -> list[Mark]:
+        """The discs with what is kept free before them; the outline of the area that braking sweeps, and its end."""
+        motion = Motion(*self._scene[1].tolist())
+        path = stopping_path(self.drive, motion, self.spec.brake)
+        corners = path_corners(path)
+        found = obstacle_marks(self.spec.obstacles, self.plant, self.reserve, corners[0])
+        return [*found, *line("way", corners, THIN, closed=True), ball("way", corners[2], 3.0 * THIN)]
 
     @classmethod
     def batch(

@@ -8,6 +8,8 @@ import numpy as np
 from safe_wrappers.checks import check_fields, non_negative, positive
 from safe_wrappers.constraints.backup.base import BoundBackupClearance
 from safe_wrappers.control.backup import point_scene
+from safe_wrappers.control.backup.damped_axis import braking
+from safe_wrappers.drawing.marks import THIN, Mark, ball, line
 from safe_wrappers.filter.constraint import Array, Constraint, HalfSpaces
 from safe_wrappers.plants.mujoco.plant import MujocoPlant, require_mujoco
 from safe_wrappers.plants.plant import Plant
@@ -71,7 +73,8 @@ class BoundWallClearance(BoundBackupClearance):
         clip = self.spec.velocity_clip
         self._point = point = planar_point(self.plant, math.inf if clip is None else clip)
         around, reach = walls(self.plant.model, point.body)
-        room, known = reach + self.spec.margin, clip is not None
+        self._room = room = reach + self.spec.margin
+        known = clip is not None
         at = point.axes, point.origin, point.joints, point.actuators
         self._scene = point_scene.scene(*at, room, known, around)
         self._motion = np.zeros(4)
@@ -101,6 +104,18 @@ class BoundWallClearance(BoundBackupClearance):
         """Admissible controls near a refused one, the nearest first: those that slide along the walls in its way."""
         pairs = point_scene.candidates(*self._scene, self._motion, self._left, control)
         return [self._point.control(control, pair) for pair in pairs]
+
+    def draw(self) -> list[Mark]:
+        """The edges that the point may not cross, around every wall, and its way until rest under full braking."""
+        x, y, vx, vy = self._motion.tolist()
+        ways = braking(self._point.axes[0], x, vx), braking(self._point.axes[1], y, vy)
+        longest = max(len(way) for way in ways)
+        way = np.stack([np.pad(way, (0, longest - len(way)), mode="edge") for way in ways], axis=1)
+        found = [*line("way", way, THIN), ball("way", way[-1], 3.0 * THIN)]
+        for left, right, low, high in self._scene.walls + self._room * np.array([-1.0, 1.0, -1.0, 1.0]):
+            corners = [[left, low], [right, low], [right, high], [left, high]]
+            found += line("limit", corners, THIN, closed=True)
+        return found
 
     def rows(self) -> HalfSpaces:
         """Bounds on the control along x and y: a convex part of what is admitted, braking included."""

@@ -7,9 +7,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from safe_wrappers.checks import name_list, non_negative
+from safe_wrappers.constraints.obstacle_marks import obstacle_marks
 from safe_wrappers.constraints.obstacles import distances, obstacles_from
 from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
 from safe_wrappers.deprecation import deprecated_parameters
+from safe_wrappers.drawing.marks import Mark, ball, edges, pad
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array
 from safe_wrappers.plants.mujoco.forecast import Forecast
@@ -115,6 +117,25 @@ class BoundWorkspace(BoundRollout):
     def room(self, forecast: Forecast) -> Array:
         poses = forecast.poses()
         return self._left(self._points(poses.frames, poses.axes))
+
+    def draw(self) -> list[Mark]:
+        """The points; the edges of the box in which they stay, or what is near of its planes; the obstacles."""
+        spec, pose = self.spec, self.plant.pose()
+        inset = spec.margin + spec.radius
+        points = self._points(pose.xpos[None], pose.xmat.reshape(1, -1, 3, 3))[0]
+        found = [ball("way", p, max(spec.radius, 0.012)) for p in points]
+        low, high = spec._low + inset, spec._high - inset
+        if np.isfinite([low, high]).all():
+            found += edges("limit", low, high, 0.004)
+        else:
+            for end in (low, high):
+                for axis in np.flatnonzero(np.isfinite(end)):
+                    foot = points[0].copy()
+                    foot[axis] = end[axis]
+                    found.append(pad("keep out", foot, np.eye(3)[axis], 0.2))
+        for p in points:
+            found += obstacle_marks(spec.keep_out, self.plant, inset, p)
+        return found
 
 
 def _corner(name: str, given: Sequence[float | None] | None) -> list[float | None] | None:

@@ -14,7 +14,12 @@ Source: appendix "Relative degree and kinetic stopping insets", for this plant. 
 import math
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from safe_wrappers.control.numerics.compiled import compiled, hypot
+
+Array = NDArray[np.float64]
 
 _WANDER = 0.012
 """Bound on the lateral deviation of the stopping path, per metre of sideways coasting: drag turns a sliding body.
@@ -88,6 +93,18 @@ def path_distance(path: StoppingPath, px: float, py: float) -> float:
     below = b <= e if path.spread else b * s <= e * a
     inside = 0.0 <= a <= s and above and below
     return (-near if inside else near) - path.wander
+
+
+def path_corners(path: StoppingPath) -> Array:
+    """Corners of the area without its wander, m: where the body is, and on in its order; the third is its end.
+
+    Shape (3, 2), of a trapezoid (4, 2).
+    """
+    along, aside = (path.forward, path.forward, 0.0), (path.crossing, path.sideways, path.sideways)
+    count = 3 if path.spread else 2
+    corners = np.tile(np.array([path.x, path.y]), (count + 1, 1))
+    corners[1:] += np.outer(along[:count], (path.ex, path.ey)) + np.outer(aside[:count], (path.sx, path.sy))
+    return corners
 
 
 @compiled

@@ -1,0 +1,121 @@
+"""SafetyOverlay: draws into the env's frames what the filter knows and does."""
+
+from typing import Any, ClassVar, Final
+
+import numpy as np
+from gymnasium.spaces import Box
+
+from safe_wrappers import info as keys
+from safe_wrappers.drawing.arrows import arrows
+from safe_wrappers.drawing.marks import Mark
+from safe_wrappers.drawing.scene import find_renderer, put
+from safe_wrappers.drawing.strip import Strip
+from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.plants.env_checks import name_of
+from safe_wrappers.stack import Layer
+from safe_wrappers.wrappers.cbf_action_filter import filter_inside
+from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
+
+_MODES: Final = ("rgb_array", "human")
+
+
+class SafetyOverlay(LayerWrapper):
+    """Draws what the filter inside knows and does into the env's own frames.
+
+    In MuJoCo's scene, in frames and in the window: what every constraint keeps free, and the way that its backup
+    would take from here (`BoundConstraint.draw`); the proposed action as an orange arrow and the executed one as a
+    blue one, where it is known which way an action pushes. Over the lower edge of a frame a strip: what was done to
+    the last action, margin, lease and slip as far as they are in info, a column per step as high as the margin, and
+    the actions as bars. Envs that are not MuJoCo's get the strip alone; so does an env without a filter.
+
+    It only looks: actions, observations, rewards, infos and random numbers are bit for bit those without it.
+
+    A window shows the marks of the state before the step, and the strip's words in its corner. Set no state by hand
+    between `render` and `step`.
+
+    Args:
+        env: With a render mode "rgb_array" or "human".
+        scene: Draw marks and arrows.
+        strip: Draw the strip.
+
+    Raises:
+        ConfigurationError: Another render mode or none; a window of an env that is not MuJoCo's; nothing to draw.
+
+    Example:
+        >>> import gymnasium as gym, safe_wrappers as sw
+        >>> env = gym.make("SafePointGoal1-v0", render_mode="rgb_array")
+        >>> env = sw.SafetyOverlay(sw.protect(env))  # gym.wrappers.RecordVideo goes around it
+    """
+
+    layer: ClassVar = Layer.OVERLAY
+
+    def __init__(self, env: Env, scene: bool = True, strip: bool = True) -> None:
+        arguments = dict(locals())
+        LayerWrapper.__init__(self, env)
+        if env.render_mode not in _MODES:
+            raise ConfigurationError(
+                f"SafetyOverlay draws into the frames of {name_of(env)}, whose render_mode is {env.render_mode!r}: "
+                "make the env with gym.make(..., render_mode='rgb_array'), or 'human' for a window"
+            )
+        if not (scene or strip):
+            raise ConfigurationError("SafetyOverlay has nothing to draw: leave scene or strip True")
+        in_scene = find_renderer(env) is not None
+        if env.render_mode == "human" and not in_scene:
+            raise ConfigurationError(
+                f"SafetyOverlay draws into the windows of MuJoCo envs alone, which {name_of(env)} is not: take "
+                "render_mode='rgb_array', whose frames get a strip"
+            )
+        self._record(arguments)
+        self.scene, self.strip = scene, strip
+        self._inside = filter_inside(env)
+        self._strip = Strip()
+        if isinstance(env.action_space, Box) and env.action_space.is_bounded():
+            self._strip = Strip(np.ravel(env.action_space.low), np.ravel(env.action_space.high))
+        self._last: dict[str, Any] | None = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Reset:
+        """Reset the env; the strip begins anew."""
+        self._last = None
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._last = dict(info)
+        self._strip.begin(info)
+        return observation, info
+
+    def step(self, action: Any) -> Step:
+        """Step the env; a window is drawn meanwhile."""
+        if self.render_mode == "human":
+            self._prepare()
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._last = dict(info)
+        self._strip.add(info)
+        return observation, reward, terminated, truncated, info
+
+    def render(self) -> Any:
+        """The env's frame with the overlay, of the same shape."""
+        self._prepare()
+        frame = self.env.render()
+        return self._strip.on(frame) if self.strip and isinstance(frame, np.ndarray) else frame
+
+    def marks(self) -> list[Mark]:
+        """What is drawn into the scene in the present state; nothing before the first reset or without a filter."""
+        if self._last is None or self._inside is None:
+            return []
+        bound = self._inside.look()
+        found = [mark for constraint in bound for mark in constraint.draw()]
+        proposed, executed = (self._last.get(key) for key in (keys.PROPOSED_ACTION, keys.EXECUTED_ACTION))
+        if bound and proposed is not None and executed is not None:
+            specs = [constraint.spec for constraint in bound]
+            found += arrows(self._inside.plant, specs, proposed, executed)
+        return found
+
+    def _prepare(self) -> None:
+        """Have the next frame show the present marks, and a window the strip's words."""
+        renderer = find_renderer(self.env)
+        if renderer is None:
+            return
+        if self.scene:
+            put(self.marks(), renderer, str(self.render_mode))
+        if self.strip and self.render_mode == "human":
+            viewer = renderer._get_viewer("human")
+            for word in self._strip.words:
+                viewer.add_overlay(2, word, "")  # mjGRID_BOTTOMLEFT

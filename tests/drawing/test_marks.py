@@ -1,0 +1,78 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from safe_wrappers.drawing import marks
+
+numbers = st.floats(-5.0, 5.0)
+points = arrays(float, 3, elements=numbers)
+sizes = st.floats(0.01, 5.0)
+
+
+def ends(mark):
+    """Of a rod, by its own axes."""
+    way = mark.size[1] * mark.axes[:, 2]
+    return mark.position - way, mark.position + way
+
+
+@given(points, points)
+def test_a_rod_goes_from_its_start_to_its_end_in_a_right_handed_frame(start, end):
+    rod = marks.segment("way", start, end, 0.1)
+    tail, tip = ends(rod)
+    np.testing.assert_allclose(tail + tip, start + end, atol=1e-9)
+    if np.linalg.norm(end - start) > 1e-9:
+        np.testing.assert_allclose(tip, end, atol=1e-9)
+    np.testing.assert_allclose(rod.axes.T @ rod.axes, np.eye(3), atol=1e-9)
+    assert np.linalg.det(rod.axes) == pytest.approx(1.0) and rod.size[0] == 0.1
+
+
+@given(points, points)
+def test_an_arrow_ends_where_its_vector_leads(tail, vector):
+    drawn = marks.arrow("executed", tail, vector, 0.1)
+    np.testing.assert_allclose(drawn.tip, tail + (vector if np.linalg.norm(vector) > 1e-12 else 0), atol=1e-9)
+
+
+@given(arrays(float, 2, elements=numbers), sizes)
+def test_a_ring_lies_on_the_floor_around_its_centre(center, radius):
+    drawn = marks.ring("limit", center, radius)
+    for rod, after in zip(drawn, [*drawn[1:], drawn[0]], strict=True):
+        tail, tip = ends(rod)
+        assert np.hypot(*(tail[:2] - center)) == pytest.approx(radius)
+        np.testing.assert_allclose(tip, ends(after)[0], atol=1e-9)
+        assert tail[2] == marks.FLOOR
+
+
+@given(arrays(float, (3, 3), elements=numbers), st.integers(2, 3), sizes, points)
+def test_an_ellipsoid_reaches_as_far_as_its_deviation_in_every_direction(root, d, sigmas, along):
+    covariance = root[:d] @ root[:d].T
+    drawn = marks.ellipsoid("estimate", np.ones(d), covariance, sigmas, 0.0)
+    assert np.linalg.det(drawn.axes) == pytest.approx(1.0)
+    if np.linalg.norm(along[:d]) > 1e-3:
+        n = np.zeros(3)
+        n[:d] = along[:d] / np.linalg.norm(along[:d])
+        reach = np.linalg.norm(drawn.size * (drawn.axes.T @ n))
+        assert reach == pytest.approx(sigmas * np.sqrt(n[:d] @ covariance @ n[:d]), abs=1e-5)
+    grown = marks.ellipsoid("estimate", np.ones(d), covariance, sigmas, 0.3)
+    np.testing.assert_allclose(grown.size - drawn.size, 0.3)
+
+
+def test_the_edges_of_a_box_are_twelve_and_meet_in_threes():
+    low, high = np.array([0.0, -1.0, 2.0]), np.array([1.0, 1.0, 5.0])
+    drawn = marks.edges("limit", low, high, 0.01)
+    assert sorted(2.0 * rod.size[1] for rod in drawn) == pytest.approx([1.0] * 4 + [2.0] * 4 + [3.0] * 4)
+    corners = [tuple(np.round(end, 9)) for rod in drawn for end in ends(rod)]
+    assert len(set(corners)) == 8 and all(corners.count(corner) == 3 for corner in corners)
+
+
+@given(points, points.filter(lambda n: np.linalg.norm(n) > 0.1))
+def test_a_pad_is_flat_along_its_normal(foot, normal):
+    drawn = marks.pad("keep out", foot, normal, 0.5)
+    assert abs(drawn.axes[:, 2] @ normal) == pytest.approx(np.linalg.norm(normal))
+    assert drawn.size[2] < 0.01 < drawn.size[0] == drawn.size[1] == 0.5
+
+
+def test_what_has_no_height_is_drawn_on_the_floor():
+    np.testing.assert_array_equal(marks.spatial([1.0]), [1.0, 0.0, marks.FLOOR])
+    np.testing.assert_array_equal(marks.spatial([1.0, 2.0, 3.0]), [1.0, 2.0, 3.0])
