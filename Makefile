@@ -3,7 +3,7 @@ BIN := .venv/bin
 # One BLAS thread: the matrices are tiny and the runs are parallel processes.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test test-library test-slow mutants fuzz lint check bench table shelf figures docs clean
+.PHONY: demo test test-library test-slow mutants fuzz lint check bench table shelf figures gallery docs clean
 
 # Tests draw nothing; the demo tries which GL can.
 test test-library test-slow fuzz: export MUJOCO_GL ?= disabled
@@ -112,6 +112,10 @@ figures: .venv/installed
 	$(BIN)/python -m benchmarks.wrapper_cost
 	$(BIN)/python -m benchmarks.occlusion_cost
 	$(BIN)/python -m benchmarks.training_time
+
+# The films of docs/gallery.md and the page: about ten minutes. MUJOCO_GL=osmesa or egl where there is no window.
+gallery: .venv/installed
+	$(BIN)/python -m benchmarks.gallery
 
 .venv/docs: .venv/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'

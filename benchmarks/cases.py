@@ -50,13 +50,13 @@ class Case:
         """Of its row."""
         return f"{self.env_id}, {self.note}" if self.note else self.env_id
 
-    def make(self) -> gym.Env[Any, Any]:
+    def make(self, render_mode: str | None = None) -> gym.Env[Any, Any]:
         """The env without the filter."""
         if any(word in self.env_id for word in ("Maze", "Fetch", "Hand")):
             import gymnasium_robotics
 
             gym.register_envs(gymnasium_robotics)
-        return gym.make(self.env_id, max_episode_steps=self.max_episode_steps)
+        return gym.make(self.env_id, max_episode_steps=self.max_episode_steps, render_mode=render_mode)
 
 
 _BLIND: dict[str, Maker] = {

@@ -182,18 +182,19 @@ def film(act: Act) -> list[Image.Image]:
 
 def _write(whole: Image.Image, left: int, side: Side, count: Count, seed: int) -> None:
     draw = ImageDraw.Draw(whole)
-    draw.text((left + 4, 5), side.title, SIDES[side.title], _font(17, bold=True))
-    draw.text((left + PANEL - 4, 8), f"seed {seed}", INK, _font(14), anchor="ra")
+    draw.text((left + 4, 5), side.title, SIDES[side.title], font(17, bold=True))
+    draw.text((left + PANEL - 4, 8), f"seed {seed}", INK, font(14), anchor="ra")
     top = HEAD + PANEL + 6
     hurt = VIOLATED if count.violations else INK
-    draw.text((left + 4, top), f"{count.violations} steps in a hazard", hurt, _font(17, bold=True))
-    draw.text((left + PANEL - 4, top + 1), f"goals: {count.goals}", INK, _font(15), anchor="ra")
+    draw.text((left + 4, top), f"{count.violations} steps in a hazard", hurt, font(17, bold=True))
+    draw.text((left + PANEL - 4, top + 1), f"goals: {count.goals}", INK, font(15), anchor="ra")
     if side.filtered:
         changed = f"the filter changed {count.changed / count.steps:.0%} of the actions"
-        draw.text((left + 4, top + 24), changed, CHANGED_TEXT, _font(15))
+        draw.text((left + 4, top + 24), changed, CHANGED_TEXT, font(15))
 
 
-def _font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
+def font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
+    """Matplotlib's own, the same everywhere."""
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
     return ImageFont.truetype(Path(mpl.get_data_path()) / "fonts" / "ttf" / name, size)
 
@@ -210,7 +211,7 @@ def strip(flags: list[tuple[bool, bool]], at: int) -> Image.Image:
     return Image.fromarray(np.tile(row[None], (STRIP, 1, 1)))
 
 
-def encode(frames: list[Image.Image], frame_ms: float) -> bytes:
+def encode(frames: list[Image.Image], frame_ms: float, quality: int = QUALITY) -> bytes:
     """An endless animated WebP."""
     data = io.BytesIO()
     frames[0].save(
@@ -220,7 +221,7 @@ def encode(frames: list[Image.Image], frame_ms: float) -> bytes:
         append_images=frames[1:],
         duration=round(frame_ms),
         loop=0,
-        quality=QUALITY,
+        quality=quality,
         method=6,
     )
     return data.getvalue()

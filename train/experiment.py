@@ -62,8 +62,23 @@ def train_experiment(experiment: ExperimentConfig, console: Console) -> None:
         return functools.partial(train_run, start=_start(experiment, arm, seed))
 
     try:
+        every = sum(arm.total_steps for arm in experiment.arms) * len(experiment.seeds)
+        before = 0
         for arms in _generations(experiment):
-            _run(experiment, arms, console, "Training", lambda arm: arm.total_steps, "steps", training, ())
+            now = sum(arm.total_steps for arm in arms) * len(experiment.seeds)
+            others = before, every - before - now
+            _run(
+                experiment,
+                arms,
+                console,
+                "Training",
+                lambda arm: arm.total_steps,
+                "steps",
+                training,
+                (),
+                others,
+            )
+            before += now
     except Interrupted as stop:
         stop.standing = [
             f"{arm.name} seed {seed}: {standing(arm, experiment.run_folder(arm, seed))}"
@@ -133,7 +148,9 @@ def _run(
     unit: str,
     call: Callable[[ArmConfig, int], Callable[..., None]],
     more: tuple[Any, ...],
+    others: tuple[int, int] = (0, 0),
 ) -> None:
+    """Runs a job per arm and seed; `others` is the work of earlier and of later jobs."""
     # Seeds outside, arms inside: after the first wave there is already a pair to look at.
     jobs = [
         Job(
@@ -146,4 +163,4 @@ def _run(
         for seed in experiment.seeds
         for arm in arms
     ]
-    run_jobs(jobs, experiment.workers, console, title)
+    run_jobs(jobs, experiment.workers, console, title, *others)

@@ -191,7 +191,7 @@ def test_what_came_out(summary):
 
 def test_a_learning_curve_shows_its_seeds():
     seeds = np.array([np.linspace(0, 10, 20), np.linspace(0, 30, 20)])
-    curve = Curve(np.arange(20.0), seeds.mean(axis=0), seeds[0], seeds[1], seeds)
+    curve = Curve(np.arange(20.0), seeds.mean(axis=0), seeds[0], seeds[1], seeds, (3, 7))
     picture = curve_picture("c", "Return", "return", {"bare": curve, "safe": None}, ARMS)
     root = check(picture)
     lines = [g for g in root.iter() if g.attrib.get("id", "").startswith("c-line2d")]

@@ -45,6 +45,12 @@ def test_the_page_has_every_verdict_and_leads_to_every_page(entries, tmp_path):
     ):
         assert expected in words(page)
     links = [attrs["href"] for tag, attrs in page.tags if tag == "a"]
+    ids = {attrs["id"] for _, attrs in page.tags if "id" in attrs}
+    assert {link[1:] for link in links if link[0] == "#"} == {i for i in ids if i.startswith("number-")}
+    files = [link for link in links if link.endswith(".csv")]
+    assert len(files) == 2  # of each plane; nothing is drawn of the task without a cost
+    assert all((path.parent / file).is_file() for file in files)
+    links = [link for link in links if link[0] != "#" and link not in files]
     assert len(links) == 6  # each experiment at its verdict and at its numbers
     assert not any(link.startswith("/") for link in links)
     targets = {os.path.normpath(path.parent / unquote(link)) for link in links}

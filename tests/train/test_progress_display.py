@@ -13,11 +13,11 @@ LIVE = {"return": "12.3", "violations": "not judged", "changed": "4.1 %"}
 
 
 class Shown:
-    def __init__(self, terminal, totals=TOTALS, unit="steps"):
+    def __init__(self, terminal, totals=TOTALS, unit="steps", **others):
         self.now = 0.0
         self.text = io.StringIO()
         self.console = Console(file=self.text, force_terminal=terminal, width=100, color_system=None)
-        self.display = ProgressDisplay("Training", unit, totals, self.console, lambda: self.now)
+        self.display = ProgressDisplay("Training", unit, totals, self.console, lambda: self.now, **others)
 
     def lines(self):
         return self.text.getvalue().splitlines()
@@ -77,6 +77,17 @@ def test_a_file_gets_lines_now_and_then():
     assert spoken[:3] == [60, 90, 120]
     assert 60 < len(spoken) < 100  # of six hours
     assert spoken[-1] - spoken[-2] > 900
+
+
+def test_what_went_before_and_what_comes_later_is_part_of_the_whole():
+    shown = Shown(terminal=False, before=4000, later=2000)
+    shown.display.start("one")
+    shown.display.steps("one", 0)
+    shown.now = 30.0
+    shown.display.steps("one", 600)
+    shown.display.tick()
+    # 5,400 steps are left, 2,000 of them of jobs that nobody has named yet, at 20 steps/s.
+    assert shown.lines()[1] == "Training: 46 %, 4,600/10,000 steps, 20 steps/s, 0:04:30 left"
 
 
 @pytest.mark.parametrize(

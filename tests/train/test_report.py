@@ -1,4 +1,5 @@
 import io
+import json
 import re
 import shutil
 import subprocess
@@ -14,6 +15,7 @@ from safe_wrappers.errors import RunStateError
 from safe_wrappers.train.config import parse_experiment
 from safe_wrappers.train.config.file import read_config
 from safe_wrappers.train.evaluation.evaluate import evaluate_run
+from safe_wrappers.train.evaluation.metrics import METRICS, REGISTRY, absent
 from safe_wrappers.train.evaluation.summary import summarize
 from safe_wrappers.train.report import write_report
 from safe_wrappers.train.run import Progress, train_run
@@ -99,7 +101,12 @@ def test_the_page_is_whole_and_asks_for_nothing_from_outside(report):
     without_data = re.sub(r"data:image/webp;base64,[\w+/=]+", "data:,", text)
     assert not re.search(r"https?://|//[a-z]|@import|<script|xmlns", without_data)
     links = [attrs.get(key, "") for _, attrs in page.tags for key in ("href", "src", "srcset", "xlink:href")]
-    assert all(link.startswith(("data:", "#")) for link in links if link)
+    files = {link for link in links if link and not link.startswith(("data:", "#"))}
+    assert all(re.fullmatch(r"report_data/[\w-]+\.csv", link) for link in files)
+    assert {report.parent / link for link in files} == set((report.parent / "report_data").iterdir())
+    assert len(files) == sum(
+        "role" in attrs for tag, attrs in page.tags if tag == "svg"
+    )  # beside every picture
     ids = [attrs["id"] for _, attrs in page.tags if "id" in attrs]
     assert len(ids) == len(set(ids))
     assert {link[1:] for link in links if link.startswith("#")} <= set(ids)
@@ -117,6 +124,59 @@ def test_every_picture_has_words_for_those_who_cannot_see_it(report):
     assert len(alts) == 4
     assert all(len(text) > 30 and text.endswith((".", ". ")) for text in labels + alts)
     assert len(set(labels + alts)) == len(labels + alts)
+
+
+def test_the_numbers_of_every_table_are_explained(report):
+    page = Page(report.read_text())
+    linked = {
+        attrs["href"].removeprefix("#number-") for tag, attrs in page.tags if attrs.get("class") == "number"
+    }
+    entries = {
+        attrs["id"].removeprefix("number-") for _, attrs in page.tags if "number-" in attrs.get("id", "")
+    }
+    assert linked == entries  # none is missing, and none is told that is not shown
+    assert {"arm", "steps", "return", "cost", "violations", "intervention_rate", "elapsed_s"} <= linked
+    said = words(page).partition("What each number is")[2]
+    for name in linked:
+        assert REGISTRY[name].label in said and REGISTRY[name].counts in said
+        assert "".join(absent(name).replace("`", "").split()) in "".join(said.split()), name
+    headings = [attrs for tag, attrs in page.tags if tag == "th" and attrs.get("scope") == "col"]
+    unexplained = len(headings) - report.read_text().count('<th scope="col"><a class="number"')
+    assert unexplained == 2 + 2  # package and version; the arms' names above every metric
+
+
+def test_only_what_every_episode_has_is_never_absent():
+    assert {name for name in METRICS if not absent(name)} == {"return", "length"}
+    assert absent("infeasible_per_1000") == "No filter is on: nothing reports `cbf/infeasible`."
+    assert absent("lease_expired") == "There is no lease: nothing reports `lease/expired`."
+    assert absent("collisions") == "Nothing reports `collisions`."
+
+
+def test_run_by_run(fake_experiment):
+    experiment = fake_experiment()
+    fill(experiment, {"violations": 5, "return": 20, "cost": 7}, {"return": 10, "intervention_rate": 0.25})
+    (experiment.run_folder(experiment.arms[1], 1) / "finished.json").unlink()
+    facts = {"timesteps": 100, "elapsed_s": 3725.4, "steps_per_s": 27.0, "filter_time_us": None}
+    (experiment.run_folder(experiment.arms[0], 0) / "finished.json").write_text(json.dumps(facts))
+    said = words(Page(write_report(experiment, summarize(experiment)).read_text()))
+    table = said.partition("Run by run")[2]
+    assert "unfiltered 0 1,000 10 20 7 50 - - 1:02:05 27 -" in table
+    assert "filtered 0 1,000 10 10 0 0 25 % 0 - - 50" in table
+    assert "filtered 1 1,000 10 10 0 0 25 % 0 - - -" in table
+    assert (
+        "Training only: all episodes of each run, with what the policy was at the time. Not finished: 1 of 4."
+        in table
+    )
+
+
+def test_a_run_that_nobody_judged_has_no_violations(fake_experiment):
+    experiment = fake_experiment("seeds=[0]")
+    silent = steps(cost=steps().cost * float("nan"))
+    fill(experiment, {"return": 20}, {"return": 10}, silent, silent)
+    table = words(Page(write_report(experiment, summarize(experiment)).read_text())).partition("Run by run")[
+        2
+    ]
+    assert "unfiltered 0 1,000 10 20 not judged not judged - -" in table
 
 
 def test_what_the_page_says(report):
@@ -228,8 +288,8 @@ def test_a_task_without_a_cost_shows_none(fake_experiment):
         table.count("not judged") == 1 + 2 * 6
     )  # the note; cost and violations of two arms in three conditions
     assert "Steps in violation, total not judged not judged" in said.partition("How it was made")[2]
-    for absent in ("Return against cost", "Cost of the trained policies", "cost per episode", "0 of 1,000"):
-        assert absent not in said.partition("How to read this")[0], absent
+    for left_out in ("Return against cost", "Cost of the trained policies", "cost per episode", "0 of 1,000"):
+        assert left_out not in said.partition("How to read this")[0], left_out
 
 
 def test_arms_of_several_tasks_are_reported_without_being_mixed_up(fake_experiment):

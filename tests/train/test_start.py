@@ -12,6 +12,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 
 from safe_wrappers.envs.goal_env import SafeGoalEnv
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
+from safe_wrappers.train import experiment as experiment_steps
 from safe_wrappers.train.evaluation.evaluate import evaluate_run
 from safe_wrappers.train.experiment import _generations, _start, train_experiment
 from safe_wrappers.train.report.origin import about
@@ -227,3 +228,16 @@ def test_evaluation_resets_without_the_options(fake_experiment, monkeypatch):
     seen.clear()
     evaluate_run(arm, 0, folder, experiment.evaluation, experiment.evaluation_filter, QUIET)
     assert sum(count > 0 for count in seen) == 2  # the two episodes; an env that is made has no hazards yet
+
+
+def test_the_time_left_is_of_all_arms(fake_experiment, monkeypatch):
+    begun = []
+
+    def note(jobs, workers, console, title, before, later):
+        begun.append(([job.name for job in jobs], before, later))
+
+    monkeypatch.setattr(experiment_steps, "run_jobs", note)
+    experiment = fake_experiment(TUNED, "arms.filtered.total_steps=128")
+    train_experiment(experiment, quiet())
+    first, second = ([f"training {arm} seed {seed}" for seed in (0, 1)] for arm in ("unfiltered", "filtered"))
+    assert begun == [(first, 0, 2 * 128), (second, 2 * 512, 0)]

@@ -29,6 +29,8 @@ class Curve:
     """(B,)"""
     seeds: NDArray[np.float64]
     """(seeds, B): each seed's own."""
+    names: tuple[int, ...]
+    """The seeds, in the order of the rows."""
 
 
 def learning_curve(experiment: ExperimentConfig, arm: ArmConfig, metric: str) -> Curve | None:
@@ -57,7 +59,14 @@ def learning_curve(experiment: ExperimentConfig, arm: ArmConfig, metric: str) ->
         if np.isfinite(means).all():
             break
     low, high = _interval(means)
-    return Curve((edges[:-1] + edges[1:]) / 2, interquartile_mean(means, axis=0), low, high, means)
+    return Curve(
+        (edges[:-1] + edges[1:]) / 2,
+        interquartile_mean(means, axis=0),
+        low,
+        high,
+        means,
+        tuple(experiment.seeds),
+    )
 
 
 def event_rate(

@@ -11,75 +11,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from safe_wrappers.info import COST, EPISODE
-
 from ..atomic import write_json
 from ..config import ExperimentConfig, FilterConfig
 from ..tables import read_rows, write_rows
 from .evaluate import conditions, evaluation_folder
 from .has_cost import evaluated_without_cost
+from .metrics import METRICS, OF_THE_FILTER, OF_THE_JUDGE, OF_THE_LEASE, RATES, TOTALS
 
 CONDITIONS: Final = {
     "training": "Training, all episodes",
     "filter_off": "Evaluation, filter off",
     "filter_on": "Evaluation, filter on",
 }
-TOTALS: Final = tuple(figure.name for figure in EPISODE if figure.how in ("count", "onsets"))
-METRICS: Final = {
-    "return": "Return / episode",
-    "length": "Steps / episode",
-    "cost": "Cost / episode",
-    "cost_substep": "Cost in substeps / episode",
-    "violations": "Steps in violation, total",
-    "violations_per_1000": "Steps in violation / 1000",
-    "intervention_rate": "Share of steps changed",
-    "correction_mean": "Correction, mean",
-    "correction_p95": "Correction, 95th pct.",
-    "infeasible": "Infeasible steps, total",
-    "infeasible_per_1000": "Infeasible steps / 1000",
-    "fallback": "Fallback steps, total",
-    "unsafe": "Steps begun with h < 0, total",
-    "stuck": "Stuck steps, total",
-    "lease_braking": "Steps braked by the lease, total",
-    "lease_expired": "Leases run out, total",
-    "goals_reached": "Goals / episode",
-    "spin_outs": "Steps in spin-out, total",
-    "spin_outs_per_million": "Steps in spin-out / million",
-    "collisions": "Collisions, total",
-    "collisions_per_million": "Collisions / million steps",
-    "seen": "Share of time that a track is seen",
-    "expiries": "Permissions to rely on a track run out, total",
-    "expiries_per_1000": "Permissions run out / 1000 steps",
-}
-"""What is reported. Totals and rates are over a condition's episodes; all else is the mean over its
-episodes of the episode's value (so `correction_p95` is the mean of the episodes' percentiles)."""
-
-
-RATES: Final = {
-    "violations_per_1000": ("violations", 1000.0),
-    "infeasible_per_1000": ("infeasible", 1000.0),
-    "spin_outs_per_million": ("spin_outs", 1e6),
-    "collisions_per_million": ("collisions", 1e6),
-    "expiries_per_1000": ("expiries", 1000.0),
-}
-"""Of a count, per so many steps. Episodes that end early have less time for violations: rates are over all steps,
-whatever the episodes."""
-
-
-def _made_from(*names: str) -> tuple[str, ...]:
-    """The metrics that are made from info keys whose names begin with one of these."""
-    of = {figure.name: figure.of[0] for figure in EPISODE}
-    return tuple(m for m in METRICS if of.get(RATES.get(m, (m,))[0], "").startswith(names))
-
-
-OF_THE_FILTER: Final = _made_from("cbf/")
-"""Left out where no filter is on: a zero there would say nothing."""
-OF_THE_LEASE: Final = _made_from("lease/")
-"""Left out where there is no lease."""
-OF_THE_JUDGE: Final = _made_from(COST)
-"""Left out where nobody judged: a zero there would be a lie."""
-NOT_JUDGED: Final = "not judged"
-
 SEEDS_FOR_AN_INTERVAL: Final = 3
 """Fewer say nothing about others: their range is given, and called so."""
 

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from ..evaluation.step_log import StepLog
 from .canvas import arm_color, arm_key, draw
-from .picture import Key, Picture, per_arm
+from .picture import Key, Picture, Plotted, per_arm
 
 
 def constraints_picture(logs: Mapping[str, StepLog], arms: list[str]) -> Picture:
@@ -50,7 +50,13 @@ def constraints_picture(logs: Mapping[str, StepLog], arms: list[str]) -> Picture
 
     keys: dict[str, Key] = {arm: (arm_key(arms.index(arm)), "fill") for arm in shares}
     height = 0.8 + 0.35 * len(names) * max(1.0, 0.6 * len(shares))
-    return Picture(title, reading, draw("constraints", f"{title}. {reading}", paint, height), keys)
+    rows = [
+        {"arm": arm, "constraint": name, "percent_of_steps": float(share)}
+        for arm, of_arm in shares.items()
+        for name, share in of_arm.items()
+    ]
+    data = Plotted("constraints", ("arm", "constraint", "percent_of_steps"), rows)
+    return Picture(title, reading, draw(data.name, f"{title}. {reading}", paint, height), keys, data)
 
 
 def _told(log: StepLog, shares: Mapping[str, float]) -> str:

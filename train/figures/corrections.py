@@ -12,7 +12,7 @@ from matplotlib.ticker import FuncFormatter
 from ..evaluation.step_log import StepLog
 from ..evaluation.summary import number
 from .canvas import arm_color, arm_key, draw
-from .picture import Key, Picture, per_arm
+from .picture import Key, Picture, Plotted, per_arm
 
 _BINS = 30
 
@@ -47,7 +47,14 @@ def corrections_picture(logs: Mapping[str, StepLog], arms: list[str]) -> Picture
         axes.set_ylim(bottom=0.7)
 
     keys: dict[str, Key] = {arm: (arm_key(arms.index(arm)), "fill") for arm in changed if len(changed[arm])}
-    return Picture(title, reading, draw("corrections", f"{title}. {reading}", paint), keys)
+    rows = [
+        {"arm": arm, "from": float(low), "to": float(high), "steps": int(count)}
+        for arm, values in changed.items()
+        if len(values)
+        for low, high, count in zip(edges, edges[1:], np.histogram(values, edges)[0], strict=False)
+    ]
+    data = Plotted("corrections", ("arm", "from", "to", "steps"), rows)
+    return Picture(title, reading, draw(data.name, f"{title}. {reading}", paint), keys, data)
 
 
 def _told(log: StepLog) -> str:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from typing import Final
 
 from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from ..evaluation.curves import Curve
 from ..evaluation.summary import number
+from ..tables import Row
 from .canvas import arm_color, arm_key, draw
-from .picture import Key, Picture
+from .picture import Key, Picture, Plotted
+
+_COLUMNS: Final = ("arm", "what", "training_steps", "value")
 
 
 def curve_picture(
@@ -47,7 +51,18 @@ def curve_picture(
             axes.plot(curve.steps, curve.iqm, color=color, linewidth=2, solid_capstyle="round")
 
     keys: dict[str, Key] = {arm: (arm_key(arms.index(arm)), "line") for arm in there}
-    return Picture(title, reading, draw(name, f"{title}. {reading}", paint, height=2.6), keys)
+    data = Plotted(name, _COLUMNS, [row for arm, curve in there.items() for row in _rows(arm, curve)])
+    return Picture(title, reading, draw(name, f"{title}. {reading}", paint, height=2.6), keys, data)
+
+
+def _rows(arm: str, curve: Curve) -> Iterator[Row]:
+    """Every line of an arm, point by point; `what` is `mean`, `low`, `high`, or `seed 0` and so on."""
+    lines = {"mean": curve.iqm, "low": curve.low, "high": curve.high}
+    seeds = {f"seed {name}": values for name, values in zip(curve.names, curve.seeds, strict=True)}
+    for what, values in (lines | seeds).items():
+        if values is not None:
+            for steps, value in zip(curve.steps, values, strict=True):
+                yield {"arm": arm, "what": what, "training_steps": float(steps), "value": float(value)}
 
 
 def _move(curve: Curve) -> str:

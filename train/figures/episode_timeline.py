@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..evaluation.step_log import StepLog
 from .canvas import arm_color, arm_key, draw
-from .picture import Key, Look, Picture, per_arm
+from .picture import Key, Look, Picture, Plotted, per_arm
 
 _BINS: Final = 20
 _LOOKS: Final[dict[str, tuple[str, Look]]] = {
@@ -69,12 +69,12 @@ def _timeline(
     last = max(int(log.step.max()) for log in logs.values())
     edges = np.unique(np.linspace(0, last + 1, min(_BINS, last + 1) + 1).round())
     scale = 100.0 if unit.startswith("%") else 1000.0
+    shares = {(arm, event): scale * _shares(logs[arm], event, edges) for arm, event in shown}
 
     def paint(axes: Axes) -> None:
         axes.set_xlabel("step in the episode")
         axes.set_title(unit)
-        for arm, event in shown:
-            values = scale * _shares(logs[arm], event, edges)
+        for (arm, event), values in shares.items():
             color = arm_color(arms.index(arm))
             axes.stairs(values, edges, baseline=None, color=color, linestyle=_LOOKS[event][0], linewidth=1.6)
         axes.set_ylim(bottom=0)
@@ -84,7 +84,14 @@ def _timeline(
         arm if len(events) == 1 else f"{arm}: {event}": (arm_key(arms.index(arm)), _LOOKS[event][1])
         for arm, event in shown
     }
-    return Picture(title, reading, draw(name, f"{title}. {reading}", paint, height=2.6), keys)
+    column = "percent_of_steps" if scale == 100.0 else "per_1000_steps"
+    rows = [
+        {"arm": arm, "event": event, "from_step": int(first), "to_step": int(end), column: float(value)}
+        for (arm, event), values in shares.items()
+        for first, end, value in zip(edges, edges[1:], values, strict=False)
+    ]
+    data = Plotted(name, ("arm", "event", "from_step", "to_step", column), rows)
+    return Picture(title, reading, draw(name, f"{title}. {reading}", paint, height=2.6), keys, data)
 
 
 def _shares(log: StepLog, event: str, edges: NDArray[np.floating]) -> NDArray[np.float64]:

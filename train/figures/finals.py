@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from matplotlib.axes import Axes
 
-from ..evaluation.summary import Summary, number
+from ..evaluation.summary import Estimate, Summary, number
 from .canvas import arm_color, draw
-from .picture import Picture
+from .picture import Picture, Plotted
 from .plane import CONDITIONS
 
 
@@ -20,7 +22,7 @@ def finals_picture(
         name: Unique on the page.
         title: Of the picture.
         unit: What the axis counts.
-        metric: One of `summary.METRICS`.
+        metric: One of `metrics.METRICS`.
         summary: The numbers.
         arms: All arms, in the order of their colours.
     """
@@ -65,4 +67,23 @@ def finals_picture(
         if best[2].iqm == worst[2].iqm == 0:
             axes.set_xlim(-0.08, 1)
 
-    return Picture(title, reading, draw(name, f"{title}. {reading}", paint, height=0.8 + 0.42 * len(rows)))
+    table = [
+        {"arm": arm, "filter": CONDITIONS[condition], "what": what, metric: value}
+        for arm, condition, estimate in rows
+        for what, value in _values(summary, arm, condition, metric, estimate)
+    ]
+    data = Plotted(name, ("arm", "filter", "what", metric), table)
+    svg = draw(name, f"{title}. {reading}", paint, height=0.8 + 0.42 * len(rows))
+    return Picture(title, reading, svg, data=data)
+
+
+def _values(
+    summary: Summary, arm: str, condition: str, metric: str, estimate: Estimate
+) -> Iterator[tuple[str, float]]:
+    """A row's line, the ends of its bar, and its dots."""
+    yield "mean", estimate.iqm
+    if estimate.low is not None and estimate.high is not None:
+        yield from (("low", estimate.low), ("high", estimate.high))
+    for row in summary.per_seed:
+        if (row["arm"], row["condition"]) == (arm, condition):
+            yield f"seed {row['seed']}", float(row[metric])

@@ -1,14 +1,26 @@
-"""What a picture is on the page: a title, the drawing, the keys of its marks, and one sentence that reads it."""
+"""What a picture is on the page: a title, the drawing, its marks, a sentence that reads it, and its numbers."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
+
+from ..tables import Row
 
 Look = Literal["fill", "line", "dot", "ring", "disc"]
 Key = tuple[str, Look]
 """A CSS colour variable of the page's style, without the dashes, and how the mark looks."""
+
+
+@dataclass(frozen=True)
+class Plotted:
+    """The drawn numbers as a table for a CSV file; cells of what does not exist are left out."""
+
+    name: str
+    """Unique on the page, as in its SVG."""
+    columns: tuple[str, ...]
+    rows: Sequence[Row]
 
 
 @dataclass(frozen=True)
@@ -20,6 +32,7 @@ class Picture:
     svg: str = ""
     keys: Mapping[str, Key] = field(default_factory=dict)
     """What the marks mean: plain text -> its look."""
+    data: Plotted | None = None
 
 
 def per_arm(told: Mapping[str, str]) -> str:

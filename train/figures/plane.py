@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 from matplotlib.axes import Axes
 
 from ..evaluation.summary import Estimate, Summary, number
+from ..tables import Row
 from .canvas import arm_color, arm_key, draw
-from .picture import Key, Picture
+from .picture import Key, Picture, Plotted
 
 Limits = tuple[tuple[float, float], tuple[float, float]]
 """Of returns and of costs."""
@@ -75,7 +76,23 @@ def plane_picture(
             )
             for condition in ends[arm]
         }
-    return Picture(title, reading, draw(name, f"{title}. {reading}", paint, height=3.1), keys)
+    rows = [row for arm, of_arm in ends.items() for row in _rows(summary, arm, of_arm)]
+    data = Plotted(name, ("arm", "filter", "what", "return", "cost"), rows)
+    return Picture(title, reading, draw(name, f"{title}. {reading}", paint, height=3.1), keys, data)
+
+
+def _rows(summary: Summary, arm: str, ends: dict[str, tuple[Estimate, Estimate]]) -> Iterator[Row]:
+    """The large marks, the ends of their bars, and the seeds' dots."""
+    for condition, (x, y) in ends.items():
+        of = {"arm": arm, "filter": CONDITIONS[condition]}
+        yield of | {"what": "mean", "return": x.iqm, "cost": y.iqm}
+        for what in ("low", "high"):
+            bar = {"return": getattr(x, what), "cost": getattr(y, what)}
+            if None not in bar.values():
+                yield of | {"what": what} | bar
+        for row in judged_rows(summary):
+            if (row["arm"], row["condition"]) == (arm, condition):
+                yield of | {"what": f"seed {row['seed']}", "return": row["return"], "cost": row["cost"]}
 
 
 def _ends(summary: Summary, arm: str) -> dict[str, tuple[Estimate, Estimate]]:

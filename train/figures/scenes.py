@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Rectangle
 
 from ..evaluation.scene import Scene
+from ..tables import Row
 from .canvas import BAD, GOAL, HAZARD, INK, MARK, VASE, arm_color, arm_key, draw
-from .picture import Key, Picture
+from .picture import Key, Picture, Plotted
 
 Frame = tuple[float, float, float, float]
 """x from, x to, y from, y to, m."""
@@ -61,7 +64,26 @@ def scene_picture(name: str, title: str, scene: Scene, color: int, frame: Frame)
     if len(scene.vases):
         keys["vase"] = ("vase", "fill")
     keys["start"] = ("ink", "ring")
-    return Picture(title, reading, draw(name, f"{title}. {reading}", paint, height=3.9), keys)
+    data = Plotted(name, ("what", "x_m", "y_m", "radius_m", "changed", "violated"), list(_rows(scene)))
+    return Picture(title, reading, draw(name, f"{title}. {reading}", paint, height=3.9), keys, data)
+
+
+def _rows(scene: Scene) -> Iterator[Row]:
+    """What stands there, and the path in the order of the steps; its last place has no step after it."""
+    for what, places, radius in (
+        ("hazard", scene.hazards, scene.hazard_radius),
+        ("goal", scene.goals, scene.goal_radius),
+    ):
+        for x, y in places:
+            yield {"what": what, "x_m": float(x), "y_m": float(y), "radius_m": float(radius)}
+    for x, y in scene.vases:
+        yield {"what": "vase", "x_m": float(x), "y_m": float(y)}
+    for step, (x, y) in enumerate(scene.agent):
+        place: Row = {"what": "path", "x_m": float(x), "y_m": float(y)}
+        if step < len(scene.violated):
+            flags = {"changed": bool(scene.intervened[step]), "violated": bool(scene.violated[step])}
+            place = {**place, **flags}
+        yield place
 
 
 def _paint(axes: Axes, scene: Scene, color: str) -> None:

@@ -11,7 +11,7 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import NDArray
 
 from .canvas import arm_color, arm_key, draw
-from .picture import Key, Picture
+from .picture import Key, Picture, Plotted
 
 Rate = tuple[NDArray[np.float64], NDArray[np.float64], int]
 """What `event_rate` returns."""
@@ -60,4 +60,16 @@ def training_timeline_picture(
         f"{arm}: {what}": (arm_key(arms.index(arm)), "line" if what == "infeasible" else "dot")
         for arm, what in shown
     }
-    return Picture(title, reading, draw("training-timeline", f"{title}. {reading}", paint, height=2.6), keys)
+    rows = [
+        {
+            "arm": arm,
+            "event": what,
+            "from_step": float(first),
+            "to_step": float(end),
+            "per_1000_steps": float(rate),
+        }
+        for (arm, what), (edges, values, _) in shown.items()
+        for first, end, rate in zip(edges, edges[1:], values, strict=False)
+    ]
+    data = Plotted("training-timeline", ("arm", "event", "from_step", "to_step", "per_1000_steps"), rows)
+    return Picture(title, reading, draw(data.name, f"{title}. {reading}", paint, height=2.6), keys, data)

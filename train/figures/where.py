@@ -11,8 +11,9 @@ from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
 from ..evaluation.step_log import StepLog
+from ..tables import Row
 from .canvas import BAD, INK, MARK, draw
-from .picture import Picture
+from .picture import Picture, Plotted
 from .telling import telling_pair
 
 _CELLS: Final = 32
@@ -88,15 +89,18 @@ def where_picture(name: str, title: str, log: StepLog, view: View, of: str) -> P
         )
     else:
         reading = f"None of {total} was {verb}."
-    paint = _painter(places, flags, view, names, color)
+    hexagons: list[Row] = []
+    paint = _painter(places, flags, view, names, color, hexagons)
+    svg = draw(name, f"{title}. {names[1]} over {names[0]}. {reading}", paint, height=3.1)
     return Picture(
         title,
         reading,
-        draw(name, f"{title}. {names[1]} over {names[0]}. {reading}", paint, height=3.1),
+        svg,
         {
             "visited": ("grid", "fill"),
             f"{verb}; the stronger, the more often": ("mark" if color == MARK else "bad", "fill"),
         },
+        Plotted(name, (*names, "steps", "share"), hexagons),
     )
 
 
@@ -114,8 +118,15 @@ class _Cells:
 
 
 def _painter(
-    places: NDArray[np.floating], flags: NDArray[np.bool_], view: View, names: list[str], color: str
+    places: NDArray[np.floating],
+    flags: NDArray[np.bool_],
+    view: View,
+    names: list[str],
+    color: str,
+    hexagons: list[Row],
 ) -> Any:
+    """Paints the cells, and adds each with its centre, steps and share to `hexagons`."""
+
     def paint(axes: Axes) -> None:
         axes.set_xlabel(names[0])
         axes.set_title(names[1])
@@ -124,22 +135,28 @@ def _painter(
         x0, x1, y0, y1 = view.extent
         axes.set_xlim(x0 - 0.02 * (x1 - x0), x1 + 0.02 * (x1 - x0))
         axes.set_ylim(y0 - 0.02 * (y1 - y0), y1 + 0.02 * (y1 - y0))
+        found = []
         for values, paper, least in ((np.ones(len(flags)), INK, 0.08), (flags, color, 0.0)):
             cells = axes.hexbin(
                 places[:, 0],
                 places[:, 1],
                 C=values,
-                reduce_C_function=np.mean,
+                reduce_C_function=np.sum if paper == INK else np.mean,
                 gridsize=(_CELLS, int(_CELLS * 0.55)),
                 extent=view.extent,
                 linewidths=0,
             )
             strength = np.asarray(cells.get_array(), dtype=float)
+            found.append((np.asarray(cells.get_offsets()), strength))
             strength = np.full(len(strength), least) if paper == INK else np.sqrt(strength)
             cells.set_array(None)
             shown = strength > 0
             cells.set_offsets(np.asarray(cells.get_offsets())[shown])
             cells.set_facecolor([(*to_rgb(paper), alpha) for alpha in strength[shown]])
             cells.set_edgecolor("none")
+        (centres, steps), (_, shares) = found
+        for (x, y), count, share in zip(centres, steps, shares, strict=True):
+            place = {names[0]: float(x), names[1]: float(y)}
+            hexagons.append(place | {"steps": int(count), "share": float(share)})
 
     return paint

@@ -54,7 +54,9 @@ class RunsFailedError(SafeWrappersError):
     """Some runs of an experiment failed; the others were brought to their end."""
 
 
-def run_jobs(jobs: Sequence[Job], workers: int | None, console: Console, title: str) -> None:
+def run_jobs(
+    jobs: Sequence[Job], workers: int | None, console: Console, title: str, before: int = 0, later: int = 0
+) -> None:
     """Runs jobs in parallel, spawned processes, one BLAS and torch thread each.
 
     A job that fails does not stop the others. If this process is killed, the jobs' processes end by
@@ -66,6 +68,8 @@ def run_jobs(jobs: Sequence[Job], workers: int | None, console: Console, title: 
         workers: Processes at a time; None for one per core that this process may use.
         console: Where progress, messages and failures are shown.
         title: What is going on.
+        before: Units of jobs that went before, which count as done.
+        later: Units of jobs that will come after these, which are still to do.
 
     Raises:
         RunsFailedError: At least one job failed; holds all their messages.
@@ -80,7 +84,7 @@ def run_jobs(jobs: Sequence[Job], workers: int | None, console: Console, title: 
     unit = jobs[0].unit if jobs else ""
     with (
         stop_request() as request,
-        ProgressDisplay(title, unit, totals, console) as display,
+        ProgressDisplay(title, unit, totals, console, before=before, later=later) as display,
         # Read by the BLAS libraries when the spawned process loads them; more threads would only fight for cores.
         environment(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")),
     ):

@@ -40,6 +40,8 @@ class ProgressDisplay:
         totals: Units of each job, by its name.
         console: A terminal gets a table that is kept up to date; anything else lines.
         clock: s; for tests.
+        before: Units of jobs that were done before these.
+        later: Units of jobs that begin when these are done; the time left is of all.
     """
 
     def __init__(
@@ -49,7 +51,11 @@ class ProgressDisplay:
         totals: Mapping[str, int],
         console: Console,
         clock: Callable[[], float] = time.monotonic,
+        before: int = 0,
+        later: int = 0,
     ) -> None:
+        self._before = before
+        self._others = before + later
         self._title = title
         self._unit = unit
         self._rows = {name: _Row(total) for name, total in totals.items()}
@@ -134,7 +140,8 @@ class ProgressDisplay:
     def _all(self) -> tuple[int, int, float]:
         rows = self._rows.values()
         speed = sum(row.pace.lately for row in rows if row.running)
-        return sum(row.done for row in rows), sum(row.total for row in rows), speed
+        done, total = sum(row.done for row in rows), sum(row.total for row in rows)
+        return self._before + done, self._others + total, speed
 
     def _running(self) -> dict[str, _Row]:
         return {name: row for name, row in self._rows.items() if row.running}

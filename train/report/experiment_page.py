@@ -10,11 +10,13 @@ from safe_wrappers.errors import RunStateError
 from ..atomic import write_text
 from ..config import ExperimentConfig
 from ..evaluation.summary import Summary
+from ..figures.plot_files import PlotFiles
 from . import sections
+from .explanation import explanations
 from .film_section import films
 from .headline import cards
 from .markup import details, document, section, text
-from .numbers import full_table, runs_table, seeds_table, short_table
+from .numbers import RUN_NUMBERS, SHORT, full_table, runs_table, seeds_columns, seeds_table, short_table
 from .origin import about, how_it_was_made, settings
 from .verdict import verdict
 
@@ -22,7 +24,7 @@ from .verdict import verdict
 def write_report(
     experiment: ExperimentConfig, summary: Summary, command: str = "", path: Path | None = None
 ) -> Path:
-    """Writes an experiment's page.
+    """Writes an experiment's page, and beside it the data of its pictures, a CSV file each.
 
     Args:
         experiment: The experiment; what its folder holds is shown, nothing is trained.
@@ -38,7 +40,10 @@ def write_report(
     """
     check_reportable(experiment, summary)
     path = path or report_path(experiment)
-    write_text(path, _page(experiment, summary, command))
+    files = PlotFiles(path)
+    page = _page(experiment, summary, command, files)
+    files.write()
+    write_text(path, page)
     return path
 
 
@@ -59,13 +64,13 @@ def check_reportable(experiment: ExperimentConfig, summary: Summary) -> None:
         )
 
 
-def _page(experiment: ExperimentConfig, summary: Summary, command: str) -> str:
+def _page(experiment: ExperimentConfig, summary: Summary, command: str, files: PlotFiles) -> str:
     return document(
-        f"{experiment.name}: safe-wrappers report", "\n".join(_parts(experiment, summary, command))
+        f"{experiment.name}: safe-wrappers report", "\n".join(_parts(experiment, summary, command, files))
     )
 
 
-def _parts(experiment: ExperimentConfig, summary: Summary, command: str) -> Iterator[str]:
+def _parts(experiment: ExperimentConfig, summary: Summary, command: str, files: PlotFiles) -> Iterator[str]:
     yield f"<header><h1>{text(experiment.name)}</h1><p>{text(about(experiment))}</p></header>"
     first, *rest = verdict(experiment, summary)
     yield f'<p class="verdict">{text(first)}</p>'
@@ -78,17 +83,18 @@ def _parts(experiment: ExperimentConfig, summary: Summary, command: str) -> Iter
         "The same episode, filter off and on",
         sections.which_episode(experiment),
         films(experiment),
-        sections.from_above(experiment),
+        sections.from_above(experiment, files),
     )
-    yield section("What it bought and what it cost", sections.outcome(experiment, summary))
-    yield section("When, where and how much the filter stepped in", sections.interventions(experiment))
-    yield section("While training", sections.training(experiment, summary))
+    yield section("What it bought and what it cost", sections.outcome(experiment, summary, files))
+    yield section("When, where and how much the filter stepped in", sections.interventions(experiment, files))
+    yield section("While training", sections.training(experiment, summary, files))
+    yield section("Run by run", runs_table(experiment, summary), sections.runs_note(experiment))
     yield section("How to read this", sections.notes(experiment, summary))
+    yield section("What each number is", explanations([*SHORT, *RUN_NUMBERS, *seeds_columns(summary)]))
     yield section(
         "How it was made",
         how_it_was_made(command),
         details("Settings", settings(experiment)),
         details("Every metric", full_table(experiment, summary)),
         details("Every seed", seeds_table(summary)),
-        details("Runs", runs_table(experiment)),
     )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from ..config import ExperimentConfig
-from ..evaluation.summary import NOT_JUDGED, Summary, number
+from ..evaluation.metrics import NOT_JUDGED
+from ..evaluation.summary import Summary, number
 from .comparison import Comparison, Outcome, Side, compare, filter_time_us
 from .markup import card, text
 from .verdict import percent

@@ -7,8 +7,10 @@ import html
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from ..evaluation.metrics import REGISTRY
 from ..evaluation.summary import number
 from ..figures.picture import Key, Picture
+from ..figures.plot_files import PlotFiles
 from .style import STYLE
 
 
@@ -53,20 +55,31 @@ def card(title: str, value: str, what: str, *others: str, mood: str = "") -> str
     )
 
 
-def pictures(items: Iterable[Picture]) -> str:
-    """Pictures side by side, each with its title, its keys and its reading; what has no drawing is a line, last."""
+def pictures(items: Iterable[Picture], files: PlotFiles | None = None) -> str:
+    """Pictures side by side, each with its title, its keys and its reading; what has no drawing is a line, last.
+
+    Args:
+        items: The pictures.
+        files: Gets what they are drawn from, and each has a link to its file; without, there are none.
+    """
     items = list(items)
     items.sort(key=lambda item: not item.svg)
-    return f'<div class="figures">{"".join(map(_figure, items))}</div>' if items else ""
+    inside = "".join(_figure(item, files) for item in items)
+    return f'<div class="figures">{inside}</div>' if items else ""
 
 
-def _figure(item: Picture) -> str:
+def _figure(item: Picture, files: PlotFiles | None) -> str:
     if not item.svg:
         return f'<div class="card told"><h3>{text(item.title)}</h3><p>{text(item.reading)}</p></div>'
+    link = "" if files is None or item.data is None else f" {_csv(files.link(item.data), item.title)}"
     return (
         f"<figure><h3>{text(item.title)}</h3>{keys(item.keys) or '<p></p>'}{item.svg}"
-        f"<figcaption>{text(item.reading)}</figcaption></figure>"
+        f"<figcaption>{text(item.reading)}{link}</figcaption></figure>"
     )
+
+
+def _csv(href: str, of: str) -> str:
+    return f'<a class="csv" href="{text(href)}" aria-label="{text(of)}, as CSV">CSV</a>'
 
 
 def keys(items: Mapping[str, Key]) -> str:
@@ -80,9 +93,31 @@ def keys(items: Mapping[str, Key]) -> str:
     return f'<p class="keys">{marks}</p>'
 
 
-def table(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Plain values, escaped; numbers rounded as everywhere."""
-    head = "".join(f'<th scope="col">{text(column)}</th>' for column in columns)
+def explained(name: str, label: str = "") -> str:
+    """A number's heading, a link to its explanation on the same page.
+
+    Args:
+        name: In the registry of numbers.
+        label: What is written; its label in the registry if not given.
+    """
+    words = text(label or REGISTRY[name].label).replace(" / ", "\N{NO-BREAK SPACE}/ ")
+    return f'<a class="number" href="#{number_id(name)}">{words}</a>'
+
+
+def number_id(name: str) -> str:
+    """Where on a page a number is explained."""
+    return f"number-{name}"
+
+
+def table(columns: Sequence[str], rows: Iterable[Sequence[Any]], heads: Iterable[str] = ()) -> str:
+    """Plain values, escaped; numbers rounded as everywhere.
+
+    Args:
+        columns: Headings, plain text.
+        rows: Values.
+        heads: Headings in HTML, in place of `columns`.
+    """
+    head = "".join(f'<th scope="col">{head}</th>' for head in heads or map(text, columns))
     body = "".join(
         "<tr>" + "".join(f"<td>{text(number(v) if isinstance(v, float) else v)}</td>" for v in row) + "</tr>"
         for row in rows

@@ -4,20 +4,31 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
+from datetime import timedelta
+from typing import Any, Final
 
 from ..config import ArmConfig, ExperimentConfig
-from ..evaluation.summary import CONDITIONS, METRICS, NOT_JUDGED, OF_THE_JUDGE, Estimate, Summary, number
+from ..evaluation.metrics import METRICS, NOT_JUDGED, OF_THE_JUDGE
+from ..evaluation.summary import CONDITIONS, Estimate, Summary, number
 from ..run.training import FINISHED_FILE
-from .markup import table, text
+from .markup import explained, table, text
 
-_SHORT = (
-    "Return / episode",
-    "Cost / episode",
-    "Steps in violation",
-    "Steps changed",
-    "Infeasible",
-    "Fallback",
+SHORT: Final = {
+    "return": "Return / episode",
+    "cost": "Cost / episode",
+    "violations": "Steps in violation",
+    "intervention_rate": "Steps changed",
+    "infeasible": "Infeasible",
+    "fallback": "Fallback",
+}
+"""The short table's numbers and their headings."""
+_FACTS: Final = ("elapsed_s", "steps_per_s", "filter_time_us")
+"""What a finished run says of itself."""
+RUN_NUMBERS: Final = (
+    *("arm", "seed", "steps", "episodes", "return", "cost", "violations", "intervention_rate", "infeasible"),
+    *_FACTS,
 )
+"""The columns of the runs' table."""
 
 
 def short_table(blocks: Iterable[tuple[str, ExperimentConfig, Summary]]) -> str:
@@ -26,7 +37,7 @@ def short_table(blocks: Iterable[tuple[str, ExperimentConfig, Summary]]) -> str:
     Args:
         blocks: (HTML heading or nothing, experiment, its numbers), one under the other.
     """
-    head = "".join(f'<th scope="col">{text(column)}</th>' for column in _SHORT)
+    head = "".join(f'<th scope="col">{explained(name, label)}</th>' for name, label in SHORT.items())
     body = "".join(_short_rows(*block) for block in blocks)
     return (
         f'<div class="wide"><table class="short"><thead><tr><th></th>{head}</tr></thead>'
@@ -48,7 +59,7 @@ def full_table(experiment: ExperimentConfig, summary: Summary) -> str:
         for metric in METRICS:
             if metric in ("cost", "violations") or any(metric in cell for cell in cells):
                 values = "".join(f"<td>{_cell(cell, metric)}</td>" for cell in cells)
-                body.append(f'<tr><th scope="row">{text(METRICS[metric])}</th>{values}</tr>')
+                body.append(f'<tr><th scope="row">{explained(metric)}</th>{values}</tr>')
     return (
         f'<div class="wide"><table><thead><tr><th></th>{heads}</tr></thead>'
         f"<tbody>{''.join(body)}</tbody></table></div>"
@@ -57,32 +68,60 @@ def full_table(experiment: ExperimentConfig, summary: Summary) -> str:
 
 def seeds_table(summary: Summary) -> str:
     """Every seed under every condition."""
+    columns = seeds_columns(summary)
+    rows = [[row.get(column, "") for column in columns] for row in summary.per_seed]
+    return table(columns, rows, (explained(column, column) for column in columns))
+
+
+def seeds_columns(summary: Summary) -> list[str]:
+    """The columns of the seeds' table, which are those of `per_seed.csv` that hold something."""
     columns = ["arm", "seed", "condition", "episodes", "steps", *METRICS]
-    columns = [column for column in columns if any(column in row for row in summary.per_seed)]
-    return table(columns, [[row.get(column, "") for column in columns] for row in summary.per_seed])
+    return [column for column in columns if any(column in row for row in summary.per_seed)]
 
 
-def runs_table(experiment: ExperimentConfig) -> str:
-    """How long each run took."""
-    rows = []
+def runs_table(experiment: ExperimentConfig, summary: Summary) -> str:
+    """What each run's training came to in all, and how long it took."""
+    trained = {(row["arm"], row["seed"]): row for row in summary.per_seed if row["condition"] == "training"}
+    body = []
     for arm in experiment.arms:
         for seed in experiment.seeds:
-            path = experiment.run_folder(arm, seed) / FINISHED_FILE
-            facts = json.loads(path.read_text()) if path.exists() else {}
-            values = [facts.get(key) for key in ("timesteps", "steps_per_s", "elapsed_s", "filter_time_us")]
-            rows.append([arm.name, seed, *("-" if value is None else value for value in values)])
-    return table(["arm", "seed", "steps", "steps/s", "seconds", "one filter call in µs"], rows)
+            row = trained.get((arm.name, seed), {}) | _facts(experiment, arm, seed)
+            cells = "".join(f"<td>{_run_cell(row, name)}</td>" for name in RUN_NUMBERS[2:])
+            body.append(f'<tr><th scope="row">{text(arm.name)}</th><td>{seed}</td>{cells}</tr>')
+    head = "".join(f'<th scope="col">{explained(name, SHORT.get(name, ""))}</th>' for name in RUN_NUMBERS)
+    return (
+        f'<div class="wide"><table class="short runs"><thead><tr>{head}</tr></thead>'
+        f"<tbody>{''.join(body)}</tbody></table></div>"
+    )
+
+
+def _facts(experiment: ExperimentConfig, arm: ArmConfig, seed: int) -> dict[str, float]:
+    path = experiment.run_folder(arm, seed) / FINISHED_FILE
+    facts = json.loads(path.read_text()) if path.exists() else {}
+    return {name: facts[name] for name in _FACTS if facts.get(name) is not None}
+
+
+def _run_cell(row: Mapping[str, Any], name: str) -> str:
+    if name not in row:
+        return NOT_JUDGED if "episodes" in row and name in OF_THE_JUDGE else "-"
+    if name == "elapsed_s":
+        return str(timedelta(seconds=round(row[name])))
+    if name == "intervention_rate":
+        return f"{100 * row[name]:.3g} %"
+    if name == "violations":
+        return f'<b class="{"bad" if row[name] else "good"}">{row[name]:,.0f}</b>'
+    return text(number(row[name]))
 
 
 def _short_rows(heading: str, experiment: ExperimentConfig, summary: Summary) -> str:
     rows = [
-        f'<tr class="experiment"><th scope="rowgroup" colspan="{len(_SHORT) + 1}">{heading}</th></tr>'
+        f'<tr class="experiment"><th scope="rowgroup" colspan="{len(SHORT) + 1}">{heading}</th></tr>'
     ] * bool(heading)
     for arm in experiment.arms:
         if not any(summary.table[arm.name].values()):
             continue
         rows.append(
-            f'<tr class="arm"><th scope="rowgroup" colspan="{len(_SHORT) + 1}">{text(arm.name)}'
+            f'<tr class="arm"><th scope="rowgroup" colspan="{len(SHORT) + 1}">{text(arm.name)}'
             f" <small>{text(_trained(arm))}</small></th></tr>"
         )
         rows += [

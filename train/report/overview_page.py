@@ -12,9 +12,11 @@ from ..config import ExperimentConfig
 from ..evaluation.summary import Summary
 from ..figures.picture import Picture
 from ..figures.plane import judged_rows, plane_limits, plane_picture
+from ..figures.plot_files import PlotFiles
 from .experiment_page import check_reportable, report_path
+from .explanation import explanations
 from .markup import document, pictures, section, text
-from .numbers import short_table
+from .numbers import SHORT, short_table
 from .origin import about, how_it_was_made
 from .verdict import verdict
 
@@ -37,6 +39,7 @@ def write_overview(entries: Sequence[Entry], path: Path, command: str = "") -> P
     """
     for entry in entries:
         check_reportable(*entry)
+    files = PlotFiles(path)
     names = ", ".join(experiment.name for experiment, _ in entries)
     blocks = [
         (f'<a href="{_link(experiment, path)}">{text(experiment.name)}</a>', experiment, summary)
@@ -47,10 +50,12 @@ def write_overview(entries: Sequence[Entry], path: Path, command: str = "") -> P
             f"<header><h1>{len(entries)} experiments</h1><p>{text(names)}</p></header>",
             section("In a sentence each", _verdicts(entries, path)),
             section("In numbers", short_table(blocks)),
-            section("Return against cost", _planes(entries)),
+            section("Return against cost", _planes(entries, files)),
+            section("What each number is", explanations(SHORT)),
             section("How it was made", how_it_was_made(command)),
         )
     )
+    files.write()
     write_text(path, document(f"{names}: safe-wrappers overview", body))
     return path
 
@@ -64,7 +69,7 @@ def _verdicts(entries: Sequence[Entry], path: Path) -> str:
     )
 
 
-def _planes(entries: Sequence[Entry]) -> str:
+def _planes(entries: Sequence[Entry], files: PlotFiles) -> str:
     arms = list(dict.fromkeys(arm.name for experiment, _ in entries for arm in experiment.arms))
     drawn = []
     for at, (experiment, summary) in enumerate(entries):
@@ -76,7 +81,7 @@ def _planes(entries: Sequence[Entry]) -> str:
         limits = plane_limits(evaluated) if evaluated else None
         drawn.append(plane_picture(summary, arms, f"plane-{at}", experiment.name, limits))
     return (
-        pictures(drawn)
+        pictures(drawn, files)
         + "<p>Experiments on the same task share their axes; an arm's name has one colour.</p>"
     )
 

@@ -9,9 +9,10 @@ from ..evaluation.curves import event_rate, learning_curve
 from ..evaluation.episode_selection import Pair, compared_pairs, shown_episode
 from ..evaluation.evaluate import evaluated_steps, evaluation_folder
 from ..evaluation.has_cost import judged_by
+from ..evaluation.metrics import OF_THE_FILTER
 from ..evaluation.scene import Scene, load_scenes
 from ..evaluation.step_log import MOST_STEPS, StepLog, pool
-from ..evaluation.summary import OF_THE_FILTER, SEEDS_FOR_AN_INTERVAL, Summary, over_seeds
+from ..evaluation.summary import SEEDS_FOR_AN_INTERVAL, Summary, over_seeds
 from ..figures.constraints import constraints_picture
 from ..figures.corrections import corrections_picture
 from ..figures.curve import curve_picture
@@ -19,9 +20,11 @@ from ..figures.episode_timeline import changes_picture, failures_picture
 from ..figures.finals import finals_picture
 from ..figures.picture import Picture
 from ..figures.plane import plane_picture
+from ..figures.plot_files import PlotFiles
 from ..figures.scenes import scene_frame, scene_picture
 from ..figures.training_timeline import training_timeline_picture
 from ..figures.where import choose_view, where_picture
+from ..run.training import FINISHED_FILE
 from .markup import pictures, text
 
 _CURVES = {
@@ -46,7 +49,7 @@ def table_note(experiment: ExperimentConfig, summary: Summary) -> str:
     )
 
 
-def from_above(experiment: ExperimentConfig) -> str:
+def from_above(experiment: ExperimentConfig, files: PlotFiles) -> str:
     """The shown episode seen from above, for tasks that publish where things are."""
     shown = shown_episode(experiment)
     if shown is None:
@@ -77,7 +80,7 @@ def from_above(experiment: ExperimentConfig) -> str:
         )
         for (arm, condition), scene in scenes.items()
     ]
-    return pictures(drawn)
+    return pictures(drawn, files)
 
 
 def which_episode(experiment: ExperimentConfig) -> str:
@@ -86,7 +89,7 @@ def which_episode(experiment: ExperimentConfig) -> str:
     return f"<p>{text(shown.reason)}</p>" if shown else ""
 
 
-def outcome(experiment: ExperimentConfig, summary: Summary) -> str:
+def outcome(experiment: ExperimentConfig, summary: Summary, files: PlotFiles) -> str:
     """Return against cost, and each with its seeds as dots."""
     names = _names(experiment)
     judged = summary.judged
@@ -97,10 +100,10 @@ def outcome(experiment: ExperimentConfig, summary: Summary) -> str:
     ]
     drawn = [item for item in finals if item.svg]
     plane = [plane_picture(summary, names)] if judged else []
-    return pictures([*plane, *drawn] or finals[:1])  # of nothing, that nothing has been evaluated
+    return pictures([*plane, *drawn] or finals[:1], files)  # of nothing, that nothing has been evaluated
 
 
-def interventions(experiment: ExperimentConfig) -> str:
+def interventions(experiment: ExperimentConfig, files: PlotFiles) -> str:
     """How large, which constraint, where, and when in an episode; from the recorded steps."""
     names = _names(experiment)
     acting = dict(_logs(experiment, "filter_on"))
@@ -128,10 +131,10 @@ def interventions(experiment: ExperimentConfig) -> str:
             f"From the first {MOST_STEPS:,} steps of each run; {left_out:,} more were evaluated but not kept."
         )
     note = f"<p>{' '.join(notes)}</p>" if notes else ""
-    return pictures(items) + note
+    return pictures(items, files) + note
 
 
-def training(experiment: ExperimentConfig, summary: Summary) -> str:
+def training(experiment: ExperimentConfig, summary: Summary, files: PlotFiles) -> str:
     """Learning curves with every seed, and when the filter was at a loss."""
     names = _names(experiment)
     filtered = [arm for arm in experiment.arms if arm.filter.kind != "none"]
@@ -166,7 +169,18 @@ def training(experiment: ExperimentConfig, summary: Summary) -> str:
     seeds = len(experiment.seeds)
     band = "range" if seeds < SEEDS_FOR_AN_INTERVAL else "bootstrap 95 % interval"
     told = f"<p>Faint lines are seeds, the band is the {band} over them.</p>" if seeds > 1 else ""
-    return pictures(items) + told
+    return pictures(items, files) + told
+
+
+def runs_note(experiment: ExperimentConfig) -> str:
+    """What the runs' table is of."""
+    running = sum(
+        not (experiment.run_folder(arm, seed) / FINISHED_FILE).exists()
+        for arm in experiment.arms
+        for seed in experiment.seeds
+    )
+    left = f" Not finished: {running} of {len(experiment.arms) * len(experiment.seeds)}." if running else ""
+    return f"<p>Training only: all episodes of each run, with what the policy was at the time.{left}</p>"
 
 
 def notes(experiment: ExperimentConfig, summary: Summary) -> str:

@@ -60,12 +60,13 @@ figure {
 figcaption { font-size: 14px; color: var(--soft); }
 .told { grid-row: span 4; align-self: start; }
 .told h3 { color: inherit; font-size: 15px; }
-.told p { color: var(--soft); margin-top: 8px; }
+.figures .told p { color: var(--soft); margin-top: 8px; }
 svg { width: 100%; height: auto; display: block; }
 svg text { font-family: inherit; }
 img { width: 100%; height: auto; display: block; border-radius: 6px; }
 .figures p, .films p { margin: 0; }
 .keys { font-size: 13px; margin: 0; line-height: 1.7; }
+section > .keys { margin-bottom: 8px; }
 .key { display: inline-block; margin-right: 14px; }
 .key i { display: inline-block; margin-right: 6px; vertical-align: middle; border: 0 solid var(--mark-color); }
 .key .fill { width: 11px; height: 11px; border-radius: 3px; background: var(--mark-color); }
@@ -75,11 +76,26 @@ b.bad, .value.bad { color: var(--bad); }
 .key .disc { width: 11px; height: 11px; border-radius: 6px; background: var(--mark-color); }
 .key .line, .key .dot { width: 20px; height: 0; border-top-width: 3px; }
 .key .dot { border-top-style: dotted; }
+a.csv { font-size: 13px; white-space: nowrap; }
+a.number { color: inherit; text-decoration: underline dotted; text-underline-offset: 3px; }
+a.number:hover { color: var(--arm1); }
+.numbers {
+  display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 420px), 1fr)); gap: 4px 28px; margin: 0;
+}
+.numbers > div { padding: 6px 8px; margin: 0 -8px; border-radius: 6px; scroll-margin-top: 12px; }
+.numbers > div:target { background: color-mix(in srgb, var(--mark) 18%, transparent); }
+.numbers dt { font-size: 15px; font-weight: 600; }
+.numbers dd { margin: 0; font-size: 14px; color: var(--soft); }
+.numbers code { font-size: 12px; color: var(--soft); font-weight: 400; overflow-wrap: anywhere; }
 .wide { overflow-x: auto; }
 table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; font-size: 15px; }
 th, td { text-align: right; padding: 6px 10px; border-bottom: 1px solid var(--line); white-space: nowrap; }
 thead th { font-size: 13px; color: var(--soft); font-weight: 600; }
 th:first-child, td:first-child { text-align: left; padding-left: 0; }
+.runs { font-size: 14px; }
+.runs th, .runs td { padding: 6px 7px; }
+.runs th:first-child { padding-left: 0; }
+.runs thead th { white-space: normal; vertical-align: bottom; }
 .short th:first-child { position: sticky; left: 0; background: var(--paper); }
 tbody th { font-weight: 400; }
 .condition th, .arm th { font-weight: 700; padding-top: 14px; }

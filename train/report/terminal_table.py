@@ -6,7 +6,8 @@ from rich.table import Table
 
 from ..config import ExperimentConfig
 from ..evaluation.has_cost import judged_by
-from ..evaluation.summary import CONDITIONS, METRICS, NOT_JUDGED, OF_THE_JUDGE, Estimate, Summary, over_seeds
+from ..evaluation.metrics import METRICS, NOT_JUDGED, OF_THE_JUDGE
+from ..evaluation.summary import CONDITIONS, Estimate, Summary, over_seeds
 
 _ALWAYS = ("cost", "violations")
 """A reader looks for these, and is told if they are not judged."""

@@ -1,0 +1,288 @@
+"""The films of docs/gallery.md, a task each, without and with the filter side by side; and the page itself.
+
+    MUJOCO_GL=osmesa python -m benchmarks.gallery [--frames FOLDER] [NAME ...]
+
+Nothing is trained: the filters, the judges and the seeded drivers are those of docs/results/standard-envs.md. Both
+sides begin with the same reset and have the same driver, which reads its own side's state.
+"""
+
+import argparse
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from PIL import Image, ImageDraw
+
+import safe_wrappers as sw
+from benchmarks.cases import PROTECTED, Case
+from benchmarks.moving_picture import CHANGED_TEXT, GAP, INK, PAPER, VIOLATED, encode, font
+from benchmarks.mujoco_drivers import Maker
+from safe_wrappers.drawing.scene import find_renderer, set_size
+
+ROOT = Path(__file__).parents[1]
+PAGE, FILMS = ROOT / "docs" / "gallery.md", ROOT / "docs" / "static" / "gallery"
+COUNTS = Path(__file__).parent / "results" / "gallery.json"
+PANEL, HEAD, FOOT, QUALITY = 320, 24, 24, 40
+FRAMES, FRAME_MS = 40, 125
+"""Of a film: five seconds."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One film.
+
+    Attributes:
+        case: Of `benchmarks.cases.PROTECTED`: env, filter and judge.
+        driver: Of the case's drivers.
+        does: What the driver does, in words.
+        keeps: What the filter keeps, in words.
+        stride: Control steps per frame.
+        seed: Of the first reset, and of the driver.
+        skip: Control steps before the first frame.
+        strength: Times the driver's action.
+        camera: What is different from the env's own.
+    """
+
+    case: str
+    driver: str
+    does: str
+    keeps: str
+    stride: int
+    seed: int = 0
+    skip: int = 0
+    strength: float = 1.0
+    camera: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def maker(self) -> Maker:
+        """Makes the driver."""
+        return PROTECTED[self.case].drivers[self.driver]
+
+
+_FIELD = {"distance": 4.3, "elevation": -68.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.3, 0.0])}
+_STRAIGHT = "straight into one hazard after another"
+SCENES = {
+    "point-goal-1": Scene(
+        "SafePointGoal1-v0", "hazard-seeking", _STRAIGHT, "out of the hazards", 10, camera=_FIELD
+    ),
+    "point-goal-2": Scene(
+        "SafePointGoal2-v0", "goal-seeking", "straight to the goal, whatever is in between", "out of the hazards",
+        14, camera=_FIELD,
+    ),
+    "car-goal-1": Scene(
+        "SafeCarGoal1-v0", "hazard-seeking", _STRAIGHT, "out of the hazards", 8, strength=50.0, camera=_FIELD
+    ),
+    "crossing": Scene(
+        "OccludedCrossing-v0", "goal-seeking", "straight across the road, looking ahead",
+        "clear of cars that pillars hide", 6,
+    ),
+    "patrols": Scene(
+        "PatrolledPointMaze-v0", "patrol-seeking", "straight at the nearest patrol",
+        "clear of patrols that walls hide, and of the walls", 6,
+    ),
+    "rover": Scene(
+        "SafeRover-v0", "full throttle and reverse", "full throttle, then full reverse",
+        "the wheels' slip below 0.2", 4, camera={"distance": 6.0},
+    ),
+    "teleop": Scene(
+        "TeleopContact-v0", "clamp-seeking", "towards the clamp, now and then a little back",
+        "the tool off the clamp", 30,
+    ),
+    "flex-joint": Scene(
+        "FlexJointReach-v0", "speed-seeking", "every motor pushes its joint the way that it moves",
+        "both joints below 8 rad/s", 3,
+    ),
+    "fetch": Scene(
+        "FetchReach-v4", "table-seeking", "the gripper down into the table, and about",
+        "the gripper in its box and off the table", 2,
+        camera={"distance": 1.9, "elevation": -20.0, "azimuth": 140.0, "lookat": np.array([1.3, 0.75, 0.55])},
+    ),
+    "cheetah": Scene(
+        "SafeHalfCheetahVelocity-v0", "pulse", "random corners of the action space, held for 15 steps",
+        "the speed below 3.21 m/s", 2,
+    ),
+    "reacher": Scene(
+        "Reacher-v5", "speed-seeking", "every motor pushes its joint the way that it moves",
+        "both joints below 5 rad/s", 2,
+        camera={"distance": 0.8, "elevation": -70.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.04, 0.0])},
+    ),
+}  # fmt: skip
+
+
+@dataclass
+class Count:
+    """What happened on one side while it was filmed."""
+
+    steps: int = 0
+    violations: int = 0
+    changed: int = 0
+
+
+class Judged(gym.Wrapper[Any, Any, Any, Any]):
+    """Writes what the case's judge says of every step into info, where the overlay finds it."""
+
+    def __init__(self, env: gym.Env[Any, Any], case: Case) -> None:
+        super().__init__(env)
+        self._judge = case.judge(env.unwrapped)
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode."""
+        found = self.env.reset(**options)
+        self._judge.start()
+        return found
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """One control step, judged."""
+        self._judge.before()
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        missed = self._judge.after(info.get("executed_action", action), info)
+        return observation, reward, terminated, truncated, info | {"cost_substep": float(not missed <= 0.0)}
+
+
+class Side:
+    """One side of a film.
+
+    Args:
+        scene: What is filmed.
+        filtered: Whether the filter is on.
+    """
+
+    def __init__(self, scene: Scene, filtered: bool) -> None:
+        case = PROTECTED[scene.case]
+        env = case.make(render_mode="rgb_array")
+        set_size(env, PANEL, PANEL)
+        renderer: Any = find_renderer(env)
+        renderer.default_cam_config = {**(renderer.default_cam_config or {}), **scene.camera}
+        self.count, self.filtered, self._scene, self._seed = Count(), filtered, scene, scene.seed
+        self.env = sw.SafetyOverlay(Judged(case.protect(env) if filtered else env, case))
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin the next episode."""
+        self.env.reset(seed=self._seed)
+        self._act = self._scene.maker(self.env.unwrapped, np.random.default_rng(self._seed))
+        self._seed += 1
+
+    def step(self, counted: bool) -> None:
+        """One control step; a new episode where this one ends."""
+        action = np.asarray(self._scene.strength * self._act(), dtype=self.env.action_space.dtype)
+        _, _, terminated, truncated, info = self.env.step(action)
+        if counted:
+            self.count.steps += 1
+            self.count.violations += bool(info["cost_substep"])
+            self.count.changed += bool(info.get("cbf/intervened", False))
+        if terminated or truncated:
+            self.reset()
+
+    def frame(self) -> Image.Image:
+        """The picture of now, with what was counted so far below it."""
+        whole = Image.new("RGB", (PANEL, HEAD + PANEL + FOOT), PAPER)
+        whole.paste(Image.fromarray(np.asarray(self.env.render(), dtype=np.uint8)), (0, HEAD))
+        draw = ImageDraw.Draw(whole)
+        draw.text((2, 3), "filter on" if self.filtered else "filter off", INK, font(14, bold=True))
+        count = self.count
+        hurt = VIOLATED if count.violations else INK
+        draw.text((2, HEAD + PANEL + 4), f"{count.violations} steps in violation", hurt, font(14, bold=True))
+        if self.filtered:
+            changed = f"{count.changed / max(count.steps, 1):.0%} changed"
+            draw.text((PANEL - 2, HEAD + PANEL + 5), changed, CHANGED_TEXT, font(13), anchor="ra")
+        return whole
+
+
+def film(scene: Scene) -> tuple[list[Image.Image], float, dict[str, Count]]:
+    """The frames, how many times faster than real they are to be shown, and the counts of both sides."""
+    sides = [Side(scene, filtered) for filtered in (False, True)]
+    for _ in range(scene.skip):
+        for side in sides:
+            side.step(counted=False)
+    frames = []
+    for _ in range(FRAMES):
+        for _ in range(scene.stride):
+            for side in sides:
+                side.step(counted=True)
+        whole = Image.new("RGB", (2 * PANEL + GAP, HEAD + PANEL + FOOT), PAPER)
+        for k, side in enumerate(sides):
+            whole.paste(side.frame(), (k * (PANEL + GAP), 0))
+        frames.append(whole)
+    task: Any = sides[0].env.unwrapped
+    for side in sides:
+        side.env.close()
+    return frames, 1000 * scene.stride * task.dt / FRAME_MS, {"off": sides[0].count, "on": sides[1].count}
+
+
+def page(counts: dict[str, dict[str, Any]]) -> str:
+    """The gallery in Markdown.
+
+    Args:
+        counts: Of every film, as `COUNTS` holds them.
+    """
+    return _HEAD + "\n".join(_section(name, SCENES[name], counts[name]) for name in SCENES)
+
+
+_HEAD = """# Gallery
+
+Every task twice: without the filter at the left, with it at the right. Both sides begin with the same reset, and the
+same seeded driver acts on both; nothing is trained. A film is five seconds long and goes round. Who judges, and what
+else was tried: [standard envs](results/standard-envs.md). What the marks and the strip mean:
+[`SafetyOverlay`](wrappers/safety-overlay.md). All of it, this page too, is made by `make gallery`.
+
+"""
+
+
+def _section(name: str, scene: Scene, counted: dict[str, Any]) -> str:
+    off, on = Count(**counted["off"]), Count(**counted["on"])
+    times = counted["times"]
+    speed = f"{times:.2g} times faster than real" if times > 1 else f"{1 / times:.2g} times slower than real"
+    said = (
+        f"Driver: {scene.does} (`{scene.driver}`). The filter keeps {scene.keeps}. In violation:"
+        f" {_of(off)} without it, {_of(on)} with it, which changed {on.changed / on.steps:.0%} of the actions."
+        f" Shown {speed}."
+    )
+    return f"""## {scene.case.removesuffix("-v0")}
+
+```{{image}} static/gallery/{name}.webp
+:alt: {scene.case}, filter off at the left and on at the right. {said.replace("`", "")}
+:width: {2 * PANEL + GAP}px
+```
+
+{said.replace("%", " %")}
+"""
+
+
+def _of(count: Count) -> str:
+    return (
+        f"{count.violations} of {count.steps} steps" if count.violations else f"none of {count.steps} steps"
+    )
+
+
+def main() -> None:
+    """Film all tasks, or some, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("names", nargs="*", default=list(SCENES), metavar="NAME", help=", ".join(SCENES))
+    parser.add_argument("--frames", type=Path, help="a folder for PNGs of every tenth frame, to look at")
+    arguments = parser.parse_args()
+    FILMS.mkdir(parents=True, exist_ok=True)
+    for name in arguments.names:
+        frames, times, counts = film(SCENES[name])
+        data = encode(frames, FRAME_MS, QUALITY)
+        (FILMS / f"{name}.webp").write_bytes(data)
+        if arguments.frames is not None:
+            arguments.frames.mkdir(parents=True, exist_ok=True)
+            for k, frame in enumerate(frames[::10]):
+                frame.save(arguments.frames / f"{name}-{k}.png")
+        known = json.loads(COUNTS.read_text()) if COUNTS.exists() else {}
+        known[name] = {"times": round(times, 3)} | {side: asdict(count) for side, count in counts.items()}
+        COUNTS.write_text(
+            json.dumps({name: known[name] for name in SCENES if name in known}, indent=1) + "\n"
+        )
+        print(f"{name}: {len(data) / 1e3:.0f} kB, {known[name]}", flush=True)
+    if known.keys() == SCENES.keys():
+        PAGE.write_text(page(known), encoding="utf-8")
+        print(PAGE)
+
+
+if __name__ == "__main__":
+    main()
