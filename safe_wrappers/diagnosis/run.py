@@ -70,7 +70,8 @@ def diagnose(
 
     Args:
         env: With a one-dimensional Box action space. It is stepped and reset, and otherwise left as it is.
-        policy: A function of the observation, or a model with `predict(observation, deterministic=True)`.
+        policy: A function of the observation, or a model with `predict(observation, deterministic=True)`. A function
+            that has `reset()` is told so where an episode begins.
         steps: Control steps of each driver.
         seed: Of drivers and resets.
         symptoms: Names, of `safe_wrappers.diagnosis.SYMPTOMS`; None looks for all.
