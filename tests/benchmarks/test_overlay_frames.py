@@ -7,9 +7,9 @@ import pytest
 
 pytest.importorskip("gymnasium_robotics")
 
-from PIL import Image  # noqa: E402
+from PIL import Image
 
-from benchmarks.overlay_frames import FOLDER, HEIGHT, SCENES, WIDTH  # noqa: E402
+from benchmarks.overlay_frames import FOLDER, HEIGHT, SCENES, WIDTH
 
 PAGE = Path(__file__).parents[2] / "docs" / "wrappers" / "safety-overlay.md"
 
