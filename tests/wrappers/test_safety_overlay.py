@@ -14,7 +14,7 @@ import safe_wrappers as sw
 from benchmarks import car_drivers
 from safe_wrappers import info as keys
 from safe_wrappers.drawing.arrows import arrows
-from safe_wrappers.drawing.scene import MOST_MARKS, find_renderer, put
+from safe_wrappers.drawing.scene import MOST_MARKS, find_renderer, put, set_size
 from safe_wrappers.envs.safe_rover import WHEELS
 from safe_wrappers.errors import ConfigurationError
 
@@ -248,6 +248,14 @@ def test_the_renderer_of_a_maze_is_its_robot_s():
     env = gym.make("PatrolledPointMaze-v0", render_mode="rgb_array")
     assert find_renderer(env) is env.unwrapped.point_env.mujoco_renderer
     assert find_renderer(Plain()) is None
+
+
+def test_a_size_is_set_where_mujoco_draws():
+    env = gym.make(TASK, render_mode="rgb_array")
+    set_size(env, 320, 200)
+    renderer, drawn = find_renderer(env), env.unwrapped.model.vis.global_
+    assert (renderer.width, renderer.height) == (drawn.offwidth, drawn.offheight) == (320, 200)
+    set_size(Plain(), 320, 200)
 
 
 # Arrows -------------------------------------------------------------------------------------------------------
