@@ -10,7 +10,8 @@ from typing import Any, Final
 from ..atomic import write_text
 from ..config import ArmConfig, FilterConfig
 from ..evaluation.evaluate import conditions
-from ..evaluation.summary import CONDITIONS, METRICS, NOT_JUDGED, OF_THE_JUDGE, episode_file, number, seed_row
+from ..evaluation.metrics import METRICS, NOT_JUDGED, OF_THE_JUDGE
+from ..evaluation.summary import CONDITIONS, episode_file, number, seed_row
 from ..run.portable import CONFIG, FILTER, POLICY
 from ..tables import read_rows
 
