@@ -1,4 +1,4 @@
-"""The one-way arrows: control <- plants <- drawing <- filter <- constraints <- wrappers <- sb3, diagnosis, train; envs aside."""
+"""The one-way arrows: control <- plants <- drawing <- filter <- constraints <- wrappers <- sb3, diagnosis, train."""
 
 import ast
 import subprocess
