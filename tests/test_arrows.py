@@ -1,4 +1,4 @@
-"""The one-way arrows: control <- plants <- filter <- constraints <- wrappers <- sb3, diagnosis, train; envs aside."""
+"""The one-way arrows: control <- plants <- drawing <- filter <- constraints <- wrappers <- sb3, diagnosis, train; envs aside."""
 
 import ast
 import subprocess
@@ -14,6 +14,7 @@ LAYERS = {
     "control": ROOT / "safe_wrappers" / "control",
     "appendix": ROOT / "safe_wrappers" / "appendix",
     "plants": ROOT / "safe_wrappers" / "plants",
+    "drawing": ROOT / "safe_wrappers" / "drawing",
     "filter": ROOT / "safe_wrappers" / "filter",
     "constraints": ROOT / "safe_wrappers" / "constraints",
     "wrappers": ROOT / "safe_wrappers" / "wrappers",
@@ -24,13 +25,14 @@ LAYERS = {
 }
 COMMON = {"checks", "deprecation", "errors", "info"}
 """Single modules at the top that every layer may use; `protect` and the package itself are the top."""
-BELOW_WRAPPERS = {"control", "plants", "filter", "constraints", "serialize", "stack", *COMMON}
+BELOW_WRAPPERS = {"control", "plants", "drawing", "filter", "constraints", "serialize", "stack", *COMMON}
 MAY_USE = {
     "control": {"control", "checks", "errors"},
     "appendix": {"appendix", "control", "plants", "checks", "errors"},
     "plants": {"control", "plants", *COMMON},
-    "filter": {"control", "plants", "filter", *COMMON},
-    "constraints": {"control", "plants", "filter", "constraints", *COMMON},
+    "drawing": {"plants", "drawing", *COMMON},
+    "filter": {"control", "plants", "drawing", "filter", *COMMON},
+    "constraints": {"control", "plants", "drawing", "filter", "constraints", *COMMON},
     "wrappers": {"wrappers", *BELOW_WRAPPERS},
     "sb3": {"wrappers", "sb3", *BELOW_WRAPPERS},
     "diagnosis": {"wrappers", "diagnosis", "protect", "", *BELOW_WRAPPERS},
@@ -43,6 +45,7 @@ FORBIDDEN = {
     "appendix": LEARNERS | {"gymnasium"},
     "filter": LEARNERS | {"gymnasium", "mujoco"},
     "plants": LEARNERS,
+    "drawing": LEARNERS,
     "constraints": LEARNERS,
     "wrappers": LEARNERS,
     "diagnosis": LEARNERS,
