@@ -1,4 +1,7 @@
-"""The one-way arrows: control <- plants <- drawing <- filter <- constraints <- wrappers <- sb3, diagnosis, train; envs aside."""
+"""The one-way arrows: control <- plants <- drawing <- filter <- constraints <- wrappers <- sb3, diagnosis, train.
+
+Envs are aside.
+"""
 
 import ast
 import subprocess
