@@ -1,4 +1,7 @@
-"""The one-way arrows: control <- plants <- drawing <- filter <- constraints <- wrappers <- sb3, diagnosis, train."""
+"""The one-way arrows: control <- plants <- drawing <- filter <- constraints <- wrappers <- sb3, diagnosis, train.
+
+Envs are aside.
+"""
 
 import ast
 import subprocess
@@ -13,8 +16,8 @@ ROOT = Path(__file__).parents[1]
 LAYERS = {
     "control": ROOT / "safe_wrappers" / "control",
     "appendix": ROOT / "safe_wrappers" / "appendix",
-    "drawing": ROOT / "safe_wrappers" / "drawing",
     "plants": ROOT / "safe_wrappers" / "plants",
+    "drawing": ROOT / "safe_wrappers" / "drawing",
     "filter": ROOT / "safe_wrappers" / "filter",
     "constraints": ROOT / "safe_wrappers" / "constraints",
     "wrappers": ROOT / "safe_wrappers" / "wrappers",
@@ -25,14 +28,14 @@ LAYERS = {
 }
 COMMON = {"checks", "deprecation", "errors", "info"}
 """Single modules at the top that every layer may use; `protect` and the package itself are the top."""
-BELOW_WRAPPERS = {"control", "drawing", "plants", "filter", "constraints", "serialize", "stack", *COMMON}
+BELOW_WRAPPERS = {"control", "plants", "drawing", "filter", "constraints", "serialize", "stack", *COMMON}
 MAY_USE = {
     "control": {"control", "checks", "errors"},
     "appendix": {"appendix", "control", "plants", "checks", "errors"},
-    "drawing": {"control", "plants", "drawing", *COMMON},
     "plants": {"control", "plants", *COMMON},
-    "filter": {"control", "drawing", "plants", "filter", *COMMON},
-    "constraints": {"control", "drawing", "plants", "filter", "constraints", *COMMON},
+    "drawing": {"plants", "drawing", *COMMON},
+    "filter": {"control", "plants", "drawing", "filter", *COMMON},
+    "constraints": {"control", "plants", "drawing", "filter", "constraints", *COMMON},
     "wrappers": {"wrappers", *BELOW_WRAPPERS},
     "sb3": {"wrappers", "sb3", *BELOW_WRAPPERS},
     "diagnosis": {"wrappers", "diagnosis", "protect", "", *BELOW_WRAPPERS},
@@ -44,8 +47,8 @@ FORBIDDEN = {
     "control": LEARNERS | {"gymnasium", "mujoco"},
     "appendix": LEARNERS | {"gymnasium"},
     "filter": LEARNERS | {"gymnasium", "mujoco"},
-    "drawing": LEARNERS,
     "plants": LEARNERS,
+    "drawing": LEARNERS,
     "constraints": LEARNERS,
     "wrappers": LEARNERS,
     "diagnosis": LEARNERS,

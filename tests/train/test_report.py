@@ -184,6 +184,7 @@ def test_what_the_page_says(report):
     for expected in (
         "PPO on fake_task:FilmedGoal-v0, 512 steps, 2 seeds; evaluation on 3 episodes",
         "Steps in violation",
+        "With the filter on, films show what it knows",
         "with the filter, of 1,080 of training and evaluation",
         "Trained without the filter, filter on",
         "return per episode range",

@@ -8,6 +8,11 @@ from ..videos.record import Video, load_video, video_path, video_problem
 from .markup import data_uri, keys, text
 
 _CONDITIONS = {"filter_off": "filter off", "filter_on": "filter on"}
+_KNOWN = (
+    '<p class="line">With the filter on, films show what it knows, where it has a place in the scene: in red what is '
+    "kept free, in yellow the way of a backup, in purple estimates; proposed actions in orange, executed ones in "
+    "blue.</p>"
+)
 
 
 def films(experiment: ExperimentConfig) -> str:
@@ -32,9 +37,10 @@ def films(experiment: ExperimentConfig) -> str:
             "left alone": ("film-bare", "fill"),
         }
     )
+    known = _KNOWN if any(words == _CONDITIONS["filter_on"] for _, words, _ in found) else ""
     parts = "".join(_film(*item) for item in found)
     more = f'<p class="line">{text(problem)}</p>' if problem else ""
-    return f'{marks}<div class="films">{parts}</div>{more}'
+    return f'{marks}{known}<div class="films">{parts}</div>{more}'
 
 
 def _film(arm: ArmConfig, words: str, video: Video) -> str:
