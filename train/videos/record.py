@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -152,7 +152,8 @@ def record_video(
     """
     checkpoint = finished_checkpoint(arm, shown.seed, run_folder)
     policy = TrainedPolicy(arm, checkpoint)
-    env = make_stack(arm.env, used, arm.learner.in_evaluation, "rgb_array")
+    filmed = replace(arm.env, kwargs={**arm.env.kwargs, "render_mode": "rgb_array"})
+    env = make_stack(filmed, used, arm.learner.in_evaluation)
     # One speed for all conditions, also where one of them ends early.
     longest = env.spec.max_episode_steps if env.spec is not None else None
     judged = False
