@@ -58,11 +58,18 @@ def said(experiment):
     return console.file.getvalue()
 
 
-def test_every_arm_is_filmed_in_the_same_episode_with_the_filter_off_and_on(evaluated, inline):
+def test_every_arm_is_filmed_in_the_same_episode_with_the_filter_off_and_on(evaluated, inline, monkeypatch):
+    tracked = []
+    monkeypatch.setattr(videos, "track_film", lambda arm, *film: tracked.append((arm.name, *film)))
     experiment = evaluated("arms.filtered.filter.kwargs.margin=0.6")  # so wide that it acts at once
     assert said(experiment) == ""
     shown = shown_episode(experiment)
     changed = 0
+    assert sorted(tracked) == sorted(
+        (arm.name, 0, experiment.run_folder(arm, 0), name, video_path(experiment, arm, name), 512)
+        for arm in experiment.arms
+        for name in ("filter_off", "filter_on")
+    )
     assert sorted(inline) == [
         f"video {arm} filter {state}" for arm in ("filtered", "unfiltered") for state in ("off", "on")
     ]

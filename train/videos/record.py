@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -155,7 +155,8 @@ def record_video(
     """
     checkpoint = finished_checkpoint(arm, shown.seed, run_folder)
     policy = TrainedPolicy(arm, checkpoint)
-    env = make_stack(arm.env, used, arm.learner.in_evaluation, "rgb_array")
+    filmed = replace(arm.env, kwargs={**arm.env.kwargs, "render_mode": "rgb_array"})
+    env = make_stack(filmed, used, arm.learner.in_evaluation)
     set_size(env, WIDTH, HEIGHT)
     if filter_inside(env) is not None:
         env = SafetyOverlay(env)
