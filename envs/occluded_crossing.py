@@ -54,7 +54,7 @@ _CARS: Final = slice(3, 3 + CARS)  # coordinates: robot x, y, heading, then the 
 _CONTACT_SQUARED: Final = (CAR_RADIUS + ROBOT_RADIUS) ** 2
 _GOAL_BODY: Final = 0  # of the mocap bodies; the pillars follow
 _ASSET: Final = Path(__file__).parent / "assets" / "occluded_crossing.xml"
-_CAMERA: Final = {"distance": 9.0, "elevation": -65.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.4, 0.0])}
+_CAMERA: Final = {"distance": 10.0, "elevation": -60.0, "azimuth": 90.0, "lookat": np.array([0.0, -0.4, 0.0])}
 _NOT_FINITE: Final = "the crossing's state is not finite: a state that was set, or a changed model, broke it"
 
 

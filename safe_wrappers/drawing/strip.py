@@ -94,7 +94,7 @@ class Strip:
         return [state_of(self._info), *words_of(self._info)]
 
     def on(self, frame: Pixels) -> Pixels:
-        """A copy of a frame, shape (height, width, 3), with the strip over its lower edge; too small a one as it is."""
+        """A copy of a frame, shape (height, width, 3), with the strip over its lower edge; a small one as it is."""
         height, width = frame.shape[:2]
         if min(height, width) < _LEAST:
             return frame

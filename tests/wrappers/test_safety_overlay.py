@@ -11,10 +11,10 @@ import pytest
 from gymnasium.spaces import Box
 
 import safe_wrappers as sw
-from benchmarks import car_drivers, drivers
+from benchmarks import car_drivers
 from safe_wrappers import info as keys
 from safe_wrappers.drawing.arrows import arrows
-from safe_wrappers.drawing.scene import MOST_MARKS, find_renderer, put
+from safe_wrappers.drawing.scene import MOST_MARKS, find_renderer, put, set_size
 from safe_wrappers.envs.safe_rover import WHEELS
 from safe_wrappers.errors import ConfigurationError
 
@@ -133,7 +133,10 @@ STACKS = {
     "FetchReach-v4": sw.protect,
     "PatrolledPointMaze-v0": sw.protect,
 }
-DRIVERS = {TASK: drivers.hazard_seeking, "SafeCarGoal1-v0": car_drivers.hazard_seeking}
+DRIVERS = {
+    TASK: lambda env, rng: lambda: np.array([1.0, 0.0]),
+    "SafeCarGoal1-v0": car_drivers.hazard_seeking,
+}
 """Who meets the filter sooner than corners of the action space do."""
 
 
@@ -144,12 +147,12 @@ def episode(env, looking):
     around = {"agent": [0, 0, 0], "hazards": [[0.6, 0.0], [-0.6, 0.0], [0.0, 0.6], [0.0, -0.6]]}
     seen = [env.reset(seed=0, options={"layout": around} if act else None)]
     space = env.action_space
-    for step in range(150 if act else 60):
+    for step in range(100 if act else 40):
         if act:
             action = act()
         elif step % 10 == 0:
             action = np.where(rng.random(space.shape) < 0.5, space.low, space.high)
-        if looking and step % 3:
+        if looking and step % 3 == 0:
             env.marks()
             env.marks()
         seen.append(env.step(action.astype(space.dtype)))
@@ -245,6 +248,14 @@ def test_the_renderer_of_a_maze_is_its_robot_s():
     env = gym.make("PatrolledPointMaze-v0", render_mode="rgb_array")
     assert find_renderer(env) is env.unwrapped.point_env.mujoco_renderer
     assert find_renderer(Plain()) is None
+
+
+def test_a_size_is_set_where_mujoco_draws():
+    env = gym.make(TASK, render_mode="rgb_array")
+    set_size(env, 320, 200)
+    renderer, drawn = find_renderer(env), env.unwrapped.model.vis.global_
+    assert (renderer.width, renderer.height) == (drawn.offwidth, drawn.offheight) == (320, 200)
+    set_size(Plain(), 320, 200)
 
 
 # Arrows -------------------------------------------------------------------------------------------------------

@@ -103,7 +103,7 @@ class BoundContactFeasibility(BoundSlacks):
         return np.minimum(self.insides(control), self.spec.margin) + self.spec.tolerance - self.spec.margin
 
     def draw(self) -> list[Mark]:
-        """At every contact as MuJoCo has it now the narrowed cone, and in it the force; the weight would be as long."""
+        """At every contact as MuJoCo has it now the narrowed cone, and in it the force; the weight is as long."""
         now, found = contacts_now(self.plant), []
         tall = _DRAWN * float(self.plant.model.stat.extent)
         for i in np.flatnonzero(self._index[now.body] >= 0):
