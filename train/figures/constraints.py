@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from ..evaluation.step_log import StepLog
+from ..tables import Row
 from .canvas import arm_color, arm_key, draw
 from .picture import Key, Picture, Plotted, per_arm
 
@@ -50,7 +51,7 @@ def constraints_picture(logs: Mapping[str, StepLog], arms: list[str]) -> Picture
 
     keys: dict[str, Key] = {arm: (arm_key(arms.index(arm)), "fill") for arm in shares}
     height = 0.8 + 0.35 * len(names) * max(1.0, 0.6 * len(shares))
-    rows = [
+    rows: list[Row] = [
         {"arm": arm, "constraint": name, "percent_of_steps": float(share)}
         for arm, of_arm in shares.items()
         for name, share in of_arm.items()

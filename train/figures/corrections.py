@@ -11,6 +11,7 @@ from matplotlib.ticker import FuncFormatter
 
 from ..evaluation.step_log import StepLog
 from ..evaluation.summary import number
+from ..tables import Row
 from .canvas import arm_color, arm_key, draw
 from .picture import Key, Picture, Plotted, per_arm
 
@@ -47,7 +48,7 @@ def corrections_picture(logs: Mapping[str, StepLog], arms: list[str]) -> Picture
         axes.set_ylim(bottom=0.7)
 
     keys: dict[str, Key] = {arm: (arm_key(arms.index(arm)), "fill") for arm in changed if len(changed[arm])}
-    rows = [
+    rows: list[Row] = [
         {"arm": arm, "from": float(low), "to": float(high), "steps": int(count)}
         for arm, values in changed.items()
         if len(values)

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from ..evaluation.step_log import StepLog
+from ..tables import Row
 from .canvas import arm_color, arm_key, draw
 from .picture import Key, Look, Picture, Plotted, per_arm
 
@@ -85,7 +86,7 @@ def _timeline(
         for arm, event in shown
     }
     column = "percent_of_steps" if scale == 100.0 else "per_1000_steps"
-    rows = [
+    rows: list[Row] = [
         {"arm": arm, "event": event, "from_step": int(first), "to_step": int(end), column: float(value)}
         for (arm, event), values in shares.items()
         for first, end, value in zip(edges, edges[1:], values, strict=False)

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from ..evaluation.summary import Estimate, Summary, number
+from ..tables import Row
 from .canvas import arm_color, draw
 from .picture import Picture, Plotted
 from .plane import CONDITIONS
@@ -67,7 +68,7 @@ def finals_picture(
         if best[2].iqm == worst[2].iqm == 0:
             axes.set_xlim(-0.08, 1)
 
-    table = [
+    table: list[Row] = [
         {"arm": arm, "filter": CONDITIONS[condition], "what": what, metric: value}
         for arm, condition, estimate in rows
         for what, value in _values(summary, arm, condition, metric, estimate)

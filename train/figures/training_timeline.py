@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import NDArray
 
+from ..tables import Row
 from .canvas import arm_color, arm_key, draw
 from .picture import Key, Picture, Plotted
 
@@ -60,7 +61,7 @@ def training_timeline_picture(
         f"{arm}: {what}": (arm_key(arms.index(arm)), "line" if what == "infeasible" else "dot")
         for arm, what in shown
     }
-    rows = [
+    rows: list[Row] = [
         {
             "arm": arm,
             "event": what,
