@@ -23,7 +23,7 @@ from safe_wrappers.train.evaluation.evaluate import evaluate_run
 from safe_wrappers.train.policies import load_policy
 from safe_wrappers.train.policies.card import write_card
 from safe_wrappers.train.policies.hub import download, upload
-from safe_wrappers.train.run import portable
+from safe_wrappers.train.run import Progress, portable
 from safe_wrappers.train.run.training import train_run
 from safe_wrappers.train.tables import write_rows
 
@@ -153,8 +153,11 @@ def test_a_filter_of_ones_own_is_told_from_none(fake_experiment, tmp_path):
 
 def test_training_for_longer_takes_the_old_policy_away_and_writes_the_new_one(fake_experiment, tmp_path):
     folder = tmp_path / "seed_0"
+    there = []
+    progress = Progress(steps=lambda _: there.append((folder / "policy").exists()), say=print)
     for steps in (128, 256):
-        train_run(fake_experiment(f"total_steps={steps}").arms[1], 0, folder, Reports().progress)
+        train_run(fake_experiment(f"total_steps={steps}").arms[1], 0, folder, progress)
+        assert there and not any(there), "while it trains there is none that is out of date"
         assert json.loads((folder / "policy" / "config.json").read_text())["timesteps"] == steps
         (folder / "policy" / "mine").touch()
     assert not (folder / "policy" / ".policy").exists()
