@@ -41,9 +41,9 @@ class Scene:
         keeps: What the filter keeps, in words.
         stride: Control steps per frame.
         seed: Of the first reset, and of the driver.
-        skip: Control steps before the first frame.
         strength: Times the driver's action.
         camera: What is different from the env's own.
+        follows: The body that the camera looks at; "" where it stands still.
     """
 
     case: str
@@ -52,9 +52,9 @@ class Scene:
     keeps: str
     stride: int
     seed: int = 0
-    skip: int = 0
     strength: float = 1.0
     camera: dict[str, Any] = field(default_factory=dict)
+    follows: str = ""
 
     @property
     def maker(self) -> Maker:
@@ -70,7 +70,7 @@ SCENES = {
     ),
     "point-goal-2": Scene(
         "SafePointGoal2-v0", "goal-seeking", "straight to the goal, whatever is in between", "out of the hazards",
-        14, camera=_FIELD,
+        14, camera=_FIELD | {"distance": 5.6, "lookat": np.array([0.0, -0.5, 0.0])},
     ),
     "car-goal-1": Scene(
         "SafeCarGoal1-v0", "hazard-seeking", _STRAIGHT, "out of the hazards", 8, strength=50.0, camera=_FIELD
@@ -85,7 +85,7 @@ SCENES = {
     ),
     "rover": Scene(
         "SafeRover-v0", "full throttle and reverse", "full throttle, then full reverse",
-        "the wheels' slip below 0.2", 4, camera={"distance": 6.0},
+        "the wheels' slip below 0.2", 4, camera={"distance": 5.0}, follows="rover",
     ),
     "teleop": Scene(
         "TeleopContact-v0", "clamp-seeking", "towards the clamp, now and then a little back",
@@ -93,7 +93,7 @@ SCENES = {
     ),
     "flex-joint": Scene(
         "FlexJointReach-v0", "speed-seeking", "every motor pushes its joint the way that it moves",
-        "both joints below 8 rad/s", 3,
+        "both joints below 8 rad/s", 3, camera={"distance": 1.9, "lookat": np.array([0.0, -0.12, 0.0])},
     ),
     "fetch": Scene(
         "FetchReach-v4", "table-seeking", "the gripper down into the table, and about",
@@ -101,8 +101,9 @@ SCENES = {
         camera={"distance": 1.9, "elevation": -20.0, "azimuth": 140.0, "lookat": np.array([1.3, 0.75, 0.55])},
     ),
     "cheetah": Scene(
-        "SafeHalfCheetahVelocity-v0", "pulse", "random corners of the action space, held for 15 steps",
-        "the speed below 3.21 m/s", 2,
+        "SafeHalfCheetahVelocity-v0", "sprinting", "of random plans the fastest, by the env's own model",
+        "the speed below 3.21 m/s", 4, seed=3,
+        camera={"distance": 4.6, "elevation": -20.0, "azimuth": 90.0}, follows="torso",
     ),
     "reacher": Scene(
         "Reacher-v5", "speed-seeking", "every motor pushes its joint the way that it moves",
@@ -122,7 +123,7 @@ class Count:
 
 
 class Judged(gym.Wrapper[Any, Any, Any, Any]):
-    """Writes what the case's judge says of every step into info, where the overlay finds it."""
+    """Writes what the case's judge says of every step into info, in place of the task's own cost."""
 
     def __init__(self, env: gym.Env[Any, Any], case: Case) -> None:
         super().__init__(env)
@@ -139,7 +140,8 @@ class Judged(gym.Wrapper[Any, Any, Any, Any]):
         self._judge.before()
         observation, reward, terminated, truncated, info = self.env.step(action)
         missed = self._judge.after(info.get("executed_action", action), info)
-        return observation, reward, terminated, truncated, info | {"cost_substep": float(not missed <= 0.0)}
+        verdict = float(not missed <= 0.0)  # what is not a number is a violation
+        return observation, reward, terminated, truncated, info | {"cost": verdict, "cost_substep": verdict}
 
 
 class Side:
@@ -154,8 +156,8 @@ class Side:
         case = PROTECTED[scene.case]
         env = case.make(render_mode="rgb_array")
         set_size(env, PANEL, PANEL)
-        renderer: Any = find_renderer(env)
-        renderer.default_cam_config = {**(renderer.default_cam_config or {}), **scene.camera}
+        self._renderer: Any = find_renderer(env)
+        self._renderer.default_cam_config = {**(self._renderer.default_cam_config or {}), **scene.camera}
         self.count, self.filtered, self._scene, self._seed = Count(), filtered, scene, scene.seed
         self.env = sw.SafetyOverlay(Judged(case.protect(env) if filtered else env, case))
         self.reset()
@@ -166,19 +168,22 @@ class Side:
         self._act = self._scene.maker(self.env.unwrapped, np.random.default_rng(self._seed))
         self._seed += 1
 
-    def step(self, counted: bool) -> None:
+    def step(self) -> None:
         """One control step; a new episode where this one ends."""
         action = np.asarray(self._scene.strength * self._act(), dtype=self.env.action_space.dtype)
         _, _, terminated, truncated, info = self.env.step(action)
-        if counted:
-            self.count.steps += 1
-            self.count.violations += bool(info["cost_substep"])
-            self.count.changed += bool(info.get("cbf/intervened", False))
+        self.count.steps += 1
+        self.count.violations += bool(info["cost_substep"])
+        self.count.changed += bool(info.get("cbf/intervened", False))
         if terminated or truncated:
             self.reset()
 
     def frame(self) -> Image.Image:
         """The picture of now, with what was counted so far below it."""
+        if self._scene.follows:
+            task: Any = self.env.unwrapped
+            camera = self._renderer._get_viewer("rgb_array").cam
+            camera.lookat[:] = task.data.body(self._scene.follows).xpos
         whole = Image.new("RGB", (PANEL, HEAD + PANEL + FOOT), PAPER)
         whole.paste(Image.fromarray(np.asarray(self.env.render(), dtype=np.uint8)), (0, HEAD))
         draw = ImageDraw.Draw(whole)
@@ -195,14 +200,11 @@ class Side:
 def film(scene: Scene) -> tuple[list[Image.Image], float, dict[str, Count]]:
     """The frames, how many times faster than real they are to be shown, and the counts of both sides."""
     sides = [Side(scene, filtered) for filtered in (False, True)]
-    for _ in range(scene.skip):
-        for side in sides:
-            side.step(counted=False)
     frames = []
     for _ in range(FRAMES):
         for _ in range(scene.stride):
             for side in sides:
-                side.step(counted=True)
+                side.step()
         whole = Image.new("RGB", (2 * PANEL + GAP, HEAD + PANEL + FOOT), PAPER)
         for k, side in enumerate(sides):
             whole.paste(side.frame(), (k * (PANEL + GAP), 0))
