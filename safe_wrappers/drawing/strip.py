@@ -1,17 +1,21 @@
 """A strip on a frame: what the step's info says of margin, filter, lease and slip, and the actions as bars."""
 
+from __future__ import annotations
+
 import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
 
 from safe_wrappers import info as keys
 from safe_wrappers.drawing.marks import COLOURS, Array
+
+if TYPE_CHECKING:
+    from PIL import ImageDraw
 
 Pixels = NDArray[np.uint8]
 Colour = tuple[int, int, int]
@@ -95,6 +99,8 @@ class Strip:
 
     def on(self, frame: Pixels) -> Pixels:
         """A copy of a frame, shape (height, width, 3), with the strip over its lower edge; a small one as it is."""
+        from PIL import Image, ImageDraw  # here: who imports the library need not draw
+
         height, width = frame.shape[:2]
         if min(height, width) < _LEAST:
             return frame
@@ -121,6 +127,8 @@ class Strip:
 
     def _write(self, draw: ImageDraw.ImageDraw, left: int, top: int, tall: int, right: int) -> None:
         """The state with its colour, then the numbers, as far as there is room."""
+        from PIL import ImageFont
+
         font = ImageFont.load_default(size=max(9, round(0.6 * tall)))
         state, *rest = self.words
         middle, x = top + tall / 2, left + tall // 4
