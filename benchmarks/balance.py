@@ -1,14 +1,11 @@
-"""Robots on legs that are kept up and go on moving: a trained policy as a shield's backup, a gait inside its cones.
+"""Walker2d, kept up and going on: a shield whose backup is a policy that was trained to stop.
 
-    python -m benchmarks.balance                          # trains what is missing first, an hour on two cores
-    python -m benchmarks.balance --robots Walker2d --episodes 2
+    python -m benchmarks.balance                # trains both policies first if they are missing, a quarter of an hour
+    python -m benchmarks.balance --episodes 2
 
-- **Walker2d**: a policy that was trained to walk for a while, and falls; and one trained to stop, from states that
-  the first one reaches. `PredictiveShield` admits an action if after it the second one brings the robot to rest.
-- **Ant**: a gait that was trained with a price on contact forces outside 0.7 of the friction cone, at the ends of
-  physics steps, judged as in `benchmarks.whole_body`, without and with `WholeBodyFilter`.
-
-Policies act deterministically, on the same episode seeds in every arm. A fall is an episode that the env ended.
+One policy was trained to walk for a while, and falls; another one to stop, from states that the first one reaches.
+`PredictiveShield` admits an action if after it the second one brings the robot to rest. Policies act
+deterministically, on the same episode seeds in every arm. A fall is an episode that the env ended.
 """
 
 import argparse
@@ -19,14 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import safe_wrappers as sw
-from benchmarks import whole_body
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 RESULTS = Path(__file__).parent / "results"
@@ -97,46 +92,6 @@ class Stopping(gym.Wrapper[Any, Any, Any, Any]):
         speed = min(5.0, abs(float(self.env.unwrapped.data.qvel[0])))
         reward = -5.0 if fell else 1.0 - 0.1 * speed - 0.05 * effort
         return observation, reward, fell, self._left == 0, info
-
-
-class Gait(gym.Wrapper[Any, Any, Any, Any]):
-    """Ant's reward for a gait: speed up to 0.6 m/s and staying up, with a price on what its feet slide.
-
-    The price is on control steps with a contact force outside 0.7 of the cone by more than 1 % of the weight at the
-    end of a physics step, one half for the control step and one half shared among its physics steps. It rises from 1
-    to 12 over `rising` steps: asked for still feet at once, PPO finds no gait.
-    """
-
-    def __init__(self, env: Any, rising: int) -> None:
-        super().__init__(env)
-        self._rising, self._steps, self._sliding = rising, 0, 0.0
-        self._model: mujoco.MjModel = env.unwrapped.model
-        self._weight = float(self._model.body_mass.sum() * np.linalg.norm(self._model.opt.gravity))
-        env.unwrapped._step_mujoco_simulation = self._simulate
-
-    def _simulate(self, control: Any, physics_steps: int) -> None:
-        """What the env does, with a look at the contacts after each physics step."""
-        data, wrench, sliding = self.env.unwrapped.data, np.zeros(6), 0
-        data.ctrl[:] = control
-        for _ in range(physics_steps):
-            mujoco.mj_step(self._model, data)
-            excess = 0.0
-            for index in range(data.ncon):
-                if data.contact[index].efc_address >= 0:
-                    mujoco.mj_contactForce(self._model, data, index, wrench)
-                    held = whole_body.SHARE * data.contact[index].friction[0] * wrench[0]
-                    excess = max(excess, float(np.hypot(wrench[1], wrench[2]) - held))
-            sliding += excess > whole_body.TOLERANCE * self._weight
-        mujoco.mj_rnePostConstraint(self._model, data)
-        self._sliding = 0.5 * (sliding > 0) + 0.5 * sliding / physics_steps
-
-    def step(self, action: Any) -> Any:
-        observation, _, fell, late, info = self.env.step(action)
-        self._steps += 1
-        price = 1.0 + 11.0 * min(1.0, self._steps / self._rising)
-        reward = 1.5 * min(1.0, info["x_velocity"] / 0.6) - 0.05 * float(np.sum(np.square(action)))
-        reward += 0.5 + price * (0.7 - self._sliding) - 10.0 * fell
-        return observation, reward, fell, late, info
 
 
 def trained(path: Path, make: Callable[[int], Any], steps: int, **hyperparameters: Any) -> Actor:
@@ -221,7 +176,7 @@ def line(row: Row) -> str:
 
 
 def kept_up(policies: Path, episodes: int, limit: int) -> list[str]:
-    """The first table's lines: Walker2d."""
+    """The table's lines."""
     steps, lines = 400_000, []
 
     def make(_: int) -> Any:
@@ -242,41 +197,18 @@ def kept_up(policies: Path, episodes: int, limit: int) -> list[str]:
     return lines
 
 
-def gait(policies: Path, episodes: int, limit: int) -> list[str]:
-    """The second table's lines: Ant's gait."""
-    steps, lines = 3_000_000, []
-    hyperparameters = {
-        "n_epochs": 8,
-        "gamma": 0.98,
-        "policy_kwargs": {"log_std_init": -1.0, "net_arch": [128, 128]},
-    }
-
-    def make(_: int) -> Any:
-        return Gait(gym.make("Ant-v5", max_episode_steps=500), steps * 6 // (10 * ENVS))
-
-    policy = trained(policies / "Ant_gait", make, steps, **hyperparameters)
-    for arm in ("no filter", "forecast, contacts alone"):
-        lines.append(whole_body.line(whole_body.drive("Ant", arm, policy, episodes, limit)))
-        print(lines[-1], flush=True)
-    return lines
-
-
 def main() -> None:
-    """Train what is missing, print the tables and write them."""
+    """Train what is missing, print the table and write it."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--robots", nargs="+", default=["Walker2d", "Ant"], choices=["Walker2d", "Ant"])
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--limit", type=int, default=500, help="steps per episode at most")
     parser.add_argument("--policies", type=Path, default=Path("runs/balance"), help="where they lie")
     parser.add_argument("--results", type=Path, default=RESULTS)
     given = parser.parse_args()
     text = f"{given.episodes} episodes of at most {given.limit} steps\n"
-    if "Walker2d" in given.robots:
-        text += "\n".join(["", HEADER, *kept_up(given.policies, given.episodes, given.limit), ""])
-    if "Ant" in given.robots:
-        text += "\n".join(["", whole_body.HEADER, *gait(given.policies, given.episodes, given.limit), ""])
+    text += "\n".join(["", HEADER, *kept_up(given.policies, given.episodes, given.limit), ""])
     given.results.mkdir(parents=True, exist_ok=True)
     (given.results / "balance.md").write_text(text)
 
