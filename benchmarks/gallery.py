@@ -69,7 +69,8 @@ SCENES = {
         "SafePointGoal1-v0", "hazard-seeking", _STRAIGHT, "out of the hazards", 10, camera=_FIELD
     ),
     "point-goal-2": Scene(
-        "SafePointGoal2-v0", "goal-seeking", "straight to the goal, whatever is in between", "out of the hazards",
+        "SafePointGoal2-v0", "goal-seeking", "straight to the goal, whatever is in between",
+        "out of the hazards and off the vases",
         14, camera=_FIELD | {"distance": 5.6, "lookat": np.array([0.0, -0.5, 0.0])},
     ),
     "car-goal-1": Scene(
@@ -103,7 +104,7 @@ SCENES = {
     "cheetah": Scene(
         "SafeHalfCheetahVelocity-v0", "sprinting", "of random plans the fastest, by the env's own model",
         "the speed below 3.21 m/s", 4, seed=3,
-        camera={"distance": 4.6, "elevation": -20.0, "azimuth": 90.0}, follows="torso",
+        camera={"distance": 4.4, "elevation": -42.0, "azimuth": 90.0}, follows="torso",
     ),
     "reacher": Scene(
         "Reacher-v5", "speed-seeking", "every motor pushes its joint the way that it moves",
