@@ -107,6 +107,7 @@ figures: .venv/installed
 	$(BIN)/python -m benchmarks.fetch
 	$(BIN)/python -m benchmarks.friction_cones
 	$(BIN)/python -m benchmarks.whole_body
+	$(BIN)/python -m benchmarks.balance
 	$(BIN)/python -m benchmarks.teleop
 	$(BIN)/python -m benchmarks.scaling
 	$(BIN)/python -m benchmarks.wrapper_cost

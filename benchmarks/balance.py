@@ -191,6 +191,7 @@ def kept_up(policies: Path, episodes: int, limit: int) -> list[str]:
         "shield": lambda env: shielded(env, stop, 16),
         "shield, no neighbours": lambda env: shielded(env, stop, 0),
     }
+    print(HEADER)
     for arm, wrap in arms.items():
         lines.append(line(drive(arm, wrap, walk, episodes, limit)))
         print(lines[-1], flush=True)

@@ -114,6 +114,7 @@ def test_metadata(wheel):
         "gymnasium",
         "mujoco",
         "numba",
+        "pillow",
         "qpsolvers",
         "daqp",
         "clarabel",

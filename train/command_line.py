@@ -47,8 +47,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     command = options.command
     for option, commands in _TAKEN_BY.items():
         if getattr(options, option) not in (None, False) and command not in commands:
-            verb = "do" if len(commands) > 1 else "does"
-            parser.error(f"{command} takes no --{option}; {' and '.join(commands)} {verb}")
+            *others, last = commands
+            takers = f"{', '.join(others)} and {last} do" if others else f"{last} does"
+            parser.error(f"{command} takes no --{option}; {takers}")
     options.configs = [Path(word) for word in options.words if "=" not in word]
     options.overrides = [word for word in options.words if "=" in word]
     if command in ("diagnose", "enjoy"):

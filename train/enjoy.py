@@ -15,7 +15,7 @@ from .atomic import write_bytes
 from .evaluation.step_log import is_violation
 from .policies import load_policy
 from .run.policy import TrainedPolicy
-from .videos.film import Film, encode, speed_of, stride_of
+from .videos.film import Film, encode, for_film, speed_of, stride_of
 
 FilterName = Literal["trained", "none", "protect"]
 
@@ -61,7 +61,8 @@ def _drawn(trained: TrainedPolicy, action_filter: FilterName, render_mode: str |
             f"{trained.arm.env.id} draws no {wanted} (its render modes: {', '.join(modes) or 'none'}); try {other},"
             " or leave it out"
         )
-    return trained.make_env(action_filter, render_mode)
+    env = trained.make_env(action_filter, render_mode)
+    return for_film(env) if render_mode == "rgb_array" else env
 
 
 def _episode(trained: TrainedPolicy, env: gym.Env[Any, Any], seed: int, film: _Film | None) -> str:

@@ -11,6 +11,7 @@ from test_run import Reports
 from safe_wrappers.train.cli import main
 from safe_wrappers.train.enjoy import enjoy_command
 from safe_wrappers.train.run.training import train_run
+from safe_wrappers.train.videos.film import STRIP
 
 LINE = r"episode (\d): return -?[\d.]+, 20 steps, (\d+) in violation"
 
@@ -37,7 +38,7 @@ def test_it_films_the_first_episode(run, tmp_path, capsys):
     assert main(["enjoy", str(run), "--episodes", "2", "--output", str(film)]) == 0
     assert f"Film: {film}" in capsys.readouterr().out
     picture = Image.open(io.BytesIO(film.read_bytes()))
-    assert picture.n_frames == 20 and picture.size[1] == 250
+    assert picture.n_frames == 20 and picture.size == (640, 480 + STRIP)
 
 
 def test_what_cannot_be_drawn_is_refused(run, tmp_path, capsys):
@@ -73,7 +74,7 @@ def test_a_window_is_the_task_s_own(run, monkeypatch):
         (["enjoy", "a", "--episodes", "0"], "--episodes: expected at least 1, got 0"),
         (["enjoy", "a", "--render", "--output", "b"], "enjoy takes --render or --output, a window or a film"),
         (["enjoy", "a", "--filter", "nun"], "invalid choice: 'nun'"),
-        (["train", "a.yaml", "--output", "b"], "train takes no --output; report and diagnose and enjoy do"),
+        (["train", "a.yaml", "--output", "b"], "train takes no --output; report, diagnose and enjoy do"),
         (["report", "a.yaml", "--render"], "report takes no --render; enjoy does"),
         (["train", "a.yaml", "b.yaml"], "train takes one CONFIG.yaml; report takes several"),
     ],

@@ -120,10 +120,10 @@ def test_what_the_command_refuses(configs, tmp_path, capsys):
     for arguments, message in (
         (["report", "--output", "x.html"], "the following arguments are required"),
         (["report", "key=value"], "the following arguments are required: CONFIG.yaml"),
-        (["train", *configs], "train takes one CONFIG.yaml and no --output; report does"),
+        (["train", *configs], "train takes one CONFIG.yaml; report takes several"),
         (
             ["compare", configs[0], "--output", "x.html"],
-            "compare takes one CONFIG.yaml and no --output; report does",
+            "compare takes no --output; report, diagnose and enjoy do",
         ),
         (["report", configs[0], "--reprot"], "unrecognized arguments: --reprot"),
     ):

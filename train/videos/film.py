@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+
+from safe_wrappers.drawing.scene import set_size
+from safe_wrappers.wrappers.cbf_action_filter import filter_inside
+from safe_wrappers.wrappers.safety_overlay import SafetyOverlay
 
 WIDTH: Final = 640
 HEIGHT: Final = 480
@@ -26,6 +31,12 @@ _COLORS: Final = {
     "violated": (214, 40, 52),
     "now": (255, 255, 255),
 }
+
+
+def for_film(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
+    """An env that has not been drawn yet, as films show it: as large as they are, and with what its filter does."""
+    set_size(env, WIDTH, HEIGHT)
+    return env if filter_inside(env) is None else SafetyOverlay(env)
 
 
 @dataclass

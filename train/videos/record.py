@@ -10,10 +10,7 @@ from typing import Any, Final
 from rich.console import Console
 
 from safe_wrappers import info as keys
-from safe_wrappers.drawing.scene import set_size
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.wrappers.cbf_action_filter import filter_inside
-from safe_wrappers.wrappers.safety_overlay import SafetyOverlay
 
 from ..atomic import write_bytes, write_json
 from ..config import ArmConfig, EnvConfig, ExperimentConfig, FilterConfig
@@ -25,7 +22,7 @@ from ..run.policy import TrainedPolicy
 from ..run.stack import make_stack
 from ..run.trackers import track_film
 from ..run.training import finished_checkpoint
-from .film import HEIGHT, WIDTH, Film, encode, speed_of, stride_of
+from .film import Film, encode, for_film, speed_of, stride_of
 from .rendering import find_rendering
 
 _PROBLEM: Final = "problem.json"
@@ -156,10 +153,7 @@ def record_video(
     checkpoint = finished_checkpoint(arm, shown.seed, run_folder)
     policy = TrainedPolicy(arm, checkpoint)
     filmed = replace(arm.env, kwargs={**arm.env.kwargs, "render_mode": "rgb_array"})
-    env = make_stack(filmed, used, arm.learner.in_evaluation)
-    set_size(env, WIDTH, HEIGHT)
-    if filter_inside(env) is not None:
-        env = SafetyOverlay(env)
+    env = for_film(make_stack(filmed, used, arm.learner.in_evaluation))
     # One speed for all conditions, also where one of them ends early.
     longest = env.spec.max_episode_steps if env.spec is not None else None
     judged = False
