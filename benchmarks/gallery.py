@@ -25,7 +25,9 @@ from safe_wrappers.drawing.scene import find_renderer, set_size
 ROOT = Path(__file__).parents[1]
 PAGE, FILMS = ROOT / "docs" / "gallery.md", ROOT / "docs" / "static" / "gallery"
 COUNTS = Path(__file__).parent / "results" / "gallery.json"
-PANEL, HEAD, FOOT, QUALITY = 320, 24, 24, 40
+PANEL, HEAD, FOOT = 320, 24, 24
+QUALITIES, MOST_BYTES = (40, 20, 8, 2), 170_000
+"""Of WebP: the first that is small enough."""
 FRAMES, FRAME_MS = 40, 125
 """Of a film: five seconds."""
 
@@ -270,7 +272,10 @@ def main() -> None:
     FILMS.mkdir(parents=True, exist_ok=True)
     for name in arguments.names:
         frames, times, counts = film(SCENES[name])
-        data = encode(frames, FRAME_MS, QUALITY)
+        for quality in QUALITIES:
+            data = encode(frames, FRAME_MS, quality)
+            if len(data) <= MOST_BYTES:
+                break
         (FILMS / f"{name}.webp").write_bytes(data)
         if arguments.frames is not None:
             arguments.frames.mkdir(parents=True, exist_ok=True)

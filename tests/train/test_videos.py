@@ -13,6 +13,7 @@ from safe_wrappers.train.evaluation.scene import load_scenes
 from safe_wrappers.train.processes.parallel import RunsFailedError
 from safe_wrappers.train.run import Progress, train_run
 from safe_wrappers.train.tables import read_rows
+from safe_wrappers.train.videos import film
 from safe_wrappers.train.videos import record as videos
 from safe_wrappers.train.videos.film import HEIGHT
 from safe_wrappers.train.videos.record import load_video, record_videos, video_path, video_problem
@@ -163,7 +164,7 @@ def test_what_a_filter_knows_is_drawn_into_its_film_and_into_no_other(evaluated,
     def fake_filter(env):
         return next((inner for inner in wrappers_of(env) if type(inner).__name__ == "FakeFilter"), None)
 
-    monkeypatch.setattr(videos, "filter_inside", fake_filter)
+    monkeypatch.setattr(film, "filter_inside", fake_filter)
     experiment = evaluated()
     said(experiment)
     for arm in experiment.arms:
