@@ -177,7 +177,7 @@ WALL = Target(
             "return max(constants.low, min(along.control_to_rest_at(constants, x, v, target), constants.high))",
             "return along.control_to_rest_at(constants, x, v, target)",
         ),
-        Mutant("reach + self.spec.margin, clip", "reach, clip"),
+        Mutant("room = reach + self.spec.margin", "room = reach"),
         Mutant("target = start - gap if before else end + gap", "target = start - gap"),
         Mutant("motion[2], motion[3] = now.vx, now.vy", "pass"),
         Mutant("    return left >= -HAIR_M", "    return not left < -HAIR_M"),
