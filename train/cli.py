@@ -62,6 +62,11 @@ def _run(options: argparse.Namespace, console: Console) -> None:
     if options.command == "report":
         _report(options, [parse_experiment(each) for each in settings], console)
         return
+    if options.command == "sweep":
+        from .sweep import sweep_experiment
+
+        sweep_experiment(settings[0], options.configs[0], options.overrides, console)
+        return
 
     from .experiment import evaluate_experiment, summarize_experiment, train_experiment
     from .report import verdict, write_report

@@ -12,6 +12,7 @@ COMMANDS: Final = {
     "train": "train every arm with every seed; a killed run goes on where it was, a finished one is left",
     "evaluate": "evaluate the trained policies on the same episodes, with the filter off and on",
     "compare": "train, evaluate, and print the comparison",
+    "sweep": "search the settings under `sweep` in the config, for the most return at cost zero",
     "report": "write the comparison as one HTML page, from what is already there; of several, also an overview",
     "enjoy": "let a trained policy act, in a window or on film if asked; takes RUN for CONFIG.yaml",
     "push": "upload a run's policy to the Hugging Face hub; takes RUN and owner/name for CONFIG.yaml",

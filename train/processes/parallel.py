@@ -7,7 +7,7 @@ import os
 import signal
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
@@ -51,11 +51,25 @@ class Job:
 
 
 class RunsFailedError(SafeWrappersError):
-    """Some runs of an experiment failed; the others were brought to their end."""
+    """Some runs of an experiment failed; the others were brought to their end.
+
+    Attributes:
+        names: Of the jobs that failed.
+    """
+
+    def __init__(self, message: str, names: Iterable[str] = ()) -> None:
+        super().__init__(message)
+        self.names = frozenset(names)
 
 
 def run_jobs(
-    jobs: Sequence[Job], workers: int | None, console: Console, title: str, before: int = 0, later: int = 0
+    jobs: Sequence[Job],
+    workers: int | None,
+    console: Console,
+    title: str,
+    before: int = 0,
+    later: int = 0,
+    unwanted: Callable[[str], bool] = lambda _: False,
 ) -> None:
     """Runs jobs in parallel, spawned processes, one BLAS and torch thread each.
 
@@ -70,6 +84,8 @@ def run_jobs(
         title: What is going on.
         before: Units of jobs that went before, which count as done.
         later: Units of jobs that will come after these, which are still to do.
+        unwanted: Asked often, by a job's name, whether nobody needs it any more: it is stopped like by a signal, or not
+            begun, and that is no failure.
 
     Raises:
         RunsFailedError: At least one job failed; holds all their messages.
@@ -79,6 +95,7 @@ def run_jobs(
     waiting = list(jobs)
     running: dict[Connection, tuple[Job, SpawnProcess]] = {}
     failures: dict[str, str] = {}
+    given_up: set[str] = set()
     stopped_at: float | None = None
     totals = {job.name: job.total for job in jobs}
     unit = jobs[0].unit if jobs else ""
@@ -92,6 +109,9 @@ def run_jobs(
             while running or (waiting and not request.signum):
                 while waiting and len(running) < at_once and not request.signum:
                     job = waiting.pop(0)
+                    if unwanted(job.name):
+                        display.end(job.name, "stopped")
+                        continue
                     connection, process = _start(job)
                     running[connection] = (job, process)
                     display.start(job.name)
@@ -104,7 +124,7 @@ def run_jobs(
                         process.join()
                         how = "failed" if job.name in failures else "done"
                         if process.exitcode != 0 and how == "done":
-                            how = "stopped" if request.signum else "failed"
+                            how = "stopped" if request.signum or job.name in given_up else "failed"
                         if how == "failed":
                             failures.setdefault(job.name, _death(process.exitcode))
                         display.end(job.name, how)
@@ -117,6 +137,10 @@ def run_jobs(
                     else:
                         failures[job.name] = message[1]
                 display.tick()
+                for job, process in running.values():
+                    if job.name not in given_up and unwanted(job.name):
+                        given_up.add(job.name)
+                        process.terminate()
                 if request.signum and stopped_at is None:
                     stopped_at = time.monotonic()
                     display.say(f"Stopping, for at most {_SAVE_S:.0f} s; another signal stops at once.")
@@ -134,7 +158,7 @@ def run_jobs(
             console.print(texts, highlight=False, markup=False, soft_wrap=True)
         raise Interrupted(request.signum)
     if failures:
-        raise RunsFailedError(f"{title}: {len(failures)} of {len(jobs)} failed.\n{texts}")
+        raise RunsFailedError(f"{title}: {len(failures)} of {len(jobs)} failed.\n{texts}", failures)
 
 
 def _cores() -> int:
