@@ -13,7 +13,8 @@ from .evaluation.evaluate import evaluate_run
 from .evaluation.summary import Summary, summarize, write_summary
 from .hyperparameters import check_task
 from .policies.card import write_card
-from .processes.parallel import Job, run_jobs
+from .processes.job import Job
+from .processes.parallel import run_jobs
 from .processes.stopping import Interrupted
 from .run.learner_callbacks import check_margins
 from .run.start import Start

@@ -55,7 +55,7 @@ def test_an_arm_without_a_filter_anywhere_cannot_be_ranked():
     given = settings({"n_envs": {"low": 1, "high": 2}}, "arms={unfiltered: {filter: none}}")
     with pytest.raises(ConfigurationError, match="return with the filter on, and there is no filter"):
         Space(given)
-    with pytest.raises(UnknownNameError, match="sweep.arm"):
+    with pytest.raises(UnknownNameError, match=r"sweep\.arm"):
         Space(settings({"n_envs": {"low": 1, "high": 2}}, arm="filtred"))
     with pytest.raises(ConfigurationError, match="'sweep' is missing"):
         Space(read_config(FAKE))

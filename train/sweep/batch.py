@@ -1,4 +1,4 @@
-"""Trials that run together: trained, given up where others were better at the same step, evaluated, told to the study."""
+"""Trials that run together: trained, given up where others were better, evaluated, told to the study."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ from ..experiment import (
     training_jobs,
     write_cards,
 )
-from ..processes.parallel import Job, RunsFailedError, run_jobs
+from ..processes.job import Job
+from ..processes.parallel import RunsFailedError, run_jobs
 from ..tables import read_rows
 from .space import FILTERED, Space, draw
 from .study import VIOLATIONS, is_worse_than_median
@@ -83,8 +84,8 @@ class Attempt:
 def run_batch(space: Space, trials: list[optuna.Trial], console: Console) -> None:
     """Trains and evaluates trials, and tells their study what they came to.
 
-    A trial is pruned by its returns, whether it was still at work then or had come to its end: what is pruned does not
-    depend on how fast the machine is.
+    A trial is pruned by its returns, whether it was still at work then or had come to its end: what is pruned does
+    not depend on how fast the machine is.
 
     Args:
         space: What is searched.

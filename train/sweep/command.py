@@ -60,9 +60,8 @@ def sweep_experiment(
 def _check_judged(space: Space) -> None:
     """Refuses a task that does not say what a step costs: no return of it would be one at cost zero."""
     arm = space.arm
-    env = make_stack(
-        arm.env, conditions(arm, space.experiment.evaluation_filter)[FILTERED], arm.learner.in_evaluation
-    )
+    used = conditions(arm, space.experiment.evaluation_filter)[FILTERED]
+    env = make_stack(arm.env, used, arm.learner.in_evaluation)
     env.action_space.seed(0)
     env.reset(seed=0)
     info = env.step(env.action_space.sample())[-1]

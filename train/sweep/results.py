@@ -26,8 +26,8 @@ _SHOWN: Final = 10
 def ranked(study: optuna.Study) -> list[optuna.trial.FrozenTrial]:
     """All trials, the best first.
 
-    By return those in whose evaluation nothing was violated; then the others that were evaluated, by their violations;
-    then the rest.
+    By return those in whose evaluation nothing was violated; then the others that were evaluated, by their
+    violations; then the rest.
     """
 
     def place(trial: optuna.trial.FrozenTrial) -> tuple[float, ...]:

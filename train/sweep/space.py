@@ -1,4 +1,4 @@
-"""What a sweep searches: each parameter is a setting of the config, and a trial is an experiment with values of them."""
+"""What a sweep searches: each parameter is a setting of the config, a trial an experiment with values of them."""
 
 from __future__ import annotations
 

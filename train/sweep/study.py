@@ -65,8 +65,8 @@ def open_study(space: Space, folder: Path) -> optuna.Study:
 def next_trials(study: optuna.Study, space: Space, folder: Path) -> list[optuna.Trial]:
     """The trials of the next batch, those first that a killed sweep left unfinished; none when all are done.
 
-    What is drawn depends on the trials that are finished and on the trial's own number, so that a sweep that was killed
-    tries the same as one that was not.
+    What is drawn depends on the trials that are finished and on the trial's own number, so that a sweep that was
+    killed tries the same as one that was not.
 
     Args:
         study: What was tried.
@@ -102,15 +102,14 @@ def is_worse_than_median(study: optuna.Study, trial: optuna.Trial) -> bool:
     import optuna
 
     kept = optuna.create_study(direction="maximize")
-    kept.add_trials(
-        [other for other in study.get_trials(deepcopy=False) if other.value is not None and is_kept(other)]
-    )
-    return bool(optuna.pruners.MedianPruner().prune(kept, study.get_trials(deepcopy=False)[trial.number]))
+    everything = study.get_trials(deepcopy=False)
+    kept.add_trials([other for other in everything if is_kept(other)])
+    return bool(optuna.pruners.MedianPruner().prune(kept, everything[trial.number]))
 
 
 def is_kept(trial: optuna.trial.FrozenTrial) -> bool:
-    """Whether nothing was violated in a trial's evaluation."""
-    return trial.constraints.get(VIOLATIONS) == 0.0
+    """Whether the trial was evaluated, and nothing was violated in it."""
+    return trial.state.name == "COMPLETE" and trial.constraints[VIOLATIONS] == 0.0
 
 
 def _differences(theirs: Mapping[str, Any], ours: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
