@@ -25,6 +25,7 @@ ENJOYED_EPISODES: Final = 3
 FILTERS: Final = ("trained", "none", "protect")
 _TAKEN_BY: Final = {
     "report": ("compare",),
+    "on": ("train", "evaluate", "compare", "sweep"),
     "output": ("report", "diagnose", "enjoy"),
     "policy": ("diagnose",),
     "steps": ("diagnose",),
@@ -93,6 +94,11 @@ def make_parser() -> argparse.ArgumentParser:
         nargs="*",
         metavar="CONFIG.yaml, key=value",
         help="the experiment, and overrides such as total_steps=1000 or arms.filtered.filter=protect",
+    )
+    parser.add_argument(
+        "--on",
+        metavar="ray[:ADDRESS]",
+        help="of train, evaluate, compare and sweep: run on a Ray cluster whose nodes share the folders",
     )
     parser.add_argument("--report", action="store_true", help="of compare: also write the HTML report")
     parser.add_argument(

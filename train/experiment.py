@@ -31,8 +31,13 @@ from .run.vec_envs import make_training_env
 from .videos.record import delete_videos, record_videos
 
 
-def train_experiment(experiment: ExperimentConfig, console: Console) -> None:
+def train_experiment(experiment: ExperimentConfig, console: Console, on: str | None = None) -> None:
     """Trains what is not trained yet, arms times seeds in parallel; first the arms that others begin with.
+
+    Args:
+        experiment: What to train.
+        console: Where progress, messages and failures are shown.
+        on: Where: None for this machine, or `ray` or `ray:ADDRESS`.
 
     Raises:
         ConfigurationError: A task, a filter or an algorithm refuses its settings; nothing has been started.
@@ -50,7 +55,8 @@ def train_experiment(experiment: ExperimentConfig, console: Console) -> None:
         for arms in generations(experiment):
             jobs = training_jobs(experiment, arms)
             now = sum(job.total for job in jobs)
-            run_jobs(jobs, experiment.workers, console, "Training", before, every - before - now)
+            later = every - before - now
+            run_jobs(jobs, experiment.workers, console, "Training", before, later, on=on)
             before += now
     except Interrupted as stop:
         stop.standing = [
@@ -84,8 +90,13 @@ def check_training(experiment: ExperimentConfig) -> None:
             check_folder(arm, seed, experiment.run_folder(arm, seed))
 
 
-def evaluate_experiment(experiment: ExperimentConfig, console: Console) -> None:
+def evaluate_experiment(experiment: ExperimentConfig, console: Console, on: str | None = None) -> None:
     """Evaluates every trained run on the same episode seeds, filter off and on, and films one episode.
+
+    Args:
+        experiment: Whose runs to evaluate.
+        console: Where progress, messages and failures are shown.
+        on: Where to evaluate, as in training; films are made on this machine.
 
     Raises:
         RunStateError: A run is not trained to its end; nothing has been started.
@@ -94,7 +105,8 @@ def evaluate_experiment(experiment: ExperimentConfig, console: Console) -> None:
     for arm in experiment.arms:
         for seed in experiment.seeds:
             check_finished(arm, experiment.run_folder(arm, seed))
-    run_jobs(evaluation_jobs(experiment, experiment.arms), experiment.workers, console, "Evaluation")
+    jobs = evaluation_jobs(experiment, experiment.arms)
+    run_jobs(jobs, experiment.workers, console, "Evaluation", on=on)
     write_cards(experiment)
     record_videos(experiment, console)
 

@@ -81,7 +81,7 @@ class Attempt:
                 self.pruned = is_worse_than_median(self.trial.study, self.trial)
 
 
-def run_batch(space: Space, trials: list[optuna.Trial], console: Console) -> None:
+def run_batch(space: Space, trials: list[optuna.Trial], console: Console, on: str | None = None) -> None:
     """Trains and evaluates trials, and tells their study what they came to.
 
     A trial is pruned by its returns, whether it was still at work then or had come to its end: what is pruned does
@@ -91,6 +91,7 @@ def run_batch(space: Space, trials: list[optuna.Trial], console: Console) -> Non
         space: What is searched.
         trials: As `next_trials` gave them.
         console: Where progress, messages and failures are shown.
+        on: Where: None for this machine, or `ray` or `ray:ADDRESS`.
 
     Raises:
         RunStateError: A trial's folder is another experiment's.
@@ -102,7 +103,7 @@ def run_batch(space: Space, trials: list[optuna.Trial], console: Console) -> Non
     def unwanted(job: str) -> bool:
         return by_name[job.split(" ")[0]].look(time.monotonic())
 
-    run = partial(run_jobs, workers=space.experiment.workers, console=console)
+    run = partial(run_jobs, workers=space.experiment.workers, console=console, on=on)
     for level in zip_longest(*(generations(attempt.experiment) for attempt in attempts), fillvalue=[]):
         jobs = _jobs(training_jobs, attempts, level)
         _attempt(by_name, console, lambda jobs=jobs: run(jobs, title="Training of trials", unwanted=unwanted))

@@ -22,7 +22,11 @@ from .study import check_optuna, next_trials, open_study
 
 
 def sweep_experiment(
-    settings: Mapping[str, Any], config: Path, overrides: Sequence[str], console: Console
+    settings: Mapping[str, Any],
+    config: Path,
+    overrides: Sequence[str],
+    console: Console,
+    on: str | None = None,
 ) -> None:
     """Searches the settings of a config's `sweep`, or goes on with the search.
 
@@ -31,6 +35,7 @@ def sweep_experiment(
         config: The file that they are from, for the command that is recommended.
         overrides: Those of the command line, for the same.
         console: Where progress and results are shown.
+        on: Where trials run: None for this machine, or `ray` or `ray:ADDRESS`.
 
     Raises:
         ConfigurationError: Optuna is missing, a parameter is refused, or the task reports no cost.
@@ -49,7 +54,7 @@ def sweep_experiment(
         while trials := next_trials(study, space, folder):
             numbers = ", ".join(str(trial.number) for trial in trials)
             console.print(f"Trial {numbers} of 0 to {space.config.trials - 1}", highlight=False)
-            run_batch(space, trials, console)
+            run_batch(space, trials, console, on)
             write_results(study, names, folder)
         path = write_results(study, names, folder)
     console.print(results_table(study, names, space.experiment.name))
