@@ -63,7 +63,7 @@ def test_a_cluster_learns_what_one_machine_learns_bit_for_bit(cluster, fake_expe
 
 def test_a_node_is_lost_and_its_run_goes_on_from_its_checkpoint_elsewhere(cluster, fake_experiment):
     made, nodes = cluster
-    experiment = fake_experiment("total_steps=24000", "checkpoint_every=1000", "seeds=[0]")
+    experiment = fake_experiment("total_steps=8192", "checkpoint_every=256", "seeds=[0]")
     folders = [experiment.run_folder(arm, 0) for arm in experiment.arms]
     kept = {}
 
@@ -82,12 +82,12 @@ def test_a_node_is_lost_and_its_run_goes_on_from_its_checkpoint_elsewhere(cluste
     loses.join()
     assert "was lost on" in told.file.getvalue()
     for folder in folders:
-        assert json.loads((folder / "finished.json").read_text())["timesteps"] == 24_064
+        assert json.loads((folder / "finished.json").read_text())["timesteps"] == 8192
         rows = read_rows(folder / "episodes.csv")
         assert kept[folder] and rows[: len(kept[folder])] == kept[folder]  # nothing done is done again
         steps = [row["timesteps"] for row in rows]
         assert steps == sorted(steps)
-        assert sum(row["length"] for row in rows) <= 24_064
+        assert sum(row["length"] for row in rows) <= 8192
 
 
 def test_failures_and_messages_come_back(cluster):

@@ -88,6 +88,8 @@ class RayWorkers:
 
     def messages(self, timeout_s: float) -> Iterator[tuple[str, Message]]:
         """What jobs have to say, by their names; waits for an end, for at most so long."""
+        if not self._running:
+            return
         ready, _ = self._ray.wait(list(self._running), num_returns=len(self._running), timeout=timeout_s)
         for name, message in self._ray.get(self._post.take.remote()):
             yield from self._moved(name, message[1]) if message[0] == "begun" else [(name, message)]

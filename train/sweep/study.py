@@ -109,7 +109,7 @@ def is_worse_than_median(study: optuna.Study, trial: optuna.Trial) -> bool:
 
 def is_kept(trial: optuna.trial.FrozenTrial) -> bool:
     """Whether the trial was evaluated, and nothing was violated in it."""
-    return trial.state.name == "COMPLETE" and trial.constraints[VIOLATIONS] == 0.0
+    return bool(trial.state.name == "COMPLETE" and trial.constraints[VIOLATIONS] == 0.0)
 
 
 def _differences(theirs: Mapping[str, Any], ours: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
