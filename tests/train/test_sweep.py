@@ -164,11 +164,12 @@ def test_the_median_is_of_trials_at_cost_zero():
         made = told(kept + reckless)
         trial = made.ask()
         trial.report(value, step=10)
-        assert study.is_worse_than_median(made, trial) is expected
+        assert study.is_worse_than_median(made, trial, trial.number) is expected
+        assert not study.is_worse_than_median(made, trial, before=4)  # the fifth is of the same batch
     made = told(kept[:4] + reckless)  # too few to say
     trial = made.ask()
     trial.report(-5.0, step=10)
-    assert not study.is_worse_than_median(made, trial)
+    assert not study.is_worse_than_median(made, trial, trial.number)
 
 
 def test_a_trial_is_asked_about_at_its_checkpoints_and_given_up(tmp_path, monkeypatch):
@@ -177,7 +178,7 @@ def test_a_trial_is_asked_about_at_its_checkpoints_and_given_up(tmp_path, monkey
     _, experiment = space.trial("trial_0000", {})
     arm = experiment.arms[0]
     monkeypatch.setattr(batch, "is_worse_than_median", lambda *_: made.trials[0].last_step == 256)
-    attempt = batch.Attempt(made.ask(), experiment, replace(arm, total_steps=512))
+    attempt = batch.Attempt(made.ask(), experiment, replace(arm, total_steps=512), 0)
     for seed in experiment.seeds:
         path = episode_file(experiment.run_folder(arm, seed), "training")
         found = [

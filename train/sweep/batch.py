@@ -29,8 +29,8 @@ from ..experiment import (
 from ..processes.job import Job
 from ..processes.parallel import RunsFailedError, run_jobs
 from ..tables import read_rows
-from .space import FILTERED, Space, draw
-from .study import VIOLATIONS, is_worse_than_median
+from .space import FILTERED, Space
+from .study import VIOLATIONS, is_worse_than_median, values_of
 
 if TYPE_CHECKING:
     import optuna
@@ -47,6 +47,8 @@ class Attempt:
     trial: optuna.Trial
     experiment: ExperimentConfig
     arm: ArmConfig
+    batch: int
+    """The number that its batch begins with."""
     reported: int = 0
     pruned: bool = False
     failed: bool = False
@@ -77,8 +79,10 @@ class Attempt:
             returns = [[row["return"] for row in rows if begin < row["timesteps"] <= end] for rows in tables]
             self.reported += 1
             if all(returns):  # an episode may be longer than that
-                self.trial.report(float(np.mean([np.mean(of_seed) for of_seed in returns])), step=end)
-                self.pruned = is_worse_than_median(self.trial.study, self.trial)
+                study = self.trial.study
+                if end not in study.get_trials(deepcopy=False)[self.trial.number].intermediate_values:
+                    self.trial.report(float(np.mean([np.mean(of_seed) for of_seed in returns])), step=end)
+                self.pruned = is_worse_than_median(study, self.trial, self.batch)
 
 
 def run_batch(space: Space, trials: list[optuna.Trial], console: Console, on: str | None = None) -> None:
@@ -106,13 +110,13 @@ def run_batch(space: Space, trials: list[optuna.Trial], console: Console, on: st
     run = partial(run_jobs, workers=space.experiment.workers, console=console, on=on)
     for level in zip_longest(*(generations(attempt.experiment) for attempt in attempts), fillvalue=[]):
         jobs = _jobs(training_jobs, attempts, level)
-        _attempt(by_name, console, lambda jobs=jobs: run(jobs, title="Training of trials", unwanted=unwanted))
+        _attempt(by_name, console, partial(run, jobs, title="Training of trials", unwanted=unwanted))
     for attempt in attempts:
         if not attempt.failed:
             attempt.report(ended=True)
     levels = [attempt.experiment.arms for attempt in attempts]
     jobs = _jobs(evaluation_jobs, attempts, levels)
-    _attempt(by_name, console, lambda: run(jobs, title="Evaluation of trials"))
+    _attempt(by_name, console, partial(run, jobs, title="Evaluation of trials"))
     for attempt in attempts:
         _tell(attempt)
 
@@ -121,8 +125,7 @@ def _begin(space: Space, trial: optuna.Trial, console: Console) -> Attempt | Non
     """The trial's experiment and its folder; None, and a failed trial, where its values are refused."""
     name = f"trial_{trial.number:04d}"
     try:
-        values = draw(trial, space.config.parameters)
-        settings, experiment = space.trial(name, values)
+        settings, experiment = space.trial(name, values_of(space, trial))
         check_training(experiment)
     except ConfigurationError as error:
         _say(console, f"{name}: {error}")
@@ -130,7 +133,7 @@ def _begin(space: Space, trial: optuna.Trial, console: Console) -> Attempt | Non
         return None
     write_text(experiment.folder / CONFIG_FILE, yaml.safe_dump(settings, sort_keys=False))
     arm = next(arm for arm in experiment.arms if arm.name == space.arm.name)
-    return Attempt(trial, experiment, arm)
+    return Attempt(trial, experiment, arm, trial.number - trial.number % space.config.at_once)
 
 
 def _jobs(make: Callable[..., list[Job]], attempts: list[Attempt], arms: Any) -> list[Job]:

@@ -11,10 +11,10 @@ import numpy as np
 
 from safe_wrappers.errors import ConfigurationError, RunStateError
 
+from .space import Space, draw
+
 if TYPE_CHECKING:
     import optuna
-
-    from .space import Space
 
 STUDY_FILE: Final = "study.db"
 VIOLATIONS: Final = "violations_per_1000"
@@ -84,26 +84,37 @@ def next_trials(study: optuna.Study, space: Space, folder: Path) -> list[optuna.
     ]
     at_once, begun = space.config.at_once, len(everything)
     # Batches begin at multiples: a kill in the midst of one leaves it smaller, and here it is filled.
-    ahead = (at_once - begun % at_once) % at_once if left else at_once
-    for number in range(begun, min(begun + ahead, space.config.trials)):
-        stream = np.random.SeedSequence((space.config.seed, number)).generate_state(1)[0]
-        study.sampler = optuna.samplers.TPESampler(seed=int(stream) >> 1)
-        left.append(study.ask())
+    ahead = -begun % at_once if left else at_once - begun % at_once
+    left += [study.ask() for _ in range(begun, min(begun + ahead, space.config.trials))]
     for trial in left:
         trial.set_user_attr(_FOLDER, here)
     return left
 
 
-def is_worse_than_median(study: optuna.Study, trial: optuna.Trial) -> bool:
+def values_of(space: Space, trial: optuna.Trial) -> dict[str, Any]:
+    """The values of a trial's parameters: drawn, or those that it has already."""
+    import optuna
+
+    stream = np.random.SeedSequence((space.config.seed, trial.number)).generate_state(1)[0]
+    trial.study.sampler = optuna.samplers.TPESampler(seed=int(stream) >> 1)
+    return draw(trial, space.config.parameters)
+
+
+def is_worse_than_median(study: optuna.Study, trial: optuna.Trial, before: int) -> bool:
     """Optuna's median rule, against trials in whose evaluation nothing was violated.
 
     Against all of them, reckless trials would set a bar that careful ones do not reach.
+
+    Args:
+        study: What was tried.
+        trial: Which is in question.
+        before: Only trials of lower numbers count: those of earlier batches, whichever ended first.
     """
     import optuna
 
     kept = optuna.create_study(direction="maximize")
     everything = study.get_trials(deepcopy=False)
-    kept.add_trials([other for other in everything if is_kept(other)])
+    kept.add_trials([other for other in everything if other.number < before and is_kept(other)])
     return bool(optuna.pruners.MedianPruner().prune(kept, everything[trial.number]))
 
 
