@@ -61,7 +61,7 @@ def rows(folder):
 def test_the_command_searches_and_its_trials_are_ordinary_experiments(tmp_path, capsys):
     config = tmp_path / "searched.yaml"
     given = settings(tmp_path, trials=2, at_once=2)
-    config.write_text(yaml.safe_dump(given))
+    config.write_text(yaml.safe_dump(given, sort_keys=False))
     assert main(["sweep", str(config), "workers=2"]) == 0
     told = capsys.readouterr().out
     found = rows(tmp_path)
@@ -118,14 +118,15 @@ def test_a_trial_that_fails_is_left_out_and_the_others_go_on(tmp_path, in_proces
     assert rows(tmp_path)[0]["return"] == ""
 
 
-def test_values_that_do_not_go_together_fail_their_trial(tmp_path, in_process):
-    given = settings(tmp_path, trials=3)
-    given["sweep"]["parameters"] = {
-        "hyperparameters.n_steps": {"choices": [32, 64]},
-        "n_envs": {"low": 1, "high": 2},
-    }
-    sweep_experiment(given, FAKE, (), QUIET)
-    assert {row["state"] for row in rows(tmp_path)} <= {"failed", "at cost zero"}
+def test_values_that_the_task_refuses_fail_their_trial(tmp_path, in_process, capsys):
+    given = settings(tmp_path, trials=1)
+    given["env"] = {"id": "fake_task:FakeGoal-v0"}
+    given["sweep"]["parameters"] = {"env.kwargs.colour": {"choices": ["red", "blue"]}}
+    sweep_experiment(given, FAKE, (), Console())
+    assert [row["state"] for row in rows(tmp_path)] == ["failed"]
+    told = capsys.readouterr().out
+    assert "trial_0000: " in told and "colour" in told
+    assert "none is recommended" in told
 
 
 def test_a_task_that_reports_no_cost_is_refused(tmp_path):

@@ -55,7 +55,7 @@ class Space:
         """
         settings = deepcopy(self._settings)
         for key, value in values.items():
-            set_value(settings, key, deepcopy(value), f"sweep.parameters.{key}")
+            set_value(settings, key, deepcopy(value), "config")
         arms = {arm: settings["arms"][arm] for arm in self.trained}
         # Those that are left out may have had the filter that others are evaluated with.
         first = next((arm for arm in self.experiment.arms if arm.filter.kind != "none"), None)
