@@ -25,6 +25,8 @@ _WRITTEN = {
     "env.judge": "`constraints`",
     "env.observation": "`constraints`",
     "learner.margin_curriculum": "mapping",
+    "sweep": "mapping",
+    "sweep.parameters.KEY.choices": "list",
 }
 """Types in YAML where Python has another one."""
 

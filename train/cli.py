@@ -57,10 +57,17 @@ def _run(options: argparse.Namespace, console: Console) -> None:
         _WITHOUT_EXPERIMENT[options.command](options, console)
         return
     from .config import parse_experiment, read_config
+    from .processes.on_ray import check_place
 
+    check_place(options.on)
     settings = [read_config(config, options.overrides) for config in options.configs]
     if options.command == "report":
         _report(options, [parse_experiment(each) for each in settings], console)
+        return
+    if options.command == "sweep":
+        from .sweep import sweep_experiment
+
+        sweep_experiment(settings[0], options.configs[0], options.overrides, console, options.on)
         return
 
     from .experiment import evaluate_experiment, summarize_experiment, train_experiment
@@ -69,9 +76,9 @@ def _run(options: argparse.Namespace, console: Console) -> None:
 
     experiment = parse_experiment(settings[0])
     if options.command in ("train", "compare"):
-        train_experiment(experiment, console)
+        train_experiment(experiment, console, options.on)
     if options.command in ("evaluate", "compare"):
-        evaluate_experiment(experiment, console)
+        evaluate_experiment(experiment, console, options.on)
     summary = summarize_experiment(experiment)
     if options.command in ("evaluate", "compare"):
         console.print(comparison_table(experiment, summary))

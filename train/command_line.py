@@ -12,6 +12,7 @@ COMMANDS: Final = {
     "train": "train every arm with every seed; a killed run goes on where it was, a finished one is left",
     "evaluate": "evaluate the trained policies on the same episodes, with the filter off and on",
     "compare": "train, evaluate, and print the comparison",
+    "sweep": "search the settings under `sweep` in the config, for the most return at cost zero",
     "report": "write the comparison as one HTML page, from what is already there; of several, also an overview",
     "enjoy": "let a trained policy act, in a window or on film if asked; takes RUN for CONFIG.yaml",
     "push": "upload a run's policy to the Hugging Face hub; takes RUN and owner/name for CONFIG.yaml",
@@ -24,6 +25,7 @@ ENJOYED_EPISODES: Final = 3
 FILTERS: Final = ("trained", "none", "protect")
 _TAKEN_BY: Final = {
     "report": ("compare",),
+    "on": ("train", "evaluate", "compare", "sweep"),
     "output": ("report", "diagnose", "enjoy"),
     "policy": ("diagnose",),
     "steps": ("diagnose",),
@@ -92,6 +94,11 @@ def make_parser() -> argparse.ArgumentParser:
         nargs="*",
         metavar="CONFIG.yaml, key=value",
         help="the experiment, and overrides such as total_steps=1000 or arms.filtered.filter=protect",
+    )
+    parser.add_argument(
+        "--on",
+        metavar="ray[:ADDRESS]",
+        help="of train, evaluate, compare and sweep: run on a Ray cluster whose nodes share the folders",
     )
     parser.add_argument("--report", action="store_true", help="of compare: also write the HTML report")
     parser.add_argument(

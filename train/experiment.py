@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
@@ -14,7 +13,8 @@ from .evaluation.evaluate import evaluate_run
 from .evaluation.summary import Summary, summarize, write_summary
 from .hyperparameters import check_task
 from .policies.card import write_card
-from .processes.parallel import Job, run_jobs
+from .processes.job import Job
+from .processes.parallel import run_jobs
 from .processes.stopping import Interrupted
 from .run.learner_callbacks import check_margins
 from .run.start import Start
@@ -31,8 +31,13 @@ from .run.vec_envs import make_training_env
 from .videos.record import delete_videos, record_videos
 
 
-def train_experiment(experiment: ExperimentConfig, console: Console) -> None:
+def train_experiment(experiment: ExperimentConfig, console: Console, on: str | None = None) -> None:
     """Trains what is not trained yet, arms times seeds in parallel; first the arms that others begin with.
+
+    Args:
+        experiment: What to train.
+        console: Where progress, messages and failures are shown.
+        on: Where: None for this machine, or `ray` or `ray:ADDRESS`.
 
     Raises:
         ConfigurationError: A task, a filter or an algorithm refuses its settings; nothing has been started.
@@ -40,7 +45,36 @@ def train_experiment(experiment: ExperimentConfig, console: Console) -> None:
         RunsFailedError: Some runs failed.
         Interrupted: A signal came; says where each run will go on.
     """
-    # All arms and folders before the first step: nobody should learn after an hour that the last one is wrong.
+    check_training(experiment)
+    for arm in experiment.arms:
+        if any(is_outgrown(arm, experiment.run_folder(arm, seed)) for seed in experiment.seeds):
+            delete_videos(experiment, arm)
+    try:
+        every = sum(arm.total_steps for arm in experiment.arms) * len(experiment.seeds)
+        before = 0
+        for arms in generations(experiment):
+            jobs = training_jobs(experiment, arms)
+            now = sum(job.total for job in jobs)
+            later = every - before - now
+            run_jobs(jobs, experiment.workers, console, "Training", before, later, on=on)
+            before += now
+    except Interrupted as stop:
+        stop.standing = [
+            f"{arm.name} seed {seed}: {standing(arm, experiment.run_folder(arm, seed))}"
+            for seed in experiment.seeds
+            for arm in experiment.arms
+        ]
+        raise
+    write_cards(experiment)
+
+
+def check_training(experiment: ExperimentConfig) -> None:
+    """Refuses an experiment before its first step: nobody should learn after an hour that the last arm is wrong.
+
+    Raises:
+        ConfigurationError: A task, a filter or an algorithm refuses its settings.
+        RunStateError: A run folder belongs to another config.
+    """
     for arm in experiment.arms:
         env = make_training_env(arm)
         check_task(arm, env)
@@ -54,43 +88,15 @@ def train_experiment(experiment: ExperimentConfig, console: Console) -> None:
             check_start(arm, start)
         for seed in experiment.seeds:
             check_folder(arm, seed, experiment.run_folder(arm, seed))
-    for arm in experiment.arms:
-        if any(is_outgrown(arm, experiment.run_folder(arm, seed)) for seed in experiment.seeds):
-            delete_videos(experiment, arm)
-
-    def training(arm: ArmConfig, seed: int) -> Callable[..., None]:
-        return functools.partial(train_run, start=_start(experiment, arm, seed))
-
-    try:
-        every = sum(arm.total_steps for arm in experiment.arms) * len(experiment.seeds)
-        before = 0
-        for arms in _generations(experiment):
-            now = sum(arm.total_steps for arm in arms) * len(experiment.seeds)
-            others = before, every - before - now
-            _run(
-                experiment,
-                arms,
-                console,
-                "Training",
-                lambda arm: arm.total_steps,
-                "steps",
-                training,
-                (),
-                others,
-            )
-            before += now
-    except Interrupted as stop:
-        stop.standing = [
-            f"{arm.name} seed {seed}: {standing(arm, experiment.run_folder(arm, seed))}"
-            for seed in experiment.seeds
-            for arm in experiment.arms
-        ]
-        raise
-    _write_cards(experiment)
 
 
-def evaluate_experiment(experiment: ExperimentConfig, console: Console) -> None:
+def evaluate_experiment(experiment: ExperimentConfig, console: Console, on: str | None = None) -> None:
     """Evaluates every trained run on the same episode seeds, filter off and on, and films one episode.
+
+    Args:
+        experiment: Whose runs to evaluate.
+        console: Where progress, messages and failures are shown.
+        on: Where to evaluate, as in training; films are made on this machine.
 
     Raises:
         RunStateError: A run is not trained to its end; nothing has been started.
@@ -99,11 +105,9 @@ def evaluate_experiment(experiment: ExperimentConfig, console: Console) -> None:
     for arm in experiment.arms:
         for seed in experiment.seeds:
             check_finished(arm, experiment.run_folder(arm, seed))
-    episodes = (1 if experiment.evaluation_filter.kind == "none" else 2) * experiment.evaluation.episodes
-    arguments = (experiment.evaluation, experiment.evaluation_filter)
-    every, evaluation = experiment.arms, lambda *_: evaluate_run
-    _run(experiment, every, console, "Evaluation", lambda _: episodes, "episodes", evaluation, arguments)
-    _write_cards(experiment)
+    jobs = evaluation_jobs(experiment, experiment.arms)
+    run_jobs(jobs, experiment.workers, console, "Evaluation", on=on)
+    write_cards(experiment)
     record_videos(experiment, console)
 
 
@@ -114,7 +118,8 @@ def summarize_experiment(experiment: ExperimentConfig) -> Summary:
     return summary
 
 
-def _write_cards(experiment: ExperimentConfig) -> None:
+def write_cards(experiment: ExperimentConfig) -> None:
+    """Writes the card of every run's policy, with what is known of it by now."""
     for arm in experiment.arms:
         for seed in experiment.seeds:
             write_card(arm, seed, experiment.run_folder(arm, seed), experiment.evaluation_filter)
@@ -130,7 +135,7 @@ def _start(experiment: ExperimentConfig, arm: ArmConfig, seed: int) -> Start | N
     return Start(source.name, experiment.run_folder(source, seed), source)
 
 
-def _generations(experiment: ExperimentConfig) -> Iterator[list[ArmConfig]]:
+def generations(experiment: ExperimentConfig) -> Iterator[list[ArmConfig]]:
     """The arms, those first that others begin with."""
     left = list(experiment.arms)
     while left:
@@ -139,28 +144,36 @@ def _generations(experiment: ExperimentConfig) -> Iterator[list[ArmConfig]]:
         left = [arm for arm in left if arm not in ready]
 
 
-def _run(
-    experiment: ExperimentConfig,
-    arms: Sequence[ArmConfig],
-    console: Console,
-    title: str,
-    total: Callable[[ArmConfig], int],
-    unit: str,
-    call: Callable[[ArmConfig, int], Callable[..., None]],
-    more: tuple[Any, ...],
-    others: tuple[int, int] = (0, 0),
-) -> None:
-    """Runs a job per arm and seed; `others` is the work of earlier and of later jobs."""
+def training_jobs(experiment: ExperimentConfig, arms: Sequence[ArmConfig], of: str = "training") -> list[Job]:
+    """A job per arm and seed, counted in steps; `of` begins their names."""
     # Seeds outside, arms inside: after the first wave there is already a pair to look at.
-    jobs = [
+    return [
         Job(
-            f"{title.lower()} {arm.name} seed {seed}",
-            total(arm),
-            unit,
-            call(arm, seed),
-            (arm, seed, experiment.run_folder(arm, seed), *more),
+            f"{of} {arm.name} seed {seed}",
+            arm.total_steps,
+            "steps",
+            functools.partial(train_run, start=_start(experiment, arm, seed)),
+            (arm, seed, experiment.run_folder(arm, seed)),
         )
         for seed in experiment.seeds
         for arm in arms
     ]
-    run_jobs(jobs, experiment.workers, console, title, *others)
+
+
+def evaluation_jobs(
+    experiment: ExperimentConfig, arms: Sequence[ArmConfig], of: str = "evaluation"
+) -> list[Job]:
+    """A job per arm and seed, counted in episodes; `of` begins their names."""
+    settings, on = experiment.evaluation, experiment.evaluation_filter
+    episodes = (1 if on.kind == "none" else 2) * settings.episodes
+    return [
+        Job(
+            f"{of} {arm.name} seed {seed}",
+            episodes,
+            "episodes",
+            evaluate_run,
+            (arm, seed, experiment.run_folder(arm, seed), settings, on),
+        )
+        for seed in experiment.seeds
+        for arm in arms
+    ]

@@ -5,7 +5,8 @@ import pytest
 from rich.console import Console
 
 from safe_wrappers.train.processes import progress_display
-from safe_wrappers.train.processes.parallel import Job, RunsFailedError, run_jobs
+from safe_wrappers.train.processes.job import Job
+from safe_wrappers.train.processes.parallel import RunsFailedError, run_jobs
 
 
 def run(jobs, terminal, workers=2):

@@ -51,13 +51,19 @@ def test_the_page_s_defaults_are_those_of_a_config_that_gives_none():
     }
     experiment = parse_experiment(given)
     required = {name for name, key in rows().items() if key.default == "required"}
-    assert required == given.keys() | {"env.id", "learner.margin_curriculum.start"}
-    curriculum = models.MarginCurriculumConfig(start=0.1)  # not there if it is not given
-    for name in rows().keys() - required:
+    assert required == given.keys() | {"env.id", "learner.margin_curriculum.start", "sweep.parameters"}
+    parameter = models.ParameterConfig(choices=[1, 2])
+    optional = {  # not there if they are not given
+        "learner": models.MarginCurriculumConfig(start=0.1),
+        "sweep": models.SweepConfig(parameters={"KEY": parameter}),
+    }
+    own = {"low", "high", "choices"}  # one of both ways has to be given
+    assert {key.name for key in KEYS("ParameterConfig") if key.default == "`null`"} == own | {"step"}
+    for name in rows().keys() - required - {f"sweep.parameters.KEY.{key}" for key in own}:
         there = experiment if hasattr(experiment, name.partition(".")[0]) else experiment.arms[0]
         for part in name.split("."):
-            there = curriculum if there is None else there
-            there = getattr(there, part)
+            there = optional[name.split(".")[0]] if there is None else there
+            there = there[part] if isinstance(there, dict) else getattr(there, part)
         there = getattr(there, "kind", there)  # filter and learner
         written = yaml.safe_load(rows()[name].default.strip("`"))
         assert written == (str(there) if isinstance(there, Path) else there), name

@@ -14,7 +14,7 @@ from safe_wrappers.envs.goal_env import SafeGoalEnv
 from safe_wrappers.errors import ConfigurationError, UnknownNameError
 from safe_wrappers.train import experiment as experiment_steps
 from safe_wrappers.train.evaluation.evaluate import evaluate_run
-from safe_wrappers.train.experiment import _generations, _start, train_experiment
+from safe_wrappers.train.experiment import _start, generations, train_experiment
 from safe_wrappers.train.report.origin import about
 from safe_wrappers.train.run import Progress, train_run
 from safe_wrappers.train.run.reset_options import ResetOptions
@@ -33,7 +33,7 @@ def quiet():
 
 def train(experiment):
     """In this process; the checkpoints of seed 0."""
-    for arms in _generations(experiment):
+    for arms in generations(experiment):
         for arm in arms:
             for seed in experiment.seeds:
                 start = _start(experiment, arm, seed)
@@ -117,7 +117,7 @@ def test_the_command_trains_the_arm_first_that_another_begins_with(fake_experime
     experiment = fake_experiment("arms.unfiltered.start_from=filtered", "seeds=[0]")
     train_experiment(experiment, quiet())
     assert (experiment.run_folder(experiment.arms[0], 0) / "start.json").exists()
-    assert [arm.name for arms in _generations(experiment) for arm in arms] == ["filtered", "unfiltered"]
+    assert [arm.name for arms in generations(experiment) for arm in arms] == ["filtered", "unfiltered"]
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from .models import (
     FilterConfig,
     NormalizeConfig,
 )
+from .sweep import ParameterConfig, SweepConfig
 
 __all__ = [
     "NAIVE",
@@ -21,6 +22,8 @@ __all__ = [
     "FilterConfig",
     "LearnerConfig",
     "NormalizeConfig",
+    "ParameterConfig",
+    "SweepConfig",
     "parse_experiment",
     "read_config",
 ]

@@ -57,7 +57,7 @@ def read_config(path: Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
         key, equals, value = override.partition("=")
         if not equals or not key:
             raise ConfigurationError(f"Override {override!r}: expected key=value, such as total_steps=1000.")
-        _set(settings, key.split("."), _load(value, f"override {override!r}"), override)
+        set_value(settings, key, _load(value, f"override {override!r}"), f"Override {override!r}")
     return settings
 
 
@@ -70,14 +70,26 @@ def _load(text: str, where: str) -> Any:
         raise ConfigurationError(f"{where}: {error}") from None
 
 
-def _set(settings: dict[str, Any], keys: list[str], value: Any, override: str) -> None:
-    for depth, key in enumerate(keys[:-1]):
-        inner = settings.setdefault(key, {})
+def set_value(settings: dict[str, Any], key: str, value: Any, what: str) -> None:
+    """Gives a setting another value, in place.
+
+    Args:
+        settings: As `read_config` returns them.
+        key: With dots, such as `arms.filtered.filter`.
+        value: The new one.
+        what: Who asks for it, for the refusal.
+
+    Raises:
+        ConfigurationError: There is a value that has no keys where the key has more.
+    """
+    keys = key.split(".")
+    for depth, outer in enumerate(keys[:-1]):
+        inner = settings.setdefault(outer, {})
         if inner is None:  # `arms: {filtered:}` is an empty mapping in disguise
-            inner = settings[key] = {}
+            inner = settings[outer] = {}
         if not isinstance(inner, dict):
             raise ConfigurationError(
-                f"Override {override!r}: {'.'.join(keys[: depth + 1])} is {inner!r}, with no keys inside."
+                f"{what}: {'.'.join(keys[: depth + 1])} is {inner!r}, with no keys inside."
             )
         settings = inner
     settings[keys[-1]] = value

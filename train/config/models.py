@@ -26,6 +26,8 @@ from .learner import NAIVE, LearnerConfig
 from .learner import MarginCurriculumConfig as MarginCurriculumConfig  # for the docs: all sections are here
 from .names import check_name
 from .section import Section
+from .sweep import ParameterConfig as ParameterConfig
+from .sweep import SweepConfig
 from .types import Count, FolderName, FunctionName, NonNegative
 
 Options = dict[str, Any]
@@ -237,6 +239,8 @@ class ExperimentConfig(Section):
     workers: Count | None = None
     """Runs at a time, each in a process; by default one per core."""
     evaluation: EvaluationConfig = EvaluationConfig()
+    sweep: SweepConfig | None = None
+    """What `safe-wrappers sweep` searches: see [`sweep`](#sweep)."""
 
     @property
     def folder(self) -> Path:

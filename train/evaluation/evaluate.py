@@ -12,7 +12,7 @@ from safe_wrappers.wrappers.record_interventions import COLUMNS
 
 from ..atomic import write_json
 from ..config import ArmConfig, EvaluationConfig, FilterConfig
-from ..processes.parallel import Progress
+from ..processes.job import Progress
 from ..run.policy import TrainedPolicy
 from ..run.stack import make_stack
 from ..run.trackers import run_logger

@@ -24,8 +24,8 @@ from ..config import ArmConfig
 from ..config.algorithms import ALGORITHMS
 from ..config.models import without_default_buffer_size
 from ..hyperparameters import constructor_arguments, learning_starts
+from ..processes.job import Progress
 from ..processes.lock import only_writer
-from ..processes.parallel import Progress
 from ..processes.stopping import RunStoppedError, heeding_termination
 from .callbacks import (
     CheckpointCallback,

@@ -17,7 +17,8 @@ from ..config import ArmConfig, EnvConfig, ExperimentConfig, FilterConfig
 from ..evaluation.episode_selection import ShownEpisode, shown_episode
 from ..evaluation.evaluate import conditions
 from ..evaluation.step_log import is_violation
-from ..processes.parallel import Job, Progress, RunsFailedError, environment, run_jobs
+from ..processes.job import Job, Progress
+from ..processes.parallel import RunsFailedError, environment, run_jobs
 from ..run.policy import TrainedPolicy
 from ..run.stack import make_stack
 from ..run.trackers import track_film

@@ -1,0 +1,209 @@
+"""Jobs as tasks of a Ray cluster; all its nodes see the same folders."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import pickle
+import signal
+import socket
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Iterator
+from types import FrameType
+from typing import Any, Final
+
+from safe_wrappers.errors import ConfigurationError, SafeWrappersError
+
+from .job import Job, Message, Progress
+from .lock import FolderHeldError
+from .stopping import RunStoppedError
+
+RETRIES: Final = 10
+"""Nodes that one job may lose."""
+_HELD_S: Final = 120.0
+"""How long a folder may still be held by the process of a node that was lost."""
+_ASK_S: Final = 1.0
+
+
+def check_place(on: str | None) -> None:
+    """Refuses a place where nothing can run.
+
+    Args:
+        on: None, `ray` or `ray:ADDRESS`.
+
+    Raises:
+        ConfigurationError: It is something else, or Ray is not installed.
+    """
+    if on is None:
+        return
+    if on.partition(":")[0] != "ray" or on == "ray:":
+        raise ConfigurationError(f"--on: expected ray or ray:ADDRESS, such as ray:10.0.0.1:6379, got {on!r}.")
+    if importlib.util.find_spec("ray") is None:
+        raise ConfigurationError("ray is not installed: pip install 'safe-wrappers[ray]'")
+
+
+class RayWorkers:
+    """Tasks of one CPU each, every one in a fresh process; they end with this process.
+
+    A task whose node or process is lost is begun again elsewhere, where a run goes on from its last checkpoint.
+
+    Args:
+        on: `ray`: the cluster that this machine is part of, or a new one of this machine alone; or `ray:ADDRESS`.
+        at_once: How many; None for one per CPU of the cluster.
+
+    Raises:
+        ConfigurationError: There is no cluster at that address.
+    """
+
+    def __init__(self, on: str, at_once: int | None) -> None:
+        check_place(on)
+        import ray
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+        self._ray = ray
+        self._mine = not ray.is_initialized()
+        if self._mine:
+            address = on.partition(":")[2] or None
+            try:
+                ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+            except ConnectionError as error:
+                raise ConfigurationError(f"--on {on}: {error}") from None
+        self.at_once = at_once or max(1, int(ray.cluster_resources().get("CPU", 1)))
+        # Beside this process: a node that is lost takes no message with it.
+        here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
+        self._post = ray.remote(_Post).options(num_cpus=0, scheduling_strategy=here).remote()
+        # A fresh process for each, as on one machine: nothing of one run is left for the next.
+        self._task = ray.remote(num_cpus=1, max_retries=RETRIES, max_calls=1)(_work)
+        self._running: dict[Any, str] = {}
+        self._places: dict[str, str] = {}
+
+    def start(self, job: Job) -> None:
+        """Begins a job."""
+        own = [os.path.abspath(path) for path in sys.path]
+        reference = self._task.remote(pickle.dumps(job), job.name, own, os.getcwd(), self._post)
+        self._running[reference] = job.name
+
+    def messages(self, timeout_s: float) -> Iterator[tuple[str, Message]]:
+        """What jobs have to say, by their names; waits for an end, for at most so long."""
+        if not self._running:
+            return
+        ready, _ = self._ray.wait(list(self._running), num_returns=len(self._running), timeout=timeout_s)
+        for name, message in self._ray.get(self._post.take.remote()):
+            yield from self._moved(name, message[1]) if message[0] == "begun" else [(name, message)]
+        for reference in ready:
+            name = self._running.pop(reference)
+            try:
+                told = self._ray.get(reference)
+            except self._ray.exceptions.RayError as error:
+                told = f"its process was lost: {error} The same command goes on from its last checkpoint."
+            yield name, ("end", told)
+
+    def stop(self, name: str) -> None:
+        """Asks a job to save and end."""
+        self._post.stop.remote(name)
+        for reference, other in self._running.items():
+            if other == name and name not in self._places:  # it still waits for a CPU
+                self._ray.cancel(reference)
+
+    def kill(self) -> None:
+        """Ends all jobs at once."""
+        for reference in self._running:
+            self._ray.cancel(reference, force=True)
+        self._ray.kill(self._post)
+        if self._mine:
+            self._ray.shutdown()
+
+    def _moved(self, name: str, place: str) -> Iterator[tuple[str, Message]]:
+        if name in self._places:
+            yield name, ("say", f"was lost on {self._places[name]}; begun again on {place}")
+        self._places[name] = place
+
+
+class _Post:
+    """What jobs say, until it is taken; and which of them are to stop. An actor."""
+
+    def __init__(self) -> None:
+        self._said: list[tuple[str, Message]] = []
+        self._stopped: set[str] = set()
+
+    def put(self, name: str, message: Message) -> None:
+        self._said.append((name, message))
+
+    def take(self) -> list[tuple[str, Message]]:
+        taken, self._said = self._said, []
+        return taken
+
+    def stop(self, name: str) -> None:
+        self._stopped.add(name)
+
+    def is_stopped(self, name: str) -> bool:
+        return name in self._stopped
+
+
+def _work(pickled: bytes, name: str, path: list[str], folder: str, post: Any) -> str:
+    """A task: does a job; returns what stopped it, "" for nothing."""
+    import ray
+
+    sys.path.extend(entry for entry in path if entry not in sys.path)
+    os.chdir(folder)
+    # For processes that it starts; Ray gave this one its own.
+    os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
+    import torch
+
+    torch.set_num_threads(1)
+
+    def say(kind: str, what: Any) -> None:
+        ray.get(post.put.remote(name, (kind, what)))  # in their order, and before the end
+
+    say("begun", f"{socket.gethostname()} ({ray.get_runtime_context().get_node_id()[:8]})")
+    progress = Progress(
+        steps=lambda steps: say("steps", steps),
+        say=lambda text: say("say", text),
+        figures=lambda figures: say("figures", dict(figures)),
+    )
+    before = signal.signal(signal.SIGTERM, _stopped)
+    ended = threading.Event()
+    threading.Thread(target=_heed, args=(post, name, ended), daemon=True).start()
+    try:
+        _do(pickle.loads(pickled), progress)
+    except RunStoppedError as stop:
+        progress.say(str(stop))
+        return "stopped"
+    except SafeWrappersError as error:
+        say("failed", str(error))
+    except Exception:  # whatever a task or a hyperparameter can do wrong: shown, and the other runs go on
+        say("failed", traceback.format_exc())
+    finally:
+        ended.set()
+        signal.signal(signal.SIGTERM, before)
+    return ""
+
+
+def _do(job: Job, progress: Progress) -> None:
+    """Does a job, if need be when the process of a lost node has let go of its folder."""
+    end = time.monotonic() + _HELD_S
+    while True:
+        try:
+            return job.call(*job.arguments, progress)
+        except FolderHeldError:
+            if time.monotonic() > end:
+                raise
+            time.sleep(_ASK_S)
+
+
+def _stopped(signum: int, frame: FrameType | None) -> None:
+    """What nobody saves is stopped at once; training has an answer of its own while it lasts."""
+    raise RunStoppedError("stopped")
+
+
+def _heed(post: Any, name: str, ended: threading.Event) -> None:
+    """Sends this process SIGTERM, as on one machine, when its job is to stop."""
+    import ray
+
+    while not ended.wait(_ASK_S):
+        if ray.get(post.is_stopped.remote(name)):
+            os.kill(os.getpid(), signal.SIGTERM)
+            return
