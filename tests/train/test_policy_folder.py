@@ -211,7 +211,7 @@ def test_training_and_evaluating_an_experiment_write_the_cards(fake_experiment, 
     arm, progress = experiment.arms[1], Reports().progress
     run = experiment.run_folder(arm, 0)
     card = run / "policy" / "README.md"
-    monkeypatch.setattr(experiment_module, "run_jobs", lambda *jobs: None)
+    monkeypatch.setattr(experiment_module, "run_jobs", lambda *jobs, **where: None)
     monkeypatch.setattr(experiment_module, "record_videos", lambda *jobs: None)
     for each in experiment.arms:
         train_run(each, 0, experiment.run_folder(each, 0), progress)

@@ -212,7 +212,7 @@ def test_the_total_of_a_finished_run_can_be_raised(fake_experiment):
 
 
 def test_films_of_a_finished_run_that_goes_on_are_deleted(fake_experiment, monkeypatch):
-    monkeypatch.setattr(experiment_module, "_run", lambda *_: None)
+    monkeypatch.setattr(experiment_module, "run_jobs", lambda *_, **__: None)
     short = fake_experiment("seeds=[0]")
     run(short)
     films = {arm.name: video_path(short, arm, "filter_on") for arm in short.arms}

@@ -233,7 +233,7 @@ def test_evaluation_resets_without_the_options(fake_experiment, monkeypatch):
 def test_the_time_left_is_of_all_arms(fake_experiment, monkeypatch):
     begun = []
 
-    def note(jobs, workers, console, title, before, later):
+    def note(jobs, workers, console, title, before, later, on):
         begun.append(([job.name for job in jobs], before, later))
 
     monkeypatch.setattr(experiment_steps, "run_jobs", note)
