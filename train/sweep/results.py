@@ -86,7 +86,7 @@ def verdict(study: optuna.Study, parameters: Sequence[str], config: Path, overri
 
 
 def _evaluated(trial: optuna.trial.FrozenTrial) -> bool:
-    return trial.state.name == "COMPLETE"
+    return bool(trial.state.name == "COMPLETE")
 
 
 def _state(trial: optuna.trial.FrozenTrial) -> str:
