@@ -26,12 +26,14 @@ def cluster():
 
     memory = 100 * 1024**2
     made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "object_store_memory": memory})
-    nodes = [made.add_node(num_cpus=1, object_store_memory=memory) for _ in range(2)]
-    ray.init(address=made.address, log_to_driver=False, logging_level="ERROR")
-    made.wait_for_nodes()
-    yield made, nodes
-    ray.shutdown()
-    made.shutdown()
+    try:
+        nodes = [made.add_node(num_cpus=1, object_store_memory=memory) for _ in range(2)]
+        ray.init(address=made.address, log_to_driver=False, logging_level="ERROR")
+        made.wait_for_nodes()
+        yield made, nodes
+    finally:
+        ray.shutdown()
+        made.shutdown()
 
 
 def console():
@@ -52,6 +54,7 @@ def learned(experiment):
     return found
 
 
+@pytest.mark.slow
 def test_a_cluster_learns_what_one_machine_learns_bit_for_bit(cluster, fake_experiment, tmp_path):
     there = fake_experiment("seeds=[0]", "workers=2", f"output={tmp_path}/there")
     here = fake_experiment("seeds=[0]", "workers=2", f"output={tmp_path}/here")
@@ -61,6 +64,7 @@ def test_a_cluster_learns_what_one_machine_learns_bit_for_bit(cluster, fake_expe
     assert learned(there) == learned(here)
 
 
+@pytest.mark.slow
 def test_a_node_is_lost_and_its_run_goes_on_from_its_checkpoint_elsewhere(cluster, fake_experiment):
     made, nodes = cluster
     experiment = fake_experiment("total_steps=8192", "checkpoint_every=256", "seeds=[0]")
