@@ -33,8 +33,18 @@ def test_its_episodes_begin_in_the_middle_of_a_walk():
         assert walker_h(observation) > 0.0, "no episode begins with a fall"
         starts.append(float(np.abs(observation[8:]).max()))
     assert max(starts) > 0.3, "and not all at rest"
-    *_, fell, late, _ = env.step(np.zeros(6, dtype=np.float32))
-    assert not late or fell
+
+
+def test_its_episodes_last_200_steps_and_pay_for_staying_up():
+    endless = gym.make("Walker2d-v5", terminate_when_unhealthy=False)
+    env = Stopping(endless, lambda observation, random: np.zeros(6, dtype=np.float32), seed=0)
+    env.reset(seed=0)
+    ends = []
+    for _ in range(201):
+        _, reward, fell, late, _ = env.step(np.zeros(6, dtype=np.float32))
+        assert not fell and 0.0 < reward <= 1.0
+        ends.append(late)
+    assert ends.index(True) == 199
 
 
 def test_a_row_counts_what_the_shield_did():
@@ -54,5 +64,7 @@ def test_a_row_counts_what_the_shield_did():
 def test_rest_is_upright():
     observation = np.zeros(17)
     assert walker_rests(observation)
-    observation[1] = 0.6
-    assert not walker_rests(observation)
+    for index, value in ((1, 0.6), (8, 0.4), (16, -0.4)):
+        moved = observation.copy()
+        moved[index] = value
+        assert not walker_rests(moved)
