@@ -1,5 +1,6 @@
 """Recordings: what an env did under a driver, step by step."""
 
+import inspect
 import math
 import warnings
 from collections.abc import Callable, Iterator
@@ -66,6 +67,15 @@ def policy_driver(policy: Predicts | Driver) -> Driver:
             "policy is a function of the observation, or has predict(observation, deterministic=True); "
             f"got {policy!r}"
         )
+    reset = getattr(policy, "reset", None)
+    if callable(reset):
+        try:
+            inspect.signature(reset).bind()
+        except TypeError as error:
+            raise ConfigurationError(
+                f"the policy's reset is called without arguments where an episode begins, and takes "
+                f"{inspect.signature(reset)}: give them defaults, or leave reset away"
+            ) from error
     return policy
 
 
@@ -202,16 +212,18 @@ def record(env: Env, driver: Driver, steps: int, seed: int) -> Recording:
     efforts: list[Array] = []
     publishes = env.has_wrapper_attr("port_effort_acted")
     observation, over, episode, control_dt, repeats = None, True, 0, _declared_dt(env), False
+    begin = getattr(driver, "reset", lambda: None)
     with _spied(env) as given, warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of what the figures count
         for _ in range(steps):
             first = over
             if first:
                 observation, _ = env.reset(seed=seed + episode)
-                getattr(driver, "reset", lambda: None)()
+                begin()
                 episode += 1
             if not rows:
                 repeats = np.array_equal(driver(observation), driver(observation))
+                begin()  # what it remembers of being asked
             action = np.asarray(driver(observation))
             if not np.isfinite(action).all():
                 raise ConfigurationError(

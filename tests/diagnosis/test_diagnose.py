@@ -9,6 +9,7 @@ import pytest
 
 import safe_wrappers as sw
 from safe_wrappers.diagnosis import SYMPTOMS, Diagnosis, Evidence, Finding, diagnose
+from safe_wrappers.diagnosis.recording import policy_driver, record
 from safe_wrappers.errors import ConfigurationError, UnknownNameError, UnsupportedEnvError
 
 pytest.importorskip("gymnasium_robotics")
@@ -166,6 +167,41 @@ def test_bad_input_is_refused_by_name():
         diagnose(env, policy=lambda observation: observation[99])
     with pytest.raises(ConfigurationError, match="steps"):
         diagnose(env, steps=1)
+
+
+class Remembers:
+    """A policy with a memory: what it has been asked since its last reset."""
+
+    def __init__(self):
+        self.asked = 0
+
+    def reset(self):
+        self.asked = 0
+
+    def __call__(self, observation):
+        self.asked += 1
+        return np.full(2, np.sin(self.asked), np.float32)
+
+
+def test_a_policy_with_a_memory_begins_its_first_episode_as_any_other():
+    recording = record(gym.make("Swimmer-v5", max_episode_steps=4), policy_driver(Remembers()), 8, seed=0)
+    expected = np.sin(np.tile(np.arange(1, 5), 2))
+    assert np.allclose(recording.actions, expected[:, None], atol=1e-6) and not recording.repeats
+
+
+def test_a_reset_that_takes_arguments_is_refused_and_one_with_defaults_is_called():
+    class Needs(Remembers):
+        def reset(self, observation):
+            raise AssertionError(observation)
+
+    class Offers(Remembers):
+        def reset(self, observation=None):
+            self.asked = 0
+
+    env = gym.make("Swimmer-v5")
+    with pytest.raises(ConfigurationError, match=r"reset is called without arguments .* \(observation\)"):
+        diagnose(env, Needs(), steps=10)
+    assert record(env, policy_driver(Offers()), 1, seed=0).actions[0, 0] == pytest.approx(np.sin(1))
 
 
 def test_an_action_that_is_not_finite_never_reaches_the_env():
