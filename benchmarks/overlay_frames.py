@@ -120,6 +120,14 @@ SCENES = {
         _changed,
         after=30,
     ),
+    "joints": Scene(
+        "HalfCheetah-v5",
+        lambda env: sw.CBFActionFilter(env, [sw.constraints.JointPositionLimit()]),
+        lambda env, rng: lambda: rng.uniform(-1.0, 1.0, 6),
+        _changed,
+        camera={"distance": 2.6},
+    ),
+    "reacher": Scene("Reacher-v5", sw.protect, _held(1.0, -1.0), _changed, camera={"distance": 0.6}),
     "crossing": Scene("OccludedCrossing-v0", _tracked, crossing_drivers.goal_seeking, _changed, after=30),
     "rover": Scene(
         "SafeRover-v0",

@@ -15,6 +15,12 @@ from safe_wrappers.wrappers import faults
 TEXT = {
     "Outages": ("faults", OFF, "lose, delay, repeat commands, to test with", "fault/*"),
     "ChunkHandover": ("", ON, "a late chunk becomes one command per control step", "handover/*"),
+    "SafetyOverlay": (
+        "",
+        GRID,
+        "draws what the filter knows into the frames",
+        "adds nothing to info",
+    ),
     "AdaptionPenalty": ("", OTHER, "a penalty on changed steps, for the learner alone", "adaption/*"),
     "RecordInterventions": ("", GRID, "counts, sums up, writes a CSV file", "interventions/*"),
     "ContactMonitor": (
@@ -35,7 +41,7 @@ TEXT = {
     "CostFunction": ("", GRID, "judges a task that reports no cost", "cost"),
 }
 """By class: what the box says if not the class's name, its colour, what it does, what it adds to info."""
-ANY_ORDER = ("AdaptionPenalty", "RecordInterventions", "ContactMonitor")
+ANY_ORDER = ("SafetyOverlay", "AdaptionPenalty", "RecordInterventions", "ContactMonitor")
 REMOTE = ("Outages", "RecordInterventions", "LeaseExpiry", "CBFActionFilter")
 """The layers of `remote`, with the lease in the channel's place."""
 
@@ -55,13 +61,16 @@ def stack() -> list[str]:
     cars = sw.occlusion.Track(
         "car*", acceleration_noise=[0.03, 0], start_position_std=[0.3, 0], start_velocity_std=[1.2, 0]
     )
-    env: Any = sw.CostFunction(gym.make("OccludedCrossing-v0"), lambda task: np.abs(task.data.qvel).max() > 3)
+    env: Any = sw.CostFunction(
+        gym.make("OccludedCrossing-v0", render_mode="rgb_array"),
+        lambda task: np.abs(task.data.qvel).max() > 3,
+    )
     env = sw.OcclusionPenalty(env, [cars], sensor="eye", tolerance=0.5)
     env = sw.protect(env)
-    env = sw.LeaseExpiry(env, env.constraints[0], closing_speed=3.0)
+    env = sw.LeaseExpiry(env, sw.StoppingBudget(env.constraints[0], closing_speed=3.0))
     env = sw.SafeActionMap(env)
     env = sw.AdaptionPenalty(sw.RecordInterventions(sw.ContactMonitor(env)), penalty=0.1)
-    env = sw.ChunkHandover(env, 16, 8)
+    env = sw.ChunkHandover(sw.SafetyOverlay(env), 16, 8)
     return names(faults.Outages(env, mean_between_s=2.0, mean_length_s=0.5))
 
 

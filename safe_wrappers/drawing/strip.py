@@ -167,6 +167,8 @@ class Strip:
             (keys.EXECUTED_ACTION, 0.54, 0.92),
         )
         for key, start, end in pairs:
+            if key not in self._info:  # a lease without a filter tells what was executed alone
+                continue
             colour = colour_of("proposed" if key == keys.PROPOSED_ACTION else "executed")
             shares = np.clip((np.ravel(self._info[key]) - low) / span, 0.0, 1.0)
             zero = np.clip(-low / span, 0.0, 1.0)

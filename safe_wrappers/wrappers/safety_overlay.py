@@ -11,10 +11,11 @@ from safe_wrappers.drawing.marks import Mark
 from safe_wrappers.drawing.scene import find_renderer, put
 from safe_wrappers.drawing.strip import Strip
 from safe_wrappers.errors import ConfigurationError
-from safe_wrappers.plants.env_checks import name_of
+from safe_wrappers.plants.env_checks import name_of, wrappers_of
 from safe_wrappers.stack import Layer
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 from safe_wrappers.wrappers.common.layer import Env, LayerWrapper, Reset, Step
+from safe_wrappers.wrappers.lease_expiry import LeaseExpiry
 
 _MODES: Final = ("rgb_array", "human")
 
@@ -23,10 +24,11 @@ class SafetyOverlay(LayerWrapper):
     """Draws what the filter inside knows and does into the env's own frames.
 
     In MuJoCo's scene, in frames and in the window: what every constraint keeps free, and the way that its backup
-    would take from here (`BoundConstraint.draw`); the proposed action as an orange arrow and the executed one as a
-    blue one, where it is known which way an action pushes. Over the lower edge of a frame a strip: what was done to
-    the last action, margin, lease and slip as far as they are in info, a column per step as high as the margin, and
-    the actions as bars. Envs that are not MuJoCo's get the strip alone; so does an env without a filter.
+    would take from here (`BoundConstraint.draw`), of a `LeaseExpiry` the clearance that its leases are worked out
+    from; the proposed action as an orange arrow and the executed one as a blue one, where it is known which way
+    an action pushes. Over the lower edge of a frame a strip: what was done to the last action, margin, lease and
+    slip as far as they are in info, a column per step as high as the margin, and the actions as bars. Envs that
+    are not MuJoCo's get the strip alone; so does an env without a filter.
 
     It only looks: actions, observations, rewards, infos and random numbers are bit for bit those without it.
 
@@ -68,6 +70,7 @@ class SafetyOverlay(LayerWrapper):
         self._record(arguments)
         self.scene, self.strip = scene, strip
         self._inside = filter_inside(env)
+        self._lease = next((inner for inner in wrappers_of(env) if isinstance(inner, LeaseExpiry)), None)
         self._strip = Strip()
         if isinstance(env.action_space, Box) and env.action_space.is_bounded():
             self._strip = Strip(np.ravel(env.action_space.low), np.ravel(env.action_space.high))
@@ -97,13 +100,17 @@ class SafetyOverlay(LayerWrapper):
         return self._strip.on(frame) if self.strip and isinstance(frame, np.ndarray) else frame
 
     def marks(self) -> list[Mark]:
-        """What is drawn into the scene in the present state; nothing before the first reset or without a filter."""
-        if self._last is None or self._inside is None:
+        """What is drawn into the scene in the present state; nothing before a reset, or without filter and lease."""
+        if self._last is None:
             return []
-        bound = self._inside.look()
-        found = [mark for constraint in bound for mark in constraint.draw()]
+        bound = () if self._inside is None else self._inside.look()
+        shown = list(bound)
+        for constraint in () if self._lease is None else self._lease.look():
+            if all(repr(constraint.spec) != repr(other.spec) for other in bound):  # drawn already
+                shown.append(constraint)
+        found = [mark for constraint in shown for mark in constraint.draw()]
         proposed, executed = (self._last.get(key) for key in (keys.PROPOSED_ACTION, keys.EXECUTED_ACTION))
-        if bound and proposed is not None and executed is not None:
+        if self._inside is not None and bound and proposed is not None and executed is not None:
             specs = [constraint.spec for constraint in bound]
             found += arrows(self._inside.plant, specs, proposed, executed)
         return found

@@ -1,6 +1,9 @@
 """What constraints draw, against geometry by hand and against where the env really goes."""
 
+import copy
+
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
 
@@ -200,6 +203,99 @@ def test_a_speed_is_an_arrow_that_reaches_the_ball_at_the_limit(body):
         speed = np.sign(arrow.axes[0, 2]) * (3.0 - env.look()[0].value()[0])
     assert abs(speed) > 0.05 and np.sign(arrow.axes[0, 2]) == np.sign(speed)
     assert arrow.size[2] / np.linalg.norm(ball.position - arrow.position) == pytest.approx(abs(speed) / 3.0)
+
+
+def link_at(env, joint, value):
+    """Where a joint's anchor and its body's centre of mass are with the joint elsewhere, all others as they are."""
+    model, data = env.unwrapped.model, copy.copy(env.unwrapped.data)
+    data.qpos[model.jnt_qposadr[joint]] = value
+    mujoco.mj_forward(model, data)
+    return data.xanchor[joint].copy(), data.xipos[model.jnt_bodyid[joint]].copy(), data.xaxis[joint].copy()
+
+
+def across(vector, axis):
+    """The direction of what is perpendicular to an axis."""
+    rest = vector - (vector @ axis) * axis
+    return rest / np.linalg.norm(rest)
+
+
+def driven(task, constraint, steps=10):
+    env = sw.CBFActionFilter(gym.make(task), [constraint])
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(steps):
+        env.unwrapped.step(0.3 * rng.uniform(-1, 1, env.action_space.shape))
+    return env
+
+
+def test_a_hinge_s_range_is_where_its_link_would_be_at_either_end():
+    keep = sw.constraints.JointPositionLimit(margin=0.1)
+    env = driven("Ant-v5", keep)
+    (marks,) = looked(env)
+    ways, ends = rods(of(marks, "way")), rods(of(marks, "limit")).reshape(-1, 2, 2, 3)
+    model, data = env.unwrapped.model, env.unwrapped.data
+    joints = sorted(model.actuator_trnid[:, 0])
+    assert len(ways) == len(ends) == len(joints) == 8
+    for joint, way, (low, high) in zip(joints, ways, ends, strict=True):
+        first, last = model.jnt_range[joint]
+        here = data.qpos[model.jnt_qposadr[joint]]
+        for rod, value in ((way, here), (low, first + 0.1), (high, last - 0.1)):
+            anchor, centre, axis = link_at(env, joint, value)
+            np.testing.assert_allclose(rod[0], anchor, atol=1e-6)
+            np.testing.assert_allclose(
+                across(rod[1] - rod[0], axis), across(centre - anchor, axis), atol=1e-6
+            )
+
+
+def test_a_slide_s_range_ends_in_squares_where_it_would_be_and_one_without_end_has_one():
+    keep = sw.constraints.JointPositionLimit(upper=0.5, lower=-np.inf, joints=["slider"])
+    env = driven("InvertedPendulum-v5", keep, 3)
+    (marks,) = looked(env)
+    (square,), (point,) = of(marks, "limit", "box"), of(marks, "way", "sphere")
+    np.testing.assert_allclose(square.position, [0.5, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(np.abs(square.axes[:, 2]), [1.0, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(point.position, [env.unwrapped.data.qpos[0], 0.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("task", ["Ant-v5", "InvertedPendulum-v5"])
+def test_a_joint_s_speed_reaches_its_ball_at_the_limit(task):
+    limit = 5.0
+    env = driven(task, sw.constraints.JointSpeedLimit(limit))
+    model, data = env.unwrapped.model, env.unwrapped.data
+    joints = sorted(model.actuator_trnid[:, 0])
+    (marks,) = looked(env)
+    per = len(marks) // len(joints)
+    for joint, start in zip(joints, range(0, len(marks), per), strict=True):
+        own = marks[start : start + per]
+        share = data.qvel[model.jnt_dofadr[joint]] / limit
+        assert abs(share) > 1e-3
+        below, above = (ball.position for ball in of(own, "limit", "sphere"))
+        if task == "Ant-v5":
+            here = data.qpos[model.jnt_qposadr[joint]]
+            tip = rods(of(own, "way"))[-1, 1]
+            for point, value in ((tip, share), (below, -1.0), (above, 1.0)):
+                anchor, centre, axis = link_at(env, joint, here + value * np.pi / 2)
+                np.testing.assert_allclose(
+                    across(point - anchor, axis), across(centre - anchor, axis), atol=1e-5
+                )
+        else:
+            (arrow,) = of(own, "way")
+            np.testing.assert_allclose(arrow.position, [data.qpos[0], 0.0, 0.0], atol=1e-12)
+            np.testing.assert_allclose(
+                arrow.tip - arrow.position, abs(share) * (above - below) / 2 * np.sign(share)
+            )
+
+
+def test_a_wheel_about_its_own_centre_has_an_arc_about_its_axle():
+    wheels = ["front_left", "rear_right"]
+    env = driven("SafeRover-v0", sw.constraints.JointSpeedLimit(50.0, joints=wheels))
+    (marks,) = looked(env)
+    data = env.unwrapped.data
+    for name, balls in zip(wheels, np.split(np.array(of(marks, "limit")), 2), strict=True):
+        joint = env.unwrapped.model.joint(name).id
+        below, above = (ball.position - data.xanchor[joint] for ball in balls)
+        assert np.linalg.norm(above) > 0.01 and abs(above @ data.xaxis[joint]) < 1e-9
+        np.testing.assert_allclose(above, -below, atol=1e-9)
 
 
 def test_contacts_have_narrowed_cones_forces_and_a_support_polygon():

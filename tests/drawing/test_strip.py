@@ -103,3 +103,13 @@ def test_bars_reach_from_zero_to_the_action_proposed_beside_executed():
     (up_y, up_x), (down_y, down_x) = (found[r].mean(axis=0) for r in ("proposed", "executed"))
     assert up_x < down_x and up_y < down_y
     assert found["proposed"][:, 0].max() <= found["executed"][:, 0].min() + 3
+
+
+def test_without_a_filter_the_executed_action_alone_has_a_bar():
+    shown = Strip(np.array([-1.0]), np.array([1.0]))
+    shown.add({keys.EXECUTED_ACTION: np.array([1.0])})
+    frame = shown.on(np.zeros((400, 600, 3), np.uint8)).astype(int)
+    seen = [
+        (np.abs(frame - strip.colour_of(role)) <= 2).all(axis=-1).any() for role in ("proposed", "executed")
+    ]
+    assert seen == [False, True]

@@ -21,6 +21,9 @@ from safe_wrappers.errors import ConfigurationError
 TASK = "SafePointGoal1-v0"
 
 
+RAIL = [sw.constraints.Plane([-0.9], [1]), sw.constraints.Plane([0.9], [-1])]
+
+
 def make(task=TASK, wrap=sw.protect):
     return wrap(gym.make(task, render_mode="rgb_array"))
 
@@ -132,6 +135,10 @@ STACKS = {
     "Ant-v5": lambda env: sw.WholeBodyFilter(env, zmp_inset=0.02),
     "FetchReach-v4": sw.protect,
     "PatrolledPointMaze-v0": sw.protect,
+    "InvertedPendulum-v5": lambda env: sw.LeaseExpiry(
+        sw.CBFActionFilter(env, [sw.constraints.JointSpeedLimit(1.0, joints=["slider"])]),
+        sw.StoppingBudget(sw.constraints.Clearance(RAIL, 8.0, bodies=["cart"]), acceleration=30.0),
+    ),
 }
 DRIVERS = {
     TASK: lambda env, rng: lambda: np.array([1.0, 0.0]),
@@ -197,6 +204,35 @@ def test_before_the_first_reset_and_without_a_filter_there_is_nothing_in_the_sce
     bare = sw.SafetyOverlay(gym.make(TASK, render_mode="rgb_array"))
     bare.reset(seed=0)
     assert bare.marks() == []
+
+
+@pytest.mark.parametrize("filtered", [True, False])
+def test_a_lease_s_clearance_is_drawn_once(filtered):
+    rail = sw.constraints.Clearance(RAIL, 8.0, bodies=["cart"])
+    env = gym.make("InvertedPendulum-v5", render_mode="rgb_array")
+    env = sw.CBFActionFilter(env, [rail]) if filtered else env
+    lease = sw.LeaseExpiry(env, sw.StoppingBudget(rail, acceleration=30.0))
+    env = sw.SafetyOverlay(lease)
+    assert env.marks() == []
+    env.reset(seed=0)
+    pads = [mark for mark in env.marks() if mark.role == "keep out"]
+    np.testing.assert_allclose([pad.position[0] for pad in pads], [-0.9, 0.9])
+    (bound,) = lease.look()
+    count = bound.plant.observation_id
+    assert lease.look() and bound.plant.observation_id == count
+    env.unwrapped.data.qvel[0] = np.nan
+    assert env.marks() == []
+
+
+def test_a_lease_that_keeps_another_distance_than_the_filter_is_drawn_too_and_a_function_has_no_place():
+    near, far = (sw.constraints.Clearance(RAIL, 8.0, bodies=["cart"], margin=m) for m in (0.0, 0.2))
+    inside = sw.CBFActionFilter(gym.make("InvertedPendulum-v5", render_mode="rgb_array"), [near])
+    env = sw.SafetyOverlay(sw.LeaseExpiry(inside, sw.StoppingBudget(far, acceleration=30.0)))
+    env.reset(seed=0)
+    at = [mark.position[0] for mark in env.marks() if mark.role == "keep out"]
+    np.testing.assert_allclose(at, [-0.9, 0.9, -0.7, 0.7])
+    told = sw.StoppingBudget(lambda env: ([1.0], [0.0]), braking=8.0, acceleration=30.0)
+    assert sw.LeaseExpiry(inside, told).look() == ()
 
 
 # Pictures -----------------------------------------------------------------------------------------------------

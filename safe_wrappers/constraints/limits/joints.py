@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safe_wrappers.checks import name_list, positive
+from safe_wrappers.constraints.limits.joint_marks import range_marks, speed_marks
 from safe_wrappers.constraints.rollout import RENAMED, BoundRollout, RolloutConstraint
 from safe_wrappers.control.numerics.compiled import compiled
 from safe_wrappers.deprecation import deprecated_parameters
+from safe_wrappers.drawing.marks import Mark
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.filter.constraint import Array, HalfSpaces
 from safe_wrappers.plants.mujoco.forecast import Forecast
@@ -183,7 +185,7 @@ class BoundJointPositionLimit(BoundRollout):
 
     def __init__(self, spec: JointPositionLimit, plant: Plant) -> None:
         super().__init__(spec, plant)
-        ids = scalar_joints(self.plant, self.spec.joints)
+        self._ids = ids = scalar_joints(self.plant, self.spec.joints)
         model: mujoco.MjModel = self.plant.model
         self._qpos = model.jnt_qposadr[ids]
         limited = model.jnt_limited[ids].astype(bool)
@@ -213,6 +215,9 @@ class BoundJointPositionLimit(BoundRollout):
 
     def room(self, forecast: Forecast) -> Array:
         return self._left(forecast.qpos)
+
+    def draw(self) -> list[Mark]:
+        return range_marks(self.plant, self._ids, self._low + self.spec.margin, self._high - self.spec.margin)
 
 
 def _positions(name: str, given: float | Sequence[float] | None) -> float | list[float] | None:
@@ -281,7 +286,7 @@ class BoundJointSpeedLimit(BoundRollout):
         hint = "on an AnalyticPlant write Barrier(lambda x: limit**2 - x[i]**2)"
         require_mujoco(plant, f"JointSpeedLimit needs a MujocoPlant (named joints); {hint}")
         super().__init__(spec, plant)
-        ids = scalar_joints(self.plant, self.spec.joints)
+        self._ids = ids = scalar_joints(self.plant, self.spec.joints)
         self._dofs = self.plant.model.jnt_dofadr[ids]
         self._limits = per_joint("limit", self.spec.limit, len(ids))
         self._bound = np.asarray(self._limits - self.spec.margin)
@@ -292,6 +297,9 @@ class BoundJointSpeedLimit(BoundRollout):
 
     def room(self, forecast: Forecast) -> Array:
         return np.asarray(self._limits - np.abs(forecast.qvel[:, self._dofs]))
+
+    def draw(self) -> list[Mark]:
+        return speed_marks(self.plant, self._ids, self._limits)
 
     def rows(self) -> HalfSpaces:
         """Two rows per joint that could reach its limit within the hold; none where controls are no forces."""

@@ -1,7 +1,7 @@
 """StoppingBudget: what a stop inside a clearance takes, and how long any command may go on before it."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -164,6 +164,16 @@ class BoundBudget:
         value = np.asarray(self._bound.value(), dtype=np.float64)
         self.clearance = value[value != np.inf]
         self.speed = np.zeros(self.clearance.shape)
+
+    def look(self) -> Sequence[BoundConstraint]:
+        """The constraint in the present state, for who looks on; none where that is not finite or there is none."""
+        if self._bound is None:
+            return ()
+        plant = self._bound.plant
+        count = plant.observation_id
+        self.measure()
+        plant.observation_id = count
+        return (self._bound,) if self.readable else ()
 
     @property
     def readable(self) -> bool:
