@@ -10,6 +10,7 @@ from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 from safe_wrappers.errors import ConfigurationError
 from safe_wrappers.train.cli import main
 from safe_wrappers.train.diagnosis.trained import of_file, of_run
+from safe_wrappers.train.tables import read_rows
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 TINY = """
@@ -46,6 +47,12 @@ def test_the_command_prints_and_writes_page_and_json(tmp_path, capsys):
     html = page.read_text()
     assert "sw.SlipLimiter(env" in html and "<svg" in html and "safe-wrappers diagnose SafeRover-v0" in html
     assert "Not found, or not measured" in html and "http" not in html
+    (table,) = (page.parent / "rover_data").iterdir()  # a plot per symptom that was found
+    assert f'href="rover_data/{table.name}"' in html and table.name == "symptom-wheel_slip.csv"
+    rows = read_rows(table)
+    assert [row["step"] for row in rows] == list(range(60))
+    slipping = np.mean([row["value"] > 0.2 for row in rows])
+    assert slipping == pytest.approx(there["findings"][0]["figure"]) and slipping > 0.0
 
 
 def test_the_policy_of_a_run_acts_as_it_was_trained(run, tmp_path):

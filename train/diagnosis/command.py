@@ -11,6 +11,7 @@ from rich.console import Console
 from safe_wrappers.diagnosis import Diagnosis, diagnose
 
 from ..config.env_ids import check_env_id
+from ..figures.plot_files import PlotFiles
 from .page import diagnosis_page
 from .trained import of_file, of_run
 
@@ -18,7 +19,7 @@ from .trained import of_file, of_run
 def diagnose_command(
     env_id: str, policy: Path | None, steps: int, output: Path, command: str, console: Console
 ) -> Diagnosis:
-    """Diagnose an env by its id, and write the page, and the same as JSON beside it.
+    """Diagnose an env by its id, and write the page, and beside it the same as JSON and its plots as CSV.
 
     Args:
         env_id: As `gym.make` takes it.
@@ -38,7 +39,9 @@ def diagnose_command(
     env.close()
     output.parent.mkdir(parents=True, exist_ok=True)
     output.with_suffix(".json").write_text(found.as_json())
-    output.write_text(diagnosis_page(found, command))
+    files = PlotFiles(output)
+    output.write_text(diagnosis_page(found, command, files))
+    files.write()
     console.print(str(found), highlight=False, markup=False, soft_wrap=True)
     console.print(f"Page: {output}", highlight=False, soft_wrap=True)
     return found

@@ -9,12 +9,13 @@ from safe_wrappers.diagnosis import Diagnosis, Finding
 from safe_wrappers.diagnosis.finding import amount
 
 from ..figures.canvas import BAD, arm_color, draw
-from ..figures.picture import Picture
+from ..figures.picture import Picture, Plotted
+from ..figures.plot_files import PlotFiles
 from ..report.markup import document, pictures, section, text
 
 
-def diagnosis_page(diagnosis: Diagnosis, command: str) -> str:
-    """The whole page."""
+def diagnosis_page(diagnosis: Diagnosis, command: str, files: PlotFiles) -> str:
+    """The whole page; `files` gets what its plots are drawn from."""
     there = diagnosis.present
     verdict = (
         f"{len(there)} symptom(s), {there[0].title} first."
@@ -26,7 +27,7 @@ def diagnosis_page(diagnosis: Diagnosis, command: str) -> str:
         f"<header><h1>{text(diagnosis.env)}</h1><p>{diagnosis.steps:,} control steps each of the drivers: "
         f'{text(drivers)}.</p></header><p class="verdict">{text(verdict)}</p>'
     )
-    found = [section(finding.title, *_parts(finding)) for finding in there]
+    found = [section(finding.title, *_parts(finding, files)) for finding in there]
     rest = [finding for finding in diagnosis.findings if not finding.present]
     rows = "".join(f"<tr><td>{text(one.title)}</td><td>{text(_why_not(one))}</td></tr>" for one in rest)
     others = section("Not found, or not measured", f"<table><tbody>{rows}</tbody></table>") if rest else ""
@@ -34,7 +35,7 @@ def diagnosis_page(diagnosis: Diagnosis, command: str) -> str:
     return document(f"Diagnosis of {diagnosis.env}", "\n".join([head, *found, others, made]))
 
 
-def _parts(finding: Finding) -> list[str]:
+def _parts(finding: Finding, files: PlotFiles) -> list[str]:
     of_drivers = [(f"{driver} driver" if driver != "policy" else "the policy", value, finding.unit)
                   for driver, value in finding.by_driver.items()]  # fmt: skip
     numbers = [*of_drivers, *finding.evidence]
@@ -44,7 +45,7 @@ def _parts(finding: Finding) -> list[str]:
     parts = [
         f"<p>A symptom from {text(amount(finding.threshold, finding.unit))} on; source: the appendix, "
         f"{text(finding.section)}.</p>",
-        f'<div style="max-width: 560px">{pictures([_plot(finding)])}</div>',
+        f'<div style="max-width: 560px">{pictures([_plot(finding)], files)}</div>',
         f"<table><tbody>{rows}</tbody></table>",
     ]
     if finding.code:
@@ -79,6 +80,7 @@ def _plot(finding: Finding) -> Picture:
 
     peak = float(np.nanmax(series.values)) if np.isfinite(series.values).any() else float("nan")
     reading = f"Largest value {peak:.3g} {series.unit}".strip() + "."
-    return Picture(
-        title, reading, draw(f"symptom-{finding.symptom}", f"{title}. {reading}", paint, height=2.2)
-    )
+    name = f"symptom-{finding.symptom}"
+    rows = [{"step": float(step), "value": float(value)} for step, value in enumerate(series.values)]
+    svg = draw(name, f"{title}. {reading}", paint, height=2.2)
+    return Picture(title, reading, svg, data=Plotted(name, ("step", "value"), rows))
