@@ -1,8 +1,8 @@
 """Where MuJoCo keeps the contacts of its data, for compiled code, which cannot ask its Python bindings.
 
-The bindings tell where contacts are while there are some, but not where they will be, nor where their number is. These
-places are found once, in data of tiny models with known numbers of contacts; where they are not found, compiled code
-reads no contacts.
+The bindings tell where contacts are while there are some, but not where they will be, nor where their number is.
+These places are found once, in data of tiny models with known numbers of contacts; where they are not found, compiled
+code reads no contacts.
 """
 
 import ctypes
