@@ -9,6 +9,7 @@ import pytest
 
 import safe_wrappers as sw
 from safe_wrappers.control.numerics.compiled import IS_COMPILED
+from safe_wrappers.plants.mujoco.contact_memory import contact_memory
 from safe_wrappers.plants.mujoco.contacts import ContactReader, can_touch_the_world
 from safe_wrappers.plants.mujoco.replay import Replay
 
@@ -224,6 +225,26 @@ def test_compiled_code_is_used_where_it_can_be():
     assert copy.deepcopy(reader)._memory is None  # of data that the copy does not hold
     filtered = '<general name="slow" joint="hip" dyntype="filter" dynprm="0.1" ctrlrange="-1 1"/>'
     assert not ContactReader(Legs(act=filtered).model)._compiles
+
+
+@pytest.mark.skipif(not IS_COMPILED, reason="compiled code is switched off")
+def test_views_that_were_made_without_contacts_show_those_that_come():
+    # MuJoCo 4.0's bindings show an array that is anywhere while there are none.
+    env = Legs()
+    env.reset()
+    env.data.qpos[2::9] += 5.0
+    mujoco.mj_forward(env.model, env.data)
+    assert env.data.ncon == 0
+    memory = contact_memory(env.model, env.data)
+    env.reset()
+    mujoco.mj_step(env.model, env.data, 100)
+    contact, count = env.data.contact, env.data.ncon
+    assert count > 1 and memory.number[0] == count
+    of_contacts = memory.reals[: count * memory.stride].reshape(count, memory.stride)
+    np.testing.assert_array_equal(of_contacts[:, 0], contact.dist)
+    np.testing.assert_array_equal(of_contacts[:, memory.pos : memory.pos + 3], contact.pos)
+    whole = of_contacts.view(np.int32)
+    np.testing.assert_array_equal(whole[:, memory.geom : memory.geom + 2], contact.geom)
 
 
 @pytest.mark.parametrize("env_id", ["Ant-v5", "Humanoid-v5", "HalfCheetah-v5"])

@@ -1,7 +1,8 @@
 """Where MuJoCo keeps the contacts of its data, for compiled code, which cannot ask its Python bindings.
 
-The bindings tell where the contacts and their fields are, but not where their number is. That place is found once,
-in data of tiny models with known numbers of contacts; where it is not found, compiled code reads no contacts.
+The bindings tell where contacts are while there are some, but not where they will be, nor where their number is.
+These places are found once, in data of tiny models with known numbers of contacts; where they are not found, compiled
+code reads no contacts.
 """
 
 import ctypes
@@ -15,6 +16,8 @@ from numpy.typing import NDArray
 from safe_wrappers.checks import Array
 
 _BEFORE = 128  # bytes before `data.energy` among which the number of contacts is
+_AFTER = 64  # bytes from it on among which the address of the contacts is
+_FIELDS = ("pos", "frame", "friction", "dim", "geom", "efc_address")  # reals, then ints
 _BALLS = """<mujoco><worldbody><geom type="plane" size="9 9 1"/><body pos="0 0 .09"><freejoint/>{}</body>
 </worldbody></mujoco>"""
 _BALL = '<geom type="sphere" size=".1" pos="{} 0 0"/>'
@@ -46,13 +49,26 @@ class ContactMemory(NamedTuple):
     row: int  # first of its rows in the solver, below 0 if it has none
 
 
+class _Layout(NamedTuple):
+    """Where things are in any data."""
+
+    number: int  # of contacts, in ints from `_BEFORE` bytes before the energy
+    arena: int  # the address at which the contacts begin, in words from the energy
+    stride: int  # of contacts, bytes
+    places: tuple[int, ...]  # of `_FIELDS` in a contact, in bytes
+
+
 def contact_memory(model: mujoco.MjModel, data: mujoco.MjData) -> ContactMemory | None:
     """Views of the memory of data; None where MuJoCo does not keep its contacts as expected."""
-    place, contact, energy = _place_of_number(), data.contact, _address(data.energy)
-    first, stride = _address(contact.dist), contact.dist.strides[0]
-    if place is None or stride % 8:
+    layout, energy = _layout(), _address(data.energy)
+    if layout is None:
+        return None
+    # Not by the bindings: from 4.0 on they show an empty array that is anywhere while there are no contacts.
+    first = int(_view(energy, _AFTER, np.uint64)[layout.arena])
+    if data.ncon and first != _address(data.contact.dist):
         return None
     reals = _view(first, int(data.narena) // 8 * 8, np.float64)
+    sizes = (8, 8, 8, 4, 4, 4)
     return ContactMemory(
         model._address,
         data._address,
@@ -61,19 +77,18 @@ def contact_memory(model: mujoco.MjModel, data: mujoco.MjData) -> ContactMemory 
         data.qvel,
         data.qacc,
         data.qacc_warmstart,
-        _view(energy - _BEFORE + 4 * place, 4, np.int32),
+        _view(energy - _BEFORE + 4 * layout.number, 4, np.int32),
         reals,
         reals.view(np.int32),
-        stride // 8,
-        *((_address(getattr(contact, name)) - first) // 8 for name in ("pos", "frame", "friction")),
-        *((_address(getattr(contact, name)) - first) // 4 for name in ("dim", "geom", "efc_address")),
+        layout.stride // 8,
+        *(place // size for place, size in zip(layout.places, sizes, strict=True)),
     )
 
 
 @functools.cache
-def _place_of_number() -> int | None:
-    """Where the number of contacts is in the data, in ints from `_BEFORE` bytes before the energy."""
-    fitting = set(range(_BEFORE // 4))
+def _layout() -> _Layout | None:
+    """Found in tiny models with known numbers of contacts."""
+    numbers, arenas = set(range(_BEFORE // 4)), set(range(_AFTER // 8))
     for count in (1, 2, 3, 5):
         model = mujoco.MjModel.from_xml_string(_BALLS.format("".join(map(_BALL.format, range(count)))))
         data = mujoco.MjData(model)
@@ -82,10 +97,16 @@ def _place_of_number() -> int | None:
                 mujoco.mj_forward(model, data)
             data.time = 0.5 + count
             words = _view(_address(data.energy) - _BEFORE, _BEFORE, np.int32)
-            fitting &= set(np.flatnonzero(words == data.ncon).tolist())
+            numbers &= set(np.flatnonzero(words == data.ncon).tolist())
             if words[-2:].view(np.float64)[0] != data.time:
                 return None
-    return fitting.pop() if len(fitting) == 1 else None
+        contact, addresses = data.contact, _view(_address(data.energy), _AFTER, np.uint64)
+        first, stride = _address(contact.dist), int(contact.dist.strides[0])
+        arenas &= set(np.flatnonzero(addresses == first).tolist())
+    if len(numbers) != 1 or len(arenas) != 1 or stride % 8:
+        return None
+    places = tuple(_address(getattr(contact, name)) - first for name in _FIELDS)
+    return _Layout(numbers.pop(), arenas.pop(), stride, places)
 
 
 def _address(array: NDArray[Any]) -> int:
