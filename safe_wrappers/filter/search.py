@@ -333,7 +333,7 @@ class SafeActionSearch:
         # Measured in shares of what acts: a control that saturates early must not look cheap to change.
         force = np.clip(nominal, least, most)
         reach, box = most - least, high - low
-        unit = np.where((reach > 0.0) & np.isfinite(box), reach / np.where(box > 0.0, box, 1.0), 1.0)
+        unit = np.where(known := (reach > 0.0) & np.isfinite(box), reach, 1.0) / np.where(known, box, 1.0)
         scaled = force / unit, normals * unit, offsets, least / unit, most / unit
         result = project_unchecked(*scaled, self._solver)
         if result.status is Status.INACTIVE:

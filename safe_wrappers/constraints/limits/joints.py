@@ -202,7 +202,10 @@ class BoundJointPositionLimit(BoundRollout):
             )
         self._below, self._above = np.isfinite(self._low), np.isfinite(self._high)
         if not (self._below.any() or self._above.any()):
-            raise ConfigurationError("none of these joints has a range in the model: pass lower and upper")
+            named = ", ".join(repr(model.joint(j).name) for j in ids)
+            raise ConfigurationError(
+                f"none of these joints has a range in the model: pass lower and upper ({named})"
+            )
 
     def now(self) -> Array:
         return self._left(self.plant.qpos)

@@ -18,10 +18,11 @@ from safe_wrappers.checks import Array
 from safe_wrappers.errors import ConfigurationError, UnsupportedEnvError
 from safe_wrappers.plants.env_checks import name_of
 from safe_wrappers.plants.mujoco.binding import Accessed
-from safe_wrappers.plants.mujoco.forecast import Recorder
+from safe_wrappers.plants.mujoco.forecast import RESETS, Recorder
 from safe_wrappers.plants.mujoco.model import control_range
 
 _TRIALS: Final = 100
+_FEWEST: Final = 10  # of them that must not have diverged
 _ROUNDING: Final = 1e-6
 """Of controls, as a share of the largest one seen, and of states: envs may compute in single precision."""
 _INSTEAD: Final = (
@@ -242,17 +243,25 @@ def _tried(raw: Any, source: Any, space: gym.spaces.Box, substeps: int) -> _Trie
     )
     actions = [(low + high) / 2.0, high, *(space.sample() for _ in range(_TRIALS))]
     twin.reset(seed=0)
-    probe, controls, departure = mujoco.MjData(at.model), [], 0.0
+    probe, taken, controls, departure = mujoco.MjData(at.model), [], [], 0.0
+    at.data.warning.number[RESETS] = 0
     for action in actions:
         mujoco.mj_copyData(probe, at.model, at.data)
         twin.step(np.array(action, dtype=space.dtype))
+        if at.data.warning.number[RESETS].any():  # MuJoCo has reset the state, and the control with it
+            twin.reset()
+            at.data.warning.number[RESETS] = 0
+            continue
+        taken.append(action)
         controls.append(at.data.ctrl.copy())
         probe.ctrl[:] = at.data.ctrl
         mujoco.mj_step(at.model, probe, nstep=substeps)
         for held, found in ((probe.qpos, at.data.qpos), (probe.qvel, at.data.qvel)):
             missed = np.abs(held - found) / (1.0 + np.abs(found))
             departure = max(departure, float(np.nan_to_num(missed, nan=np.inf).max(initial=0.0)))
-    return _Tried(np.array(actions, dtype=space.dtype).astype(np.float64), np.array(controls), departure)
+    if len(taken) < _FEWEST:
+        raise RuntimeError(f"in {len(actions) - len(taken)} of {len(actions)} steps its simulation diverged")
+    return _Tried(np.array(taken, dtype=space.dtype).astype(np.float64), np.array(controls), departure)
 
 
 def _envs_of(raw: Any) -> list[Any]:

@@ -29,9 +29,15 @@ _HANDLED = (
 
 def _refuse_unsupported(model: mujoco.MjModel) -> None:
     """Raise for any actuator whose force is not affine in its control at a given state."""
+    every = bool(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_ACTUATION))
     # Not nu: from MuJoCo 3.12 on an actuator may have no control at all.
     for i in range(len(model.actuator_trntype)):
         name = model.actuator(i).name or f"#{i}"
+        if every or model.opt.disableactuator & _bit(model.actuator_group[i]):
+            raise UnsupportedEnvError(
+                f"actuator {name!r} is disabled (actuatorgroupdisable, or the flag actuation), which MujocoPlant "
+                "does not model; enable it, or take it out of the model"
+            )
         for what, field, kinds, handled in _HANDLED:
             kind = kinds(int(getattr(model, field)[i])).name.partition("_")[2].lower()
             if kind not in handled:
@@ -45,6 +51,11 @@ def _refuse_unsupported(model: mujoco.MjModel) -> None:
                 f"{kind} {name!r} clamps the sum of its actuators' forces (actuatorfrcrange), which MujocoPlant "
                 "does not model; give the actuators a forcerange instead, or use AnalyticPlant"
             )
+
+
+def _bit(group: int) -> int:
+    """Of an actuator's group in `disableactuator`; those above 30 cannot be disabled."""
+    return 1 << int(group) if 0 <= group <= 30 else 0
 
 
 def _refuse(actuator: str, what: str, handled: str) -> None:

@@ -1,0 +1,353 @@
+"""Random MuJoCo models through MujocoPlant and a filter: supported, or refused by name, never a crash.
+
+    python -m benchmarks.random_models                   # 10,000 models; goes on where it was stopped
+    python -m benchmarks.random_models --models 200 --results DIR
+    python -m benchmarks.random_models --seed 17         # one of them: its XML, and what became of it
+
+A model that MuJoCo compiles and can simulate becomes one of Gymnasium's MuJoCo envs, twice: one is filtered, the twin
+is given what was executed. It is *supported* if every forecast of an executed control is the env's step and the twin's
+to the last bit, every executed control is finite and in the action space, and f + g u is MuJoCo's acceleration where
+no constraint is active. It is *refused* if the library says so and names the part of the model. Everything else is a
+*defect*: another exception, a crash, more than a minute, a number that is wrong. Models run in batches, each in a
+process of its own, so that a crash is seen and has a seed.
+"""
+
+import argparse
+import json
+import os
+import random
+import re
+import selectors
+import subprocess
+import sys
+import tempfile
+import traceback
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from gymnasium.envs.mujoco import MujocoEnv
+
+import safe_wrappers as sw
+from benchmarks.random_mjcf import RandomModel
+from safe_wrappers.errors import SafeWrappersError
+
+RESULTS = Path(__file__).parent / "results"
+STEPS = 5
+BATCH = 200
+LONGEST_S = 60.0
+"""Of one model, the first one's imports and compilation included."""
+_FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
+_HINGE_OR_SLIDE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+_READ = ("qpos", "qvel", "act", "qacc", "ctrl", "xpos", "xipos", "sensordata", "qfrc_actuator", "cfrc_ext", "mocap_pos")
+
+
+class Machine(MujocoEnv):
+    """Any MJCF as one of Gymnasium's MuJoCo envs; actions are the controls."""
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - Gymnasium's
+
+    def __init__(self, xml: str, frame_skip: int, dtype: type) -> None:
+        self._xml, self._dtype = xml, dtype
+        super().__init__(__file__, frame_skip, gym.spaces.Box(-np.inf, np.inf, (1,)))
+
+    def _initialize_simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        model = mujoco.MjModel.from_xml_string(self._xml)
+        return model, mujoco.MjData(model)
+
+    def _set_action_space(self) -> gym.spaces.Box:
+        limited, bounds = self.model.actuator_ctrllimited == 1, self.model.actuator_ctrlrange
+        low, high = np.where(limited, bounds.T, [[-np.inf], [np.inf]])
+        self.action_space = gym.spaces.Box(low.astype(self._dtype), high.astype(self._dtype), dtype=self._dtype)
+        return self.action_space
+
+    def reset_model(self) -> Any:
+        draw, model = self.np_random, self.model
+        qpos = self.init_qpos.copy()
+        mujoco.mj_integratePos(model, qpos, draw.normal(0.0, 0.3, model.nv), 1.0)
+        self.data.mocap_pos += draw.normal(0.0, 0.1, (model.nmocap, 3))
+        self.set_state(qpos, draw.normal(0.0, 0.5, model.nv))
+        return np.zeros(1, np.float32)
+
+    def step(self, action: Any) -> Any:
+        self.do_simulation(action, self.frame_skip)
+        return np.zeros(1, np.float32), 0.0, False, False, {}
+
+
+class Defect(Exception):
+    """What the library did is wrong."""
+
+
+def trial(seed: int) -> tuple[str, str]:
+    """What became of a model: "mujoco", "supported", "refused" or "defect", and why."""
+    drawn = RandomModel(seed)
+    rng = random.Random(f"trial {seed}")
+    frame_skip, dtype = rng.choice((1, 2, 4, 5)), rng.choice((np.float32, np.float64))
+    try:
+        machine, twin = (Machine(drawn.xml, frame_skip, dtype) for _ in range(2))
+        _simulate(twin, seed)
+    except (ValueError, mujoco.FatalError) as error:
+        return "mujoco", str(error)
+    try:
+        return _closed_loop(machine, twin, seed, rng)
+    except SafeWrappersError as error:
+        return ("refused" if _names_a_part(str(error), machine.model) else "defect"), str(error)
+    except Exception:
+        return "defect", traceback.format_exc()
+
+
+def _simulate(env: Machine, seed: int) -> None:
+    env.reset(seed=seed)
+    for _ in range(STEPS):
+        env.step(np.clip(np.zeros_like(env.action_space.low), env.action_space.low, env.action_space.high))
+
+
+def _names_a_part(message: str, model: mujoco.MjModel) -> bool:
+    """Whether a refusal says which part of the model is not supported."""
+    kinds = ("body", "jnt", "geom", "site", "tendon", "actuator", "eq")
+    names = [getattr(model, kind)(i).name for kind in kinds for i in range(getattr(model, _counts(kind)))]
+    named = any(re.search(rf"\b{re.escape(name)}\b", message) for name in names if name)
+    return named or bool(re.search(r"'#\d+'|no actuator|the model's \w+ (is|are)", message))
+
+
+def _counts(kind: str) -> str:
+    return {"body": "nbody", "actuator": "nu", "jnt": "njnt"}.get(kind, f"n{kind}")
+
+
+def _closed_loop(machine: Machine, twin: Machine, seed: int, rng: random.Random) -> tuple[str, str]:
+    onlooker = sw.MujocoPlant()
+    onlooker.bind(machine)
+    share_step = rng.choice((None, True))
+    plants = {"share_step": share_step} if rng.random() < 0.8 else {"delay_s": 0.013}
+    env, unfit = _filtered(machine, plants, rng)
+    env.reset(seed=seed)
+    twin.reset(seed=seed)
+    for _ in range(STEPS):
+        onlooker.observe()
+        proposed = _proposal(machine.action_space, rng)
+        *_, info = env.step(proposed)
+        executed = info["executed_action"]
+        if not (np.isfinite(executed).all() and machine.action_space.contains(executed.astype(proposed.dtype))):
+            raise Defect(f"executed {executed} of {machine.action_space}")
+        _check_forecast(onlooker, machine, executed)
+        twin.step(executed.astype(proposed.dtype))
+        _check_twin(machine, twin)
+        onlooker.observe()
+        if np.isfinite(onlooker.state).all():
+            _check_response(onlooker, rng)
+            _ask(onlooker, executed)
+    return "supported", unfit
+
+
+def _filtered(machine: Machine, plants: dict[str, Any], rng: random.Random) -> tuple[gym.Env[Any, Any], str]:
+    """The machine with a filter of the first constraint that fits, and why others did not."""
+    model, limits, unfit = machine.model, sw.constraints, []
+    scalar = [
+        n for j in range(model.njnt) if model.jnt_type[j] in _HINGE_OR_SLIDE and (n := model.joint(j).name)
+    ]
+    body = model.body(model.nbody - 1).name
+    some = rng.sample(scalar, min(2, len(scalar)))
+    options = [
+        limits.SpeedLimit(rng.uniform(0.05, 2.0), body=rng.choice((None, body))),
+        limits.Workspace(low=[-1.0, None, 0.0], high=[1.0, 1.0, None], bodies=[body], horizon=2),
+        limits.Upright(body=body, lowest=0.1, tilt=1.0),
+        limits.Clearance([limits.Plane([0.5, 0.0, 0.0], [-1.0, 0.0, 0.0])], 3.0, bodies=[body]),
+    ]
+    if some:
+        options += [limits.JointPositionLimit(-0.5, 0.5, some), limits.JointPositionLimit(joints=some)]
+    rng.shuffle(options)
+    speed = rng.uniform(0.05, 2.0)
+    first = [limits.JointSpeedLimit(speed), *([limits.JointSpeedLimit(speed, some)] if some else [])]
+    for constraint in [*(first if rng.random() < 0.6 else []), *options]:
+        also = [options[0]] if rng.random() < 0.2 and constraint is not options[0] else []
+        try:
+            return sw.CBFActionFilter(machine, [constraint, *also], sw.MujocoPlant(**plants)), " | ".join(unfit)
+        except SafeWrappersError as error:
+            if not _names_a_part(str(error), model):
+                raise
+            unfit.append(str(error))
+    raise Defect(f"no constraint fits: {unfit}")
+
+
+def _proposal(space: gym.spaces.Box, rng: random.Random) -> Any:
+    """Anything that a policy may propose: inside, at a corner, outside, not finite."""
+    low, high = np.maximum(space.low, -3.0), np.minimum(space.high, 3.0)
+    draw = np.random.default_rng(rng.getrandbits(32))
+    inside = low + (high - low) * draw.random(low.shape)
+    kind = rng.random()
+    if kind < 0.2:
+        inside = np.where(draw.random(low.shape) < 0.5, low, high)
+    elif kind < 0.3:
+        inside = 3.0 * inside + 1.0
+    elif kind < 0.35:
+        inside = inside * np.nan
+    return inside.astype(space.dtype)
+
+
+def _check_forecast(onlooker: sw.MujocoPlant, machine: Machine, executed: Any) -> None:
+    """The forecast from the state before the step is where the env is now, bit for bit."""
+    end = onlooker.forecast(executed).path[-1]
+    reached = np.concatenate([machine.data.qpos, machine.data.qvel])
+    was_reset = machine.data.warning.number[mujoco.mjtWarning.mjWARN_BADQPOS :].any() and np.isnan(end).all()
+    if not (was_reset or np.array_equal(end, reached, equal_nan=True)):
+        raise Defect(f"the forecast is {np.abs(end - reached).max():.3g} away from the env")
+
+
+def _check_twin(machine: Machine, twin: Machine) -> None:
+    """The filtered env is where an env is that was given the executed action, bit for bit."""
+    states = [np.zeros(mujoco.mj_stateSize(m.model, _FULL)) for m in (machine, twin)]
+    for m, state in zip((machine, twin), states, strict=True):
+        mujoco.mj_getState(m.model, m.data, state, _FULL)
+    differ = [n for n in _READ if getattr(machine.data, n).tobytes() != getattr(twin.data, n).tobytes()]
+    if states[0].tobytes() != states[1].tobytes() or differ:
+        raise Defect(f"the filtered env is elsewhere than its twin; they differ in {differ}")
+
+
+def _check_response(onlooker: sw.MujocoPlant, rng: random.Random) -> None:
+    """Without active constraints f + g u is what MuJoCo says."""
+    drift, effect = onlooker.acceleration
+    data = onlooker.forward()
+    if data.nefc or not np.isfinite(effect).all():
+        if not np.isfinite(effect).all():
+            raise Defect("g is not finite")
+        return
+    low, high = onlooker.actuators.acting_range(data.actuator_length, data.actuator_velocity)
+    low, high = np.clip(low, -3.0, 3.0), np.clip(high, -3.0, 3.0)
+    control = low + rng.random() * (high - low)
+    expected = onlooker.under(control)
+    if expected.nefc:
+        return
+    size = 1.0 + np.abs(expected.qacc).max(initial=0.0) + np.abs(effect * control).max(initial=0.0)
+    missed = np.abs(drift + effect @ control - expected.qacc).max(initial=0.0)
+    if not missed <= 1e-7 * size:
+        raise Defect(f"f + g u is {missed:.3g} away from an acceleration of {size - 1.0:.3g}")
+
+
+def _ask(onlooker: sw.MujocoPlant, executed: Any) -> None:
+    """Whatever else constraints may ask a plant."""
+    body = onlooker.model.body(onlooker.model.nbody - 1).name
+    longer = onlooker.forecast(executed, 3)
+    asked: dict[str, Any] = {
+        "f": onlooker.f,
+        "g": onlooker.g,
+        "inertia": onlooker.inertia_diagonal(),
+        "position": onlooker.motion("body", body)[0],
+        "braking": onlooker.braking(),
+        "substep_ago": onlooker.substep_ago().frames,
+        "poses": longer.poses().centres if np.isfinite(longer.path).all() else 0.0,
+        "point": onlooker.point("body", body)[3],
+    }
+    onlooker.sketch(executed, 2)
+    onlooker.contact_forecast(executed)
+    for what, found in asked.items():
+        if not np.isfinite(found).all():
+            raise Defect(f"{what} is not finite at a finite state")
+
+
+def child(first: int, last: int) -> None:
+    """Print the outcomes of these seeds as JSON lines, each after its seed."""
+    warnings.simplefilter("ignore")
+    warnings.filterwarnings("error", category=RuntimeWarning, module="safe_wrappers")
+    for seed in range(first, last):
+        print(seed, flush=True)
+        print(json.dumps(trial(seed)), flush=True)
+
+
+def outcomes(first: int, last: int) -> Iterator[tuple[int, str, str]]:
+    """Seed, outcome and reason of each seed, in processes that may crash or hang."""
+    while first < last:
+        seed, why = first, "exit"
+        with tempfile.TemporaryDirectory() as folder:  # MuJoCo writes its log into the working directory
+            command = [sys.executable, "-m", "benchmarks.random_models", "--child", str(first), str(last)]
+            where = os.environ | {"PYTHONPATH": str(RESULTS.parents[1]), "MUJOCO_GL": "disabled"}
+            process = subprocess.Popen(command, stdout=subprocess.PIPE, cwd=folder, env=where, text=True, bufsize=1)
+            assert process.stdout is not None
+            for line in _lines_in_time(process):
+                if line.strip().isdigit():
+                    seed = int(line)
+                else:
+                    outcome, why = json.loads(line)
+                    yield seed, outcome, why
+                    first = seed + 1
+            process.kill()
+            code = process.wait()
+        if first < last:
+            how = f"more than {LONGEST_S:g} s" if code == -9 else f"the interpreter ended with {code}"
+            yield seed, "defect", how
+            first = seed + 1
+
+
+def _lines_in_time(process: "subprocess.Popen[str]") -> Iterator[str]:
+    with selectors.DefaultSelector() as selector:
+        assert process.stdout is not None
+        selector.register(process.stdout, selectors.EVENT_READ)
+        while selector.select(LONGEST_S):
+            line = process.stdout.readline()
+            if not line:
+                return
+            yield line
+
+
+def kind_of(refusal: str) -> str:
+    """A refusal without the names and numbers of one model."""
+    first = refusal.partition("Use AnalyticPlant")[0].partition("Covered would be")[0]
+    return re.sub(r"'[^']*'", "'...'", re.sub(r"-?\d[\d.e+-]*", "N", first))[:140].strip()
+
+
+def main() -> None:
+    """Run, or go on; print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--models", type=int, default=10_000, help="that MuJoCo compiles")
+    parser.add_argument("--seed", type=int, help="of one model to look at")
+    parser.add_argument("--child", type=int, nargs=2, help=argparse.SUPPRESS)
+    parser.add_argument("--results", type=Path, default=RESULTS, help="folder for the counts and the table")
+    arguments = parser.parse_args()
+    if arguments.child:
+        child(*arguments.child)
+    elif arguments.seed is not None:
+        print(RandomModel(arguments.seed).xml)
+        print(*trial(arguments.seed), sep="\n")
+    else:
+        run(arguments.models, arguments.results)
+
+
+def run(models: int, results: Path) -> None:
+    """Count until there are so many models, and keep the counts after every batch."""
+    path = results / "random_models.json"
+    new: dict[str, Any] = {"next_seed": 0, "mujoco": 0, "supported": 0, "refused": {}, "unfit": {}, "defects": []}
+    counts = json.loads(path.read_text()) if path.exists() else new
+    while (tried := counts["supported"] + sum(counts["refused"].values()) + len(counts["defects"])) < models:
+        first = counts["next_seed"]
+        for seed, outcome, why in outcomes(first, first + min(BATCH, models - tried)):
+            if outcome in ("mujoco", "supported"):
+                counts[outcome] += 1
+            elif outcome == "refused":
+                counts["refused"][kind_of(why)] = counts["refused"].get(kind_of(why), 0) + 1
+            else:
+                counts["defects"].append({"seed": seed, "why": why})
+            for each in why.split(" | ") if outcome == "supported" and why else ():
+                counts["unfit"][kind_of(each)] = counts["unfit"].get(kind_of(each), 0) + 1
+            counts["next_seed"] = seed + 1
+        path.write_text(json.dumps(counts, indent=1) + "\n")
+        print(f"{counts['next_seed']} seeds, {len(counts['defects'])} defects", flush=True)
+    text = table(counts)
+    path.with_suffix(".md").write_text(text + "\n")
+    print(text)
+
+
+def table(counts: dict[str, Any]) -> str:
+    """Markdown: what became of the models."""
+    lines = ["| outcome | models |", "|---|---|", f"| supported | {counts['supported']:,} |"]
+    refused = sorted(counts["refused"].items(), key=lambda item: -item[1])
+    lines += [f"| refused: {kind} | {count:,} |" for kind, count in refused]
+    lines += [f"| defect | {len(counts['defects']):,} |"]
+    lines += [f"| (refused by MuJoCo itself) | {counts['mujoco']:,} |"]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
