@@ -52,7 +52,7 @@ lint: .venv/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	rm -rf build/types && mkdir -p build/types/safe_wrappers
-	ln -s $(CURDIR)/safe_wrappers/* $(CURDIR)/envs $(CURDIR)/train build/types/safe_wrappers/
+	ln -s $(CURDIR)/safe_wrappers/* $(CURDIR)/envs $(CURDIR)/train $(CURDIR)/examples build/types/safe_wrappers/
 	cd build/types && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache -p safe_wrappers
 
 check: lint test

@@ -26,11 +26,11 @@ env = sw.ChunkHandover(
 model = PPO("MlpPolicy", Monitor(env), n_steps=min(512, steps), seed=0, device="cpu")
 model.learn(steps)
 
-observation, _ = env.reset(seed=1)
+observation = env.reset(seed=1)[0]
 done, peak, held_back = False, 0.0, 0
 while not done:
-    chunk, _ = model.predict(observation, deterministic=True)
-    observation, _, terminated, truncated, info = env.step(chunk)
+    chunk = model.predict(observation, deterministic=True)[0]
+    observation, reward, terminated, truncated, info = env.step(chunk)
     peak = max(peak, info["handover/peak_jerk"])
     held_back += info["handover/limited"]
     done = terminated or truncated

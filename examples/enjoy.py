@@ -17,11 +17,11 @@ options = parser.parse_args()
 trained = load_policy(options.run)
 env = trained.make_env()  # make_env("none"): without the filter
 for seed in range(options.episodes):
-    observation, _ = env.reset(seed=seed)
+    observation = env.reset(seed=seed)[0]
     trained.begin(env)
     done = False
     while not done:
-        observation, _, terminated, truncated, info = env.step(trained(observation))
+        observation, reward, terminated, truncated, info = env.step(trained(observation))
         done = terminated or truncated
     episode = info["interventions"]
     changed = f", {episode['intervention_rate']:.0%} changed" if "intervention_rate" in episode else ""

@@ -34,10 +34,11 @@ model.learn(steps)
 
 episodes, reached, lowest = 5, 0, float("inf")
 for seed in range(episodes):
-    observation, _ = env.reset(seed=seed)
+    observation = env.reset(seed=seed)[0]
     truncated = False
     while not truncated:
-        observation, _, _, truncated, info = env.step(model.predict(observation, deterministic=True)[0])
+        action = model.predict(observation, deterministic=True)[0]
+        observation, reward, terminated, truncated, info = env.step(action)
         lowest = min(lowest, info["cbf/margin"])
     reached += info["is_success"]
 print(f"{reached:.0f} of {episodes} goals reached; the smallest margin was {lowest:.3f} m")

@@ -19,7 +19,7 @@ rail = [sw.constraints.Plane([-wall], [1]), sw.constraints.Plane([wall], [-1])]
 
 for leased in (False, True):
     cart = gym.make("InvertedPendulum-v5")
-    env = cart
+    data, env = cart.get_wrapper_attr("data"), cart
     if leased:
         clearance = sw.constraints.Clearance(rail, bodies=["cart"], braking=8.0)
         env = sw.LeaseExpiry(cart, sw.StoppingBudget(clearance, acceleration=30.0))
@@ -27,11 +27,11 @@ for leased in (False, True):
     env.reset(seed=0)
     silent = braked = contacts = 0
     for step in range(steps):
-        x, v = cart.unwrapped.data.qpos[0], cart.unwrapped.data.qvel[0]
+        x, v = data.qpos[0], data.qvel[0]
         goal = 0.6 * (-1) ** (step // 25)  # to and fro; while its commands arrive, never near a wall
         _, _, _, _, info = env.step(np.array([8.0 * (goal - x) - 3.0 * v], np.float32).clip(-3, 3))
         silent += info["fault/active"]
         braked += info.get("lease/braking", False)
-        contacts += abs(cart.unwrapped.data.qpos[0]) > wall
+        contacts += abs(data.qpos[0]) > wall
     name = "lease" if leased else "no lease"
     print(f"{name}: {silent} silent steps, {braked} braked, {contacts} behind a wall")

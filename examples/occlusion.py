@@ -20,8 +20,8 @@ cars = sw.occlusion.Track(
     start_velocity_std=[1, 0],  # m/s
 )
 task = gym.make("OccludedCrossing-v0")
-env = sw.OcclusionPenalty(task, [cars], sensor="eye", tolerance=0.5, weight=0.05)
-env = sw.protect(env)  # keeps clear of where the cars may be
+watched = sw.OcclusionPenalty(task, [cars], sensor="eye", tolerance=0.5, weight=0.05)
+env = sw.protect(watched)  # keeps clear of where the cars may be
 
 env.reset(seed=0)
 seen, penalty, changed = [], 0.0, 0

@@ -4,6 +4,7 @@ python examples/own_env.py --steps 2000
 """
 
 import argparse
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -21,13 +22,15 @@ class Ferry(gym.Env):
     observation_space = gym.spaces.Box(-np.inf, np.inf, (2,))
     action_space = gym.spaces.Box(-1, 1, (1,))
 
-    def reset(self, *, seed=None, options=None):
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start 5 to 8 m above the weir, at rest."""
         super().reset(seed=seed)
         self.x, self.v = self.np_random.uniform(5, 8), 0.0
         return np.array([self.x, self.v], np.float32), {}
 
-    def step(self, action):
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """0.1 s of thrust against the current."""
         self.v += 0.1 * (2.0 * float(action[0]) - 0.5 * (self.v + 1.0))
         self.x += 0.1 * self.v
@@ -39,7 +42,8 @@ for env in (Ferry(), sw.CBFActionFilter(Ferry(), [dry])):
     env.reset(seed=0)
     over = 0
     for _ in range(steps):
-        observation, _, _, truncated, _ = env.step(np.array([-1.0], np.float32))  # down the river
+        down_the_river = np.array([-1.0], np.float32)
+        observation, reward, terminated, truncated, info = env.step(down_the_river)
         over += observation[0] < 0
         if over == 1 or truncated:  # lost
             break

@@ -21,11 +21,11 @@ recorder = sw.RecordInterventions(env)  # and what that cost is counted
 model = PPO("MlpPolicy", Monitor(recorder), n_steps=min(2048, steps), seed=0, device="cpu")
 model.learn(steps, callback=InterventionCallback())  # figures in SB3's log, under safety/
 
-observation, _ = recorder.reset(seed=1)
+observation = recorder.reset(seed=1)[0]
 done = False
 while not done:
-    action, _ = model.predict(observation, deterministic=True)
-    observation, _, terminated, truncated, info = recorder.step(action)
+    action = model.predict(observation, deterministic=True)[0]
+    observation, reward, terminated, truncated, info = recorder.step(action)
     done = terminated or truncated
 episode = info["interventions"]
 print(f"return {episode['return']:.1f}, steps in violation {episode['violations']}")

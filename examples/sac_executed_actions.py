@@ -16,9 +16,9 @@ parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--steps", type=int, default=50_000)
 steps = parser.parse_args().steps
 
-env = sw.FilterObservation(sw.protect(gym.make("SafePointGoal1-v0")))  # sees what the filter decides by
-env = sw.AdaptionPenalty(sw.RecordInterventions(env), penalty=0.05)  # for the proposals that were changed
-env = Monitor(sw.ActionRepeat(env, repeat=4))  # an action every 80 ms explores farther
+seeing = sw.FilterObservation(sw.protect(gym.make("SafePointGoal1-v0")))  # sees what the filter decides by
+charged = sw.AdaptionPenalty(sw.RecordInterventions(seeing), penalty=0.05)  # for what was changed
+env = Monitor(sw.ActionRepeat(charged, repeat=4))  # an action every 80 ms explores farther
 model = SAC(
     "MlpPolicy",
     env,
@@ -32,6 +32,7 @@ model = SAC(
 model.learn(steps, callback=InterventionCallback())
 
 buffer = model.replay_buffer
+assert isinstance(buffer, ExecutedActionReplayBuffer)
 print(
     f"{buffer.size()} steps; the filter changed {buffer.changed[: buffer.size()].mean():.0%} of the actions"
 )

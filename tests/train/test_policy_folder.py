@@ -1,8 +1,10 @@
 """What a run leaves for others: the same actions, nothing pickled, another env or filter refused."""
 
 import json
+import os
 import pickle
 import shutil
+import subprocess
 import sys
 import types
 
@@ -11,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from hub_server import serving
 from rich.console import Console
 from test_run import Reports
 
@@ -256,6 +259,40 @@ def test_a_policy_goes_to_the_hub_and_comes_back(reacher, hub, capsys):
     np.testing.assert_array_equal(there(observation), here(observation))
     assert main(["enjoy", "hub:me/reacher", "--episodes", "1"]) == 0
     assert "episode 0: return" in capsys.readouterr().out
+
+
+THROUGH_THE_HUB = """
+import sys
+import numpy as np
+from safe_wrappers.train.cli import main
+from safe_wrappers.train.policies import load_policy
+run = sys.argv[1]
+assert main(["push", run, "me/reacher"]) == 0
+there, here = load_policy("hub:me/reacher"), load_policy(run)
+observation, _ = here.make_env().reset(seed=0)
+np.testing.assert_array_equal(there(observation), here(observation))
+assert main(["enjoy", "hub:me/reacher", "--episodes", "1"]) == 0
+"""
+
+
+def test_the_real_package_takes_it_there_and_back(reacher, tmp_path):
+    pytest.importorskip("huggingface_sb3", reason="pip install 'safe-wrappers[hub]'")
+    write_card(load_policy(reacher).arm, 0, reacher, FilterConfig())
+    card = (reacher / "policy" / "README.md").read_text()
+    with serving(tmp_path / "hub") as url:  # huggingface_hub reads the variables when it is imported
+        env = {"HF_ENDPOINT": url, "HF_HOME": str(tmp_path / "home"), "HF_TOKEN": "hf_stub"}
+        done = subprocess.run(
+            [sys.executable, "-c", THROUGH_THE_HUB, str(reacher)],
+            env={**os.environ, **env},
+            capture_output=True,
+            text=True,
+        )
+    assert done.returncode == 0, done.stderr
+    assert "Uploaded: config.json" in done.stdout and "episode 0: return" in done.stdout
+    there = tmp_path / "hub" / "me" / "reacher"
+    for name in ("config.json", "filter.json", "model.npz", "normalisation.npz"):
+        assert (there / name).read_bytes() == (reacher / "policy" / name).read_bytes()
+    assert (there / "README.md").read_text().splitlines()[-5:] == card.splitlines()[-5:]
 
 
 def test_what_cannot_go_there_is_refused(policy, hub, tmp_path, monkeypatch, capsys):

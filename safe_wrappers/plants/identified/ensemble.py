@@ -80,7 +80,7 @@ def _fitted(inputs: Array, targets: Array, seed: int) -> list[tuple[Array, Array
             weights, biases = layers[-1]
             loss = (torch.baddbmm(biases, values, weights) - y[chosen]).square().mean()
             optimizer.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
+            loss.backward()
             optimizer.step()
     finally:
         torch.set_num_threads(threads)
