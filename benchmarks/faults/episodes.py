@@ -25,16 +25,20 @@ def lowest(env: Any) -> Any:
 
 
 def trace(env: Any, seed: int = 0, steps: int = STEPS) -> list[Any]:
-    """Everything an agent sees of one episode, as bytes and plain values."""
-    seen: list[Any] = [env.reset(seed=seed)[0].tobytes()]
+    """Everything an agent sees of one episode, as bytes and plain values; of a vector env, of its first ones."""
+    seen: list[Any] = [plain(env.reset(seed=seed)[0])]
     for action in actions(env, steps):
-        observation, reward, terminated, truncated, info = env.step(action)
-        seen.append((observation.tobytes(), float(reward), terminated, truncated, plain(info)))
-        if terminated or truncated:
+        answer = env.step(action)
+        seen.append(plain(answer))
+        if np.any(answer[2]) or np.any(answer[3]):
             break
     return seen
 
 
-def plain(info: dict[str, Any]) -> dict[str, Any]:
-    """Info whose arrays compare as bytes."""
-    return {k: v.tobytes() if isinstance(v, np.ndarray) else v for k, v in info.items()}
+def plain(value: Any) -> Any:
+    """What compares bit for bit: arrays as bytes."""
+    if isinstance(value, np.ndarray):
+        return [plain(one) for one in value] if value.dtype == object else value.tobytes()
+    if isinstance(value, dict):
+        return {key: plain(one) for key, one in value.items()}
+    return tuple(plain(one) for one in value) if isinstance(value, tuple) else value

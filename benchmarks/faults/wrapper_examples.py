@@ -41,7 +41,8 @@ class ThreeTorques(InvertedPendulumEnv):
 gym.register(DISCRETE, entry_point=f"{__name__}:ThreeTorques", max_episode_steps=1000)
 
 
-def _clearance() -> sw.constraints.HeadingDriveClearance:
+def clearance() -> sw.constraints.HeadingDriveClearance:
+    """Out of the hazards."""
     return sw.constraints.HeadingDriveClearance(
         [sw.constraints.Discs("hazard_positions", radius=0.2)], margin=0.004
     )
@@ -77,7 +78,7 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
         ),
     },
     "CBFActionFilter": {
-        "a HeadingDriveClearance": (TASK, lambda: {"constraints": [_clearance()]}),
+        "a HeadingDriveClearance": (TASK, lambda: {"constraints": [clearance()]}),
         "a JointSpeedLimit with options": (
             "Reacher-v5",
             lambda: {
@@ -137,7 +138,7 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
             "Reacher-v5",
             lambda: {"constraints": [sw.constraints.JointSpeedLimit(4.0)], "neighbours": 2},
         ),
-        "discs": (TASK, lambda: {"constraints": [_clearance()]}),
+        "discs": (TASK, lambda: {"constraints": [clearance()]}),
     },
     "LeaseExpiry": {
         "a Clearance": (
@@ -159,7 +160,7 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
         "a value with a closing speed": (
             TASK,
             lambda: {
-                "budget": {"clearance": _clearance(), "closing_speed": 4.0},
+                "budget": {"clearance": clearance(), "closing_speed": 4.0},
                 "blend_time": 0.0,
             },
         ),
@@ -297,7 +298,7 @@ EXAMPLES: dict[str, dict[str, tuple[str, Callable[[], dict[str, Any]]]]] = {
 
 INSIDE: dict[str, Callable[[Env], Env]] = dict.fromkeys(
     ("AdaptionPenalty", "SafeActionMap", "SafetyOverlay", "StuckEscape"),
-    lambda env: sw.CBFActionFilter(env, [_clearance()]),
+    lambda env: sw.CBFActionFilter(env, [clearance()]),
 )
 """Wrapper name -> the wrapper that it needs inside."""
 
@@ -347,7 +348,7 @@ def inside(name: str, env: Env) -> Env:
     return INSIDE.get(name, lambda env: env)(env)
 
 
-def build(name: str, case: str, around: Callable[[Env], Env] = lambda env: env) -> Any:
-    """The wrapper of an example; `around` is put around the task first."""
+def build(name: str, case: str, around: Callable[[Env], Env] = lambda env: env, **more: Any) -> Any:
+    """The wrapper of an example, with more arguments; `around` is put around the task first."""
     env_id, arguments = example(name, case)
-    return getattr(sw, name)(inside(name, around(made(name, env_id))), **arguments())
+    return getattr(sw, name)(inside(name, around(made(name, env_id))), **(arguments() | more))
