@@ -38,12 +38,15 @@ def cells(row: Row, groups: tuple[str, ...] = tuple(GROUPS)) -> dict[tuple[str, 
 def outcome(row: Row, cell: Cell, clean: object) -> Found:
     """Of one cell; `clean` is the episode of an env that never saw a fault."""
     session = row.open()
-    found = cell(session)
-    if found.outcome in DEFECTS or found.outcome is Outcome.NOT_APPLICABLE:
-        return found
-    if plain(session.episode()) != clean:
-        return Found(Outcome.DIVERGED, f"another episode afterwards ({found.outcome}: {found.note})")
-    return found
+    try:
+        found = cell(session)
+        if found.outcome in DEFECTS or found.outcome is Outcome.NOT_APPLICABLE:
+            return found
+        if plain(session.episode()) == clean:
+            return found
+    except Exception as error:
+        return Found(Outcome.CRASHED, f"{type(error).__name__}: {error}")
+    return Found(Outcome.DIVERGED, f"another episode afterwards ({found.outcome}: {found.note})")
 
 
 def judge(row: Row, groups: tuple[str, ...] = tuple(GROUPS)) -> list[dict[str, str]]:

@@ -94,8 +94,8 @@ def judged(row: Row, session: Session, answer: Answer, usual: Answer, alone: Ans
         return wrong
     if error is not None:
         text = f"{type(error).__name__}: {error}"
-        if isinstance(error, OF_OURS):
-            return Found(Outcome.CRASHED if answer.reached else Outcome.REFUSED, text)
+        if isinstance(error, OF_OURS) and not answer.reached:
+            return Found(Outcome.REFUSED, text)
         own = alone is not None and type(alone.error) is type(error)
         return Found(Outcome.ERROR if own else Outcome.CRASHED, text)
     if wrong is None and same(answer, usual):
