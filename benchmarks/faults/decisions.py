@@ -37,11 +37,13 @@ def _state(row: Row, value: float) -> Cell:
     def run(session: Session) -> Found:
         session.begin()
         break_state(session, value)
-        bare = row.bare().begin() if row.looks else None
-        if bare is not None:
+
+        def alone() -> Answer:
+            bare = row.bare().begin()
             break_state(bare, value)
+            return bare.step(action)
+
         action = session.actions[BEFORE]
-        alone = None if bare is None else bare.step(action)
         return judged(row, session, session.step(action), row.open().begin().step(action), alone)
 
     return run

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 
 from benchmarks.faults.outcomes import Found, judged
-from benchmarks.faults.stacks import BEFORE, Row, Session
+from benchmarks.faults.stacks import BEFORE, Answer, Row, Session
 
 Change = Callable[[Any], Any]
 
@@ -70,36 +70,38 @@ KEPT: dict[str, dict[str, Change]] = {
 """Column -> variant -> the same numbers in another form."""
 
 
-def inputs(row: Row) -> dict[tuple[str, str], Callable[[], Found]]:
+def inputs(row: Row) -> dict[tuple[str, str], Callable[[Session], Found]]:
     """The cells of a row."""
-    cells: dict[tuple[str, str], Callable[[], Found]] = {}
-    for column, variants in (SPOILED | KEPT).items():
-        for variant, change in variants.items():
-            cells[column, variant] = _cell(row, change, column in KEPT)
-    return cells
+    usual: list[Answer] = []
 
+    def without_a_fault(action: Any, anew: bool) -> Answer:
+        if anew or not usual:
+            usual.append(row.open().begin().step(action))
+        return usual[-1] if anew else usual[0]
 
-def _cell(row: Row, change: Change, same_numbers: bool) -> Callable[[], Found]:
-    def run(session: Session) -> Found:
-        session.begin()
-        action = session.actions[BEFORE]
-        space: Any = session.env.action_space
-        discrete = isinstance(space, gym.spaces.Discrete)
-        spoiled = change(np.float64(action) if discrete else action)
-        usual = action
-        if same_numbers and not discrete:
-            usual = np.array(spoiled, dtype=np.float64 if np.ndim(spoiled) == 0 else None)
-            usual = usual.astype(np.float64 if usual.dtype == np.float64 else space.dtype)
-        elif same_numbers:
-            spoiled = change(action)
-            usual = int(np.asarray(spoiled))
-        bare = row.bare().begin()
-        return judged(
-            row,
-            session,
-            session.step(spoiled),
-            row.open().begin().step(usual),
-            bare.step(spoiled),
-        )
+    def cell(change: Change, same_numbers: bool) -> Callable[[Session], Found]:
+        def run(session: Session) -> Found:
+            session.begin()
+            action = session.actions[BEFORE]
+            space: Any = session.env.action_space
+            discrete = isinstance(space, gym.spaces.Discrete)
+            spoiled = change(action if same_numbers or not discrete else np.float64(action))
+            plain = action
+            if same_numbers:
+                numbers = np.array(spoiled)
+                kind = numbers.dtype if numbers.dtype == np.float64 else space.dtype
+                plain = int(numbers) if discrete else numbers.astype(kind)
+            answer = session.step(spoiled)
+            expected = without_a_fault(plain, same_numbers)
+            return judged(row, session, answer, expected, lambda: row.bare().begin().step(spoiled))
 
-    return run
+        return run
+
+    without_a_fault(row.open().actions[BEFORE], False)
+    columns = [(column, variants, False) for column, variants in SPOILED.items()]
+    columns += [(column, variants, True) for column, variants in KEPT.items()]
+    return {
+        (column, variant): cell(change, same_numbers)
+        for column, variants, same_numbers in columns
+        for variant, change in variants.items()
+    }

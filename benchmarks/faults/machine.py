@@ -10,7 +10,7 @@ import numpy as np
 
 import safe_wrappers as sw
 from benchmarks.faults.outcomes import Found, Outcome, flags, judged, reached_wrongly
-from benchmarks.faults.stacks import BEFORE, Row, Session
+from benchmarks.faults.stacks import BEFORE, Answer, Row, Session
 from safe_wrappers.wrappers.cbf_action_filter import SAFE_TOLERANCE, filter_inside
 from safe_wrappers.wrappers.common.receiver import CommandReceiver
 
@@ -143,20 +143,29 @@ def _clock(by_s: float) -> Callable[[Row], Cell]:
             session.begin()
             receiver = next((one for one in session.layers() if isinstance(one, CommandReceiver)), None)
             action = session.actions[BEFORE]
-            raw, bare = session.raw(), row.bare().begin()
             if receiver is not None:
                 receiver.set_observation_time(receiver.now_s + by_s)
-            for one in (raw, bare.raw()):
-                if hasattr(one, "data"):
-                    one.data.time += by_s
+            _set_time(session, by_s)
             counter = time.perf_counter
             with mock.patch.object(time, "perf_counter", lambda: counter() + by_s):
                 answer = session.step(action)
-            return judged(row, session, answer, row.open().begin().step(action), bare.step(action))
+
+            def alone() -> Answer:
+                bare = row.bare().begin()
+                _set_time(bare, by_s)
+                return bare.step(action)
+
+            return judged(row, session, answer, row.open().begin().step(action), alone)
 
         return run
 
     return cell
+
+
+def _set_time(session: Session, by_s: float) -> None:
+    raw = session.raw()
+    if hasattr(raw, "data"):
+        raw.data.time += by_s
 
 
 def machine(row: Row) -> dict[tuple[str, str], Cell]:

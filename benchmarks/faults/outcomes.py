@@ -1,6 +1,6 @@
 """What became of a fault, and how that is judged from one step or an episode."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from enum import StrEnum
 from typing import Any, NamedTuple
 
@@ -77,7 +77,9 @@ def reached_wrongly(session: Session, answers: Iterable[Answer]) -> Found | None
     return None
 
 
-def judged(row: Row, session: Session, answer: Answer, usual: Answer, alone: Answer | None) -> Found:
+def judged(
+    row: Row, session: Session, answer: Answer, usual: Answer, alone: Callable[[], Answer] | None
+) -> Found:
     """The outcome of one step.
 
     Args:
@@ -85,7 +87,7 @@ def judged(row: Row, session: Session, answer: Answer, usual: Answer, alone: Ans
         session: In which the fault was.
         answer: Of the step with the fault.
         usual: Of the same step without it.
-        alone: Of the same step with the fault, of the bare env; None where the fault does not reach it.
+        alone: Makes the same step with the fault in the bare env; None where the fault does not reach it.
     """
     error = answer.error
     wrong = reached_wrongly(session, [answer])
@@ -96,7 +98,7 @@ def judged(row: Row, session: Session, answer: Answer, usual: Answer, alone: Ans
         text = f"{type(error).__name__}: {error}"
         if isinstance(error, OF_OURS) and not answer.reached:
             return Found(Outcome.REFUSED, text)
-        own = alone is not None and type(alone.error) is type(error)
+        own = alone is not None and type(alone().error) is type(error)
         return Found(Outcome.ERROR if own else Outcome.CRASHED, text)
     if wrong is None and same(answer, usual):
         return Found(Outcome.HARMLESS)
@@ -104,7 +106,7 @@ def judged(row: Row, session: Session, answer: Answer, usual: Answer, alone: Ans
     new = [text for text in answer.warned if text not in usual.warned]
     if found or any("the policy's action" in text or "operator's action" in text for text in new):
         return Found(Outcome.FLAGGED, ", ".join([*found, *new]))
-    if as_alone and alone is not None and _continues(answer, alone):
+    if as_alone and alone is not None and _continues(answer, alone()):
         return Found(Outcome.PASSED, ", ".join(new))
     return Found(Outcome.SILENT, ", ".join(new))
 
