@@ -2,7 +2,6 @@
 
     python -m benchmarks.fault_matrix                       # all rows that are not in the CSV yet
     python -m benchmarks.fault_matrix --only LeaseExpiry    # one row anew
-    python -m benchmarks.fault_matrix --table               # the table from the CSV alone
 
 A cell is a short episode on a real env, with a recorder at its bottom that sees every action which reaches the
 simulation, and the fault in the middle. After it the next episode has to be bit for bit that of an env that never saw
@@ -23,10 +22,11 @@ from benchmarks.faults.lifecycle import lifecycle
 from benchmarks.faults.machine import machine
 from benchmarks.faults.outcomes import DEFECTS, Found, Outcome
 from benchmarks.faults.stacks import Row, Session, rows
+from benchmarks.faults.table import markdown
 
 RESULTS = Path(__file__).parent / "results" / "fault_matrix.csv"
 COLUMNS = ("kind", "row", "example", "fault", "variant", "outcome", "note")
-GROUPS = {"inputs": inputs, "decisions": decisions, "machine": machine, "lifecycle": lifecycle}
+GROUPS = {"The action": inputs, "The decision": decisions, "The machine": machine, "The env": lifecycle}
 Cell = Callable[[Session], Found]
 
 
@@ -70,7 +70,7 @@ def read() -> list[dict[str, str]]:
 
 
 def write(found: list[dict[str, str]]) -> None:
-    """The CSV file, in the order of the rows."""
+    """The CSV file, in the order of the rows, and the tables."""
     order = {(row.name, row.case): place for place, row in enumerate(rows())}
     kept = [cell for cell in found if (cell["row"], cell["example"]) in order]
     kept.sort(key=lambda cell: order[cell["row"], cell["example"]])
@@ -78,6 +78,9 @@ def write(found: list[dict[str, str]]) -> None:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
         writer.writerows(kept)
+    first = next(rows())
+    faults = {group: list(dict.fromkeys(fault for fault, _ in cells(first, (group,)))) for group in GROUPS}
+    RESULTS.with_suffix(".md").write_text(markdown(kept, faults), encoding="utf-8")
 
 
 def main() -> None:

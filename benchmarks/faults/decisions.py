@@ -24,27 +24,23 @@ class SolverError(RuntimeError):
     """What a solver raises that breaks."""
 
 
-def break_state(session: Session, value: float) -> None:
-    """Write a number into the first position and velocity."""
-    raw = session.raw()
-    if hasattr(raw, "data"):
-        raw.data.qpos[0] = raw.data.qvel[0] = value
-    else:
-        raw.state = np.full_like(np.asarray(raw.state, dtype=np.float64), value)
-
-
 def _state(row: Row, value: float) -> Cell:
+    """A step that ends in a state, and returns an observation, which is no number."""
+
+    def steps(session: Session) -> tuple[Answer, Answer]:
+        session.begin(BEFORE - 1)
+        session.bottoms[0].leaves = value
+        return session.step(session.actions[BEFORE - 1]), session.step(session.actions[BEFORE])
+
     def run(session: Session) -> Found:
-        session.begin()
-        break_state(session, value)
-
-        def alone() -> Answer:
-            bare = row.bare().begin()
-            break_state(bare, value)
-            return bare.step(action)
-
-        action = session.actions[BEFORE]
-        return judged(row, session, session.step(action), row.open().begin().step(action), alone)
+        first, second = steps(session)
+        usual = row.open().begin(BEFORE - 1)
+        before, after = (usual.step(usual.actions[i]) for i in (BEFORE - 1, BEFORE))
+        if first.error is not None:
+            return judged(row, session, first, before, lambda: steps(row.bare())[0])
+        found = judged(row, session, second, after, lambda: steps(row.bare())[1])
+        said = flags(first.info, before.info)
+        return Found(Outcome.FLAGGED, ", ".join(said)) if said and found.outcome is Outcome.SILENT else found
 
     return run
 

@@ -13,36 +13,38 @@ from safe_wrappers.errors import SafeWrappersError
 
 
 class Outcome(StrEnum):
-    """How a cell of the matrix ends; the last five are defects."""
+    """How a cell of the matrix ends; what each means says `MEANS`."""
 
     REFUSED = "refused"
-    """An error of this library; the env was not stepped."""
-    ERROR = "error"
-    """The env's own error, or that of the user's code, came through as it was."""
     FLAGGED = "flagged"
-    """Info or a warning says so; what was executed is finite and in the action space."""
+    ERROR = "error"
     HARMLESS = "harmless"
-    """Bit for bit as without the fault."""
     PASSED = "passed on"
-    """The wrapper only looks on: the env got what it would have got alone, and it was finite."""
     KEPT = "kept"
-    """The limit was kept, judged with the right model."""
     WAITS = "waits"
-    """The step takes as long as what hangs."""
-    NOT_APPLICABLE = "not applicable"
-    """There is nothing that the fault could hit."""
+    NOT_APPLICABLE = "-"
     SILENT = "SILENT"
-    """Something else happened than without the fault, and nothing says so."""
     NON_FINITE = "NON-FINITE"
-    """A number that is not finite reached the env."""
     OUTSIDE = "OUTSIDE"
-    """An action outside the action space reached the env through a wrapper that decides."""
     CRASHED = "CRASHED"
-    """An error that does not say what was expected."""
     DIVERGED = "DIVERGED"
-    """The next episode, or that of a copy, is another one."""
 
 
+MEANS: dict[Outcome, str] = {
+    Outcome.REFUSED: "an error of this library that says what was expected; the env was not stepped",
+    Outcome.FLAGGED: "info says so, or a warning; what was executed is finite and in the action space",
+    Outcome.ERROR: "the error of the env, of the solver or of `pickle` itself comes through; no step was made",
+    Outcome.HARMLESS: "bit for bit as without the fault",
+    Outcome.PASSED: "the wrapper decides nothing: the env got what it would have got alone, finite numbers",
+    Outcome.KEPT: "the limit was kept, judged with the right model",
+    Outcome.WAITS: "the step takes as long as what hangs",
+    Outcome.NOT_APPLICABLE: "there is nothing that the fault could hit",
+    Outcome.SILENT: "something else happened than without the fault, and nothing says so",
+    Outcome.NON_FINITE: "a number that is not finite reached the env",
+    Outcome.OUTSIDE: "an action outside the action space reached the env through a wrapper that decides",
+    Outcome.CRASHED: "an error that does not say what was expected",
+    Outcome.DIVERGED: "the next episode, or that of a copy, is another one",
+}
 DEFECTS = (Outcome.SILENT, Outcome.NON_FINITE, Outcome.OUTSIDE, Outcome.CRASHED, Outcome.DIVERGED)
 
 

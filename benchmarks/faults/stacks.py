@@ -23,37 +23,59 @@ class BrokenEnvError(RuntimeError):
     """What an env raises that breaks."""
 
 
+_GATES: dict[int, tuple[threading.Event, threading.Event]] = {}
+"""By the id of a `Bottom`, whose copies have none: events that a step is inside, and that it may go on."""
+
+
 class Bottom(gym.Wrapper[Any, Any, Any, Any]):
-    """The env itself: keeps what reached it, and breaks or blocks when it is told to."""
+    """The env itself: keeps what reached it, and breaks or blocks when it is told to.
+
+    Attributes:
+        given: Every action that reached the env.
+        breaks: "step" or "reset", which then raises.
+        leaves: What the next step leaves in the state, and returns as observation.
+    """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
         self.given: list[Any] = []
         self.breaks = ""
-        self._gate: dict[str, threading.Event] = {}
-
-    def __getstate__(self) -> dict[str, Any]:
-        return vars(self) | {"_gate": {}}
+        self.leaves: float | None = None
 
     def block(self) -> tuple[threading.Event, threading.Event]:
         """The next step alone waits: events that say that it is inside, and that it may go on."""
-        self._gate = {"inside": threading.Event(), "go on": threading.Event()}
-        return self._gate["inside"], self._gate["go on"]
+        _GATES[id(self)] = threading.Event(), threading.Event()
+        return _GATES[id(self)]
 
     def step(self, action: Any) -> Any:
-        gate, self._gate = self._gate, {}
-        if gate:
-            gate["inside"].set()
-            gate["go on"].wait(20.0)
+        gate = _GATES.pop(id(self), None)
+        if gate is not None:
+            gate[0].set()
+            gate[1].wait(20.0)
         if self.breaks == "step":
             raise BrokenEnvError("the env broke in step")
         self.given.append(np.array(action))
-        return self.env.step(action)
+        if self.leaves is None:
+            return self.env.step(action)
+        value, self.leaves = self.leaves, None
+        observation, *rest = self.env.step(action)
+        raw: Any = self.unwrapped
+        if hasattr(raw, "data"):
+            raw.data.qpos[0] = raw.data.qvel[0] = value
+        else:
+            raw.state = np.full_like(np.asarray(raw.state, dtype=np.float64), value)
+        return _filled(observation, value), *rest
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         if self.breaks == "reset":
             raise BrokenEnvError("the env broke in reset")
         return self.env.reset(seed=seed, options=options)
+
+
+def _filled(observation: Any, value: float) -> Any:
+    if isinstance(observation, dict):
+        return {key: _filled(one, value) for key, one in observation.items()}
+    return np.full_like(observation, value)
 
 
 @dataclass(frozen=True)
@@ -193,7 +215,11 @@ def _constraint(name: str) -> Callable[..., Any]:
 
 
 def _wrapper(name: str, case: str) -> Callable[..., Any]:
-    return lambda around, **more: wrapper_examples.build(name, case, around, **more)
+    # The check of a simulation takes longer than everything else of a cell.
+    own = {"plant": lambda: sw.SimulatorPlant(check_steps=20)} if name == "ActionShield" else {}
+    return lambda around, **more: wrapper_examples.build(
+        name, case, around, **{key: make() for key, make in own.items()}, **more
+    )
 
 
 def rows(only: str = "") -> Iterator[Row]:
