@@ -53,7 +53,7 @@ CONFIG = Path(__file__).with_suffix(".yaml")
 RESULTS = Path(__file__).parent / "results"
 PHASES = ("start", "training", "checkpoint", "policy", "evaluation", "report")
 """A checkpoint's is that of its writing; the policy's from the last checkpoint to the note that a run is finished."""
-KILLS_A_ROUND = 4
+KILLS_A_ROUND = 6
 LONGEST_S = 300.0
 WALL_CLOCK = ("filter_time_us", "elapsed_s", "steps_per_s")
 """No two runs have the same ones."""
@@ -72,8 +72,8 @@ class Attempt:
     steps: int
     saved: int
     """Of these, those that were in a checkpoint."""
-    seconds: dict[str, list[float]] = field(default_factory=dict)
-    """How long its phases took."""
+    seconds: dict[tuple[str, str], list[float]] = field(default_factory=dict)
+    """How long its phases took, by phase and arm, in their order."""
 
 
 class Stage:
@@ -168,7 +168,9 @@ def ended(group: int) -> int:
             status = os.waitstatus_to_exitcode(how)
 
 
-def attempt(folder: Path, phase: str | None = None, skip: int = 0, delay_s: float = 0.0) -> Attempt:
+def attempt(
+    folder: Path, target: tuple[str, str] | None = None, skip: int = 0, delay_s: float = 0.0
+) -> Attempt:
     """Gives the command; kills it so long after the phase begins that comes after `skip` such ones."""
     stage = Stage()
 
@@ -180,8 +182,8 @@ def attempt(folder: Path, phase: str | None = None, skip: int = 0, delay_s: floa
 
     group = in_a_fork(command, folder.with_suffix(".log"))
     os.close(stage._tell)
-    now, arm, since, left = "start", "", time.monotonic(), skip
-    seconds: dict[str, list[float]] = {}
+    now, since, left = ("start", ""), time.monotonic(), skip
+    seconds: dict[tuple[str, str], list[float]] = {}
     kill_at: float | None = None
     killed, text = False, b""
     give_up = since + LONGEST_S
@@ -200,18 +202,23 @@ def attempt(folder: Path, phase: str | None = None, skip: int = 0, delay_s: floa
         *lines, text = (text + got).split(b"\n")
         for line in lines:
             seconds.setdefault(now, []).append(time.monotonic() - since)
-            now, arm = line.decode().split(" ")
+            now = _place(line)
             since = time.monotonic()
-            if now == phase and kill_at is None:
+            if now == target and kill_at is None:
                 kill_at, left = (since + delay_s, left) if left == 0 else (None, left - 1)
     status = ended(group)
     # What it had still said before it was gone.
     while killed and (got := os.read(stage.told, 4096)):
         *lines, text = (text + got).split(b"\n")
         if lines:
-            now, arm = lines[-1].decode().split(" ")
+            now = _place(lines[-1])
     os.close(stage.told)
-    return Attempt(None if killed else status, now, arm, stage.noted(0), stage.noted(1), seconds)
+    return Attempt(None if killed else status, *now, stage.noted(0), stage.noted(1), seconds)
+
+
+def _place(line: bytes) -> tuple[str, str]:
+    phase, _, arm = line.decode().partition(" ")
+    return phase, arm
 
 
 def read_experiment(folder: Path) -> ExperimentConfig:
@@ -257,9 +264,9 @@ def left_by(run: Path) -> dict[str, str]:
         with np.load(path, allow_pickle=False) as arrays:
             for name in arrays.files:
                 if name not in WALL_CLOCK:
-                    found[f"{path.relative_to(run)}:{name}"] = str(arrays[name].dtype).encode() + arrays[
-                        name
-                    ].tobytes()
+                    found[f"{path.relative_to(run)}:{name}"] = (
+                        str(arrays[name].dtype).encode() + arrays[name].tobytes()
+                    )
     return {name: hashlib.sha256(data).hexdigest() for name, data in found.items()}
 
 
@@ -284,7 +291,7 @@ def resumes_at(told: ExperimentConfig, arm: str) -> int:
     return 0 if checkpoint is None else checkpoint.timesteps
 
 
-def round_of_kills(number: int, folder: Path, typical: dict[str, float]) -> dict[str, Any]:
+def round_of_kills(number: int, folder: Path, typical: dict[tuple[str, str], float]) -> dict[str, Any]:
     """One comparison: some kills, then its end; and what is wrong with it then."""
     rng = np.random.default_rng([20261123, number])
     told = read_experiment(folder)
@@ -293,21 +300,23 @@ def round_of_kills(number: int, folder: Path, typical: dict[str, float]) -> dict
     cuts: dict[str, list[int]] = {arm.name: [] for arm in told.arms}
     kills, wrong = [], []
     # In the order in which they come, so that none is behind the end of the one before.
-    for phase in sorted(rng.choice(PHASES, KILLS_A_ROUND), key=PHASES.index):
+    places = list(typical)
+    for at in sorted(rng.integers(0, len(places), KILLS_A_ROUND)):
+        skip = int(rng.integers(0, 2)) if places[at][0] in ("training", "checkpoint") else 0
         before = done(told)
-        made = attempt(folder, str(phase), int(rng.integers(0, 3)), float(rng.uniform(0, typical[phase])))
+        made = attempt(folder, places[at], skip, float(rng.uniform(0, typical[places[at]])))
         if made.status is not None:
             if made.status:
                 wrong.append(f"the command ended with {made.status}, see {folder.with_suffix('.log')}")
             break
         lost = 0
         if made.phase in ("training", "checkpoint", "policy"):
-            at = resumes_at(told, made.arm)
-            lost = max(0, made.steps - at)
-            if at < made.saved:
-                wrong.append(f"{made.arm} had a checkpoint of step {made.saved} and goes on from {at}")
-            if at and not (told.output / told.name / made.arm / "seed_0" / "finished.json").exists():
-                cuts[made.arm].append(at)
+            step = resumes_at(told, made.arm)
+            lost = max(0, made.steps - step)
+            if step < made.saved:
+                wrong.append(f"{made.arm} had a checkpoint of step {made.saved} and goes on from {step}")
+            if step and not (told.output / told.name / made.arm / "seed_0" / "finished.json").exists():
+                cuts[made.arm].append(step)
         after = done(told)
         gone = [name for name, checksum in before.items() if after.get(name) != checksum]
         wrong += [f"{name} is gone or changed after a kill in phase {made.phase}" for name in gone]
@@ -338,7 +347,7 @@ def round_of_kills(number: int, folder: Path, typical: dict[str, float]) -> dict
     return {"round": number, "kills": kills, "wrong": wrong, "cuts": cuts}
 
 
-def warm_up(folder: Path) -> dict[str, float]:
+def warm_up(folder: Path) -> dict[tuple[str, str], float]:
     """Imports and compiles all that is needed, in this process; then how long each phase takes, s."""
     torch.set_num_threads(1)
     shutil.rmtree(folder, ignore_errors=True)
@@ -354,7 +363,7 @@ def warm_up(folder: Path) -> dict[str, float]:
     if made.status:
         raise RuntimeError(f"see {folder.with_suffix('.log')}")
     shutil.rmtree(folder)
-    return {phase: float(np.mean(made.seconds[phase])) for phase in PHASES}
+    return {place: float(np.mean(seconds)) for place, seconds in made.seconds.items()}
 
 
 def summary(rounds: list[dict[str, Any]], command: str) -> str:

@@ -10,23 +10,18 @@ from rich.console import Console
 
 from .config import ArmConfig, ExperimentConfig
 from .evaluation.evaluate import evaluate_run
+from .evaluation.intact import check_training_table
 from .evaluation.summary import Summary, summarize, write_summary
 from .hyperparameters import check_task
 from .policies.card import write_card
 from .processes.job import Job
 from .processes.parallel import run_jobs
 from .processes.stopping import Interrupted
+from .run.folder import check_finished, check_folder, is_outgrown
 from .run.learner_callbacks import check_margins
 from .run.start import Start
 from .run.trackers import check_trackers
-from .run.training import (
-    check_finished,
-    check_folder,
-    check_start,
-    is_outgrown,
-    standing,
-    train_run,
-)
+from .run.training import check_start, standing, train_run
 from .run.vec_envs import make_training_env
 from .videos.record import delete_videos, record_videos
 
@@ -105,6 +100,7 @@ def evaluate_experiment(experiment: ExperimentConfig, console: Console, on: str 
     for arm in experiment.arms:
         for seed in experiment.seeds:
             check_finished(arm, experiment.run_folder(arm, seed))
+            check_training_table(experiment.run_folder(arm, seed))
     jobs = evaluation_jobs(experiment, experiment.arms)
     run_jobs(jobs, experiment.workers, console, "Evaluation", on=on)
     write_cards(experiment)
