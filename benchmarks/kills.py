@@ -1,4 +1,4 @@
-"""`compare` is killed at random moments until it has come to its end; then what is there is held against what should be.
+"""`compare` is killed at random moments until it has come to its end; is what is there then what should be there?
 
     python -m benchmarks.kills    # 120 kills, some minutes; goes on where it was stopped
 
@@ -95,7 +95,7 @@ class Stage:
 
 def staged(stage: Stage) -> list[Any]:
     """Patches that tell where the command is."""
-    train, save, policy = training.train_run, training.save_checkpoint, training.write_policy
+    train, save = training.train_run, training.save_checkpoint
     evaluate, summarize, step = experiment.evaluate_run, experiment.summarize_experiment, EpisodeRows._on_step
     fork = multiprocessing.get_context("fork")
 
@@ -132,7 +132,6 @@ def staged(stage: Stage) -> list[Any]:
         mock.patch.object(record, "_render_modes", lambda _: ()),
         mock.patch.object(experiment, "train_run", trained),
         mock.patch.object(training, "save_checkpoint", saved),
-        mock.patch.object(training, "write_policy", policy),
         mock.patch.object(EpisodeRows, "_on_step", stepped),
         mock.patch.object(experiment, "evaluate_run", evaluated),
         mock.patch.object(experiment, "summarize_experiment", summarized),
@@ -329,7 +328,8 @@ def round_of_kills(number: int, folder: Path, typical: dict[tuple[str, str], flo
     after = done(told)
     wrong += [f"{name} was made again" for name, checksum in before.items() if after.get(name) != checksum]
     for arm in told.arms:
-        points = tuple(cuts[arm.name])
+        # After its last checkpoint a run makes no step any more.
+        points = tuple(step for step in cuts[arm.name] if step < arm.total_steps)
         name = "_".join(("cut", arm.name, *map(str, points)))
         reference = folder.parent / name
         if not (reference / "left.json").exists():
@@ -388,8 +388,8 @@ def summary(rounds: list[dict[str, Any]], command: str) -> str:
     same = sum(not each["wrong"] for each in rounds)
     lines += [
         "",
-        f"{sum(counts.values())} kills in {len(rounds)} comparisons; {same} of them came to an end with what clean cuts"
-        " at the same checkpoints leave, bit for bit.",
+        f"{sum(counts.values())} kills in {len(rounds)} comparisons; {same} of them came to an end with what clean"
+        " cuts at the same checkpoints leave, bit for bit.",
         "",
         *(f"* {line}" for line in wrong),
     ]

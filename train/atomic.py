@@ -21,6 +21,9 @@ def write_bytes(path: Path, data: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())  # or a power cut could leave the new name on an empty file
         os.replace(temporary, path)
+    except OSError as error:
+        error.filename = str(path)  # a write that fails does not say to which file
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -15,7 +15,9 @@ from ..atomic import write_json
 from ..checksums import checksums, damage, read_facts
 from ..config import ArmConfig, EvaluationConfig, FilterConfig
 from ..processes.job import Progress
-from ..run.folder import EVALUATION
+from ..processes.lock import only_writer
+from ..processes.storage import telling_of_storage
+from ..run.folder import EVALUATION, check_finished
 from ..run.policy import TrainedPolicy
 from ..run.stack import make_stack
 from ..run.trackers import run_logger
@@ -72,8 +74,22 @@ def evaluate_run(
         progress: Where to report to.
 
     Raises:
-        RunStateError: The run is not finished, or its folder or policy cannot be used.
+        RunStateError: The run is not finished, its folder or policy cannot be used, or another process is at work in
+            it.
     """
+    check_finished(arm, folder)
+    with telling_of_storage(folder), only_writer(folder):
+        _evaluate(arm, seed, folder, settings, default_filter, progress)
+
+
+def _evaluate(
+    arm: ArmConfig,
+    seed: int,
+    folder: Path,
+    settings: EvaluationConfig,
+    default_filter: FilterConfig,
+    progress: Progress,
+) -> None:
     checkpoint = finished_checkpoint(arm, seed, folder)
     filters = conditions(arm, default_filter)
     out = evaluation_folder(folder)

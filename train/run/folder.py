@@ -56,7 +56,10 @@ def check_finished(arm: ArmConfig, folder: Path) -> None:
 
 def is_outgrown(arm: ArmConfig, folder: Path) -> bool:
     """Whether the run was finished with fewer steps than it should have now: what shows its policy is out of date."""
-    return (folder / FINISHED_FILE).exists() and not is_finished(arm, folder)
+    try:
+        return int(finished_facts(folder).get("timesteps", arm.total_steps)) < arm.total_steps
+    except RunStateError:  # nobody knows of how many; its evaluation does
+        return False
 
 
 def check_folder(arm: ArmConfig, seed: int, folder: Path) -> None:

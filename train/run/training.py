@@ -26,6 +26,7 @@ from ..hyperparameters import constructor_arguments, learning_starts
 from ..processes.job import Progress
 from ..processes.lock import only_writer
 from ..processes.stopping import RunStoppedError, heeding_termination
+from ..processes.storage import telling_of_storage
 from .callbacks import (
     CheckpointCallback,
     EpisodeRows,
@@ -79,11 +80,11 @@ def train_run(
 
     Raises:
         ConfigurationError: The policy to begin with does not fit.
-        RunStateError: The folder belongs to another config, another process is at work in it, or all its
-            checkpoints are damaged.
+        RunStateError: The folder belongs to another config, another process is at work in it, all its checkpoints
+            are damaged, or the disk is full or cannot be written to.
         RunStoppedError: SIGTERM came; says from which step the run will go on.
     """
-    with only_writer(folder):
+    with telling_of_storage(folder), only_writer(folder):
         check_folder(arm, seed, folder)
         wrong = _finished_damage(folder)
         if wrong is not None:
@@ -124,6 +125,27 @@ def _train(
         for outdated in (EVALUATION, POLICY):
             shutil.rmtree(folder / outdated, ignore_errors=True)
     (folder / FINISHED_FILE).unlink(missing_ok=True)
+    with heeding_termination() as asked_to_stop:
+        if model.num_timesteps < arm.total_steps:
+            facts = _learn(arm, seed, folder, envs, model, checkpoint, progress, asked_to_stop)
+        else:  # it was killed with its last checkpoint there; not even an env is reset: the scaling would move
+            assert checkpoint is not None
+            facts = _facts(model, checkpoint.elapsed_s, envs, checkpoint)
+        write_policy(arm, seed, folder, model)
+        files = checksums(folder / name for name in _BESIDE)
+        write_json(folder / FINISHED_FILE, facts | {"files": files})
+
+
+def _learn(
+    arm: ArmConfig,
+    seed: int,
+    folder: Path,
+    envs: VecEnv,
+    model: BaseAlgorithm,
+    checkpoint: Checkpoint | None,
+    progress: Progress,
+    asked_to_stop: Callable[[], bool],
+) -> dict[str, Any]:
     before_s = 0.0 if checkpoint is None else checkpoint.elapsed_s
     # SB3 seeds env i with seed + i, so that seeds 0 and 1 would share all but one of their envs' episodes.
     vec_env = model.get_env()
@@ -138,39 +160,35 @@ def _train(
 
     def save(final: bool = False) -> dict[str, Any]:
         facts = _facts(model, elapsed_s(), envs, checkpoint)
-        save_checkpoint(folder / CHECKPOINTS, model, facts, [folder / name for name in _BESIDE], final)
+        save_checkpoint(folder / CHECKPOINTS, model, facts, [folder / name for name in _BESIDE], final=final)
         return facts
 
     filtered = arm.filter.kind != "none"
-    with heeding_termination() as asked_to_stop:
-        callbacks = CallbackList(
-            [
-                StopCallback(asked_to_stop),
-                InterventionCallback(),
-                EpisodeRows(folder / EPISODES),
-                ProgressCallback(progress.steps, progress.figures, filtered),
-                CheckpointCallback(arm.checkpoint_every, save),
-                *learner_callbacks(arm),
-            ]
+    callbacks = CallbackList(
+        [
+            StopCallback(asked_to_stop),
+            InterventionCallback(),
+            EpisodeRows(folder / EPISODES),
+            ProgressCallback(progress.steps, progress.figures, filtered),
+            CheckpointCallback(arm.checkpoint_every, save),
+            *learner_callbacks(arm),
+        ]
+    )
+    try:
+        model.learn(
+            arm.total_steps - model.num_timesteps,
+            callback=callbacks,
+            reset_num_timesteps=checkpoint is None,
         )
-        try:
-            model.learn(
-                arm.total_steps - model.num_timesteps,
-                callback=callbacks,
-                reset_num_timesteps=checkpoint is None,
-            )
-        except TrainingStopped as stop:
-            if model.num_timesteps > 0:
-                save()
-            lost = stop.reached - model.num_timesteps
-            later = f"; {lost:,} later step{'s' * (lost > 1)} will be made again" if lost else ""
-            raise RunStoppedError(f"stopped; goes on {_from_step(model.num_timesteps)}{later}") from None
-        finally:
-            model.logger.close()
-        facts = save(final=True)
-        write_policy(arm, seed, folder, model)
-        files = checksums(folder / name for name in _BESIDE)
-        write_json(folder / FINISHED_FILE, facts | {"files": files})
+    except TrainingStopped as stop:
+        if model.num_timesteps > 0:
+            save()
+        lost = stop.reached - model.num_timesteps
+        later = f"; {lost:,} later step{'s' * (lost > 1)} will be made again" if lost else ""
+        raise RunStoppedError(f"stopped; goes on {_from_step(model.num_timesteps)}{later}") from None
+    finally:
+        model.logger.close()
+    return save(final=True)
 
 
 def _finished_damage(folder: Path) -> str | None:
