@@ -124,14 +124,15 @@ def save_checkpoint(
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
-    if folder.exists():  # a damaged one that was passed over, or the last rollout's of a finishing run
-        # Found before the other is gone: it may be the only one.
-        successor = root / f"{folder.name}.new"
-        shutil.rmtree(successor, ignore_errors=True)
-        temporary.rename(successor)
+    # A damaged one that was passed over, or the start's of a rollout that was given up. It may be the only one: its
+    # successor can be found, as the later of the two, before it is gone; that of a kill in between is whole, too.
+    successor = root / f"{folder.name}.new"
+    if folder.exists():
+        if not successor.exists():
+            temporary = temporary.rename(successor)
         shutil.rmtree(folder)
-        temporary = successor
     temporary.rename(folder)
+    shutil.rmtree(successor, ignore_errors=True)
     older = [other for other in _folders(root) if other != folder]
     for old in older if final else older[:-1]:
         shutil.rmtree(old)
