@@ -82,7 +82,7 @@ def test_what_a_disk_refuses_is_a_line_also_where_torch_has_made_another_error_o
         try:
             raise OSError(number, os.strerror(number))
         except OSError:
-            raise RuntimeError("PytorchStreamWriter failed writing file")
+            raise RuntimeError("PytorchStreamWriter failed writing file")  # noqa: B904
 
     with pytest.raises(RunStateError, match=words) as refusal, telling_of_storage(tmp_path):
         refuse()
@@ -111,7 +111,7 @@ def test_a_folder_that_cannot_be_written_to_is_refused_at_the_start(
             train(experiment, arm)
     there = sorted(tmp_path.rglob("*"))
     monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may write everywhere
-    with pytest.raises(RunStateError, match="cannot be written to .* choose another `output`"):
+    with pytest.raises(RunStateError, match=r"cannot be written to .* choose another `output`"):
         command(experiment, Console(quiet=True))
     assert sorted(tmp_path.rglob("*")) == there
 
@@ -165,7 +165,7 @@ def test_a_file_system_without_locks_is_refused(tmp_path, monkeypatch):
 
     monkeypatch.setattr(fcntl, "flock", flock)
     with (
-        pytest.raises(RunStateError, match="cannot lock files .* choose an `output` on a disk"),
+        pytest.raises(RunStateError, match=r"cannot lock files .* choose an `output` on a disk"),
         only_writer(tmp_path),
     ):
         pass
@@ -215,7 +215,7 @@ def test_a_setting_that_the_first_update_finds_wrong_does_not_block_the_correcte
 def test_temporary_files_of_killed_processes_go_and_those_of_live_ones_stay(tmp_path):
     from safe_wrappers.train.atomic import write_text
 
-    def temporary(pid, host=socket.gethostname()):
+    def temporary(pid, host):
         path = Path(tmp_path / f".a[1].csv.{host}.{pid}.tmp")
         path.write_text("half")
         return path
@@ -224,7 +224,8 @@ def test_temporary_files_of_killed_processes_go_and_those_of_live_ones_stay(tmp_
     if not child:
         os._exit(0)
     os.waitpid(child, 0)
-    dead, live, elsewhere = temporary(child), temporary(os.getppid()), temporary(child, "another-machine")
+    here = socket.gethostname()
+    dead, live, elsewhere = temporary(child, here), temporary(os.getppid(), here), temporary(child, "another")
     write_text(tmp_path / "a[1].csv", "whole")
     assert (tmp_path / "a[1].csv").read_text() == "whole"
     assert not dead.exists() and live.exists() and elsewhere.exists()
