@@ -19,6 +19,7 @@ from .command_line import DIAGNOSED_STEPS, ENJOYED_EPISODES, FILTERS, parse
 from .local_imports import importable
 from .processes.output import lasting_output
 from .processes.stopping import Interrupted
+from .processes.storage import telling_of_storage
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -37,7 +38,10 @@ def _main(arguments: Sequence[str] | None) -> int:
     from rich.console import Console
 
     try:
-        with importable([*(config.parent for config in options.configs), Path.cwd()]):
+        with (
+            telling_of_storage(Path.cwd()),
+            importable([*(config.parent for config in options.configs), Path.cwd()]),
+        ):
             _run(options, Console())
     except SafeWrappersError as error:
         print(f"error: {error}", file=sys.stderr)

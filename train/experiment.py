@@ -10,23 +10,20 @@ from rich.console import Console
 
 from .config import ArmConfig, ExperimentConfig
 from .evaluation.evaluate import evaluate_run
+from .evaluation.intact import check_training_table
 from .evaluation.summary import Summary, summarize, write_summary
 from .hyperparameters import check_task
 from .policies.card import write_card
 from .processes.job import Job
+from .processes.lock import check_free
 from .processes.parallel import run_jobs
 from .processes.stopping import Interrupted
+from .processes.storage import check_writable
+from .run.folder import check_finished, check_folder, is_outgrown
 from .run.learner_callbacks import check_margins
 from .run.start import Start
 from .run.trackers import check_trackers
-from .run.training import (
-    check_finished,
-    check_folder,
-    check_start,
-    is_outgrown,
-    standing,
-    train_run,
-)
+from .run.training import check_start, standing, train_run
 from .run.vec_envs import make_training_env
 from .videos.record import delete_videos, record_videos
 
@@ -73,7 +70,8 @@ def check_training(experiment: ExperimentConfig) -> None:
 
     Raises:
         ConfigurationError: A task, a filter or an algorithm refuses its settings.
-        RunStateError: A run folder belongs to another config.
+        RunStateError: A run folder belongs to another config, cannot be written to, or another process is at work
+            in it.
     """
     for arm in experiment.arms:
         env = make_training_env(arm)
@@ -87,7 +85,10 @@ def check_training(experiment: ExperimentConfig) -> None:
         if start is not None:
             check_start(arm, start)
         for seed in experiment.seeds:
-            check_folder(arm, seed, experiment.run_folder(arm, seed))
+            folder = experiment.run_folder(arm, seed)
+            check_folder(arm, seed, folder)
+            check_writable(folder)
+            check_free(folder)
 
 
 def evaluate_experiment(experiment: ExperimentConfig, console: Console, on: str | None = None) -> None:
@@ -99,12 +100,17 @@ def evaluate_experiment(experiment: ExperimentConfig, console: Console, on: str 
         on: Where to evaluate, as in training; films are made on this machine.
 
     Raises:
-        RunStateError: A run is not trained to its end; nothing has been started.
+        RunStateError: A run is not trained to its end, its folder cannot be written to, or another process is at work
+            in it; nothing has been started.
         RunsFailedError: Some runs failed.
     """
     for arm in experiment.arms:
         for seed in experiment.seeds:
-            check_finished(arm, experiment.run_folder(arm, seed))
+            folder = experiment.run_folder(arm, seed)
+            check_finished(arm, folder)
+            check_training_table(folder)
+            check_writable(folder)
+            check_free(folder)
     jobs = evaluation_jobs(experiment, experiment.arms)
     run_jobs(jobs, experiment.workers, console, "Evaluation", on=on)
     write_cards(experiment)

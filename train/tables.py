@@ -7,6 +7,7 @@ import io
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+from safe_wrappers.errors import RunStateError
 from safe_wrappers.wrappers.record_interventions import read_episodes
 
 from .atomic import write_text
@@ -26,8 +27,17 @@ def append_row(path: Path, columns: Sequence[str], row: Row) -> None:
 
 
 def read_rows(path: Path) -> list[dict[str, float]]:
-    """Reads a table of numbers; a half-written last line and empty cells are left out."""
-    return read_episodes(path) if path.exists() else []
+    """Reads a table of numbers; a half-written last line and empty cells are left out.
+
+    Raises:
+        RunStateError: It is no table of numbers.
+    """
+    try:
+        return read_episodes(path) if path.exists() else []
+    except (ValueError, TypeError, csv.Error) as error:
+        raise RunStateError(
+            f"{str(path)!r} is damaged ({error}); `safe-wrappers train` goes on from the checkpoint's copy."
+        ) from None
 
 
 def _lines(columns: Sequence[str], rows: Iterable[Row], header: bool) -> str:

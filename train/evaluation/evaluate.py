@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator
+import shutil
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 from safe_wrappers import info as keys
+from safe_wrappers.errors import RunStateError
 from safe_wrappers.wrappers.record_interventions import COLUMNS
 
 from ..atomic import write_json
+from ..checksums import checksums, damage, read_facts
 from ..config import ArmConfig, EvaluationConfig, FilterConfig
 from ..processes.job import Progress
+from ..processes.lock import only_writer
+from ..processes.storage import telling_of_storage
+from ..run.folder import EVALUATION, check_finished
 from ..run.policy import TrainedPolicy
 from ..run.stack import make_stack
 from ..run.trackers import run_logger
-from ..run.training import EVALUATION, finished_checkpoint
+from ..run.training import finished_checkpoint
 from ..tables import write_rows
 from .scene import Scene, SceneRecorder, save_scenes
 from .step_log import StepLog, StepRecorder, load_steps, save_steps
@@ -69,8 +74,22 @@ def evaluate_run(
         progress: Where to report to.
 
     Raises:
-        RunStateError: The run is not finished, or its folder or policy cannot be used.
+        RunStateError: The run is not finished, its folder or policy cannot be used, or another process is at work in
+            it.
     """
+    check_finished(arm, folder)
+    with telling_of_storage(folder), only_writer(folder):
+        _evaluate(arm, seed, folder, settings, default_filter, progress)
+
+
+def _evaluate(
+    arm: ArmConfig,
+    seed: int,
+    folder: Path,
+    settings: EvaluationConfig,
+    default_filter: FilterConfig,
+    progress: Progress,
+) -> None:
     checkpoint = finished_checkpoint(arm, seed, folder)
     filters = conditions(arm, default_filter)
     out = evaluation_folder(folder)
@@ -80,9 +99,10 @@ def evaluate_run(
         "timesteps": checkpoint.timesteps,
         "recording": _RECORDING,
     }
-    if (out / STATE_FILE).exists() and json.loads((out / STATE_FILE).read_text()) == state:
+    if _is_done(out, state):
         return
-    (out / STATE_FILE).unlink(missing_ok=True)  # from here on the rows may be of two settings
+    (out / STATE_FILE).unlink(missing_ok=True)
+    shutil.rmtree(out, ignore_errors=True)  # or after a kill there would be rows of two settings
     policy = TrainedPolicy(arm, checkpoint)
     logger = run_logger(arm, seed, folder)
     for at, (condition, used) in enumerate(filters.items()):
@@ -102,7 +122,17 @@ def evaluate_run(
         save_scenes(out / f"{condition}.npz", scenes)
         save_steps(out / f"{condition}_steps.npz", evaluation.steps.finish())
     logger.close()
-    write_json(out / STATE_FILE, state)
+    write_json(out / STATE_FILE, state | {"files": checksums(sorted(out.iterdir()))})
+
+
+def _is_done(out: Path, state: Mapping[str, Any]) -> bool:
+    """Whether an evaluation like this one is there, whole."""
+    try:
+        found = read_facts(out / STATE_FILE, "")
+    except RunStateError:
+        return False
+    files = found.pop("files", {})
+    return found == state and damage(out, files) is None
 
 
 class _Evaluation:

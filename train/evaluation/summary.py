@@ -16,6 +16,7 @@ from ..config import ExperimentConfig, FilterConfig
 from ..tables import read_rows, write_rows
 from .evaluate import conditions, evaluation_folder
 from .has_cost import evaluated_without_cost
+from .intact import check_results
 from .metrics import METRICS, OF_THE_FILTER, OF_THE_JUDGE, OF_THE_LEASE, RATES, TOTALS
 
 CONDITIONS: Final = {
@@ -127,7 +128,12 @@ def estimate(values: Sequence[float]) -> Estimate:
 
 
 def summarize(experiment: ExperimentConfig) -> Summary:
-    """Reads every run's rows and sums them up."""
+    """Reads every run's rows and sums them up.
+
+    Raises:
+        RunStateError: A table is not as its run left it.
+    """
+    check_results(experiment)
     per_seed: list[dict[str, Any]] = []
     table: Table = {}
     for arm in experiment.arms:

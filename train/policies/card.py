@@ -7,9 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from safe_wrappers.errors import RunStateError
+
 from ..atomic import write_text
+from ..checksums import read_facts
 from ..config import ArmConfig, FilterConfig
 from ..evaluation.evaluate import conditions
+from ..evaluation.intact import check_evaluation
 from ..evaluation.metrics import METRICS, NOT_JUDGED, OF_THE_JUDGE
 from ..evaluation.summary import CONDITIONS, episode_file, number, seed_row
 from ..run.portable import CONFIG, FILTER, POLICY
@@ -39,8 +43,9 @@ def write_card(arm: ArmConfig, seed: int, run: Path, default_filter: FilterConfi
     folder = run / POLICY
     if not (folder / CONFIG).is_file():
         return
-    config = json.loads((folder / CONFIG).read_text())
-    constraints = json.loads((folder / FILTER).read_text())["constraints"]
+    again = "`safe-wrappers train` writes it again"
+    config = read_facts(folder / CONFIG, again)
+    constraints = read_facts(folder / FILTER, again)["constraints"]
     used = conditions(arm, default_filter).get("filter_on", FilterConfig())
     own = f"through the filter `{arm.filter.kind}`" if arm.filter.kind != "none" else "without a filter"
     lines = [
@@ -84,7 +89,12 @@ def write_card(arm: ArmConfig, seed: int, run: Path, default_filter: FilterConfi
 
 
 def _table(run: Path) -> list[str]:
-    rows = {name: read_rows(episode_file(run, name)) for name in CONDITIONS}
+    try:
+        check_evaluation(run)
+        measured_in = tuple(CONDITIONS)
+    except RunStateError:  # it will be made again
+        measured_in = ("training",)
+    rows = {name: read_rows(episode_file(run, name)) for name in measured_in}
     measured = {name: seed_row(episodes, _FIGURES) for name, episodes in rows.items() if episodes}
     if not measured:
         return ["Nothing was measured yet."]

@@ -13,9 +13,9 @@ from safe_wrappers.errors import ConfigurationError, RunStateError
 
 from ..config.stored import stored_arm
 from ..run.checkpoint import latest_checkpoint
+from ..run.folder import CHECKPOINTS, RUN_FILE
 from ..run.policy import TrainedPolicy
 from ..run.portable import CONFIG, POLICY, constraints_of, filter_spec, read_policy
-from ..run.training import CHECKPOINTS, RUN_FILE
 from .hub import HUB, download
 
 

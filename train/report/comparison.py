@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from ..config import ArmConfig, ExperimentConfig
 from ..evaluation.episode_selection import Pair, compared_pairs
 from ..evaluation.evaluate import evaluated_steps
 from ..evaluation.summary import Estimate, Summary
-from ..run.training import FINISHED_FILE
+from ..run.folder import finished_facts
 
 
 @dataclass(frozen=True)
@@ -129,8 +128,7 @@ def filter_time_us(experiment: ExperimentConfig, pairs: Sequence[Pair]) -> float
     for pair in pairs:
         for seed in experiment.seeds:
             folder = experiment.run_folder(pair.filtered, seed)
-            if (folder / FINISHED_FILE).exists():
-                trained.append(json.loads((folder / FINISHED_FILE).read_text()).get("filter_time_us"))
+            trained.append(finished_facts(folder).get("filter_time_us"))
             log = evaluated_steps(folder, "filter_on")
             evaluated.append(log.filter_time_us if log is not None else math.nan)
     times = [time for time in trained if time is not None] or [time for time in evaluated if time == time]

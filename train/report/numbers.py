@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from datetime import timedelta
 from typing import Any, Final
@@ -10,7 +9,7 @@ from typing import Any, Final
 from ..config import ArmConfig, ExperimentConfig
 from ..evaluation.metrics import METRICS, NOT_JUDGED, OF_THE_JUDGE
 from ..evaluation.summary import CONDITIONS, Estimate, Summary, number
-from ..run.training import FINISHED_FILE
+from ..run.folder import finished_facts
 from .markup import explained, table, text
 
 SHORT: Final = {
@@ -96,8 +95,7 @@ def runs_table(experiment: ExperimentConfig, summary: Summary) -> str:
 
 
 def _facts(experiment: ExperimentConfig, arm: ArmConfig, seed: int) -> dict[str, float]:
-    path = experiment.run_folder(arm, seed) / FINISHED_FILE
-    facts = json.loads(path.read_text()) if path.exists() else {}
+    facts = finished_facts(experiment.run_folder(arm, seed))
     return {name: facts[name] for name in _FACTS if facts.get(name) is not None}
 
 

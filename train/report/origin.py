@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import platform
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -11,6 +10,7 @@ from typing import Final
 
 import yaml
 
+from ..checksums import read_facts
 from ..config import ExperimentConfig
 from ..run.start import START_FILE
 from .markup import details, table, text
@@ -68,8 +68,8 @@ def _begun(experiment: ExperimentConfig) -> Iterator[str]:
     """What arms began with that did not begin at random, as their runs recorded it."""
     for arm in experiment.arms:
         path = experiment.run_folder(arm, experiment.seeds[0]) / START_FILE
-        if path.exists():
-            start = json.loads(path.read_text())
+        start = read_facts(path, "delete it, and the page says nothing of the start")
+        if start:
             yield (
                 f"Arm {arm.name} began with the policy of {start['from']} after {start['timesteps']:,} steps, which"
                 " do not count as its own."

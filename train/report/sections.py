@@ -24,7 +24,7 @@ from ..figures.plot_files import PlotFiles
 from ..figures.scenes import scene_frame, scene_picture
 from ..figures.training_timeline import training_timeline_picture
 from ..figures.where import choose_view, where_picture
-from ..run.training import FINISHED_FILE
+from ..run.folder import FINISHED_FILE
 from .markup import pictures, text
 
 _CURVES = {

@@ -37,7 +37,10 @@ class EpisodeRows(BaseCallback):
         self.path = path
 
     def _on_training_start(self) -> None:
-        kept = [row for row in read_rows(self.path) if row["timesteps"] <= self.num_timesteps]
+        begun = self.num_timesteps > 0
+        kept = (
+            [row for row in read_rows(self.path) if row["timesteps"] <= self.num_timesteps] if begun else []
+        )
         write_rows(self.path, EPISODE_COLUMNS, kept)
 
     def _on_step(self) -> bool:

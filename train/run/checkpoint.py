@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-import os
 import pickle
 import random
 import shutil
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -24,7 +22,8 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from safe_wrappers.errors import RunStateError
 
-from ..atomic import write_json
+from ..atomic import write_bytes, write_json
+from ..checksums import checksums, damage
 from ..config.algorithms import ALGORITHMS
 
 MODEL: Final = "model.zip"
@@ -48,6 +47,14 @@ class Checkpoint:
     folder: Path
     timesteps: int
     elapsed_s: float
+    filter_time_us: float | None = None
+    beside: tuple[str, ...] = ()
+    """Files of the run's folder that are kept here, too."""
+
+    def put_back(self, run: Path) -> None:
+        """Makes the files of the run's folder what they were when the checkpoint was saved."""
+        for name in self.beside:
+            write_bytes(run / name, (self.folder / name).read_bytes())
 
     def load_model(
         self, algorithm: str, env: VecEnv | None, device: str, buffer_size: int | None = None
@@ -86,15 +93,23 @@ class Checkpoint:
         return VecNormalize.load(str(path), env) if path.exists() else env
 
 
-def save_checkpoint(root: Path, model: BaseAlgorithm, elapsed_s: float, final: bool = False) -> Path:
+def save_checkpoint(
+    root: Path,
+    model: BaseAlgorithm,
+    facts: Mapping[str, Any],
+    beside: Iterable[Path] = (),
+    final: bool = False,
+) -> Path:
     """Saves model, normaliser, replay buffer and random states under `root`, then drops older checkpoints.
 
-    Everything is written into a hidden folder that is renamed at the end: there is no half checkpoint.
+    Everything is written into a hidden folder that is renamed at the end: there is no half checkpoint. One that
+    could not be written leaves the disk as it was.
 
     Args:
         root: The run's folder of checkpoints.
         model: The model between two rollouts.
-        elapsed_s: Training time so far, over all restarts.
+        facts: Of the run so far, over all restarts: `timesteps`, `elapsed_s`, `filter_time_us`.
+        beside: Files of the run's folder that belong to this step; those that are there are kept, too.
         final: The run is finished: no replay buffer is needed any more, and no older checkpoint.
 
     Returns:
@@ -104,21 +119,41 @@ def save_checkpoint(root: Path, model: BaseAlgorithm, elapsed_s: float, final: b
     temporary = root / ".writing"  # a killed process may have left one; its successor clears it
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
-    model.save(temporary / MODEL)
-    normalize = model.get_vec_normalize_env()
-    if normalize is not None:
-        normalize.save(str(temporary / NORMALIZE))
-    if isinstance(model, OffPolicyAlgorithm) and not final:
-        model.save_replay_buffer(temporary / REPLAY)
-    (temporary / RANDOM).write_bytes(pickle.dumps(_random_states()))
-    files = {path.name: _checksum(path) for path in sorted(temporary.iterdir())}
-    write_json(temporary / STATE, {"timesteps": model.num_timesteps, "elapsed_s": elapsed_s, "files": files})
-    if folder.exists():  # a damaged one that was passed over, or the last rollout's of a finishing run
+    try:
+        _write(temporary, model, facts, beside, final)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+    # A damaged one that was passed over, or the start's of a rollout that was given up. It may be the only one: its
+    # successor can be found, as the later of the two, before it is gone; that of a kill in between is whole, too.
+    successor = root / f"{folder.name}.new"
+    if folder.exists():
+        if not successor.exists():
+            temporary = temporary.rename(successor)
         shutil.rmtree(folder)
-    os.replace(temporary, folder)
-    for old in _folders(root)[: -1 if final else -2]:
+    temporary.rename(folder)
+    shutil.rmtree(successor, ignore_errors=True)
+    older = [other for other in _folders(root) if other != folder]
+    for old in older if final else older[:-1]:
         shutil.rmtree(old)
     return folder
+
+
+def _write(
+    folder: Path, model: BaseAlgorithm, facts: Mapping[str, Any], beside: Iterable[Path], final: bool
+) -> None:
+    model.save(folder / MODEL)
+    normalize = model.get_vec_normalize_env()
+    if normalize is not None:
+        normalize.save(str(folder / NORMALIZE))
+    if isinstance(model, OffPolicyAlgorithm) and not final:
+        model.save_replay_buffer(folder / REPLAY)
+    (folder / RANDOM).write_bytes(pickle.dumps(_random_states()))
+    kept = [path.name for path in beside if path.is_file()]
+    for name in kept:
+        shutil.copyfile(folder.parents[1] / name, folder / name)
+    files = checksums(sorted(folder.iterdir()))
+    write_json(folder / STATE, {**facts, "beside": kept, "files": files})
 
 
 def latest_checkpoint(root: Path, warn: Callable[[str], None]) -> Checkpoint | None:
@@ -141,7 +176,13 @@ def latest_checkpoint(root: Path, warn: Callable[[str], None]) -> Checkpoint | N
             state = json.loads((folder / STATE).read_text())
             if damages:
                 warn(f"{damages[-1]}; continuing from the checkpoint before it, {folder}")
-            return Checkpoint(folder, int(state["timesteps"]), float(state["elapsed_s"]))
+            return Checkpoint(
+                folder,
+                int(state["timesteps"]),
+                float(state["elapsed_s"]),
+                state.get("filter_time_us"),
+                tuple(state.get("beside", ())),
+            )
         damages.append(damage)
     if damages:
         raise RunStateError(
@@ -179,18 +220,7 @@ def _damage(folder: Path) -> str | None:
         files: dict[str, str] = json.loads(state.read_text())["files"]
     except (OSError, ValueError, KeyError, TypeError):
         return f"{state} is missing or unreadable"
-    for name, checksum in files.items():
-        path = folder / name
-        if not path.exists():
-            return f"{path} is missing"
-        if _checksum(path) != checksum:
-            return f"{path} is not as it was written (its checksum differs)"
-    return None
-
-
-def _checksum(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return damage(folder, files)
 
 
 def _random_states() -> dict[str, Any]:

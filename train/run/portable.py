@@ -6,7 +6,6 @@ and running statistics are arrays, and all else is made anew from the config.
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import re
@@ -31,6 +30,7 @@ from safe_wrappers.plants.env_checks import wrappers_of
 from safe_wrappers.wrappers.cbf_action_filter import filter_inside
 
 from ..atomic import write_bytes, write_json
+from ..checksums import checksums, damage, read_facts
 from ..config import NAIVE, ArmConfig
 from ..config.algorithms import ALGORITHMS, ON_POLICY
 from ..config.stored import stored_arm
@@ -79,7 +79,7 @@ def write_policy(arm: ArmConfig, seed: int, run: Path, model: BaseAlgorithm) -> 
         "observation_space": _described(model.observation_space),
         "action_space": _described(model.action_space),
         "versions": {name: version(name) for name in _PACKAGES},
-        "files": {path.name: _checksum(path) for path in sorted(temporary.iterdir())},
+        "files": checksums(sorted(temporary.iterdir())),
     }
     write_json(temporary / CONFIG, config)
     shutil.rmtree(folder, ignore_errors=True)
@@ -152,13 +152,22 @@ def read_policy(folder: Path) -> PolicyFolder:
         files, name, fingerprint = dict(config["files"]), config["arm"], config["config"]
     except (ValueError, KeyError, TypeError) as error:
         raise RunStateError(f"{str(path)!r} is unreadable: {error!r}") from error
-    for file, checksum in files.items():
-        if not (folder / file).is_file() or _checksum(folder / file) != checksum:
-            raise RunStateError(
-                f"{str(folder / file)!r} is missing or not as it was written (its checksum differs)"
-            )
+    wrong = damage(folder, files)
+    if wrong is not None:
+        raise RunStateError(wrong)
     spec = json.loads((folder / FILTER).read_text())
     return PolicyFolder(folder, stored_arm(name, fingerprint), config, spec)
+
+
+def policy_damage(folder: Path) -> str | None:
+    """What is wrong with a run's policy, in words; None where it is whole, or the run's version left none."""
+    if not folder.exists():
+        return None
+    try:
+        files = read_facts(folder / CONFIG, "").get("files")
+    except RunStateError as error:
+        return str(error).partition(";")[0]
+    return damage(folder, files) if files else f"{folder / CONFIG} is missing"
 
 
 def filter_spec(arm: ArmConfig) -> dict[str, Any]:
@@ -225,7 +234,3 @@ def _npz(arrays: Mapping[str, Any]) -> bytes:
     data = io.BytesIO()
     np.savez(data, **arrays)
     return data.getvalue()
-
-
-def _checksum(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import json
 import math
 import tempfile
 import time
@@ -25,6 +24,7 @@ from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputF
 from safe_wrappers.errors import ConfigurationError, RunStateError
 
 from ..atomic import write_json
+from ..checksums import read_facts
 from ..config import ArmConfig
 
 TENSORBOARD: Final = "tensorboard"
@@ -46,7 +46,7 @@ class Tracker(KVWriter):
 
     def __init__(self, arm: ArmConfig, seed: int, folder: Path) -> None:
         path, kind, self._lost = folder / IDS_FILE, type(self).__name__, False
-        ids = json.loads(path.read_text()) if path.exists() else {}
+        ids = read_facts(path, "delete it, and the run is a new one there.")
         known = ids.get(kind)
         try:
             found = self._open(folder.resolve().parents[1].name, arm, seed, folder, known)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -20,13 +19,14 @@ from safe_wrappers.errors import RunStateError
 from safe_wrappers.sb3 import InterventionCallback
 
 from ..atomic import write_json
+from ..checksums import checksums, damage
 from ..config import ArmConfig
 from ..config.algorithms import ALGORITHMS
-from ..config.models import without_default_buffer_size
 from ..hyperparameters import constructor_arguments, learning_starts
 from ..processes.job import Progress
 from ..processes.lock import only_writer
 from ..processes.stopping import RunStoppedError, heeding_termination
+from ..processes.storage import telling_of_storage
 from .callbacks import (
     CheckpointCallback,
     EpisodeRows,
@@ -35,16 +35,26 @@ from .callbacks import (
     TrainingStopped,
 )
 from .checkpoint import MODEL, Checkpoint, latest_checkpoint, save_checkpoint
+from .folder import (
+    CHECKPOINTS,
+    EPISODES,
+    EVALUATION,
+    FINISHED_FILE,
+    check_finished,
+    check_folder,
+    claim_folder,
+    finished_facts,
+    is_finished,
+    is_outgrown,
+)
 from .learner_callbacks import learner_callbacks
-from .portable import POLICY, write_policy
+from .portable import POLICY, policy_damage, write_policy
 from .start import START_FILE, Policy, Start, begin_with, policy_of_file, policy_of_model, refuse_misfit
 from .trackers import run_logger
 from .vec_envs import make_training_env, make_vec_env
 
-RUN_FILE: Final = "run.json"
-FINISHED_FILE: Final = "finished.json"
-CHECKPOINTS: Final = "checkpoints"
-EVALUATION: Final = "evaluation"
+_BESIDE: Final = (EPISODES, START_FILE)
+"""What lies beside the checkpoints and is kept in them, too."""
 
 
 def train_run(
@@ -54,7 +64,8 @@ def train_run(
 
     A finished run is left as it is, unless the arm's `total_steps` were raised: then it goes on, and its evaluation,
     which was of another policy, is deleted. A continued run starts new episodes (the envs' inner state is not
-    saved), with env seeds of its own, so that no episode is seen twice.
+    saved), with env seeds of its own, so that no episode is seen twice. Of a finished run, what is damaged is made
+    again from its last checkpoint.
 
     The folder becomes this run's (`run.json`) when its envs and its model could be made.
 
@@ -69,14 +80,17 @@ def train_run(
 
     Raises:
         ConfigurationError: The policy to begin with does not fit.
-        RunStateError: The folder belongs to another config, another process is at work in it, or all its
-            checkpoints are damaged.
+        RunStateError: The folder belongs to another config, another process is at work in it, all its checkpoints
+            are damaged, or the disk is full or cannot be written to.
         RunStoppedError: SIGTERM came; says from which step the run will go on.
     """
-    with only_writer(folder):
+    with telling_of_storage(folder), only_writer(folder):
         check_folder(arm, seed, folder)
-        if _is_finished(arm, folder):
-            _claim_folder(arm, seed, folder)  # the last rollout may have gone beyond totals that were raised
+        wrong = _finished_damage(folder)
+        if wrong is not None:
+            progress.say(f"{wrong}; made again from the last checkpoint")
+        elif is_finished(arm, folder):
+            claim_folder(arm, seed, folder)  # the last rollout may have gone beyond totals that were raised
             progress.steps(arm.total_steps)
             return
         checkpoint = latest_checkpoint(folder / CHECKPOINTS, progress.say)
@@ -101,14 +115,37 @@ def _train(
     begun = None
     if start is not None and checkpoint is None:
         begun = begin_with(model, f"arms.{arm.name}", start.name, _file_of(start, seed))
-    _claim_folder(arm, seed, folder)
+    claim_folder(arm, seed, folder)
+    if checkpoint is not None:
+        checkpoint.put_back(folder)
     if begun is not None:
         write_json(folder / START_FILE, begun)
         say(f"begins with the policy of {begun['from']}, {begun['timesteps']:,} steps old")
     if is_outgrown(arm, folder):
         for outdated in (EVALUATION, POLICY):
             shutil.rmtree(folder / outdated, ignore_errors=True)
-        (folder / FINISHED_FILE).unlink()
+    (folder / FINISHED_FILE).unlink(missing_ok=True)
+    with heeding_termination() as asked_to_stop:
+        if model.num_timesteps < arm.total_steps:
+            facts = _learn(arm, seed, folder, envs, model, checkpoint, progress, asked_to_stop)
+        else:  # it was killed with its last checkpoint there; not even an env is reset: the scaling would move
+            assert checkpoint is not None
+            facts = _facts(model, checkpoint.elapsed_s, envs, checkpoint)
+        write_policy(arm, seed, folder, model)
+        files = checksums(folder / name for name in _BESIDE)
+        write_json(folder / FINISHED_FILE, facts | {"files": files})
+
+
+def _learn(
+    arm: ArmConfig,
+    seed: int,
+    folder: Path,
+    envs: VecEnv,
+    model: BaseAlgorithm,
+    checkpoint: Checkpoint | None,
+    progress: Progress,
+    asked_to_stop: Callable[[], bool],
+) -> dict[str, Any]:
     before_s = 0.0 if checkpoint is None else checkpoint.elapsed_s
     # SB3 seeds env i with seed + i, so that seeds 0 and 1 would share all but one of their envs' episodes.
     vec_env = model.get_env()
@@ -121,43 +158,53 @@ def _train(
     def elapsed_s() -> float:
         return before_s + time.monotonic() - begin
 
-    def save() -> None:
-        save_checkpoint(folder / CHECKPOINTS, model, elapsed_s())
+    def save(final: bool = False) -> dict[str, Any]:
+        facts = _facts(model, elapsed_s(), envs, checkpoint)
+        save_checkpoint(folder / CHECKPOINTS, model, facts, [folder / name for name in _BESIDE], final=final)
+        return facts
 
     filtered = arm.filter.kind != "none"
-    with heeding_termination() as asked_to_stop:
-        callbacks = CallbackList(
-            [
-                StopCallback(asked_to_stop),
-                InterventionCallback(),
-                EpisodeRows(folder / "episodes.csv"),
-                ProgressCallback(progress.steps, progress.figures, filtered),
-                CheckpointCallback(arm.checkpoint_every, save),
-                *learner_callbacks(arm),
-            ]
+    callbacks = CallbackList(
+        [
+            StopCallback(asked_to_stop),
+            InterventionCallback(),
+            EpisodeRows(folder / EPISODES),
+            ProgressCallback(progress.steps, progress.figures, filtered),
+            CheckpointCallback(arm.checkpoint_every, save),
+            *learner_callbacks(arm),
+        ]
+    )
+    try:
+        model.learn(
+            arm.total_steps - model.num_timesteps,
+            callback=callbacks,
+            reset_num_timesteps=checkpoint is None,
         )
-        try:
-            model.learn(
-                arm.total_steps - model.num_timesteps,
-                callback=callbacks,
-                reset_num_timesteps=checkpoint is None,
-            )
-        except TrainingStopped as stop:
-            if model.num_timesteps > 0:
-                save()
-            lost = stop.reached - model.num_timesteps
-            later = f"; {lost:,} later step{'s' * (lost > 1)} will be made again" if lost else ""
-            raise RunStoppedError(f"stopped; goes on {_from_step(model.num_timesteps)}{later}") from None
-        finally:
-            model.logger.close()
-        save_checkpoint(folder / CHECKPOINTS, model, elapsed_s(), final=True)
-        write_policy(arm, seed, folder, model)
-        write_json(folder / FINISHED_FILE, _facts(model, elapsed_s(), envs))
+    except TrainingStopped as stop:
+        if model.num_timesteps > 0:
+            save()
+        lost = stop.reached - model.num_timesteps
+        later = f"; {lost:,} later step{'s' * (lost > 1)} will be made again" if lost else ""
+        raise RunStoppedError(f"stopped; goes on {_from_step(model.num_timesteps)}{later}") from None
+    finally:
+        model.logger.close()
+    return save(final=True)
+
+
+def _finished_damage(folder: Path) -> str | None:
+    """What is wrong with what a finished run left beside its checkpoint."""
+    try:
+        facts = finished_facts(folder)
+    except RunStateError as error:
+        return str(error).partition(";")[0]
+    if not facts:
+        return None
+    return damage(folder, facts.get("files", {})) or policy_damage(folder / POLICY)
 
 
 def standing(arm: ArmConfig, folder: Path) -> str:
     """Where a run that nobody is working on stands: `finished`, or `from step 8,192` on."""
-    if _is_finished(arm, folder):
+    if is_finished(arm, folder):
         return "finished"
     try:
         checkpoint = latest_checkpoint(folder / CHECKPOINTS, lambda _: None)
@@ -168,23 +215,6 @@ def standing(arm: ArmConfig, folder: Path) -> str:
 
 def _from_step(step: int) -> str:
     return f"from step {step:,}" if step else "from the start"
-
-
-def check_finished(arm: ArmConfig, folder: Path) -> None:
-    """Refuses a run that is not trained to its end.
-
-    Raises:
-        RunStateError: It is not.
-    """
-    if not _is_finished(arm, folder):
-        raise RunStateError(
-            f"The run in {str(folder)!r} is not trained to its end; run `safe-wrappers train` (or `compare`)."
-        )
-
-
-def is_outgrown(arm: ArmConfig, folder: Path) -> bool:
-    """Whether the run was finished with fewer steps than it should have now: what shows its policy is out of date."""
-    return (folder / FINISHED_FILE).exists() and not _is_finished(arm, folder)
 
 
 def finished_checkpoint(arm: ArmConfig, seed: int, folder: Path) -> Checkpoint:
@@ -230,68 +260,6 @@ def _file_of(start: Start, seed: int) -> Path:
     return finished_checkpoint(start.arm, seed, start.path).folder / MODEL
 
 
-def check_folder(arm: ArmConfig, seed: int, folder: Path) -> None:
-    """Refuses a folder that belongs to another config; `total_steps` may be more than what it was begun with.
-
-    Raises:
-        RunStateError: Another config's; shows the settings that differ.
-    """
-    path = folder / RUN_FILE
-    if not path.exists():
-        if (folder / CHECKPOINTS).exists():
-            raise RunStateError(
-                f"{str(folder)!r} has checkpoints but no {RUN_FILE} that says what they are of; delete it, or"
-                " choose another `name` or `output`."
-            )
-        return
-    try:
-        theirs = json.loads(path.read_text())
-        without_default_buffer_size(theirs.get("config", {}))  # older folders have it
-        there, here = _flat(theirs), _flat(json.loads(json.dumps(_identity(arm, seed))))
-    except (ValueError, AttributeError):
-        raise RunStateError(f"{str(path)!r} is unreadable; delete {str(folder)!r} to train again.") from None
-    differ = {key for key in there.keys() | here.keys() if there.get(key, "unset") != here.get(key, "unset")}
-    if there.get("total_steps", 0) <= arm.total_steps:
-        differ.discard("total_steps")
-    if differ:
-        lines = [
-            f"  {key}: {there.get(key, 'unset')!r} in the folder, {here.get(key, 'unset')!r} in the config"
-            + " (it can be raised, not lowered)" * (key == "total_steps")
-            for key in sorted(differ)
-        ]
-        raise RunStateError(
-            f"The run folder {str(folder)!r} belongs to another config:\n" + "\n".join(lines) + "\n"
-            "Choose another `name` or `output`, go back to its settings, or delete the folder."
-        )
-
-
-def _claim_folder(arm: ArmConfig, seed: int, folder: Path) -> None:
-    """Marks a folder that `check_folder` let through as this run's, or as one whose total was raised."""
-    path = folder / RUN_FILE
-    if not path.exists() or json.loads(path.read_text())["config"].get("total_steps") != arm.total_steps:
-        write_json(path, _identity(arm, seed))
-
-
-def _identity(arm: ArmConfig, seed: int) -> dict[str, Any]:
-    return {"arm": arm.name, "seed": seed, "config": arm.fingerprint()}
-
-
-def _is_finished(arm: ArmConfig, folder: Path) -> bool:
-    path = folder / FINISHED_FILE
-    return path.exists() and int(json.loads(path.read_text())["timesteps"]) >= arm.total_steps
-
-
-def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, item in value.items():
-        name = key if not prefix and key != "config" else f"{prefix}.{key}".lstrip(".")
-        if isinstance(item, dict) and item:
-            flat.update(_flat(item, "" if name == "config" else name))
-        else:
-            flat[name] = item
-    return flat
-
-
 def _new_model(arm: ArmConfig, seed: int, envs: VecEnv) -> BaseAlgorithm:
     if arm.normalize.observation or arm.normalize.reward:
         envs = VecNormalize(
@@ -323,11 +291,15 @@ def _continued(
     return model
 
 
-def _facts(model: BaseAlgorithm, elapsed_s: float, envs: VecEnv) -> dict[str, Any]:
+def _facts(
+    model: BaseAlgorithm, elapsed_s: float, envs: VecEnv, checkpoint: Checkpoint | None
+) -> dict[str, Any]:
     times = [time_us for time_us in envs.get_attr("filter_time_us") if time_us is not None]
+    # A run that was killed when its last checkpoint was written makes no step any more.
+    before = None if checkpoint is None else checkpoint.filter_time_us
     return {
         "timesteps": model.num_timesteps,
         "elapsed_s": elapsed_s,
         "steps_per_s": model.num_timesteps / elapsed_s,
-        "filter_time_us": float(np.mean(times)) if times else None,
+        "filter_time_us": float(np.mean(times)) if times else before,
     }

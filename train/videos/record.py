@@ -10,9 +10,10 @@ from typing import Any, Final
 from rich.console import Console
 
 from safe_wrappers import info as keys
-from safe_wrappers.errors import ConfigurationError
+from safe_wrappers.errors import ConfigurationError, RunStateError
 
 from ..atomic import write_bytes, write_json
+from ..checksums import checksums, damage, read_facts
 from ..config import ArmConfig, EnvConfig, ExperimentConfig, FilterConfig
 from ..evaluation.episode_selection import ShownEpisode, shown_episode
 from ..evaluation.evaluate import conditions
@@ -51,7 +52,12 @@ def load_video(path: Path) -> Video | None:
     facts = path.with_suffix(".json")
     if not (path.exists() and facts.exists()):
         return None
-    values = json.loads(facts.read_text())
+    try:
+        values = read_facts(facts, "")
+    except RunStateError:
+        return None
+    if damage(path.parent, values.get("files", {})) is not None:
+        return None
     return Video(
         path.read_bytes(), **{key: values[key] for key in ("steps", "speed", "changed", "violations")}
     )
@@ -68,7 +74,9 @@ def delete_videos(experiment: ExperimentConfig, arm: ArmConfig) -> None:
 def video_problem(experiment: ExperimentConfig) -> str:
     """The one line that says why there are no videos; empty if nothing is known to stand against them."""
     path = experiment.folder / "videos" / _PROBLEM
-    return str(json.loads(path.read_text())["problem"]) if path.exists() else ""
+    return str(
+        read_facts(path, "`safe-wrappers evaluate` (or `compare`) writes it again.").get("problem", "")
+    )
 
 
 def record_videos(experiment: ExperimentConfig, console: Console) -> None:
@@ -184,6 +192,7 @@ def record_video(
         "speed": speed,
         "changed": sum(film.changed),
         "violations": sum(film.violated) if judged else None,
+        "files": checksums([path]),
     }
     write_json(path.with_suffix(".json"), facts)
     progress.steps(1)
@@ -208,7 +217,11 @@ def _up_to_date(
         return False
     timesteps = finished_checkpoint(arm, shown.seed, experiment.run_folder(arm, shown.seed)).timesteps
     expected = json.loads(json.dumps(_state(arm, used, shown, timesteps)))
-    return bool(json.loads(facts.read_text())["state"] == expected)
+    try:
+        found = read_facts(facts, "")
+    except RunStateError:
+        return False
+    return found.get("state") == expected and damage(path.parent, found.get("files", {})) is None
 
 
 def _render_modes(env: EnvConfig) -> tuple[str, ...]:

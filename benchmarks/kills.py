@@ -1,0 +1,421 @@
+"""`compare` is killed at random moments until it has come to its end; is what is there then what should be there?
+
+    python -m benchmarks.kills    # 120 kills, some minutes; goes on where it was stopped
+
+The command of `benchmarks/kills.yaml` runs in a process group of its own: PPO without a filter and SAC through one,
+checkpoints, evaluation, report. SIGKILL goes to the whole group, at a random moment of a phase that is drawn, and the
+same command is given again; after some kills it is left alone to its end. Whatever takes long to import is imported
+once, and commands and runs are forked from there instead of started (`multiprocessing`'s fork for its spawn): nothing
+else is other than at a terminal. Films are left out (no display is needed then).
+
+What should be there. A run that goes on from a checkpoint makes new episodes, so a run that was killed is not the one
+that was not. But it must be the run that was cut off cleanly right after the checkpoints from which it went on: such
+runs are made too, in this order, and all that a run leaves is compared with theirs bit for bit: rows of training and
+evaluation, every step of the evaluation, weights, scaling. A run that lost no step must be the undisturbed one. Steps
+that are made again must be those since the last checkpoint, and what was finished before a kill must still be there
+after it, as it was.
+"""
+
+import argparse
+import ctypes
+import hashlib
+import json
+import mmap
+import multiprocessing
+import os
+import select
+import shutil
+import signal
+import struct
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import torch
+
+from safe_wrappers.train import cli, experiment
+from safe_wrappers.train.config import ArmConfig, ExperimentConfig, parse_experiment, read_config
+from safe_wrappers.train.evaluation.evaluate import evaluate_run
+from safe_wrappers.train.processes.job import Progress
+from safe_wrappers.train.run import training
+from safe_wrappers.train.run.callbacks import EpisodeRows
+from safe_wrappers.train.run.checkpoint import latest_checkpoint
+from safe_wrappers.train.run.training import train_run
+from safe_wrappers.train.videos import record
+
+CONFIG = Path(__file__).with_suffix(".yaml")
+RESULTS = Path(__file__).parent / "results"
+PHASES = ("start", "training", "checkpoint", "policy", "evaluation", "report")
+"""A checkpoint's is that of its writing; the policy's from the last checkpoint to the note that a run is finished."""
+KILLS_A_ROUND = 6
+LONGEST_S = 300.0
+WALL_CLOCK = ("filter_time_us", "elapsed_s", "steps_per_s")
+"""No two runs have the same ones."""
+QUIET = Progress(lambda _: None, lambda _: None)
+_SUBREAPER = 36
+
+
+@dataclass
+class Attempt:
+    """One command: how it ended, in which phase, and the steps that its run had made."""
+
+    status: int | None
+    """None: it was killed."""
+    phase: str
+    arm: str
+    steps: int
+    saved: int
+    """Of these, those that were in a checkpoint."""
+    seconds: dict[tuple[str, str], list[float]] = field(default_factory=dict)
+    """How long its phases took, by phase and arm, in their order."""
+
+
+class Stage:
+    """What forked processes say of themselves: their phases through a pipe, their steps in shared memory."""
+
+    def __init__(self) -> None:
+        self.told, self._tell = os.pipe()
+        self.steps = mmap.mmap(-1, 16)
+
+    def say(self, phase: str, arm: str = "") -> None:
+        os.write(self._tell, f"{phase} {arm}\n".encode())
+
+    def note(self, at: int, steps: int) -> None:
+        struct.pack_into("q", self.steps, 8 * at, steps)
+
+    def noted(self, at: int) -> int:
+        return int(struct.unpack_from("q", self.steps, 8 * at)[0])
+
+
+def staged(stage: Stage) -> list[Any]:
+    """Patches that tell where the command is."""
+    train, save = training.train_run, training.save_checkpoint
+    evaluate, summarize, step = experiment.evaluate_run, experiment.summarize_experiment, EpisodeRows._on_step
+    fork = multiprocessing.get_context("fork")
+
+    def trained(arm: ArmConfig, *given: Any, **named: Any) -> None:
+        stage.note(0, 0)
+        stage.note(1, 0)
+        stage.say("training", arm.name)
+        train(arm, *given, **named)
+        stage.say("start")
+
+    def saved(root: Path, model: Any, *given: Any, final: bool = False, **named: Any) -> Path:
+        arm = root.parents[1].name
+        stage.say("checkpoint", arm)
+        folder: Path = save(root, model, *given, final=final, **named)
+        stage.note(1, model.num_timesteps)
+        stage.say("policy" if final else "training", arm)
+        return folder
+
+    def stepped(self: EpisodeRows) -> bool:
+        stage.note(0, self.num_timesteps)
+        return step(self)
+
+    def evaluated(arm: ArmConfig, *given: Any) -> None:
+        stage.say("evaluation", arm.name)
+        evaluate(arm, *given)
+        stage.say("start")
+
+    def summarized(*given: Any) -> Any:
+        stage.say("report")
+        return summarize(*given)
+
+    return [
+        mock.patch.object(multiprocessing, "get_context", lambda _: fork),
+        mock.patch.object(record, "_render_modes", lambda _: ()),
+        mock.patch.object(experiment, "train_run", trained),
+        mock.patch.object(training, "save_checkpoint", saved),
+        mock.patch.object(EpisodeRows, "_on_step", stepped),
+        mock.patch.object(experiment, "evaluate_run", evaluated),
+        mock.patch.object(experiment, "summarize_experiment", summarized),
+    ]
+
+
+def in_a_fork(work: Callable[[], int], log: Path) -> int:
+    """Does work in a forked process, a group of its own; returns its id."""
+    child = os.fork()
+    if child:
+        os.setpgid(child, child)  # here too: whichever of the two comes first
+        return child
+    os.setpgid(0, 0)
+    out = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    os.dup2(out, 1)
+    os.dup2(out, 2)
+    try:
+        os._exit(work())
+    except BaseException:
+        traceback.print_exc()
+        os._exit(70)
+
+
+def ended(group: int) -> int:
+    """Waits for all processes of a group; returns the first one's status."""
+    status = 0
+    while True:
+        try:
+            child, how = os.waitpid(-group, 0)
+        except ChildProcessError:
+            return status
+        if child == group:
+            status = os.waitstatus_to_exitcode(how)
+
+
+def attempt(
+    folder: Path, target: tuple[str, str] | None = None, skip: int = 0, delay_s: float = 0.0
+) -> Attempt:
+    """Gives the command; kills it so long after the phase begins that comes after `skip` such ones."""
+    stage = Stage()
+
+    def command() -> int:
+        for patch in staged(stage):
+            patch.start()
+        stage.say("start")
+        return cli.main(["compare", str(CONFIG), f"output={folder}", "--report"])
+
+    group = in_a_fork(command, folder.with_suffix(".log"))
+    os.close(stage._tell)
+    now, since, left = ("start", ""), time.monotonic(), skip
+    seconds: dict[tuple[str, str], list[float]] = {}
+    kill_at: float | None = None
+    killed, text = False, b""
+    give_up = since + LONGEST_S
+    while True:
+        wait_s = max(0.0, (give_up if kill_at is None else kill_at) - time.monotonic())
+        if not select.select([stage.told], [], [], wait_s)[0]:
+            os.killpg(group, signal.SIGKILL)
+            killed = True
+            if kill_at is None:
+                raise TimeoutError(f"{folder}: more than {LONGEST_S:.0f} s in phase {now}")
+            break
+        got = os.read(stage.told, 4096)
+        if not got:
+            seconds.setdefault(now, []).append(time.monotonic() - since)
+            break
+        *lines, text = (text + got).split(b"\n")
+        for line in lines:
+            seconds.setdefault(now, []).append(time.monotonic() - since)
+            now = _place(line)
+            since = time.monotonic()
+            if now == target and kill_at is None:
+                kill_at, left = (since + delay_s, left) if left == 0 else (None, left - 1)
+    status = ended(group)
+    # What it had still said before it was gone.
+    while killed and (got := os.read(stage.told, 4096)):
+        *lines, text = (text + got).split(b"\n")
+        if lines:
+            now = _place(lines[-1])
+    os.close(stage.told)
+    return Attempt(None if killed else status, *now, stage.noted(0), stage.noted(1), seconds)
+
+
+def _place(line: bytes) -> tuple[str, str]:
+    phase, _, arm = line.decode().partition(" ")
+    return phase, arm
+
+
+def read_experiment(folder: Path) -> ExperimentConfig:
+    return parse_experiment(read_config(CONFIG, [f"output={folder}"]))
+
+
+def cut_off(folder: Path, arm: str, cuts: tuple[int, ...]) -> Path:
+    """A run that is cut off cleanly after each of these checkpoints, then trained to its end and evaluated."""
+    told = read_experiment(folder)
+    config = next(each for each in told.arms if each.name == arm)
+    run = told.run_folder(config, 0)
+    save = training.save_checkpoint
+
+    def part(cut: int | None) -> int:
+        def saved(root: Path, model: Any, *given: Any, **named: Any) -> Path:
+            made = save(root, model, *given, **named)
+            if model.num_timesteps == cut:
+                os._exit(0)
+            return made
+
+        with mock.patch.object(training, "save_checkpoint", saved):
+            train_run(config, 0, run, QUIET)
+            evaluate_run(config, 0, run, told.evaluation, told.evaluation_filter, QUIET)
+        return 0
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for cut in (*cuts, None):
+        if ended(in_a_fork(lambda cut=cut: part(cut), folder.with_suffix(".log"))):  # type: ignore[misc]
+            raise RuntimeError(f"see {folder.with_suffix('.log')}")
+    return run
+
+
+def left_by(run: Path) -> dict[str, str]:
+    """What a run leaves, by file and array, as checksums; not what a wall clock says."""
+    found: dict[str, Any] = {name: (run / name).read_bytes() for name in ("run.json", "episodes.csv")}
+    facts = json.loads((run / "finished.json").read_text())
+    found["finished.json"] = json.dumps(
+        {key: value is None if key in WALL_CLOCK else value for key, value in facts.items()}
+    ).encode()
+    for path in sorted((*run.glob("evaluation/*.csv"), *run.glob("policy/*.json"))):
+        found[str(path.relative_to(run))] = path.read_bytes()
+    for path in sorted(run.glob("*/*.npz")):
+        with np.load(path, allow_pickle=False) as arrays:
+            for name in arrays.files:
+                if name not in WALL_CLOCK:
+                    found[f"{path.relative_to(run)}:{name}"] = (
+                        str(arrays[name].dtype).encode() + arrays[name].tobytes()
+                    )
+    return {name: hashlib.sha256(data).hexdigest() for name, data in found.items()}
+
+
+def done(told: ExperimentConfig) -> dict[str, str]:
+    """What is finished by now, as checksums: nothing of it may go or change."""
+    found = {}
+    for arm in told.arms:
+        run = told.run_folder(arm, 0)
+        of_training = ("finished.json", "episodes.csv", "policy/config.json", "policy/model.npz")
+        names = of_training if (run / "finished.json").exists() else ()
+        if (run / "evaluation" / "evaluation.json").exists():
+            names = (*names, *(f"evaluation/{path.name}" for path in (run / "evaluation").iterdir()))
+        for name in names:
+            found[f"{arm.name}/{name}"] = hashlib.sha256((run / name).read_bytes()).hexdigest()
+    return found
+
+
+def resumes_at(told: ExperimentConfig, arm: str) -> int:
+    """The step from which a run will go on."""
+    run = told.output / told.name / arm / "seed_0"
+    checkpoint = latest_checkpoint(run / "checkpoints", lambda line: None)
+    return 0 if checkpoint is None else checkpoint.timesteps
+
+
+def round_of_kills(number: int, folder: Path, typical: dict[tuple[str, str], float]) -> dict[str, Any]:
+    """One comparison: some kills, then its end; and what is wrong with it then."""
+    rng = np.random.default_rng([20261123, number])
+    told = read_experiment(folder)
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    cuts: dict[str, list[int]] = {arm.name: [] for arm in told.arms}
+    kills, wrong = [], []
+    # In the order in which they come, so that none is behind the end of the one before.
+    places = list(typical)
+    for at in sorted(rng.integers(0, len(places), KILLS_A_ROUND)):
+        skip = int(rng.integers(0, 2)) if places[at][0] in ("training", "checkpoint") else 0
+        before = done(told)
+        made = attempt(folder, places[at], skip, float(rng.uniform(0, typical[places[at]])))
+        if made.status is not None:
+            if made.status:
+                wrong.append(f"the command ended with {made.status}, see {folder.with_suffix('.log')}")
+            break
+        lost = 0
+        if made.phase in ("training", "checkpoint", "policy"):
+            step = resumes_at(told, made.arm)
+            lost = max(0, made.steps - step)
+            if step < made.saved:
+                wrong.append(f"{made.arm} had a checkpoint of step {made.saved} and goes on from {step}")
+            if step and not (told.output / told.name / made.arm / "seed_0" / "finished.json").exists():
+                cuts[made.arm].append(step)
+        after = done(told)
+        gone = [name for name, checksum in before.items() if after.get(name) != checksum]
+        wrong += [f"{name} is gone or changed after a kill in phase {made.phase}" for name in gone]
+        kills.append({"phase": made.phase, "arm": made.arm, "lost": lost, "results_lost": len(gone)})
+    before = done(told)
+    status = attempt(folder).status
+    if status:
+        wrong.append(f"the command ended with {status}, see {folder.with_suffix('.log')}")
+        return {"round": number, "kills": kills, "wrong": wrong}
+    after = done(told)
+    wrong += [f"{name} was made again" for name, checksum in before.items() if after.get(name) != checksum]
+    for arm in told.arms:
+        # After its last checkpoint a run makes no step any more.
+        points = tuple(step for step in cuts[arm.name] if step < arm.total_steps)
+        name = "_".join(("cut", arm.name, *map(str, points)))
+        reference = folder.parent / name
+        if not (reference / "left.json").exists():
+            left = left_by(cut_off(reference, arm.name, points))
+            (reference / "left.json").write_text(json.dumps(left))
+        expected = json.loads((reference / "left.json").read_text())
+        found = left_by(told.run_folder(arm, 0))
+        differ = sorted(k for k in expected.keys() | found.keys() if expected.get(k) != found.get(k))
+        if differ:
+            wrong.append(f"{arm.name}, cut at {points}: other than a clean cut: {', '.join(differ)}")
+    litter = [str(path.relative_to(folder)) for path in folder.rglob(".*") if path.name != ".lock"]
+    wrong += [f"left behind: {name}" for name in litter]
+    if not wrong:
+        shutil.rmtree(folder)
+    return {"round": number, "kills": kills, "wrong": wrong, "cuts": cuts}
+
+
+def warm_up(folder: Path) -> dict[tuple[str, str], float]:
+    """Imports and compiles all that is needed, in this process; then how long each phase takes, s."""
+    torch.set_num_threads(1)
+    shutil.rmtree(folder, ignore_errors=True)
+    for arm in (told := read_experiment(folder)).arms:
+        train_run(arm, 0, told.run_folder(arm, 0), QUIET)
+        evaluate_run(arm, 0, told.run_folder(arm, 0), told.evaluation, told.evaluation_filter, QUIET)
+    experiment.summarize_experiment(told)
+    from safe_wrappers.train.report import write_report
+
+    write_report(told, experiment.summarize_experiment(told))
+    shutil.rmtree(folder)
+    made = attempt(folder)
+    if made.status:
+        raise RuntimeError(f"see {folder.with_suffix('.log')}")
+    shutil.rmtree(folder)
+    return {place: float(np.mean(seconds)) for place, seconds in made.seconds.items()}
+
+
+def summary(rounds: list[dict[str, Any]], command: str) -> str:
+    """What came of it, as a page."""
+    kills = [kill for each in rounds for kill in each["kills"]]
+    wrong = [line for each in rounds for line in each["wrong"]]
+    counts = Counter(kill["phase"] for kill in kills)
+    lines = [
+        "# Kills of `compare`",
+        "",
+        f"`{command}`",
+        "",
+        "| Killed in | kills | steps made again: mean | most | results lost |",
+        "|---|---|---|---|---|",
+    ]
+    for phase in (*PHASES, "all"):
+        of = [kill for kill in kills if phase in (kill["phase"], "all")]
+        if of:
+            lost = [kill["lost"] for kill in of]
+            results = sum(kill["results_lost"] for kill in of)
+            lines.append(f"| {phase} | {len(of)} | {np.mean(lost):.0f} | {max(lost)} | {results} |")
+    same = sum(not each["wrong"] for each in rounds)
+    lines += [
+        "",
+        f"{sum(counts.values())} kills in {len(rounds)} comparisons; {same} of them came to an end with what clean"
+        " cuts at the same checkpoints leave, bit for bit.",
+        "",
+        *(f"* {line}" for line in wrong),
+    ]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--kills", type=int, default=120)
+    parser.add_argument("--folder", type=Path, default=Path("runs/kills"))
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    options = parser.parse_args()
+    ctypes.CDLL(None).prctl(_SUBREAPER, 1, 0, 0, 0)  # orphans of a killed command are waited for here
+    path = options.results / "kills.json"
+    rounds: list[dict[str, Any]] = json.loads(path.read_text()) if path.exists() else []
+    options.folder.mkdir(parents=True, exist_ok=True)
+    typical = warm_up(options.folder / "undisturbed")
+    while sum(len(each["kills"]) for each in rounds) < options.kills:
+        number = len(rounds)
+        rounds.append(round_of_kills(number, options.folder / f"round_{number}", typical))
+        path.write_text(json.dumps(rounds, indent=1) + "\n")
+        print(rounds[-1], flush=True)
+    (options.results / "kills.md").write_text(
+        summary(rounds, f"python -m benchmarks.kills --kills {options.kills}")
+    )
+
+
+if __name__ == "__main__":
+    main()

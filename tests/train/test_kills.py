@@ -1,0 +1,102 @@
+"""SIGKILL at every file operation of a checkpoint: there is a whole one afterwards, no older one than before."""
+
+import os
+import shutil
+import signal
+import sys
+
+import fake_task
+import pytest
+import torch
+from stable_baselines3 import SAC
+
+from safe_wrappers.train.processes.lock import only_writer
+from safe_wrappers.train.run.checkpoint import latest_checkpoint, save_checkpoint
+
+OPERATIONS = ("open", "os.", "shutil.")
+"""Audit events of the interpreter: each file operation is announced before it is made."""
+
+
+@pytest.fixture(scope="module")
+def model():
+    torch.manual_seed(0)
+    return SAC(
+        "MlpPolicy", fake_task.FakeGoal(), buffer_size=8, policy_kwargs={"net_arch": [2]}, device="cpu"
+    )
+
+
+def save(model, root, step, final=False):
+    model.num_timesteps = step
+    save_checkpoint(root, model, {"timesteps": step, "elapsed_s": 1.0}, [root.parent / "a.csv"], final=final)
+
+
+def killed_at(operation, root, work):
+    """Does work in a forked process, and whether it was killed before its end."""
+    child = os.fork()
+    if child:
+        return os.WIFSIGNALED(os.waitpid(child, 0)[1])
+    left = operation
+
+    def kill(event, arguments):
+        nonlocal left
+        if event.startswith(OPERATIONS) and any(str(root) in str(argument) for argument in arguments):
+            left -= 1
+            if left < 0:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+    sys.addaudithook(kill)
+    work()
+    os._exit(0)
+
+
+@pytest.mark.parametrize(
+    ("before", "step", "final"),
+    [
+        ((), 64, False),
+        ((64,), 128, False),
+        ((64, 128), 192, False),
+        ((64, 128), 192, True),
+        ((64, 128), 128, False),  # a rollout that was given up
+        ((128,), 128, False),
+        ((128,), 128, True),
+    ],
+)
+def test_a_kill_at_any_file_operation_loses_no_checkpoint(tmp_path, model, before, step, final):
+    whole = tmp_path / "whole"
+    whole.mkdir()
+    (whole / "a.csv").write_text("rows\n")
+    for each in before:
+        save(model, whole / "checkpoints", each)
+    for operation in range(1000):
+        run = tmp_path / "run"
+        shutil.rmtree(run, ignore_errors=True)
+        shutil.copytree(whole, run)
+        root = run / "checkpoints"
+        killed = killed_at(operation, root, lambda root=root: save(model, root, step, final))
+        found = latest_checkpoint(root, pytest.fail)
+        reached = 0 if found is None else found.timesteps
+        assert reached in {max(before, default=0), step}
+        if killed and operation % 7 == 3:  # the same command goes on, and is killed, too
+            killed_at(operation, root, lambda root=root: save(model, root, step, final))
+            found = latest_checkpoint(root, pytest.fail)
+            assert reached <= (0 if found is None else found.timesteps)
+        save(model, root, step, final)
+        names = sorted(path.name for path in root.iterdir())
+        kept = sorted({*(() if final else before), step})[-2:]
+        assert names == [f"step_{each:012d}" for each in kept]
+        assert latest_checkpoint(root, pytest.fail).timesteps == step
+        if not killed:
+            break
+    assert operation > 10
+
+
+def test_a_killed_process_holds_no_folder(tmp_path):
+    hold = only_writer(tmp_path)
+    child = os.fork()
+    if not child:
+        hold.__enter__()
+        os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(child, 0)
+    assert f"process {child} on " in (tmp_path / ".lock").read_text()
+    with only_writer(tmp_path):
+        assert f"process {os.getpid()} on " in (tmp_path / ".lock").read_text()
