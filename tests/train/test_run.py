@@ -327,7 +327,7 @@ def test_a_corrupted_checkpoint_falls_back_to_the_one_before(fake_experiment, mo
             lambda c: (c / "model.zip").write_bytes(b"x"),
             "model.zip is not as it was written (its checksum differs)",
         ),
-        (lambda c: (c / "random.pkl").unlink(), "random.pkl is missing"),
+        (lambda c: (c / "random.json").unlink(), "random.json is missing"),
         (lambda c: (c / "state.json").write_text("{"), "state.json is missing or unreadable"),
     ],
 )

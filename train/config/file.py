@@ -11,7 +11,6 @@ import yaml
 
 from safe_wrappers.errors import ConfigurationError
 
-
 _MOST: Final = 100_000
 """Values in a file. A few lines of aliases of aliases can stand for any number of them."""
 _BITS: Final = 64

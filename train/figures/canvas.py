@@ -93,7 +93,8 @@ def _svg(figure: Figure, name: str, alt: str) -> str:
     text = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", text, flags=re.DOTALL)
     # HTML knows SVG; what is left holds no address at all.
     text = re.sub(r'\s(xmlns(:\w+)?)="[^"]*"', "", text)
-    # Two pictures in one page must not share ids.
+    # Two pictures in one page must not share ids. Theirs begin with names of arms.
+    name = re.sub(r"[^\w.-]", "-", name)
     text = re.sub(r'\bid="([^"]+)"', rf'id="{name}-\1"', text)
     text = re.sub(r"url\(#([^)]+)\)", rf"url(#{name}-\1)", text)
     text = re.sub(r'xlink:href="#([^"]+)"', rf'href="#{name}-\1"', text)

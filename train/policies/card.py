@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -54,9 +55,9 @@ def write_card(arm: ArmConfig, seed: int, run: Path, default_filter: FilterConfi
         f"tags: [{json.dumps(arm.env.id)}, reinforcement-learning, deep-reinforcement-learning, safe-wrappers]",
         "---",
         "",
-        f"# {arm.algorithm} on {arm.env.id}",
+        f"# {arm.algorithm} on {_text(arm.env.id)}",
         "",
-        f"Arm `{arm.name}`, seed {seed}: trained for {config['timesteps']:,} steps {own}"
+        f"Arm {_code(arm.name)}, seed {seed}: trained for {config['timesteps']:,} steps {own}"
         f" (learner `{arm.learner.kind}`).",
         "",
         "## Safety figures",
@@ -68,7 +69,7 @@ def write_card(arm: ArmConfig, seed: int, run: Path, default_filter: FilterConfi
         "",
         "## The filter that it was trained with",
         "",
-        *([f"* `{constraint}`" for constraint in constraints] or ["None."]),
+        *([f"* {_code(constraint)}" for constraint in constraints] or ["None."]),
         "",
         "A policy that was trained through a filter is no safer without it. Loading refuses another env or filter,"
         " unless told.",
@@ -83,7 +84,7 @@ def write_card(arm: ArmConfig, seed: int, run: Path, default_filter: FilterConfi
         "```",
         "",
         "Weights and statistics are arrays, all else is JSON: nothing is unpickled. Made with"
-        f" {', '.join(f'{name} {number}' for name, number in config['versions'].items())}.",
+        f" {_text(', '.join(f'{name} {number}' for name, number in config['versions'].items()))}.",
     ]
     write_text(folder / CARD, "\n".join(lines) + "\n")
 
@@ -111,9 +112,23 @@ def _cell(row: Mapping[str, Any], key: str) -> str:
     return NOT_JUDGED if key in OF_THE_JUDGE else "-"
 
 
+def _text(value: object) -> str:
+    """In one line, and no markup."""
+    return html.escape(_line(value), quote=False)
+
+
+def _code(value: object) -> str:
+    """In one line, as it is but for what would end the code."""
+    return f"`{_line(value)}`"
+
+
+def _line(value: object) -> str:
+    return " ".join(str(value).split()).replace("`", "'")
+
+
 def _judge(arm: ArmConfig) -> str:
     if arm.env.cost is not None:
-        return f"Violations are judged by `{arm.env.cost}`."
+        return f"Violations are judged by {_code(arm.env.cost)}."
     if arm.env.judge is not None:
         return "Violations are judged by the filter's own limits."
     return "Violations are the task's own, where it reports a cost."

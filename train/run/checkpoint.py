@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 import random
 import shutil
 import warnings
@@ -25,11 +24,12 @@ from safe_wrappers.errors import RunStateError
 from ..atomic import write_bytes, write_json
 from ..checksums import checksums, damage
 from ..config.algorithms import ALGORITHMS
+from .data_pickles import pickles_of_model, read_pickle
 
 MODEL: Final = "model.zip"
 NORMALIZE: Final = "vecnormalize.pkl"
 REPLAY: Final = "replay_buffer.pkl"
-RANDOM: Final = "random.pkl"
+RANDOM: Final = "random.json"
 STATE: Final = "state.json"
 _NO_BUFFER: Final[dict[str, Any]] = {
     "buffer_size": 1,
@@ -69,28 +69,44 @@ class Checkpoint:
         """
         sizes = {} if buffer_size is None else {"buffer_size": buffer_size}
         changed = _NO_BUFFER if env is None else sizes
+        path = self.folder / MODEL
         model: BaseAlgorithm = ALGORITHMS[algorithm].load(
-            self.folder / MODEL, env=env, device=device, custom_objects=changed
+            path, env=env, device=device, custom_objects=pickles_of_model(path) | changed
         )
         if env is not None:
             # A finished run's last checkpoint has no replay buffer.
             if isinstance(model, OffPolicyAlgorithm) and (self.folder / REPLAY).exists():
-                empty = model.replay_buffer
-                with warnings.catch_warnings():
-                    # HER ends the episodes that were cut: a continued run starts new ones, as it should.
-                    warnings.filterwarnings("ignore", "The last trajectory in the replay buffer")
-                    model.load_replay_buffer(self.folder / REPLAY)
-                assert empty is not None and model.replay_buffer is not None
-                if empty.buffer_size > model.replay_buffer.buffer_size:
-                    _move(model.replay_buffer, empty)
-                    model.replay_buffer = empty
-            _set_random_states(pickle.loads((self.folder / RANDOM).read_bytes()))
+                empty, saved = model.replay_buffer, self._replay_buffer(model)
+                assert empty is not None
+                if empty.buffer_size > saved.buffer_size:
+                    _move(saved, empty)
+                else:
+                    model.replay_buffer = saved
+            if (self.folder / RANDOM).exists():  # older checkpoints have none that is read
+                _set_random_states(json.loads((self.folder / RANDOM).read_text()))
         return model
 
     def load_normalize(self, env: VecEnv) -> VecEnv:
         """Puts the saved running statistics around the env; returns the env itself if the run had none."""
         path = self.folder / NORMALIZE
-        return VecNormalize.load(str(path), env) if path.exists() else env
+        if not path.exists():
+            return env
+        scaled: VecNormalize = read_pickle(path)
+        scaled.set_venv(env)
+        return scaled
+
+    def _replay_buffer(self, model: OffPolicyAlgorithm) -> ReplayBuffer:
+        """The saved one, as `load_replay_buffer` makes it ready."""
+        buffer: ReplayBuffer = read_pickle(self.folder / REPLAY)
+        buffer.device = model.device
+        if isinstance(buffer, HerReplayBuffer):
+            assert model.env is not None
+            buffer.set_env(model.env)
+            with warnings.catch_warnings():
+                # HER ends the episodes that were cut: a continued run starts new ones, as it should.
+                warnings.filterwarnings("ignore", "The last trajectory in the replay buffer")
+                buffer.truncate_last_trajectory()
+        return buffer
 
 
 def save_checkpoint(
@@ -148,7 +164,7 @@ def _write(
         normalize.save(str(folder / NORMALIZE))
     if isinstance(model, OffPolicyAlgorithm) and not final:
         model.save_replay_buffer(folder / REPLAY)
-    (folder / RANDOM).write_bytes(pickle.dumps(_random_states()))
+    write_json(folder / RANDOM, _random_states())
     kept = [path.name for path in beside if path.is_file()]
     for name in kept:
         shutil.copyfile(folder.parents[1] / name, folder / name)
@@ -224,10 +240,13 @@ def _damage(folder: Path) -> str | None:
 
 
 def _random_states() -> dict[str, Any]:
-    return {"python": random.getstate(), "numpy": np.random.get_state(), "torch": torch.get_rng_state()}
+    kind, keys, *rest = np.random.get_state(legacy=True)
+    torch_state = torch.get_rng_state().tolist()
+    return {"python": random.getstate(), "numpy": [kind, keys.tolist(), *rest], "torch": torch_state}
 
 
 def _set_random_states(states: dict[str, Any]) -> None:
-    random.setstate(states["python"])
-    np.random.set_state(states["numpy"])
-    torch.set_rng_state(states["torch"])
+    version, internal, gauss = states["python"]
+    random.setstate((version, tuple(internal), gauss))
+    np.random.set_state(tuple(states["numpy"]))
+    torch.set_rng_state(torch.tensor(states["torch"], dtype=torch.uint8))

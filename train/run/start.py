@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import zipfile
 from collections.abc import Mapping
 from copy import deepcopy
@@ -19,6 +18,7 @@ from safe_wrappers.errors import ConfigurationError
 
 from ..config import ArmConfig
 from .checkpoint import NORMALIZE
+from .data_pickles import pickles_of_model, read_pickle
 
 START_FILE: Final = "start.json"
 """In a run's folder: whose policy it began with."""
@@ -69,12 +69,13 @@ def policy_of_file(path: Path) -> Policy:
 
     Raises:
         ConfigurationError: There is none, or it is no SB3 model.
+        RunStateError: A pickle in it names what is no data.
     """
     if not path.is_file():
         raise ConfigurationError(f"start_from: there is no file {str(path)!r}.")
     beside = path.parent / NORMALIZE
     try:
-        data, parameters, _ = load_from_zip_file(path, device="cpu")
+        data, parameters, _ = load_from_zip_file(path, device="cpu", custom_objects=pickles_of_model(path))
         assert data is not None
         weights: Any = parameters["policy"]
         return Policy(
@@ -82,7 +83,7 @@ def policy_of_file(path: Path) -> Policy:
             data["observation_space"],
             data["action_space"],
             weights,
-            _statistics(pickle.loads(beside.read_bytes()) if beside.exists() else None),
+            _statistics(read_pickle(beside) if beside.exists() else None),
             int(data["num_timesteps"]),
         )
     except (zipfile.BadZipFile, ValueError, AssertionError, KeyError, AttributeError) as error:
