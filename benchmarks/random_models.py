@@ -13,6 +13,7 @@ process of its own, so that a crash is seen and has a seed.
 """
 
 import argparse
+import copy
 import json
 import os
 import random
@@ -37,7 +38,7 @@ from benchmarks.random_mjcf import RandomModel
 from safe_wrappers.errors import SafeWrappersError
 
 RESULTS = Path(__file__).parent / "results"
-STEPS = 5
+STEPS = 3
 BATCH = 500
 LONGEST_S = 120.0
 """Of one model, the first one's imports and compilation included."""
@@ -51,13 +52,12 @@ class Machine(MujocoEnv):
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - Gymnasium's
 
-    def __init__(self, xml: str, frame_skip: int, dtype: type) -> None:
-        self._xml, self._dtype = xml, dtype
+    def __init__(self, model: mujoco.MjModel, frame_skip: int, dtype: type) -> None:
+        self._made, self._dtype = model, dtype
         super().__init__(__file__, frame_skip, gym.spaces.Box(-np.inf, np.inf, (1,)))
 
     def _initialize_simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        model = mujoco.MjModel.from_xml_string(self._xml)
-        return model, mujoco.MjData(model)
+        return self._made, mujoco.MjData(self._made)
 
     def _set_action_space(self) -> gym.spaces.Box:
         limited, bounds = self.model.actuator_ctrllimited == 1, self.model.actuator_ctrlrange
@@ -88,7 +88,8 @@ def trial(seed: int) -> tuple[str, str]:
     rng = random.Random(f"trial {seed}")
     frame_skip, dtype = rng.choice((1, 2, 4, 5)), rng.choice((np.float32, np.float64))
     try:
-        machine, twin = (Machine(drawn.xml, frame_skip, dtype) for _ in range(2))
+        model = mujoco.MjModel.from_xml_string(drawn.xml)
+        machine, twin = (Machine(each, frame_skip, dtype) for each in (model, copy.copy(model)))
         _simulate(twin, seed)
     except (ValueError, mujoco.FatalError) as error:
         return "mujoco", str(error)
