@@ -41,12 +41,20 @@ class Bottom(gym.Wrapper):
         return super().step(action)
 
 
-def slow(observation):
-    return 3.0 - abs(observation[2])  # rad/s
+def drift(x):
+    return np.array([x[1], 15.0 * np.sin(x[0])])
 
 
-def brake(observation):
-    return [np.clip(-4.0 * observation[2], -2.0, 2.0)]
+def push(x):
+    return np.array([[0.0], [3.0]])
+
+
+def angle_and_speed(env):
+    return env.state
+
+
+def slow(x):
+    return 9.0 - x[1] ** 2  # rad^2/s^2
 
 
 def made(env_id):
@@ -64,9 +72,8 @@ def reacher():
 
 
 def pendulum():
-    shield = sw.constraints.PredictiveShield(slow, horizon=6, backup=brake)
-    env = sw.CBFActionFilter(made("Pendulum-v1"), [shield], sw.SimulatorPlant(check_steps=20))
-    return sw.RecordInterventions(env)
+    plant = sw.AnalyticPlant(drift, push, angle_and_speed, lower=-2.0, upper=2.0, control_dt=0.05)
+    return sw.RecordInterventions(sw.CBFActionFilter(made("Pendulum-v1"), [sw.constraints.Barrier(slow)], plant))
 
 
 STACKS = [point_goal, reacher, pendulum]
@@ -145,7 +152,7 @@ class Calls(RuleBasedStateMachine):
     @initialize()
     def begin(self):
         self.stack, self.twin = self.make(), self.make()
-        self.running = False  # whether an episode has begun
+        self.running = self.seeded = False  # whether an episode has begun, and ever one with a seed
         self.margin = 0.0
         self.episode = []
 
@@ -154,6 +161,9 @@ class Calls(RuleBasedStateMachine):
 
     @rule(seed=SEEDS)
     def reset(self, seed):
+        if not self.seeded and seed is None:
+            seed = 0
+        self.seeded = True
         start = self.stack.reset(seed=seed)
         same(start, self.twin.reset(seed=seed), "reset")
         self.running, self.episode = True, []
@@ -268,6 +278,7 @@ class VectorCalls(RuleBasedStateMachine):
 
     @rule(seed=SEEDS)
     def reset(self, seed):
+        seed = seed if self.running else seed or 0
         same(self.stack.reset(seed=seed), self.twin.reset(seed=seed), "reset")
         self.running = True
 
